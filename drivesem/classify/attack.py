@@ -184,13 +184,13 @@ def report_run(
     run = ClassifiedRun.of(
         frames,
         classes,
-        dict(sorted(failed.items())),
-        round(seconds, 3),
         out=str(out),
         objects=config.objects or "embedded",
         network=config.network,
         method=config.method,
         params=tuple(str(one) for one in params_of(config)),
+        frames_failed=dict(sorted(failed.items())),
+        seconds=round(seconds, 3),
     )
     files.write_json(out / METRICS, run.to_json())
     files.write_text(out / CSV, csv_text([frame.row() for frame in frames]))

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from drivesem.classify.results import ClassifiedFrame, ClassifiedRun, ClassTally
 from drivesem.report import web
+from drivesem.report.drawing import jpeg_address
 from drivesem.report.tables import percent
 from drivesem.truth.grades import Grade
 from scene_ir import files
 
 SECOND_PICTURE = "second.png"
 """A second renderer's picture of a failure, in the folder of its frame."""
-_QUALITY = 90
-"""Of the page's pictures, which are copies of the folders'."""
-_ORDER = {Grade.CONFIRMED: 0, Grade.CERTAIN: 1, Grade.THRESHOLD: 2, None: 3}
+_ORDER: dict[str | None, int] = {Grade.CONFIRMED: 0, Grade.CERTAIN: 1, Grade.THRESHOLD: 2}
 
 
 def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]) -> None:
     """Write the page beside the run's folder of frames. Raises FormatError where a picture is missing."""
-    worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 3), f.attacked.margin, f.identifier))  # type: ignore[call-overload]
+    worst = sorted(frames, key=lambda f: (_ORDER.get(f.grade, 3), f.attacked.margin, f.identifier))
     cards = [_card(frame, path.parent / "frames" / frame.identifier) for frame in worst]
     rows = [(one, *shares(one)) for one in run.classes]
     before, after = shares(run.whole)
@@ -46,11 +42,5 @@ def _card(frame: ClassifiedFrame, folder: Path) -> dict[str, Any]:
     shots = {"before": "benign.png", "after": "counterexample.png"}
     if frame.second is not None:
         shots[frame.second.agreement.by] = SECOND_PICTURE
-    pictures = [(name, _embedded(folder / file)) for name, file in shots.items()]
+    pictures = [(name, jpeg_address(files.read_image(folder / file))) for name, file in shots.items()]
     return {"frame": frame, "shots": pictures, "moved": ", ".join(told)}
-
-
-def _embedded(path: Path) -> str:
-    image = files.read_image(path)[..., ::-1]
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

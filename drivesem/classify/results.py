@@ -124,15 +124,8 @@ class ClassifiedRun:
     seconds: float
 
     @classmethod
-    def of(
-        cls,
-        frames: Sequence[ClassifiedFrame],
-        classes: Sequence[str],
-        failed: dict[str, str],
-        seconds: float,
-        **facts: Any,
-    ) -> ClassifiedRun:
-        """Count frames. facts: the fields that say what was asked."""
+    def of(cls, frames: Sequence[ClassifiedFrame], classes: Sequence[str], **facts: Any) -> ClassifiedRun:
+        """Count frames. facts: the fields that frames do not tell."""
         tallies = []
         for name in classes:
             own = [frame for frame in frames if frame.label == name]
@@ -142,10 +135,8 @@ class ClassifiedRun:
             tallies.append(ClassTally(name, len(own), benign, attacked, certain, confirmed))
         return cls(
             classes=tuple(tallies),
-            frames_failed=failed,
             queries=sum(frame.queries for frame in frames),
             passes=sum(frame.passes for frame in frames),
-            seconds=seconds,
             **facts,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from functools import lru_cache
 from pathlib import Path
@@ -30,8 +31,18 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
     if path.suffix.lower() not in (".jpg", ".jpeg"):
         files.write_png(path, picture)
         return
-    _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-    files.write_bytes(path, data.tobytes())
+    files.write_bytes(path, _jpeg(picture, 92))
+
+
+def jpeg_address(picture: np.ndarray) -> str:
+    """A picture as JPEG in the address by which a page shows it. Its quality is high, or people who are asked how
+    real it looks would judge the compression.
+    """
+    return f"data:image/jpeg;base64,{base64.b64encode(_jpeg(picture, 90)).decode('ascii')}"
+
+
+def _jpeg(picture: np.ndarray, quality: int) -> bytes:
+    return cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def depth_colours(depth_m: np.ndarray) -> np.ndarray:

@@ -80,9 +80,9 @@ class _Attackers:
         place, shown = job
         arm = self._arms[place]
         if place not in self._kept:
-            like = [one for one in self._kept.values() if one.config.network == arm.config.network]
-            any_other = next(iter(self._kept.values()), None)
-            self._kept[place] = Attacker.of(arm.config, like[0] if like else any_other)
+            # One that attacks the same network, or else any.
+            others = sorted(self._kept.values(), key=lambda one: one.config.network != arm.config.network)
+            self._kept[place] = Attacker.of(arm.config, next(iter(others), None))
         self._kept[place].attack(shown, arm.out)
 
 

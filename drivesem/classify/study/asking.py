@@ -9,12 +9,11 @@ from drivesem.classify.study.kept import keep_results, load_results
 from drivesem.classify.study.lab import PICTURES, TABLES, Lab
 from drivesem.classify.study.looking import LOOKED
 from drivesem.classify.study.results import Facts, Results
-from drivesem.classify.study.tables import ORDERS, flat, remarks, tables_of
-from drivesem.questions.study.kept_rows import KEPT, NOT_TOLD
+from drivesem.classify.study.tables import ORDERS, tables_of
+from drivesem.questions.study.kept_rows import KEPT, command_of
 from drivesem.report.answer import Answer
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
 from drivesem.settings.commands import Study
-from drivesem.settings.text import command_line
 
 _WRITTEN = (
     *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
@@ -47,7 +46,7 @@ def study_run(study: Study) -> Answer:
     lab.attack()
     lab.teach()
     results = Results(Facts.of(study, lab), lab)
-    answer = _answer(study, results, lab.out)
+    answer = _answer(results, lab.out)
     keep_results(lab.out / KEPT, results)
     answer.write()
     return answer
@@ -55,40 +54,38 @@ def study_run(study: Study) -> Answer:
 
 def _again(study: Study, folder: Path) -> Answer:
     results = load_results(folder)
-    told = results.facts.study
     if study.bootstrap is not None:
-        told = replace(told, bootstrap=study.bootstrap)
+        told = replace(results.facts.study, bootstrap=study.bootstrap)
         results.facts = replace(results.facts, study=told)
-    answer = _answer(told, results, folder_of(study.out, folder))
+    answer = _answer(results, folder_of(study.out, folder))
     if study.out is not None:
         answer.write()
     return answer
 
 
-def _answer(study: Study, results: Results, out: Path) -> Answer:
+def _answer(results: Results, out: Path) -> Answer:
     found, facts = tables_of(results), results.facts
-    command = command_line("study", study, (*NOT_TOLD, "name"))
     return Answer(
         out=out,
         name="study",
         heading="Image classifiers",
         data={
-            "study": study.name,
+            "study": facts.study.name,
             "out": str(out),
             "networks": [one.name for one in facts.networks],
-            "objects": study.objects or "embedded",
+            "objects": facts.study.objects or "embedded",
             "pictures": facts.counts,
             "bootstrap": results.drawing.draws,
             "tables": {
-                one.name: {"rows": one.rows, "reference": one.reference, "notes": remarks(one)} for one in found
+                one.name: {"rows": one.rows, "reference": one.reference, "notes": one.notes} for one in found
             },
             "frames_failed": facts.failed,
         },
-        tables={one.name: flat(one.rows) for one in found if one.rows},
+        tables={one.name: one.rows for one in found if one.rows},
         sheets=[one.sheet() for one in found],
-        notes=[_NOTE.format(draws=results.drawing.draws), *(note for one in found for note in remarks(one))],
+        notes=[_NOTE.format(draws=results.drawing.draws), *(note for one in found for note in one.notes)],
         words=_WORDS,
         printed=[one.sheet(classes=False) for one in found if one.name != ORDERS],
-        lead=[f"`{command.replace('study', f'study {study.name}', 1)}`", ""],
+        lead=[f"`{command_of(facts.study)}`", ""],
         failed=facts.failed,
     )

@@ -35,10 +35,6 @@ class Answers:
     label: Integers
     unit: Integers
 
-    def among(self, kept: np.ndarray) -> Answers:
-        """Some pictures: kept (M,) bool."""
-        return Answers(self.right[kept], self.label[kept], self.unit[kept])
-
     def by_class(self, count: int) -> list[float | None]:
         """Accuracy within each class; None of a class without pictures."""
         own = [self.right[self.label == place] for place in range(count)]
@@ -50,9 +46,8 @@ class Answers:
         """
         weights = np.ones(len(self.label))
         if sizes is not None:
-            weights = (np.asarray(sizes) / np.maximum(np.bincount(self.label, minlength=len(sizes)), 1))[
-                self.label
-            ]
+            counts = np.bincount(self.label, minlength=len(sizes))
+            weights = (np.asarray(sizes) / np.maximum(counts, 1))[self.label]
         return drawing.ratio(self.right * weights, weights, self.unit)
 
     def below(self, other: Answers, drawing: Drawing) -> Interval:

@@ -7,16 +7,15 @@ of the classes below; all are keyed as `results` asks for them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.study.lab import TABLES
-from drivesem.classify.study.results import OVERALL, Facts, Key, Results
+from drivesem.classify.study.results import OVERALL, Facts, K, Key, Results
 from drivesem.questions.realism.measures import METRICS
 from drivesem.questions.study.kept_rows import (
     STUDY,
@@ -33,7 +32,6 @@ from drivesem.run.records import load_record
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-_T = TypeVar("_T")
 _SCHEMA = 1
 _ANSWERS, _SETS = "answers.csv", "sets.csv"
 _DISTANCES, _CHANCES = "distances.csv.gz", "chances.csv.gz"
@@ -109,24 +107,19 @@ class _Head:
 def keep_results(folder: Path, results: Results) -> None:
     """Write what was noted, whole."""
     facts = asdict(results.facts) | {"study": settings_of(results.facts.study)}
-    certain = [asdict(CertainRow(name, by, count)) for (name, by), count in results.certain.items()]
-    answers = (
-        AnswersRow(what, name, by, other or None, "".join("01"[bool(one)] for one in right))
-        for (what, name, by, other), right in results.right.items()
-    )
+    certain = [asdict(CertainRow(*key, count)) for key, count in results.certain.items()]
+    answers = (AnswersRow(*key, "".join("01"[bool(one)] for one in right)) for key, right in results.right.items())
     distances = (
-        DistanceRow(what, name, by, metric or None, place, float(far))
-        for (what, name, by, metric), column in results.distances.items()
-        for place, far in enumerate(column)
+        DistanceRow(*key, place, far)
+        for key, column in results.distances.items()
+        for place, far in enumerate(column.tolist())
     )
     chances = (
-        ChancesRow(name, by, trained or None, place, " ".join(map(repr, row)))
-        for (name, by, trained), rows in results.chances.items()
+        ChancesRow(*key, place, " ".join(map(repr, row)))
+        for key, rows in results.chances.items()
         for place, row in enumerate(rows.tolist())
     )
-    sets = (
-        SetRow(name, by, metric, kind, distance) for (name, by, metric, kind), distance in results.sets.items()
-    )
+    sets = (SetRow(*key, distance) for key, distance in results.sets.items())
     with files.whole_folder(folder) as into:
         files.write_json(into / STUDY, {"schema": _SCHEMA, "facts": facts, "certain": certain})
         write_rows(into / _ANSWERS, AnswersRow, answers)
@@ -192,11 +185,11 @@ def _distances(path: Path, count: int) -> dict[Key, Floats]:
             require(row.distance >= 0, f"{where}: distance", "at least 0", row.distance)
             yield where, (row.what, row.network, row.strategy, row.metric or ""), row.picture, row.distance
 
-    return {key: np.array(column, np.float64) for key, column in _columns(values(), count, path).items()}
+    return _columns(values(), count, path)
 
 
-def _chances(path: Path, facts: Facts) -> dict[Key, Floats]:
-    def values() -> Iterator[tuple[str, Key, int, list[float]]]:
+def _chances(path: Path, facts: Facts) -> dict[tuple[str, str, str], Floats]:
+    def values() -> Iterator[tuple[str, tuple[str, str, str], int, list[float]]]:
         for where, row in read_rows(path, ChancesRow):
             try:
                 chances = [float(word) for word in row.chances.split()]
@@ -208,22 +201,20 @@ def _chances(path: Path, facts: Facts) -> dict[Key, Floats]:
             require(good, f"{where}: chances", f"{len(facts.classes)} from 0 to 1", row.chances[:40])
             yield where, (row.network, row.strategy, row.trained or ""), row.picture, chances
 
-    rows = _columns(values(), len(facts.pictures), path)
-    return {key: np.array(column, np.float64) for key, column in rows.items()}
+    return _columns(values(), len(facts.pictures), path)
 
 
-def _columns(rows: Iterator[tuple[str, Key, int, _T]], count: int, path: Path) -> Mapping[Key, list[_T]]:
+def _columns(rows: Iterator[tuple[str, K, int, float | list[float]]], count: int, path: Path) -> dict[K, Floats]:
     """Values by key, of each picture one, in their order."""
-    found: dict[Key, list[_T]] = {}
+    found: dict[K, list[float | list[float]]] = {}
     for where, key, picture, value in rows:
         column = found.setdefault(key, [])
         require(picture == len(column) < count, f"{where}: picture", f"{len(column)}, of {count}", picture)
         column.append(value)
     for key, column in found.items():
-        require(
-            len(column) == count, str(path), f"{count} pictures of {', '.join(filter(None, key))}", len(column)
-        )
-    return found
+        expected = f"{count} pictures of {', '.join(filter(None, key))}"
+        require(len(column) == count, str(path), expected, len(column))
+    return {key: np.array(column, np.float64) for key, column in found.items()}
 
 
 def _sets(path: Path, facts: Facts) -> dict[Key, float | None]:

@@ -25,7 +25,7 @@ from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT, STRATEGIES, Arm, attack_of, preset, run_arms
 from drivesem.classify.study.figures import keeping_shares
-from drivesem.classify.study.looking import LOOKED, Apart, Eyes, apart, kept
+from drivesem.classify.study.looking import LOOKED, Eyes, apart, kept
 from drivesem.classify.training import embedded, fit_last
 from drivesem.questions.realism.asking import AVAILABLE, chosen
 from drivesem.questions.realism.measures import load
@@ -52,9 +52,10 @@ _NEEDS = {
     "sizes": (),
 }
 TABLES = tuple(_NEEDS)
+LEARNT = ("retraining", "robustness", "worth")
+"""Tables of retrained networks."""
 _SIZES = {"limit": (480, 36), "fresh": (232, 36), "train_pictures": (960, 144)}
 """Pictures by default, and with --quick."""
-_Key = tuple[str, ...]
 
 
 @dataclass
@@ -70,7 +71,7 @@ class Lab:
     tables: tuple[str, ...]
     test: tuple[Shown, ...]
     train: tuple[Shown, ...]
-    arms: dict[_Key, Arm] = field(default_factory=dict[_Key, Arm])
+    arms: dict[tuple[str, str, str], Arm] = field(default_factory=dict[tuple[str, str, str], Arm])
     taught: dict[tuple[str, str], Classifier] = field(default_factory=dict[tuple[str, str], Classifier])
     failed: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -97,11 +98,6 @@ class Lab:
     def deep(self) -> tuple[Eyes, ...]:
         """Networks of the tables that take long: with --quick the first alone."""
         return self.eyes[:1] if self.study.quick else self.eyes
-
-    @property
-    def strategies(self) -> tuple[str, ...]:
-        """What the tables need of each network."""
-        return tuple(one for one in STRATEGIES if any(one in _NEEDS[name] for name in self.tables))
 
     def wants(self, *names: str) -> bool:
         return any(name in self.tables for name in names)
@@ -133,9 +129,10 @@ class Lab:
 
     def attack(self) -> None:
         """All attacks on the networks as they are. Raises UsageError or SceneError."""
-        for eyes, strategy in product(self.eyes, self.strategies):
-            grade = not self.study.quick
-            self._add("test", eyes, strategy, self.test, grade=grade, **preset(eyes.theirs, strategy))
+        needed = [one for one in STRATEGIES if any(one in _NEEDS[name] for name in self.tables)]
+        for eyes, strategy in product(self.eyes, needed):
+            usual, grade = preset(eyes.theirs, strategy), not self.study.quick
+            self._add("test", eyes, strategy, self.test, strategy, **usual, grade=grade)
         for eyes, strategy in product(self.deep, GRADIENT):
             usual = preset(eyes.theirs, strategy)
             for params in SINGLE if self.wants("parameters") else ():
@@ -144,7 +141,7 @@ class Lab:
             for network in {*NETWORKS} - {eyes.theirs} if self.wants("hyperparameters") else ():
                 name = f"{strategy}-as-{network}"
                 self._add(network, eyes, strategy, self.test, name, **preset(network, strategy))
-            if self.wants("retraining", "robustness", "worth"):
+            if self.wants(*LEARNT):
                 shown = [self.train[place] for place in self.replaced]
                 self._add("train", eyes, strategy, shown, f"{strategy}-train", **usual)
         self.failed |= run_arms(list(self.arms.values()), self.study, "attacking pictures")
@@ -158,21 +155,15 @@ class Lab:
                 report_run(arm.config, arm.out, self.classes, self.done, {}, seconds)
 
     def _add(
-        self,
-        kind: str,
-        eyes: Eyes,
-        strategy: str,
-        shown: Sequence[Shown],
-        name: str | None = None,
-        **settings: Any,
+        self, kind: str, eyes: Eyes, strategy: str, shown: Sequence[Shown], name: str, **settings: Any
     ) -> None:
-        folder = f"{eyes.name}-{name or strategy}"
-        config = attack_of(self.study, self.out, folder, settings.pop("network", eyes.spec), **settings)
+        folder, network = f"{eyes.name}-{name}", settings.pop("network", eyes.spec)
+        config = attack_of(self.study, self.out, folder, network, **settings)
         self.arms[kind, eyes.name, strategy] = Arm(config, tuple(shown))
 
     def teach(self) -> None:
         """Networks retrained on each method's counterexamples, and attacked anew."""
-        if not self.wants("retraining", "robustness", "worth"):
+        if not self.wants(*LEARNT):
             return
         settings = attack_of(self.study, self.out, "", self.eyes[0].spec)
         studio = Studio.of(settings)
@@ -200,9 +191,8 @@ class Lab:
     def _attack_taught(self) -> None:
         before = set(self.arms)
         for eyes, trained, strategy in product(self.deep, GRADIENT, GRADIENT):
-            usual = dict(preset(eyes.theirs, strategy))
+            usual, network = preset(eyes.theirs, strategy), str(self.weights(eyes, trained))
             name = f"{trained}-retrained-{strategy}"
-            network = str(self.weights(eyes, trained))
             self._add(f"against {trained}", eyes, strategy, self.few, name, **usual, network=network)
         fresh = [arm for key, arm in self.arms.items() if key not in before]
         self.failed |= run_arms(fresh, self.study, "attacking retrained networks")
@@ -230,7 +220,7 @@ class Lab:
         """Distances (N,) from the pictures before, as `Results.far` says."""
         if what == "pixels":
             return self.pixels(self.eyes_of(network))[f"{strategy} apart"].astype(np.float64)
-        return self.apart(network, strategy).pairs[metric]
+        return self.apart(network, strategy)[metric]
 
     def chances(self, network: str, strategy: str, trained: str) -> Floats:
         """Softmax (N, C) of a network, as it was or trained so, for the pictures against it as it was."""
@@ -256,8 +246,8 @@ class Lab:
             return target.features(BENIGN, before)
         return target.features(f"{strategy} against {source.name}", after)
 
-    def apart(self, network: str, strategy: str) -> Apart:
-        """How far counterexamples are from the pictures before."""
+    def apart(self, network: str, strategy: str) -> Mapping[str, np.ndarray]:
+        """How far counterexamples are from the pictures before, as `looking.apart` says."""
         before, after = pictures(self.arms["test", network, strategy], self.done)
         path = self.out / LOOKED / f"{network}-{strategy}-distances.npz"
         return apart(path, list(zip(before, after, strict=True)), self.measures)

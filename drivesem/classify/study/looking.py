@@ -12,9 +12,9 @@ from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.training import embedded
+from drivesem.questions.realism.comparison import Measures
 from drivesem.questions.realism.frechet import Gaussian, frechet
-from drivesem.questions.realism.measures import METRICS, PairDistance, SetFeatures
-from drivesem.questions.worth.measures import Floats
+from drivesem.questions.realism.measures import METRICS
 from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
 from drivesem.run.looking import weights_digest
@@ -66,25 +66,10 @@ class Eyes:
         return "\n".join((weights_digest(self.network), *(f"{path.parent.name}/{path.name}" for path in paths)))
 
 
-@dataclass(frozen=True, slots=True)
-class Apart:
-    """How far pictures are from those they were made of. pairs (M,) by metric, PSNR's as squared errors; sets: by
-    metric the features (M, D) before and after.
+def apart(path: Path, pairs: Sequence[tuple[Path, Path]], measures: Measures) -> Mapping[str, np.ndarray]:
+    """How far pictures are from those they were made of: distances (M,) by metric, PSNR's as squared errors; of
+    metrics of sets the features (M, D), as "METRIC before" and "METRIC after". path: the file that keeps them.
     """
-
-    pairs: Mapping[str, Floats]
-    sets: Mapping[str, tuple[Floats, Floats]]
-
-    def between(self, metric: str, kept: np.ndarray) -> float | None:
-        """The distance of the sets of some pictures, kept (M,) bool; None where there are too few."""
-        first, second = (side[kept] for side in self.sets[metric])
-        return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None
-
-
-def apart(
-    path: Path, pairs: Sequence[tuple[Path, Path]], measures: Mapping[str, PairDistance | SetFeatures]
-) -> Apart:
-    """Distances of pictures, before and after. path: the file that keeps them."""
 
     def compute() -> Mapping[str, np.ndarray]:
         columns: dict[str, list[np.ndarray | float]] = {}
@@ -99,8 +84,13 @@ def apart(
                         columns.setdefault(f"{name} after", []).append(measure(after))  # type: ignore[call-arg]
         return {name: np.asarray(column, np.float64) for name, column in columns.items()}
 
-    about = "\n".join((", ".join(measures), *(str(after.parent.name) for _, after in pairs)))
-    found = kept(path, about, compute)
-    pairwise = {name: found[name] for name in measures if METRICS[name].pairwise}
-    rest = [name for name in measures if not METRICS[name].pairwise]
-    return Apart(pairwise, {name: (found[f"{name} before"], found[f"{name} after"]) for name in rest})
+    about = "\n".join((", ".join(measures), *(after.parent.name for _, after in pairs)))
+    return kept(path, about, compute)
+
+
+def between(features: Mapping[str, np.ndarray], metric: str, among: np.ndarray) -> float | None:
+    """The distance of the sets of some pictures, among (M,) bool; None where there are too few. features: as of
+    `apart`.
+    """
+    first, second = (features[f"{metric} {side}"][among] for side in ("before", "after"))
+    return frechet(Gaussian.of(first), Gaussian.of(second)) if len(first) > 1 else None

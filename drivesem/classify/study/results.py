@@ -15,7 +15,8 @@ from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.study import pixels
 from drivesem.classify.study.arms import GRADIENT
 from drivesem.classify.study.figures import Answers, Drawing
-from drivesem.classify.study.lab import BENIGN, Lab
+from drivesem.classify.study.lab import BENIGN, LEARNT, Lab
+from drivesem.classify.study.looking import between
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.questions.realism.measures import METRICS, missing, psnr_db
 from drivesem.questions.worth.measures import Floats, Points, classified
@@ -23,8 +24,9 @@ from drivesem.questions.worth.runs import PREFERRED
 from drivesem.settings.commands import Study
 from scene_ir.errors import FormatError
 
-Key = tuple[str, ...]
+Key = tuple[str, str, str, str]
 OVERALL = "overall"
+K = TypeVar("K", bound=tuple[str, ...])
 _T = TypeVar("_T")
 
 
@@ -98,10 +100,10 @@ class Results:
     facts: Facts
     lab: Lab | None = None
     right: dict[Key, np.ndarray] = field(default_factory=dict[Key, np.ndarray])
-    chances: dict[Key, Floats] = field(default_factory=dict[Key, Floats])
+    chances: dict[tuple[str, str, str], Floats] = field(default_factory=dict[tuple[str, str, str], Floats])
     distances: dict[Key, Floats] = field(default_factory=dict[Key, Floats])
     sets: dict[Key, float | None] = field(default_factory=dict[Key, "float | None"])
-    certain: dict[Key, int | None] = field(default_factory=dict[Key, "int | None"])
+    certain: dict[tuple[str, str], int | None] = field(default_factory=dict[tuple[str, str], "int | None"])
 
     @property
     def deep(self) -> tuple[Network, ...]:
@@ -121,8 +123,7 @@ class Results:
     @cached_property
     def units(self) -> np.ndarray:
         """Which object each picture (N,) is of."""
-        places = {name: place for place, name in enumerate(sorted({*self.facts.pictures}))}
-        return np.array([places[name] for name in self.facts.pictures], np.int64)
+        return np.unique(self.facts.pictures, return_inverse=True)[1]
 
     def answers(self, what: str, network: Network, strategy: str, other: str = "test") -> Answers:
         """What a network makes of pictures, under a strategy or, for BENIGN, as they are.
@@ -138,8 +139,7 @@ class Results:
 
     def taught(self, network: Network, trained: str) -> bool:
         """Whether it was retrained so."""
-        wanted = any(name in self.facts.tables for name in ("retraining", "robustness", "worth"))
-        return wanted and network.deep and trained in GRADIENT
+        return network.deep and trained in GRADIENT and any(name in self.facts.tables for name in LEARNT)
 
     def points(self, network: Network, strategy: str, rho: Floats, trained: str = "") -> Points:
         """Pictures before a network, as it was or retrained; what is drawn together are an object's."""
@@ -161,7 +161,7 @@ class Results:
             kept = kept & (self.labels == self.facts.classes.index(kind))
         if not METRICS[metric].pairwise:
             key = (network.name, strategy, metric, kind)
-            return self._noted(self.sets, key, lambda lab: lab.apart(*key[:2]).between(metric, kept))
+            return self._noted(self.sets, key, lambda lab: between(lab.apart(*key[:2]), metric, kept))
         if not kept.any():
             return None
         mean = float(self.far(network, strategy, metric)[kept].mean())
@@ -172,7 +172,7 @@ class Results:
         key = (network.name, strategy)
         return self._noted(self.certain, key, lambda lab: lab.certain(*key))
 
-    def _noted(self, store: dict[Key, _T], key: Key, compute: Callable[[Lab], _T]) -> _T:
+    def _noted(self, store: dict[K, _T], key: K, compute: Callable[[Lab], _T]) -> _T:
         if key not in store:
             if self.lab is None:
                 raise FormatError("what was kept", f"figures of {', '.join(filter(None, key))}", "none")

@@ -50,8 +50,8 @@ _PLAIN = ("pictures", "certain", "worth", "gain", "distance", *_SETTINGS)
 
 @dataclass(frozen=True)
 class Table:
-    """rows, reference: ours and the paper's, of the same columns; columns: what people are shown, in order; plain:
-    whether all its numbers are no shares.
+    """rows, reference: ours and the paper's, of the same columns; columns: what people are shown, in order; notes:
+    with the paper's own errors; orders: whether the paper's hold; plain: whether all its numbers are no shares.
     """
 
     name: str
@@ -60,6 +60,7 @@ class Table:
     rows: Sequence[Row]
     reference: Sequence[Row]
     notes: tuple[str, ...] = ()
+    orders: Sequence[Row] = ()
     plain: bool = False
 
     def sheet(self, classes: bool = True) -> Sheet:
@@ -76,28 +77,26 @@ class Table:
             return "yes" if value else "no"
         if isinstance(value, str):
             return NAMES.get(value, value)
-        plain = self.plain or name in _PLAIN
-        shown = _number(value) if plain else f"{100 * value:.1f}"
-        if row.get(f"{name}_low") is None:
-            return shown
-        ends = (row[f"{name}_low"], row[f"{name}_high"])
-        low, high = (_number(end) if plain else f"{100 * end:.1f}" for end in ends)
-        return f"{shown} [{low}, {high}]"
 
+        def number(one: float) -> str:
+            if not (self.plain or name in _PLAIN):
+                return f"{100 * one:.1f}"
+            return str(one) if isinstance(one, int) else f"{one:.3g}"
 
-def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.3g}"
+        low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+        ends = "" if low is None or high is None else f" [{number(low)}, {number(high)}]"
+        return number(value) + ends
 
 
 def _bounded(name: str, one: Interval) -> Row:
     found = {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
-    return {key: None if value is None else round(value, 5) for key, value in found.items()}
+    return {key: _rounded(value) for key, value in found.items()}
 
 
 def tables_of(lab: Results) -> list[Table]:
     """All that are wanted, and what they say of orders."""
     found = [_BUILDERS[name](lab) for name in lab.facts.tables]
-    orders = [row for name in lab.facts.tables for row in _ORDERS.get(name, lambda lab: [])(lab)]
+    orders = [row for table in found for row in table.orders]
     if orders:
         held, turned = (sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed"))
         note = (
@@ -144,26 +143,31 @@ def _by_class(values: Sequence[float]) -> Row:
 
 
 def _degradation(lab: Results) -> Table:
-    rows = []
-    for eyes, strategy in product(lab.facts.networks, (BENIGN, *STRATEGIES)):
-        answers = lab.answers("attacked", eyes, strategy)
-        row = {"network": eyes.name, "strategy": strategy, **_with_classes(lab, answers)}
-        rows.append(row | {"certain": None if strategy == BENIGN else lab.certain_of(eyes, strategy)})
+    rows: list[Row] = []
+    orders: list[Row] = []
+    for eyes in lab.facts.networks:
+        ours = {one: lab.answers("attacked", eyes, one) for one in (BENIGN, *STRATEGIES)}
+        for one, answers in ours.items():
+            row = {"network": eyes.name, "strategy": one, **_with_classes(lab, answers)}
+            rows.append(row | {"certain": None if one == BENIGN else lab.certain_of(eyes, one)})
+        theirs = {one: figures()["degradation"][eyes.theirs][one][-1] for one in STRATEGIES}
+        orders += _order(lab, "degradation", eyes, theirs, ours)
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
     columns = ("network", "strategy", *lab.facts.classes, "overall", "at_paper_sizes", "certain")
-    return Table("degradation", "Accuracy by class and strategy, %", columns, rows, reference)
-
-
-def _moved(lab: Results, eyes: Network, strategy: str, params: str) -> Answers:
-    return lab.answers("attacked", eyes, strategy, "test" if params == _BOTH else params)
+    title, notes = "Accuracy by class and strategy, %", REMARKS["degradation"]
+    return Table("degradation", title, columns, rows, reference, notes, orders)
 
 
 def _parameters(lab: Results) -> Table:
+    rows: list[Row] = []
+    orders: list[Row] = []
     moved = (*SINGLE[:3], _BOTH, SINGLE[3])
-    rows = [
-        {"network": eyes.name, "strategy": one, "params": what, **_overall(lab, _moved(lab, eyes, one, what))}
-        for eyes, one, what in product(lab.deep, GRADIENT, moved)
-    ]
+    for eyes, strategy in product(lab.deep, GRADIENT):
+        ours = {one: lab.answers("attacked", eyes, strategy, "test" if one == _BOTH else one) for one in moved}
+        row = {"network": eyes.name, "strategy": strategy}
+        rows += [row | {"params": params, **_overall(lab, one)} for params, one in ours.items()]
+        theirs: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
+        orders += _order(lab, f"parameters, {NAMES[strategy]}", eyes, theirs, ours)
     reference = [
         row | {"params": params, "overall": value}
         for row, values in _paper("parameters", "strategy")
@@ -171,7 +175,7 @@ def _parameters(lab: Results) -> Table:
     ]
     note = "The paper says that light does not matter, without figures."
     columns = ("network", "strategy", "params", "overall", "at_paper_sizes")
-    return Table("parameters", "Accuracy by what is moved, %", columns, rows, reference, (note,))
+    return Table("parameters", "Accuracy by what is moved, %", columns, rows, reference, (note,), orders)
 
 
 def _hyperparameters(lab: Results) -> Table:
@@ -185,19 +189,29 @@ def _hyperparameters(lab: Results) -> Table:
         value = figures()["degradation"][network][strategy][-1]
         reference.append({"network": NETWORKS[network], **settings, "overall": value})
     columns = ("network", "strategy", "settings", *_SETTINGS, "overall")
-    return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference)
+    notes = REMARKS["hyperparameters"]
+    return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference, notes)
 
 
 def _learners(lab: Results, table: str, title: str, trained: Sequence[str], what: str) -> Table:
     """Networks that were trained so, on each of TESTS. what: as of `Results.answers`."""
     rows: list[Row] = []
-    for eyes, one in product(lab.deep, (BENIGN, *trained)):
-        row: Row = {"network": eyes.name, "trained_on": one}
-        for test in TESTS:
-            row |= _bounded(test, lab.answers(what, eyes, test, one).overall(lab.drawing))
-        rows.append(row | {"pictures": len(lab.answers(what, eyes, BENIGN, one).right)})
+    orders: list[Row] = []
+    for eyes in lab.deep:
+        for one in (BENIGN, *trained):
+            row: Row = {"network": eyes.name, "trained_on": one}
+            for test in TESTS:
+                row |= _bounded(test, lab.answers(what, eyes, test, one).overall(lab.drawing))
+            rows.append(row | {"pictures": len(lab.answers(what, eyes, BENIGN, one).right)})
+        for i, test in enumerate(TESTS):
+            theirs = {one: figures()[table][eyes.theirs][one][i] for one in (BENIGN, *GRADIENT)}
+            ours = {one: lab.answers(what, eyes, test, one) for one in theirs}
+            pairs = _order(lab, f"{table}, on {NAMES[test]}", eyes, theirs, ours)
+            # Is a retrained network better than the benign one?
+            orders += [pair for pair in pairs if pair["first"] == BENIGN]
     reference = [row | dict(zip(TESTS, values, strict=True)) for row, values in _paper(table, "trained_on")]
-    return Table(table, title, ("network", "trained_on", *TESTS, "pictures"), rows, reference)
+    columns = ("network", "trained_on", *TESTS, "pictures")
+    return Table(table, title, columns, rows, reference, REMARKS.get(table, ()), orders)
 
 
 def _retraining(lab: Results) -> Table:
@@ -234,7 +248,7 @@ def _worth(lab: Results) -> Table:
         "counterexamples. Gain: the worth before the network less that before the one retrained on such pictures."
     )
     columns = ("network", "strategy", "membership", "weighted", "worth", "gain")
-    return Table("worth", "Information worth", columns, rows, reference, (note,))
+    return Table("worth", "Information worth", columns, rows, reference, (note, *REMARKS["worth"]))
 
 
 def _realism(lab: Results) -> Table:
@@ -314,35 +328,6 @@ def _order(
             yield row | {"paper": round(apart, 4), **_bounded("ours", one), "verdict": verdict(apart, one)}
 
 
-def _strategies_in_order(lab: Results) -> list[Row]:
-    rows: list[Row] = []
-    for eyes in lab.facts.networks:
-        theirs = {one: figures()["degradation"][eyes.theirs][one][-1] for one in STRATEGIES}
-        ours = {one: lab.answers("attacked", eyes, one) for one in STRATEGIES}
-        rows += _order(lab, "degradation", eyes, theirs, ours)
-    return rows
-
-
-def _parameters_in_order(lab: Results) -> list[Row]:
-    rows: list[Row] = []
-    for eyes, strategy in product(lab.deep, GRADIENT):
-        theirs: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
-        ours = {one: _moved(lab, eyes, strategy, one) for one in _COMPARED}
-        rows += _order(lab, f"parameters, {NAMES[strategy]}", eyes, theirs, ours)
-    return rows
-
-
-def _learners_in_order(lab: Results, table: str, what: str) -> list[Row]:
-    """For each test: is a retrained network better than the benign one?"""
-    rows: list[Row] = []
-    for eyes, (i, test) in product(lab.deep, enumerate(TESTS)):
-        theirs = {trained: figures()[table][eyes.theirs][trained][i] for trained in (BENIGN, *GRADIENT)}
-        ours = {trained: lab.answers(what, eyes, test, trained) for trained in theirs}
-        pairs = _order(lab, f"{table}, on {NAMES[test]}", eyes, theirs, ours)
-        rows += [row for row in pairs if row["first"] == BENIGN]
-    return rows
-
-
 _BUILDERS: dict[str, Callable[[Results], Table]] = {
     "degradation": _degradation,
     "worth": _worth,
@@ -355,20 +340,3 @@ _BUILDERS: dict[str, Callable[[Results], Table]] = {
     "pixels": _pixels,
     "sizes": _sizes,
 }
-_ORDERS: dict[str, Callable[[Results], list[Row]]] = {
-    "degradation": _strategies_in_order,
-    "parameters": _parameters_in_order,
-    "retraining": lambda lab: _learners_in_order(lab, "retraining", "known"),
-    "robustness": lambda lab: _learners_in_order(lab, "robustness", "fresh"),
-}
-
-
-def flat(rows: Sequence[Row]) -> list[Row]:
-    """Rows of the same columns, for a CSV file."""
-    columns = dict.fromkeys(name for row in rows for name in row)
-    return [{name: row.get(name) for name in columns} for row in rows]
-
-
-def remarks(table: Table) -> tuple[str, ...]:
-    """What is to be said below a table: ours, and the paper's own errors."""
-    return (*table.notes, *REMARKS.get(table.name, ()))

@@ -18,7 +18,7 @@ from drivesem.questions.study.counts import StudyCounts
 from drivesem.questions.study.grades import grades_of
 from drivesem.questions.study.kept import keep, load_kept
 from drivesem.questions.study.kept_retrain import keep_retrain, load_retrain
-from drivesem.questions.study.kept_rows import KEPT, NOT_TOLD
+from drivesem.questions.study.kept_rows import KEPT, command_of
 from drivesem.questions.study.kept_transfer import keep_transfer, load_transfer
 from drivesem.questions.study.labels import label_frames, label_sets
 from drivesem.questions.study.largest import largest, write_largest
@@ -38,7 +38,6 @@ from drivesem.report.answer import Answer
 from drivesem.report.terminal import Console
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
 from drivesem.settings.commands import Confirm, Study
-from drivesem.settings.text import command_line
 from drivesem.training.known import warn_of_overlaps
 from drivesem.truth.redraw.choose import SecondRenderers
 
@@ -96,8 +95,7 @@ _Found = tuple[dict[str, Any], Told, Callable[[Path], None]]
 
 def _answer(study: Study, out: Path, found: _Found) -> Answer:
     data, told, draw = found
-    command = command_line("study", study, (*NOT_TOLD, "name")).replace("study", f"study {study.name}", 1)
-    return report.answer_of(told, out, data, command, draw)
+    return report.answer_of(told, out, data, command_of(study), draw)
 
 
 _Kept = tuple[Study, Callable[[Study], _Found]]

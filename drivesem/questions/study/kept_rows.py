@@ -18,6 +18,7 @@ from drivesem.questions.study.arms import draws_of
 from drivesem.run.records import dump_rows, load_rows
 from drivesem.settings.commands import Study
 from drivesem.settings.errors import UsageError
+from drivesem.settings.text import command_line
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -43,6 +44,11 @@ Marked = tuple[float, str]
 def settings_of(study: Study) -> dict[str, Any]:
     """Those that are kept."""
     return {name: value for name, value in asdict(study).items() if name not in NOT_TOLD}
+
+
+def command_of(study: Study) -> str:
+    """What repeats it, as it is typed."""
+    return command_line("study", study, (*NOT_TOLD, "name")).replace("study", f"study {study.name}", 1)
 
 
 def check_name(path: Path, name: str) -> None:

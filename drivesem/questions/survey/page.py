@@ -3,7 +3,6 @@ the original. One page without network; answers leave it as a CSV file."""
 
 from __future__ import annotations
 
-import base64
 import csv
 import hashlib
 import io
@@ -23,6 +22,7 @@ from drivesem.questions.realism.comparison import area_of, rectangle_around, veh
 from drivesem.questions.realism.frechet import Floats
 from drivesem.questions.survey.agreement import alpha, interval, nominal
 from drivesem.report import web
+from drivesem.report.drawing import jpeg_address
 from drivesem.run.finished import Frame, Run
 from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
@@ -44,8 +44,6 @@ CHOICES = {
 LEAST, MOST = 1, 10
 """The scale of realism."""
 COLUMNS = ("survey", "participant", "item", "position", "named", "realism", "seconds")
-_JPEG_QUALITY = 90
-"""High, or people would judge the compression."""
 _CONTEXT = 2.0
 """A picture is so many times as wide and high as its vehicle, so that one sees where it stands."""
 _LEAST_HW = (180, 320)
@@ -160,8 +158,8 @@ def render_page(items: Sequence[tuple[Item, View]]) -> str:
     shown = [
         {
             "item": item.item,
-            "original": _jpeg(view.original),
-            "changed": _jpeg(view.changed),
+            "original": jpeg_address(view.original),
+            "changed": jpeg_address(view.changed),
             "outline": view.outline_xyxy,
         }
         for item, view in items
@@ -172,11 +170,6 @@ def render_page(items: Sequence[tuple[Item, View]]) -> str:
     asked = {"count": len(items), "choices": CHOICES, "least": LEAST, "most": MOST}
     home = "drivesem.questions.survey"
     return web.render(f"{home}:survey.html", f"{home}:survey.js", data=data, **asked)
-
-
-def _jpeg(image: Picture) -> str:
-    encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
 
 
 def write_key(path: Path, items: Sequence[Item], facts: Mapping[str, Any]) -> None:
