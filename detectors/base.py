@@ -12,13 +12,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from detectors.memory import in_halves
 from detectors.types import Detections, Targets
+
+N = TypeVar("N", bound=nn.Module)
 
 
 class DetectorError(ValueError):
@@ -217,6 +219,13 @@ def compute_exactly(device: str | torch.device) -> None:
     """Have a GPU convolve in float32; cuDNN's own choice is TF32, of ten bits."""
     if torch.device(device).type == "cuda":
         torch.backends.cudnn.allow_tf32 = False
+
+
+def ready(network: N, device: str | torch.device = "cpu") -> N:
+    """Frozen, in eval mode, channels-last."""
+    compute_exactly(device)
+    network.requires_grad_(False)
+    return network.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
 @torch.no_grad()

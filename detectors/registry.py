@@ -15,7 +15,7 @@ from torch import nn
 
 from detectors import ensemble, planted
 from detectors.adapters import choose
-from detectors.base import Detector, DetectorError, Predictor, compute_exactly
+from detectors.base import Detector, DetectorError, Predictor, compute_exactly, ready
 from detectors.reading import read_file, read_text
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
@@ -124,7 +124,7 @@ def load_detector(
         raise DetectorError(f"{path}: expected architecture {known}, found {architecture!r}")
     try:
         settings: dict[str, Any] = {
-            "classes": _names(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
+            "classes": class_names(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
             "t_star": float(metadata.get("t_star", "0.5")),
         }
         if not 0 < settings["t_star"] <= 1:
@@ -151,10 +151,8 @@ def load_detector(
 def _ready(
     detector: SqueezeDet | YoloV3, device: str | torch.device, gradient_precision: torch.dtype | None
 ) -> Detector:
-    """Frozen, in eval mode, channels-last."""
-    detector.requires_grad_(False)
     detector.gradient_precision = gradient_precision
-    return detector.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+    return ready(detector, device)
 
 
 def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None = None) -> None:
@@ -215,7 +213,7 @@ def _check_card(path: Path) -> None:
         raise DetectorError(f"{path}: expected {expected}, found {found}")
 
 
-def _names(told: Any) -> tuple[str, ...]:
+def class_names(told: Any) -> tuple[str, ...]:
     """Classes of metadata. ValueError where they are none."""
     if not isinstance(told, list) or not all(isinstance(name, str) for name in told):
         raise ValueError("classes: expected a list of names, found something else")

@@ -397,10 +397,7 @@ class _Run:
         if differing:
             name = differing[0]
             raise DetectorError(f"{path}: {name}: expected {wanted[name]} as set, found {found.get(name)}")
-        sections: dict[str, dict[str, Tensor]] = {"weights": {}, "average": {}, "optimiser": {}}
-        for key, tensor in tensors.items():
-            section, name = key.split(".", 1)
-            sections[section][name] = tensor
+        sections = in_sections(tensors, "weights", "average", "optimiser")
         for section in ("weights", "average"):
             shapes = {name: value.shape for name, value in sections[section].items()}
             if shapes != {name: value.shape for name, value in self.average.items()}:
@@ -477,6 +474,15 @@ def _settings_of(facts: Mapping[str, str]) -> dict[str, Any]:
     if "bfloat16" in found:  # how checkpoints named it before there were other precisions
         found["precision"] = "bfloat16" if found["bfloat16"] else "float32"
     return found
+
+
+def in_sections(tensors: Mapping[str, Tensor], *names: str) -> dict[str, dict[str, Tensor]]:
+    """A checkpoint's tensors, "SECTION.NAME", by section. KeyError or ValueError where one is in none of these."""
+    sections: dict[str, dict[str, Tensor]] = {name: {} for name in names}
+    for key, tensor in tensors.items():
+        section, name = key.split(".", 1)
+        sections[section][name] = tensor
+    return sections
 
 
 def state_of(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

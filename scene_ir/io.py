@@ -483,6 +483,11 @@ def to_uint8(image: Tensor) -> np.ndarray:
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
 
 
+def as_written(image: Tensor) -> Tensor:
+    """A picture with values in [0, 1] on the 8-bit grid, as it is once it is written and read."""
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
 def to_tensor(picture: np.ndarray) -> Tensor:
     """A picture (H, W, 3) uint8 as (3, H, W) float32 in [0, 1]; `to_uint8` gives it back."""
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).to(torch.float32) / 255

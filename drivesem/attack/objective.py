@@ -27,6 +27,7 @@ from drivesem.evaluation import failures
 from drivesem.settings.blocks import KEEP_MB
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
+from scene_ir.io import as_written
 from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.types import Render, SceneIR
 
@@ -297,7 +298,7 @@ class Objective:
     def look(self, scene: SceneIR, render: Render) -> Rendered:
         """A state of the scene that is drawn already, detected and labelled."""
         # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
-        render = replace(render, image=(render.image.clamp(0, 1) * 255).round() / 255)
+        render = replace(render, image=as_written(render.image))
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.regions import ROI_DIM, Regions
-from drivesem.attack.theta import ParameterSpec, ThetaSpace
+from drivesem.attack.theta import ParameterSpec, ThetaSpace, lattice_names, parameters_of
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import kept_within, yaw_matrix
@@ -40,11 +40,8 @@ SIX = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
 """The paper's parameters. The others need a budget that goes beyond the paper's."""
 
 
-def _lattice_names() -> tuple[str, ...]:
-    half = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
-    points = [(i, j, k) for i in range(half[0]) for j in range(half[1]) for k in range(half[2])]
-    return tuple(f"ffd[{i},{j},{k}].{axis}" for i, j, k in points for axis in "xyz")
-
+_HALF = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
+"""Of the lattice: the other half mirrors it."""
 
 SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.COLOR: ParameterSpec(
@@ -58,7 +55,7 @@ SPECS: dict[Parameter, ParameterSpec] = {
     ),
     Parameter.TRANSLATE: ParameterSpec(2, True, "own lengths", ("translate.along", "translate.across")),
     Parameter.ROTATE: ParameterSpec(1, True, "rad", ("yaw",)),
-    Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", _lattice_names()),
+    Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", lattice_names("ffd", _HALF)),
     Parameter.SIZE: ParameterSpec(1, True, "share of its own", ("size",)),
     Parameter.SUN: ParameterSpec(
         LIGHT_DIM, False, "code", tuple(f"sun.{n}" for n in ("azimuth", "elevation", "strength"))
@@ -171,23 +168,9 @@ class Perturbation:
     sun: Tensor | None = None
 
 
-def normalise_params(params: Iterable[str]) -> tuple[Parameter, ...]:
-    """Parameters by name, in theta's order. Raises FormatError on an unknown, a repeated or no parameter."""
-    known = [str(p) for p in Parameter]
-    names = [str(p).strip() for p in params]
-    for name in names:
-        if name not in known:
-            raise FormatError("params", f"names among {', '.join(known)}", repr(name))
-    if not names:
-        raise FormatError("params", f"at least one of {', '.join(known)}", "none")
-    if len(set(names)) != len(names):
-        raise FormatError("params", "each parameter once", ",".join(names))
-    return tuple(p for p in Parameter if p.value in names)
-
-
 def parse_params(text: str) -> tuple[Parameter, ...]:
     """Parameters from "translate,rotate,mesh". Raises FormatError naming the unknown one and the known ones."""
-    return normalise_params(part for part in text.split(",") if part.strip())
+    return parameters_of(Parameter, (part for part in text.split(",") if part.strip()))
 
 
 def combo(number: int) -> tuple[Parameter, ...]:
@@ -214,7 +197,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
         parametrisation: Parametrisation = "ground",
     ) -> None:
         specs = SPECS | {Parameter.TRANSLATE: _IN_REGIONS} if parametrisation == "roi" else SPECS
-        super().__init__(normalise_params(params), specs, len(scene.objects), scene.objects.translation)
+        super().__init__(parameters_of(Parameter, params), specs, len(scene.objects), scene.objects.translation)
         self.scene = scene
         self.parametrisation: Parametrisation = parametrisation
         self.budget = budget or Budget()

@@ -7,17 +7,38 @@ objects before a classifier in `drivesem.classify.space`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import product
 from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from scene_ir.errors import RangeError, ShapeError
+from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.types import check_finite
 
 P = TypeVar("P", bound=StrEnum)
+
+
+def parameters_of(kind: type[P], names: Iterable[str]) -> tuple[P, ...]:
+    """Parameters by name, in theta's order. Raises FormatError on an unknown, a repeated or no parameter."""
+    known = [str(p) for p in kind]
+    asked = [name.strip() for name in names]
+    for name in asked:
+        if name not in known:
+            raise FormatError("params", f"names among {', '.join(known)}", repr(name))
+    if not asked:
+        raise FormatError("params", f"at least one of {', '.join(known)}", "none")
+    if len(set(asked)) != len(asked):
+        raise FormatError("params", "each parameter once", ",".join(asked))
+    return tuple(p for p in kind if p.value in asked)
+
+
+def lattice_names(word: str, shape: Sequence[int]) -> tuple[str, ...]:
+    """Names of the coordinates of a lattice's points, such as `ffd[0,3,1].x`."""
+    points = product(*map(range, shape))
+    return tuple(f"{word}[{i},{j},{k}].{axis}" for i, j, k in points for axis in "xyz")
 
 
 @dataclass(frozen=True, slots=True)

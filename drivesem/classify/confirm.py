@@ -12,9 +12,10 @@ import torch
 
 from drivesem.classify.attack import Attacker, report_run
 from drivesem.classify.finished import ClassifyRun
-from drivesem.classify.objective import as_written
 from drivesem.classify.page import SECOND_PICTURE
 from drivesem.classify.redraw.base import Redraw, Solid, likeness
+from drivesem.classify.redraw.mitsuba import MitsubaRenderer
+from drivesem.classify.redraw.pyrender import PyrenderRenderer
 from drivesem.classify.results import SCHEMA, ClassifiedRun, SecondLook
 from drivesem.classify.scenes import camera
 from drivesem.run.ask import Bar, ask
@@ -27,21 +28,17 @@ from drivesem.settings.commands import Classify
 from drivesem.truth.grades import Grade
 from drivesem.truth.redraw.base import NoSecondRendererError
 from scene_ir import files
-from scene_ir.io import to_uint8
+from scene_ir.io import as_written, to_uint8
 
 
 def open_renderer(name: str) -> Redraw:
     """mitsuba, pyrender, or auto: Mitsuba where it is installed. Raises NoSecondRendererError."""
     if name != "pyrender":
-        from drivesem.classify.redraw.mitsuba import MitsubaRenderer
-
         try:
             return MitsubaRenderer()
         except NoSecondRendererError:
             if name == "mitsuba":
                 raise
-    from drivesem.classify.redraw.pyrender import PyrenderRenderer
-
     return PyrenderRenderer()
 
 

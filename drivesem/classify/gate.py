@@ -49,7 +49,7 @@ class GateWorker(FailureWorker[FramePair]):
 
     def answer(self, name: str, source: str, folder: Path) -> FramePair:
         """See `FailureWorker`."""
-        poses = Poses.of(self, name)
+        poses = Poses(self, name)
         objective = poses.objective
         wrong: list[tuple[bool, bool]] = []
         for number in range(self.config.samples):
@@ -63,12 +63,12 @@ class GateWorker(FailureWorker[FramePair]):
         return FramePair(name, source, Pair(None, own, own, before, after))
 
 
-def gate_run(config: Classify) -> tuple[bool, Answer]:
-    """Whether --network may take the place of the run's, and what is said. Raises UsageError or SceneError."""
+def gate_run(config: Classify) -> Answer:
+    """Whether --network may take the place of the run's: `passed` of the data. Raises UsageError or SceneError."""
     asked = ask_of_failures(config, GateWorker, "comparing")
     pairs = {one.identifier: [one.pair] for one in asked.answers}
     rows = rows_of(pairs, config.tolerance, DRAWS, config.seed)
     facts = {"run": str(asked.run.folder), "before": asked.run.config.network, "after": config.network}
     answer = answer_of(asked.out, rows, len(pairs), facts | {"tolerance": config.tolerance}, asked.failed, _WORDS)
     answer.write()
-    return answer.data["passed"], answer
+    return answer

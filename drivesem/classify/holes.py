@@ -19,16 +19,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.classify.attack import Attacker
-from drivesem.classify.finished import Asked, FailureWorker, ask_of_failures
-from drivesem.classify.objective import ClassifierObjective, as_written
+from drivesem.classify.finished import FailureWorker, ask_of_failures
 from drivesem.classify.scenes import SEEN_PX, VIEWS
-from drivesem.classify.space import Change
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
 from drivesem.settings.commands import Classify
 from drivesem.truth.rules import Floats, Where, fit
+from scene_ir.io import as_written
 
 AXES: tuple[str, ...] = ("pitch", "yaw", "roll")
 _NOTES = (
@@ -81,7 +79,7 @@ class HoleWorker(FailureWorker[PoseHole]):
 
     def answer(self, name: str, source: str, folder: Path) -> PoseHole:
         """See `FailureWorker`."""
-        poses, config = Poses.of(self, name), self.config
+        poses, config = Poses(self, name), self.config
         label, bounds = poses.objective.scene.model.label, poses.bounds(config.reach)
         asked = poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
         fails = poses.called(asked) != label
@@ -107,36 +105,30 @@ class HoleWorker(FailureWorker[PoseHole]):
         )
 
 
-@dataclass(frozen=True, slots=True)
 class Poses:
-    """An object as it was found, in other poses. stream: of the draws of what a camera does; rng: of poses."""
+    """The object of a failure that a question is about, as it was found, in other poses. rng: of poses. Raises
+    SceneError.
+    """
 
-    objective: ClassifierObjective
-    change: Change
-    attacker: Attacker
-    stream: str
-    rng: np.random.Generator
-
-    @classmethod
-    def of(cls, worker: FailureWorker[Any], name: str) -> Poses:
-        """Around a failure that a question is about. Raises SceneError."""
-        objective, theta = worker.run.rebuilt(worker.attacker, name)
-        seed, change = worker.config.seed, objective.space.change(theta)
-        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-        return cls(objective, change, worker.attacker, f"{worker.question}:{name}:{seed}", rng)
+    def __init__(self, worker: FailureWorker[Any], name: str) -> None:
+        seed = worker.config.seed
+        self.objective, theta = worker.run.rebuilt(worker.attacker, name)
+        self.rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        self._change = self.objective.space.change(theta)
+        self._nuisances, self._stream = worker.attacker.grader.nuisances, f"{worker.question}:{name}:{seed}"
 
     def bounds(self, reach: float) -> Floats:
         """Lowest and highest angles (3, 2), degrees, within `reach` rad of the pose that was found."""
-        angles = self.change.angles
+        angles = self._change.angles
         found = np.zeros(3) if angles is None else np.degrees(angles.numpy().astype(float))
         return np.stack([found - math.degrees(reach), found + math.degrees(reach)], axis=1)
 
     @torch.no_grad()
     def picture(self, degrees: Floats, number: int) -> Tensor:
         """The picture (3, H, W) in a pose (3,), in the draw of that number."""
-        change = replace(self.change, angles=torch.from_numpy(np.radians(degrees)).float())
+        change = replace(self._change, angles=torch.from_numpy(np.radians(degrees)).float())
         picture = as_written(self.objective.scene.picture(change))
-        draw = self.attacker.grader.nuisances.of_picture(self.stream, number, (SEEN_PX, SEEN_PX))
+        draw = self._nuisances.of_picture(self._stream, number, (SEEN_PX, SEEN_PX))
         return draw.picture(picture)
 
     def called(self, degrees: Floats, first: int = 0) -> NDArray[np.int64]:
@@ -154,12 +146,6 @@ def _as_seen(where: Where, view: str) -> dict[str, tuple[float, float]]:
 def holes_run(config: Classify) -> Answer:
     """Look around a run's failures, or go on with it. Raises UsageError or SceneError."""
     asked = ask_of_failures(config, HoleWorker, "looking around failures")
-    answer = _answer(asked)
-    answer.write()
-    return answer
-
-
-def _answer(asked: Asked[PoseHole]) -> Answer:
     ordered = sorted(asked.answers, key=lambda hole: (-hole.interval[0], hole.identifier))
     rows = [
         asdict(hole)
@@ -175,7 +161,7 @@ def _answer(asked: Asked[PoseHole]) -> Answer:
         for hole in ordered
     )
     title = f"Holes of {asked.run.config.network}, by pose"
-    return Answer(
+    answer = Answer(
         out=asked.out,
         name="holes",
         heading="Holes by pose",
@@ -185,6 +171,8 @@ def _answer(asked: Asked[PoseHole]) -> Answer:
         notes=_NOTES,
         failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )
+    answer.write()
+    return answer
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:

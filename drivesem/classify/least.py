@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
 from rich import box
 from torch import Tensor
 
-from drivesem.classify.finished import Asked, FailureWorker, ask_of_failures
-from drivesem.classify.space import Moved, ObjectSpace
+from drivesem.classify.finished import FailureWorker, ask_of_failures
+from drivesem.classify.space import AXES, Moved, ObjectSpace
 from drivesem.questions.explain.minimal import LeastSearch, ThetaBlock, minimal
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, number_of
@@ -25,10 +24,8 @@ from scene_ir.io import to_uint8
 
 _POINTS = 16
 """Of the grid of scales, as for detectors."""
-_AXES = ("pose.pitch", "pose.yaw", "pose.roll")
 WORDS = ("picture", "called", "left out")
 """Columns of words; the others hold numbers."""
-_LOOKS: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False}
 _LONGEST = 24
 """Letters of a name that stays on one line: all fits into 80 columns then. ShapeNet's hashes are longer."""
 _NOTES = (
@@ -69,7 +66,7 @@ class LeastChange:
     def row(self) -> tuple[str, ...]:
         """A line of the table."""
         dropped = ", ".join(name.removeprefix("pose.") for name in self.dropped)
-        told = [f"{self.angles[axis]:+.3f}" if self.angles.get(axis) else "-" for axis in _AXES]
+        told = [f"{self.angles[axis]:+.3f}" if self.angles.get(axis) else "-" for axis in AXES]
         return (
             *(self.identifier, self.predicted, f"{100 * self.share:.0f}", *told),
             *(f"{self.vertex:.4f}" if self.vertex else "-", dropped or "-"),
@@ -114,54 +111,31 @@ class LeastWorker(FailureWorker[LeastChange]):
 
 def blocks(space: ObjectSpace) -> list[ThetaBlock]:
     """What to try to leave out: each parameter, the vertices first, then each coordinate of pose and light."""
-    found = []
-    for parameter, where in space.blocks.items():
-        found.append(ThetaBlock(str(parameter), _mask(space, where.start, where.stop)))
-    for parameter, where in space.blocks.items():
-        if parameter is not Moved.VERTEX:
-            found += [ThetaBlock(space.name(i), _mask(space, i, i + 1)) for i in range(where.start, where.stop)]
-    return found
-
-
-def _mask(space: ObjectSpace, start: int, stop: int) -> Tensor:
+    parts = {str(parameter): where for parameter, where in space.blocks.items()}
+    parts |= {space.name(i): slice(i, i + 1) for i in space.singles}
     place = torch.arange(space.dim)
-    return (place >= start) & (place < stop)
+    return [ThetaBlock(name, (place >= where.start) & (place < where.stop)) for name, where in parts.items()]
 
 
 def _angles(space: ObjectSpace, theta: Tensor) -> dict[str, float]:
     pose = space.block(theta, Moved.POSE)
-    return {} if pose is None else dict(zip(_AXES, (round(a, 6) for a in pose.tolist()), strict=True))
+    return {} if pose is None else dict(zip(AXES, (round(a, 6) for a in pose.tolist()), strict=True))
 
 
 def explain_run(config: Classify) -> Answer:
     """Find the least change of a run's failures, or go on with it. Raises UsageError or SceneError."""
     asked = ask_of_failures(config, LeastWorker, "shortening changes")
-    answer = _answer(asked)
-    answer.write()
-    return answer
-
-
-def sheet_of(found: Sequence[LeastChange], network: str) -> Sheet:
-    """The table of a network's failures."""
-    columns = ("picture", "called", "enough\n%", "pitch\nrad", "yaw\nrad", "roll\nrad", "vertex", "left out")
-    title = f"How little is enough: {number_of(len(found), 'failure')} of {network}"
-    short = all(len(one.identifier) <= _LONGEST for one in found)
-    looks = _LOOKS | {"unbroken": columns[0 if short else 1 : -1]}
-    return Sheet(title, columns, tuple(one.row() for one in found), looks)
-
-
-def _answer(asked: Asked[LeastChange]) -> Answer:
     found = asked.answers
     middle = median(one.share for one in found) if found else math.nan
     rows = [asdict(one) | {"sentence": one.sentence()} for one in found]
     flat = [
         {"identifier": one.identifier, "label": one.label, "predicted": one.predicted, "share": one.share}
-        | {axis: one.angles.get(axis) for axis in _AXES}
-        | {f"found_{axis}": one.found.get(axis) for axis in _AXES}
+        | {axis: one.angles.get(axis) for axis in AXES}
+        | {f"found_{axis}": one.found.get(axis) for axis in AXES}
         | {"vertex": one.vertex, "light": one.light, "sign_changes": one.sign_changes}
         for one in found
     ]
-    return Answer(
+    answer = Answer(
         out=asked.out,
         name="explain",
         heading="How little is enough",
@@ -172,3 +146,15 @@ def _answer(asked: Asked[LeastChange]) -> Answer:
         words=WORDS,
         failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )
+    answer.write()
+    return answer
+
+
+def sheet_of(found: Sequence[LeastChange], network: str) -> Sheet:
+    """The table of a network's failures."""
+    columns = ("picture", "called", "enough\n%", "pitch\nrad", "yaw\nrad", "roll\nrad", "vertex", "left out")
+    title = f"How little is enough: {number_of(len(found), 'failure')} of {network}"
+    short = all(len(one.identifier) <= _LONGEST for one in found)
+    unbroken = columns[0 if short else 1 : -1]
+    looks = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False, "unbroken": unbroken}
+    return Sheet(title, columns, tuple(one.row() for one in found), looks)

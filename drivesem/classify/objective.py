@@ -13,6 +13,7 @@ from drivesem.classify.networks.base import Scorer
 from drivesem.classify.scenes import ObjectScene
 from drivesem.classify.space import ObjectSpace
 from scene_ir.errors import RangeError
+from scene_ir.io import as_written
 
 Aimed = Literal["logit", "hinge", "softmax"]
 """What an attack raises. logit: the true class's score falls, as in the paper; hinge: so does what it is ahead of
@@ -61,11 +62,6 @@ def aim(scores: Tensor, label: int, aimed: Aimed) -> Tensor:
         return -ahead(scores, label).clamp_min(0)
     chances = scores.softmax(0)
     return torch.cat([chances[:label], chances[label + 1 :]]).amax()
-
-
-def as_written(image: Tensor) -> Tensor:
-    """A picture on the 8-bit grid."""
-    return (image.clamp(0, 1) * 255).round() / 255
 
 
 class ClassifierObjective:

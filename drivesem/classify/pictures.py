@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -38,24 +38,18 @@ class Shown:
 
 @dataclass(frozen=True)
 class Studio:
-    """What a process needs to draw objects: built once, used for many."""
+    """What a process needs to draw objects: built once, used for many. model: loads an object by name."""
 
     objects: ObjectSet
     backgrounds: Callable[[str], Tensor]
-    _kept: dict[str, ObjectModel] = field(default_factory=dict[str, ObjectModel])
+    model: Callable[[str], ObjectModel]
 
     @classmethod
     def of(cls, config: Classify) -> Studio:
         """Raises SceneError for objects or backgrounds that cannot be used."""
-        return cls(open_objects(config.objects), open_backgrounds(config.backgrounds))
-
-    def model(self, name: str) -> ObjectModel:
-        """An object; the last one is kept, as it is seen from several views."""
-        if name not in self._kept:
-            model = self.objects.load(name)
-            self._kept.clear()
-            self._kept[name] = model
-        return self._kept[name]
+        objects = open_objects(config.objects)
+        # The last object is kept, as it is seen from several views.
+        return cls(objects, open_backgrounds(config.backgrounds), lru_cache(maxsize=1)(objects.load))
 
     def scene(self, shown: Shown) -> ObjectScene:
         """Raises SceneError naming the object's file, or the background's."""

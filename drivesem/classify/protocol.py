@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 from drivesem.attack.methods.base import Attack
 from drivesem.attack.methods.sampling import Sampling
@@ -10,7 +10,7 @@ from drivesem.attack.methods.scw import SCW
 from drivesem.attack.methods.sgd import SGD
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.classify.objective import Aimed
-from drivesem.classify.space import Amounts, Moved, moved_of
+from drivesem.classify.space import FARTHEST, Amounts, Moved, moved_of
 from drivesem.settings.commands import Classify
 
 SAMPLED = ("random", "halton")
@@ -21,14 +21,12 @@ _STEPS = {
     "si-fgsm": Amounts(0.002, 0.15, _LIGHT_STEP),
     "sgd": Amounts(0.01, 0.20, _LARGER_LIGHT_STEP),
     "scw": Amounts(0.01, 0.30, _LARGER_LIGHT_STEP),
-    "random": Amounts(0.01, 0.15, _LIGHT_STEP),
-    "halton": Amounts(0.01, 0.15, _LIGHT_STEP),
+    **dict.fromkeys(SAMPLED, Amounts(0.01, 0.15, _LIGHT_STEP)),
 }
 """For VGG-16; of sCW they are learning rates; samples have none, and need the unit alone."""
 _WITHIN = {
-    "sgd": Amounts(0.05, 1.0, math.inf),
-    "random": Amounts(0.05, 0.75, 0.5),
-    "halton": Amounts(0.05, 0.75, 0.5),
+    "sgd": Amounts(0.05, 1.0, FARTHEST.lighting),
+    **dict.fromkeys(SAMPLED, Amounts(0.05, 0.75, 0.5)),
 }
 """How far theta may go; the others are held by their few steps."""
 
@@ -65,9 +63,9 @@ def steps_of(config: Classify) -> Amounts:
 
 def reach_of(config: Classify) -> Amounts:
     """How far each parameter may go."""
-    return _asked(config, "within", _WITHIN.get(config.method, Amounts(math.inf, math.inf, math.inf)))
+    return _asked(config, "within", _WITHIN.get(config.method, FARTHEST))
 
 
 def _asked(config: Classify, which: str, usual: Amounts) -> Amounts:
     given = {str(one): getattr(config, f"{which}_{one}") for one in Moved}
-    return Amounts(**{name: getattr(usual, name) if value is None else value for name, value in given.items()})
+    return replace(usual, **{name: value for name, value in given.items() if value is not None})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,6 @@ from drivesem.classify.objects.types import ObjectModel
 from drivesem.classify.space import Change
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.raster.verbs import Backend
 from scene_ir.render.lit import Lights, LitMesh, Materials, over
 from scene_ir.types import Camera
 
@@ -51,7 +51,6 @@ class ObjectScene:
     model: ObjectModel
     view: str
     background: Tensor
-    backend: Backend = "warp"
 
     @cached_property
     def mesh(self) -> LitMesh:
@@ -83,7 +82,7 @@ class ObjectScene:
     def picture(self, change: Change | None = None) -> Tensor:
         """(3, SEEN_PX, SEEN_PX) RGB in [0, 1]; differentiable to the change."""
         placed, lights = self.placed(change), self.lights(change)
-        return self.shown(*self.mesh.render_part(placed, camera(), lights, self.backend))
+        return self.shown(*self.mesh.render_part(placed, camera(), lights))
 
     def shown(self, drawn: Tensor, x: int = 0, y: int = 0) -> Tensor:
         """What a renderer drew (4, h, w) from column x and row y on, before the background, as a network sees it.
@@ -205,13 +204,13 @@ def generated_background(name: str) -> Tensor:
 
 def in_turn(names: Sequence[str]) -> list[str]:
     """Names "class/object" so that of classes each has its turn: the first of each, then the second."""
-    seen: dict[str, int] = {}
-    ranked = []
-    for place, name in enumerate(names):
+    seen: Counter[str] = Counter()
+    turns: list[tuple[int, str]] = []
+    for name in names:
         kind = name.rpartition("/")[0]
-        ranked.append((seen.setdefault(kind, 0), place, name))
+        turns.append((seen[kind], name))
         seen[kind] += 1
-    return [name for _, _, name in sorted(ranked)]
+    return [name for _, name in sorted(turns, key=lambda turn: turn[0])]
 
 
 def _seed(name: str) -> int:

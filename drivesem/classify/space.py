@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from itertools import chain
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from drivesem.attack.theta import ParameterSpec, Projected, ThetaSpace
+from drivesem.attack.theta import ParameterSpec, Projected, ThetaSpace, lattice_names, parameters_of
 from scene_ir import ffd
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import RangeError
 from scene_ir.geometry import weld
 from scene_ir.types import LATTICE, LATTICE_POINTS
 
@@ -50,7 +51,8 @@ class Amounts:
 FARTHEST = Amounts(vertex=0.5, pose=math.pi, lighting=0.9)
 """Where no bound is asked for: half an object, all the way round, hardly any light."""
 
-_POSE = ParameterSpec(3, False, "rad", ("pose.pitch", "pose.yaw", "pose.roll"))
+AXES = ("pose.pitch", "pose.yaw", "pose.roll")
+_POSE = ParameterSpec(3, False, "rad", AXES)
 _LIGHTING = ParameterSpec(
     5, False, "share", ("light.strength", "light.environment", "light.x", "light.y", "light.z")
 )
@@ -59,18 +61,12 @@ _LIGHTING = ParameterSpec(
 def _vertex_spec(shape: Shape) -> ParameterSpec:
     if shape == "each":
         return ParameterSpec(3, True, "object sizes", ("x", "y", "z"), "vertices")
-    points = [(i, j, k) for i in range(LATTICE[0]) for j in range(LATTICE[1]) for k in range(LATTICE[2])]
-    names = tuple(f"lattice[{i},{j},{k}].{axis}" for i, j, k in points for axis in "xyz")
-    return ParameterSpec(3 * LATTICE_POINTS, False, "object sizes", names)
+    return ParameterSpec(3 * LATTICE_POINTS, False, "object sizes", lattice_names("lattice", LATTICE))
 
 
 def moved_of(text: str) -> tuple[Moved, ...]:
     """Parameters of "pose,vertex", in theta's order. Raises FormatError on an unknown, a repeated or no name."""
-    known = [str(one) for one in Moved]
-    names = [part.strip() for part in text.split(",") if part.strip()]
-    if not names or len(set(names)) != len(names) or not set(names) <= set(known):
-        raise FormatError("params", f"names among {', '.join(known)}, each once", repr(text))
-    return tuple(one for one in Moved if one.value in names)
+    return parameters_of(Moved, (part for part in text.split(",") if part.strip()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +118,7 @@ class ObjectSpace(ThetaSpace[Moved]):
 
     def project(self, theta: Tensor) -> Projected:
         """theta (D,) within its bounds."""
-        inside = torch.minimum(torch.maximum(theta, self.lower), self.upper)
+        inside = theta.clamp(self.lower, self.upper)
         names = (str(p) for p, where in self.blocks.items() if not torch.equal(inside[where], theta[where]))
         return Projected(inside, tuple(f"{name}: bounds" for name in names))
 
@@ -142,9 +138,12 @@ class ObjectSpace(ThetaSpace[Moved]):
             most[Moved.VERTEX] = offsets.norm(dim=1).amax()
         return {str(p): round(float(value), 6) for p, value in most.items()}
 
+    @property
+    def singles(self) -> list[int]:
+        """The coordinates of pose and light."""
+        blocks = [range(self.dim)[where] for p, where in self.blocks.items() if p is not Moved.VERTEX]
+        return list(chain(*blocks))
+
     def few(self, theta: Tensor) -> dict[str, str]:
         """theta (D,) for people: each coordinate that is not one of many, by name."""
-        few: Iterable[int] = (
-            i for p, where in self.blocks.items() if p is not Moved.VERTEX for i in range(where.start, where.stop)
-        )
-        return {self.name(i): self.display(i, float(theta[i])) for i in few}
+        return {self.name(i): self.display(i, float(theta[i])) for i in self.singles}

@@ -15,10 +15,11 @@ from torch import Tensor, nn
 
 from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
-from detectors.training import CHECKPOINT, PRECISIONS, restore, state_of
+from detectors.training import CHECKPOINT, PRECISIONS, in_sections, restore, state_of
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.embedded import open_objects
+from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.progress import progress_bar, training_bar
@@ -37,9 +38,6 @@ _EMBEDDED_AT_A_TIME = 4
 """More is no faster on a CPU, and VGG-16's maps are so large that the system clears them anew each time."""
 _TINY = 1e-12
 
-
-_Splits = dict[str, tuple[Tensor, Tensor]]
-"""By split: pictures (N, 3, H, W) uint8, and their labels (N,)."""
 _Fitted = tuple[list[dict[str, float]], dict[str, float]]
 """What each epoch came to, and the accuracy by split."""
 
@@ -55,15 +53,19 @@ def train_run(config: Classify) -> dict[str, Any]:
     claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
     folder = Path(config.data) if config.data else out / PICTURES
     failed = {} if config.data else write_pictures(config, folder)[1]
-    splits = {name: read_pictures(folder, name, classes) for name in ("train", "val", "test")}
+    splits = {name: read_pictures(folder, name, classes) for name in SPLITS}
+    images = {name: shown for name, (shown, _) in splits.items()}
+    labels = {name: told.to(config.device) for name, (_, told) in splits.items()}
     if config.layers == "last":
-        curve, accuracy = _fit_last(network, splits, config, generator)
+        network.eval()
+        known = {name: embedded(network, images[name], config.device, f"looking at {name}") for name in SPLITS}
+        curve, accuracy = fit_last(network, known, labels, config, generator)
     else:
-        curve, accuracy = _fit_all(network, splits, config, generator, out / CHECKPOINT)
+        curve, accuracy = _fit_all(network, images, labels, config, generator, out / CHECKPOINT)
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
-    counts = {name: len(labels) for name, (_, labels) in splits.items()}
+    counts = {name: len(told) for name, told in labels.items()}
     data = {
         "out": str(out),
         "weights": str(path),
@@ -78,16 +80,6 @@ def train_run(config: Classify) -> dict[str, Any]:
     }
     files.write_json(out / RECORD, data)
     return data
-
-
-def _fit_last(network: Classifier, splits: _Splits, config: Classify, generator: torch.Generator) -> _Fitted:
-    network.eval()
-    looked = {
-        name: embedded(network, images, config.device, f"looking at {name}")
-        for name, (images, _) in splits.items()
-    }
-    labels = {name: labels.to(config.device) for name, (_, labels) in splits.items()}
-    return fit_last(network, looked, labels, config, generator)
 
 
 def fit_last(
@@ -124,16 +116,20 @@ def fit_last(
 
 
 def _fit_all(
-    network: Classifier, splits: _Splits, config: Classify, generator: torch.Generator, checkpoint: Path
+    network: Classifier,
+    images: dict[str, Tensor],
+    labels: dict[str, Tensor],
+    config: Classify,
+    generator: torch.Generator,
+    checkpoint: Path,
 ) -> _Fitted:
-    """Fit all layers, each picture mirrored in half of all epochs."""
-    labels = {name: labels.to(config.device) for name, (_, labels) in splits.items()}
+    """Fit all layers to pictures (N, 3, H, W) uint8, mirrored in half of all epochs, and labels (N,), by split."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    images, dtype = splits["train"][0], PRECISIONS[config.precision]
+    dtype = PRECISIONS[config.precision]
 
     def batch(rows: Tensor, epoch: int) -> tuple[Tensor, Tensor]:
         network.train()
-        shown = _shown(images[rows], config.device, epoch <= config.half)
+        shown = _shown(images["train"][rows], config.device, epoch <= config.half)
         mirrored = torch.rand(len(rows), generator=generator) < 0.5
         shown = torch.where(mirrored.to(shown.device).view(-1, 1, 1, 1), shown.flip(-1), shown)
         with torch.autocast(config.device.partition(":")[0], dtype, enabled=dtype != torch.float32):
@@ -143,7 +139,7 @@ def _fit_all(
     def accuracy(name: str, epoch: int) -> float:
         network.eval()
         half = epoch <= config.half
-        features = embedded(network, splits[name][0], config.device, f"looking at {name}", half)
+        features = embedded(network, images[name], config.device, f"looking at {name}", half)
         return _accuracy(network.last(features), labels[name])
 
     return _fit(network, batch, accuracy, labels, config, generator, checkpoint)
@@ -213,11 +209,8 @@ class _State:
     def load(self, path: Path) -> list[dict[str, float]]:
         """What each epoch came to before the file was written. Raises DetectorError for what is no such file."""
         facts, tensors = read_weights(path)
-        parts: dict[str, dict[str, Tensor]] = {"weights": {}, "optimiser": {}, "random": {}}
         try:
-            for key, tensor in tensors.items():
-                part, _, name = key.partition(".")
-                parts[part][name] = tensor
+            parts = in_sections(tensors, "weights", "optimiser", "random")
             self.module.load_state_dict(parts["weights"])
             restore(self.optimiser, parts["optimiser"])
             self.schedule.load_state_dict(json.loads(facts["schedule"]))

@@ -24,20 +24,17 @@ from drivesem.run.page import PAGE
 from drivesem.settings.commands import Classify
 from drivesem.settings.devices import check_device
 
-_ASKED = {"explain": explain_run, "holes": holes_run}
+_ASKED = {"explain": explain_run, "holes": holes_run, "gate": gate_run}
 
 
 def run(config: Classify) -> int:
     """Draw, train, attack, or ask about a run; exit code 0, and 1 where a gate is not passed.
     Raises UsageError or SceneError for bad input."""
     check_device(config.device)
-    if config.what == "gate":
-        passed, answer = gate_run(config)
-        say(answer, config.json)
-        return 0 if passed else 1
     if config.what in _ASKED:
-        say(_ASKED[config.what](config), config.json)
-        return 0
+        answer = _ASKED[config.what](config)
+        say(answer, config.json)
+        return 0 if answer.data.get("passed", True) else 1
     does = {"data": _data, "train": _train, "attack": _attack, "confirm": _confirm}
     does[config.what](config, Console(stderr=True) if config.json else Console())
     return 0
@@ -48,7 +45,7 @@ def _data(config: Classify, console: Console) -> None:
     claim(out, config, ("train", "val", "test"))
     counts, failed = write_pictures(config, out)
     console.print(f"pictures: {', '.join(f'{count} {split}' for split, count in counts.items())}")
-    _end(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed})
+    _end(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed}, failed)
 
 
 def _train(config: Classify, console: Console) -> None:
@@ -61,7 +58,7 @@ def _train(config: Classify, console: Console) -> None:
         console.print(
             f"accuracy on {split}: {percent(value)} % [{low}, {high}] of {data['pictures'][split]}", markup=False
         )
-    _end(config, console, Path(data["weights"]), data)
+    _end(config, console, Path(data["weights"]), data, data["frames_failed"])
 
 
 def _attack(config: Classify, console: Console) -> None:
@@ -74,7 +71,7 @@ def _attack(config: Classify, console: Console) -> None:
         f"{grades['threshold']} misclassified by threshold, {grades['certain']} for certain",
         soft_wrap=True,
     )
-    _end(config, console, Path(found.out) / PAGE, found.to_json())
+    _end(config, console, Path(found.out) / PAGE, found.to_json(), found.frames_failed)
 
 
 def _confirm(config: Classify, console: Console) -> None:
@@ -96,13 +93,9 @@ def _confirm(config: Classify, console: Console) -> None:
 
 
 def _end(
-    config: Classify,
-    console: Console,
-    written: Path,
-    data: Mapping[str, Any],
-    failed: Mapping[str, str] | None = None,
+    config: Classify, console: Console, written: Path, data: Mapping[str, Any], failed: Mapping[str, str]
 ) -> None:
-    say_end(written, console, data["frames_failed"] if failed is None else failed)
+    say_end(written, console, failed)
     if config.json:
         print_json(data)
 

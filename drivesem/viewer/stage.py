@@ -25,7 +25,7 @@ from drivesem.attack.space import Budget
 from drivesem.evaluation import failures
 from drivesem.report.tables import number_of
 from drivesem.viewer.knobs import Knobs, State
-from scene_ir.io import load_scene, to_uint8
+from scene_ir.io import as_written, load_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, Render, SceneIR, scene_to
 
@@ -220,8 +220,7 @@ class Stage:
         before = self.objective.benign.render.image
         rows = []
         for row, (x0, y0, x1, y1) in enumerate(render.drawn.tolist()):
-            here = render.image[:, y0:y1, x0:x1]
-            if not torch.equal((here.clamp(0, 1) * 255).round() / 255, before[:, y0:y1, x0:x1]):
+            if not torch.equal(as_written(render.image[:, y0:y1, x0:x1]), before[:, y0:y1, x0:x1]):
                 rows.append(row)
         return replace(render, drawn=render.drawn[rows])
 

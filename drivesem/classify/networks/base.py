@@ -72,10 +72,9 @@ class Classifier(nn.Module, ABC):
 
     def retarget(self, classes: Sequence[str], generator: torch.Generator) -> None:
         """Have a new last layer, for other classes, with small random weights."""
-        *path, name = self.head.split(".")
         layer = nn.Linear(self.last.in_features, len(classes))
         with torch.no_grad():
             layer.weight.normal_(0, 0.01, generator=generator)
             layer.bias.zero_()
-        setattr(self.get_submodule(".".join(path)), name, layer)
+        self.set_submodule(self.head, layer)
         self.classes = tuple(classes)

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD, Classifier
 from scene_ir.errors import FormatError
 
-LIBRARIES = ("torchvision", "timm")
+PREFIXES = ("torchvision:", "timm:")
+"""Of names of their networks."""
 
 
 class LibraryClassifier(Classifier):

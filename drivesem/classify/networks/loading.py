@@ -9,12 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-import detectors.registry
-from detectors.base import compute_exactly
+from detectors.base import ready
 from detectors.reading import read_state
+from detectors.registry import SHIPPED as DETECTORS
+from detectors.registry import class_names, halved, write_weights
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.networks.libraries import LIBRARIES, LibraryClassifier
+from drivesem.classify.networks.libraries import PREFIXES, LibraryClassifier
 from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -24,7 +25,7 @@ ARCHITECTURES: dict[str, type[Classifier]] = {
     kind.architecture: kind for kind in (SqueezeNet, VGG16, PooledVGG16, ResNet50)
 }
 """By the name that weights files carry."""
-SHIPPED = detectors.registry.SHIPPED[SqueezeDet.name].parent / "squeezenet-objects.safetensors"
+SHIPPED = DETECTORS[SqueezeDet.name].parent / "squeezenet-objects.safetensors"
 """`squeezenet`, for the embedded objects."""
 _TORCH_FILES = (".pth", ".pt", ".bin")
 
@@ -38,8 +39,10 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
     if path.suffix != ".safetensors":
         trained = "weights that drivesem classify train wrote (.safetensors)"
         expected = f"{SqueezeNet.architecture}, {trained}, or an ONNX file (.onnx)"
-        known = ", which tells ImageNet's classes apart: train it on these (classify train --network)"
-        raise FormatError("--network", expected, name_or_path + (known if _is_library(name_or_path) else ""))
+        found = name_or_path
+        if found.startswith(PREFIXES):
+            found += ", which tells ImageNet's classes apart: train it on these (classify train --network)"
+        raise FormatError("--network", expected, found)
     metadata, tensors = _read(path)
     network = _made(metadata.get("architecture"), classes_of(path, metadata), f"{path}: architecture")
     if network.classes != tuple(classes):
@@ -62,17 +65,15 @@ def to_train(
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(generator.initial_seed())
         network = _made(architecture, classes, "--network", pretrained=weights is None)
-    if weights is None:
-        if isinstance(network, LibraryClassifier):
-            network.retarget(classes, generator)
-            return network
-        if anew and architecture != SqueezeNet.architecture:
-            return network
-        if architecture != SqueezeNet.architecture:
-            raise FormatError("--weights", f"a file with weights of {architecture}", "nothing")
-        path = SHIPPED
-    else:
-        path = Path(weights)
+    usual = SHIPPED if isinstance(network, SqueezeNet) else None
+    path = Path(weights) if weights is not None else usual
+    if path is None and isinstance(network, LibraryClassifier):
+        network.retarget(classes, generator)
+        return network
+    if path is None and anew:
+        return network
+    if path is None:
+        raise FormatError("--weights", f"a file with weights of {architecture}", "nothing")
     tensors = {network.own_name(key): tensor for key, tensor in _tensors(path).items()}
     network.retarget(classes, generator)
     own, name = network.state_dict(), network.head
@@ -85,10 +86,9 @@ def to_train(
 
 def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -> None:
     """Write weights as float16, what was counted in training as float32."""
-    halved = detectors.registry.halved(network)
-    tensors = {key: value for key, value in halved.items() if value.is_floating_point()}
+    tensors = {key: value for key, value in halved(network).items() if value.is_floating_point()}
     metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
-    detectors.registry.write_weights(path, metadata, tensors)
+    write_weights(path, metadata, tensors)
 
 
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
@@ -98,36 +98,22 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     return read_weights(path)
 
 
-def ready(network: Classifier, device: str = "cpu") -> Classifier:
-    """Frozen, in eval mode, channels-last."""
-    compute_exactly(device)
-    network.requires_grad_(False)
-    return network.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-
-
 def classes_of(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...]:
     """The classes that a weights file is for. Raises FormatError."""
     try:
-        names = json.loads(metadata.get("classes", ""))
-    except ValueError:
-        names = None
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise FormatError(f"{path}: classes", "a list of names", repr(metadata.get("classes"))[:60])
-    return tuple(names)
+        return class_names(json.loads(metadata.get("classes", "")))
+    except ValueError as error:
+        raise FormatError(f"{path}: classes", "a list of names", repr(metadata.get("classes"))[:60]) from error
 
 
 def _made(architecture: str | None, classes: Sequence[str], where: str, *, pretrained: bool = False) -> Classifier:
     """The network of that name, with any weights, or with a library's own."""
-    if architecture is not None and _is_library(architecture):
+    if architecture is not None and architecture.startswith(PREFIXES):
         return LibraryClassifier(architecture, classes, pretrained=pretrained)
     if architecture not in ARCHITECTURES:
-        known = ", ".join([*ARCHITECTURES, *(f"{library}:NAME" for library in LIBRARIES)])
+        known = ", ".join([*ARCHITECTURES, *(f"{prefix}NAME" for prefix in PREFIXES)])
         raise FormatError(where, f"one of {known}", architecture)
     return ARCHITECTURES[architecture](classes)
-
-
-def _is_library(architecture: str) -> bool:
-    return architecture.partition(":")[0] in LIBRARIES and ":" in architecture
 
 
 def _tensors(path: Path) -> dict[str, Tensor]:

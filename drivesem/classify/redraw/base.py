@@ -42,12 +42,13 @@ class Solid:
         """An object, with a change."""
         model = scene.model
         corners, normals, away = scene.mesh.corners(scene.placed(change))
-        order = torch.where(away[:, None], torch.tensor([0, 2, 1]), torch.tensor([0, 1, 2]))[..., None].expand(
-            -1, -1, 3
-        )
+
+        def wound(values: Tensor) -> Array:
+            return torch.where(away[:, None, None], values[:, [0, 2, 1]], values).reshape(-1, 3).numpy()
+
         return cls(
-            points=corners.gather(1, order).reshape(-1, 3).numpy(),
-            normals=normals.reshape(-1, 3, 3).gather(1, order).reshape(-1, 3).numpy(),
+            points=wound(corners),
+            normals=wound(normals.reshape(-1, 3, 3)),
             diffuse=model.diffuse.numpy(),
             specular=model.specular.numpy(),
             shininess=model.shininess.numpy(),

@@ -8,6 +8,7 @@ import torch
 
 from drivesem.attack.labels import Labeller, shown_boxes
 from drivesem.truth.redraw.base import Redrawn
+from scene_ir.io import as_written
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 
@@ -32,5 +33,4 @@ class CompositorDraw:
     def redraw(self, changed: SceneIR) -> Redrawn:
         """A state of the scene, as a file would hold it."""
         render = self.compositor.render(changed)
-        image = (render.image.clamp(0, 1) * 255).round() / 255
-        return Redrawn(image, self.labeller.moved(changed, render).targets, shown_boxes(render))
+        return Redrawn(as_written(render.image), self.labeller.moved(changed, render).targets, shown_boxes(render))

@@ -81,9 +81,17 @@ def test_projection_keeps_to_the_bounds_and_is_idempotent(values):
     assert once.active == tuple(f"{name}: bounds" for name, is_so in beyond.items() if is_so)
 
 
-@pytest.mark.parametrize("text", ["", "pose,pose", "pose,colour", "yaw"])
-def test_what_are_no_parameters(text):
-    with pytest.raises(FormatError, match="names among vertex, pose, lighting"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "at least one of vertex, pose, lighting, found none"),
+        ("pose,pose", "each parameter once, found pose,pose"),
+        ("pose,colour", "names among vertex, pose, lighting, found 'colour'"),
+        ("yaw", "names among vertex, pose, lighting, found 'yaw'"),
+    ],
+)
+def test_what_are_no_parameters(text, message):
+    with pytest.raises(FormatError, match=message):
         moved_of(text)
 
 
