@@ -40,6 +40,8 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     if not isinstance(header, dict):
         raise FormatError(f"{path}: header", "an object", type(header).__name__)
     metadata = header.pop("__metadata__", {})
+    if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
+        raise FormatError(f"{path}: __metadata__", "texts by name", repr(metadata)[:60])
     body = memoryview(data)[_HEADER + length :]
     return metadata, {name: _tensor(f"{path}: {name}", entry, body) for name, entry in header.items()}
 

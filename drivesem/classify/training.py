@@ -48,6 +48,7 @@ def train_run(config: Classify) -> dict[str, Any]:
     out = folder_of(config.out, Path("runs") / f"classifier-{config.network}-seed{config.seed}")
     classes = open_objects(config.objects).classes
     generator = torch.Generator().manual_seed(config.seed)
+    torch.manual_seed(config.seed)  # dropout draws from torch's own
     anew = config.layers == "all"
     network = to_train(config.network, config.weights, classes, generator, anew).to(config.device)
     claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)

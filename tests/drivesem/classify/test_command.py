@@ -132,6 +132,18 @@ def test_the_whole_network_can_be_trained(standins, tmp_path, capsys):
     assert not torch.equal(network.get_parameter("conv1.weight"), start.get_parameter("conv1.weight"))
 
 
+def test_equal_seeds_give_equal_networks_with_dropout_too(standins, tmp_path, capsys, monkeypatch):
+    embed = loading.SqueezeNet.embed
+    dropout = torch.nn.functional.dropout
+    monkeypatch.setattr(loading.SqueezeNet, "embed", lambda self, x: dropout(embed(self, x), 0.5, self.training))
+    words = ("train", "--views", "left", "--limit", "3", "--layers", "all", "--epochs", "1")
+    for name in ("one", "other"):
+        torch.rand(1)
+        assert answer(capsys, *words, "--out", str(tmp_path / name))[0] == 0
+    one, other = ((tmp_path / name / "squeezenet.safetensors").read_bytes() for name in ("one", "other"))
+    assert one == other
+
+
 def test_training_goes_on_to_the_bit(standins, tmp_path, capsys, monkeypatch):
     words = ("train", "--views", "left", "--limit", "3", "--layers", "all", "--epochs", "3", "--batch", "2")
 

@@ -237,6 +237,15 @@ def test_a_file_for_something_else(tmp_path, metadata, message):
         load_classifier(str(tmp_path / "other.safetensors"), CLASSES)
 
 
+@pytest.mark.parametrize("told", [["squeezenet"], {"classes": 5}, "squeezenet"])
+def test_a_file_that_says_nothing_readable_of_itself(tmp_path, told):
+    header = json.dumps({"__metadata__": told}).encode()
+    path = tmp_path / "other.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(FormatError, match=r"other.safetensors: __metadata__: expected texts by name"):
+        load_classifier(str(path), CLASSES)
+
+
 def test_parameters_of_the_published_networks():
     thousand = [str(i) for i in range(1000)]
     counts = {kind: sum(p.numel() for p in kind(thousand).parameters()) for kind in (VGG16, ResNet50)}
