@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +26,13 @@ UNKNOWN = (120, 120, 120)
 """Sky in depth maps; pixels of no object."""
 NEAR_M, FAR_M = 3.0, 200.0
 """Ends of the depth scale, which is logarithmic."""
+_LINES_OFF = 4
+"""So many lines of text above or below its box a label may stand where all nearer places are taken."""
+_HIDDEN = 0.2
+"""Share of a box from which on a label hides it."""
+
+Spot = tuple[int, int, int, int]
+"""x0, y0, x1, y1 px; x1 and y1 are outside."""
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
@@ -109,3 +118,68 @@ def write_text(
     picture = Image.fromarray(np.ascontiguousarray(part))
     ImageDraw.Draw(picture).text((0, 0), text, colour, _font(size_px))
     part[:] = np.asarray(picture)
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A line of text on a plate. colour: of the text; plate: behind it."""
+
+    text: str
+    colour: tuple[int, int, int]
+    plate: tuple[int, int, int] = (0, 0, 0)
+    size_px: int = TEXT_PX - 3
+
+
+@dataclass
+class Labels:
+    """Texts at the boxes of a picture of size_wh px, none of them over another where there is room.
+
+    The text that is added first has the best place: above its box; else below it, beside it, inside, or some lines
+    further off. Where all of these are taken, it stands where it hides the least of the others. seen: boxes
+    (x0, y0, x1, y1) px that no text should hide.
+    """
+
+    size_wh: tuple[int, int]
+    seen: Sequence[Sequence[float]] = ()
+    placed: list[tuple[Spot, Label]] = field(default_factory=list)
+
+    def add(self, xyxy: Sequence[float], label: Label, within: bool = False) -> None:
+        """Find a label's place at its box. within: the box's middle comes before all others."""
+
+        def covers(spot: Spot) -> tuple[float, int]:
+            others = sum(_shared(spot, taken) for taken, _ in self.placed)
+            return others, sum(_shared(spot, box) > _HIDDEN * _shared(box, box) for box in self.seen)
+
+        extent = text_extent(label.text, label.size_px)
+        self.placed.append((min(_places(xyxy, extent, self.size_wh, within), key=covers), label))
+
+    def draw(self, canvas: np.ndarray) -> None:
+        """Write all of them into `canvas` (H, W, 3)."""
+        for (x0, y0, x1, y1), label in self.placed:
+            canvas[y0:y1, x0:x1] = label.plate
+            write_text(canvas, (x0 + 2, y0), label.text, label.colour, label.size_px)
+
+
+def _shared(a: Sequence[float], b: Sequence[float]) -> float:
+    """How many px two boxes share."""
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
+
+
+def _places(
+    xyxy: Sequence[float], extent: tuple[int, int], size_wh: tuple[int, int], within: bool
+) -> Iterator[Spot]:
+    """Where a text of an extent may stand at a box, all inside of the picture, the best first."""
+    (wide, high), (x0, y0, x1, y1) = extent, (round(v) for v in xyxy)
+    middle = (x0 + x1 - wide + 1) // 2
+    corners = [(middle, (y0 + y1 - high + 1) // 2)] if within else []
+    columns = (x0 - 1, x1 - wide + 2, middle)
+    above, below = y0 - high - 1, y1 + 2
+    corners += [(x, y) for y in (above, below) for x in columns]
+    corners += [(x, y) for x in (x1 + 3, x0 - wide - 2) for y in (y0 - 1, y1 - high + 2)]  # beside
+    corners += [(x, y) for y in (y0 + 2, y1 - high - 1) for x in columns]
+    for line in range(1, _LINES_OFF + 1):
+        off = line * (high + 1)
+        corners += [(x, y) for y in (above - off, below + off) for x in columns]
+    for left, top in corners:
+        x, y = (max(min(v, size - long), 0) for v, size, long in zip((left, top), size_wh, extent, strict=True))
+        yield x, y, x + wide, y + high

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.outcome import Marks
+from drivesem.report.drawing import Label, Labels
 from drivesem.run.report.pictures import DETECTED_COLOUR, IGNORED_COLOUR, LOST_COLOUR, PHANTOM_COLOUR, TRUE_COLOUR
 
 _LEGEND = (
@@ -22,6 +23,7 @@ _LEGEND_PX = 22
 def marked(image: NDArray[np.uint8], marks: Marks) -> NDArray[np.uint8]:
     """The image (H, W, 3) uint8 RGB with its marks, and a line below that names their colours."""
     canvas = np.concatenate([image, np.full((_LEGEND_PX, image.shape[1], 3), 250, np.uint8)])
+    labels = Labels((image.shape[1], image.shape[0]), [*marks.missed.tolist(), *marks.alarms.tolist()])
     for box in marks.ignored:
         _rectangle(canvas, box, IGNORED_COLOUR, 1)
     for box in marks.found:
@@ -32,7 +34,8 @@ def marked(image: NDArray[np.uint8], marks: Marks) -> NDArray[np.uint8]:
         _rectangle(canvas, box, LOST_COLOUR, 2)
     for box, score in zip(marks.alarms, marks.alarm_scores, strict=True):
         _rectangle(canvas, box, PHANTOM_COLOUR, 2)
-        _text(canvas, f"{score:.2f}", (int(box[0]), max(int(box[1]) - 3, 10)), PHANTOM_COLOUR)
+        labels.add(box.tolist(), Label(f"{score:.2f}", PHANTOM_COLOUR))
+    labels.draw(canvas)
     x = 6
     for name, colour in (*_LEGEND, ("found at", DETECTED_COLOUR)):
         y = image.shape[0] + _LEGEND_PX // 2

@@ -286,8 +286,9 @@ def _write(
         detection_records(least.detections, objective.judged.names),
         explanation.least.failures,
         objective.t_star,
+        sensitivity.numbers((image.shape[1], image.shape[0]), _boxes(least)),
     )
-    files.write_png(part / "minimal_overlay.png", sensitivity.numbered(marked, _boxes(least)))
+    files.write_png(part / "minimal_overlay.png", marked)
     if views:
         rows = [
             (name, to_uint8(one.render.image), _boxes(one), gradient) for name, (one, gradient) in views.items()

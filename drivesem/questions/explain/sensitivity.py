@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from drivesem.attack.objective import Objective, Rendered
-from drivesem.report.drawing import INK, MARGIN_PX, PAPER, TEXT_PX, pale, paste, text_extent, write_text
+from drivesem.report.drawing import INK, MARGIN_PX, PAPER, TEXT_PX, Label, Labels, pale, paste, write_text
 
 Floats = NDArray[np.floating]
 Picture = NDArray[np.uint8]
@@ -52,16 +52,18 @@ def overlay(image: Picture, gradient: Floats, brightest: float) -> Picture:
     return (pale(image) * (1 - opacity) + heat * opacity).round().astype(np.uint8)
 
 
+def numbers(size_wh: tuple[int, int], boxes_xyxy: Floats) -> Labels:
+    """Each object's number, in brackets, in the middle of its box (N, 4) px of a picture, or near it."""
+    labels = Labels(size_wh)
+    for i, box in enumerate(boxes_xyxy.tolist()):
+        labels.add(box, Label(f"[{i}]", INK, PAPER, TEXT_PX), within=True)
+    return labels
+
+
 def numbered(image: Picture, boxes_xyxy: Floats) -> Picture:
-    """A picture (H, W, 3) with each object's number, in brackets, in the middle of its box (N, 4) px."""
+    """A picture (H, W, 3) with each object's number at its box (N, 4) px."""
     canvas = image.copy()
-    for i, (x0, y0, x1, y1) in enumerate(boxes_xyxy.tolist()):
-        text = f"[{i}]"
-        width, height = text_extent(text, TEXT_PX)
-        x = round(min(max((x0 + x1 - width) / 2, 0), image.shape[1] - width))
-        y = round(min(max((y0 + y1 - height) / 2, 0), image.shape[0] - height))
-        canvas[y : y + height, x : x + width] = PAPER
-        write_text(canvas, (x + 2, y), text, INK)
+    numbers((image.shape[1], image.shape[0]), boxes_xyxy).draw(canvas)
     return canvas
 
 

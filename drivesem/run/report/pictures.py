@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.report.drawing import Label, Labels
 from drivesem.run.report import grading
 from drivesem.run.results import BoxRecord, Failure
 
@@ -28,20 +29,27 @@ def overlay(
     detections: tuple[BoxRecord, ...],
     failures: tuple[Failure, ...],
     threshold: float,
+    labels: Labels | None = None,
 ) -> Image:
     """`image` with true boxes (green; grey where ignored), detections above `threshold` (yellow, with class and
-    score), lost objects (red) and phantoms (purple) with their kinds and grades.
+    score), lost objects (orange) and phantoms (purple) with their kinds and grades. labels: texts that are to be
+    drawn too, and have their places.
     """
     canvas = image.copy()
+    labels = labels or Labels((image.shape[1], image.shape[0]))
+    labels.seen = [box.xyxy for box in (*failures, *targets)]
+    for failure in failures:
+        grade = f": {failure.grade}" if failure.grade else ""
+        labels.add(failure.xyxy, Label(f"{grading.what(failure)}{grade}", _colour(failure)))
     for box in targets:
         _draw(canvas, box.xyxy, IGNORED_COLOUR if box.ignore else TRUE_COLOUR, 1)
     for box in detections:
         if box.score is not None and box.score >= threshold:
-            _draw(canvas, box.xyxy, DETECTED_COLOUR, 1, f"{box.label} {box.score:.2f}")
+            _draw(canvas, box.xyxy, DETECTED_COLOUR, 1)
+            labels.add(box.xyxy, Label(f"{box.label} {box.score:.2f}", DETECTED_COLOUR))
     for failure in failures:
-        colour = LOST_COLOUR if failure.kind == "lost" else PHANTOM_COLOUR
-        grade = f": {failure.grade}" if failure.grade else ""
-        _draw(canvas, failure.xyxy, colour, 2, f"{grading.what(failure)}{grade}", below=True)
+        _draw(canvas, failure.xyxy, _colour(failure), 2)
+    labels.draw(canvas)
     return canvas
 
 
@@ -51,19 +59,12 @@ def difference(before: Image, after: Image) -> Image:
     return np.clip(127.5 + DIFFERENCE_GAIN * signed, 0, 255).astype(np.uint8)
 
 
+def _colour(failure: Failure) -> tuple[int, int, int]:
+    return LOST_COLOUR if failure.kind == "lost" else PHANTOM_COLOUR
+
+
 def _draw(
-    canvas: Image,
-    xyxy: tuple[float, float, float, float],
-    colour: tuple[int, int, int],
-    thickness: int,
-    text: str = "",
-    below: bool = False,
+    canvas: Image, xyxy: tuple[float, float, float, float], colour: tuple[int, int, int], thickness: int
 ) -> None:
     x0, y0, x1, y1 = (round(v) for v in xyxy)
     cv2.rectangle(canvas, (x0, y0), (x1, y1), colour, thickness, cv2.LINE_AA)
-    if text:
-        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
-        x = min(max(x0, 0), max(canvas.shape[1] - width, 0))
-        y = min(y1 + height + 4, canvas.shape[0] - 3) if below else max(y0 - 4, height + 1)
-        cv2.rectangle(canvas, (x, y - height - 2), (x + width, y + 3), (0, 0, 0), -1)
-        cv2.putText(canvas, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
