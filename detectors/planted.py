@@ -49,6 +49,7 @@ _PAINT = (0.2, 0.4, 0.8, 0.75)
 above tyres."""
 _LEAST_VARIANCE = 1e-8
 """Of luma: keeps the gradient of its root finite."""
+_ORDERED, _POSITIVE = "LOW:HIGH, two numbers in order", "a positive number"
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +189,7 @@ class Band:
             raise DetectorError(f"planted: expected features among {', '.join(FEATURES)}, found {self.feature!r}")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             found = f"{_short(self.low)}:{_short(self.high)}"
-            raise DetectorError(f"planted: {self.feature}: expected LOW:HIGH, two numbers in order, found {found}")
+            raise DetectorError(f"planted: {self.feature}: expected {_ORDERED}, found {found}")
 
     @property
     def width(self) -> float:
@@ -212,7 +213,7 @@ class PlantedFault:
         for name in ("depth", "softness"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise DetectorError(f"planted: {name}: expected a positive number, found {value}")
+                raise DetectorError(f"planted: {name}: expected {_POSITIVE}, found {value}")
 
     @classmethod
     def of(cls, text: str) -> PlantedFault:
@@ -225,9 +226,14 @@ class PlantedFault:
             name, _, value = (word.strip() for word in part.partition("="))
             if name in ("depth", "softness") and name not in settings:
                 settings[name] = _number(value)
+                if math.isnan(settings[name]):
+                    raise DetectorError(f"planted: {name}: expected {_POSITIVE}, found {value or 'nothing'}")
             else:
                 low, _, high = value.partition(":")
-                bands.append(Band(name, _number(low), _number(high)))
+                ends = _number(low), _number(high)
+                if name in FEATURES and any(map(math.isnan, ends)):
+                    raise DetectorError(f"planted: {name}: expected {_ORDERED}, found {value or 'nothing'}")
+                bands.append(Band(name, *ends))
         return cls(tuple(bands), **settings)
 
     @property

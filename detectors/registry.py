@@ -108,10 +108,10 @@ def load_detector(
     path = SHIPPED.get(str(name_or_path), Path(name_or_path))
     if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
         known = ", ".join(sorted(SHIPPED))
-        kinds = ", ".join(f"{kind}:" for kind in choose.KINDS)
+        kinds = ", ".join([DARKNET, *(f"{kind}:" for kind in choose.KINDS), ensemble.PREFIX])
         raise DetectorError(
-            f"detector: expected one of {known} or a path.safetensors, found {str(name_or_path)!r} (those from "
-            f"elsewhere begin with {DARKNET}, {kinds})"
+            f"detector: expected {known}, a path.safetensors, or what begins with {kinds} or "
+            f"{planted.PREFIX}, found {str(name_or_path)!r}"
         )
     if not path.is_file():
         raise DetectorError(f"{path}: expected a weights file, found none")

@@ -6,7 +6,7 @@ Objects are numbered by their row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -17,6 +17,9 @@ from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.removal import without_objects
 from scene_ir.types import SceneIR
+
+REMOVED = "removed"
+"""Where a scene's provenance says that vehicles were taken out: nothing is kept of these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +38,10 @@ def edited(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> Edit
     removed = [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
     changed = moved(scene, edit, bent)
     notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in removed))
-    return EditedScene(without_objects(changed, removed), tuple(removed), tuple(notes))
+    left = without_objects(changed, removed)
+    if removed:
+        left = replace(left, provenance={**left.provenance, REMOVED: "vehicles, by an edit"})
+    return EditedScene(left, tuple(removed), tuple(notes))
 
 
 def moved(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> SceneIR:

@@ -57,7 +57,7 @@ def _step(config: Bench, console: Console) -> Measured:
     try:
         detector = load_detector(config.detector, config.device)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     if config.boxes is not None:
         return _boxes(config, Path(config.boxes), detector, console)
     sizes, beside = step.cases(*_sizes(config))
@@ -115,7 +115,7 @@ def _detector(config: Bench, console: Console) -> Measured:
     try:
         rows = _dicts(watched(measured, len(names) * len(detector.SIZES_HW), console))
     except DetectorError as error:
-        raise UsageError("--detector", "a detector with gradients", error) from error
+        raise UsageError.of("--detector", "a detector with gradients", error) from error
     return Measured({"rows": rows, "method": detector.METHOD}, [Section(detector.TITLE, detector.COLUMNS, rows)])
 
 
@@ -128,7 +128,7 @@ def _climb(config: Bench, console: Console) -> Measured:
             for name, dtype in climb.PRECISIONS.items()
         }
     except DetectorError as error:
-        raise UsageError("--detector", "a detector with gradients", error) from error
+        raise UsageError.of("--detector", "a detector with gradients", error) from error
     cars, params = _sizes(config)[0], parse_params(config.params)
     measured = climb.measure(cars, params, config.passes, 4 if config.quick else 20, detectors, config.seed)
     rows = _dicts(watched(measured, len(cars) * len(detectors), console))

@@ -33,11 +33,11 @@ def run(config: Check) -> int:
     try:
         detector = load_predictor(config.detector, config.device, config.tiles)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     try:
         report = check_detector(detector, (height, width), seed=config.seed, device=config.device)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     if config.json:
         print_json({"detector_setting": config.detector, **asdict(report)})
     else:

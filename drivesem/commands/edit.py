@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from drivesem.attack.scene_edits import edited
+from drivesem.attack.scene_edits import REMOVED, edited
 from drivesem.commands.render import picture_path
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
@@ -17,7 +17,10 @@ from drivesem.settings.commands import Edit
 from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
 from drivesem.settings.errors import UsageError
 from scene_ir import files
+from scene_ir.exchange import CHANGE
 from scene_ir.io import load_scene, save_scene
+
+_STAYS = "not the photograph: vehicles that were removed, exchanged, added, loaded or taken away stay so"
 
 
 def run(config: Edit) -> int:
@@ -31,7 +34,9 @@ def run(config: Edit) -> int:
     edit = frame_edit("edit", _changes(config))
     scene = load_scene(folder)
     result = edited(scene.at_rest(), edit, scene) if config.photographed else edited(scene, edit)
-    for note in result.notes:
+    stays = config.photographed and not {CHANGE, REMOVED}.isdisjoint(scene.provenance)
+    notes = (*([_STAYS] if stays else []), *result.notes)
+    for note in notes:
         sys.stderr.write(f"drivesem: {note}\n")
     if save is not None:
         save_scene(result.scene, save)
@@ -40,13 +45,12 @@ def run(config: Edit) -> int:
     seconds = round(time.perf_counter() - start, 3)
     written = {name: str(path) for name, path in (("out", out), ("save", save)) if path is not None}
     if config.json:
-        found = {"scene": config.scene, **written, "objects": len(result.scene.objects), "notes": result.notes}
+        found = {"scene": config.scene, **written, "objects": len(result.scene.objects), "notes": notes}
         print_json({**found, "seconds": seconds})
     else:
-        what = (
-            f"{number_of(len(result.scene.objects), 'vehicle')}, {len(result.removed)} removed ({seconds:.1f} s)"
-        )
-        Console().print(f"{' and '.join(written.values())}: {what}", soft_wrap=True)
+        what = number_of(len(result.scene.objects), "vehicle")
+        what += f", {len(result.removed)} removed" if result.removed else ""
+        Console().print(f"{' and '.join(written.values())}: {what} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 

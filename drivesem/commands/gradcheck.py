@@ -203,7 +203,7 @@ def _detector(name: str, device: str) -> SqueezeDet:
     try:
         detector = load_detector(name, device)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     if not isinstance(detector, SqueezeDet):
         raise UsageError("--detector", "one whose anchors can be held fixed: SqueezeDet", type(detector).__name__)
     return detector

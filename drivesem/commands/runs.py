@@ -24,6 +24,8 @@ from drivesem.store import place
 from drivesem.truth.grades import Grade
 from scene_ir import files
 
+_SETTING = "FOLDER"
+"""What names a run on the command line."""
 _HOME = "runs"
 """Where `drivesem attack` puts runs without --out."""
 
@@ -38,7 +40,7 @@ def run(config: Runs) -> int:
     return 0
 
 
-_place = partial(place, setting="FOLDER")
+_place = partial(place, setting=_SETTING)
 
 
 def _list(config: Runs, console: Console) -> dict[str, Any]:
@@ -64,7 +66,7 @@ def _line(row: Mapping[str, Any]) -> str:
 
 def _runs_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise UsageError("FOLDER", "a folder with runs of drivesem attack", folder)
+        raise UsageError(_SETTING, "a folder with runs of drivesem attack", folder)
     if (folder / CONFIG).is_file():
         return [folder]
     runs = (path.parent for path in folder.glob(f"*/{CONFIG}") if (path.parent / FRAMES).is_dir())
@@ -72,7 +74,7 @@ def _runs_in(folder: Path) -> list[Path]:
 
 
 def _row(folder: Path) -> dict[str, Any]:
-    attack, figures = attack_of(folder), _figures(folder)
+    attack, figures = attack_of(folder, _SETTING), _figures(folder)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return {
         "run": str(folder),
@@ -98,7 +100,8 @@ def _show(config: Runs, console: Console) -> dict[str, Any]:
     told = []
     for folder in map(_place, config.folders):
         usual = {field.name: field.default for field in fields(Attack)}
-        asked = {key: value for key, value in settings_of(attack_of(folder)).items() if value != usual[key]}
+        settings = settings_of(attack_of(folder, _SETTING))
+        asked = {key: value for key, value in settings.items() if value != usual[key]}
         told.append({**_row(folder), "settings": asked, "left": len(files.leftovers(folder))})
         console.print(
             f"{folder}: {number_of(told[-1]['frames'], 'frame')}, {told[-1]['mb']:.0f} MB",
@@ -123,7 +126,7 @@ def _merge(config: Runs, console: Console) -> dict[str, Any]:
 def _prune(config: Runs, console: Console) -> dict[str, Any]:
     removed: list[str] = []
     for folder in map(Path, config.folders):
-        attack_of(folder)
+        attack_of(folder, _SETTING)
         hold(folder)  # what another command is writing now is none of this
         for path in files.leftovers(folder):
             # A question to the run writes below it, and holds the folder of its own answers alone.

@@ -54,8 +54,8 @@ def run(config: Synth) -> int:
     order = order_of(config)
     total = len(order.places())
     hold(order.out)
+    done = synthesise(order, mapping(config))
     with progress_bar(Console(stderr=True), remaining=True) as progress:
-        done = synthesise(order, mapping(config))
         for _ in progress.track(done, total=total, description="making frames"):
             pass
     found: dict[str, object] = {"out": str(order.out), "frames": total}

@@ -374,7 +374,7 @@ def _peer(config: Attack) -> Callable[[], Predictor] | None:
         peer = load_predictor(name, config.device, config.tiles)
         JudgedClasses.of(peer)
     except DetectorError as error:
-        raise UsageError("--peer", "auto, off, or a detector", error) from error
+        raise UsageError.of("--peer", "auto, off, or a detector", error) from error
     return lambda: peer
 
 
@@ -382,7 +382,7 @@ def _witness(config: Attack, name: str) -> Callable[[Tensor], Tensor]:
     try:
         return witness_of(load_predictor(name, config.device, config.tiles))
     except DetectorError as error:
-        raise UsageError("--witness", "a detector", error) from error
+        raise UsageError.of("--witness", "a detector", error) from error
 
 
 def _placebo(run: Path, identifier: str) -> Placebo:
@@ -402,7 +402,7 @@ def named_detector(config: Attack) -> Predictor:
             return load_predictor(config.detector, config.device, config.tiles)
         return load_detector(config.detector, config.device, getattr(torch, config.precision))
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
 
 
 def suited_to(config: Attack, detector: Predictor) -> Attack:
@@ -419,7 +419,7 @@ def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -
     try:
         JudgedClasses.of(detector)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     if isinstance(detector, Detector):
         return
     if needs_gradient:

@@ -124,13 +124,15 @@ def is_attack(run: Path) -> bool:
     return isinstance(loaded, dict) and set(loaded) <= {field.name for field in fields(Attack)}
 
 
-def attack_of(run: Path) -> Attack:
-    """The configuration of a run of `drivesem attack`. Raises UsageError where the folder is none."""
+def attack_of(run: Path, setting: str = "--run") -> Attack:
+    """The configuration of a run of `drivesem attack`. setting: what names it on the command line. Raises
+    UsageError where the folder is none.
+    """
     path = run / CONFIG
     if not path.is_file():
-        raise UsageError("--run", "a run's folder, with its config.yaml", run)
+        raise UsageError(setting, "a run's folder, with its config.yaml", run)
     if not is_attack(run):
-        raise UsageError("--run", "a run of drivesem attack", run)
+        raise UsageError(setting, "a run of drivesem attack", run)
     attack: Attack = from_json(Attack, files.read_yaml(path), str(path))
     try:
         # The run that a placebo was like may be gone.
@@ -140,11 +142,11 @@ def attack_of(run: Path) -> Attack:
     return attack
 
 
-def trusted_attack(run: Path, trust: bool) -> Attack:
+def trusted_attack(run: Path, trust: bool, setting: str = "--run") -> Attack:
     """The same, to load its detectors: a run comes from anywhere, and so would code that its settings name.
     trust: whether that may run. Raises UsageError as `attack_of`, and where it may not.
     """
-    attack = attack_of(run)
+    attack = attack_of(run, setting)
     for setting in ("detector", "peer", "witness"):
         code = code_of(getattr(attack, setting) or "")
         if code is not None and not trust:
@@ -154,16 +156,16 @@ def trusted_attack(run: Path, trust: bool) -> Attack:
     return attack
 
 
-def detector_of(attack: Attack, device: str) -> Predictor:
+def detector_of(attack: Attack, device: str, setting: str = "--run") -> Predictor:
     """The run's detector, in float32, in which a run judges too whatever it took its gradients in.
 
-    Raises UsageError where it cannot be had, or knows no cars.
+    setting: what names the run on the command line. Raises UsageError where it cannot be had, or knows no cars.
     """
     try:
         detector = load_predictor(attack.detector, device, attack.tiles)
         JudgedClasses.of(detector)
     except DetectorError as error:
-        raise UsageError("--run", "a run whose detector can be had", error) from error
+        raise UsageError.of(setting, "a run whose detector can be had", error) from error
     return detector
 
 

@@ -147,7 +147,7 @@ def load_shown(folders: Sequence[str]) -> tuple[list[ShownRun], int]:
         summary = _summary(run.folder / METRICS)
         if len(shared) < len(every):
             summary = _again(summary, results)
-        shown.append(_shown(run.name, run.folder, attack_of(run.folder), summary, results))
+        shown.append(_shown(run.name, run.folder, attack_of(run.folder, "RUN"), summary, results))
     _check_photographs(shown)
     return shown, len(every) - len(shared)
 

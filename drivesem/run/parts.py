@@ -33,7 +33,7 @@ def merge(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
     parts = load_runs(folders, setting="FOLDER", may_be_empty=True)
     if not any(part.frames for part in parts):
         raise UsageError("FOLDER", "runs with frames", f"none in {', '.join(folders)}")
-    attacks = [trusted_attack(part.folder, trust) for part in parts]
+    attacks = [trusted_attack(part.folder, trust, "FOLDER") for part in parts]
     for part, attack in zip(parts, attacks, strict=True):
         _check_alike(parts[0], attacks[0], part, attack)
     # Whatever the first was told of frames that are there: those of `out` stay, which may be a part's own.
@@ -64,7 +64,8 @@ def merge(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise FormatError(METRICS, "frames_failed, frames_without_vehicles and seconds", error) from error
     failed = {name: why for name, why in sorted(failed.items()) if name not in results}
-    summary = summary_of(config, parse_params(parts[0].params), detector_of(config, config.device), ordered)
+    detector = detector_of(config, config.device, "FOLDER")
+    summary = summary_of(config, parse_params(parts[0].params), detector, ordered)
     empty = set().union(*emptied)
     without = passed_over + len(empty)
     summary = replace(summary, frames_failed=failed, frames_without_vehicles=without, seconds=seconds)

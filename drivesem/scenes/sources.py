@@ -212,7 +212,7 @@ def _finder(config: Scenes) -> Predictor:
     try:
         return load_predictor(config.finder)
     except DetectorError as error:
-        raise UsageError("--finder", "a detector", error) from error
+        raise UsageError.of("--finder", "a detector", error) from error
 
 
 def derender_settings(

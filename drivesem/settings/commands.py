@@ -67,6 +67,8 @@ Search = Literal[
 ]  # fmt: skip
 """Attacks that look for failures; the placebo looks for none."""
 
+_NETWORK = "squeezenet"
+"""The classifier that is attacked, or trained, where none is named."""
 _AGAIN = ("name", "kept", "out", "bootstrap", "json")
 """Settings of a study that is told again."""
 
@@ -446,15 +448,15 @@ class Holes(Trust, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate(Bootstrap, Tiles, FrameCommand):
+class Gate(Trust, Bootstrap, Tiles, FrameCommand):
     """Compare two detectors around certain failures of runs: exit code 1 where the new one fails more often."""
 
     runs: RunFolders = ()
     """Folders of drivesem attack."""
-    before: str = "squeezedet"
-    """The detector that stands: shipped, a file, or another project's."""
-    after: str = "squeezedet"
-    """The one that is to take its place."""
+    before: str | None = None
+    """The detector that stands: shipped, a file, or another project's; by default the runs' own."""
+    after: Annotated[str | None, Required("the detector that is to take the place of --before")] = None
+    """The one that is to take its place; it has to be named."""
     tolerance: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.05
     """By how much the share of lost objects may grow, of a hole, of a kind of failure, and of all."""
     samples: Count = 32
@@ -490,10 +492,10 @@ class Runs(Trust, Command):
 
     def check(self) -> None:
         super().check()
-        refuse(self.what != "list" and not self.folders, "FOLDER", f"runs to {self.what}", "none")
-        refuse(
-            (self.what == "merge") != (self.out is not None), "--out", "a folder, of runs merge alone", self.out
-        )
+        refuse(self.what != "list" and not self.folders, "FOLDER", f"runs to {self.what}", "nothing")
+        merges, given = self.what == "merge", self.out is not None
+        refuse(merges and not given, "--out", "the folder of the run that is made", "nothing")
+        refuse(given and not merges, "--out", "runs merge", f"runs {self.what}")
         refuse(self.dry and self.what != "prune", "--dry", "runs prune", f"runs {self.what}")
         elsewhere = next((folder for folder in self.folders if is_url(folder)), None)
         here = elsewhere is None or self.what != "prune"
@@ -650,8 +652,10 @@ class Edit(Command):
     remove: Repeated = ()
     """Rows of vehicles to take out, with their shadows; or all."""
     photographed: Flag = False
-    """Begin with the scene as it was photographed, where the folder holds a counterexample or an edit. A shape is
-    then also given as a share of what it was bent to: 'objects[2].mesh=60%'."""
+    """Begin with the scene as it was photographed, where the folder holds a counterexample or an edit: every
+    vehicle at its place, in its shape and paint, without weather. Vehicles that were removed, exchanged, added,
+    loaded or taken away stay so. A shape is then also given as a share of what it was bent to:
+    'objects[2].mesh=60%'."""
     edits: str | None = None
     """A YAML file of changes; what --set says of the same thing wins."""
     out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -1129,9 +1133,10 @@ class Classify(FrameCommand):
     """From where each object is seen, with commas."""
     backgrounds: Annotated[str, Folder("a folder of photographs")] | None = None
     """Photographs to put behind objects; by default pictures that are made."""
-    network: str = "squeezenet"
+    network: str = ""
     """Attack: squeezenet, weights that classify train wrote, or an ONNX file; train: squeezenet, vgg16,
-    vgg16-pooled, resnet50, torchvision:NAME or timm:NAME; gate: as attack (docs/classify.md)."""
+    vgg16-pooled, resnet50, torchvision:NAME or timm:NAME; by default squeezenet. Gate: the new one, as of attack;
+    it has to be named (docs/classify.md)."""
     weights: str | None = None
     """Train: what the network begins with, such as torchvision's file; squeezenet needs none, and with --layers
     all others begin anew where none is named."""
@@ -1185,6 +1190,11 @@ class Classify(FrameCommand):
     nuisances: str = "shift_px=3"
     """Attack: what a draw changes of a picture (docs/grades.md)."""
 
+    def __post_init__(self) -> None:
+        # Beside a run there is no default: a network compared with itself passes every gate.
+        if not self.network and self.what != "gate":
+            object.__setattr__(self, "network", _NETWORK)
+
     def check(self) -> None:
         super().check()
         whole = self.what == "train" and self.layers == "all"
@@ -1201,6 +1211,7 @@ class Classify(FrameCommand):
             of_run and not self.folder, "RUN", f"a folder of drivesem classify attack, to {self.what}", "nothing"
         )
         refuse(not of_run and self.folder is not None, "RUN", f"no folder, for classify {self.what}", self.folder)
+        refuse(not self.network, "--network", "the network that is to take the place of the run's", "nothing")
         refuse(
             self.what == "confirm" and self.out is not None, "--out", "none: confirm goes on in the run", self.out
         )

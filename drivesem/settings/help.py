@@ -151,7 +151,7 @@ class _Told:
         positional = any("Positional" in repr(marker) for marker in getattr(hint, "__metadata__", ()))
         text, default = texts.get(field.name, ""), field.default
         required = default is MISSING and not positional
-        if not positional and default not in (MISSING, None, False, ()):
+        if not positional and default not in (MISSING, None, False, (), ""):
             text += f" (default: {_default(default)})"
         names = metavar or _value(hint)
         if not positional:

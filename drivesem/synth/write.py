@@ -255,11 +255,11 @@ def jobs_of(order: Order) -> list[Job]:
 
 
 def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
-    """Make the data set that `order` asks for, yielding each frame's number as it is done.
+    """Make the data set that `order` asks for: each frame's number, as it is done.
 
     At the end come the files that frames share, and `manifest.json`: recipe, and each frame's seed, shapes and
     objects. A frame's bytes depend on its seed, index and settings alone, not on order, engine or number of
-    frames. Raises FormatError where the folder holds frames of another recipe.
+    frames. Raises FormatError where the folder holds frames of another recipe, before the first is asked for.
     """
     stamp = order.out / _STATE / "recipe.json"
     recipe = order.recipe()
@@ -273,8 +273,12 @@ def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
             raise FormatError(f"{stamp}: {key}", repr(recipe.get(key)), repr(found.get(key)))
     if not order.resume or not stamp.exists():
         files.write_json(stamp, recipe)
+    return _made(order, recipe, engine or map)
+
+
+def _made(order: Order, recipe: Mapping[str, object], engine: Engine) -> Iterator[int]:
     jobs = jobs_of(order)
-    yield from (engine or map)(make_frame, jobs)
+    yield from engine(make_frame, jobs)
     _finish(order, recipe, jobs)
 
 

@@ -31,7 +31,7 @@ def startable(name: str, device: str, setting: str = "--start") -> Detector:
         detector = load_detector(name, device)
         JudgedClasses.of(detector)
     except DetectorError as error:
-        raise UsageError(setting, "a detector that can be trained", error) from error
+        raise UsageError.of(setting, "a detector that can be trained", error) from error
     return detector
 
 

@@ -49,9 +49,10 @@ def opened(config: View) -> Shown:
             frame.result.identifier: ShownFrame(frame.folder / "scene", _told(frame.result))
             for frame in run.frames
         }
-        attack = trusted_attack(run.folder, config.trust)
+        attack = trusted_attack(run.folder, config.trust, _SETTING)
         t_star = attack.t_star if t_star is None else t_star
-        detector = detector_of(attack, config.device) if config.detector is None else _detector(config)
+        own = config.detector is None
+        detector = detector_of(attack, config.device, _SETTING) if own else _detector(config)
     else:
         if not path.is_dir():
             raise UsageError(_SETTING, "a scene of drivesem derender, a folder of some, or a run", config.scene)
@@ -78,7 +79,7 @@ def _detector(config: View) -> Predictor:
         detector = load_predictor(config.detector or _OTHERWISE, config.device, config.tiles)
         JudgedClasses.of(detector)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector that knows cars", error) from error
+        raise UsageError.of("--detector", "a detector that knows cars", error) from error
     return detector
 
 

@@ -84,12 +84,14 @@ def test_words_give_settings_and_settings_words(text: str) -> None:
     [
         ("", "expected features among height_px, aspect, across, lightness, contrast, found ''"),
         ("weight=1:2", "found 'weight'"),
-        ("aspect", "aspect: expected LOW:HIGH, two numbers in order"),
+        ("aspect", "aspect: expected LOW:HIGH, two numbers in order, found nothing"),
+        ("aspect=1.6", "aspect: expected LOW:HIGH, two numbers in order, found 1.6"),
+        ("aspect=:2", "aspect: expected LOW:HIGH, two numbers in order, found :2"),
         ("aspect=2:1", "found 2:1"),
         ("aspect=1:inf", "found 1:inf"),
         ("aspect=1:2,aspect=3:4", "each once, found aspect, aspect"),
         ("depth=3", "at least one feature, each once, found none"),
-        ("aspect=1:2,depth=no", "depth: expected a positive number, found nan"),
+        ("aspect=1:2,depth=no", "depth: expected a positive number, found no"),
         ("aspect=1:2,softness=0", "softness: expected a positive number, found 0"),
     ],
 )

@@ -64,7 +64,8 @@ def test_anchors_in_metadata_that_are_none(weights: Path) -> None:
 def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         DetectorError,
-        match=r"detector: expected one of squeezedet, yolov3-slim or a path\.safetensors, found 'yolo9'",
+        match=r"detector: expected squeezedet, yolov3-slim, a path\.safetensors, or what begins with darknet:, "
+        r".*, module:, ensemble: or planted:, found 'yolo9'$",
     ):
         load_detector("yolo9")
 

@@ -139,7 +139,7 @@ class Yardstick:
         try:
             detector = load_detector(config.detector, config.device)
         except DetectorError as error:
-            raise UsageError("--detector", "a detector with gradients", error) from error
+            raise UsageError.of("--detector", "a detector with gradients", error) from error
         first = Worker.of(attack_settings(config, methods[0]), detector)
         workers = {method: first.beside(attack_settings(config, method)) for method in methods}
         kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"

@@ -40,7 +40,7 @@ class ReachWorker:
         try:
             detector = load_detector(config.detector, config.device)
         except DetectorError as error:
-            raise UsageError("--detector", "a detector with gradients", error) from error
+            raise UsageError.of("--detector", "a detector with gradients", error) from error
         if type(detector).candidates is Detector.candidates:
             raise UsageError("--detector", "one that tells its candidates", detector.name)
         return cls(config, source, detector, None if config.out is None else Path(config.out) / "frames")

@@ -104,7 +104,7 @@ def _detector(config: Eval) -> Predictor:
         detector = load_predictor(config.detector or "", config.device, config.tiles)
         JudgedClasses.of(detector)
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     return detector
 
 

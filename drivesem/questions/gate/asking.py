@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from drivesem.questions.gate.rows import rows_of
 from drivesem.report.answer import Answer
 from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.finished import Run, load_runs
-from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, folder_of
+from drivesem.run.folder import FRAMES, PRESENTATION, attack_of, claim, folder_of, trusted_attack
 from drivesem.run.tally import certain_losses
 from drivesem.settings.commands import Gate
 from drivesem.settings.errors import UsageError
@@ -29,6 +30,8 @@ _FREE = (*PRESENTATION, "runs", "tolerance", "bootstrap")
 def gate_run(config: Gate) -> tuple[bool, Answer]:
     """Whether the gate is passed, and what is said. Raises UsageError or SceneError for bad input."""
     runs = load_runs(config.runs, config.limit, "RUN")
+    if config.before is None:
+        config = replace(config, before=_own_detector(runs, config.trust))
     detectors_of(config)
     out = folder_of(config.out, runs[0].folder / "gate")
     claim(out, config, _WRITTEN, _FREE, renews=True)
@@ -51,20 +54,31 @@ def gate_run(config: Gate) -> tuple[bool, Answer]:
     return answer.data["passed"], answer
 
 
+def _own_detector(runs: list[Run], trust: bool) -> str:
+    """The detector that runs attacked. Raises UsageError where they have several, where it runs code that is not
+    trusted, and where its file is no longer the one that a run was made with: that may be the new one.
+    """
+    names = list(dict.fromkeys(trusted_attack(run.folder, trust, "RUN").detector for run in runs))
+    if len(names) > 1:
+        raise UsageError("--before", "the detector that stands: these runs have several", ", ".join(names))
+    return names[0]
+
+
 def detectors_of(config: Gate) -> tuple[Predictor, Predictor]:
     """The two. Raises UsageError where one cannot be had, or they do not know the same classes."""
     found: list[Predictor] = []
-    for setting, name in (("--before", config.before), ("--after", config.after)):
+    for setting, name in (("--before", config.before or ""), ("--after", config.after or "")):
         try:
             found.append(load_predictor(name, config.device, config.tiles))
             JudgedClasses.of(found[-1])
         except DetectorError as error:
-            raise UsageError(setting, "a detector", error) from error
+            raise UsageError.of(setting, "a detector", error) from error
     before, after = found
-    if set(before.classes) != set(after.classes):
-        raise UsageError(
-            "--after", f"the classes of --before, {', '.join(before.classes)}", ", ".join(after.classes)
-        )
+    lacking = [name for name in before.classes if name not in after.classes]
+    further = [name for name in after.classes if name not in before.classes]
+    if lacking or further:
+        first = f"no {lacking[0]}" if lacking else f"{further[0]}, which --before does not know"
+        raise UsageError("--after", "the classes of --before", first)
     return before, after
 
 
@@ -73,7 +87,7 @@ class GateWorker:
 
     def __init__(self, config: Gate, run: Run, out: Path) -> None:
         self.config, self.run, self.out = config, run, out
-        self.attack, self.params = attack_of(run.folder), parse_params(run.params)
+        self.attack, self.params = attack_of(run.folder, "RUN"), parse_params(run.params)
         self.detectors = detectors_of(config)
 
     def __call__(self, name: str) -> None:

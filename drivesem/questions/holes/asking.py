@@ -43,7 +43,7 @@ def holes_run(config: Holes) -> Answer:
     runs = load_runs(config.runs, config.limit, "RUN")
     out = folder_of(config.out, runs[0].folder / "holes")
     for run in runs:
-        trusted_attack(run.folder, config.trust)  # before anything is written
+        trusted_attack(run.folder, config.trust, "RUN")  # before anything is written
     claim(out, config, _WRITTEN, _FREE)
     _tell_effort(runs, config)
     found: dict[str, FrameHoles] = {}
@@ -103,8 +103,8 @@ class HolesWorker:
     def __init__(self, config: Holes, run: Run, out: Path) -> None:
         self.run, self.out = run, out
         self.effort = Effort(config.samples, config.contrast, config.reach, config.seed)
-        self.attack, self.params = trusted_attack(run.folder, config.trust), parse_params(run.params)
-        self.detector = detector_of(self.attack, config.device)
+        self.attack, self.params = trusted_attack(run.folder, config.trust, "RUN"), parse_params(run.params)
+        self.detector = detector_of(self.attack, config.device, "RUN")
 
     def __call__(self, name: str) -> None:
         """One frame, from the run's folder to its own."""

@@ -95,7 +95,7 @@ def detectors_of(specs: Sequence[str], config: Asking, out: Path, t_star: float 
             predictor = order.load()
             JudgedClasses.of(predictor)
         except DetectorError as error:
-            raise UsageError("--detectors", "detectors", error) from error
+            raise UsageError.of("--detectors", "detectors", error) from error
         asked.append(Asked(name, order, predictor, t_star))
     return asked
 

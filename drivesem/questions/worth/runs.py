@@ -105,7 +105,7 @@ class SecondDetector:
             self._predictor = self._order.load()
             self._names = JudgedClasses.of(self._predictor).names
         except DetectorError as error:
-            raise UsageError("--second", "a detector, or a run of drivesem retrain", error) from error
+            raise UsageError.of("--second", "a detector, or a run of drivesem retrain", error) from error
         self._memory = Memory(self._order, self._predictor)
         self.name, self.t_star = name, t_star_of(self._predictor)
 

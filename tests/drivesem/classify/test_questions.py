@@ -222,6 +222,7 @@ def test_bad_input_is_one_line_and_exit_code_2(run, tmp_path, capsys):
         ("attack", run): "RUN: expected no folder, for classify attack",
         ("confirm", run, "--out", tmp_path): "--out: expected none: confirm goes on in the run",
         ("holes", run, "--samples", "5"): "--samples: expected at least 24",
+        ("gate", run): "--network: expected the network that is to take the place of the run's, found nothing",
     }
     for words, message in cases.items():
         code, _, said = answer(capsys, *words)

@@ -288,8 +288,8 @@ def test_failures_have_kinds_and_grades(
         (["--draws", "8"], "--draws: expected at least 16, which a certificate's rule needs, found 8"),
         (["--nuisances", "wind=3"], "--nuisances: expected default, off, or NAME=NUMBER with commas"),
         (["--nuisances", "jpeg=99"], "--nuisances: jpeg: expected a number of at least 0, at most 95, found 99"),
-        (["--witness", "blind"], "--witness: expected a detector, found"),
-        (["--peer", "blind"], "--peer: expected auto, off, or a detector, found"),
+        (["--witness", "blind"], "--witness: detector blinking: expected one that knows Car, found dog"),
+        (["--peer", "blind"], "--peer: detector blinking: expected one that knows Car, found dog"),
     ],
 )
 def test_what_cannot_grade_is_refused(

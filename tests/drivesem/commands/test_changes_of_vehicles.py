@@ -49,6 +49,16 @@ def test_a_run_holds_what_was_done_and_agrees_with_its_files(runs: Runs, kind: s
     assert main(["verify", "--run", str(folder)]) == 0
 
 
+def test_an_edit_leaves_the_change_and_says_so(
+    runs: Runs, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = runs["leave"][0] / "frames" / "demo-000" / "scene"
+    capsys.readouterr()
+    assert main(["edit", str(scene), "--photographed", "--out", str(tmp_path / "a.png")]) == 0
+    note = "not the photograph: vehicles that were removed, exchanged, added, loaded or taken away stay so"
+    assert f"drivesem: {note}" in capsys.readouterr().err.splitlines()
+
+
 @pytest.mark.parametrize("kind", ["leave", "park"])
 def test_a_run_can_be_asked(runs: Runs, kind: str, tmp_path: Path) -> None:
     folder, _ = runs[kind]

@@ -59,7 +59,19 @@ def test_one_whose_code_raises_ends_in_2(method: str, tmp_path: Path, capsys: py
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--detector", "yolo9"], "--detector: expected a detector, found detector: expected one of"),
+        (
+            ["--detector", "yolo9"],
+            "--detector: expected a detector (squeezedet, yolov3-slim, a path.safetensors, ",
+        ),
+        (
+            ["--detector", "planted:aspect=1.6"],
+            "--detector: planted: aspect: expected LOW:HIGH, two numbers in order, found 1.6\n",
+        ),
+        (["--detector", "gone.onnx"], "found 'gone.onnx'\n"),
+        (
+            ["--detector", "gone.safetensors"],
+            "drivesem: --detector: gone.safetensors: expected a weights file, found none\n",
+        ),
         (["--detector", "squeezedet", "--size", "32x32"], "--size: expected WIDTHxHEIGHT, each at least 64 px"),
     ],
 )

@@ -358,13 +358,70 @@ def test_frames_that_cannot_be_compared_do_not_pass(
     assert "No certain failure" not in page
 
 
-def test_other_classes_are_no_comparison(
-    gate: Callable[[str], tuple[int, dict[str, Any]]], capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """The one line of a gate that is refused."""
+
+    def call(*words: object) -> str:
+        capsys.readouterr()
+        assert main(["gate", *map(str, words)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("drivesem: ")
+
+    return call
+
+
+@pytest.mark.usefixtures("gate")
+def test_other_classes_are_no_comparison(attacked: Path, said: Callable[..., str]) -> None:
+    other = said(attacked, "--after", "other")
+    assert other == "--after: expected the classes of --before, found Bus, which --before does not know"
+    fewer = said(attacked, "--before", "other", "--after", "any")
+    assert fewer == "--after: expected the classes of --before, found no Bus"
+
+
+def test_a_gate_has_to_be_told_the_new_detector(attacked: Path, said: Callable[..., str]) -> None:
+    """The old one beside itself would pass for ever."""
+    wanted = "the detector that is to take the place of --before"
+    assert said(attacked) == f"--after: expected {wanted}, found nothing"
+    assert not (attacked / "gate").exists()
+
+
+def test_before_is_the_runs_own_detector(
+    gate: Callable[[str], tuple[int, dict[str, Any]]],
+    attacked: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["gate", "nowhere", "--after", "any"]) == 2
-    capsys.readouterr()
-    code, _ = gate("other")
-    assert code == 2
+    _, named = gate("worse")
+    words = ["--after", "worse", "--samples", "20", "--workers", "1"]
+    assert main(["gate", str(attacked), *words, "--json", "--out", str(tmp_path / "own")]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["before"], told["rows"]) == ("any", named["rows"])
+    assert "before: any" in (tmp_path / "own" / "config.yaml").read_text()
+
+
+def test_runs_whose_detector_cannot_be_taken_for_the_old_one(
+    attacked: Path, tmp_path: Path, said: Callable[..., str]
+) -> None:
+    run = shutil.copytree(attacked, tmp_path / "run")
+    config, as_it_was = run / "config.yaml", (run / "config.yaml").read_text()
+
+    def of(detector: str) -> None:
+        config.write_text(as_it_was.replace("detector: any\n", f"detector: {detector}\n"))
+
+    of("better")
+    several = "the detector that stands: these runs have several"
+    assert said(attacked, run, "--after", "worse") == f"--before: expected {several}, found any, better"
+    of("module:evil.py:D")
+    trusted = f"{config}: detector: expected a detector that is data alone, or --trust"
+    assert said(run, "--after", "worse").startswith(trusted)
+    # weights that were written over: the new detector may be in the old one's file
+    weights = tmp_path / "weights.safetensors"
+    weights.write_bytes(b"new")
+    of(str(weights))
+    (run / "files.json").write_text(json.dumps({str(weights): "0" * 64}))
+    made_with = f"expected the files that this run was made with, found another {weights}"
+    assert made_with in said(run, "--after", "worse")
 
 
 @pytest.mark.parametrize(

@@ -217,12 +217,15 @@ def test_prune_passes_over_what_a_question_is_writing(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["runs", "merge", "a"], "--out: expected a folder, of runs merge alone, found None"),
+        (["runs", "merge", "a"], "--out: expected the folder of the run that is made, found nothing"),
+        (["runs", "show", "a", "--out", "b"], "--out: expected runs merge, found runs show"),
         (
             ["runs", "merge", "a", "--out", "b\udcff"],
             r"--out: expected text that UTF-8 holds, found 'b\udcff'",
         ),
-        (["runs", "show"], "FOLDER: expected runs to show, found none"),
+        (["runs", "show"], "FOLDER: expected runs to show, found nothing"),
+        (["runs", "show", "a/nope"], "FOLDER: expected a run's folder, with its config.yaml, found a/nope"),
+        (["runs", "prune", "a", "--dry"], "FOLDER: expected a run's folder, with its config.yaml, found a"),
         (["runs", "list", "nowhere"], "FOLDER: expected a folder with runs of drivesem attack, found nowhere"),
         (["runs", "list", "--dry"], "--dry: expected runs prune, found runs list"),
         (["attack", "--part", "3/2"], "--part: expected K/N, the K-th of N parts, such as 2/4, found '3/2'"),

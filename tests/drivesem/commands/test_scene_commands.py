@@ -366,6 +366,28 @@ def test_an_edit_begins_with_the_photograph_again(
     assert not np.array_equal(files.read_image(once), files.read_image(still))
 
 
+def test_what_an_edit_removed_stays_so_and_that_is_said(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed, still = tmp_path / "S", tmp_path / "still.png"
+    words = ["edit", str(demo), "--remove", "0", "--set", "objects[1].rotate=10deg", "--save", str(changed)]
+    assert main(words) == 0
+    left = len(load_scene(demo).objects) - 1
+    assert f"S: {left} vehicles, 1 removed (" in capsys.readouterr().out
+    words = ["edit", str(changed), "--photographed", "-o", str(still)]
+    found, said = succeed(words, capsys)
+    note = "not the photograph: vehicles that were removed, exchanged, added, loaded or taken away stay so"
+    assert said == f"drivesem: {note}\n"
+    assert (found["notes"], found["objects"]) == ([note], left)
+    assert main(words) == 0
+    assert f"still.png: {left} vehicles (" in capsys.readouterr().out
+    assert not np.array_equal(files.read_image(still), files.read_image(demo / "photograph.png"))
+    once = tmp_path / "once.png"
+    succeed(["edit", str(demo), "--remove", "0", "-o", str(once)], capsys)
+    assert np.array_equal(files.read_image(once), files.read_image(still))
+    assert succeed(["edit", str(changed), "--set", "weather=fog", "-o", str(once)], capsys)[1] == ""
+
+
 def test_without_vehicles_the_background_is_left(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

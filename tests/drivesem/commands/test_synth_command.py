@@ -72,6 +72,16 @@ def test_bad_input_is_one_line(
     assert not out.exists()
 
 
+def test_another_recipe_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No bar before it."""
+    out = tmp_path / "set"
+    stamp = out / ".drivesem" / "recipe.json"
+    files.write_json(stamp, order_of(Synth(frames=1, seed=7, out=str(out))).recipe())
+    assert main(["synth", "--frames", "1", "--seed", "8", "--out", str(out)]) == 2
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", f"drivesem: {stamp}: seed: expected 8, found 7\n")
+
+
 def test_a_folder_that_is_a_file_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "file"
     path.write_text("")

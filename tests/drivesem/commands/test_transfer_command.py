@@ -176,7 +176,10 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert refused(*asked) == "--run: expected a folder of drivesem attack, found nothing"
     assert refused("--run", tmp_path / "none", *asked).startswith("--run: expected a folder of drivesem attack")
     assert refused("--run", run) == "--detectors: expected detectors with commas, found nothing"
-    assert refused("--run", run, "--detectors", "squeezdet").startswith("--detectors: expected detectors, found")
+    unknown = refused("--run", run, "--detectors", "squeezdet")
+    assert unknown.startswith("--detectors: expected detectors (squeezedet, yolov3-slim, a path.safetensors, or")
+    assert unknown.endswith("ensemble: or planted:), found 'squeezdet'")
+    assert (unknown.count("expected"), unknown.count("found")) == (1, 1)
     assert "each detector once, found squeezedet" in refused("--run", run, "--detectors", "squeezedet,squeezedet")
     assert "each run once" in refused("--run", f"{run},{run}", *asked)
     assert "--bootstrap" in refused("--run", run, *asked, "--bootstrap", "-1")

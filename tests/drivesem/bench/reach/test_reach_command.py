@@ -45,7 +45,10 @@ def test_options() -> None:
         (["--reach", "--draws", "1"], "--draws: expected at least 2"),
         (["--reach", "--directions", "4"], "--directions: expected no --reach beside it"),
         (["--reach", "--max-error", "0.1"], "--max-error: expected no --reach beside it"),
-        (["--reach", "--detector", "nowhere.safetensors"], "--detector: expected a detector with gradients"),
+        (
+            ["--reach", "--detector", "nowhere.safetensors"],
+            "--detector: nowhere.safetensors: expected a weights file",
+        ),
     ],
 )
 def test_what_does_not_go_together(words: list[str], message: str, refused: Callable[..., str]) -> None:

@@ -175,7 +175,7 @@ def test_two_sources_make_a_matrix(finished: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--detectors", "squeezdet"], "--detectors: expected detectors, found"),
+        (["--detectors", "squeezdet"], "--detectors: expected detectors (squeezedet, "),
         (["--detectors", ","], "--detectors: expected detectors with commas"),
         (["--sources", "squeezedet,squeezedet"], "--sources: expected each detector once, found squeezedet"),
         (["--detector", "squeezdet"], "--detector: expected a detector"),
