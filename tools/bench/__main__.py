@@ -115,7 +115,7 @@ def _found(config: BenchTool, console: Console) -> Measured:
     try:
         frames = dict(watched(found.measure(config, sheets), found.count(config), console))
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     rows = [car for name in sorted(frames) for car in frames[name]]
     if sheets is not None:
         found.rank_sheets(rows, sheets)
@@ -128,7 +128,7 @@ def _redraw(config: BenchTool, console: Console) -> Measured:
     try:
         frames = dict(watched(redraw.measure(config, _sheets(config)), found.count(config), console))
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     rows = [frames[name] for name in sorted(frames)]
     fields = {"frames": len(rows), "rows": [asdict(row) for row in rows], "summary": redraw.summary(rows)}
     return _measured(redraw, fields)
@@ -141,7 +141,7 @@ def _weather(config: BenchTool, console: Console) -> Measured:
         measured = weather.measure(config, frames, _sheets(config))
         rows = [row for found in watched(measured, frames, console) for row in found]
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     return _measured(weather, {"rows": [asdict(row) for row in rows], "summary": weather.summary(rows)})
 
 
@@ -176,7 +176,7 @@ def _moves(config: BenchTool, console: Console) -> Measured:
         measured = watched(moves.measure(config, frames, _sheets(config)), frames, console)
         rows = [row for found in measured for row in found]
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     return _measured(moves, {"rows": [asdict(row) for row in rows], "summary": moves.summary(rows)})
 
 
@@ -212,7 +212,7 @@ def _viewer(config: BenchTool, console: Console) -> Measured:
         detector = load_predictor(config.detector, config.device, config.tiles)
         rows = list(watched(viewer.measure(scene, detector, states, config.seed), 8, console))
     except DetectorError as error:
-        raise UsageError("--detector", "a detector", error) from error
+        raise UsageError.of("--detector", "a detector", error) from error
     return _measured(viewer, {"rows": [asdict(row) for row in rows]})
 
 

@@ -210,7 +210,7 @@ def test_the_command_reads_scenes_and_draws_failures(
     ("words", "message"),
     [
         (["--detector", "onnx:gone.onnx"], "gone.onnx: expected an ONNX file, found none"),
-        (["--detector", "nowhere"], "detector: expected one of squeezedet"),
+        (["--detector", "nowhere"], "--detector: expected a detector (squeezedet"),
         (["--dataset", "kitti"], "--root: expected the folder of data set 'kitti'"),
         (["--dataset", "kitti", "--root", ".", "--scenes", "."], "--scenes: expected no --dataset beside it"),
         (["--device", "meta"], "--device: expected cpu"),
