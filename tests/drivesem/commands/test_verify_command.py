@@ -401,6 +401,11 @@ def nested(*keys: Any, value: Any) -> Callable[[Any], None]:
     return edit
 
 
+def by_another_judge(data: Any) -> None:
+    """Open3D judges where it can be loaded, or else outlines."""
+    data["checked_by"] = "outlines" if data["checked_by"] == "open3d" else "open3d"
+
+
 @pytest.mark.parametrize(
     ("edit", "field"),
     [
@@ -433,7 +438,7 @@ def test_each_figure_of_the_run(
         (nested("active_constraints", value=["objects[0]: road"]), "result.json: active_constraints"),
         (nested("violated_at_start", value=["objects[0]: road"]), "result.json: violated_at_start"),
         (nested("became_ignored", value=[0]), "result.json: became_ignored"),
-        (nested("checked_by", value="outlines"), "result.json: checked_by"),
+        (by_another_judge, "result.json: checked_by"),
         (nested("change", value="a car is gone"), "result.json: change"),
         (nested("identity_psnr_db", value=31.0), "identity_psnr_db"),
         (nested("failures", 0, "index", value=1), "failures[0].index"),
@@ -447,10 +452,7 @@ def test_each_figure_of_the_run(
 def test_each_figure_of_a_frame(
     run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
 ) -> None:
-    before = files.read_json(run / FRAME / "result.json")
     change(run / FRAME / "result.json", edit)
-    if field.endswith("checked_by") and files.read_json(run / FRAME / "result.json") == before:
-        pytest.skip("Open3D cannot be loaded here: outlines are what judged")
     assert {field, "result.json"} <= set(told(verify(run)))
 
 
