@@ -37,6 +37,10 @@ OUTLINE_TURN = (0.1, 0.25)
 OUTLINE_PX = (1.0, 2.2)
 """Distance inside the photographed mesh up to, and beyond, which texels belong to the outline, and to the
 inside."""
+BESIDE_OUTLINE_PX = (2.0, 3.0)
+"""The same distance of a point at the outline now, up to which it was there in the photograph, and what is beside
+it goes with it, and beyond which it was inside: the photographed outline would be a rim beside the vehicle. Between
+pixels' centres a point of the outline can lie two pixels inside."""
 MIRRORED_RIM = (0.0, 1.0)
 """How much of a texel is outline, from which on, and where no longer, it stands for the other side: at the outline
 a matte may have taken in what lies behind, and a pixel there is drawn out over many."""

@@ -519,8 +519,8 @@ class Prepared:
         counts = torch.bincount(owner, minlength=2 * count)
         seen = self.texels.sample(xy, counts, self.settings.backend, "clamp")
         weight = smoothstep(seen[:, channels.ALPHA], 0.9, 0.99)
-        for channel in (channels.HIDDEN, channels.OUTLINE):
-            weight = weight * (1.0 - smoothstep(seen[:, channel], 0.0, 1.0))
+        for part in (seen[:, channels.HIDDEN], texture.outline_share(seen[:, channels.INSET])):
+            weight = weight * (1.0 - smoothstep(part, 0.0, 1.0))
         plain = (weight > 0.0).nonzero()[:, 0]
         # By their places within the object, so that others beside it change nothing.
         size = torch.bincount(owner[plain], minlength=count)

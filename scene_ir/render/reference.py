@@ -180,7 +180,7 @@ def _photographed_rows(
     uv = rows.xy + move
     seen = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
     rgb, rest = seen.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
-    alpha, hidden, outline, z_seen, support = rest.unbind(1)
+    alpha, hidden, inset, z_seen, support = rest.unbind(1)
     rgb = texture.relit(rgb, brighter)
     clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
     inside = texture.inside_weight(uv, *prepared.frame_hw)
@@ -192,7 +192,8 @@ def _photographed_rows(
         near = near * smoothstep(alpha, *model.SOLID_ALPHA)
         weight = weight + facing * (1.0 - inside) * near * clear
     weight = weight * (1.0 - smoothstep(z_then - z_seen, *model.DEPTH_TOLERANCE_M))
-    kept = smoothstep(outline[m:], 0.0, 1.0) * texture.outline_weight(turned[m:])
+    kept = smoothstep(texture.outline_share(inset[m:]), 0.0, 1.0) * texture.outline_weight(turned[m:])
+    kept = kept * (1.0 - smoothstep(inset[rows.anchor], *model.BESIDE_OUTLINE_PX))
     weight = torch.cat([weight[:m], weight[m:] * kept])
     rim = 1.0 - smoothstep(cos_then[:m], *model.RIM)
     opened = smoothstep(turned[:m], *model.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
@@ -250,7 +251,7 @@ def _completion(
         * (1.0 - smoothstep(z - seen[:, channels.DEPTH], *model.DEPTH_TOLERANCE_M))
         * texture.facing_weight(cos_now[need] - cos_then, cos_then, own[:, channels.OWN_PAINT])
         * smoothstep(cos_then, *model.MIRRORED_COS)
-        * (1.0 - smoothstep(seen[:, channels.OUTLINE], *model.MIRRORED_RIM))
+        * (1.0 - smoothstep(texture.outline_share(seen[:, channels.INSET]), *model.MIRRORED_RIM))
     )
     rgb, alpha = seen[:, : channels.ALPHA], seen[:, channels.ALPHA : channels.HIDDEN]
     straight = rgb / alpha.clamp(min=model.LEAST_MIRRORED_ALPHA)

@@ -23,6 +23,8 @@ from scene_ir.types import Crop, Source
 
 _PAD = 2
 """Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
+_DEEP_PX = 4.0
+"""Deeper inside the mesh than this, texels are all alike: none is near the outline."""
 
 
 def smoothstep(x: Tensor, low: float, high: float) -> Tensor:
@@ -139,7 +141,7 @@ def source_texels(
     """The `channels.TEXEL` numbers of the texels of one object inside `rect`, padded.
 
     mesh_depth: Crop (1, h, w) m of the unperturbed mesh, inf beside it; hidden: (H, W) in [0, 1], 1 where a nearer
-    object stands before this one. Beyond the mesh, texels are of the outline and as deep as its nearest piece.
+    object stands before this one. Beyond the mesh, texels are of the outline and as far away as its nearest piece.
     """
     x0, y0, x1, y1 = rect[0] - _PAD, rect[1] - _PAD, rect[2] + _PAD, rect[3] + _PAD
     window = (x0, y0, x1, y1)
@@ -152,10 +154,10 @@ def source_texels(
     depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    outline = 1.0 - smoothstep(torch.from_numpy(np.ascontiguousarray(distance)).to(rgba), *model.OUTLINE_PX)
+    inset = torch.from_numpy(np.ascontiguousarray(distance)).to(rgba).clamp(max=_DEEP_PX)
     pool = 2 * model.SUPPORT_PX + 1
     support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=model.SUPPORT_PX)[0]
-    values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), outline[None], depth, support])
+    values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), inset[None], depth, support])
     return Crop(values, x0, y0)
 
 
@@ -200,6 +202,14 @@ def facing_weight(turned: Tensor, cos_source: Tensor, paint: Tensor) -> Tensor:
     positive = 0.5 * (cos_source + (cos_source.square() + model.SQUARED_COS).sqrt())
     rest, coat = model.GRAZING
     return 1.0 - smoothstep(turned / (positive + rest + (coat - rest) * paint), *model.STRETCH)
+
+
+def outline_share(inset: Tensor) -> Tensor:
+    """How much of a texel is the outline: 1 beside the photographed mesh and up to `model.OUTLINE_PX` inside it.
+
+    inset (R,): distance, px, to the nearest texel's centre that the mesh does not cover, 0 for such.
+    """
+    return 1.0 - smoothstep(inset, *model.OUTLINE_PX)
 
 
 def outline_weight(turned: Tensor) -> Tensor:

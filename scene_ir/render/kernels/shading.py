@@ -26,17 +26,26 @@ look_type = wp.types.vector(length=ch.LOOK, dtype=wp.float32)
 own_type = wp.types.vector(length=ch.OWN, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
-DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE, BORDER, EXTENDED = (
+DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE_TURN, BORDER, EXTENDED = (
     wp.constant(wp.vec2f(*edges))
     for edges in (
         *(model.DEPTH_TOLERANCE_M, model.STRETCH, model.OPEN_TURN, model.OPEN_ALPHA, model.RIM),
         *([turn * turn for turn in model.OUTLINE_TURN], model.BORDER_PX, model.EXTENDED_PX),
     )
 )
-MIRRORED_RIM, MIRRORED_COS, SOLID, SUPPORTED, COVERED, ANY, OCCLUDED, ZENITH_UP, HORIZON_UP = (
+OUTLINE_PX, BESIDE, MIRRORED_RIM, MIRRORED_COS, SOLID, SUPPORTED, COVERED, ANY, OCCLUDED, ZENITH_UP, HORIZON_UP = (
     wp.constant(wp.vec2f(*edges))
     for edges in (
-        *(model.MIRRORED_RIM, model.MIRRORED_COS, model.SOLID_ALPHA, model.SUPPORTED, model.COVERED, (0.0, 1.0)),
+        *(
+            model.OUTLINE_PX,
+            model.BESIDE_OUTLINE_PX,
+            model.MIRRORED_RIM,
+            model.MIRRORED_COS,
+            model.SOLID_ALPHA,
+            model.SUPPORTED,
+            model.COVERED,
+            (0.0, 1.0),
+        ),
         *(model.OCCLUDED[1:], model.ZENITH_UP, model.HORIZON_UP),
     )
 )
@@ -465,6 +474,13 @@ def facing_weight(turned: float, cos_then: float, paint: float):
 
 
 @wp.func
+def place(pixels: Pixels, i: int):
+    """Of a packed pixel, px."""
+    at = pixels.table[i]
+    return wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
+
+
+@wp.func
 def lookup(look: look_type, xy: wp.vec2f):
     """Where a pixel looks at the photograph, px."""
     return wp.vec2f(xy[0] + look[ch.MOVE], xy[1] + look[ch.MOVE + 1])
@@ -544,11 +560,17 @@ def mesh_loss(look: look_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f, g:
 
 
 @wp.func
-def halo_pixel(look: look_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
-    """Premultiplied RGB and opacity."""
+def outline_share(texel: texel_type):
+    """`texture.outline_share`."""
+    return 1.0 - step(texel[ch.INSET], OUTLINE_PX)
+
+
+@wp.func
+def halo_pixel(look: look_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f):
+    """Premultiplied RGB and opacity. inset: of the mesh pixel that this one moves with."""
     seen = seen_weight(look, texel, xy, wh)
-    on_outline = 1.0 - step(look[ch.TURNED] * look[ch.TURNED], OUTLINE)
-    shown = seen[0] * step(texel[ch.OUTLINE], ANY) * on_outline
+    on_outline = 1.0 - step(look[ch.TURNED] * look[ch.TURNED], OUTLINE_TURN)
+    shown = seen[0] * step(outline_share(texel), ANY) * on_outline * (1.0 - step(inset, BESIDE))
     return wp.vec4f(
         shown * relit(texel[0], look[ch.BRIGHTER]),
         shown * relit(texel[1], look[ch.BRIGHTER]),
@@ -558,8 +580,8 @@ def halo_pixel(look: look_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
 
 
 @wp.func
-def halo_loss(look: look_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
-    return wp.dot(halo_pixel(look, texel, xy, wh), g)
+def halo_loss(look: look_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
+    return wp.dot(halo_pixel(look, texel, inset, xy, wh), g)
 
 
 @wp.func
@@ -649,7 +671,7 @@ def shade_kernel(start: int, pixels: Pixels, photograph: Photograph, looks: Look
     to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     left = float(0.0)
-    xy = wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
+    xy = place(pixels, i)
     wh = photograph.frame_wh[at[0]]
     if in_mesh(pixels, i):
         a = looks.look[i]
@@ -663,8 +685,12 @@ def shade_kernel(start: int, pixels: Pixels, photograph: Photograph, looks: Look
             to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
             left = p[LEFT]
     if in_halo(pixels, i):
-        a = looks.look[wp.int32(pixels.nearest[i])]
-        to_halo = halo_pixel(a, texel_at(photograph, at[0], lookup(a, xy)), xy, wh)
+        j = wp.int32(pixels.nearest[i])
+        a = looks.look[j]
+        texel = texel_at(photograph, at[0], lookup(a, xy))
+        if texel[ch.ALPHA] != 0.0:  # else there is nothing to show
+            inset = texel_at(photograph, at[0], lookup(a, place(pixels, j)))[ch.INSET]
+            to_halo = halo_pixel(a, texel, inset, xy, wh)
     looks.mesh[i] = to_mesh
     looks.halo[i] = to_halo
     looks.fill[i] = left
@@ -685,7 +711,7 @@ def shade_backward_kernel(
     i = start + wp.tid()
     to_share = float(0.0)
     at = pixels.table[i]
-    xy = wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
+    xy = place(pixels, i)
     wh = photograph.frame_wh[at[0]]
     if in_mesh(pixels, i):
         a = looks.look[i]
@@ -731,9 +757,12 @@ def shade_backward_kernel(
         if (
             texel2.value[ch.ALPHA] != 0.0 or texel2.to_u[ch.ALPHA] != 0.0 or texel2.to_v[ch.ALPHA] != 0.0
         ):  # else there is nothing near
-            to_look2, to_texel2, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(b, texel2.value, xy, wh, g2)
-            to_look2[ch.MOVE] += wp.dot(to_texel2, texel2.to_u)
-            to_look2[ch.MOVE + 1] += wp.dot(to_texel2, texel2.to_v)
+            anchor = texel_around(photograph, at[0], lookup(b, place(pixels, j)))
+            to_look2, to_texel2, to_inset, to_xy2, to_wh2, to_g2 = wp.grad(halo_loss)(
+                b, texel2.value, anchor.value[ch.INSET], xy, wh, g2
+            )
+            to_look2[ch.MOVE] += wp.dot(to_texel2, texel2.to_u) + to_inset * anchor.to_u[ch.INSET]
+            to_look2[ch.MOVE + 1] += wp.dot(to_texel2, texel2.to_v) + to_inset * anchor.to_v[ch.INSET]
             wp.atomic_add(grads.look, j, to_look2)
     wp.atomic_add(grads.coverage, i, to_share)
 
@@ -890,7 +919,7 @@ def completed(
     weight = weight * (1.0 - step(own[ch.MIRROR + 2] - texel[ch.DEPTH], DEPTH))
     facing_now = facing_weight(facing - own[ch.MIRROR_COS], own[ch.MIRROR_COS], own[ch.OWN_PAINT])
     weight = weight * facing_now * step(own[ch.MIRROR_COS], MIRRORED_COS)
-    weight = weight * (1.0 - step(texel[ch.OUTLINE], MIRRORED_RIM))
+    weight = weight * (1.0 - step(outline_share(texel), MIRRORED_RIM))
     straight = clamped(
         wp.vec3f(texel[0], texel[1], texel[2]) / wp.max(texel[ch.ALPHA], model.LEAST_MIRRORED_ALPHA)
     )
@@ -1001,5 +1030,5 @@ def adjoints_kernel(out: wp.array(dtype=wp.float32)):
     c = wp.vec3f(0.0, 0.0, 0.0)
     g = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     b = look_type()
-    out[0] = mesh_loss(b, a, xy, xy, g, 0.0) + halo_loss(b, a, xy, xy, g)
+    out[0] = mesh_loss(b, a, xy, xy, g, 0.0) + halo_loss(b, a, 0.0, xy, xy, g)
     out[1] = completed_loss(own_type(), 0.0, a, xy, c, g, xy, c) + mirror_loss(own_type(), xy)

@@ -444,15 +444,19 @@ def test_nearest_hits_stay_within_their_draw_and_reach() -> None:
     assert nearest.tolist() == [1, 1, 1, 1, -1] + [5] * 6 + [-1, -1]
 
 
-def test_halo_moves_with_the_outline(street: Street) -> None:
-    """A matte that is larger than the mesh stays joined to the vehicle when that turns."""
-    scene = street(torch.float64)
-    scene = replace(scene, objects=_only(scene.objects, [0]))
+def _widely_cut(scene: SceneIR, index: int) -> SceneIR:
+    """One object of a scene, photographed, with a matte that is larger than its mesh."""
+    scene = replace(scene, objects=_only(scene.objects, [index]))
     shot = Compositor(scene, REFERENCE).render(scene).opacity[0]
     wide = torch.nn.functional.max_pool2d(torch.nn.functional.pad(shot.values, (3, 3, 3, 3))[None], 7, 1, 3)[0]
     inside = (slice(None), slice(max(-(shot.y0 - 3), 0), None), slice(max(-(shot.x0 - 3), 0), None))
     matte = Crop(wide[inside], max(shot.x0 - 3, 0), max(shot.y0 - 3, 0))
-    taken = solve_sources(scene, [matte], None, SolveSettings(margin_px=6.0, backend="reference"))
+    return solve_sources(scene, [matte], None, SolveSettings(margin_px=6.0, backend="reference"))
+
+
+def test_halo_moves_with_the_outline(street: Street) -> None:
+    """A matte that is larger than the mesh stays joined to the vehicle when that turns."""
+    taken = _widely_cut(street(torch.float64), 0)
     still = Compositor(taken, REFERENCE).render(taken).opacity[0].values.sum()
     turned = Compositor(taken, REFERENCE).render(_moved(taken, dyaw=0.08)).opacity[0]
     solid = (turned.values[0] > 0.5).numpy().astype("uint8")
@@ -463,6 +467,20 @@ def test_halo_moves_with_the_outline(street: Street) -> None:
     )
     assert gaps == 2
     assert float(turned.values.sum()) == pytest.approx(float(still), rel=0.15)
+
+
+@pytest.mark.parametrize("dyaw", [-0.3, -0.4])
+def test_an_outline_that_turned_away_leaves_no_rim(street: Street, dyaw: float) -> None:
+    """Beside the mesh, no pixel is more opaque than one beside it that is nearer to the mesh."""
+    taken = _widely_cut(street(torch.float64), 2)
+    compositor, turned = Compositor(taken, REFERENCE), _moved(taken, dyaw=dyaw)
+    drawn, opacity = compositor.draw(turned.objects), compositor.render(turned).opacity[0].values[0]
+    hit = (drawn.mesh.face >= 0).reshape(opacity.shape)
+    distance = torch.from_numpy(cv2.distanceTransform((~hit).numpy().astype("uint8"), cv2.DIST_L2, 5))
+    around = [torch.nn.functional.unfold(v[None, None].double(), 3, padding=1) for v in (opacity, distance)]
+    near = around[1] < distance.flatten() - 0.3
+    rise = opacity.flatten() - (around[0] * near).amax(dim=1)
+    assert float(rise[0][~hit.flatten()].max()) < 0.1
 
 
 def test_outside_of_what_is_drawn_no_vehicle_changes_anything(photographed: SceneIR) -> None:
