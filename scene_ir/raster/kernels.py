@@ -170,8 +170,13 @@ def bounds_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(
 
 
 @wp.func
+def edge_at(n: wp.vec3d, x: wp.float64, y: wp.float64):
+    return (n[0] * x + n[1] * y) + n[2]
+
+
+@wp.func
 def edge(n: wp.vec3d, x: int, y: int):
-    return (n[0] * wp.float64(x) + n[1] * wp.float64(y)) + n[2]
+    return edge_at(n, wp.float64(x), wp.float64(y))
 
 
 @wp.func
@@ -407,7 +412,9 @@ class Hit:
 
 
 @wp.func
-def find_hit(f: int, x: int, y: int, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)):
+def find_hit(
+    f: int, x: wp.float64, y: wp.float64, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)
+):
     hit = Hit()
     corners = faces[f]
     hit.i0 = corners[0]
@@ -416,9 +423,9 @@ def find_hit(f: int, x: int, y: int, clip: wp.array(dtype=wp.vec3f), faces: wp.a
     hit.c0 = wp.vec3d(clip[hit.i0])
     hit.c1 = wp.vec3d(clip[hit.i1])
     hit.c2 = wp.vec3d(clip[hit.i2])
-    e0 = edge(wp.cross(hit.c1, hit.c2), x, y)
-    e1 = edge(wp.cross(hit.c2, hit.c0), x, y)
-    e2 = edge(wp.cross(hit.c0, hit.c1), x, y)
+    e0 = edge_at(wp.cross(hit.c1, hit.c2), x, y)
+    e1 = edge_at(wp.cross(hit.c2, hit.c0), x, y)
+    e2 = edge_at(wp.cross(hit.c0, hit.c1), x, y)
     hit.e = wp.vec3d(e0, e1, e2)
     hit.scale = ONE / ((e0 + e1) + e2)
     hit.b = hit.e * hit.scale
@@ -449,7 +456,7 @@ def interpolate_kernel(
     f = face[i]
     if f >= 0:
         at = pixel_xy(i, rects, offsets)
-        hit = find_hit(f, at[0], at[1], clip, faces)
+        hit = find_hit(f, wp.float64(at[0]), wp.float64(at[1]), clip, faces)
         for k in range(attributes.shape[1]):
             value = hit.e[0] * wp.float64(attributes[hit.i0, k]) + hit.e[1] * wp.float64(attributes[hit.i1, k])
             out[i, k] = wp.float32((value + hit.e[2] * wp.float64(attributes[hit.i2, k])) * hit.scale)
@@ -474,7 +481,7 @@ def interpolate_backward_kernel(
     f = face[i]
     if f >= 0:
         at = pixel_xy(i, rects, offsets)
-        hit = find_hit(f, at[0], at[1], clip, faces)
+        hit = find_hit(f, wp.float64(at[0]), wp.float64(at[1]), clip, faces)
         # d out_k / d e_i = (a_ik - out_k) / sum e
         g0 = ZERO
         g1 = ZERO

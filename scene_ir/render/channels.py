@@ -5,8 +5,8 @@ A name is the channel where a quantity begins; one of several numbers ends where
 
 from __future__ import annotations
 
-# Of a texel: premultiplied RGB, opacity; how far nearer objects hid it; how deep inside the photographed mesh it is,
-# px, see `texture.outline_share`; depth, m; whether the vehicle is near it at all.
+# Of a texel: premultiplied RGB, opacity; how far nearer objects hid it; how deep inside the photographed mesh it
+# is, px, see `texture.outline_share`; depth, m; whether the vehicle is near it at all.
 ALPHA, HIDDEN, INSET, DEPTH, SUPPORT, TEXEL = 3, 4, 5, 6, 7, 8
 
 # Of a pixel's look at the photograph: displacement of its lookup, px (2); w then and now, m; cosine towards the

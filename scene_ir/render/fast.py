@@ -19,14 +19,15 @@ from scene_ir.render.prepare import photographed as photographed_at
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """What no parameter touches. faces (F, 3) int32; base_clip (V, 3), then; base (V, 3): cosine towards the
-    camera then, paint, height; own (V, channels.OWN), with local normals, without depth; texels, dark: values (S,
-    channels.TEXEL) and (S, 4), the fourth 0, rects (N, 4), offsets (N + 1,); patches
-    (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
+    """What no parameter touches. faces, beside (F, 3) int32, see `surfaces.Surface`; base_clip (V, 3), then;
+    base (V, 3): cosine towards the camera then, paint, height; own (V, channels.OWN), with local normals, without
+    depth; texels, dark: values (S, channels.TEXEL) and (S, 4), the fourth 0, rects (N, 4), offsets (N + 1,);
+    patches (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
     frame_wh (N, 2) px; unproject (N, 3, 3).
     """
 
     faces: Tensor
+    beside: Tensor
     base_clip: Tensor
     base: Tensor
     own: Tensor
@@ -45,6 +46,7 @@ class Fixed:
         height, width = prepared.frame_hw
         return cls(
             faces=fleet.faces.to(torch.int32).contiguous(),
+            beside=fleet.beside.to(torch.int32).contiguous(),
             base_clip=base.clip,
             base=torch.stack([base.cos, fleet.paint, prepared.height], dim=1),
             own=prepared.all_attributes(prepared.sharp, torch.zeros_like(prepared.height)),
@@ -71,15 +73,16 @@ class Fixed:
         plain = ("base_clip", "base", "own", "patches", "frame_wh", "unproject")
         return cls(
             faces=_shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts]),
+            beside=_shifted([p.beside for p in parts], [p.faces.shape[0] for p in parts]),
             texels=_packed([p.texels for p in parts]),
             dark=_packed([p.dark for p in parts]),
             **{name: torch.cat([getattr(p, name) for p in parts]) for name in plain},
         )
 
 
-def _shifted(faces: Sequence[Tensor], vertices: Sequence[int]) -> Tensor:
-    """Faces of several sets of vertices, once these lie one after the other."""
-    return torch.cat([f + sum(vertices[:i]) for i, f in enumerate(faces)])
+def _shifted(numbers: Sequence[Tensor], counts: Sequence[int]) -> Tensor:
+    """Numbers of what lies in several sets, once these lie one after the other; -1 stays."""
+    return torch.cat([torch.where(n < 0, n, n + sum(counts[:i])) for i, n in enumerate(numbers)])
 
 
 def _packed(crops: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:

@@ -39,8 +39,8 @@ OUTLINE_PX = (1.0, 2.2)
 inside."""
 BESIDE_OUTLINE_PX = (2.0, 3.0)
 """The same distance of a point at the outline now, up to which it was there in the photograph, and what is beside
-it goes with it, and beyond which it was inside: the photographed outline would be a rim beside the vehicle. Between
-pixels' centres a point of the outline can lie two pixels inside."""
+it goes with it, and beyond which it was inside: the photographed outline would be a rim beside the vehicle. Two
+pixels, since a point that is looked up between pixels' centres can be at the outline and lie so far inside."""
 MIRRORED_RIM = (0.0, 1.0)
 """How much of a texel is outline, from which on, and where no longer, it stands for the other side: at the outline
 a matte may have taken in what lies behind, and a pixel there is drawn out over many."""
@@ -72,6 +72,11 @@ SATURATED = 1e-6
 """A colour this near to 0 or 1 is at the bound: rounding decides on which side of it."""
 FAR_AWAY_PX = 1e5
 """Where points are looked up that were behind the camera."""
+SUBPIXELS = ((0, 0), (1, -3), (-1, 3), (5, 1), (-3, -5), (-5, 5), (-7, -1), (3, 7), (7, -7))
+"""Places within a pixel, in its sixteenths, over which what a mesh shows of itself is averaged: trims thinner than
+a pixel would be rows of dots. The centre, and eight of which no two share a row or a column (Direct3D's)."""
+WALK = 8
+"""So many faces a walk over the mesh passes at most to such a place."""
 NEAREST_MIRRORED_M = 0.1
 """Points of the other side nearer to the camera's plane than this are looked up as there."""
 

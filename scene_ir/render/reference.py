@@ -12,7 +12,7 @@ from torch import Tensor
 
 from scene_ir.geometry import kept_within
 from scene_ir.raster import verbs
-from scene_ir.render import channels, model, texture
+from scene_ir.render import channels, model, surfaces, texture
 from scene_ir.render.prepare import Drawn, Layers, Prepared, active, patch_faces
 from scene_ir.render.sun import Sun
 from scene_ir.render.texture import smoothstep
@@ -162,6 +162,45 @@ def _mesh_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: 
     return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
 
+def _averaged_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
+    """`_mesh_attributes`, but the mean over the pixels, at `model.SUBPIXELS`: what is thinner than a pixel would
+    else be a row of dots."""
+    fleet, clip = prepared.fleet, drawn.geometry.clip.double()
+    face = drawn.mesh.face[rows.pixel[: rows.mesh_rows]].long()
+    hit = (face >= 0).nonzero()[:, 0]
+    total = clip.new_zeros(len(face), attributes.shape[1])
+    count = clip.new_zeros(len(face), 1)
+    for k, place in enumerate(model.SUBPIXELS):
+        xy = rows.xy[hit].double() + clip.new_tensor(place) / 16.0
+        found = face[hit]
+        if k:
+            found = _walked(found, xy, clip.detach(), fleet.faces, fleet.beside)
+        row, corner = hit[found >= 0], fleet.faces[found[found >= 0]]
+        share = surfaces.weights_at(clip[corner], xy[found >= 0])
+        total = total.index_add(0, row, (share[..., None] * attributes.double()[corner]).sum(dim=1))
+        count[row] += 1.0
+    return rows.fringe.fill((total / count.clamp(min=1.0)).to(attributes))
+
+
+def _walked(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tensor) -> Tensor:
+    """Faces (K,) that places xy (K, 2) px lie in, reached from `face` (K,) over the mesh's edges; -1 where it ends
+    or turns away before, or that takes more than `model.WALK` faces."""
+    found, here = torch.full_like(face, -1), face
+    first = clip.new_zeros(len(face))
+    for passed in range(model.WALK):
+        corner = clip[faces[here.clamp(min=0)]]
+        normals = torch.stack([torch.linalg.cross(corner[:, k - 2], corner[:, k - 1]) for k in range(3)], dim=1)
+        det = (corner[:, 0] * normals[:, 0]).sum(dim=1)
+        first = det if passed == 0 else first
+        edge = (normals[..., :2] * xy[:, None]).sum(dim=2) + normals[..., 2]
+        least, nearest = (edge * det.sign()[:, None]).min(dim=1)
+        walks = (here >= 0) & (found < 0) & (det * first > 0.0)
+        found = torch.where(walks & (least >= 0.0), here, found)
+        across = beside[here.clamp(min=0)].gather(1, nearest[:, None])[:, 0]
+        here = torch.where(walks, across, torch.full_like(here, -1))
+    return found
+
+
 def _photographed_rows(
     prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows, sun: Sun | None
 ) -> _Shaded:
@@ -233,7 +272,7 @@ def _completion(
     cos_now: (Rm,) towards the camera.
     """
     attributes = prepared.all_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
-    own = _mesh_attributes(prepared, drawn, rows, attributes)[need]
+    own = _averaged_attributes(prepared, drawn, rows, attributes)[need]
     gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
     colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], own, sun), gain, lift)
     clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]

@@ -38,13 +38,15 @@ _WELD = 1e-5
 class Surface:
     """A mesh made ready to draw, sharp edges split.
 
-    unit (V, 3), faces (F, 3) int64; weights, mirror_weights (V, 64): lattice weights of each vertex and of its
-    mirror image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in [0,
-    1]; part (V,) int64, a `Part` of a face around it; closed: whether its faces bound volumes and look outwards.
+    unit (V, 3), faces (F, 3) int64; beside (F, 3) int64: the face across the edge that is opposite to each corner,
+    -1 where there is none or more than one; weights, mirror_weights (V, 64): lattice weights of each vertex and of
+    its mirror image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in
+    [0, 1]; part (V,) int64, a `Part` of a face around it; closed: whether faces bound volumes and look outwards.
     """
 
     unit: Tensor
     faces: Tensor
+    beside: Tensor
     weights: Tensor
     mirror_weights: Tensor
     weld: Tensor
@@ -76,7 +78,8 @@ def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | No
     grey = torch.full((len(points), 3), 0.7) if colours is None else colours.detach().cpu()
     kinds = part.cpu()
     tensors = (
-        unit, new_faces, lattice_weights(unit), lattice_weights(mirror), torch.as_tensor(weld)[origin],
+        unit, new_faces, torch.as_tensor(_beside(weld[triangles])), lattice_weights(unit),
+        lattice_weights(mirror), torch.as_tensor(weld)[origin],
         grey[origin].to(dtype),
         _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
         torch.zeros(len(first), dtype=torch.int64).index_copy(
@@ -84,6 +87,20 @@ def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | No
         ),
     )  # fmt: skip
     return Surface(*(t.to(vertices.device) for t in tensors), closed=_closed(points[triangles], weld[triangles]))
+
+
+def _beside(faces: np.ndarray) -> np.ndarray:
+    """See `Surface.beside`. faces (F, 3): of welded points."""
+    edges = np.sort(
+        np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1
+    )
+    order = np.lexsort(edges.T)
+    ordered = edges[order]
+    same = (ordered[1:] == ordered[:-1]).all(axis=1)
+    pair = np.flatnonzero(same & ~np.append(same[1:], False) & ~np.insert(same[:-1], 0, False))
+    beside = np.full(len(edges), -1)
+    beside[order[pair]], beside[order[pair + 1]] = order[pair + 1] // 3, order[pair] // 3
+    return beside.reshape(-1, 3)
 
 
 def _closed(corners: np.ndarray, faces: np.ndarray) -> bool:
@@ -139,7 +156,7 @@ class Fleet:
     """The surfaces of N objects, one after the other.
 
     owner (V,) int64: the object of each vertex; vertex_ranges, face_ranges (N, 2) int64; faces (F, 3) int64 into
-    the V vertices; colours (V, 3); paint, glass (V,).
+    the V vertices; beside (F, 3) int64, see `Surface`, into the F faces; colours (V, 3); paint, glass (V,).
     """
 
     surfaces: tuple[Surface, ...]
@@ -147,6 +164,7 @@ class Fleet:
     vertex_ranges: Tensor
     face_ranges: Tensor
     faces: Tensor
+    beside: Tensor
     colours: Tensor
     paint: Tensor
     glass: Tensor
@@ -166,12 +184,17 @@ class Fleet:
             return torch.cat(parts) if parts else like.new_zeros(shape)
 
         faces = [s.faces + int(start) for s, start in zip(surfaces, ends[:-1], strict=True)]
+        beside = [
+            torch.where(s.beside < 0, s.beside, s.beside + int(start))
+            for s, start in zip(surfaces, face_ends[:-1], strict=True)
+        ]
         return cls(
             tuple(surfaces),
             torch.repeat_interleave(torch.arange(len(surfaces)), counts).to(device),
             ranges(ends),
             ranges(face_ends),
             packed(faces, 0, 3).to(torch.int64),
+            packed(beside, 0, 3).to(torch.int64),
             packed([s.colours for s in surfaces], 0, 3),
             packed([s.paint for s in surfaces], 0),
             packed([s.glass for s in surfaces], 0),

@@ -40,6 +40,7 @@ class Setting:
     inside: Tensor
     reach_px: Sequence[float]
     faces: Tensor
+    beside: Tensor
     base_clip: Tensor
     base: Tensor
     own: Tensor
@@ -107,7 +108,7 @@ class Photographed(torch.autograd.Function):
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
         pixels = filled(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
-        vertices = filled(shading.Vertices, s.faces, clip, facing, brighter, s.base_clip, s.base, s.own)
+        vertices = filled(shading.Vertices, s.faces, s.beside, clip, facing, brighter, s.base_clip, s.base, s.own)
         photograph = filled(
             shading.Photograph, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
         )

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
+# ruff: noqa: E501, UP018, RUF046, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
 # returns the gradients of all arguments.
 """The pixels of photographed vehicles as Warp kernels: one pass a stage, forward and backward, float32.
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from scene_ir.raster.kernels import Hit, Taps, add_to_corners, find_hit, find_taps
+from scene_ir.raster.kernels import ONE, Hit, Taps, add_to_corners, find_hit, find_taps
 from scene_ir.raster.launch import start_warp
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import channels as ch
@@ -25,6 +25,13 @@ wp.set_module_options({"fuse_fp": True, "fast_math": False, "max_unroll": ch.OWN
 look_type = wp.types.vector(length=ch.LOOK, dtype=wp.float32)
 own_type = wp.types.vector(length=ch.OWN, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
+COUNT = len(model.SUBPIXELS)
+SUBPIXELS = wp.constant(
+    wp.types.matrix(shape=(COUNT, 2), dtype=wp.float64)(
+        *(part / 16.0 for place in model.SUBPIXELS for part in place)
+    )
+)
+subpixel_faces = wp.types.vector(length=COUNT + 1, dtype=wp.int32)
 
 DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE_TURN, BORDER, EXTENDED = (
     wp.constant(wp.vec2f(*edges))
@@ -77,9 +84,11 @@ class Pixels:
 
 @wp.struct
 class Vertices:
-    """The meshes' faces, and their vertices: `prepare.Geometry`'s clip, cosine and brightness, and `fast.Fixed`'s."""
+    """The meshes' faces and what is beside them, and their vertices: `prepare.Geometry`'s clip, cosine and brightness,
+    and `fast.Fixed`'s."""
 
     faces: wp.array(dtype=wp.vec3i)
+    beside: wp.array(dtype=wp.vec3i)
     clip: wp.array(dtype=wp.vec3f)
     facing: wp.array(dtype=wp.float32)
     brighter: wp.array(dtype=wp.float32)
@@ -192,9 +201,9 @@ def corner_values(vertices: Vertices, i: int):
 
 
 @wp.func
-def scaled_pixel(hit: Hit, at: wp.vec4i):
+def scaled_pixel(hit: Hit, x: wp.float64, y: wp.float64):
     """A pixel (x, y, 1) over the sum of the edge functions there: what their gradients are times."""
-    return wp.vec3d(wp.float64(at[1]), wp.float64(at[2]), wp.float64(1.0)) * hit.scale
+    return wp.vec3d(x, y, wp.float64(1.0)) * hit.scale
 
 
 @wp.func
@@ -236,7 +245,7 @@ def look_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: Looks):
     value = look_type()
     if pixels.face[i] >= 0:
         at = pixels.table[i]
-        hit = find_hit(pixels.face[i], at[1], at[2], vertices.clip, vertices.faces)
+        hit = find_hit(pixels.face[i], wp.float64(at[1]), wp.float64(at[2]), vertices.clip, vertices.faces)
         a = corner_values(vertices, hit.i0) * wp.float32(hit.b[0])
         a += corner_values(vertices, hit.i1) * wp.float32(hit.b[1])
         a += corner_values(vertices, hit.i2) * wp.float32(hit.b[2])
@@ -260,7 +269,7 @@ def look_backward_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: 
         at = pixels.table[i]
         x = wp.float32(at[1])
         y = wp.float32(at[2])
-        hit = find_hit(pixels.face[i], at[1], at[2], vertices.clip, vertices.faces)
+        hit = find_hit(pixels.face[i], wp.float64(at[1]), wp.float64(at[2]), vertices.clip, vertices.faces)
         v = found_at(pixels, looks, i)
         go = grads.look[i]
         # Back through the division, to the interpolated values.
@@ -278,7 +287,7 @@ def look_backward_kernel(start: int, pixels: Pixels, vertices: Vertices, looks: 
         s1 = look_dot(g, corner_values(vertices, hit.i1))
         s2 = look_dot(g, corner_values(vertices, hit.i2))
         mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
-        q = scaled_pixel(hit, at)
+        q = scaled_pixel(hit, wp.float64(at[1]), wp.float64(at[2]))
         add_to_corners(hit, q * (s0 - mean), q * (s1 - mean), q * (s2 - mean), grads.clip)
         d = wp.vec3d(wp.float64(g[0]), wp.float64(g[1]), wp.float64(g[ch.CORNER_W]))
         wp.atomic_add(grads.clip, hit.i0, d * -hit.b[0])
@@ -771,15 +780,69 @@ def shade_backward_kernel(
 
 
 @wp.func
+def face_at(start: int, x: wp.float64, y: wp.float64, vertices: Vertices):
+    """`reference._walked`, to one place."""
+    here = start
+    first = wp.float64(0.0)
+    found = int(-1)
+    passed = int(0)
+    while passed < model.WALK and here >= 0 and found < 0:
+        hit = find_hit(here, x, y, vertices.clip, vertices.faces)
+        det = wp.dot(hit.c0, wp.cross(hit.c1, hit.c2))
+        if passed == 0:
+            first = det
+        side = hit.e * wp.sign(det)
+        nearest = int(0)
+        if side[1] < side[0]:
+            nearest = 1
+        if side[2] < side[nearest]:
+            nearest = 2
+        if det * first <= wp.float64(0.0):
+            here = -1
+        elif side[nearest] >= wp.float64(0.0):
+            found = here
+        else:
+            here = vertices.beside[here][nearest]
+        passed += 1
+    return found
+
+
+@wp.func
+def faces_within(pixels: Pixels, vertices: Vertices, i: int):
+    """The faces at `model.SUBPIXELS` of a pixel that is hit, -1 where there is none; then how many there are."""
+    at = pixels.table[i]
+    out = subpixel_faces()
+    out[0] = pixels.face[i]
+    out[COUNT] = 1
+    k = int(1)
+    while k < COUNT:
+        x = wp.float64(at[1]) + SUBPIXELS[k, 0]
+        y = wp.float64(at[2]) + SUBPIXELS[k, 1]
+        out[k] = face_at(pixels.face[i], x, y, vertices)
+        if out[k] >= 0:
+            out[COUNT] += 1
+        k += 1
+    return out
+
+
+@wp.func
 def own_at(pixels: Pixels, vertices: Vertices, i: int):
-    """The mesh's own attributes at a pixel that it hits, else 0."""
+    """The mesh's own attributes over a pixel that it hits, else 0."""
     value = own_type()
     if pixels.face[i] >= 0:
         at = pixels.table[i]
-        hit = find_hit(pixels.face[i], at[1], at[2], vertices.clip, vertices.faces)
-        value = vertices.own[hit.i0] * wp.float32(hit.b[0])
-        value += vertices.own[hit.i1] * wp.float32(hit.b[1])
-        value += vertices.own[hit.i2] * wp.float32(hit.b[2])
+        found = faces_within(pixels, vertices, i)
+        k = int(0)
+        while k < COUNT:
+            if found[k] >= 0:
+                x = wp.float64(at[1]) + SUBPIXELS[k, 0]
+                y = wp.float64(at[2]) + SUBPIXELS[k, 1]
+                hit = find_hit(found[k], x, y, vertices.clip, vertices.faces)
+                value += vertices.own[hit.i0] * wp.float32(hit.b[0])
+                value += vertices.own[hit.i1] * wp.float32(hit.b[1])
+                value += vertices.own[hit.i2] * wp.float32(hit.b[2])
+            k += 1
+        value = value / wp.float32(found[COUNT])
     return value
 
 
@@ -800,18 +863,25 @@ def own_filled(pixels: Pixels, vertices: Vertices, i: int):
 def own_to_clip(pixels: Pixels, vertices: Vertices, i: int, g: own_type, share: float, grads: Gradients):
     """Add what `share` of a gradient to `own_at` means for the corners; returns g . own_at."""
     at = pixels.table[i]
-    hit = find_hit(pixels.face[i], at[1], at[2], vertices.clip, vertices.faces)
-    s0 = own_dot(g, vertices.own[hit.i0])
-    s1 = own_dot(g, vertices.own[hit.i1])
-    s2 = own_dot(g, vertices.own[hit.i2])
-    mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
-    if share != 0.0:
-        part = wp.float64(share)
-        q = scaled_pixel(hit, at)
-        add_to_corners(
-            hit, q * (part * (s0 - mean)), q * (part * (s1 - mean)), q * (part * (s2 - mean)), grads.clip
-        )
-    return wp.float32(mean)
+    found = faces_within(pixels, vertices, i)
+    each = ONE / wp.float64(found[COUNT])
+    total = wp.float64(0.0)
+    k = int(0)
+    while k < COUNT:
+        if found[k] >= 0:
+            x = wp.float64(at[1]) + SUBPIXELS[k, 0]
+            y = wp.float64(at[2]) + SUBPIXELS[k, 1]
+            hit = find_hit(found[k], x, y, vertices.clip, vertices.faces)
+            s0 = own_dot(g, vertices.own[hit.i0])
+            s1 = own_dot(g, vertices.own[hit.i1])
+            s2 = own_dot(g, vertices.own[hit.i2])
+            mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+            total += mean * each
+            if share != 0.0:
+                q = scaled_pixel(hit, x, y) * (wp.float64(share) * each)
+                add_to_corners(hit, q * (s0 - mean), q * (s1 - mean), q * (s2 - mean), grads.clip)
+        k += 1
+    return wp.float32(total)
 
 
 @wp.func

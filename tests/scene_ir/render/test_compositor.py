@@ -9,8 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -21,8 +23,8 @@ from scene_ir.raster.layout import Layout
 from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor, render
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.render.sources import SolveSettings, analytic_shadows, solve_sources
-from scene_ir.types import Crop, Objects, Render, SceneIR, scene_to
+from scene_ir.render.sources import SolveSettings, analytic_shadows, from_own_picture, solve_sources
+from scene_ir.types import Crop, Mesh, Objects, Part, Render, SceneIR, scene_to
 
 REFERENCE = RenderSettings(backend="reference")
 IDENTITY = 1e-5
@@ -426,6 +428,24 @@ def test_welded_normals_are_one_a_place(street: Street) -> None:
         torch.testing.assert_close(here, here[:1].expand_as(here))
 
 
+def test_each_face_knows_what_is_across_its_edges(street: Street) -> None:
+    surface = surfaces.Surface.of(street(torch.float64).meshes[0], torch.float64)
+    points = surface.weld[surface.faces]
+    assert bool((surface.beside >= 0).all())
+    for face, corners in enumerate(points.tolist()):
+        for corner, across in enumerate(surface.beside[face].tolist()):
+            assert set(corners) & set(points[across].tolist()) == set(corners) - {corners[corner]}
+            assert face in surface.beside[across].tolist()
+
+
+def test_nothing_is_across_the_border_of_a_mesh_or_an_edge_of_three_faces() -> None:
+    vertices = torch.tensor([[0.0, 0, 0], [0, -0.5, 0], [0.5, 0, 0], [-0.5, 0, 0], [0, 0, 0.5], [-0.5, -0.5, 0]])
+    faces = torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4], [1, 3, 5]])
+    mesh = Mesh(vertices, faces, torch.zeros(4, dtype=torch.int64))
+    beside = surfaces.Surface.of(mesh, torch.float64).beside
+    assert beside.tolist() == [[-1, -1, -1], [-1, 3, -1], [-1, -1, -1], [-1, -1, 1]]
+
+
 def test_scene_to_changes_every_floating_tensor(photographed: SceneIR) -> None:
     single = scene_to(photographed, torch.float32)
     assert single.objects.source[0].foreground.values.dtype == torch.float32
@@ -481,6 +501,39 @@ def test_an_outline_that_turned_away_leaves_no_rim(street: Street, dyaw: float) 
     near = around[1] < distance.flatten() - 0.3
     rise = opacity.flatten() - (around[0] * near).amax(dim=1)
     assert float(rise[0][~hit.flatten()].max()) < 0.1
+
+
+def _ribbed(stripe: float) -> Mesh:
+    """A box in three parts along its length, whose middle part, a fiftieth of it, has the grey `stripe`."""
+    parts = []
+    for low, high in ((-0.5, -0.01), (-0.01, 0.01), (0.01, 0.5)):
+        part = trimesh.creation.box(bounds=[[low, -1.0, -0.5], [high, 0.0, 0.5]])
+        across = np.abs(part.face_normals[:, 0]) > 0.5
+        outer = np.abs(np.abs(part.triangles_center[:, 0]) - 0.5) < 1e-6
+        parts.append(part.triangles[~across | outer])
+    corners = torch.from_numpy(np.concatenate(parts))
+    grey = torch.where(corners[:, :, 0].abs().amax(dim=1) < 0.02, stripe, 0.8)
+    colours = grey[:, None, None].expand(-1, 3, 3).reshape(-1, 3)
+    part = torch.full((len(corners),), int(Part.OTHER))
+    return Mesh(corners.reshape(-1, 3), torch.arange(3 * len(corners)).reshape(-1, 3), part, "ribbed", colours)
+
+
+def test_a_stripe_thinner_than_a_pixel_is_as_dark_wherever_it_lies(street: Street) -> None:
+    """On a side that the photograph did not see, and that the vehicle turned into view: leaning, it is a line, and
+    no row of dots."""
+    scene = street(torch.float64)
+    objects = _only(scene.objects, [0])
+    place = objects.translation.new_tensor([[0.0, 1.65, 9.0]])
+    behind = replace(objects, translation=place, yaw=objects.yaw.new_tensor([-math.pi / 2]))
+    pictures = []
+    for stripe in (0.8, 0.0):
+        taken = from_own_picture(replace(scene, meshes=(_ribbed(stripe),), objects=behind), "reference")
+        compositor = Compositor(taken, REFERENCE)
+        turns = torch.linspace(0.30, 0.42, 7).tolist()
+        pictures.append(torch.stack([compositor.render(_moved(taken, dyaw=turn)).image for turn in turns]))
+    darkness = (pictures[0] - pictures[1])[:, :, 36:45].mean(dim=(1, 2)).sum(dim=1)
+    assert 0.05 < float(darkness.mean()) < 0.3
+    assert float(darkness.std() / darkness.mean()) < 0.5
 
 
 def test_outside_of_what_is_drawn_no_vehicle_changes_anything(photographed: SceneIR) -> None:
