@@ -164,22 +164,21 @@ def _mesh_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: 
 
 def _averaged_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
     """`_mesh_attributes`, but the mean over the pixels, at `model.SUBPIXELS`: what is thinner than a pixel would
-    else be a row of dots."""
+    else be a row of dots. A place that is not reached counts as the pixel's centre."""
     fleet, clip = prepared.fleet, drawn.geometry.clip.double()
     face = drawn.mesh.face[rows.pixel[: rows.mesh_rows]].long()
     hit = (face >= 0).nonzero()[:, 0]
-    total = clip.new_zeros(len(face), attributes.shape[1])
-    count = clip.new_zeros(len(face), 1)
-    for k, place in enumerate(model.SUBPIXELS):
-        xy = rows.xy[hit].double() + clip.new_tensor(place) / 16.0
-        found = face[hit]
-        if k:
-            found = _walked(found, xy, clip.detach(), fleet.faces, fleet.beside)
-        row, corner = hit[found >= 0], fleet.faces[found[found >= 0]]
-        share = surfaces.weights_at(clip[corner], xy[found >= 0])
-        total = total.index_add(0, row, (share[..., None] * attributes.double()[corner]).sum(dim=1))
-        count[row] += 1.0
-    return rows.fringe.fill((total / count.clamp(min=1.0)).to(attributes))
+    centre, start = rows.xy[hit].double(), face[hit]
+    total = clip.new_zeros(len(hit), attributes.shape[1])
+    for place in model.SUBPIXELS:
+        xy = centre + clip.new_tensor(place) / 16.0
+        found = _walked(start, xy, clip.detach(), fleet.faces, fleet.beside)
+        xy = torch.where(found[:, None] < 0, centre, xy)
+        corner = fleet.faces[torch.where(found < 0, start, found)]
+        share = surfaces.weights_at(clip[corner], xy)
+        total = total + (share[..., None] * attributes.double()[corner]).sum(dim=1)
+    mean = clip.new_zeros(len(face), attributes.shape[1]).index_copy(0, hit, total / len(model.SUBPIXELS))
+    return rows.fringe.fill(mean.to(attributes))
 
 
 def _walked(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tensor) -> Tensor:

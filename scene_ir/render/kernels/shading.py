@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from scene_ir.raster.kernels import ONE, Hit, Taps, add_to_corners, find_hit, find_taps
+from scene_ir.raster.kernels import ONE, ZERO, Hit, Taps, add_to_corners, find_hit, find_taps
 from scene_ir.raster.launch import start_warp
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import channels as ch
@@ -25,13 +25,12 @@ wp.set_module_options({"fuse_fp": True, "fast_math": False, "max_unroll": ch.OWN
 look_type = wp.types.vector(length=ch.LOOK, dtype=wp.float32)
 own_type = wp.types.vector(length=ch.OWN, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
-COUNT = len(model.SUBPIXELS)
+PLACES = len(model.SUBPIXELS)
 SUBPIXELS = wp.constant(
-    wp.types.matrix(shape=(COUNT, 2), dtype=wp.float64)(
+    wp.types.matrix(shape=(PLACES, 2), dtype=wp.float64)(
         *(part / 16.0 for place in model.SUBPIXELS for part in place)
     )
 )
-subpixel_faces = wp.types.vector(length=COUNT + 1, dtype=wp.int32)
 
 DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE_TURN, BORDER, EXTENDED = (
     wp.constant(wp.vec2f(*edges))
@@ -109,6 +108,15 @@ class Photograph:
     turn: wp.array(dtype=wp.vec2f)
     sun: wp.array(dtype=wp.vec4f)
     unproject: wp.array(dtype=wp.mat33f)
+
+
+@wp.struct
+class Spot:
+    """A place, px, and what is hit there."""
+
+    hit: Hit
+    x: wp.float64
+    y: wp.float64
 
 
 @wp.struct
@@ -780,49 +788,45 @@ def shade_backward_kernel(
 
 
 @wp.func
-def face_at(start: int, x: wp.float64, y: wp.float64, vertices: Vertices):
-    """`reference._walked`, to one place."""
-    here = start
-    first = wp.float64(0.0)
-    found = int(-1)
+def centre_of(pixels: Pixels, vertices: Vertices, i: int):
+    """What a pixel's centre hits."""
+    at = pixels.table[i]
+    spot = Spot()
+    spot.x = wp.float64(at[1])
+    spot.y = wp.float64(at[2])
+    spot.hit = find_hit(pixels.face[i], spot.x, spot.y, vertices.clip, vertices.faces)
+    return spot
+
+
+@wp.func
+def spot_of(centre: Spot, face: int, k: int, vertices: Vertices):
+    """`reference._walked`, to the k-th place within a pixel whose centre hits a face."""
+    spot = Spot()
+    spot.x = centre.x + SUBPIXELS[k, 0]
+    spot.y = centre.y + SUBPIXELS[k, 1]
+    front = wp.dot(centre.hit.c0, wp.cross(centre.hit.c1, centre.hit.c2))
+    found = bool(False)
     passed = int(0)
-    while passed < model.WALK and here >= 0 and found < 0:
-        hit = find_hit(here, x, y, vertices.clip, vertices.faces)
-        det = wp.dot(hit.c0, wp.cross(hit.c1, hit.c2))
-        if passed == 0:
-            first = det
-        side = hit.e * wp.sign(det)
+    here = face
+    while passed < model.WALK and here >= 0 and not found:
+        spot.hit = find_hit(here, spot.x, spot.y, vertices.clip, vertices.faces)
+        det = wp.dot(spot.hit.c0, wp.cross(spot.hit.c1, spot.hit.c2))
+        side = spot.hit.e * wp.sign(det)
         nearest = int(0)
         if side[1] < side[0]:
             nearest = 1
         if side[2] < side[nearest]:
             nearest = 2
-        if det * first <= wp.float64(0.0):
+        if det * front <= ZERO:
             here = -1
-        elif side[nearest] >= wp.float64(0.0):
-            found = here
+        elif side[nearest] >= ZERO:
+            found = True
         else:
             here = vertices.beside[here][nearest]
         passed += 1
-    return found
-
-
-@wp.func
-def faces_within(pixels: Pixels, vertices: Vertices, i: int):
-    """The faces at `model.SUBPIXELS` of a pixel that is hit, -1 where there is none; then how many there are."""
-    at = pixels.table[i]
-    out = subpixel_faces()
-    out[0] = pixels.face[i]
-    out[COUNT] = 1
-    k = int(1)
-    while k < COUNT:
-        x = wp.float64(at[1]) + SUBPIXELS[k, 0]
-        y = wp.float64(at[2]) + SUBPIXELS[k, 1]
-        out[k] = face_at(pixels.face[i], x, y, vertices)
-        if out[k] >= 0:
-            out[COUNT] += 1
-        k += 1
-    return out
+    if not found:
+        spot = centre
+    return spot
 
 
 @wp.func
@@ -830,20 +834,15 @@ def own_at(pixels: Pixels, vertices: Vertices, i: int):
     """The mesh's own attributes over a pixel that it hits, else 0."""
     value = own_type()
     if pixels.face[i] >= 0:
-        at = pixels.table[i]
-        found = faces_within(pixels, vertices, i)
+        centre = centre_of(pixels, vertices, i)
         k = int(0)
-        while k < COUNT:
-            if found[k] >= 0:
-                x = wp.float64(at[1]) + SUBPIXELS[k, 0]
-                y = wp.float64(at[2]) + SUBPIXELS[k, 1]
-                hit = find_hit(found[k], x, y, vertices.clip, vertices.faces)
-                value += vertices.own[hit.i0] * wp.float32(hit.b[0])
-                value += vertices.own[hit.i1] * wp.float32(hit.b[1])
-                value += vertices.own[hit.i2] * wp.float32(hit.b[2])
+        while k < PLACES:
+            hit = spot_of(centre, pixels.face[i], k, vertices).hit
+            value += vertices.own[hit.i0] * wp.float32(hit.b[0])
+            value += vertices.own[hit.i1] * wp.float32(hit.b[1])
+            value += vertices.own[hit.i2] * wp.float32(hit.b[2])
             k += 1
-        value = value / wp.float32(found[COUNT])
-    return value
+    return value * (1.0 / float(PLACES))
 
 
 @wp.func
@@ -862,24 +861,21 @@ def own_filled(pixels: Pixels, vertices: Vertices, i: int):
 @wp.func
 def own_to_clip(pixels: Pixels, vertices: Vertices, i: int, g: own_type, share: float, grads: Gradients):
     """Add what `share` of a gradient to `own_at` means for the corners; returns g . own_at."""
-    at = pixels.table[i]
-    found = faces_within(pixels, vertices, i)
-    each = ONE / wp.float64(found[COUNT])
-    total = wp.float64(0.0)
+    centre = centre_of(pixels, vertices, i)
+    each = ONE / wp.float64(PLACES)
+    total = ZERO
     k = int(0)
-    while k < COUNT:
-        if found[k] >= 0:
-            x = wp.float64(at[1]) + SUBPIXELS[k, 0]
-            y = wp.float64(at[2]) + SUBPIXELS[k, 1]
-            hit = find_hit(found[k], x, y, vertices.clip, vertices.faces)
-            s0 = own_dot(g, vertices.own[hit.i0])
-            s1 = own_dot(g, vertices.own[hit.i1])
-            s2 = own_dot(g, vertices.own[hit.i2])
-            mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
-            total += mean * each
-            if share != 0.0:
-                q = scaled_pixel(hit, x, y) * (wp.float64(share) * each)
-                add_to_corners(hit, q * (s0 - mean), q * (s1 - mean), q * (s2 - mean), grads.clip)
+    while k < PLACES:
+        spot = spot_of(centre, pixels.face[i], k, vertices)
+        hit = spot.hit
+        s0 = own_dot(g, vertices.own[hit.i0])
+        s1 = own_dot(g, vertices.own[hit.i1])
+        s2 = own_dot(g, vertices.own[hit.i2])
+        mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+        total += mean * each
+        if share != 0.0:
+            q = scaled_pixel(hit, spot.x, spot.y) * (wp.float64(share) * each)
+            add_to_corners(hit, q * (s0 - mean), q * (s1 - mean), q * (s2 - mean), grads.clip)
         k += 1
     return wp.float32(total)
 
