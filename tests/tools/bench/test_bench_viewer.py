@@ -34,7 +34,9 @@ def test_viewer(
     assert [row["where"] for row in rows] == ["HTTP", "HTTP", *(["browser"] * 2 if browser else [])]
     for row in rows:
         assert (row["size"], row["cars"], row["states"]) == ("1241 x 376", 6, 2)
-        assert 0 < row["picture_ms"] < row["detections_ms"]
+        assert (
+            min(row["picture_ms"], row["detections_ms"]) > 0
+        )  # asked at once: beside other work either may be first
         assert (row["cpu_ms"] is None) == (row["where"] == "browser")
         assert row["cpu_ms"] is None or row["cpu_ms"] > 1
 
