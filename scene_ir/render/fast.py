@@ -15,6 +15,7 @@ from scene_ir.raster import verbs
 from scene_ir.render import channels, texture
 from scene_ir.render.prepare import Drawn, Prepared
 from scene_ir.render.prepare import photographed as photographed_at
+from scene_ir.render.surfaces import shifted
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +73,12 @@ class Fixed:
             return parts[0]
         plain = ("base_clip", "base", "own", "patches", "frame_wh", "unproject")
         return cls(
-            faces=_shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts]),
-            beside=_shifted([p.beside for p in parts], [p.faces.shape[0] for p in parts]),
+            faces=torch.cat(shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts])),
+            beside=torch.cat(shifted([p.beside for p in parts], [p.faces.shape[0] for p in parts])),
             texels=_packed([p.texels for p in parts]),
             dark=_packed([p.dark for p in parts]),
             **{name: torch.cat([getattr(p, name) for p in parts]) for name in plain},
         )
-
-
-def _shifted(numbers: Sequence[Tensor], counts: Sequence[int]) -> Tensor:
-    """Numbers of what lies in several sets, once these lie one after the other; -1 stays."""
-    return torch.cat([torch.where(n < 0, n, n + sum(counts[:i])) for i, n in enumerate(numbers)])
 
 
 def _packed(crops: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:

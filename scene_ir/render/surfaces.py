@@ -151,6 +151,11 @@ def _share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
     return like.new_zeros(like.shape[0]).index_add(0, index, flags) / total.clamp(min=1.0)
 
 
+def shifted(numbers: Sequence[Tensor], counts: Sequence[int]) -> list[Tensor]:
+    """Numbers of what lies in several sets, so many in each, once these lie one after the other; -1 stays."""
+    return [torch.where(n < 0, n, n + sum(counts[:i])) for i, n in enumerate(numbers)]
+
+
 @dataclass(frozen=True, slots=True)
 class Fleet:
     """The surfaces of N objects, one after the other.
@@ -183,11 +188,8 @@ class Fleet:
         def packed(parts: list[Tensor], *shape: int) -> Tensor:
             return torch.cat(parts) if parts else like.new_zeros(shape)
 
-        faces = [s.faces + int(start) for s, start in zip(surfaces, ends[:-1], strict=True)]
-        beside = [
-            torch.where(s.beside < 0, s.beside, s.beside + int(start))
-            for s, start in zip(surfaces, face_ends[:-1], strict=True)
-        ]
+        faces = shifted([s.faces for s in surfaces], counts.tolist())
+        beside = shifted([s.beside for s in surfaces], [s.faces.shape[0] for s in surfaces])
         return cls(
             tuple(surfaces),
             torch.repeat_interleave(torch.arange(len(surfaces)), counts).to(device),

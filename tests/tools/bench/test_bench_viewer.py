@@ -34,9 +34,8 @@ def test_viewer(
     assert [row["where"] for row in rows] == ["HTTP", "HTTP", *(["browser"] * 2 if browser else [])]
     for row in rows:
         assert (row["size"], row["cars"], row["states"]) == ("1241 x 376", 6, 2)
-        assert (
-            min(row["picture_ms"], row["detections_ms"]) > 0
-        )  # asked at once: beside other work either may be first
+        # Both are asked for at once: beside other work either may come first.
+        assert min(row["picture_ms"], row["detections_ms"]) > 0
         assert (row["cpu_ms"] is None) == (row["where"] == "browser")
         assert row["cpu_ms"] is None or row["cpu_ms"] > 1
 
