@@ -16,12 +16,12 @@ from contextlib import contextmanager
 from dataclasses import fields
 from types import FrameType
 
+from drivesem.config.blocks import Command, option
+from drivesem.config.commands import COMMANDS
+from drivesem.config.errors import UsageError
+from drivesem.config.parsing import parse
 from drivesem.run.allocation import keep_freed
 from drivesem.run.lock import let_go
-from drivesem.settings.blocks import Command, option
-from drivesem.settings.commands import COMMANDS
-from drivesem.settings.errors import UsageError
-from drivesem.settings.parsing import parse
 from scene_ir.errors import shown
 
 _MODULES = "drivesem.commands.{}"

@@ -56,7 +56,7 @@ def _version(module: str, also: str = "") -> str:
 
 _EGL = (
     "import os; os.environ.setdefault('PYOPENGL_PLATFORM', 'egl'); "
-    "from drivesem.truth.redraw.screen import Screen; Screen(); print('draws')"
+    "from drivesem.failures.second_renderer.screen import Screen; Screen(); print('draws')"
 )
 _WEIGHTS = (
     "from detectors.registry import load_detector; from scene_ir.derender import pose; "
@@ -64,7 +64,7 @@ _WEIGHTS = (
 )
 _KERNELS = "import warp; warp.config.quiet = True; warp.init(); print(warp.__version__)"
 _PRESETS = (
-    "from drivesem.settings.presets import presets; found = presets(); "
+    "from drivesem.config.presets import presets; found = presets(); "
     "assert found, 'no preset is installed'; print(len(found))"
 )
 _GPU = (

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from drivesem.settings.blocks import Command, Output
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import is_url
+from drivesem.config.blocks import Command, Output
+from drivesem.config.errors import UsageError
+from drivesem.config.values import is_url
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -32,7 +32,7 @@ QUICK = [
     "detectors/test_quality.py",
     "detectors/adapters/test_formats.py",
     "detectors/yolov3/test_yolov3_cfg.py",
-    "drivesem/settings/test_edits.py",
+    "drivesem/config/test_edits.py",
     "drivesem/data/test_joined.py",
     "drivesem/data/test_label_table.py",
     "drivesem/evaluation/test_voc_matching.py",
@@ -45,8 +45,8 @@ QUICK = [
     "drivesem/scenes/test_segmenter.py",
     "drivesem/run/test_results.py",
     "drivesem/training/test_mixture.py",
-    "drivesem/questions/explain/test_shapley.py",
-    "drivesem/questions/survey/test_agreement.py",
+    "drivesem/analysis/explain/test_shapley.py",
+    "tools/experiments/survey/test_agreement.py",
     "drivesem/bench/test_timing.py",
     "drivesem/commands/test_convert_command.py",
     "tools/test_fit_kitti_statistics.py",
@@ -79,8 +79,8 @@ def full_disk() -> Callable[[int], AbstractContextManager[None]]:
 @pytest.fixture(scope="session")
 def screen() -> Any:
     """OpenGL without a window. Skipped by name where neither EGL nor OSMesa is: pip has none."""
-    from drivesem.truth.redraw.base import NoSecondRendererError
-    from drivesem.truth.redraw.screen import shared_screen
+    from drivesem.failures.second_renderer.base import NoSecondRendererError
+    from drivesem.failures.second_renderer.screen import shared_screen
 
     try:
         return shared_screen()

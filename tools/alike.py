@@ -14,10 +14,10 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+from drivesem.config.errors import UsageError
 from drivesem.report.tables import number_of
 from drivesem.run.finished import load_runs
 from drivesem.run.results import Failure, FrameResult
-from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError
 
 Known = tuple[str, str | None, str | None, int | None]

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = "{out}"

@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.questions.realism.closeness import Perception, Picture
 from drivesem.synth.layout import footprint
 from scene_ir.derender import background, maps, segment, street, upright
 from scene_ir.derender.derender import VEHICLES
 from scene_ir.derender.silhouette import grow
 from tools.bench.derender import changed_region, make_case, share_of, without
 from tools.bench.pictures import psnr
+from tools.experiments.realism.closeness import Perception, Picture
 
 Mask = NDArray[np.bool_]
 SEED = 0

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from detectors.types import CLASSES, Detections, Targets
+from drivesem.config.errors import UsageError
 from drivesem.evaluation.failures import Failures
-from drivesem.settings.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)

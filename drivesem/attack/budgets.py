@@ -19,7 +19,7 @@ from typing import Any
 
 from drivesem.attack.feasibility_check import Reach
 from drivesem.attack.space import Budget, Parameter, Parametrisation
-from drivesem.settings.edits import (
+from drivesem.config.edits import (
     ANGLE_UNITS,
     LENGTH_UNITS,
     SHARE_UNITS,
@@ -27,7 +27,7 @@ from drivesem.settings.edits import (
     mapping_of,
     measure,
 )
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
 

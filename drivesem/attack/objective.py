@@ -23,8 +23,8 @@ from drivesem.attack.judging import JudgedClasses, t_star_of
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
 from drivesem.attack.methods.base import GRADIENT_PASSES, Group, Problem, Score, Views
 from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.config.blocks import KEEP_MB
 from drivesem.evaluation import failures
-from drivesem.settings.blocks import KEEP_MB
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.io import as_written

@@ -1,6 +1,6 @@
 """Edits applied to a scene: vehicles moved, turned, bent, painted, removed; other weather and foliage.
 
-The counterpart for generated streets is `drivesem.synth.edits`; both take the edits of `drivesem.settings.edits`.
+The counterpart for generated streets is `drivesem.synth.edits`; both take the edits of `drivesem.config.edits`.
 Objects are numbered by their row.
 """
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.space import Budget, ground_axes
-from drivesem.settings.edits import ALL, FrameEdit, ObjectEdit
+from drivesem.config.edits import ALL, FrameEdit, ObjectEdit
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.removal import without_objects

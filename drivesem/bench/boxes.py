@@ -23,8 +23,8 @@ from drivesem.bench.scenes import HEIGHT, WIDTH
 from drivesem.bench.step import Stepping, pair
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Clock, Spread
+from drivesem.config.blocks import KEEP_MB
 from drivesem.data.kitti import read_calib, read_labels
-from drivesem.settings.blocks import KEEP_MB
 from scene_ir.derender.derender import VEHICLES, DerenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.geometry import clip_boxes, project_boxes

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 
 from drivesem.bench.tables import Columns
+from drivesem.config.blocks import Scenes, shared
+from drivesem.config.commands import Attack, Bench
+from drivesem.config.errors import UsageError
+from drivesem.config.parsing import parse, preset_words
 from drivesem.evaluation.resampling import DRAWS, intervals, rate
 from drivesem.run.attack import Worker
 from drivesem.run.frame import write_frame
 from drivesem.scenes.sources import NoVehicleError, open_source
-from drivesem.settings.blocks import Scenes, shared
-from drivesem.settings.commands import Attack, Bench
-from drivesem.settings.errors import UsageError
-from drivesem.settings.parsing import parse, preset_words
 
 FRAMES = 20
 """Frames that tell, where nobody says how many."""

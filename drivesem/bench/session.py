@@ -14,9 +14,9 @@ import torch
 
 from drivesem.bench import tables
 from drivesem.bench.timing import machine, versions
+from drivesem.config.devices import check_device
+from drivesem.config.errors import UsageError
 from drivesem.report.terminal import Console
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
 from scene_ir import files
 
 T = TypeVar("T")

@@ -18,7 +18,7 @@ from drivesem.attack.space import Parameter, ParameterSpace, combo
 from drivesem.bench.scenes import BenchScene, bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Budget, Clock, Spread, Taken, rounds
-from drivesem.settings.blocks import KEEP_MB
+from drivesem.config.blocks import KEEP_MB
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR, scene_to

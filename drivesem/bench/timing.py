@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from drivesem.settings.devices import memory_gb
+from drivesem.config.devices import memory_gb
 
 _PACKAGES = {"torch": "torch", "warp": "warp-lang", "drivesem": "drivesem"}
 

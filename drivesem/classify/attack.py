@@ -22,6 +22,11 @@ from drivesem.classify.protocol import aimed_by, attack_of, params_of, reach_of,
 from drivesem.classify.results import SCHEMA, ClassifiedFrame, ClassifiedRun, Verdict
 from drivesem.classify.scenes import ObjectScene, in_turn
 from drivesem.classify.space import ObjectSpace
+from drivesem.config.commands import Classify
+from drivesem.config.errors import UsageError
+from drivesem.failures.certificate import Rule
+from drivesem.failures.grades import Grade
+from drivesem.failures.nuisances import Nuisances
 from drivesem.report.tables import csv_text
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import METRICS
@@ -29,11 +34,6 @@ from drivesem.run.folder import FRAMES, claim, folder_of
 from drivesem.run.frame import RESULT
 from drivesem.run.page import PAGE
 from drivesem.run.records import dump_record, load_record
-from drivesem.settings.commands import Classify
-from drivesem.settings.errors import UsageError
-from drivesem.truth.certificate import Rule
-from drivesem.truth.grades import Grade
-from drivesem.truth.nuisances import Nuisances
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.io import to_uint8

@@ -18,15 +18,15 @@ from drivesem.classify.redraw.mitsuba import MitsubaRenderer
 from drivesem.classify.redraw.pyrender import PyrenderRenderer
 from drivesem.classify.results import SCHEMA, ClassifiedRun, SecondLook
 from drivesem.classify.scenes import camera
+from drivesem.config.commands import Classify
+from drivesem.failures.grades import Grade
+from drivesem.failures.second_renderer.base import NoSecondRendererError
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
 from drivesem.run.lock import hold
 from drivesem.run.records import dump_record
-from drivesem.settings.commands import Classify
-from drivesem.truth.grades import Grade
-from drivesem.truth.redraw.base import NoSecondRendererError
 from scene_ir import files
 from scene_ir.io import as_written, to_uint8
 

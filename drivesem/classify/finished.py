@@ -17,14 +17,14 @@ from drivesem.classify.objective import ClassifierObjective
 from drivesem.classify.pictures import Shown
 from drivesem.classify.protocol import aimed_by
 from drivesem.classify.results import SCHEMA, ClassifiedFrame
+from drivesem.config.commands import Classify
+from drivesem.config.errors import UsageError
+from drivesem.failures.grades import Grade
 from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, Kept, KeptFrames
 from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_files, claim
 from drivesem.run.frame import RESULT
 from drivesem.run.records import dump_record, from_json, load_record
-from drivesem.settings.commands import Classify
-from drivesem.settings.errors import UsageError
-from drivesem.truth.grades import Grade
 from scene_ir import files
 from scene_ir.errors import FormatError
 

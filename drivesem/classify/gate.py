@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivesem.analysis.gate.report import answer_of
+from drivesem.analysis.gate.results import Pair
+from drivesem.analysis.gate.rows import rows_of
 from drivesem.classify.attack import network_of
 from drivesem.classify.finished import ClassifyRun, FailureWorker, ask_of_failures
 from drivesem.classify.holes import Poses
 from drivesem.classify.objective import Seen
+from drivesem.config.commands import Classify
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.questions.gate.report import answer_of
-from drivesem.questions.gate.results import Pair
-from drivesem.questions.gate.rows import rows_of
+from drivesem.failures.grades import Grade
+from drivesem.failures.neighbourhood import NEAR
 from drivesem.report.answer import Answer
-from drivesem.settings.commands import Classify
-from drivesem.truth.grades import Grade
-from drivesem.truth.neighbourhood import NEAR
 
 _WORDS = (
     "wrong",

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.objective import Seen
-from drivesem.truth.certificate import Drawn, Rule, count_draws
-from drivesem.truth.grades import SECOND, Agreement, Count
-from drivesem.truth.nuisances import Nuisances
+from drivesem.failures.certificate import Drawn, Rule, count_draws
+from drivesem.failures.grades import SECOND, Agreement, Count
+from drivesem.failures.nuisances import Nuisances
 
 
 @dataclass(frozen=True, slots=True)

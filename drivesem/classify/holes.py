@@ -21,11 +21,11 @@ from torch import Tensor
 
 from drivesem.classify.finished import FailureWorker, ask_of_failures
 from drivesem.classify.scenes import SEEN_PX, VIEWS
+from drivesem.config.commands import Classify
 from drivesem.evaluation.resampling import wilson
+from drivesem.failures.rules import Floats, Where, fit
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet
-from drivesem.settings.commands import Classify
-from drivesem.truth.rules import Floats, Where, fit
 from scene_ir.io import as_written
 
 AXES: tuple[str, ...] = ("pitch", "yaw", "roll")

@@ -12,12 +12,12 @@ import torch
 from rich import box
 from torch import Tensor
 
+from drivesem.analysis.explain.minimal import LeastSearch, ThetaBlock, minimal
 from drivesem.classify.finished import FailureWorker, ask_of_failures
 from drivesem.classify.space import AXES, Moved, ObjectSpace
-from drivesem.questions.explain.minimal import LeastSearch, ThetaBlock, minimal
+from drivesem.config.commands import Classify
 from drivesem.report.answer import Answer
 from drivesem.report.tables import Sheet, number_of
-from drivesem.settings.commands import Classify
 from scene_ir import files
 from scene_ir.errors import RangeError
 from scene_ir.io import to_uint8

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from drivesem.classify.results import ClassifiedFrame, ClassifiedRun, ClassTally
+from drivesem.failures.grades import Grade
 from drivesem.report import web
 from drivesem.report.drawing import jpeg_address
 from drivesem.report.tables import percent
-from drivesem.truth.grades import Grade
 from scene_ir import files
 
 SECOND_PICTURE = "second.png"

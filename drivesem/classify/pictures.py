@@ -14,9 +14,9 @@ from torch import Tensor
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectModel, ObjectSet, Split
 from drivesem.classify.scenes import VIEWS, ObjectScene, in_turn, open_backgrounds
+from drivesem.config.commands import Classify
+from drivesem.config.errors import UsageError
 from drivesem.run.ask import Bar, JobResults, ask
-from drivesem.settings.commands import Classify
-from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import to_uint8

@@ -11,7 +11,7 @@ from drivesem.attack.methods.sgd import SGD
 from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.classify.objective import Aimed
 from drivesem.classify.space import FARTHEST, Amounts, Moved, moved_of
-from drivesem.settings.commands import Classify
+from drivesem.config.commands import Classify
 
 SAMPLED = ("random", "halton")
 _LIGHT_STEP, _LARGER_LIGHT_STEP = 0.2, 0.4

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from drivesem.truth.grades import Agreement, Count, Grade
+from drivesem.failures.grades import Agreement, Count, Grade
 
 SCHEMA = 1
 

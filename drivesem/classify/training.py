@@ -21,11 +21,11 @@ from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.pictures import read_pictures, write_pictures
+from drivesem.config.commands import Classify
 from drivesem.evaluation.resampling import wilson
 from drivesem.report.progress import progress_bar, training_bar
 from drivesem.report.terminal import Console
 from drivesem.run.folder import PRESENTATION, claim, folder_of
-from drivesem.settings.commands import Classify
 from scene_ir import files
 
 PICTURES = "pictures"

@@ -6,10 +6,10 @@ from typing import Any
 
 from rich.table import Table
 
+from drivesem.config.commands import Anchors
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Anchors
 from drivesem.training.anchors import fitted_anchors
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from rich.table import Table
 
+from drivesem.config.commands import Attack
 from drivesem.evaluation.coco import SCORE_TITLES
+from drivesem.failures.grades import Grade, Kind
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.attack import attack_run
 from drivesem.run.report.grading import KINDS, NO_KIND
 from drivesem.run.results import RunSummary
-from drivesem.settings.commands import Attack
-from drivesem.truth.grades import Grade, Kind
 
 
 def run(config: Attack) -> int:

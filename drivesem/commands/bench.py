@@ -12,20 +12,21 @@ from typing import Any
 from detectors.base import Detector, DetectorError
 from detectors.registry import SHIPPED, load_detector
 from drivesem.attack.space import parse_params
-from drivesem.bench import boxes, climb, detector, memory, night, render, scale, step
-from drivesem.bench.planted import across, across_names, summary, yardstick
+from drivesem.bench import boxes, night, render, step
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
+from drivesem.config.commands import Bench
+from drivesem.config.errors import UsageError
+from drivesem.config.values import numbers
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
 from drivesem.scenes.sources import open_source
-from drivesem.settings.commands import Bench
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import numbers
 from scene_ir.errors import FormatError
+from tools.bench import climb, detector, memory, scale
+from tools.bench.planted import across, across_names, summary, yardstick
 
 _SECONDS_A_PASS = 0.5
 """Of an attack on a frame as large as KITTI's, with its certificates and its share of the frame's survey."""

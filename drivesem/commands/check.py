@@ -13,11 +13,11 @@ from detectors.adapters.module import RAISES_NOTHING
 from detectors.base import DetectorError
 from detectors.check import Report, check_detector
 from detectors.registry import load_predictor
+from drivesem.config.commands import Check
+from drivesem.config.devices import check_device
+from drivesem.config.errors import UsageError
 from drivesem.report.answer import print_json
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Check
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
 
 LEAST_SIDE = 64
 """Of a picture, px: its blocks must be larger than a network's stride."""

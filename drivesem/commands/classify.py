@@ -15,14 +15,14 @@ from drivesem.classify.page import shares
 from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun, ClassTally
 from drivesem.classify.training import train_run
+from drivesem.config.commands import Classify
+from drivesem.config.devices import check_device
 from drivesem.report.answer import print_json
 from drivesem.report.tables import Sheet, number_of, percent
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say, say_end
 from drivesem.run.folder import claim, folder_of
 from drivesem.run.page import PAGE
-from drivesem.settings.commands import Classify
-from drivesem.settings.devices import check_device
 
 _ASKED = {"explain": explain_run, "holes": holes_run, "gate": gate_run}
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivesem.questions.confirm.asking import confirm_run
+from drivesem.analysis.confirm.asking import confirm_run
+from drivesem.config.commands import Confirm
+from drivesem.config.devices import check_device
 from drivesem.run.ask import say
-from drivesem.settings.commands import Confirm
-from drivesem.settings.devices import check_device
 
 
 def run(config: Confirm) -> int:

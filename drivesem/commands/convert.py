@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
+from drivesem.config.commands import Convert
+from drivesem.config.errors import UsageError
+from drivesem.config.values import class_map
 from drivesem.data.label_table import Written
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.run.conversion import Conversion, convert
 from drivesem.run.labels import layout_of
-from drivesem.settings.commands import Convert
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import class_map
 
 
 def run(config: Convert) -> int:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+from drivesem.config.commands import Derender
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.derender import derender_run
 from drivesem.scenes.sources import Photographs, SceneSource
-from drivesem.settings.commands import Derender
 
 
 def run(config: Derender) -> int:

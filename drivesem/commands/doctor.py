@@ -5,11 +5,11 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
+from drivesem.config.commands import Doctor
 from drivesem.doctor import PARTS, about, examine
 from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Doctor
 
 _LOOKS = {"works": "green", "missing": "yellow", "broken": "red"}
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivesem.drive.running import drive_run
+from drivesem.config.commands import Drive
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say
-from drivesem.settings.commands import Drive
+from drivesem.video.running import drive_run
 
 
 def run(config: Drive) -> int:

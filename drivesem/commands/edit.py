@@ -9,13 +9,13 @@ from typing import Any
 
 from drivesem.attack.scene_edits import REMOVED, edited
 from drivesem.commands.render import picture_path
+from drivesem.config.commands import Edit
+from drivesem.config.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
+from drivesem.config.errors import UsageError
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.scenes.scene import Scene, free_folder
-from drivesem.settings.commands import Edit
-from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
-from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.exchange import CHANGE
 from scene_ir.io import load_scene, save_scene

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drivesem.questions.evaluate.figures import evaluate_files
-from drivesem.questions.evaluate.report import print_result
+from drivesem.analysis.evaluate.figures import evaluate_files
+from drivesem.analysis.evaluate.report import print_result
+from drivesem.config.commands import Eval
 from drivesem.report.answer import print_json
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Eval
 
 _FILE_WIDTH = 120
 """Characters a line of the tables where they go to a file and not to a terminal."""
@@ -16,8 +16,8 @@ def run(config: Eval) -> int:
     """Evaluate and report; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
     console = Console(stderr=True)
     if config.detector is not None:
-        from drivesem.questions.evaluate.detector import evaluate_detector, print_figures
-        from drivesem.settings.devices import check_device
+        from drivesem.analysis.evaluate.detector import evaluate_detector, print_figures
+        from drivesem.config.devices import check_device
 
         check_device(config.device)
         figures = evaluate_detector(config)

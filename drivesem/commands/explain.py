@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drivesem.questions.explain.asking import explain_run
+from drivesem.analysis.explain.asking import explain_run
+from drivesem.config.commands import Explain
+from drivesem.config.devices import check_device
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say
-from drivesem.settings.commands import Explain
-from drivesem.settings.devices import check_device
 
 
 def run(config: Explain) -> int:

@@ -7,13 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from drivesem.commands.convert import sentence
+from drivesem.config.commands import Export
+from drivesem.config.errors import UsageError
+from drivesem.config.values import class_map
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.run.export import Tables, chosen, export_dataset
 from drivesem.run.finished import load_runs
-from drivesem.settings.commands import Export
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import class_map
 
 
 def run(config: Export) -> int:

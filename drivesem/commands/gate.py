@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drivesem.questions.gate.asking import gate_run
+from drivesem.analysis.gate.asking import gate_run
+from drivesem.config.commands import Gate
+from drivesem.config.devices import check_device
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say
-from drivesem.settings.commands import Gate
-from drivesem.settings.devices import check_device
 
 
 def run(config: Gate) -> int:

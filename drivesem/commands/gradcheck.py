@@ -18,7 +18,18 @@ from detectors.base import DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
 from drivesem.attack.space import SIX, Parameter, StepSizes
-from drivesem.bench.gradcheck import (
+from drivesem.config.commands import Gradcheck
+from drivesem.config.devices import check_device
+from drivesem.config.errors import UsageError
+from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
+from drivesem.report.terminal import Console
+from drivesem.run.ask import Bar, ask, say_end
+from drivesem.run.attack import select_frames
+from drivesem.scenes.sources import SceneSource, open_source
+from scene_ir import files
+from scene_ir.raster.verbs import Backend
+from tools.bench.gradcheck import (
     FUNCTIONALS,
     LOSS,
     POINTS,
@@ -31,20 +42,9 @@ from drivesem.bench.gradcheck import (
     rows_of,
     worst,
 )
-from drivesem.bench.reach.agreement import rows_of as rows_of_reach
-from drivesem.bench.reach.frames import ReachWorker, measure_of
-from drivesem.bench.reach.report import answer_of as reach_answer
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
-from drivesem.report.terminal import Console
-from drivesem.run.ask import Bar, ask, say_end
-from drivesem.run.attack import select_frames
-from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.commands import Gradcheck
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
-from scene_ir import files
-from scene_ir.raster.verbs import Backend
+from tools.bench.reach.agreement import rows_of as rows_of_reach
+from tools.bench.reach.frames import ReachWorker, measure_of
+from tools.bench.reach.report import answer_of as reach_answer
 
 _DEFAULT_SCENES = 1
 _FILE_WIDTH = 120

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drivesem.questions.holes.asking import holes_run
+from drivesem.analysis.holes.asking import holes_run
+from drivesem.config.commands import Holes
+from drivesem.config.devices import check_device
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say
-from drivesem.settings.commands import Holes
-from drivesem.settings.devices import check_device
 
 
 def run(config: Holes) -> int:

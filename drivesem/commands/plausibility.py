@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivesem.questions.plausibility.asking import plausibility_run
+from drivesem.config.commands import Plausibility
 from drivesem.run.ask import say
-from drivesem.settings.commands import Plausibility
+from tools.experiments.plausibility.asking import plausibility_run
 
 
 def run(config: Plausibility) -> int:

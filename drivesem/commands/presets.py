@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from rich.table import Table
 
+from drivesem.config.commands import Presets
+from drivesem.config.parsing import commands_of
+from drivesem.config.presets import presets, remark
 from drivesem.report.answer import print_json
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Presets
-from drivesem.settings.parsing import commands_of
-from drivesem.settings.presets import presets, remark
 
 
 def run(config: Presets) -> int:

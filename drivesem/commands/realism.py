@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivesem.questions.realism.asking import realism_run
+from drivesem.config.commands import Realism
 from drivesem.run.ask import say
-from drivesem.settings.commands import Realism
+from tools.experiments.realism.asking import realism_run
 
 
 def run(config: Realism) -> int:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from drivesem.config.commands import Render
+from drivesem.config.errors import UsageError
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.scenes.scene import load_scene
-from drivesem.settings.commands import Render
-from drivesem.settings.errors import UsageError
 from scene_ir import files
 
 

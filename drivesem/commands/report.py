@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from drivesem.config.commands import Report
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
 from drivesem.run.page import report_runs
-from drivesem.settings.commands import Report
 
 
 def run(config: Report) -> int:

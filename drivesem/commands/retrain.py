@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
+from drivesem.config.commands import Retrain
+from drivesem.config.devices import check_device
 from drivesem.report.answer import print_json
 from drivesem.report.tables import percent
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Retrain
-from drivesem.settings.devices import check_device
 from drivesem.training.retrain import RetrainRow, retrain_run
 
 

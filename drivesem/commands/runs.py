@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from drivesem.commands.attack import told_grades
+from drivesem.config.commands import DEFAULT_COMBO, Attack, Runs
+from drivesem.config.errors import UsageError
+from drivesem.failures.grades import Grade
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
@@ -18,10 +21,7 @@ from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_o
 from drivesem.run.labels import frames_in
 from drivesem.run.lock import held_elsewhere, hold
 from drivesem.run.parts import merge
-from drivesem.settings.commands import DEFAULT_COMBO, Attack, Runs
-from drivesem.settings.errors import UsageError
 from drivesem.store import place
-from drivesem.truth.grades import Grade
 from scene_ir import files
 
 _SETTING = "FOLDER"

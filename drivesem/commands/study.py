@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivesem.questions.study.asking import study_run
+from drivesem.config.commands import Study
+from drivesem.config.devices import check_device
 from drivesem.run.ask import say, show
-from drivesem.settings.commands import Study
-from drivesem.settings.devices import check_device
+from tools.experiments.detection.asking import study_run
 
 
 def run(config: Study) -> int:
@@ -14,7 +14,7 @@ def run(config: Study) -> int:
     """
     check_device(config.device)
     if config.name == "classification":
-        from drivesem.classify.study.asking import study_run as classification_run
+        from tools.experiments.classification.asking import study_run as classification_run
 
         answer = classification_run(config)
     else:

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from drivesem.questions.survey.page import (
+from drivesem.config.commands import Survey
+from drivesem.report.answer import print_json
+from drivesem.report.tables import number_of
+from drivesem.report.terminal import Console
+from drivesem.run.finished import load_runs
+from drivesem.run.folder import folder_of
+from scene_ir import files
+from tools.experiments.survey.page import (
     CHANGED,
     KEY,
     PAGE,
@@ -12,13 +19,6 @@ from drivesem.questions.survey.page import (
     survey_name,
     write_key,
 )
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
-from drivesem.report.terminal import Console
-from drivesem.run.finished import load_runs
-from drivesem.run.folder import folder_of
-from drivesem.settings.commands import Survey
-from scene_ir import files
 
 
 def run(config: Survey) -> int:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivesem.questions.survey.results import survey_results
+from drivesem.config.commands import SurveyResults
 from drivesem.run.ask import say
-from drivesem.settings.commands import SurveyResults
+from tools.experiments.survey.results import survey_results
 
 
 def run(config: SurveyResults) -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from drivesem.config.commands import Synth
+from drivesem.config.errors import UsageError
 from drivesem.report.answer import print_json
 from drivesem.report.progress import progress_bar
 from drivesem.report.tables import number_of
@@ -12,8 +14,6 @@ from drivesem.report.terminal import Console
 from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
 from drivesem.run.workers import mapping
-from drivesem.settings.commands import Synth
-from drivesem.settings.errors import UsageError
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, synthesise
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from drivesem.config.commands import Train
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Train
 from drivesem.training.train import train_run
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivesem.questions.transfer.asking import transfer_run
+from drivesem.analysis.transfer.asking import transfer_run
+from drivesem.config.commands import Transfer
 from drivesem.run.ask import say
-from drivesem.settings.commands import Transfer
 
 
 def run(config: Transfer) -> int:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from drivesem.questions.verify.asking import WHOLE_RUN, verify_run
+from drivesem.analysis.verify.asking import WHOLE_RUN, verify_run
+from drivesem.config.commands import Verify
+from drivesem.config.devices import check_device
 from drivesem.report.answer import print_json
 from drivesem.report.tables import Sheet, number_of
 from drivesem.report.terminal import Console
 from drivesem.run.ask import say_end
 from drivesem.run.report.grading import UNKNOWN
-from drivesem.settings.commands import Verify
-from drivesem.settings.devices import check_device
 
 _MOST_SHOWN, _MOST_ALIKE = 30, 5
 """Differences that are told on a terminal, and of them those of one check of a frame; verify.json has them all."""

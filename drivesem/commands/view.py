@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 import webbrowser
 
+from drivesem.config.commands import View
+from drivesem.config.errors import UsageError
 from drivesem.report.answer import print_json
 from drivesem.report.tables import number_of
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import View
-from drivesem.settings.errors import UsageError
 from drivesem.viewer.frames import Shown, opened
 from drivesem.viewer.server import HOST, Server, Viewer
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivesem.questions.worth.asking import worth_run
+from drivesem.config.commands import Worth
 from drivesem.run.ask import say
-from drivesem.settings.commands import Worth
+from tools.experiments.worth.asking import worth_run
 
 
 def run(config: Worth) -> int:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
+from drivesem.config.blocks import Sharing
 from drivesem.report.answer import Answer, print_json
 from drivesem.report.progress import progress_bar
 from drivesem.report.terminal import Console
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
 from drivesem.run.workers import outcomes
-from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import SceneError
 

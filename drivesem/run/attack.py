@@ -35,6 +35,15 @@ from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.attack.methods.subsets import Subsets
 from drivesem.attack.objective import OF_DETECTIONS
 from drivesem.attack.space import SIX, Parameter, combo, parse_params
+from drivesem.config.blocks import FrameCommand, option
+from drivesem.config.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
+from drivesem.config.devices import check_device
+from drivesem.config.errors import UsageError
+from drivesem.config.values import part_of
+from drivesem.failures.certificate import Rule
+from drivesem.failures.grading import Grader, witness_of
+from drivesem.failures.nuisances import Nuisances
+from drivesem.failures.second_renderer.choose import SecondRenderers
 from drivesem.report.tables import number_of
 from drivesem.run.ask import Bar, ask
 from drivesem.run.finished import MANIFEST, METRICS
@@ -45,15 +54,6 @@ from drivesem.run.page import write_run
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.tally import tally
 from drivesem.scenes.sources import NoVehicleError, SceneSource, make_ready, open_source
-from drivesem.settings.blocks import FrameCommand, option
-from drivesem.settings.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import part_of
-from drivesem.truth.certificate import Rule
-from drivesem.truth.grading import Grader, witness_of
-from drivesem.truth.nuisances import Nuisances
-from drivesem.truth.redraw.choose import SecondRenderers
 from scene_ir import files
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings

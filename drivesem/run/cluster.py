@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from drivesem.config.blocks import Sharing
+from drivesem.config.errors import UsageError
 from drivesem.run.jobs import Start, begin, do, ended
-from drivesem.settings.blocks import Sharing
-from drivesem.settings.errors import UsageError
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from drivesem.config.errors import UsageError
 from drivesem.data.frames import images_in, size_of_image
 from drivesem.data.kitti import read_calib
 from drivesem.data.kitti_labels import TYPES, label_folder
@@ -17,7 +18,6 @@ from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry
 from drivesem.data.registry import images_beside, write_table
 from drivesem.run.labels import layout_of, read
 from drivesem.run.training_data import labels_of_run, pictures
-from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError
 
 

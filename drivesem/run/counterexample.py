@@ -27,6 +27,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.base import Predictor, device_of
+from drivesem.config.commands import Attack, Search
+from drivesem.config.devices import check_device
+from drivesem.config.errors import UsageError
 from drivesem.report.tables import number_of
 from drivesem.run.attack import Worker, named_detector, suited_to
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
@@ -34,9 +37,6 @@ from drivesem.run.report import grading, pictures
 from drivesem.run.results import Failure, FrameResult
 from drivesem.run.tally import graded
 from drivesem.scenes.scene import Scene, png
-from drivesem.settings.commands import Attack, Search
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
 from scene_ir.io import to_uint8
 from scene_ir.types import SceneIR
 

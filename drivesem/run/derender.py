@@ -9,11 +9,11 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
+from drivesem.config.commands import Derender
 from drivesem.run.ask import Bar, ask
 from drivesem.run.folder import PRESENTATION, claim
 from drivesem.scenes.sheet import write_scene_sheet
 from drivesem.scenes.sources import SceneSource, make_ready, open_source
-from drivesem.settings.commands import Derender
 from scene_ir.io import count_objects, load_scene, save_scene
 
 RECORD, SHEET = "scene.json", "sheet.jpg"

@@ -8,14 +8,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from drivesem.config.errors import UsageError
 from drivesem.data.label_table import Written, to_coco
+from drivesem.failures.grades import Grade
 from drivesem.report.tables import csv_text
 from drivesem.run.conversion import Conversion, convert
 from drivesem.run.finished import Run
 from drivesem.run.results import Failure, FrameResult
 from drivesem.run.training_data import told_of
-from drivesem.settings.errors import UsageError
-from drivesem.truth.grades import Grade
 from scene_ir import files
 
 PROVENANCE = "provenance.json"

@@ -8,15 +8,15 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from drivesem.config.commands import Attack
+from drivesem.config.errors import UsageError
+from drivesem.failures.grades import Grade
 from drivesem.run.folder import CONFIG
 from drivesem.run.labels import MANIFEST, RESULT, names_in
 from drivesem.run.lock import held_elsewhere
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.run.tally import graded
-from drivesem.settings.commands import Attack
-from drivesem.settings.errors import UsageError
-from drivesem.truth.grades import Grade
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -12,12 +12,12 @@ from typing import Any
 from detectors.base import DetectorError, Predictor
 from detectors.registry import code_of, load_predictor
 from drivesem.attack.judging import JudgedClasses
+from drivesem.config.blocks import Output
+from drivesem.config.commands import Attack
+from drivesem.config.errors import UsageError
+from drivesem.config.text import to_yaml
 from drivesem.run.lock import LOCK, hold
 from drivesem.run.records import from_json
-from drivesem.settings.blocks import Output
-from drivesem.settings.commands import Attack
-from drivesem.settings.errors import UsageError
-from drivesem.settings.text import to_yaml
 from scene_ir import files
 
 CONFIG = "config.yaml"

@@ -28,18 +28,18 @@ from drivesem.attack.methods.margin_search import FRESH, OfMargins, value_of
 from drivesem.attack.methods.placebo import Placebo
 from drivesem.attack.objective import Objective, Rendered
 from drivesem.attack.space import Budget, Parameter, ParameterSpace, Parametrisation
+from drivesem.config.blocks import KEEP_MB
 from drivesem.data import kitti
 from drivesem.evaluation.failures import Failures
+from drivesem.failures.certificate import with_regions
+from drivesem.failures.grades import Grade
+from drivesem.failures.grading import Case, Graded, Grader, Grades
+from drivesem.failures.kinds import View
+from drivesem.failures.nuisances import Nuisances
+from drivesem.failures.second_renderer.compositor import CompositorDraw
+from drivesem.failures.views import DrawnViews
 from drivesem.run.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
-from drivesem.settings.blocks import KEEP_MB
-from drivesem.truth.certificate import with_regions
-from drivesem.truth.grades import Grade
-from drivesem.truth.grading import Case, Graded, Grader, Grades
-from drivesem.truth.kinds import View
-from drivesem.truth.nuisances import Nuisances
-from drivesem.truth.redraw.compositor import CompositorDraw
-from drivesem.truth.views import DrawnViews
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.exchange import CHANGE

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.failures.second_renderer.photograph import PhotographRedraw
+from drivesem.failures.second_renderer.placing import Lens
 from drivesem.scenes.sources import scene_folders
-from drivesem.truth.redraw.photograph import PhotographRedraw
-from drivesem.truth.redraw.placing import Lens
 from scene_ir import files
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import SceneIR

@@ -16,8 +16,8 @@ import torch
 from detectors.adapters.module import RAISES_NOTHING, blamed
 from detectors.base import DetectorError
 from drivesem import store
+from drivesem.config.errors import UsageError
 from drivesem.run.allocation import keep_freed
-from drivesem.settings.errors import UsageError
 from scene_ir.errors import SceneError, WriteError
 
 J = TypeVar("J")

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock

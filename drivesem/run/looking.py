@@ -19,10 +19,10 @@ from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
 from detectors.types import Detections
 from drivesem.attack.judging import JudgedClasses
+from drivesem.config.blocks import Sharing
 from drivesem.run.ask import Bar, ask
 from drivesem.run.frame import as_detections, detection_records
 from drivesem.run.results import BoxRecord
-from drivesem.settings.blocks import Sharing
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from detectors.registry import ONNX
+from drivesem.config.commands import Attack
 from drivesem.run.folder import FRAMES, settings_of
 from drivesem.run.frame import RESULT
-from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.errors import FormatError
 

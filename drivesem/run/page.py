@@ -11,9 +11,13 @@ import numpy as np
 
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.space import combo
+from drivesem.config.commands import COMBO_NUMBERS, Attack, Report
+from drivesem.config.errors import UsageError
+from drivesem.config.text import command_line
 from drivesem.data.label_table import WEATHERS
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.outcome import Outcome
+from drivesem.failures.certificate import Rule
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, attack_of
@@ -24,10 +28,6 @@ from drivesem.run.report.html import render_report
 from drivesem.run.report.page import Chart, Line, Page, PaperFigure, ShownRun
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import boxes_of, graded, tally
-from drivesem.settings.commands import COMBO_NUMBERS, Attack, Report
-from drivesem.settings.errors import UsageError
-from drivesem.settings.text import command_line
-from drivesem.truth.certificate import Rule
 from scene_ir import files
 from scene_ir.errors import FormatError
 

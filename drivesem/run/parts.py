@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivesem.attack.space import parse_params
+from drivesem.config.commands import Attack
+from drivesem.config.errors import UsageError
 from drivesem.run.attack import WRITTEN, conclude, summary_of
 from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
 from drivesem.run.folder import FRAMES, claim, detector_of, settings_of, trusted_attack
@@ -16,8 +18,6 @@ from drivesem.run.frame import RESULT
 from drivesem.run.manifest import digest_of
 from drivesem.run.records import from_json
 from drivesem.run.results import RunSummary
-from drivesem.settings.commands import Attack
-from drivesem.settings.errors import UsageError
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivesem.attack.budgets import budget_of
-from drivesem.settings.commands import Attack
+from drivesem.config.commands import Attack
 
 THEIR_DETECTOR = "squeezedet"
 PROTOCOL = {

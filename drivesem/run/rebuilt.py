@@ -14,9 +14,9 @@ from drivesem.attack.budgets import budget_of
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.config.commands import Attack
 from drivesem.run.frame import RESULT
 from drivesem.run.results import FrameResult
-from drivesem.settings.commands import Attack
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drivesem.evaluation.coco import Scores
+from drivesem.failures.grades import Agreement, Count
 from drivesem.run.records import from_json
-from drivesem.truth.grades import Agreement, Count
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -9,10 +9,10 @@ from typing import Any, Protocol, TypeVar
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.judging import JudgedClasses
 from drivesem.evaluation import coco
+from drivesem.failures.grades import Grade, Kind
+from drivesem.failures.kinds import OF_OBJECTS
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
-from drivesem.truth.grades import Grade, Kind
-from drivesem.truth.kinds import OF_OBJECTS
 
 
 class Graded(Protocol):

@@ -13,9 +13,9 @@ import torch
 from drivesem.data.frames import size_of_image
 from drivesem.data.kitti_labels import table_of
 from drivesem.data.label_table import REGION, LabelTable, camera_entry, shortest
+from drivesem.failures.grades import Grade
 from drivesem.run.labels import RESULT, frames_in
 from drivesem.run.results import FrameResult, load_frame
-from drivesem.truth.grades import Grade
 from scene_ir.errors import FormatError
 from scene_ir.io import load_camera, load_others
 

@@ -20,9 +20,9 @@ import cv2
 import torch
 
 from drivesem import store
+from drivesem.config.blocks import Sharing
 from drivesem.run.cluster import on_ray
 from drivesem.run.jobs import Start, attempt, begin, do, ended
-from drivesem.settings.blocks import Sharing
 
 J = TypeVar("J")
 R = TypeVar("R")

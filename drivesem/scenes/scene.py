@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.attack.scene_edits import edited
+from drivesem.config.edits import ALL, frame_edit, merged, parse_setting
+from drivesem.config.errors import UsageError
 from drivesem.data import kitti, registry
 from drivesem.data.photographs import camera_for, photograph, read_pixels
 from drivesem.scenes.sources import derender_settings, placed
-from drivesem.settings.edits import ALL, frame_edit, merged, parse_setting
-from drivesem.settings.errors import UsageError
 from scene_ir import io
 from scene_ir.io import to_tensor, to_uint8
 from scene_ir.render.compositor import render

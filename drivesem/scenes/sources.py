@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from drivesem.settings.blocks import DEMO, PHOTOGRAPHS, SCENES, Scenes
-from drivesem.settings.commands import Derender
-from drivesem.settings.errors import UsageError
+from drivesem.config.blocks import DEMO, PHOTOGRAPHS, SCENES, Scenes
+from drivesem.config.commands import Derender
+from drivesem.config.errors import UsageError
 from drivesem.store import place
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.types import Frame, SceneIR

@@ -1,7 +1,7 @@
 """Edits of generated scenes: vehicles moved, turned, bent, painted, removed; other weather and foliage.
 
 The generator renders the edited world itself, so that what de-rendering and attacks make of an edit can be held
-against the truth. A file of edits is YAML, each frame's entry as `drivesem.settings.edits` has it:
+against the truth. A file of edits is YAML, each frame's entry as `drivesem.config.edits` has it:
 
     frames:
       all:                              # every frame, or a frame's number
@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from drivesem.settings.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
+from drivesem.config.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
 from drivesem.synth.frames import Plan
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light

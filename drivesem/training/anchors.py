@@ -9,9 +9,9 @@ import numpy as np
 
 from detectors.anchors import fit_anchors, mean_best_iou
 from detectors.squeezedet import ANCHOR_SIZES_WH
+from drivesem.config.commands import Anchors
+from drivesem.config.errors import UsageError
 from drivesem.data.registry import Dataset, open_dataset
-from drivesem.settings.commands import Anchors
-from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError
 
 

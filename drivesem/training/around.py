@@ -18,18 +18,18 @@ from detectors.training import Sample
 from detectors.types import CLASSES, Targets
 from drivesem.attack.feasible.bounds import Limits
 from drivesem.attack.space import Parameter
+from drivesem.config.commands import Attack
 from drivesem.data import kitti
+from drivesem.failures.margin import of_background, of_objects
+from drivesem.failures.neighbourhood import NEAR, Neighbourhood
+from drivesem.failures.nuisances import Nuisances
+from drivesem.failures.views import SHARPNESS
 from drivesem.run.frame import as_targets
 from drivesem.run.rebuilt import rebuilt
 from drivesem.run.tally import certain_losses
-from drivesem.settings.commands import Attack
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.semantic import state_at
 from drivesem.training.targets import TRAINED, training_targets
-from drivesem.truth.margin import of_background, of_objects
-from drivesem.truth.neighbourhood import NEAR, Neighbourhood
-from drivesem.truth.nuisances import Nuisances
-from drivesem.truth.views import SHARPNESS
 from scene_ir import files
 
 AT_ONCE = 4

@@ -17,13 +17,13 @@ from drivesem.attack.judging import HEADLINE, JudgedClasses
 from drivesem.attack.labels import LabelMode, with_others
 from drivesem.data import kitti
 from drivesem.evaluation.coco import ClassScores, evaluate
+from drivesem.failures.second_renderer.choose import SecondRenderers
+from drivesem.failures.second_renderer.generator import GeneratorRedraw
 from drivesem.run.frame import RESULT, as_targets
 from drivesem.run.labels import frames_in
 from drivesem.run.looking import as_picture, detections_in
 from drivesem.run.results import FrameResult, load_frame
 from drivesem.training.targets import TRAINED, training_targets
-from drivesem.truth.redraw.choose import SecondRenderers
-from drivesem.truth.redraw.generator import GeneratorRedraw
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_others, load_scene

@@ -15,6 +15,8 @@ from detectors.training import CHECKPOINT, LOG, Sample
 from detectors.types import CLASSES, Detections
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
+from drivesem.config.commands import Attack, Retrain
+from drivesem.config.errors import UsageError
 from drivesem.data.registry import open_dataset
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
 from drivesem.report.tables import Sheet, csv_text, percent
@@ -22,8 +24,6 @@ from drivesem.report.terminal import Console
 from drivesem.run.attack import Worker, attack_frames
 from drivesem.run.folder import SHARING, claim, trusted_attack
 from drivesem.run.frame import as_targets
-from drivesem.settings.commands import Attack, Retrain
-from drivesem.settings.errors import UsageError
 from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, figures, frames_of, look
 from drivesem.training.curves import draw
 from drivesem.training.frames import FrameStore

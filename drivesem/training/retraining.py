@@ -13,11 +13,11 @@ from detectors.squeezedet import SqueezeDet
 from detectors.training import Beside, Sample, TrainingSettings, train
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
+from drivesem.config.commands import Retrain
+from drivesem.config.errors import UsageError
+from drivesem.config.values import interval, size_hw
 from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
-from drivesem.settings.commands import Retrain
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import interval, size_hw
 from drivesem.training.attacked import AttackedFrame
 from drivesem.training.mixture import Shares
 from scene_ir import files

@@ -11,7 +11,7 @@ from torch import Tensor
 from detectors.base import Detector, DetectorError
 from detectors.registry import ARCHITECTURES, DARKNET, SHIPPED, load_detector, read_weights
 from detectors.squeezedet import SeededDropout, SqueezeDet
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 
 AUTO, NONE, SQUEEZENET = "auto", "none", "squeezenet"
 BACKBONE = Path("build/squeezenet1_1.safetensors")

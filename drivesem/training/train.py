@@ -19,17 +19,17 @@ from detectors.base import Detector
 from detectors.registry import read_weights
 from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
+from drivesem.config.commands import SYNTH, Train
+from drivesem.config.devices import check_device
+from drivesem.config.errors import UsageError
+from drivesem.config.text import command_line
+from drivesem.config.values import interval, numbers, size_hw
 from drivesem.data.joined import open_folders
 from drivesem.data.splits import chosen
 from drivesem.report.progress import training_bar
 from drivesem.report.terminal import Console
 from drivesem.run.folder import SHARING, claim
 from drivesem.run.workers import mapping
-from drivesem.settings.commands import SYNTH, Train
-from drivesem.settings.devices import check_device
-from drivesem.settings.errors import UsageError
-from drivesem.settings.text import command_line
-from drivesem.settings.values import interval, numbers, size_hw
 from drivesem.training import keeper
 from drivesem.training.card import Recipe
 from drivesem.training.frames import FrameStore

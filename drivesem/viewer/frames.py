@@ -11,13 +11,13 @@ from detectors.registry import load_predictor
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.space import Budget
+from drivesem.config.commands import View
+from drivesem.config.errors import UsageError
 from drivesem.report.tables import number_of
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import CONFIG, detector_of, trusted_attack
 from drivesem.run.results import FrameResult
 from drivesem.scenes.sources import scene_folders
-from drivesem.settings.commands import View
-from drivesem.settings.errors import UsageError
 from drivesem.viewer.server import ShownFrame
 from scene_ir import files
 from scene_ir.io import count_objects

@@ -26,7 +26,7 @@ from drivesem.attack.space import (
     behind_camera,
     ground_axes,
 )
-from drivesem.settings.edits import FOLIAGE_NAMES, SUN_NAMES, WEATHER_NAMES
+from drivesem.config.edits import FOLIAGE_NAMES, SUN_NAMES, WEATHER_NAMES
 from scene_ir.errors import RangeError, shown
 from scene_ir.types import SceneIR
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from drivesem.config.blocks import Sharing
+from drivesem.config.errors import UsageError
 from drivesem.run.gltf import glb_of
 from drivesem.run.workers import mapping
-from drivesem.settings.blocks import Sharing
-from drivesem.settings.errors import UsageError
 from scene_ir.io import load_scene
 
 _SIZE = (1280, 720)

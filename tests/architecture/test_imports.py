@@ -84,13 +84,13 @@ RULES = (
     # the second renderer of photographs shares nothing with the first one but the scene that both read
     *(
         Rule(
-            f"drivesem.truth.redraw.{name}",
+            f"drivesem.failures.second_renderer.{name}",
             (
-                *("scene_ir.types", "scene_ir.errors", "detectors.types", "drivesem.truth.redraw"),
+                *("scene_ir.types", "scene_ir.errors", "detectors.types", "drivesem.failures.second_renderer"),
                 *("drivesem.attack.contrast", "drivesem.attack.labels.Difficulty"),
             ),
             ("torch", "numpy", "scipy", "cv2", "pyrender", "OpenGL", "triton"),
-            never=("drivesem.truth.redraw.compositor",),
+            never=("drivesem.failures.second_renderer.compositor",),
         )
         for name in ("photograph", "baking", "placing", "screen", "shadows", "weathering")
     ),
@@ -101,7 +101,7 @@ RULES = (
         None,
     ),
     Rule(
-        "drivesem.drive",
+        "drivesem.video",
         ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run", "synth"))),
         None,
     ),
@@ -113,7 +113,13 @@ RULES = (
     Rule("drivesem.report", ("scene_ir.errors", "scene_ir.files"), None, never=_NOT_TO_SHOW),
     Rule(
         "drivesem.run.report",
-        ("drivesem.report", "drivesem.run.results", "drivesem.truth.grades", "scene_ir.errors", "scene_ir.files"),
+        (
+            "drivesem.report",
+            "drivesem.run.results",
+            "drivesem.failures.grades",
+            "scene_ir.errors",
+            "scene_ir.files",
+        ),
         None,
         never=_NOT_TO_SHOW,
     ),
@@ -227,8 +233,8 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
             "drivesem/evaluation/coco.py",
             "import importlib\nimportlib.import_module('drivesem.attack.labels')",
         ),
-        ("drivesem/run/attack.py", "def f():\n    from drivesem.questions.verify import frame"),
-        ("drivesem/questions/verify/frame.py", "from drivesem.commands import verify"),
+        ("drivesem/run/attack.py", "def f():\n    from drivesem.analysis.verify import frame"),
+        ("drivesem/analysis/verify/frame.py", "from drivesem.commands import verify"),
         ("drivesem/run/report/page.py", "import torch"),
         ("drivesem/run/report/page.py", "from scene_ir.render import compositor"),
     ],
@@ -318,7 +324,7 @@ def test_top_level_names() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    ["drivesem", "drivesem.cli", "drivesem.settings.parsing", "scene_ir.files"],
+    ["drivesem", "drivesem.cli", "drivesem.config.parsing", "scene_ir.files"],
 )
 def test_importing_loads_nothing_heavy(module: str) -> None:
     code = f"import sys, {module}; print(*sorted(set({HEAVY!r}) & set(sys.modules)))"

@@ -21,7 +21,7 @@ import tyro
 import yaml
 
 from drivesem.cli import main
-from drivesem.settings.parsing import parse
+from drivesem.config.parsing import parse
 from tools.bench.settings import BenchTool
 
 ROOT = Path(__file__).resolve().parents[2]

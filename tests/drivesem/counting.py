@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 from detectors.types import CLASSES
 from drivesem.attack.judging import HEADLINE
+from drivesem.config.commands import Attack
 from drivesem.evaluation import coco
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult, RunSummary
 from drivesem.run.tally import graded
-from drivesem.settings.commands import Attack
 
 T_STAR = 0.5
 

@@ -21,14 +21,14 @@ import torch
 
 import drivesem as ds
 from drivesem.cli import main
+from drivesem.config.commands import Attack
+from drivesem.config.errors import UsageError
+from drivesem.failures.grades import Agreement, Count
 from drivesem.run import attack as run_attack
 from drivesem.run.attack import Worker
 from drivesem.run.counterexample import AttackOptions
 from drivesem.run.results import Failure, load_frame
 from drivesem.scenes.scene import image_of
-from drivesem.settings.commands import Attack
-from drivesem.settings.errors import UsageError
-from drivesem.truth.grades import Agreement, Count
 from scene_ir.errors import FormatError, RangeError, SceneError
 from scene_ir.files import read_image
 from scene_ir.types import Frame

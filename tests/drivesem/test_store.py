@@ -17,8 +17,8 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from drivesem import store
 from drivesem.cli import main
+from drivesem.config.errors import UsageError
 from drivesem.data.registry import open_dataset
-from drivesem.settings.errors import UsageError
 from drivesem.store import Store, place
 from scene_ir.errors import FormatError
 from tests.drivesem.commands.test_attack_command import contents, without_times

@@ -17,13 +17,13 @@ from rich.console import Console
 
 from detectors.base import DetectorError
 from detectors.registry import load_predictor
-from drivesem.bench import memory, render
+from drivesem.bench import render
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, targets_of, watched
 from drivesem.bench.tables import Section
+from drivesem.config.errors import UsageError
+from drivesem.config.values import numbers
 from drivesem.run.allocation import keep_freed
-from drivesem.settings.errors import UsageError
-from drivesem.settings.values import numbers
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.errors import SceneError
 from tools.bench import (
@@ -35,6 +35,7 @@ from tools.bench import (
     found,
     install,
     label_free,
+    memory,
     moves,
     parts,
     redraw,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.bench.tables import Columns
+from drivesem.config.blocks import DEMO
 from drivesem.data.registry import open_dataset
 from drivesem.report.drawing import write_picture
-from drivesem.settings.blocks import DEMO
 from drivesem.synth.frames import SynthSettings, generate_frame
 from scene_ir.derender import depth, maps, segment
 from scene_ir.derender.derender import derender

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.bench.tables import Columns
-from drivesem.questions.realism.closeness import PERCEPTUAL, Perception, Picture
 from drivesem.synth.demo import take_apart
 from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
@@ -44,6 +43,7 @@ from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import Crop, Frame, Labels, SceneIR
 from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
+from tools.experiments.realism.closeness import PERCEPTUAL, Perception, Picture
 
 Mask = NDArray[np.bool_]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from drivesem.bench.tables import Columns
+from drivesem.config.edits import FOLIAGE_NAMES, FrameEdit
 from drivesem.report.drawing import write_picture
-from drivesem.settings.edits import FOLIAGE_NAMES, FrameEdit
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthSettings

@@ -24,11 +24,11 @@ from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller, MovedLabels
 from drivesem.attack.scene_edits import moved
 from drivesem.bench.tables import Columns
+from drivesem.config.blocks import Scenes
+from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.evaluation.resampling import wilson
 from drivesem.run.workers import outcomes
 from drivesem.scenes.sources import SceneSource, open_source
-from drivesem.settings.blocks import Scenes
-from drivesem.settings.edits import FrameEdit, ObjectEdit
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene

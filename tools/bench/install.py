@@ -12,7 +12,7 @@ from pathlib import Path
 
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 from tools.versions import ROOT, Ended, Run, run_words
 
 STEPS_TITLE, SIZES_TITLE, STARTS_TITLE = "From a clone to the first report", "What lies on the disk", "Starts"

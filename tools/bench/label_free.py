@@ -17,8 +17,8 @@ from torch import Tensor
 
 from detectors.boxes import iou_matrix
 from drivesem.bench.tables import Columns
+from drivesem.config.blocks import DEMO
 from drivesem.run.workers import outcomes
-from drivesem.settings.blocks import DEMO
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, placements
 from scene_ir.types import Camera, Frame, Labels
 from tools.bench.settings import BenchTool

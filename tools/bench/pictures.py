@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drivesem.questions.realism.closeness import Mask, Picture
 from scene_ir.errors import ShapeError
+from tools.experiments.realism.closeness import Mask, Picture
 
 EXACT_DB = 99.0
 """Stands for the infinite PSNR of equal pixels, so that figures stay numbers."""

@@ -22,9 +22,9 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.registry import load_predictor
 from drivesem.bench.tables import Columns
+from drivesem.failures.second_renderer.photograph import PhotographRedraw
 from drivesem.report.drawing import PAPER, write_text
 from drivesem.run.workers import outcomes
-from drivesem.truth.redraw.photograph import PhotographRedraw
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, SceneIR

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from drivesem.settings.blocks import DEMO, SOURCES, Count, DataSource, Flag, FrameCommand, Tiles
-from drivesem.settings.constraints import OneOf, Parsed
-from drivesem.settings.errors import refuse
-from drivesem.settings.values import numbers
+from drivesem.config.blocks import DEMO, SOURCES, Count, DataSource, Flag, FrameCommand, Tiles
+from drivesem.config.constraints import OneOf, Parsed
+from drivesem.config.errors import refuse
+from drivesem.config.values import numbers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,8 @@ import numpy as np
 import psutil
 
 from drivesem.bench.tables import Columns
+from drivesem.config.blocks import Sharing
 from drivesem.run.workers import mapping
-from drivesem.settings.blocks import Sharing
 from drivesem.synth.variations import MIXED
 from drivesem.synth.write import Order, synthesise
 

@@ -23,13 +23,13 @@ from detectors.registry import load_predictor
 from drivesem.attack.goals import of_detections
 from drivesem.attack.judging import t_star_of
 from drivesem.bench.tables import Columns
+from drivesem.config.edits import FrameEdit
 from drivesem.data.classes import VEHICLES
+from drivesem.failures.margin import of_objects
 from drivesem.report.drawing import write_picture
-from drivesem.settings.edits import FrameEdit
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthFrame, SynthSettings, Truth
-from drivesem.truth.margin import of_objects
 from scene_ir.derender.derender import derender
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor

@@ -20,54 +20,54 @@ from detectors.registry import load_detector, save_detector
 from detectors.yolov3 import darknet
 from detectors.yolov3.cfg import Section, build
 from detectors.yolov3.yolov3 import YoloV3
+from drivesem.analysis.transfer.matrix import SHOWN, FrameLosses, PairCounts, ShownRun, Target
+from drivesem.analysis.verify.change import THETA, check_change
+from drivesem.analysis.verify.differences import CheckLog
 from drivesem.attack.budgets import budget_of
 from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.space import Parameter, ParameterSpace, parse_params
-from drivesem.classify.study import pixels
-from drivesem.classify.study.asking import study_run as classification_run
-from drivesem.classify.study.kept import keep_results
-from drivesem.classify.study.results import Facts, Network, Results
+from drivesem.config.commands import Attack, Report, Study
+from drivesem.config.edits import read_edits, read_frame_edit
+from drivesem.config.parsing import parse
+from drivesem.config.text import to_yaml
 from drivesem.data import kitti
 from drivesem.data.layouts import read_table
 from drivesem.data.photographs import photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
 from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
 from drivesem.evaluation.matches import Matches
-from drivesem.questions.realism import weights as realism_weights
-from drivesem.questions.study.arms import Arm
-from drivesem.questions.study.asking import study_run
-from drivesem.questions.study.counts import (
+from drivesem.run.finished import load_run
+from drivesem.run.page import report_runs
+from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame, load_frame
+from drivesem.run.tally import tally
+from drivesem.scenes.segmenter import OnnxSegmenter
+from scene_ir import files
+from scene_ir.io import load_scene, save_scene
+from scene_ir.meshes.load import import_mesh, save_mesh
+from scene_ir.types import Camera, Crop, Environment, Front, Labels, Mesh, Objects, SceneIR, Source
+from tools.experiments.classification import pixels
+from tools.experiments.classification.asking import study_run as classification_run
+from tools.experiments.classification.kept import keep_results
+from tools.experiments.classification.results import Facts, Network, Results
+from tools.experiments.detection.arms import Arm
+from tools.experiments.detection.asking import study_run
+from tools.experiments.detection.counts import (
     ArmCounts,
     CountedFailure,
     FrameCounts,
     SeenObject,
     StudyCounts,
 )
-from drivesem.questions.study.kept import keep
-from drivesem.questions.study.kept_retrain import keep_retrain
-from drivesem.questions.study.kept_transfer import keep_transfer
-from drivesem.questions.study.lessons import BENIGN, lessons_of
-from drivesem.questions.study.robust import KINDS, Counted, FrameStates
-from drivesem.questions.study.running import AttackFacts
-from drivesem.questions.study.taught import RetrainCounts, SeenBenign
-from drivesem.questions.study.transfer import AskedArm, TransferCounts
-from drivesem.questions.survey.page import Item, read_answers, read_key, write_key
-from drivesem.questions.transfer.matrix import SHOWN, FrameLosses, PairCounts, ShownRun, Target
-from drivesem.questions.verify.change import THETA, check_change
-from drivesem.questions.verify.differences import CheckLog
-from drivesem.run.finished import load_run
-from drivesem.run.page import report_runs
-from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame, load_frame
-from drivesem.run.tally import tally
-from drivesem.scenes.segmenter import OnnxSegmenter
-from drivesem.settings.commands import Attack, Report, Study
-from drivesem.settings.edits import read_edits, read_frame_edit
-from drivesem.settings.parsing import parse
-from drivesem.settings.text import to_yaml
-from scene_ir import files
-from scene_ir.io import load_scene, save_scene
-from scene_ir.meshes.load import import_mesh, save_mesh
-from scene_ir.types import Camera, Crop, Environment, Front, Labels, Mesh, Objects, SceneIR, Source
+from tools.experiments.detection.kept import keep
+from tools.experiments.detection.kept_retrain import keep_retrain
+from tools.experiments.detection.kept_transfer import keep_transfer
+from tools.experiments.detection.lessons import BENIGN, lessons_of
+from tools.experiments.detection.robust import KINDS, Counted, FrameStates
+from tools.experiments.detection.running import AttackFacts
+from tools.experiments.detection.taught import RetrainCounts, SeenBenign
+from tools.experiments.detection.transfer import AskedArm, TransferCounts
+from tools.experiments.realism import weights as realism_weights
+from tools.experiments.survey.page import Item, read_answers, read_key, write_key
 from tools.onnx_graph import constant_graph
 
 SIZE_HW = (40, 80)

@@ -16,8 +16,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from drivesem.settings.commands import COMMANDS
-from drivesem.settings.help import TOPICS, command_help
+from drivesem.config.commands import COMMANDS
+from drivesem.config.help import TOPICS, command_help
 
 ROOT = Path(__file__).resolve().parents[2]
 WRITTEN = {

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from detectors.squeezedet import BGR_MEAN, Fire, SqueezeDet
 from drivesem.classify.networks.base import Classifier
-from drivesem.questions.realism import networks
+from tools.experiments.realism import networks
 
 _FIRES = dict(list(SqueezeDet.layout.fires.items())[:8])
 """Up to fire9: what SqueezeDet has after that is its own."""

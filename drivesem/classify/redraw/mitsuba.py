@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from drivesem.classify.redraw.base import Solid
-from drivesem.truth.redraw.base import NoSecondRendererError
+from drivesem.failures.second_renderer.base import NoSecondRendererError
 from scene_ir.render.lit import GAMMA, UP
 
 NAME = "mitsuba"

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from drivesem.classify.redraw.base import Array, Solid
-from drivesem.truth.redraw.screen import Coat, Window, shared_screen
+from drivesem.failures.second_renderer.screen import Coat, Window, shared_screen
 from scene_ir.render.lit import AROUND, GAMMA, UP
 
 _MATT = 0.96**2

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from drivesem.failures.grades import SECOND, Agreement, Count, Grade, Kind
 from drivesem.run.results import Failure, FrameResult, RunSummary
-from drivesem.truth.grades import SECOND, Agreement, Count, Grade, Kind
 
 KINDS = {
     Kind.MISSED: "missed",

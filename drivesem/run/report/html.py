@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from drivesem.failures.grades import Grade
 from drivesem.report import web
 from drivesem.report.tables import number_of
 from drivesem.run.report import grading
@@ -19,7 +20,6 @@ from drivesem.run.report.charts import Fall, curve_chart, fall_chart, key_of, tr
 from drivesem.run.report.frames import Card, CloseUp, cards_of, in_units, told
 from drivesem.run.report.page import Page, ShownRun
 from drivesem.run.results import RunSummary
-from drivesem.truth.grades import Grade
 
 _COLUMNS = {
     "AP50": "ap50",

@@ -5,8 +5,8 @@ import torch
 
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.aims import EVERYTHING, Aim
+from drivesem.config.errors import UsageError
 from drivesem.evaluation.failures import Failures
-from drivesem.settings.errors import UsageError
 
 TARGETS = Targets(torch.rand(4, 4), torch.tensor([0, 0, 1, 2]), torch.tensor([False, False, False, True]))
 FOUND = Detections(torch.rand(2, 4), torch.tensor([0, 2]), torch.tensor([0.9, 0.8]))

@@ -15,7 +15,7 @@ from drivesem.attack.budgets import PRESETS, budget_of, reach_of, written
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import SIX, Budget, Parameter, ParameterSpace
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 from scene_ir.errors import FormatError, RangeError
 
 

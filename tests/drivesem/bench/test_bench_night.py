@@ -9,8 +9,8 @@ import pytest
 
 from drivesem.bench import night
 from drivesem.bench.night import Spent
-from drivesem.settings.commands import Bench
-from drivesem.settings.errors import UsageError
+from drivesem.config.commands import Bench
+from drivesem.config.errors import UsageError
 
 FRAMES = [Spent(2.0, 4.0, 3.0, 1.0, 1.0), Spent(4.0, 8.0, 1.0, 1.0, 1.0)]
 

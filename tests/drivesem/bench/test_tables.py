@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
-from drivesem.bench import memory, step, tables
+from drivesem.bench import step, tables
 from scene_ir.errors import FormatError
+from tools.bench import memory
 
 
 def _result(what: str, **row: Any) -> dict[str, Any]:

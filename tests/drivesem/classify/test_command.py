@@ -260,7 +260,7 @@ def test_a_class_without_pictures(standins, tmp_path, capsys):
 @pytest.mark.parametrize("network", ["vgg16", "resnet50"])
 def test_presets_are_the_papers(network):
     from drivesem.classify.protocol import params_of, reach_of, steps_of
-    from drivesem.settings.parsing import parse
+    from drivesem.config.parsing import parse
 
     table = {
         ("vgg16", "si-fgsm"): (0.002, 0.15),

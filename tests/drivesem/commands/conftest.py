@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivesem.config.commands import Attack
+from drivesem.config.text import to_yaml
 from drivesem.run.results import BoxRecord, FrameResult, dump_frame
-from drivesem.settings.commands import Attack
-from drivesem.settings.text import to_yaml
 from scene_ir import files
 
 HEIGHT, WIDTH = 80, 130

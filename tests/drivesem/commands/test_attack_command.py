@@ -15,9 +15,9 @@ from detectors.incremental import reference
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.cli import main
+from drivesem.config.commands import GRADIENT_FREE, Attack
 from drivesem.run import attack as run_attack
 from drivesem.run.results import load_frame
-from drivesem.settings.commands import GRADIENT_FREE, Attack
 from drivesem.synth.demo import demo_scene
 from drivesem.synth.write import Order, synthesise
 from scene_ir.io import load_scene

@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from drivesem.attack.space import combo
-from drivesem.bench import climb, memory, render, step
-from drivesem.bench.planted import across, across_names, yardstick
-from drivesem.bench.planted.pool import FramePool, SeenCar
+from drivesem.bench import render, step
 from drivesem.bench.scenes import bench_scene
 from drivesem.bench.timing import Taken
 from drivesem.cli import main
 from drivesem.commands import bench
+from tools.bench import climb, memory
+from tools.bench.planted import across, across_names, yardstick
+from tools.bench.planted.pool import FramePool, SeenCar
 
 
 @pytest.fixture(autouse=True)

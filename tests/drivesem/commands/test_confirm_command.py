@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
+from drivesem.analysis.confirm.results import load
 from drivesem.cli import main
-from drivesem.questions.confirm.results import load
+from drivesem.failures.second_renderer import screen
+from drivesem.failures.second_renderer.generator import GeneratorRedraw
 from drivesem.run.results import load_frame
-from drivesem.truth.redraw import screen
-from drivesem.truth.redraw.generator import GeneratorRedraw
 from scene_ir import files
 
 

@@ -17,13 +17,13 @@ import torch
 
 from detectors.base import Detector
 from detectors.types import CLASSES, Detections
+from drivesem.analysis.explain import asking as explain_asking
+from drivesem.analysis.explain import frame as explaining
+from drivesem.analysis.explain.results import read_explanation
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.methods.given import Given
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
-from drivesem.questions.explain import asking as explain_asking
-from drivesem.questions.explain import frame as explaining
-from drivesem.questions.explain.results import read_explanation
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.frame import FrameSettings, attack_scene, write_frame

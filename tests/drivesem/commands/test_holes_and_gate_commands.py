@@ -18,10 +18,10 @@ from torch import Tensor
 
 from detectors.planted import features
 from detectors.types import Detections
+from drivesem.analysis.gate import asking as gate_asking
+from drivesem.analysis.holes.results import load, load_inside
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
-from drivesem.questions.gate import asking as gate_asking
-from drivesem.questions.holes.results import load, load_inside
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run

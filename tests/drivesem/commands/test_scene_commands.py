@@ -15,14 +15,14 @@ import torch
 import trimesh
 
 from drivesem.cli import main
+from drivesem.config.blocks import DATASETS
+from drivesem.config.commands import Derender, Edit, Render
+from drivesem.config.edits import read_frame_edit
+from drivesem.config.parsing import parse
 from drivesem.data.registry import DATASETS as READERS
 from drivesem.data.registry import open_dataset
 from drivesem.run.lock import LOCK
 from drivesem.scenes.sheet import GAIN, PANEL_PX, scene_sheet
-from drivesem.settings.blocks import DATASETS
-from drivesem.settings.commands import Derender, Edit, Render
-from drivesem.settings.edits import read_frame_edit
-from drivesem.settings.parsing import parse
 from scene_ir import files
 from scene_ir.derender.silhouette import extent, placed, silhouettes
 from scene_ir.errors import RangeError

@@ -9,9 +9,9 @@ import pytest
 
 from drivesem.cli import main
 from drivesem.commands.synth import order_of
+from drivesem.config.commands import Synth
+from drivesem.config.parsing import parse
 from drivesem.data.registry import open_dataset
-from drivesem.settings.commands import Synth
-from drivesem.settings.parsing import parse
 from scene_ir import files
 
 

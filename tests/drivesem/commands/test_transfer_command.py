@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from detectors.types import Detections
+from drivesem.analysis.transfer import asking
 from drivesem.cli import main
-from drivesem.questions.transfer import asking
 from drivesem.run import looking
 from drivesem.run.results import load_frame
 

@@ -10,10 +10,10 @@ import pytest
 
 from detectors.registry import code_of
 from drivesem.cli import main
+from drivesem.config.commands import Attack
+from drivesem.config.errors import UsageError
+from drivesem.config.text import to_yaml
 from drivesem.run.folder import attack_of, trusted_attack
-from drivesem.settings.commands import Attack
-from drivesem.settings.errors import UsageError
-from drivesem.settings.text import to_yaml
 
 CODE = """
 from pathlib import Path

@@ -16,6 +16,7 @@ import torch
 import yaml
 
 from detectors.types import CLASSES, Detections
+from drivesem.analysis.verify.differences import CHECKS
 from drivesem.attack import objective
 from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasibility_check import check_scene
@@ -24,7 +25,6 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
-from drivesem.questions.verify.differences import CHECKS
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run import frame as run_frame

@@ -20,8 +20,8 @@ import pytest
 
 from drivesem.cli import main
 from drivesem.commands import view
-from drivesem.settings.commands import View
-from drivesem.settings.parsing import parse
+from drivesem.config.commands import View
+from drivesem.config.parsing import parse
 from drivesem.viewer import frames, window
 from scene_ir.io import load_scene, save_scene
 

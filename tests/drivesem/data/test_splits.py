@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from drivesem.config.blocks import Scenes
+from drivesem.config.commands import Train
+from drivesem.config.errors import UsageError
 from drivesem.data.registry import open_dataset
 from drivesem.data.splits import PUBLISHED, chosen
 from drivesem.data.truth import Exposure, Place
 from drivesem.data.vkitti1 import Vkitti1Writer
 from drivesem.scenes.sources import open_source
-from drivesem.settings.blocks import Scenes
-from drivesem.settings.commands import Train
-from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera
 

@@ -18,10 +18,10 @@ import pytest
 import ray
 
 from drivesem.cli import main
+from drivesem.config.blocks import Sharing
+from drivesem.config.errors import UsageError
 from drivesem.run import cluster as clusters
 from drivesem.run.workers import outcomes
-from drivesem.settings.blocks import Sharing
-from drivesem.settings.errors import UsageError
 from drivesem.store import place
 from scene_ir.errors import FormatError, SceneError
 from tests.drivesem.commands.test_attack_command import contents

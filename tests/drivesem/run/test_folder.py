@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from drivesem.config.commands import Attack
+from drivesem.config.errors import UsageError
 from drivesem.run.folder import NAMED, check_files, claim
 from drivesem.run.lock import let_go
-from drivesem.settings.commands import Attack
-from drivesem.settings.errors import UsageError
 
 
 @pytest.fixture

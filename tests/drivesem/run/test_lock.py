@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from drivesem.cli import main
+from drivesem.config.errors import UsageError
 from drivesem.run.lock import LOCK, held_elsewhere, hold, let_go
-from drivesem.settings.errors import UsageError
 
 OTHER = """
 import sys

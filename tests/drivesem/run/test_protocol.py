@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from drivesem.attack.budgets import budget_of, written
+from drivesem.config.commands import Attack
+from drivesem.config.parsing import parse
 from drivesem.run.protocol import PROTOCOL, follows_paper
-from drivesem.settings.commands import Attack
-from drivesem.settings.parsing import parse
 
 PRESET = Path(__file__).parents[3] / "configs" / "paper.yaml"
 

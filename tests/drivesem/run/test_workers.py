@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from drivesem.config.blocks import Sharing
+from drivesem.config.errors import UsageError
 from drivesem.run.jobs import give_back
 from drivesem.run.workers import outcomes
-from drivesem.settings.blocks import Sharing
-from drivesem.settings.errors import UsageError
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 from tools.hostile.trial import soon
 
@@ -200,7 +200,7 @@ import signal
 from functools import partial
 
 from drivesem.run.workers import outcomes
-from drivesem.settings.blocks import Sharing
+from drivesem.config.blocks import Sharing
 from tests.drivesem.run.test_workers import lingering
 
 signal.signal(signal.SIGINT, signal.default_int_handler)

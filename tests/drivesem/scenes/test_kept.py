@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from drivesem.cli import main
+from drivesem.config.commands import Attack
 from drivesem.scenes.kept import KeptScenes, digest_of
 from drivesem.scenes.sources import PhotographSource, _kept_scenes
-from drivesem.settings.commands import Attack
 from drivesem.synth.demo import demo_scene
 from scene_ir import files
 from scene_ir.derender import derender as derendering

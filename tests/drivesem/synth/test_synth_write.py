@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from drivesem.config.blocks import Sharing
 from drivesem.data.registry import WRITERS, open_dataset
 from drivesem.run.workers import mapping
-from drivesem.settings.blocks import Sharing
 from drivesem.synth import write
 from drivesem.synth.exposure import CLASS_NAMES, expose
 from drivesem.synth.frames import VARIANTS, SynthSettings, boxes_alone, plan_frame, render_frame, variation_of

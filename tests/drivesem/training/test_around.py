@@ -15,11 +15,11 @@ from detectors.base import Candidates
 from detectors.registry import load_detector
 from detectors.types import CLASSES
 from drivesem.attack.space import parse_params
+from drivesem.failures.second_renderer.choose import SecondRenderers
 from drivesem.run.folder import attack_of
 from drivesem.run.results import Failure
 from drivesem.training.around import AT_ONCE, AroundFailures, Consistency, Worst, apart, failures_in, least_sure
 from drivesem.training.attacked import AttackedFrame, RedrawnSamples, frames_of
-from drivesem.truth.redraw.choose import SecondRenderers
 
 BOX = torch.tensor([[10.0, 20.0, 60.0, 50.0]], dtype=torch.float64)
 CAR = torch.zeros(1, dtype=torch.int64)

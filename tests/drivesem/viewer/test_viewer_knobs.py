@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from drivesem.attack.budgets import PRESETS, budget_of
 from drivesem.attack.scene_edits import moved
 from drivesem.attack.space import Parameter
-from drivesem.settings.commands import Edit, Render
-from drivesem.settings.edits import frame_edit, merged, parse_setting
-from drivesem.settings.parsing import parse
+from drivesem.config.commands import Edit, Render
+from drivesem.config.edits import frame_edit, merged, parse_setting
+from drivesem.config.parsing import parse
 from drivesem.viewer.knobs import PICTURE, Knobs
 from scene_ir import ffd
 from scene_ir.errors import RangeError

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivesem.settings.edits import FrameEdit
+from drivesem.config.edits import FrameEdit
 from drivesem.synth.frames import SynthSettings, plan_frame
 from tools.bench import foliage
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.settings.errors import UsageError
+from drivesem.config.errors import UsageError
 from tools.bench import install
 from tools.bench.__main__ import main
 from tools.versions import Ended

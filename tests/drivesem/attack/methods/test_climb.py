@@ -11,7 +11,7 @@ from torch import Tensor
 from drivesem.attack.methods.base import Group
 from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.margin_search import LEAST_PASSES
-from drivesem.settings import commands
+from drivesem.config import commands
 from scene_ir.errors import RangeError
 from tests.drivesem.attack.methods.street import CARS, DIM, Street
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from drivesem.attack.methods.base import Attack
 from drivesem.attack.methods.placebo import Placebo
+from drivesem.config.commands import COUNTED, RESTARTED
+from drivesem.config.commands import Attack as Config
 from drivesem.run.attack import attack_method
-from drivesem.settings.commands import COUNTED, RESTARTED
-from drivesem.settings.commands import Attack as Config
 
 START = torch.zeros(6)
 LIKE = (0.1, -0.3, 0.02, 0.0, 0.5, 0.25)

@@ -9,7 +9,7 @@ from drivesem.attack.methods.cma_es import CMAES
 from drivesem.attack.methods.fgsm import FGSM
 from drivesem.attack.methods.sampling import Sampling
 from drivesem.attack.theta import Projected
-from drivesem.settings.commands import GRADIENT_FREE
+from drivesem.config.commands import GRADIENT_FREE
 from scene_ir.errors import RangeError
 
 STEP = torch.tensor([0.01, 0.02, 0.0, 0.05])

@@ -11,7 +11,7 @@ from drivesem.classify.redraw.base import Solid, likeness
 from drivesem.classify.results import Likeness
 from drivesem.classify.scenes import DRAWN_PX, VIEWS, ObjectScene, camera, generated_background
 from drivesem.classify.space import Change
-from drivesem.truth.redraw.base import NoSecondRendererError
+from drivesem.failures.second_renderer.base import NoSecondRendererError
 from tests.drivesem.classify.standins import model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)

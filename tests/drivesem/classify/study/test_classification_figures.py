@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from drivesem.classify.objects.types import CLASSES
 from drivesem.classify.paper import figures
-from drivesem.classify.study.figures import Answers, Drawing, keeping_shares, verdict
 from drivesem.evaluation.resampling import Interval
+from tools.experiments.classification.figures import Answers, Drawing, keeping_shares, verdict
 
 DRAWING = Drawing(50, 0)
 

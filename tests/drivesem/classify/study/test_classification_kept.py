@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.classify.study import pixels
-from drivesem.classify.study.arms import STRATEGIES
-from drivesem.classify.study.kept import keep_results, load_results
-from drivesem.classify.study.lab import BENIGN
-from drivesem.classify.study.results import OVERALL, Facts, Network, Results
-from drivesem.classify.study.tables import tables_of
-from drivesem.settings.commands import Study
+from drivesem.config.commands import Study
 from scene_ir.errors import FormatError
+from tools.experiments.classification import pixels
+from tools.experiments.classification.arms import STRATEGIES
+from tools.experiments.classification.kept import keep_results, load_results
+from tools.experiments.classification.lab import BENIGN
+from tools.experiments.classification.results import OVERALL, Facts, Network, Results
+from tools.experiments.classification.tables import tables_of
 
 CLASSES = ("box", "ball")
 PICTURES = ("box/0", "box/0", "ball/0", "ball/1", "box/1")

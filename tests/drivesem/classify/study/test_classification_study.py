@@ -11,14 +11,14 @@ from torch import nn
 
 from drivesem.classify import pictures, scenes
 from drivesem.classify.networks import loading
-from drivesem.classify.study import lab, pixels
-from drivesem.classify.study.arms import STRATEGIES
 from drivesem.classify.training import fit_last
 from drivesem.cli import main
-from drivesem.settings.commands import Classify
+from drivesem.config.commands import Classify
 from scene_ir import files
 from tests.drivesem.classify.conftest import Colours
 from tests.drivesem.classify.standins import KINDS, StandIns
+from tools.experiments.classification import lab, pixels
+from tools.experiments.classification.arms import STRATEGIES
 
 
 class Tints(Colours):

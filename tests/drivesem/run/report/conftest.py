@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from drivesem.attack.judging import HEADLINE
+from drivesem.config.commands import Attack
+from drivesem.config.text import to_yaml
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
-from drivesem.settings.commands import Attack
-from drivesem.settings.text import to_yaml
 from scene_ir import files
 from tests.drivesem.counting import summary_of
 

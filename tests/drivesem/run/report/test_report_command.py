@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from drivesem.cli import main
+from drivesem.config.commands import Attack
 from drivesem.evaluation.coco import ClassScores, Scores
 from drivesem.run.page import load_shown, query_curves, write_run
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import cards_of
-from drivesem.settings.commands import Attack
 from scene_ir import files
 
 

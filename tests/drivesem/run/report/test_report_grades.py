@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from drivesem.cli import main
+from drivesem.failures.grades import Agreement, Count
 from drivesem.run.page import load_shown
 from drivesem.run.report import grading
 from drivesem.run.report.frames import cards_of
 from drivesem.run.results import Failure, FrameResult
-from drivesem.truth.grades import Agreement, Count
 
 CERTAIN = Count(16, 16, 15, 16, 1.42, -0.61)
 CHANCE = Count(9, 16, 12, 16)

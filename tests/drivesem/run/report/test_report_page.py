@@ -17,12 +17,12 @@ import pytest
 from PIL import Image
 
 from drivesem.cli import main
+from drivesem.config.commands import Attack
 from drivesem.report.plots import COLOURS
 from drivesem.run.page import load_shown
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import cards_of
 from drivesem.run.results import load_frame
-from drivesem.settings.commands import Attack
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -1,0 +1,257 @@
+"""Figures of detections against labels, by the rules of one protocol."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivesem.analysis.evaluate.report import write_report
+from drivesem.analysis.evaluate.sets import EvalSet, chosen_classes, open_sets
+from drivesem.config.commands import Eval
+from drivesem.config.errors import UsageError, refuse
+from drivesem.evaluation import breakdown, coco, kitti
+from drivesem.evaluation.curves import Rule, Tally, average_precision, sampled_curve
+from drivesem.evaluation.instances import EVERY_CLASS, Found, Truths
+from drivesem.evaluation.matching import Candidates, Match, mean_of
+from drivesem.evaluation.resampling import (
+    DRAWS,
+    Averaged,
+    Difference,
+    Figure,
+    Interval,
+    Sampled,
+    differences,
+    intervals,
+)
+from drivesem.evaluation.results import ClassRow, KittiRow, Result
+
+VOC_OVERLAP = 0.5
+"""At least so much must overlap (VOC)."""
+MANY_FRAMES = 5000
+"""From so many frames on there are no bootstrap draws by default."""
+
+
+def evaluate_files(config: Eval) -> Result:
+    """Read what the configuration names, count, and write what it asks for. Raises UsageError or SceneError for
+    bad input.
+    """
+    with _no_garbage_collection():
+        result = evaluate(config, open_sets(config))
+    if config.out is not None:
+        write_report(Path(config.out), result)
+    return result
+
+
+@contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Python's search for cycles, again and again through a million annotations, takes a sixth of the time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def evaluate(config: Eval, sets: EvalSet) -> Result:
+    """All figures that the configuration asks for."""
+    judge = _Judge(config, sets)
+    first = judge.looked_at(sets.found[0])
+    generator = np.random.default_rng(config.seed)
+    compared: list[Difference] = []
+    spread: list[Interval] = []
+    draws = config.bootstrap
+    if draws is None:
+        draws = 0 if sets.truths.frames > MANY_FRAMES and len(sets.found) == 1 else DRAWS
+    if draws:
+        spread = intervals(first.figures, sets.truths.frames, draws, generator)
+    if len(sets.found) > 1:
+        second = judge.looked_at(sets.found[1])
+        compared = differences(first.figures, second.figures, sets.truths.frames, draws, generator)
+    stats, facts = judge.stats(sets.found[0])
+    counted = sets.truths.label[~sets.truths.ignore]
+    return Result(
+        protocol=config.protocol,
+        facts={
+            "gt": config.gt,
+            "pred": config.pred,
+            **({"pred_b": config.pred_b} if config.pred_b is not None else {}),
+            "frames": sets.truths.frames,
+            "objects": int((counted != EVERY_CLASS).sum()),
+            "detections": len(sets.found[0]),
+            "bootstrap": draws,
+            **facts,
+        },
+        classes=first.classes,
+        curves=first.curves,
+        parts=tuple(breakdown.rows(first.candidates, first.matches, judge.names, judge.rule, sets.weather)),
+        figures={figure.name: figure.value() for figure in first.figures},
+        stats=stats,
+        rows=first.rows,
+        intervals=tuple(spread),
+        comparison=tuple(compared),
+        notes=sets.notes,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Looked:
+    """One set of detections, matched and counted. matches: one a class, at its overlap."""
+
+    candidates: Candidates
+    matches: tuple[Match, ...]
+    classes: tuple[ClassRow, ...]
+    curves: dict[str, list[list[float]]]
+    figures: tuple[Figure, ...]
+    rows: tuple[KittiRow, ...] = ()
+
+
+_MOST_DETECTIONS = 2000
+"""KITTI's rule plays a frame again for each of them: its cost grows with the square."""
+
+
+class _Judge:
+    """One protocol's rules. names: the classes with figures, in the order of their labels after `_own`."""
+
+    def __init__(self, config: Eval, sets: EvalSet) -> None:
+        self.config, self.sets = config, sets
+        self.names: tuple[str, ...] = sets.classes
+        self.truths, self.relabel = sets.truths, np.arange(len(sets.classes) + 1)
+        self.rule: Rule = "coco" if config.protocol == "coco" else "voc"
+        if config.protocol == "kitti":
+            self.rule = "kitti"
+            wanted = chosen_classes(config.classes) if config.classes is not None else kitti.CLASSES
+            self.names = tuple(name for name in kitti.CLASSES if name in wanted)
+            if not self.names:
+                raise UsageError("--classes", f"some of {', '.join(kitti.CLASSES)}", config.classes)
+            self.relabel, self.truths = _without_others(sets, self.names)
+
+    def stats(self, found: Found) -> tuple[list[float] | None, dict[str, Any]]:
+        """COCO's twelve numbers, and who counted."""
+        if self.config.protocol == "kitti":
+            return None, {"small_detections": self.config.small_detections}
+        if self.config.protocol == "voc":
+            return None, {"overlap": VOC_OVERLAP}
+        ids = self.sets.truth_ids
+        engine = coco.fastest_engine(ids)
+        return coco.twelve_numbers(self.truths, found, len(self.names), engine, ids), {"engine": engine}
+
+    def overlap(self, name: str) -> float:
+        """The overlap at which a class is looked at."""
+        return kitti.CLASSES[name] if self.config.protocol == "kitti" else VOC_OVERLAP
+
+    def looked_at(self, found: Found) -> _Looked:
+        """Match one set of detections and count."""
+        curves: list[kitti.Curve] = []
+        if self.config.protocol == "kitti":
+            small = self.config.small_detections
+            of_frame_and_class = np.bincount(found.frame * len(self.sets.classes) + found.label)
+            most = int(of_frame_and_class.max(initial=0))
+            expected = f"at most {_MOST_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
+            refuse(most > _MOST_DETECTIONS, "--pred", expected, f"{most:,}")
+            curves = kitti.evaluate(self.sets.truths, found, self.sets.classes, small)
+            curves = [curve for curve in curves if curve.name in self.names]
+            labels = self.relabel[found.label]
+            found = Found(found.frame, labels, found.boxes, found.score).rows(labels >= 0)
+        limit = coco.MAX_DETECTIONS if self.config.protocol == "coco" else None
+        candidates = Candidates.of(self.truths, found, VOC_OVERLAP, limit)
+        by_overlap = {o: self._match(candidates, o) for o in {self.overlap(name) for name in self.names}}
+        matches = tuple(by_overlap[self.overlap(name)] for name in self.names)
+        tallies = [candidates.tally(match, k) for k, match in enumerate(matches)]
+        further, figures = self._figures(candidates, tallies, curves)
+        return _Looked(
+            candidates,
+            matches,
+            tuple(self._row(k, tally, found, further[k]) for k, tally in enumerate(tallies)),
+            {name: sampled_curve(tally) for name, tally in zip(self.names, tallies, strict=True)},
+            figures,
+            tuple(
+                KittiRow(c.name, c.difficulty, c.r11(), c.r40(), c.ground_truth, c.precision().tolist())
+                for c in curves
+            ),
+        )
+
+    def _match(self, candidates: Candidates, overlap: float) -> Match:
+        return candidates.voc(overlap) if self.config.protocol == "voc" else candidates.coco(overlap)
+
+    def _row(self, label: int, tally: Tally, found: Found, further: dict[str, float | None]) -> ClassRow:
+        best = tally.best_f1()
+        f1, t_star, precision, recall = best if best is not None else (None, None, None, None)
+        return ClassRow(
+            name=self.names[label],
+            overlap=self.overlap(self.names[label]),
+            objects=int(tally.count()),
+            detections=int((found.label == label).sum()),
+            ap=further.pop("ap", average_precision(tally, self.rule)),
+            recall=tally.recall(),
+            t_star=t_star,
+            f1=f1,
+            precision_at_t_star=precision,
+            recall_at_t_star=recall,
+            further=further,
+        )
+
+    def _figures(
+        self, candidates: Candidates, tallies: Sequence[Tally], curves: Sequence[kitti.Curve]
+    ) -> tuple[list[dict[str, float | None]], tuple[Figure, ...]]:
+        """Further figures of each class, and those that intervals are given for."""
+        if self.config.protocol == "kitti":
+            names = [f"{c.name} {c.difficulty} R40" for c in curves]
+            return [{} for _ in tallies], tuple(
+                Figure(name, (Sampled(c),)) for name, c in zip(names, curves, strict=True)
+            )
+        if self.config.protocol == "voc":
+            old = [{"ap07": average_precision(tally, "voc07")} for tally in tallies]
+            parts = tuple(Averaged(tally, "voc") for tally in tallies)
+            return old, (Figure("mAP", parts), Figure("mAP07", tuple(Averaged(t, "voc07") for t in tallies)))
+        averaged: list[list[Averaged]] = []
+        for threshold in coco.IOU_THRESHOLDS.tolist():
+            match = candidates.coco(threshold)
+            averaged.append([Averaged(candidates.tally(match, k), "coco") for k in range(len(self.names))])
+        further: list[dict[str, float | None]] = []
+        for k in range(len(self.names)):
+            values = [row[k].value(None) for row in averaged]
+            further.append({"ap50": values[0], "ap75": values[5], "ap": mean_of(values)})
+        return further, (
+            Figure("AP", tuple(part for row in averaged for part in row)),
+            Figure("AP50", tuple(averaged[0])),
+            Figure("AP75", tuple(averaged[5])),
+        )
+
+
+def _without_others(sets: EvalSet, names: Sequence[str]) -> tuple[np.ndarray, Truths]:
+    """Labels among `names` by label (-1: another class, or every one), and the truths of `names`; neighbours are
+    ignored there.
+    """
+    relabel = np.full(len(sets.classes) + 1, -1)
+    neighbour = np.zeros(len(sets.classes) + 1, np.bool_)
+    for i, kind in enumerate(sets.classes):
+        near = kitti.NEIGHBOURS.get(kind)
+        if kind in names:
+            relabel[i] = names.index(kind)
+        elif near in names:
+            relabel[i], neighbour[i] = names.index(near), True
+    truths = sets.truths
+    labels = relabel[truths.label]
+    kept = truths.rows((labels >= 0) | (truths.label == EVERY_CLASS))
+    label = relabel[kept.label]
+    ignore = kept.ignore | neighbour[kept.label] | (label < 0)
+    own = np.where(neighbour, -1, relabel)
+    return own, Truths(
+        kept.frames,
+        kept.frame,
+        label,
+        kept.boxes,
+        ignore,
+        kept.truncation,
+        kept.occlusion,
+        kept.distance_m,
+        kept.area,
+    )

@@ -1,0 +1,254 @@
+"""Labels and detections as `drivesem eval` takes them: the same frames, the same classes, the same edges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from drivesem.config.commands import Eval
+from drivesem.config.errors import UsageError
+from drivesem.config.values import class_map
+from drivesem.data.kitti_labels import TYPES
+from drivesem.data.label_table import REGION, LabelTable
+from drivesem.evaluation import kitti
+from drivesem.evaluation.instances import Found, Truths, from_xywh, from_xyxy
+from drivesem.report.tables import number_of
+from drivesem.run.labels import layout_of, read
+from drivesem.store import place
+from scene_ir import files
+
+_SHOWN = 3
+_KITTI_TYPES = tuple(kind for kind in TYPES if kind != "DontCare")
+
+
+@dataclass(frozen=True, slots=True)
+class EvalSet:
+    """Labels and one or two sets of detections. classes: labels are indices into it. truth_ids (M,): as the file
+    numbers the labels, where it does. weather (F,): of the frames. notes: what a reader of the figures must know.
+    """
+
+    frames: tuple[str, ...]
+    classes: tuple[str, ...]
+    truths: Truths
+    found: list[Found]
+    truth_ids: np.ndarray | None
+    weather: tuple[str | None, ...]
+    notes: tuple[str, ...] = ()
+
+
+def open_sets(config: Eval) -> EvalSet:
+    """Read, map and align what the configuration names.
+
+    UsageError or FormatError, one line: ids that do not match, a class that nobody mapped, a score that is no
+    number, no detections at all.
+    """
+    gt_path = place(config.gt or "", "--gt")
+    paths = [place(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
+    gt_layout = layout_of(gt_path) if config.gt_format == "auto" else config.gt_format
+    truth = read(gt_path, gt_layout, stage=config.stage)
+    wanted = _wanted(config, truth)
+    gt_known = _known(gt_layout, truth)
+    stages = (config.stage, config.stage_b or config.stage)
+    tables: list[LabelTable] = []
+    for path, stage in zip(paths, stages, strict=False):
+        layout = layout_of(path) if config.pred_format == "auto" else config.pred_format
+        table = read(path, layout, scored=True, stage=stage, truth=truth)
+        # KITTI and runs have a file for every frame; in other layouts a frame without detections has none
+        needed = (wanted or truth.frames) if layout in ("kitti", "run") else ()
+        table = _aligned(table, truth, path, needed)
+        tables.append(table)
+    if wanted is not None:
+        truth, tables = truth.over(wanted), [table.over(wanted) for table in tables]
+    else:
+        tables = [t if t.frames == truth.frames else t.over(truth.frames) for t in tables]
+    classes = _classes(config, truth, tables, gt_known)
+    chosen = _chosen(config, classes)
+    truths, ids = _truths(
+        _renamed(truth, class_map("--map-gt", config.map_gt), classes, gt_path, "--map-gt"), chosen
+    )
+    found = [
+        _found(
+            _renamed(table, class_map("--map", config.map), classes, path, "--map").in_edges(truth.edges), chosen
+        )
+        for table, path in zip(tables, paths, strict=True)
+    ]
+    judged = tuple(classes) if chosen is None else tuple(chosen)
+    return EvalSet(truth.frames, judged, truths, found, ids, tuple(truth.weather()), _notes(config, truths))
+
+
+def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
+    """Classes that a layout has names for, whether they occur or not."""
+    fixed: tuple[str, ...] = _KITTI_TYPES if layout in ("kitti", "vkitti1", "vkitti2") else ()
+    if layout == "run":
+        from detectors.types import CLASSES
+
+        fixed = CLASSES
+    return tuple(dict.fromkeys((*fixed, *truth.kinds)))
+
+
+def _wanted(config: Eval, truth: LabelTable) -> tuple[str, ...] | None:
+    if config.frames is None:
+        return None
+    names = [line.strip() for line in files.read_text(Path(config.frames)).splitlines() if line.strip()]
+    missing = sorted(set(names) - set(truth.frames))
+    if missing or not names:
+        raise UsageError("--frames", f"identifiers of {config.gt}", _some(missing) if missing else "none")
+    return tuple(dict.fromkeys(names))
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > _SHOWN else "")
+
+
+def _aligned(table: LabelTable, truth: LabelTable, path: Path, needed: Sequence[str]) -> LabelTable:
+    """The table, if its frames are labelled ones, and those `needed` among them. Files name them with _ for /."""
+    flat = {"_".join(name.split("/")): name for name in truth.frames}
+    if not set(table.frames) <= set(truth.frames) and set(table.frames) <= set(flat):
+        table = replace(table, frames=tuple(flat[name] for name in table.frames))
+    others = sorted(set(table.frames) - set(truth.frames))
+    if others:
+        raise UsageError(str(path), f"ids of the {len(truth.frames)} labelled frames", f"{_some(others)}")
+    missing = sorted(set(needed) - set(table.frames))
+    if missing:
+        raise UsageError(
+            str(path), "detections of every labelled frame (or --frames)", f"none of {_some(missing)}"
+        )
+    return table
+
+
+def _classes(
+    config: Eval, truth: LabelTable, tables: Sequence[LabelTable], known: Sequence[str]
+) -> tuple[str, ...]:
+    """All class names after mapping. For KITTI its types; else those of the labels, and of detections by them."""
+    if config.protocol == "kitti":
+        return _KITTI_TYPES
+    mapping = class_map("--map-gt", config.map_gt)
+    names = [mapping.get(kind, kind) for kind in truth.kinds]
+    allowed = {mapping.get(kind, kind) for kind in known} | set(names)
+    own = class_map("--map", config.map)
+    detected = {own.get(kind, kind) for table in tables for kind in _used(table)}
+    extra = sorted(name for name in detected if name is not None and name in allowed and name not in names)
+    return tuple(dict.fromkeys(name for name in (*names, *extra) if name is not None))
+
+
+def _used(table: LabelTable) -> list[str]:
+    """The kinds that occur."""
+    return [table.kinds[i] for i in np.unique(table.kind[table.kind >= 0]).tolist()]
+
+
+def _chosen(config: Eval, classes: Sequence[str]) -> tuple[str, ...] | None:
+    if config.classes is None:
+        return None
+    names = chosen_classes(config.classes)
+    for name in names:
+        if name not in classes:
+            raise UsageError("--classes", f"some of {', '.join(classes)}", repr(name))
+    # KITTI's neighbouring classes must stay: its own rules leave out what is not judged
+    return None if config.protocol == "kitti" else names
+
+
+def chosen_classes(text: str) -> tuple[str, ...]:
+    """The names of "Car,Van", each once."""
+    return tuple(dict.fromkeys(word.strip() for word in text.split(",")))
+
+
+def _renamed(
+    table: LabelTable, mapping: Mapping[str, str | None], classes: Sequence[str], path: Path, option: str
+) -> LabelTable:
+    """The table with `classes` as its kinds; boxes of a class that is left out are left out."""
+    index = {name.lower(): i for i, name in reversed(list(enumerate(classes)))}
+    exact = {name: i for i, name in enumerate(classes)}
+    unknown = sorted(set(mapping) - set(table.kinds))
+    if unknown and not set(mapping) & set(table.kinds):
+        raise UsageError(option, f"classes of {path} ({', '.join(table.kinds) or 'none'})", _some(unknown))
+    out = len(classes)
+    places = np.full(len(table.kinds) + 1, REGION)
+    for i, kind in enumerate(table.kinds):
+        name = mapping.get(kind, kind)
+        if name is None:
+            places[i] = out
+            continue
+        # letter case decides only where two classes differ by nothing else
+        place = exact.get(name, index.get(name.lower()))
+        if place is None:
+            if not (table.kind == i).any():
+                place = out
+            else:
+                expected = f"one of {', '.join(classes) or 'none'}, or {option} {kind}=CLASS (or {kind}=-)"
+                raise UsageError(
+                    f"{path}: class {kind!r}",
+                    expected,
+                    f"{number_of(int((table.kind == i).sum()), 'box', 'boxes')} of it",
+                )
+        places[i] = place
+    kind = places[table.kind]  # REGION, -1, is the last place
+    table = replace(table, kinds=tuple(classes), kind=kind)
+    return table.rows(kind != out) if (kind == out).any() else table
+
+
+def _selection(
+    kind: np.ndarray, kinds: Sequence[str], chosen: Sequence[str] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which boxes are of a chosen class or a region, and their labels among the chosen."""
+    if chosen is None:
+        return np.ones(len(kind), np.bool_), kind
+    places = np.full(len(kinds) + 1, len(chosen))
+    places[-1] = REGION
+    for i, name in enumerate(chosen):
+        places[kinds.index(name)] = i
+    labels = places[kind]
+    return labels != len(chosen), labels
+
+
+def _truths(table: LabelTable, chosen: Sequence[str] | None) -> tuple[Truths, np.ndarray | None]:
+    keep, labels = _selection(table.kind, table.kinds, chosen)
+    boxes = from_xywh(table.boxes) if table.edges == "xywh" else from_xyxy(table.boxes)
+    truths = Truths(
+        frames=len(table.frames),
+        frame=table.frame,
+        label=labels,
+        boxes=boxes,
+        ignore=table.ignore,
+        truncation=table.truncation,
+        occlusion=table.occlusion,
+        distance_m=np.hypot(table.pose[:, 3], table.pose[:, 5]),
+        area=np.where(np.isnan(table.area), boxes[:, 4] * boxes[:, 5], table.area),
+    )
+    ids = table.box_ids
+    return (truths, ids) if keep.all() else (truths.rows(keep), None if ids is None else ids[keep])
+
+
+def _found(table: LabelTable, chosen: Sequence[str] | None) -> Found:
+    keep, labels = _selection(table.kind, table.kinds, chosen)
+    boxes = from_xywh(table.boxes) if table.edges == "xywh" else from_xyxy(table.boxes)
+    return Found(table.frame, labels, boxes, table.score).rows(keep & (labels >= 0))
+
+
+def _notes(config: Eval, truths: Truths) -> tuple[str, ...]:
+    """What a reader of the figures must know."""
+    notes: list[str] = []
+    if config.protocol == "kitti":
+        unknown = int(((truths.occlusion < 0) & ~truths.ignore & (truths.label >= 0)).sum())
+        if unknown:
+            notes.append(
+                number_of(
+                    unknown,
+                    "object without occlusion counts as visible",
+                    "objects without occlusion count as visible",
+                )
+            )
+        unknown = int(((truths.truncation < 0) & ~truths.ignore & (truths.label >= 0)).sum())
+        if unknown:
+            notes.append(
+                number_of(
+                    unknown,
+                    "object without truncation counts as whole",
+                    "objects without truncation count as whole",
+                )
+            )
+        judged = ", ".join(kitti.CLASSES)
+        notes.append(f"judged are {judged}; detections below the minimum height: {config.small_detections}")
+    return tuple(notes)

@@ -1,1 +1,0 @@
-"""`drivesem study classification`: the paper's tables for classifiers."""

@@ -1,0 +1,26 @@
+"""What this machine has: torch devices, and memory."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from drivesem.config.errors import UsageError
+
+
+def check_device(device: str) -> None:
+    """Raises UsageError naming --device where this machine has no such torch device."""
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        found = f"{device!r}: {error}".split("\n")[0]
+        raise UsageError("--device", "a torch device of this machine", found) from error
+
+
+def memory_gb() -> float | None:
+    """Gigabytes (2^30 bytes) of memory that this machine has; None where its system does not tell."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, OSError, ValueError):
+        return None

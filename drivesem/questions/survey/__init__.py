@@ -1,1 +1,0 @@
-"""The human study: the page, its key, answers, and how far people agree."""

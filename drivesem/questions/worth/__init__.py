@@ -1,1 +1,0 @@
-"""Information worth and gain: how much counterexamples teach."""

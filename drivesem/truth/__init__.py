@@ -1,1 +1,0 @@
-"""Is a failure one? Kinds, margins, what a camera does between two frames, certificates, second renderers."""

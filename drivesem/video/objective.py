@@ -1,0 +1,180 @@
+"""theta of a clip to its loss: the mean of its frames', in each of which stands what is a frame's attack."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from detectors.base import Predictor
+from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.objective import Objective, Rendered
+from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.config.commands import Drive
+from drivesem.evaluation.failures import judge
+from drivesem.video.space import ClipSpace, project
+from drivesem.video.taking import TakenClip
+from scene_ir import ffd
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What a detector makes of one frame. found, counted: of each object, whether it is found, and judged; lost,
+    phantoms: which are missed and how many are made up that were right in the photograph.
+    """
+
+    rendered: Rendered
+    found: tuple[bool, ...]
+    counted: tuple[bool, ...]
+    lost: tuple[int, ...]
+    phantoms: int
+
+
+class ClipObjective:
+    """What an attack on a clip raises. keys: frames that a gradient step looks at, evenly spread; each step looks
+    at others, in turn. looked: is called for each frame that was looked at. Raises as `Objective`.
+    """
+
+    def __init__(
+        self,
+        clip: TakenClip,
+        detector: Predictor,
+        params: Sequence[Parameter],
+        budget: Budget,
+        config: Drive,
+    ) -> None:
+        self.frames = [
+            Objective(
+                Compositor(scene, RenderSettings()),
+                ParameterSpace(scene, params, budget),
+                detector,
+                config.objective_labels,
+                config.objective,
+                t_star=config.t_star,
+                whole=True,
+            )
+            for scene in clip.scenes
+        ]
+        self.space = ClipSpace([objective.space for objective in self.frames], clip.tracks, config.bend)
+        self.sets: list[FeasibleSet] = [
+            objective.feasible_set(only_bounds=config.project == "bounds") for objective in self.frames
+        ]
+        self._keys = max(min(config.keys, len(self.frames)), 1)
+        self.looked: Callable[[], object] = lambda: None
+        self._steps = 0
+        self._scores: dict[bytes, Score] = {}
+        self._previews: dict[bytes, Score] = {}
+
+    @property
+    def passes(self) -> int:
+        """Of the detector so far, a gradient counted as 3."""
+        return sum(objective.passes for objective in self.frames)
+
+    def problem(self, keep_last: bool = False) -> Problem:
+        """This objective as attacks see it."""
+        space = self.space
+        return Problem(
+            loss_and_grad=self.loss_and_grad,
+            project=lambda theta: project(space, self.sets, theta),
+            score=self.score,
+            step=space.step,
+            lower=space.lower,
+            upper=space.upper,
+            groups=tuple(self._group(parameter, where) for parameter, where in space.blocks.items()),
+            preview=lambda theta: self._previews.get(_key(theta)),
+            keep_last=keep_last,
+        )
+
+    def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
+        """Loss and gradient (D,) at theta (D,), the means over this step's key frames."""
+        count = len(self.frames)
+        chosen = {(self._steps + round(k * count / self._keys)) % count for k in range(self._keys)}
+        self._steps += 1
+        leaf = theta.detach().clone().requires_grad_(True)
+        total, gradient = 0.0, torch.zeros_like(theta)
+        seen: list[Score] = []
+        for frame in sorted(chosen):
+            objective, here = self.frames[frame], self.space.of_frame(leaf, frame)
+            loss, along = objective.loss_and_grad(here.detach())
+            total += loss
+            gradient += torch.autograd.grad(here, leaf, along)[0]
+            preview = objective.preview(here.detach())
+            seen += [] if preview is None else [preview]
+            self.looked()
+        self._previews[_key(theta)] = _summed(seen)
+        return total / len(chosen), gradient / len(chosen)
+
+    def score(self, theta: Tensor) -> Score:
+        """What the detector makes of the whole clip at theta (D,)."""
+        key = _key(theta)
+        if key not in self._scores:
+            self._scores[key] = _summed([self._scored(frame, sight) for frame, sight in self.sights(theta)])
+        return self._scores[key]
+
+    def sights(self, theta: Tensor) -> Iterator[tuple[int, Sight]]:
+        """Every frame at theta (D,), rendered, judged, by its number; none is kept."""
+        for frame in range(len(self.frames)):
+            yield frame, self.sight(theta, frame)
+
+    @torch.no_grad()
+    def sight(self, theta: Tensor, frame: int) -> Sight:
+        """One frame at theta (D,)."""
+        objective, here = self.frames[frame], self.space.of_frame(theta, frame)
+        scene = objective.space.apply(objective.space.scene, here)
+        objective.passes += 1
+        self.looked()
+        return self.judged(frame, objective.look(scene, objective.compositor.render(scene)))
+
+    def judged(self, frame: int, rendered: Rendered) -> Sight:
+        """What stands in a frame's picture."""
+        objective = self.frames[frame]
+        count = len(objective.space.scene.objects)
+        targets = objective.judged.targets(rendered.moved.targets)
+        found = judge(targets, rendered.detections, objective.t_star).found[:count]
+        failed = objective.failures(rendered, "moved")
+        return Sight(
+            rendered,
+            tuple(found.tolist()),
+            tuple((~targets.ignore[:count]).tolist()),
+            failed.lost,
+            len(failed.phantoms),
+        )
+
+    def _scored(self, frame: int, sight: Sight) -> Score:
+        hidden = sight.rendered.moved.out_of_sight.nonzero()[:, 0].tolist()
+        tracks = [self.space.tracks[int(self.space.rows[frame][i])] for i in hidden]
+        paper = self.frames[frame].failures(sight.rendered, "paper")
+        return Score(
+            loss=sight.rendered.loss,
+            lost=len(sight.lost),
+            phantoms=sight.phantoms,
+            success=bool(sight.lost or sight.phantoms),
+            success_paper=paper.success,
+            violations=tuple(f"cars[{track}]: visibility" for track in tracks),
+        )
+
+    def _group(self, parameter: Parameter, where: slice) -> Group:
+        owners = self.space.owners(parameter)
+        return Group(parameter.value, where, owners, ffd.low_modes() if parameter is Parameter.MESH else None)
+
+
+def _summed(scores: Sequence[Score]) -> Score:
+    """A clip's score of its frames': the mean loss, and how much fails in all."""
+    violations = tuple(dict.fromkeys(name for score in scores for name in score.violations))
+    return Score(
+        loss=sum(score.loss for score in scores) / max(len(scores), 1),
+        lost=sum(score.lost for score in scores),
+        phantoms=sum(score.phantoms for score in scores),
+        success=any(score.success for score in scores) and not violations,
+        success_paper=any(score.success_paper for score in scores) and not violations,
+        violations=violations,
+    )
+
+
+def _key(theta: Tensor) -> bytes:
+    return theta.detach().cpu().numpy().tobytes()

@@ -1,0 +1,135 @@
+"""The figures of confirmed frames, by hand."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from detectors.types import CLASSES
+from drivesem.analysis.confirm.judge import RendererFailure, Stand
+from drivesem.analysis.confirm.report import Share, answer_of, summarise
+from drivesem.analysis.confirm.results import Confirmed, dump, load
+from drivesem.evaluation.resampling import wilson
+from drivesem.run.results import BoxRecord, FrameResult
+from scene_ir.errors import FormatError
+
+BOX = (100.0, 100.0, 160.0, 140.0)
+
+
+def lost(survives: bool, index: int | None = 1) -> RendererFailure:
+    return RendererFailure("lost", "Car", BOX, index, None, survives)
+
+
+def phantom(survives: bool) -> RendererFailure:
+    return RendererFailure("phantom", "Car", BOX, None, 0.75, survives)
+
+
+def confirmed(
+    name: str, ours: tuple[RendererFailure, ...] = (), theirs: tuple[RendererFailure, ...] = (), **changes: Any
+) -> Confirmed:
+    facts: dict[str, Any] = {
+        "identifier": name,
+        "source": "00",
+        "renderer": "generator",
+        "compositor": ours,
+        "second": theirs,
+        "stands": (Stand(0, True, 1.0, 0.9), Stand(1, False, 1.0, 0.1)),
+        "targets_benign": (BoxRecord(BOX, "Car", index=1),),
+        "targets_changed": (BoxRecord(BOX, "Car", index=1),),
+        "detections_benign": (BoxRecord(BOX, "Car", score=0.9),),
+        "detections_changed": (),
+        "not_carried": (),
+        "seconds": 1.0,
+    }
+    return Confirmed(**facts | changes)
+
+
+def result(name: str) -> FrameResult:
+    target, hit = (BoxRecord(BOX, "Car", index=0),), (BoxRecord(BOX, "Car", score=0.9),)
+    return FrameResult(
+        identifier=name,
+        objects=1,
+        queries=1,
+        loss_trace=(),
+        theta=(),
+        active_constraints=(),
+        violations=(),
+        targets_benign=target,
+        targets_moved=target,
+        detections_benign=hit,
+        detections_rerendered=hit,
+        detections_attacked=hit,
+        failures=(),
+        became_ignored=(),
+        success_paper=False,
+        success_moved=False,
+        identity_psnr_db=None,
+        seconds=0.0,
+    )
+
+
+FRAMES = [
+    confirmed("a", (lost(True), phantom(False)), (lost(True),)),
+    confirmed("b", (phantom(False),), (lost(False, 2),)),
+    confirmed("c", (lost(False),)),
+    confirmed("d", (), (phantom(False),)),
+    confirmed("e"),
+    confirmed("f", (lost(True),), (lost(True),), not_carried=("objects[3]: no such vehicle",)),
+]
+
+
+def test_shares_by_hand() -> None:
+    report = summarise(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
+    assert report.frames == 5
+    assert report.left == {"f": ["objects[3]: no such vehicle"]}
+    assert [(s.name, s.survive, s.failures) for s in report.shares] == [
+        ("frames", 2, 3),
+        ("frames, same failure", 1, 3),
+        ("lost", 1, 2),
+        ("phantoms", 0, 2),
+        ("frames, second only", 1, 2),
+    ]
+    assert (report.shares[0].low, report.shares[0].high) == wilson(2, 3)
+    assert report.overlap == (pytest.approx(0.9), 0.9, 5)
+    assert {name: s.headline.ap50 for name, s in report.scores.items()} == {
+        "photograph": pytest.approx(1.0),
+        "second renderer, unchanged": pytest.approx(1.0),
+        "compositor": pytest.approx(1.0),
+        "second renderer": 0.0,
+    }
+    assert report.to_json()["survive"] == pytest.approx(2 / 3)
+
+
+def test_without_a_failure_there_is_no_share() -> None:
+    assert Share.of("frames", []) == Share("frames", 0, 0, None, None, None)
+    report = summarise([FRAMES[-1]], [result("f")], CLASSES, 0.5)
+    assert (report.frames, report.scores, report.overlap) == (0, {}, None)
+    assert report.to_json()["survive"] is None
+
+
+def test_files(tmp_path: Path) -> None:
+    report = summarise(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
+    answer_of(tmp_path, report, FRAMES, {}, {}).write()
+    rows = list(csv.DictReader((tmp_path / "confirm.csv").read_text().splitlines()))
+    assert [row["survives"] for row in rows] == ["True", "True", "False", "False", "False", "True"]
+    assert (rows[0]["lost_both"], rows[0]["phantoms_compositor"], rows[0]["box_iou"]) == ("1", "1", "0.9")
+    assert {row["second"] for row in rows} == {"generator"}
+    assert rows[5]["not_carried"] == "objects[3]: no such vehicle"
+    text = (tmp_path / "confirm.md").read_text()
+    assert "| frames | 3 | 2 | 66.67 |" in text
+    assert "Frame f is not counted: objects[3]: no such vehicle." in text
+
+
+def test_a_frame_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / "confirmed.json"
+    path.write_text(dump(FRAMES[0]))
+    assert load(path) == FRAMES[0]
+    path.write_text('{"schema": 2}')
+    with pytest.raises(FormatError, match=r"confirmed\.json: identifier: expected a value"):
+        load(path)
+    path.write_text('{"schema": 0}')
+    with pytest.raises(FormatError, match="schema"):
+        load(path)

@@ -1,0 +1,162 @@
+"""Tables, CSV and plots of explanations made by hand; and back from JSON what was written."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+
+from drivesem.analysis.explain.players import Size
+from drivesem.analysis.explain.plots import write_waterfalls
+from drivesem.analysis.explain.report import answer_of, means, sheets, what_if
+from drivesem.analysis.explain.results import (
+    Contribution,
+    Explanation,
+    Least,
+    PartOutcome,
+    Sensitivity,
+    read_explanation,
+    write_explanation,
+)
+from drivesem.run.results import Coordinate, Failure
+from scene_ir.errors import FormatError
+
+GOOD, BAD = PartOutcome(1.0, 0, 0, False, False), PartOutcome(3.0, 1, 2, True, False)
+
+
+def contribution(kind: str, name: str, loss: float, fails: float, error: float | None = None) -> Contribution:
+    bad, good = (BAD, GOOD) if fails > 0.5 else (GOOD, BAD)
+    return Contribution(kind, name, loss, error, fails, error, 2 * loss, abs(loss) / 2, bad, good)
+
+
+def explanation(name: str, rotate: float = 0.5) -> Explanation:
+    sizes = (
+        Size("rotate", 0, 2.0, "deg", 3.5),
+        Size("rotate", 2, 5.0, "deg", 8.7),
+        Size("mesh", 2, 0.1, "m", 1.0),
+    )
+    least = Least(
+        scan=(False, True, False, True),
+        sign_changes=3,
+        scale_whole=0.3,
+        scale=0.5,
+        dropped=("mesh", "objects[0]"),
+        norm_found=8.0,
+        norm_whole=4.0,
+        norm=2.0,
+        outcome=replace(BAD, phantoms=0),
+        violations=(),
+        sizes=(Size("rotate", 2, 2.5, "deg", 4.3),),
+        failures=(Failure("lost", "Car", (1.0, 2.0, 3.0, 4.0), index=2),),
+        theta=(Coordinate("objects[2].yaw", "rad", 0.04, -0.35, 0.35, "2.5 deg"),),
+    )
+    return Explanation(
+        identifier=name,
+        source="abc",
+        objects=3,
+        benign=GOOD,
+        found=BAD,
+        contributions=(
+            contribution("parameter", "rotate", 2 - rotate, 0.75),
+            contribution("parameter", "mesh", rotate, 0.25),
+            contribution("object", "objects[0]", -0.5, 0.0, 0.1),
+            contribution("object", "objects[2]", 2.5, 1.0, 0.1),
+        ),
+        exact=("parameter",),
+        sizes=sizes,
+        least=least,
+        sensitivity={"benign": Sensitivity((0.1, 0.2, 0.3), 0.4)},
+        renders=99,
+        seconds=1.5,
+    )
+
+
+def test_back_from_json(tmp_path: Path) -> None:
+    path, told = tmp_path / "explain.json", explanation("a")
+    write_explanation(path, told)
+    assert read_explanation(path) == told
+    for broken in ("[]", "{}", '{"schema": 1}', path.read_text().replace('"sign_changes"', '"signs"')):
+        (tmp_path / "broken.json").write_text(broken)
+        with pytest.raises(FormatError, match=r"broken\.json: (schema|identifier|least)"):
+            read_explanation(tmp_path / "broken.json")
+    (tmp_path / "old.json").write_text('{"schema": 0}')
+    with pytest.raises(FormatError, match="schema: expected 1"):
+        read_explanation(tmp_path / "old.json")
+
+
+def test_the_least_change_in_words() -> None:
+    least = explanation("a").least
+    assert least.left == 0.25
+    assert least.parameters == ("rotate",)
+    assert least.objects == (2,)
+
+
+def test_means_over_frames() -> None:
+    rows = means([explanation("a", 0.5), explanation("b", 1.5)], 200, 0)
+    rotate, mesh = rows
+    assert (rotate.name, rotate.loss.value, mesh.loss.value) == ("rotate", 1.0, 1.0)
+    assert (rotate.loss.low, rotate.loss.high) == (0.5, 1.5)
+    assert (rotate.fails.value, rotate.fails.low, rotate.fails.high) == (0.75, 0.75, 0.75)
+    assert (rotate.alone, rotate.without, mesh.alone, mesh.without) == (2, 0, 0, 2)
+    assert (rotate.needed, mesh.needed) == (2, 0)
+    assert (rotate.found, rotate.least, mesh.found, mesh.least) == (5.0, 2.5, 0.1, None)
+    assert rotate.gradient_share == pytest.approx(0.5)
+    (lone, _) = means([explanation("a")], 0, 0)
+    assert (lone.loss.value, lone.loss.low, lone.loss.high) == (1.5, None, None)
+    assert lone.to_json()["loss"] == 1.5
+
+
+def test_a_parameter_that_some_frames_leave_alone() -> None:
+    without = explanation("b")
+    without = replace(
+        without,
+        contributions=tuple(c for c in without.contributions if c.name != "mesh"),
+        sizes=without.sizes[:2],
+    )
+    _, mesh = means([explanation("a", 1.0), without], 0, 0)
+    assert mesh.loss.value == 0.5
+    assert (mesh.alone, mesh.without) == (0, 2)
+    assert mesh.gradient_share == 0.5
+
+
+def test_tables() -> None:
+    frames = [explanation("a"), explanation("b")]
+    by_parameter, by_frame = sheets(frames, means(frames, 0, 0))
+    assert by_parameter.rows[0] == ("rotate", "+1.50", "+75", "75", "2", "0", "2", "5 deg", "2.5 deg")
+    row = dict(zip(by_frame.columns, by_frame.rows[0], strict=True))
+    assert (row["loss"], row["failures"], row["still"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
+    assert (row["enough, %"], row["needs"], row["cars"]) == ("25.0", "rotate", "2 of 3")
+    assert row["most loss by"] == "[2] +2.50"
+    parts = {row[0]: row for row in what_if(frames[0]).rows}
+    assert parts["everything"][4:6] == ("3.00", "1 + 2")
+    assert parts["rotate"][1:4] == ("+1.50", "+75", "75")
+    assert parts["objects[0]"][1] == "-0.50 ± 0.10"
+    assert parts["objects[0]"][4:] == ("1.00", "0 + 0", "3.00", "1 + 2")
+
+
+def test_files(tmp_path: Path) -> None:
+    frames = [explanation("a"), explanation("b", 1.5)]
+    answer_of(tmp_path, frames, means(frames, 20, 0), 20, {"frames_failed": {}, "frames_by_exchange": []}).write()
+    rows = list(csv.DictReader((tmp_path / "explain.csv").read_text().splitlines()))
+    assert [row["frame"] for row in rows] == ["a"] * 4 + ["b"] * 4
+    assert (rows[0]["found"], rows[0]["least"], rows[0]["unit"]) == ("5.0", "2.5", "deg")
+    assert (rows[2]["name"], rows[2]["found"], rows[2]["least_steps"]) == ("objects[0]", "", "0.0")
+    assert rows[3]["least_steps"] == "4.3"
+    page = (tmp_path / "explain.md").read_text()
+    assert page.count("\n## ") == 4
+    assert all(len(line.split("|")) > 5 for line in page.splitlines() if line.startswith("|"))
+    assert min(cv2.imread(str(tmp_path / "explain.png")).shape[:2]) > 150
+
+
+def test_waterfalls_grow_with_the_number_of_cars(tmp_path: Path) -> None:
+    few, many = explanation("a"), explanation("a")
+    cars = tuple(contribution("object", f"objects[{i}]", (-1) ** i * 0.3, 0.1, 0.05) for i in range(12))
+    many = replace(many, contributions=many.of_kind("parameter") + cars)
+    heights = []
+    for told in (few, many):
+        write_waterfalls(tmp_path / "shapley.png", told)
+        heights.append(cv2.imread(str(tmp_path / "shapley.png")).shape[0])
+    assert heights[1] > heights[0] + 10 * 40

@@ -1,0 +1,190 @@
+"""Rows of the gate from hand-made pairs: shares, intervals, what grew and how often by chance; verdict, XML."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivesem.analysis.gate.report import answer_of, junit
+from drivesem.analysis.gate.results import Pair
+from drivesem.analysis.gate.rows import ALL, HOLE, KIND, PHANTOMS, rows_of
+
+DRAWS = 200
+
+
+def first(count: int, of: int) -> tuple[bool, ...]:
+    return tuple(i < count for i in range(of))
+
+
+def pair(
+    before: int,
+    after: int,
+    of: int = 20,
+    error: str = "missed",
+    index: int = 0,
+    phantoms: tuple[int, int] = (0, 0),
+) -> Pair:
+    """The new detector fails in the samples in which the old one does, and in more or in fewer."""
+    return Pair(index, "Car", error, *(first(count, of) for count in (before, after, *phantoms)))
+
+
+def rows(found, tolerance: float = 0.05):
+    return rows_of(found, tolerance, DRAWS, 0)
+
+
+def test_shares_and_order() -> None:
+    found = {"a": [pair(10, 10), pair(4, 14, index=1)], "b": [pair(10, 5, error="placed")]}
+    told = rows(found)
+    assert [(row.level, row.hole) for row in told] == [
+        (HOLE, "a: objects[1]"),
+        (HOLE, "a: objects[0]"),
+        (HOLE, "b: objects[0]"),
+        (KIND, "missed"),
+        (KIND, "placed"),
+        (ALL, ALL),
+        (PHANTOMS, PHANTOMS),
+    ]
+    most, whole = told[0], told[-2]
+    assert (most.before, most.after, most.difference) == pytest.approx((0.2, 0.7, 0.5))
+    assert (whole.before, whole.after, whole.samples, whole.holes) == pytest.approx((24 / 60, 29 / 60, 60, 3))
+
+
+def test_what_grew_is_beyond_the_tolerance_and_beyond_chance() -> None:
+    assert not any(row.grew for row in rows({"a": [pair(10, 10)]}))
+    assert rows({"a": [pair(4, 14)]})[0].grew
+    assert not rows({"a": [pair(4, 14)]}, tolerance=0.6)[0].grew
+    # One sample of 20 is above the tolerance, and may be chance.
+    one = rows({"a": [pair(10, 12)]})[0]
+    assert one.difference == pytest.approx(0.1)
+    assert one.low == pytest.approx(0.0)
+    assert not one.grew
+    # Better never fails.
+    assert not any(row.grew for row in rows({"a": [pair(14, 4), pair(20, 0, index=1)]}))
+
+
+def test_phantoms_are_a_row_of_their_own() -> None:
+    """Of all samples, whether the object is lost there or not; they alone may fail a gate."""
+    told = rows({"a": [pair(10, 9, phantoms=(2, 12))], "b": [pair(3, 3, phantoms=(0, 9))]})
+    assert [row.hole for row in told if row.grew] == [PHANTOMS]
+    row = told[-1]
+    assert (row.before, row.after, row.samples, row.holes) == pytest.approx((2 / 40, 21 / 40, 40, 2))
+    case = ET.fromstring(junit(told, {})).find(f"testcase[@name='{PHANTOMS}']/failure")
+    assert case is not None
+    assert case.attrib["message"] == "phantoms in 5.0 % before, 52.5 % after"
+
+
+def test_pairing_counts() -> None:
+    """Both fail half of the time, the one where the other does not: as often, so nothing grew, but not alike."""
+    even, never = tuple(i % 2 == 0 for i in range(20)), (False,) * 20
+    opposite = Pair(0, "Car", "missed", even, tuple(not one for one in even), never, never)
+    alike, other = rows({"a": [pair(10, 10)]})[0], rows({"a": [opposite]})[0]
+    assert alike.low == alike.high == 0
+    assert other.low is not None
+    assert other.high is not None
+    assert other.low < -0.2 < 0.2 < other.high
+    assert not other.grew
+
+
+def test_p_is_of_samples_in_which_one_fails_alone() -> None:
+    """Ten of them, all of the new detector. A kind of one hole, and all of one kind, are no further test."""
+    hole, kind, whole, phantoms = rows({"a": [pair(4, 14)]})
+    assert (hole.p, kind.p, whole.p, phantoms.p) == pytest.approx((2**-9, 2**-9, 2**-9, 1))
+    # Two holes and phantoms: three tests, and all of both holes a fourth.
+    told = {row.hole: row.p for row in rows({"a": [pair(4, 14)], "b": [pair(9, 9)]})}
+    assert told["a: objects[0]"] == told["missed"] == told[ALL] == pytest.approx(4 * 2**-10)
+    assert told["b: objects[0]"] == 1
+
+
+def test_one_sample_tells_nothing() -> None:
+    told = rows({"a": [pair(0, 1, of=1)]})
+    assert (told[0].difference, told[0].low) == (1, 1)
+    assert not any(row.grew for row in told)
+
+
+def seen(holes: int, samples: int, new_alone: float, old_alone: float, seed: int) -> dict[str, list[Pair]]:
+    """Holes in which one half of the samples is lost, and in so large shares of all by one detector alone."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for index in range(holes):
+        lot, lost = rng.random(samples), rng.random(samples) < 0.5
+        new, old = lot < new_alone, lot > 1 - old_alone
+        before, after = (lost | old) & ~new, (lost | new) & ~old
+        found.append(Pair(index, "Car", "missed", *(tuple(one.tolist()) for one in (before, after))))
+    return {"a": found}
+
+
+def share_not_passed(holes: int, samples: int, new_alone: float, old_alone: float, of: int) -> float:
+    told = (rows_of(seen(holes, samples, new_alone, old_alone, seed), 0.05, 40, seed) for seed in range(of))
+    return sum(any(row.grew for row in one) for one in told) / of
+
+
+@pytest.mark.parametrize("samples", [8, 32])
+@pytest.mark.parametrize("holes", [1, 2, 3, 13])
+def test_detectors_that_are_alike_pass(holes: int, samples: int) -> None:
+    """Each alone loses the object in a tenth of the samples."""
+    assert share_not_passed(holes, samples, 0.1, 0.1, of=80) <= 0.06
+
+
+@pytest.mark.parametrize(
+    ("holes", "samples", "new_alone"),
+    [
+        pytest.param(1, 24, 0.7, id="nearly blind, in one small hole"),
+        pytest.param(3, 32, 0.3, id="in three holes"),
+        pytest.param(13, 32, 0.2, id="a little worse in each of 13 holes"),
+    ],
+)
+def test_one_that_is_worse_does_not(holes: int, samples: int, new_alone: float) -> None:
+    assert share_not_passed(holes, samples, new_alone, 0.05, of=40) >= 0.95
+
+
+def test_a_blind_one_does_not_pass_in_one_hole_of_24_samples() -> None:
+    assert rows({"a": [pair(12, 24, of=24)]})[0].grew
+    assert rows({"a": [pair(18, 24, of=24)]})[0].grew
+
+
+NONE = "nothing to compare"
+
+
+@pytest.mark.parametrize(
+    ("found", "failed", "passed", "says_none"),
+    [
+        pytest.param({}, {}, True, True, id="no certain failure"),
+        pytest.param({}, {"a": "no scene"}, False, False, id="all frames failed"),
+        pytest.param({"b": [pair(5, 5)]}, {"a": "no scene"}, False, False, id="one of two frames failed"),
+        pytest.param({"a": [Pair(0, "Car", "missed", (), ())]}, {}, False, False, id="no sample counts"),
+        pytest.param({"b": [pair(5, 5)]}, {}, True, False, id="nothing grew"),
+        pytest.param({"b": [pair(4, 14)]}, {}, False, False, id="a row grew"),
+    ],
+)
+def test_the_verdict(found, failed, passed, says_none, tmp_path: Path) -> None:
+    """A gate is passed where all that should be compared was compared, and no row grew."""
+    answer = answer_of(tmp_path, rows(found), sum(map(len, found.values())), {"before": "x", "after": "y"}, failed)
+    assert answer.data["passed"] == passed
+    assert answer.data["frames_failed"] == failed
+    assert any(NONE in note for note in answer.notes) == says_none
+    assert any("could not be compared" in note for note in answer.notes) == bool(failed)
+    suite = ET.fromstring((tmp_path / "gate.xml").read_text())
+    assert int(suite.attrib["tests"]) == len(list(suite))
+    assert int(suite.attrib["errors"]) == len(failed)
+    errors = {case.attrib["name"]: case.find("error") for case in suite}
+    assert {name: one.attrib["message"] for name, one in errors.items() if one is not None} == failed
+
+
+def test_without_failures_there_is_nothing_to_say() -> None:
+    assert rows({}) == []
+    assert rows({"a": [Pair(0, "Car", "missed", (), (), (), ())]}) == []
+    assert ET.fromstring(junit([], {})).attrib["tests"] == "0"
+
+
+def test_junit() -> None:
+    told = rows({"a<b>": [pair(4, 14)], "c": [pair(5, 5)]})
+    suite = ET.fromstring(junit(told, {}))
+    assert (suite.attrib["tests"], suite.attrib["failures"]) == (str(len(told)), str(sum(r.grew for r in told)))
+    cases = {case.attrib["name"]: case for case in suite}
+    failure = cases["a<b>: objects[0]"].find("failure")
+    assert failure is not None
+    assert failure.attrib["message"] == "lost 20.0 % before, 70.0 % after"
+    assert cases["c: objects[0]"].find("failure") is None

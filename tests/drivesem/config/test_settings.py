@@ -1,0 +1,363 @@
+"""The command line as a user types it: precedence, unknown keys, one line and exit code 2 for bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import drivesem
+from drivesem.cli import main
+from drivesem.config.blocks import Command, Regions, constraints, option
+from drivesem.config.commands import COMMANDS, Attack, Drive, Explain, Study, Synth
+from drivesem.config.constraints import Anywhere, Constraint, Folder, Of, OneOf, Required, Within
+from drivesem.config.errors import UsageError
+from drivesem.config.parsing import commands_of, parse, preset_words
+from drivesem.config.text import to_yaml
+from drivesem.run.folder import attack_of
+
+ROOT = Path(__file__).parents[3]
+CONFIGS = ROOT / "configs"
+
+
+def test_defaults() -> None:
+    assert parse(["attack"]) == Attack()
+    assert parse(["synth", "--frames", "3"]) == Synth(frames=3)
+
+
+def test_command_line_wins_over_preset(tmp_path: Path) -> None:
+    preset = tmp_path / "preset.yaml"
+    preset.write_text("combo: 3\nsteps: 4\njson: true\nresume: false\n")
+    config = parse(["attack", "--steps", "7", "--config", str(preset)])
+    assert config == Attack(combo=3, steps=7, json=True, resume=False)
+
+
+def test_resolved_configuration_reads_back(tmp_path: Path) -> None:
+    config = Attack(params="translate,mesh", limit=2, keep_going=True, resume=False, out="a b")
+    path = tmp_path / "config.yaml"
+    path.write_text("".join(f"{line}\n" for line in to_yaml(config).splitlines() if "null" not in line))
+    assert parse(["attack", f"--config={path}"]) == config
+
+
+def test_words_without_an_option_are_no_settings_of_a_file(tmp_path: Path) -> None:
+    """Commands write them into config.yaml with all others: null where there were none."""
+    path = tmp_path / "config.yaml"
+    path.write_text(to_yaml(Drive(steps=3)))
+    assert parse(["drive", "--config", str(path)]) == Drive(steps=3)
+    assert parse(["drive", "clips", "--config", str(path)]) == Drive(steps=3, clip="clips")
+    path.write_text(to_yaml(Drive(clip="clips")))
+    with pytest.raises(UsageError, match=r"config\.yaml: clip: expected nothing: .*, found clips"):
+        parse(["drive", "--config", str(path)])
+
+
+_NEEDED: dict[str, tuple[str, ...]] = {
+    "study": ("single",),
+    "classify": ("attack",),
+    "explain": ("--run", "run"),
+    "confirm": ("--run", "run"),
+    "plausibility": ("--run", "run"),
+    "verify": ("--run", "run"),
+    "transfer": ("--run", "run", "--detectors", "squeezedet"),
+    **dict.fromkeys(("holes", "report", "realism", "worth", "survey"), ("run",)),
+    "gate": ("run", "--after", "new.safetensors"),
+    "survey-results": ("answers.csv", "--survey", "survey"),
+    **dict.fromkeys(("render", "edit", "view"), ("scene",)),
+    "eval": ("--gt", "labels", "--pred", "results"),
+    "convert": ("labels", "--to", "coco", "--out", "out"),
+    "export": ("--run", "run", "--to", "coco", "--out", "out"),
+    "check": ("--detector", "squeezedet"),
+    **dict.fromkeys(("anchors", "train"), ("--root", "frames")),
+    "retrain": ("--run", "run"),
+}
+"""Words without which a command does not begin."""
+
+
+@functools.cache
+def default_of(name: str) -> Command:
+    """A command's settings with nothing beside what it needs."""
+    return parse([name, *_NEEDED.get(name, ())])
+
+
+@pytest.mark.parametrize("preset", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_presets_parse(preset: Path) -> None:
+    names = commands_of(str(preset))
+    assert names
+    for name in names:
+        by_file = parse([name, "--config", str(preset), *_NEEDED.get(name, ())])
+        assert isinstance(by_file, COMMANDS[name])
+        for told in (preset.stem, f"configs/{preset.stem}.yaml"):
+            assert parse([name, "--config", told, *_NEEDED.get(name, ())]) == by_file
+
+
+def test_papers_preset_is_for_attacks_and_studies() -> None:
+    theirs = {"objective": "confidence", "objective_labels": "paper", "keep": "last", "project": "bounds"}
+    theirs["parametrisation"] = "roi"
+    attack = parse(["attack", "--config", str(CONFIGS / "paper.yaml")])
+    study = parse(["study", "multi", "--config", str(CONFIGS / "paper.yaml"), "--steps", "3"])
+    assert attack == Attack(combo=2, **theirs)
+    assert study == Study(name="multi", steps=3, **theirs)
+    with pytest.raises(UsageError, match=r"paper\.yaml: expected a preset for drivesem retrain, found one"):
+        preset_words(str(CONFIGS / "paper.yaml"), "retrain")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("combos: 2\n", "combos: expected one of"),
+        ("[1, 2]\n", "expected a mapping"),
+        ("combo: [\n", "expected YAML"),
+        ("json: 3\n", "json: expected true or false"),
+        ("steps: {a: 1}\n", "steps: expected one value"),
+        ("for: [attack, study]\ncombos: 2\n", "combos: expected one of"),
+        ("for: [attack, studies]\ncombo: 2\n", "for: expected commands: attack, "),
+        ("for: study\nsteps: 2\n", "expected a preset for drivesem attack, found one for study"),
+    ],
+)
+def test_bad_preset(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(UsageError, match=message) as caught:
+        preset_words(str(path), "attack")
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["attack", "--combo", "7"], "--combo: expected 1, 2, 3 or 4, found 7"),
+        (["attack", "--combo", "2", "--params", "mesh"], "--params: expected no --combo"),
+        (["attack", "--params", "wheels"], "wheels"),
+        (["attack", "--steps", "0"], "--steps: expected at least 1, found 0"),
+        (["attack", "--steps", "many"], "--steps"),
+        (["attack", "--limit", "0"], "--limit"),
+        (["attack", "--workers", "0"], "--workers"),
+        (["attack", "--dataset", "kitti"], "--root"),
+        (["attack", "--dataset", "kitty", "--root", "."], "kitty"),
+        (["attack", "--root", "somewhere"], "--root"),
+        (["attack", "--objective-labels", "mine"], "--objective-labels"),
+        (["attack", "--frobnicate"], "frobnicate"),
+        (["attack", "--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["attack", "--config"], "--config"),
+        (["attack", "--config="], "--config: expected a YAML file, or a preset: paper, quick, found nothing"),
+        (["attack", "--config=", "--json"], "preset: paper, quick, found nothing"),
+        (["attack", "--config", ""], "--config: expected a YAML file, or a preset: paper, quick, found nothing"),
+        (["attack", "--out", "b\udcffd"], r"--out: expected text that UTF-8 holds, found 'b\udcffd'"),
+        (["attack", "--config", "qick"], "or a preset: paper, quick, found qick; did you mean quick?"),
+        (["view"], "SCENE|RUN: expected a value (drivesem view --help says which), found none"),
+        (["export", "runs/a"], "--to: expected a value (drivesem export --help says which), found none"),
+        (["classify"], "{data,train,attack,confirm,explain,holes,gate}: expected a value (drivesem classify"),
+        (["attack", "--detector", "nowhere.safetensors"], "nowhere.safetensors"),
+        (
+            ["attack", "--detector", "retinanot"],
+            "--detector: expected a detector (squeezedet, yolov3-slim, a path.s",
+        ),
+        (["attack", "--detector", "retinanot"], "module:, ensemble: or planted:), found 'retinanot'"),
+        (["gate", "run"], "--after: expected the detector that is to take the place of --before, found nothing"),
+        (
+            ["classify", "gate", "run"],
+            "--network: expected the network that is to take the place of the run's, found",
+        ),
+        (["attack", "--device", "quantum"], "quantum"),
+        (["frobnicate"], "frobnicate"),
+        (["attak"], "found attak; did you mean attack?"),
+        (["attack", "--limt", "3"], "found --limt; did you mean --limit?"),
+        (["attack", "--limt=3"], "found --limt; did you mean --limit?"),
+        (["study", "multi", "--no-confirm"], "an option of drivesem study"),
+        (["attack", "--method", "climbs"], "--method: expected one of si-fgsm, apgd"),
+        (["attack", "--method", "climbs"], "found climbs; did you mean climb?"),
+        (["attack", "stray"], "expected options of drivesem attack (its --help lists them), found stray"),
+        (["verify", "--limit", "2"], "--run: expected a folder of drivesem attack, found nothing"),
+        (["verify", "nowhere"], "nowhere"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("drivesem: ")
+    assert message in captured.err
+    assert not list(tmp_path.iterdir()), "bad settings leave nothing behind"
+
+
+_TAKE_RUNS = ["verify", "explain", "confirm", "plausibility", "transfer --detectors squeezedet"]
+
+
+@pytest.mark.parametrize("command", _TAKE_RUNS)
+def test_the_run_may_stand_first(command: str) -> None:
+    name, *rest = command.split()
+    assert parse([name, "runs/a", *rest]) == parse([name, "--run", "runs/a", *rest])
+
+
+def outside(constraint: Constraint, number: type) -> list[Any]:
+    """Values that a constraint does not let through."""
+    match constraint:
+        case Within(low, high, ends):
+            low_values = [low - 1] if ends[0] == "[" else [low - 1, low]
+            high_values = [] if high == math.inf else [high + 1] if ends[1] == "]" else [high + 1, high]
+            return [number(value) for value in (*low_values, *high_values)] + [math.nan] * (number is float)
+        case Required():
+            return []
+        case Of() | Anywhere():
+            return []
+        case Folder() | OneOf():
+            return ["nowhere"]
+        case _:
+            return ["="]
+
+
+DECLARED = [
+    (name, field, constraint)
+    for name, command in COMMANDS.items()
+    for field, declared in constraints(command).items()
+    for constraint in declared
+]
+
+
+@pytest.mark.parametrize(("name", "field", "constraint"), DECLARED)
+def test_what_a_type_declares_is_asked(name: str, field: str, constraint: Constraint) -> None:
+    config, flag = default_of(name), option(field)
+    kind = next(f for f in dataclasses.fields(config) if f.name == field)
+    number = float if "float" in str(kind.type) or "Share" in str(kind.type) or "Score" in str(kind.type) else int
+    for value in outside(constraint, number):
+        with pytest.raises(UsageError, match=rf"^{flag}: expected .*, found ") as caught:
+            dataclasses.replace(config, **{field: value}).check()
+        assert "\n" not in str(caught.value)
+    if isinstance(constraint, Required):
+        with pytest.raises(UsageError, match=f"^{constraint.setting or flag}: expected .*, found nothing$"):
+            dataclasses.replace(config, **{field: None}).check()
+    if isinstance(constraint, Of):
+        other = next(method for method in ("subsets", "si-fgsm") if method not in constraint.methods)
+        with pytest.raises(UsageError, match=f"^{flag}: expected --method .* beside it, found {other}$"):
+            dataclasses.replace(config, method=other, **{field: 3}).check()
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value"),
+    [
+        (name, field, value)
+        for name, field, constraint in DECLARED
+        if isinstance(constraint, Within)
+        for value in outside(constraint, int)[:1]
+    ],
+)
+def test_a_value_outside_ends_the_command(
+    name: str, field: str, value: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([name, *_NEEDED.get(name, ()), f"{option(field)}={value}"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith(f"drivesem: {option(field)}: expected ")
+    assert said.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_defaults_are_settings_and_read_back(name: str, tmp_path: Path) -> None:
+    config = default_of(name)
+    config.check()
+    read = yaml.safe_load(to_yaml(config))
+    known = {key: tuple(value) if isinstance(value, list) else value for key, value in read.items()}
+    assert COMMANDS[name](**known) == config
+
+
+_KEYS = {
+    "attack": "json out limit seed workers device keep_going resume dataset root combo params detector method "
+    "steps queries step_form rate momentum norm restarts scouts like budget range early_stop "
+    "objective_labels objective target_objects target_classes fit backend precision t_star tiles",
+    "study": "json out limit seed workers device keep_going resume name quick dataset root detector steps "
+    "queries budget objective_labels objective method precision controls confirm detectors sources "
+    "benign_root held_out benign_frames fresh train_steps mix label_mode fit t_star bootstrap",
+    "explain": "json out limit seed workers device keep_going resume run frame least points permutations "
+    "bootstrap",
+    "confirm": "json out limit seed workers device keep_going resume run root",
+    "retrain": "json out limit seed workers device keep_going resume run dataset root start fraction mix "
+    "label_mode ramp validation fresh attack_steps steps minutes batch window scale rate warmup "
+    "loss precision checkpoint_every",
+    "train": "json out limit seed workers device keep_going resume detector dataset root held_out also "
+    "frames held_out_frames weights start anchors steps minutes batch window scale optimiser "
+    "momentum rate backbone_rate weight_decay warmup warmup_power drops drop_factor clip average "
+    "dropout loss precision checkpoint_every evaluate_every thin semantic loaders note",
+}
+"""Keys of the config.yaml of runs that are there."""
+
+
+@pytest.mark.parametrize("name", _KEYS)
+def test_keys_of_older_runs_are_known(name: str) -> None:
+    assert set(_KEYS[name].split()) <= {field.name for field in dataclasses.fields(COMMANDS[name])}
+
+
+def test_a_run_opens_whatever_the_order_of_its_keys(tmp_path: Path) -> None:
+    config = dataclasses.asdict(Attack(steps=3, t_star=0.4))
+    (tmp_path / "config.yaml").write_text(
+        yaml.safe_dump({key: config[key] for key in reversed(_KEYS["attack"].split())})
+    )
+    assert attack_of(tmp_path) == Attack(steps=3, t_star=0.4)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"drivesem {drivesem.__version__}\n"
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert drivesem.__version__ == declared
+
+
+def test_help_is_quick() -> None:
+    """Of the processor's time: the clock's says how busy the machine is."""
+    assert min(_seconds([sys.executable, "-m", "drivesem.cli", "--help"]) for _ in range(3)) < 0.5
+
+
+def _seconds(words: list[str]) -> float:
+    before = os.times()
+    finished = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "attack" in finished.stdout
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+@pytest.mark.parametrize(
+    ("words", "of_run", "whole"),
+    [
+        ((), False, False),
+        ((), True, True),
+        (("--incremental",), True, False),
+        (("--incremental",), False, False),
+        (("--whole",), False, True),
+    ],
+)
+def test_a_question_may_look_otherwise_than_its_run(words: tuple[str, ...], of_run: bool, whole: bool) -> None:
+    asked = parse(["explain", "--run", "run", *words])
+    assert isinstance(asked, Explain)
+    assert asked.whole_beside(of_run) is whole
+
+
+@pytest.mark.parametrize("command", [("attack",), ("study", "single"), ("bench",), ("explain", "--run", "run")])
+def test_incremental_and_whole_exclude_each_other(command: tuple[str, ...]) -> None:
+    parse([*command, "--incremental"])
+    with pytest.raises(UsageError, match="--incremental: expected it or --whole, found both"):
+        parse([*command, "--incremental", "--whole"])
+
+
+@pytest.mark.parametrize("command", [("attack",), ("study", "single"), ("bench",), ("explain", "--run", "run")])
+def test_how_much_is_kept_of_layers(command: tuple[str, ...]) -> None:
+    kept = [parse([*command, *words]) for words in ((), ("--keep-mb", "50"))]
+    assert [config.keep_mb for config in kept if isinstance(config, Regions)] == [800, 50]
+    with pytest.raises(UsageError, match="--keep-mb: expected at least 1, found 0"):
+        parse([*command, "--keep-mb", "0"])

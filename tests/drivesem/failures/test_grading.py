@@ -1,0 +1,181 @@
+"""Grades of failures of a scene whose detector is made to fail."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from detectors.types import Detections
+from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.labels import Labeller
+from drivesem.evaluation import failures
+from drivesem.failures.grades import Grade
+from drivesem.failures.grading import Case, Grader, Grades
+from drivesem.failures.nuisances import Nuisances
+from drivesem.failures.second_renderer.base import NoSecondRendererError, Redrawn, SecondRenderer
+from drivesem.failures.second_renderer.compositor import CompositorDraw
+from drivesem.run.frame import State, case_of
+from drivesem.synth.demo import demo_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.types import SceneIR
+
+
+class Oracle:
+    """Sees each car that is painted as photographed, and none that is not: the picture holds the labels."""
+
+    name = "oracle"
+    classes: tuple[str, ...] = ("Car",)
+
+    def __init__(self, blind: bool = True) -> None:
+        self.blind = blind
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images
+
+    def decode(self, raw: Tensor) -> list[Detections]:
+        """Of the first rows of pixels: a box each, and whether its car was painted."""
+        rows = raw[0, :, 0]
+        count = round(float(rows[0, 0]) * 255)
+        boxes, labels = [], []
+        for i in range(count):
+            box = [float(rows[0, 1 + 4 * i + j]) * 1500 - 100 for j in range(4)]
+            painted = float(rows[1, 1 + 4 * i]) > 0.5
+            if not (painted and self.blind):
+                boxes.append(box)
+                labels.append(0)
+        found = torch.tensor(boxes).reshape(-1, 4)
+        return [Detections(found, torch.tensor(labels, dtype=torch.int64), torch.full((len(boxes),), 0.9))]
+
+
+@dataclasses.dataclass
+class Told:
+    """A renderer whose pictures tell the oracle where the cars are."""
+
+    of: CompositorDraw
+    name: str = "told"
+    honest: bool = True
+
+    def redraw(self, changed: SceneIR) -> Redrawn:
+        redrawn = self.of.redraw(changed)
+        image = torch.zeros_like(redrawn.image)
+        count = len(changed.objects)
+        image[0, 0, 0] = count / 255
+        for i in range(count):
+            image[0, 0, 1 + 4 * i : 5 + 4 * i] = (redrawn.targets.boxes_xyxy[i] + 100) / 1500
+            image[1, 0, 1 + 4 * i] = float(self.honest and bool(changed.objects.texture_code[i].any()))
+        return dataclasses.replace(redrawn, image=image)
+
+
+CAR = 3
+"""A row of the scene."""
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    scene = demo_scene(0, 0)
+    painted = torch.zeros_like(scene.objects.texture_code)
+    painted[CAR] = 0.3
+    changed = scene.with_objects(texture_code=painted)
+    compositor = Compositor(scene)
+    render = compositor.render(scene)
+    labeller = Labeller(scene, render)
+    renderer = CompositorDraw(compositor, labeller)
+    judged = JudgedClasses.of(Oracle())
+    paper = labeller.paper()
+
+    def seen(boxes: Tensor) -> Detections:
+        return Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), torch.full((len(boxes),), 0.9))
+
+    boxes = paper.boxes_xyxy
+    others = torch.cat([boxes[:CAR], boxes[CAR + 1 :]])
+    benign = State(scene, render, paper, seen(boxes))
+    now = State(changed, compositor.render(changed), paper, seen(others))
+    whole = case_of("frame", renderer, judged, benign, now, lambda: scene)
+    return dataclasses.replace(whole, renderer=Told(renderer))
+
+
+OFF = Nuisances.of("off")
+"""The camera stands still: the oracle reads numbers, which must not be shifted."""
+LOST = failures.Failures(lost=(CAR,), phantoms=())
+
+
+def graded(case: Case, second: SecondRenderer | None = None, peer: Oracle | None = None) -> Grades:
+    grader = Grader(
+        Oracle(),
+        0.5,
+        OFF,
+        second=None if second is None else lambda name, scene: second,
+        peer=None if peer is None else lambda: peer,
+    )
+    return grader.grade(case, LOST)
+
+
+def told(case: Case, honest: bool = True) -> Told:
+    assert isinstance(case.renderer, Told)
+    return Told(case.renderer.of, "second", honest)
+
+
+def test_certain_where_nobody_else_is_asked(case: Case) -> None:
+    grades = graded(case)
+    assert grades.lost[CAR].grade is Grade.CERTAIN
+    assert grades.lost[CAR].count.after == grades.lost[CAR].count.before == 16
+
+
+def test_confirmed_where_the_second_renderer_fails_too(case: Case) -> None:
+    (one,) = graded(case, told(case)).lost.values()
+    assert one.grade is Grade.CONFIRMED
+    assert one.second is not None
+    assert (one.second.by, one.second.before, one.second.after) == ("second", 4, 4)
+
+
+def test_not_confirmed_where_it_does_not(case: Case) -> None:
+    (one,) = graded(case, told(case, honest=False)).lost.values()
+    assert one.grade is Grade.CERTAIN
+    assert one.second is not None
+    assert one.second.after == 0
+
+
+def test_shared_where_the_peer_loses_it_too(case: Case) -> None:
+    assert graded(case, told(case), Oracle()).lost[CAR].grade is Grade.SHARED
+    kept = graded(case, told(case), Oracle(blind=False)).lost[CAR]
+    assert kept.grade is Grade.CONFIRMED
+    assert kept.peer is not None
+    assert (kept.peer.before, kept.peer.after) == (4, 0)
+
+
+def test_no_second_renderer_is_said_and_nothing_is_lost(case: Case) -> None:
+    def none(name: str, scene: SceneIR) -> SecondRenderer:
+        raise NoSecondRendererError("EGL", "a driver (Debian: libegl1 libgl1-mesa-dri)", "none")
+
+    grades = Grader(Oracle(), 0.5, OFF, second=none).grade(case, LOST)
+    assert grades.lost[CAR].grade is Grade.CERTAIN
+    assert "libegl1" in grades.notes[0]
+
+
+def test_what_holds_only_at_the_threshold(case: Case) -> None:
+    """The picture that was judged shows it lost, its draws do not."""
+    still = dataclasses.replace(case, changed=case.base)
+    (one,) = Grader(Oracle(), 0.5, OFF).grade(still, LOST).lost.values()
+    assert one.grade is Grade.THRESHOLD
+    assert (one.count.after, one.count.after_draws) == (0, 5)
+
+
+def test_a_failure_of_no_kind_has_no_grade_of_its_own(case: Case) -> None:
+    found = dataclasses.replace(case, now=case.benign)
+    assert not Grader(Oracle(), 0.5, OFF).grade(found, LOST).lost
+
+
+def test_draws_of_the_scene_before_the_change_are_kept(case: Case) -> None:
+    grader = Grader(Oracle(), 0.5, OFF)
+    grader.grade(case, LOST)
+    asked: list[SceneIR] = []
+
+    class Counting(Told):
+        def redraw(self, changed: SceneIR) -> Redrawn:
+            asked.append(changed)
+            return super().redraw(changed)
+
+    assert isinstance(case.renderer, Told)
+    grader.grade(dataclasses.replace(case, renderer=Counting(case.renderer.of)), LOST)
+    assert len(asked) == 16

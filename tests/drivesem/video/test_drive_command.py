@@ -1,0 +1,231 @@
+"""`drivesem drive` as a user types it: what it prints and writes, going on, bad input; and real folders."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from drivesem.cli import main
+from drivesem.run.records import from_json
+from drivesem.synth.write import Order, synthesise
+from drivesem.video import running, taking
+from drivesem.video.page import write_page
+from drivesem.video.results import DriveResult
+from drivesem.video.taking import TakenClip
+from scene_ir import files
+from scene_ir.io import load_scene
+from scene_ir.types import SceneIR
+from tests.drivesem.video.clips import clip_of
+
+WORDS = ["drive", "--params", "color,translate", "--steps", "1", "--keys", "2", "--keep", "last", "--json"]
+
+
+@pytest.fixture(scope="module")
+def taken(street: Callable[..., SceneIR]) -> TakenClip:
+    return clip_of(street, 3, drawn=True, without=1)
+
+
+@pytest.fixture(scope="module")
+def finished(taken: TakenClip, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A command on a clip that is taken apart already."""
+    out = tmp_path_factory.mktemp("drive") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(running, "Taker", lambda *_: None)
+        patch.setattr(running, "take_clip", lambda *_: taken)
+        assert main([*WORDS, "--limit", "3", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.mark.parametrize("words", ["export --to kitti --out out", "retrain --out out", "verify", "explain"])
+def test_it_is_told_from_an_attack_that_was_killed(
+    words: str,
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command, *rest = words.split()
+    assert main([command, str(finished), *rest]) == 2
+    error = capsys.readouterr().err
+    assert "--run: expected a" in error
+    assert "of drivesem attack, found" in error
+    assert "stopped early" not in error
+
+
+def test_what_is_written(finished: Path, taken: TakenClip) -> None:
+    told = json.loads((finished / "drive.json").read_text())
+    assert told["frames"] == 3
+    assert told["names"] == list(taken.names)
+    assert told["params"] == ["color", "translate"]
+    assert told["feasible"] == 3
+    assert told["queries"] == 1
+    assert sorted(car["track"] for car in told["cars"]) == [4, 7, 9]
+    for car in told["cars"]:
+        assert set(car["states"]) == {"before", "after", "control"}
+        for state, letters in car["states"].items():
+            assert len(letters) == 3
+            assert car[f"lost_{state}"] == letters.count("l")
+        assert car["frames"] == sum(letter in "fl" for letter in car["states"]["after"])
+    (last,) = (car for car in told["cars"] if car["track"] == 9)
+    assert [way is None for way in last["path_m"]] == [False, True, False]
+    assert last["states"]["after"][1] == " "
+    assert any(name.startswith("cars[4].paint") for name in told["theta"])
+    for name in taken.names:
+        for side in ("before", "after"):
+            assert files.read_image(finished / "frames" / name / f"{side}.jpg").shape == (188, 621, 3)
+    assert (finished / "config.yaml").is_file()
+    assert len((finished / "drive.csv").read_text().splitlines()) == 4
+    assert not files.leftovers(finished)
+
+
+def test_the_video_has_all_frames(finished: Path) -> None:
+    video = cv2.VideoCapture(str(finished / "clip.webm"))
+    count = 0
+    while video.read()[0]:
+        count += 1
+    assert count == 3
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
+    assert (finished / "clip.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
+
+
+def test_a_second_command_tells_what_is_there(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main([*WORDS, "--limit", "3", "--out", str(finished)]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((finished / "drive.json").read_text())
+    assert main([*WORDS, "--out", str(finished), "--limit", "2"]) == 2
+    assert "other values of limit" in capsys.readouterr().err
+
+
+def test_a_clip_that_memory_cannot_hold_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(taking, "memory_gb", lambda: 0.5)
+    assert main(["drive", "--limit", "30", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.endswith(
+        "CLIP: frames: expected at most 6 frames, as memory of 0.5 GB holds (--limit takes the first), found 30"
+    )
+    assert not (tmp_path / "out" / "scenes").exists()
+
+
+def test_the_table_names_cars(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main([*(word for word in WORDS if word != "--json"), "--limit", "3", "--out", str(finished)]) == 0
+    said = capsys.readouterr().out
+    assert "4 Car" in said
+    assert "by a random change" in said
+
+
+def test_the_page_escapes_and_runs_one_script(finished: Path, tmp_path: Path) -> None:
+    data = json.loads((finished / "drive.json").read_text())
+    data["clip"] = "<b>clip</b>"
+    data["names"][0] = "</script><i>"
+    write_page(tmp_path / "page.html", from_json(DriveResult, data, "drive.json"))
+    page = (tmp_path / "page.html").read_text()
+    assert "<b>clip" not in page
+    assert "<i>" not in page
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    assert len(scripts) == 1
+    assert f"'sha256-{base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()}'" in page
+    assert "default-src 'none'" in page
+
+
+def test_a_slider_shows_frames_in_a_browser(chromium: Any, finished: Path) -> None:
+    complaints: list[str] = []
+    page = chromium.new_page(viewport={"width": 1280, "height": 900})
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto((finished / "report.html").as_uri())
+    page.wait_for_load_state("networkidle")
+    assert page.locator("#after").evaluate("image => image.naturalWidth") == 621
+    page.locator("#frame").focus()
+    page.keyboard.press("End")
+    assert page.locator("#name").inner_text() == "002"
+    assert page.locator("#after").get_attribute("src") == "frames/002/after.jpg"
+    page.wait_for_function("document.querySelector('video').readyState >= 1")
+    assert page.locator("video").evaluate("video => video.videoWidth") == 622
+    assert page.locator("video").evaluate("video => video.error") is None
+    width, wide = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+    assert width <= wide
+    page.close()
+    assert not complaints
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none"], "none: expected a folder of clips: Virtual KITTI"),
+        (["--sequence", "0001"], "--sequence: expected a CLIP beside it, found 0001"),
+        (["--combo", "1", "--params", "mesh"], "--params: expected no --combo beside it"),
+        (["--params", "wheels"], "wheels"),
+        (["--bend", "9"], "--bend: expected 0 to 5, found 9"),
+        (["--params", "sun"], "params: sun"),
+        (["--method", "climb"], "--method"),
+        (["--detector", "none.onnx"], "--detector: expected a detector"),
+    ],
+)
+def test_bad_input_is_a_line(
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["drive", *words]) == 2
+    said = capsys.readouterr()
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["vkitti2", "kitti"])
+def test_what_the_generator_wrote(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    people = layout == "kitti"
+    variations = ("mixed",) if people else ("clone",)
+    order = Order(tmp_path / "data", 3, 5, layout, sequence=3, people=people, variations=variations)
+    assert len(list(synthesise(order))) == 3
+    out = tmp_path / "out"
+    words = ["drive", str(tmp_path / "data"), "--params", "color", "--steps", "1", "--certify", "0", "--no-fit"]
+    words += ["--workers", "1", "--out", str(out), "--json"]
+    capsys.readouterr()
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["frames"] == 3
+    assert told["cars"]
+    meshes: dict[str, set[str]] = {}
+    for name in told["names"]:
+        scene = load_scene(out / "scenes" / name)
+        tracks = scene.provenance["tracks"].split(",")
+        for i in range(len(scene.objects)):
+            mesh = scene.meshes[int(scene.objects.mesh_index[i])].name
+            meshes.setdefault(tracks[int(scene.provenance[f"objects[{i}].label"])], set()).add(mesh)
+    assert meshes
+    assert all(len(names) == 1 for names in meshes.values())
+
+
+@pytest.mark.slow
+def test_a_killed_command_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was taken apart stays, and the end is the same."""
+    words = ["drive", "--limit", "2", "--params", "color", "--steps", "1", "--certify", "0", "--workers", "1"]
+    found = []
+    for name in ("whole", "killed"):
+        out = tmp_path / name
+        if name == "killed":
+            shutil.copytree(tmp_path / "whole", out)
+            shutil.rmtree(out / "scenes" / "drive-001")
+            for path in (out / "drive.json", out / "frames"):
+                path.unlink() if path.is_file() else shutil.rmtree(path)
+        capsys.readouterr()
+        assert main([*words, "--out", str(out), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        found.append({key: value for key, value in told.items() if key not in ("out", "seconds")})
+    assert found[0] == found[1]
+    assert len(found[0]["cars"]) >= 3

@@ -1,0 +1,145 @@
+"""theta of a clip: one change a car, a smooth path, and the way back to what is feasible in all frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.video.results import CarResult, Missed
+from drivesem.video.space import ClipSpace, project
+from drivesem.video.taking import TakenClip
+from scene_ir.types import SceneIR
+from tests.drivesem.video.clips import clip_of
+
+PARAMS = ("color", "weather", "translate", "rotate", "mesh")
+
+
+@pytest.fixture(scope="module")
+def streets(street: Callable[..., SceneIR]) -> TakenClip:
+    return clip_of(street, 4, without=2)
+
+
+@pytest.fixture(scope="module")
+def space(streets: TakenClip) -> ClipSpace:
+    return ClipSpace([ParameterSpace(scene, PARAMS) for scene in streets.scenes], streets.tracks)
+
+
+def random_theta(space: ClipSpace, share: float = 1.0, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    place = torch.rand(space.dim, generator=generator)
+    return share * (space.lower + place * (space.upper - space.lower))
+
+
+def test_what_is_a_cars_is_the_same_in_all_frames(space: ClipSpace, streets: TakenClip) -> None:
+    theta = random_theta(space)
+    for parameter in (Parameter.COLOR, Parameter.ROTATE, Parameter.MESH):
+        seen: dict[int, torch.Tensor] = {}
+        for frame, tracks in enumerate(streets.tracks):
+            block = space.spaces[frame].block(space.of_frame(theta, frame), parameter)
+            assert block is not None
+            for row, track in enumerate(tracks):
+                assert torch.equal(seen.setdefault(track, block[row]), block[row])
+    for frame, one in enumerate(space.spaces):
+        weather = one.block(space.of_frame(theta, frame), Parameter.WEATHER)
+        assert weather is not None
+        assert torch.equal(weather, theta[space.blocks[Parameter.WEATHER]])
+
+
+def test_theta_0_is_the_clip_as_it_was(space: ClipSpace, streets: TakenClip) -> None:
+    for frame, scene in enumerate(streets.scenes):
+        here = space.of_frame(space.theta0, frame)
+        assert not here.any()
+        assert torch.equal(space.spaces[frame].apply(scene, here).objects.translation, scene.objects.translation)
+
+
+def test_a_path_is_a_cubic_within_its_bounds(streets: TakenClip) -> None:
+    spaces = [ParameterSpace(streets.scenes[0], ("translate",))] * 9
+    space = ClipSpace(spaces, [streets.tracks[0]] * 9)
+    theta = random_theta(space)
+    path = torch.stack([space.of_frame(theta, frame) for frame in range(9)]).double()
+    assert (path.abs() <= 0.25).all()
+    fourth = torch.diff(path, n=4, dim=0)
+    assert fourth.abs().max() < 1e-5
+    assert torch.diff(path, n=3, dim=0).abs().max() > 1e-3
+    length_m = streets.scenes[0].objects.size_lhw[:, :1]
+    assert torch.equal(space.path(theta, 3), space.of_frame(theta, 3).reshape(-1, 2) * length_m)
+    still = ClipSpace(spaces, [streets.tracks[0]] * 9, bend=0)
+    theta = random_theta(still)
+    assert all(torch.equal(still.of_frame(theta, f), still.of_frame(theta, 0)) for f in range(9))
+
+
+def test_bounds_are_the_tightest_of_a_cars_frames(streets: TakenClip) -> None:
+    budget = Budget(translate_m=4.0, translate=1.5, of_distance=0.05)
+    spaces = [ParameterSpace(scene, ("translate",), budget) for scene in streets.scenes]
+    space = ClipSpace(spaces, streets.tracks)
+    upper = space.upper.reshape(space.count, -1)
+    for row, track in enumerate(space.tracks):
+        own = [
+            float(one.upper.reshape(-1, 2)[tracks.index(track), 0])
+            for one, tracks in zip(spaces, streets.tracks, strict=True)
+            if track in tracks
+        ]
+        assert float(upper[row, 0]) == pytest.approx(min(own), rel=1e-4)
+
+
+def test_gradients_go_back_to_the_clip(space: ClipSpace) -> None:
+    theta = random_theta(space).double().requires_grad_(True)
+    weights = torch.rand(space.spaces[1].dim, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    (gradient,) = torch.autograd.grad((space.of_frame(theta, 1) * weights).sum(), theta)
+    step = torch.zeros_like(gradient)
+    step[space.blocks[Parameter.TRANSLATE].start + 2] = 1e-3
+    moved = space.of_frame(theta.detach() + step, 1) - space.of_frame(theta.detach(), 1)
+    change = (moved * weights).sum() / 1e-3
+    assert float((gradient * step).sum() / 1e-3) == pytest.approx(float(change), rel=1e-5, abs=1e-9)
+
+
+def test_names_units_and_values_are_a_cars(space: ClipSpace) -> None:
+    told = space.theta_by_name(random_theta(space))
+    first = "cars[4].translate.along[0]"
+    assert first in told
+    assert str(told[first]["display"]).endswith(" m")
+    assert told["cars[9].yaw"]["unit"] == "rad"
+    assert "weather.fog" in told
+
+
+def test_projection_is_feasible_in_every_frame_and_keeps_what_is(space: ClipSpace, streets: TakenClip) -> None:
+    sets = [FeasibleSet(one) for one in space.spaces]
+    found = project(space, sets, random_theta(space, 0.9))
+    assert found.active
+    for frame, feasible in enumerate(sets):
+        here = space.of_frame(found.theta, frame)
+        assert torch.allclose(feasible.project(here).theta, here, atol=1e-5)
+    again = project(space, sets, found.theta)
+    assert torch.allclose(again.theta, found.theta, atol=1e-5)
+    assert torch.equal(project(space, sets, space.theta0).theta, space.theta0)
+    assert bool(found.theta.any())
+
+
+def test_cars_that_cannot_move_stay(space: ClipSpace) -> None:
+    """Where a frame grants nothing, the clip has nothing, and the search for it ends."""
+
+    class Nothing:
+        def project(self, theta: torch.Tensor) -> object:
+            return type("Found", (), {"theta": torch.zeros_like(theta), "active": ("objects[0]: road",)})()
+
+    sets = [FeasibleSet(one) for one in space.spaces]
+    found = project(space, [Nothing(), *sets[1:]], random_theta(space, 0.5))  # pyright: ignore[reportArgumentType]
+    assert not space.of_frame(found.theta, 0).any()
+    assert f"cars[{space.tracks[int(space.rows[0][0])]}]: road" in found.active
+
+
+def test_misses_are_counted_by_stretch_and_metre() -> None:
+    away = (30.0, 28.0, 25.0, 24.0, 25.0, None, 20.0, 19.0)
+    missed = Missed.of("flll- lf", away)
+    assert missed == Missed(frames=6, lost=4, longest=3, metres=7.0, metres_lost=6.0)
+    nothing = Missed.of("--  ", (9.0, 8.0, None, None))
+    assert nothing == Missed(0, 0, 0, 0.0, 0.0)
+    car = CarResult.of(
+        4, "Car", {"before": "ff", "after": "fl", "control": "ll"}, (9.0, 7.5), (None, None), [True]
+    )
+    assert (car.frames, car.lost_before, car.lost_after, car.lost_control, car.newly) == (2, 0, 1, 2, 1)
+    assert (car.metres, car.metres_lost_after, car.graded, car.certain) == (1.5, 1.5, 1, 1)

@@ -1,0 +1,121 @@
+"""A clip of which a picture is damaged: the others are taken apart alike, whichever comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from drivesem.data.clips import Clip
+from drivesem.video import taking
+from drivesem.video.taking import Taker, Taking
+from scene_ir.derender.derender import DerenderSettings
+from scene_ir.derender.silhouette import Placement, placed
+from scene_ir.errors import FormatError
+from scene_ir.types import Camera, Frame, Labels, SceneIR
+
+NAMES = ("a", "b", "c")
+TRACKS = (4, 7)
+HEIGHTS = {"a": (20, 30), "b": (60, 60), "c": (40, 10)}
+"""Of both cars: b shows both best, then c the first and a the second."""
+MESHES = {"a": "sedan", "b": "van", "c": "suv"}
+"""What a car is taken for in each frame."""
+SIZE = torch.tensor([4.2, 1.5, 1.8])
+
+
+class Drive:
+    """The frames, of which the pictures of some cannot be read."""
+
+    identifiers = NAMES
+
+    def __init__(self, *damaged: str) -> None:
+        self._damaged = damaged
+
+    def labels(self, identifier: str) -> Labels:
+        """Two cars."""
+        return Labels(
+            kind=("Car", "Car"),
+            boxes_xyxy=torch.tensor([[0.0, 0.0, 50.0, float(height)] for height in HEIGHTS[identifier]]),
+            truncation=torch.zeros(2),
+            occlusion=torch.zeros(2, dtype=torch.int64),
+            translation=torch.tensor([[-2.0, 1.6, 15.0], [3.0, 1.6, 20.0]]),
+            yaw=torch.zeros(2),
+            size_lhw=SIZE.repeat(2, 1),
+            ignore_xyxy=torch.zeros(0, 4),
+        )
+
+    def frame(self, identifier: str) -> Frame:
+        """Grey. FormatError where it is damaged."""
+        if identifier in self._damaged:
+            raise FormatError(f"{identifier}.png", "an image", "none")
+        camera = Camera(torch.tensor([[90.0, 0, 50], [0, 90, 30], [0, 0, 1]]), 60, 100)
+        return Frame(identifier, torch.zeros(3, 60, 100), camera, labels=self.labels(identifier))
+
+
+@pytest.fixture
+def taker(
+    street: Callable[..., SceneIR], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[Taker, dict[str, list[str]]]]:
+    """What takes the clip apart, and the meshes that each frame's cars got."""
+
+    def shapes(frame: Frame, _: DerenderSettings) -> dict[int, Placement]:
+        here = torch.zeros(3), torch.tensor(0.0)
+        return {row: placed(MESHES[frame.identifier], *here, SIZE) for row in range(len(TRACKS))}
+
+    def build(*damaged: str, keep_going: bool) -> tuple[Taker, dict[str, list[str]]]:
+        meshes: dict[str, list[str]] = {}
+
+        def derender(frame: Frame, settings: DerenderSettings) -> SceneIR:
+            names = [known.mesh.name for known in settings.known or () if known is not None]
+            meshes[frame.identifier] = [name.split("-")[0] for name in names]
+            return street([(-2.0, 15.0), (3.0, 20.0)])
+
+        clip = Clip("clip", Drive(*damaged), NAMES, lambda _: TRACKS)
+        monkeypatch.setattr(taking, "clips_in", lambda _: {"clip": clip})
+        monkeypatch.setattr(taking, "placements", shapes)
+        monkeypatch.setattr(taking, "derender", derender)
+        return Taker(Taking("folder", None, None, 0, False, keep_going), tmp_path), meshes
+
+    return build
+
+
+@pytest.mark.parametrize("order", [NAMES, NAMES[::-1], ("b", "a", "c")])
+def test_the_next_best_view_stands_in_for_a_damaged_one(
+    order: tuple[str, ...], taker: Callable[..., tuple[Taker, dict[str, list[str]]]]
+) -> None:
+    whole, meshes = taker(keep_going=True)
+    for name in order:
+        whole.source.scene(name)
+    assert meshes == {name: ["van", "van"] for name in order}
+    damaged, meshes = taker("b", keep_going=True)
+    for name in order:
+        if name == "b":
+            with pytest.raises(FormatError, match=r"b\.png"):
+                damaged.source.scene(name)
+        else:
+            damaged.source.scene(name)
+    assert meshes == {name: ["suv", "sedan"] for name in order if name != "b"}
+
+
+def test_without_keep_going_no_frame_is_taken_apart_with_another_shape(
+    taker: Callable[..., tuple[Taker, dict[str, list[str]]]],
+) -> None:
+    """The picture is repaired, and the command goes on: all of its frames have the best view's shapes."""
+    damaged, meshes = taker("b", keep_going=False)
+    for name in NAMES:
+        with pytest.raises(FormatError, match=r"b\.png"):
+            damaged.source.scene(name)
+    assert not meshes
+
+
+def test_a_clip_whose_first_picture_is_damaged_has_a_camera(
+    taker: Callable[..., tuple[Taker, dict[str, list[str]]]],
+) -> None:
+    camera = taker("a", keep_going=True)[0].source.camera()
+    assert camera is not None
+    assert (camera.width, camera.height) == (100, 60)
+    assert taker(*NAMES, keep_going=True)[0].source.camera() is None
+    with pytest.raises(FormatError, match=r"a\.png"):
+        taker("a", keep_going=False)[0].source.camera()

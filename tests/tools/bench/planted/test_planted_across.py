@@ -1,0 +1,159 @@
+"""Faults of a whole detector, and what pooled rules say of them, in a made-up world of cars."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from detectors.planted import PlantedFault
+from drivesem.analysis.holes.results import Samples
+from tools.bench.planted.across import (
+    AS_PHOTOGRAPHED,
+    CARS,
+    FRAMES,
+    HIT,
+    KINDS,
+    AcrossAttempt,
+    AcrossFrame,
+    Looked,
+    plant_across,
+)
+from tools.bench.planted.across_names import (
+    ALL,
+    CONTRAST,
+    NameRow,
+    chance_rows,
+    drawn_evidence,
+    rows_of,
+    searched_evidence,
+    summary_rows,
+)
+from tools.bench.planted.pool import LOOKS, FramePool, SeenCar
+
+NAMES = ("height_px", "aspect", "across", "lightness", "contrast", "moved_m")
+T_STAR = 0.5
+
+
+def world(frames: int, states: int, seed: int = 0) -> list[FramePool]:
+    """Cars that keep their height and place, more or less; paint changes much. Labels are what the detector sees,
+    more or less. None is ever lost.
+    """
+    rng = np.random.default_rng(seed)
+    pools = []
+    for number in range(frames):
+        cars = rng.uniform([25, 1.0, 0.1, 0.2, 0.1], [90, 2.8, 0.9, 0.6, 0.3], (5, 5))
+
+        def seen(index: int, cars: np.ndarray = cars, free: bool = True) -> SeenCar:
+            own = cars[index].copy()
+            if free:
+                own *= rng.uniform(0.9, 1.1, 5)
+                own[3:] = rng.uniform([0.05, 0.05], [0.9, 0.4])
+            told = own * rng.normal(1, 0.02, 5)
+            moved = float(rng.random()) if free else 0.0
+            return SeenCar(index, (*own.tolist(), moved), 2.0, ((0.9, *told.tolist()),))
+
+        looks = tuple(tuple(seen(i, free=False) for i in range(5)) for _ in range(4))
+        drawn = tuple(tuple(seen(i) for i in range(5)) for _ in range(states))
+        pools.append(FramePool(f"{number:03d}", T_STAR, NAMES, looks, drawn))
+    return pools
+
+
+@pytest.fixture(scope="module")
+def pools() -> list[FramePool]:
+    return world(20, 12)
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[3], KINDS[8]])
+def test_faults_hide_few_cars_as_photographed_and_some_others(
+    pools: list[FramePool], kind: tuple[str, ...]
+) -> None:
+    one = plant_across(pools, kind, 0)
+    assert one is not None
+    assert one.fault.names == kind
+    assert one == plant_across(pools, kind, 0)
+    assert one != plant_across(pools, kind, 1)
+    assert one.still <= AS_PHOTOGRAPHED
+    assert HIT[0] <= one.cars <= HIT[1]
+    assert one.hit >= one.cars
+    assert 0.4 < one.sharp < 1
+    hidden = {
+        (pool.frame, car.index)
+        for pool in pools
+        for state in pool.states
+        for car in state
+        if car.hidden(one.fault, T_STAR) and car.index not in pool.hidden_as_photographed(one.fault)
+    }
+    assert len(hidden) >= CARS
+    assert len({frame for frame, _ in hidden}) >= FRAMES
+
+
+def test_what_no_car_reaches_is_not_planted() -> None:
+    assert plant_across(world(2, 4), ("height_px",), 0) is None, "too few frames"
+    assert plant_across([], ("height_px",), 0) is None
+
+
+def test_a_frame_without_cars_changes_nothing(pools: list[FramePool]) -> None:
+    empty = FramePool("empty", T_STAR, (), ((),) * LOOKS, ((),) * 12)
+    with_it, without = (plant_across(all_of, KINDS[0], 0) for all_of in ([*pools, empty], pools))
+    assert with_it is not None
+    assert without is not None
+    assert (with_it.fault, with_it.sharp) == (without.fault, without.sharp)
+    assert rows_of([with_it], [*pools, empty], [], ())[0].named == rows_of([without], pools, [], ())[0].named
+
+
+def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
+    """At least two of three, the third in part: a rule may take a second feature along."""
+    kinds = (KINDS[0], KINDS[3], KINDS[8])
+    planted = [one for kind in kinds if (one := plant_across(pools, kind, 0)) is not None]
+    rows = [row for row in rows_of(planted, pools, [], ()) if row.by == ALL]
+    *faults, none = rows
+    assert sum(row.named for row in faults) >= 2
+    for row, kind in zip(faults, kinds, strict=True):
+        assert row.in_part
+        assert all(name in row.rules[0] for name in kind)
+        assert row.passes == 20 * 12
+    assert (none.rules, none.named, none.failures) == ((), False, 0)
+
+
+def test_searches_bring_their_samples_and_their_passes(pools: list[FramePool]) -> None:
+    fault = PlantedFault.of("height_px=30:40")
+    around = Samples(NAMES, ((35.0, 1.5, 0.5, 0.3, 0.2, 0.1),) * 3, (-1.0, -1.0, 2.0))
+    attempt = AcrossAttempt("003", fault.text, "climb", 1, 1, 24, (Looked(2, around),))
+    others = [replace(attempt, fault=""), replace(attempt, method="halton")]
+    frames = [AcrossFrame("003", "", (attempt, *others))]
+    found = searched_evidence(fault, "climb", pools, frames)
+    plain = drawn_evidence(fault, pools, CONTRAST)
+    assert len(found.fails) == len(plain.fails) + 3
+    assert found.fails.sum() == plain.fails.sum() + 2
+    assert found.objects[-3:].tolist() == [3002] * 3
+    assert found.passes == CONTRAST * 20 + 24 + 3
+    assert found.columns["height_px"][-1] == 35
+
+
+def test_cars_that_are_hidden_as_photographed_are_no_evidence(pools: list[FramePool]) -> None:
+    fault = PlantedFault.of("height_px=30:40")
+    evidence = drawn_evidence(fault, pools, 12)
+    before = sum(len(pool.hidden_as_photographed(fault)) for pool in pools)
+    assert before > 0
+    assert len(evidence.fails) == 12 * (5 * 20 - before)
+
+
+def test_chance_has_no_name(pools: list[FramePool]) -> None:
+    rows = chance_rows(pools, 0, shams=6)
+    assert [row["faults"] for row in rows] == [6, 6]
+    assert sum(row["told"] for row in rows) <= 1
+
+
+def test_rows_are_summed_by_what_named_them() -> None:
+    fault = PlantedFault.of("height_px=30:40")
+    one = NameRow(fault.text, "climb", 0.2, 0.1, 0.0, 0.5, 9, 4, 300, ("a", "b"), True, True, 1)
+    blunt = replace(one, named=False, rules=(), further=0, passes=100, sharp=0.1)
+    planted, sharp, none = summary_rows([one, blunt, replace(one, fault="", sharp=None, further=2)])
+    assert (sharp["by"], sharp["faults"], sharp["named"]) == ("climb, sharp faults", 1, 1)
+    assert (planted["faults"], planted["named"], planted["in_part"], planted["told"]) == (2, 1, 2, 1)
+    assert planted["low"] < 0.5 < planted["high"]
+    assert (planted["further"], planted["passes"]) == (1, 200)
+    assert (none["by"], none["named"], none["told"], none["further"]) == ("climb, no fault", None, 1, 2)
+    assert one.to_json()["rule"] == "a"

@@ -1,0 +1,93 @@
+"""`drivesem gradcheck --reach`: options, what is printed and written, and that finished frames are kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivesem.cli import main
+from drivesem.config.commands import Gradcheck
+from drivesem.config.parsing import parse
+from tools.bench.reach.frames import ReachWorker
+from tools.bench.reach.slopes import Slopes
+
+WORDS = ("gradcheck", "--reach", "--draws", "2", "--limit", "2", "--workers", "1")
+SLOPES = Slopes(
+    0, 10.0, "rotate", "yaw", ((1.0, 3.0),) * 3, ((0.0, 1.0),) * 3, ((2.0, 2.0), (1.0, None), (1.0, 1.0))
+)
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the frames that are measured, which takes no time."""
+    names: list[str] = []
+
+    def measure(_: ReachWorker, name: str) -> tuple[Slopes, ...]:
+        names.append(name)
+        return (SLOPES, replace(SLOPES, object=1, distance_m=50.0))
+
+    monkeypatch.setattr(ReachWorker, "_measure", measure)
+    return names
+
+
+def test_options() -> None:
+    assert parse(list(WORDS)) == Gradcheck(reach=True, draws=2, limit=2, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--draws", "3"], "--draws: expected --reach beside it"),
+        (["--reach", "--draws", "1"], "--draws: expected at least 2"),
+        (["--reach", "--directions", "4"], "--directions: expected no --reach beside it"),
+        (["--reach", "--max-error", "0.1"], "--max-error: expected no --reach beside it"),
+        (
+            ["--reach", "--detector", "nowhere.safetensors"],
+            "--detector: nowhere.safetensors: expected a weights file",
+        ),
+    ],
+)
+def test_what_does_not_go_together(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert refused("gradcheck", *words).startswith(f"drivesem: {message}")
+
+
+def test_all_is_written_and_finished_frames_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], measured: list[str]
+) -> None:
+    words = [*WORDS, "--json", "--out", str(tmp_path)]
+    assert main(words) == 0
+    first = json.loads(capsys.readouterr().out)
+    assert len(measured) == 2
+    assert {path.name for path in tmp_path.glob("reach.*")} == {"reach.json", "reach.csv", "reach.md", "reach.png"}
+    assert first == json.loads((tmp_path / "reach.json").read_text())
+    assert {row["distance"] for row in first["rows"]} == {"all", "under 15 m", "over 30 m"}
+    assert first["rows"][0]["objects"] == 4
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert len(measured) == 2, "they were read"
+    assert main([*words, "--seed", "5"]) == 0
+    assert len(measured) == 4, "another seed is another question"
+
+
+@pytest.mark.usefixtures("measured")
+def test_a_table_without_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(list(WORDS)) == 0
+    told = capsys.readouterr().out
+    assert "Gradients and slopes of margins" in told
+    assert "Point gradients by distance" in told
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_that_the_detector_finds_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ReachWorker, "_measure", lambda *_: ())
+    assert main(list(WORDS)) == 2
+    assert "expected at least one vehicle that the detector finds" in capsys.readouterr().err.splitlines()[-1]

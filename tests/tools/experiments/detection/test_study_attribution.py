@@ -1,0 +1,144 @@
+"""Which factor takes how many points: arms of both ways, sums that are exact, and a waterfall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from drivesem.config.commands import Attack, Study
+from drivesem.config.parsing import parse
+from drivesem.run.protocol import follows_paper
+from tools.experiments.detection.arms import PAPERS, attack_of
+from tools.experiments.detection.attribution import (
+    COUNTED,
+    OURS,
+    Attribution,
+    Plan,
+    attributed,
+    told,
+    write_waterfall,
+)
+from tools.experiments.detection.counts import StudyCounts
+
+FRAMES, DRAWS = 6, 10
+
+
+def plan_of(**settings: Any) -> Plan:
+    study = Study(name="attribution", **settings)
+    return Plan.of(study, attack_of(study))
+
+
+@pytest.mark.parametrize(("other", "count"), [(None, 13), ("yolov3-slim", 16)])
+def test_each_attack_is_an_arm_once(other: str | None, count: int, tmp_path: Path) -> None:
+    plan = plan_of(other_detector=other)
+    arms = plan.arms()
+    assert len({arm.name for arm in arms}) == len({arm.folder for arm in arms}) == len(arms) == count
+    assert len({str(arm.config) for arm in arms}) == count
+    for arm in arms:
+        arm.config.check()
+        assert not arm.config.grade
+    named = {arm.name: arm.config for arm in arms}
+    default = Attack(combo=2, limit=200, grade=False)
+    assert named[OURS] == default
+    assert follows_paper(named[PAPERS]) == (other is None)
+    assert named[PAPERS].detector == (other or default.detector)
+
+
+def test_a_way_changes_one_factor_at_a_time_and_the_factors_start_as_ours() -> None:
+    plan = plan_of(objective="total", keep="last", parametrisation="roi", other_detector="other")
+    assert plan.config(frozenset()) == plan_of().config(frozenset())
+    for way in plan.ways():
+        assert (way[0], way[-1]) == (frozenset(), {*plan.factors})
+        for one, other in pairwise(way):
+            (factor,) = other - one
+            changed = [k for k, v in vars(plan.config(one)).items() if v != vars(plan.config(other))[k]]
+            assert len(changed) == (factor != COUNTED)
+    assert plan.ways()[1] != plan.ways()[0]
+
+
+@pytest.fixture
+def found(frame: Callable[..., Any], counted: Callable[..., Any]) -> Attribution:
+    """Labels that are aimed at lose a car in two frames of six; what is not projected drives it away in all."""
+    plan, runs = plan_of(limit=FRAMES), []
+    for arm in plan.arms():
+        lost = 2 if arm.config.objective_labels == "paper" else 0
+        by = 40.0 if arm.config.project == "bounds" else 0.0
+        runs.append(counted(arm, [frame(f"{i}", moved_by=by, found=i >= lost) for i in range(FRAMES)]))
+    return attributed(Study(name="attribution"), plan, StudyCounts(tuple(runs), 1, {"000009": "no camera"}), DRAWS)
+
+
+def test_points_sum_to_the_difference_on_both_ways_and_in_the_mean(found: Attribution) -> None:
+    assert found.ours == 0
+    difference = found.papers - found.ours
+    assert difference > 0.4
+    assert sum(share.points.value for share in found.shares) == pytest.approx(difference, abs=1e-12)
+    assert found.total.points.value == pytest.approx(difference, abs=1e-12)
+    for way in range(2):
+        assert sum(share.ways[way] for share in found.shares) == pytest.approx(difference, abs=1e-12)
+    both = sum(share.points.value for share in found.shares[:2])
+    assert found.labels.points.value == pytest.approx(both, abs=1e-12)
+    for share in found.rows():
+        assert share.points.value == pytest.approx(sum(share.ways) / 2, abs=1e-12)
+        assert share.points.low <= share.points.value <= share.points.high
+
+
+def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
+    shares = {share.name: share for share in found.shares}
+    for name in ("loss", "iterate kept", "parametrisation"):
+        assert (shares[name].points.value, shares[name].points.low, shares[name].p) == (0, 0, 1)
+    # by labels that move a car that drove away is found; by labels that stay it is lost, and a false one beside
+    assert shares["projection"].ways[1] == 0 < shares["projection"].ways[0]
+    assert shares[COUNTED].ways[0] == 0 < shares[COUNTED].ways[1]
+    assert shares["projection"].alone.value == 0
+    # ten of twelve cars are found, nothing else: precision is 1 up to a recall of 10 / 12
+    assert shares["labels aimed at"].alone.value == pytest.approx(1 - 84 / 101)
+    assert 0 < shares["labels aimed at"].p <= 1
+
+
+def test_a_detector_counts_with_what_its_fall_begins_from(
+    frame: Callable[..., Any], counted: Callable[..., Any]
+) -> None:
+    """A detector that finds one car less before, and yet another less after, has fallen by the latter alone."""
+    plan, runs = plan_of(limit=FRAMES, other_detector="other"), []
+    for arm in plan.arms():
+        results = [frame(f"{i}") for i in range(FRAMES)]
+        if arm.config.detector == "other":
+            one = results[0].detections_benign[:1]
+            results[0] = replace(results[0], detections_benign=one, detections_attacked=one)
+            results[1] = replace(results[1], detections_attacked=one)
+        runs.append(counted(arm, results))
+    found = attributed(Study(name="attribution"), plan, StudyCounts(tuple(runs), 0, {}), DRAWS)
+    assert found.shares[-1].name == "detector"
+    # 11 of 12 cars are found before, 10 after, nothing else: precision is 1 up to these recalls
+    assert (found.ours, found.papers) == (0, pytest.approx((92 - 84) / 101))
+    assert found.shares[-1].points.value == pytest.approx(found.papers, abs=1e-12)
+    assert [share.points.value for share in found.shares[:-1]] == [0] * 6
+
+
+def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:
+    text = told(found)
+    first = text.sheets[0]
+    assert [row[0] for row in first.rows] == [*(share.name for share in found.shares), "labels, both", "all"]
+    assert first.title.endswith(f"from 0.00, ours, to {100 * found.papers:.2f}, the paper's protocol")
+    data = found.to_json()
+    assert (data["frames"], data["papers"], len(data["arms"])) == (FRAMES, found.papers, 13)
+    assert data["rows"][0]["name"] == COUNTED
+    assert data["rows"][0]["points_low"] <= data["rows"][0]["points"]
+    assert any("000009" in note for note in text.notes)
+    write_waterfall(tmp_path / "a.png", found)
+    picture = cv2.imread(str(tmp_path / "a.png"))
+    assert picture is not None
+    assert picture.std() > 10
+
+
+def test_the_other_detector_is_of_this_study_alone(refused: Callable[..., str]) -> None:
+    assert "--other-detector: expected study attribution" in refused(
+        "study", "multi", "--other-detector", "yolov3"
+    )
+    assert parse(["study", "attribution", "--other-detector", "yolov3-slim"]).other_detector == "yolov3-slim"

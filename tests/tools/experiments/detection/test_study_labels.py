@@ -1,0 +1,43 @@
+"""Labels that stay behind: how far, and which failures are theirs alone."""
+
+import pytest
+
+from tools.experiments.detection.labels import LabelSets, label_frames, label_sets
+
+
+def iou(shift: float) -> float:
+    """Of a box 50 px wide and itself, shifted."""
+    return (50 - shift) / (50 + shift)
+
+
+def sets_of(run) -> LabelSets:
+    return label_sets(run.arm.name, label_frames(run))
+
+
+def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
+    """The detector follows the car: any failure is the labels'. 10 px is an IoU of 0.67, 40 px one of 0.11."""
+    shifts = [0.0, 10.0, 40.0, 40.0]
+    found = sets_of(arm_run(arm("translate"), [frame(str(i), moved_by=s) for i, s in enumerate(shifts)]))
+    assert (found.frames, found.objects) == (4, 8)
+    assert found.iou["least"] == pytest.approx(iou(40))
+    assert found.iou["median"] == 1.0
+    assert found.below == {0.5: 2 / 8, 0.7: 3 / 8}
+    half, strict = found.counted[0.5], found.counted[0.7]
+    assert (half.paper, half.moved, half.only_unmoved) == (2, 0, 2)
+    assert (strict.paper, strict.moved, strict.only_unmoved) == (3, 0, 3)
+    assert (half.lost_paper, half.lost_only_unmoved) == (2, 2)
+    flat = found.flat()
+    assert flat["only_unmoved_at_0.7"] == 3
+    assert flat["below_0.5"] == 0.25
+
+
+def test_a_car_that_is_really_lost_is_lost_by_both(frame, arm_run, arm) -> None:
+    one = sets_of(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counted[0.5]
+    assert (one.paper, one.moved, one.only_unmoved) == (1, 1, 0)
+    assert (one.lost_paper, one.lost_only_unmoved) == (1, 0)
+
+
+def test_no_objects(arm_run, arm) -> None:
+    found = sets_of(arm_run(arm("mesh"), []))
+    assert found.objects == 0
+    assert set(found.iou.values()) == set(found.below.values()) == {None}

@@ -1,0 +1,323 @@
+"""`drivesem study retrain`: how detectors are judged, what is said of them, and the whole on embedded frames."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from detectors.registry import load_detector, save_detector
+from detectors.types import CLASSES, Detections, Targets
+from drivesem.analysis.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, PairCounts, ShownRun, Target, row_of
+from drivesem.analysis.transfer.report import sheets as transfer_sheets
+from drivesem.attack.methods.base import Attack
+from drivesem.cli import main
+from drivesem.config.commands import Study
+from drivesem.evaluation.matches import Matches
+from drivesem.evaluation.resampling import Interval
+from drivesem.run.frame import as_detections
+from drivesem.run.protocol import PROTOCOL
+from drivesem.run.results import Failure, FrameResult
+from tools.experiments.detection import lessons, retrain, retrain_report
+from tools.experiments.detection.counts import ArmCounts
+from tools.experiments.detection.lessons import BENIGN, lessons_of, reference_of
+from tools.experiments.detection.report import OWN_PROTOCOL, answer_of
+from tools.experiments.detection.robust import KINDS, RobustRow
+from tools.experiments.detection.running import AttackFacts
+from tools.experiments.detection.taught import RetrainCounts, SeenBenign, Taught, taught
+
+FRAMES, DRAWS = 8, 40
+THEIRS = {name: value for name, value in PROTOCOL.items() if name != "early_stop"}
+"""The paper's protocol, as a study is told it."""
+ASKED = (
+    *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
+    *("recall_moved", "reference"),
+)
+"""What other programs read of a row."""
+CAR = torch.tensor([[10.0, 20.0, 60.0, 50.0]])
+
+
+def benign_frames(missed: Sequence[int]) -> tuple[list[Detections], list[Targets]]:
+    """Frames of one car; it is not found in those of `missed`."""
+    wanted = [Targets(CAR, torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.bool))] * FRAMES
+    none = Detections(CAR[:0], torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+    hit = Detections(CAR, torch.zeros(1, dtype=torch.int64), torch.tensor([0.9]))
+    return [none if i in missed else hit for i in range(FRAMES)], wanted
+
+
+def seen(missed: Sequence[int] = ()) -> SeenBenign:
+    found, wanted = benign_frames(missed)
+    return SeenBenign(Matches.of(wanted, found, 0), 0.5)
+
+
+def known(name: str, results: Sequence[FrameResult], kept: int) -> PairCounts:
+    """A detector that finds the first car of the attacked picture in the first `kept` frames, others always."""
+    source = ShownRun(BENIGN, "squeezedet", "si-fgsm", "rotate")
+    target = Target(name, name, CLASSES, 0.5)
+    found = {
+        "benign": [as_detections(r.detections_benign, CLASSES) for r in results],
+        "rerendered": [as_detections(r.detections_benign, CLASSES) for r in results],
+        "attacked": [
+            as_detections(r.detections_benign if i < kept else r.detections_attacked, CLASSES)
+            for i, r in enumerate(results)
+        ],
+    }
+    return PairCounts.of(source, target, results, found)
+
+
+def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult]) -> None:
+    """Four frames whose first car is lost, in one of them for certain; the target loses it in that one alone."""
+    lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, grade="threshold")
+    results = [
+        replace(frame(str(i), found=False, success=True), failures=(replace(lost, grade=grade),))
+        for i, grade in enumerate(("threshold", "threshold", "threshold", "confirmed"))
+    ]
+    told = row_of(known("target", results, 3), DRAWS, 0)
+    assert told.counts[CERTAIN] == (1, 1)
+    assert told.counts[THRESHOLD] == (0, 3)
+    assert told.counts[TRANSFER] == (1, 4)
+    assert told.flat()["certain_rate"] == 1.0
+    shares = transfer_sheets([told])[1]
+    assert [cell.split("\n")[-1] for cell in shares.rows[0][5:7]] == ["1 of 1", "0 of 3"]
+
+
+@pytest.fixture
+def found(frame: Callable[..., FrameResult], arm_run: Callable[..., Any], arm: Callable[..., Any]) -> Taught:
+    """Four frames: the detector as it was loses a car in all of them; the retrained ones in half."""
+    study = Study(name="retrain", quick=True, bootstrap=DRAWS, **THEIRS)  # pyright: ignore[reportArgumentType]
+    plan = lessons_of(study)
+    lost = [frame(str(i), found=False, success=True) for i in range(4)]
+    half = [frame(str(i), found=i < 2, success=i >= 2) for i in range(4)]
+    names = [BENIGN, *(lesson.name for lesson in plan)]
+    runs = [arm_run(arm(name), lost if name == BENIGN else half) for name in names]
+    counts = RetrainCounts(
+        attack="combo 2",
+        learned=AttackFacts(4, 4, 4, 1, {}),
+        judged=AttackFacts(4, 4 * len(names), 4 * len(names), 0, {"9": "no camera"}),
+        shown={lesson.name: 4 for lesson in plan},
+        benign=4,
+        benign_frames=tuple(f"{i:03d}" for i in range(FRAMES)),
+        seen={name: seen() if name == BENIGN else seen([0]) for name in names},
+        known=[known(name, lost, 0 if name == BENIGN else 2) for name in names],
+        fresh=[ArmCounts.of(run) for run in runs],
+    )
+    return taught(study, counts)
+
+
+def test_the_drop_is_paired_over_frames(found: Taught) -> None:
+    """One car a frame, the first missed: at weights w the recall is 1 - w0 / n, and precision 1 up to it."""
+    flat = found.rows[1].flat()
+    weights = np.random.default_rng(0).multinomial(FRAMES, np.full(FRAMES, 1 / FRAMES), size=DRAWS)
+    falls = 1 - (np.floor(100 * (1 - weights[:, 0] / FRAMES) + 1e-9) + 1) / 101
+    assert flat["benign_drop"] == pytest.approx(1 - (np.floor(100 * 7 / 8) + 1) / 101)
+    assert flat["benign_drop_low"] == pytest.approx(np.quantile(falls, 0.025))
+    assert flat["benign_drop_high"] == pytest.approx(np.quantile(falls, 0.975))
+    assert flat["benign_recall_drop"] == pytest.approx(1 / 8)
+    assert flat["benign_ap50"] == pytest.approx(1 - flat["benign_drop"])
+    first = found.rows[0].flat()
+    assert (first["benign_drop"], first["benign_drop_low"], first["benign_drop_high"]) == (0.0, 0.0, 0.0)
+
+
+def test_gains_are_over_the_detector_as_it_was(found: Taught) -> None:
+    before, after = (r.flat() for r in found.rows[:2])
+    assert (before["gain_moved"], before["fresh_gain_moved"]) == (0.0, 0.0)
+    for prefix in ("", "fresh_"):
+        rise = after[f"{prefix}moved_ap50"] - before[f"{prefix}moved_ap50"]
+        assert rise > 0.2
+        assert after[f"{prefix}gain_moved"] == pytest.approx(rise)
+        assert after[f"{prefix}gain_moved_low"] <= rise <= after[f"{prefix}gain_moved_high"]
+    assert (before["broken_rate"], after["broken_rate"]) == (1.0, 0.5)
+    assert (before["fresh_broken_rate"], after["fresh_broken_rate"]) == (1.0, 0.5)
+    assert after["drop_moved"] == pytest.approx(after["photographs_ap50"] - after["moved_ap50"])
+
+
+def test_the_papers_figures_stand_beside_its_protocol_only(found: Taught) -> None:
+    study = Study(name="retrain", **THEIRS)  # pyright: ignore[reportArgumentType]
+    plan = lessons_of(study)
+    assert reference_of("retrained, paper's protocol", plan, study) == (0.7276, 0.8473)
+    own = Study(name="retrain")
+    assert {reference_of(lesson.name, plan, own) for lesson in plan} == {None}
+    rows = [replace(row, reference=None) for row in found.rows]
+    told = retrain_report.told(replace(found, rows=rows))
+    assert OWN_PROTOCOL in told.notes
+    assert not any("there" in column for sheet in told.sheets for column in sheet.columns)
+
+
+def test_what_is_told(found: Taught, tmp_path: Path) -> None:
+    data = found.to_json()
+    json.dumps(data, allow_nan=False)
+    assert [set(ASKED) - set(r) for r in data["rows"]] == [set()] * 3
+    assert [(r["reference"], r["reference_benign"]) for r in data["rows"]] == [
+        (0.659, 0.994),
+        (0.659, 0.994),
+        (None, None),  # which is trained in another way than the paper's
+    ]
+    assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (4, FRAMES, 1.0)
+    shown = {name: (t["pictures"], t["labels"]) for name, t in data["training"].items()}
+    assert shown["retrained, ours"] == ("counterexample", "moved")
+    assert shown["retrained on benign re-rendered images"] == ("rerender", "benign")
+    told = retrain_report.told(found)
+    answer_of(told, tmp_path, {}, "drivesem study retrain", None).write()
+    text = (tmp_path / "study.md").read_text()
+    assert all(f"## {sheet.title}" in text for sheet in told.sheets)
+    for part in ("65.90", "99.40", "92.97", "Frame 9 could not be used: no camera", "1 frame without vehicles"):
+        assert part in text
+    lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
+    assert [line["name"] for line in lines] == [r.name for r in found.rows]
+    stream = io.StringIO()
+    answer_of(told, tmp_path, {}, "", None).print(Console(file=stream, width=100))
+    assert "retrained, ours" in stream.getvalue()
+    retrain_report.write_plot(tmp_path / "study.png", found)
+    assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
+
+
+def test_the_picture_is_of_failures_where_states_were_shown(
+    found: Taught, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Groups without any bar are left out; AP50 has no groups of states."""
+    drawn: list[dict[str, list[Interval | None]]] = []
+    draw = retrain_report.bars
+    monkeypatch.setattr(retrain_report, "bars", lambda axes, series: (drawn.append(series), draw(axes, series)))
+    monkeypatch.setattr(retrain_report.files, "write_bytes", lambda *_: None)
+    told = Interval("", 0.2, 0.1, 0.3)
+    row = RobustRow("certain", "ours", dict.fromkeys(KINDS, told), {}, replace(told, value=0.5), None, None)
+    retrain_report.write_plot(Path("a.png"), replace(found, chances=[row]))
+    assert [one.value for one in drawn[0]["ours"] if one] == [0.2, 0.2, 0.2, 0.5]
+    retrain_report.write_plot(Path("a.png"), found)
+    once = replace(found, rows=[found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])])
+    retrain_report.write_plot(Path("a.png"), once)
+    assert [len(series[BENIGN]) for series in drawn[1:]] == [3, 2]
+
+
+def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Store:
+        names = ("a", "b")
+        digest = "of their pictures"
+
+        def __len__(self) -> int:
+            return len(self.names)
+
+    looks: list[int] = []
+
+    def detect(detector: object, store: Store, indices: Sequence[int], device: str) -> list[Detections]:
+        looks.append(len(indices))
+        return benign_frames([1])[0][: len(indices)]
+
+    monkeypatch.setattr(retrain, "detect", detect)
+    detector, store, path = load_detector("squeezedet"), Store(), tmp_path / "seen.json"
+    first = retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    again = retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    assert looks == [2]
+    assert [len(one) for one in again] == [len(one) for one in first] == [1, 0]
+    assert torch.equal(again[0].boxes_xyxy, first[0].boxes_xyxy)
+    assert torch.equal(again[0].scores, first[0].scores)
+    with torch.no_grad():
+        next(iter(detector.parameters())).add_(1.0)
+    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    store.names = ("a",)  # pyright: ignore[reportAttributeAccessIssue]
+    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    store.digest = "of others"  # pyright: ignore[reportAttributeAccessIssue]
+    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    assert looks == [2, 2, 1, 1], "other weights, other frames, other pictures"
+
+
+def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
+    weights = tmp_path / "w.safetensors"
+    detector = load_detector("squeezedet")
+    save_detector(detector, weights, {"retrained_from": "squeezedet", "steps": "2"})
+    retrain.set_threshold(detector, weights, 0.123456789)
+    assert load_detector(weights).t_star == detector.t_star == 0.123457
+    written = weights.stat().st_mtime_ns
+    retrain.set_threshold(load_detector(weights), weights, 0.123456789)
+    assert weights.stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--train-steps", "0"], "--train-steps: expected at least 1, found 0"),
+        (["--fresh", "0"], "--fresh: expected at least 1, found 0"),
+        (["--benign-frames", "-3"], "--benign-frames: expected at least 1, found -3"),
+        (["--held-out", "x"], "--held-out, --benign-root: expected none with the embedded frames"),
+        (["--detector", "squeezdet"], "--detector: expected a detector that can be trained"),
+        (["--detector", "onnx:none.onnx"], "--detector: expected a detector"),
+        (["--mix", "half"], "half"),
+        (["--dataset", "kitti"], "--root: expected the folder of data set 'kitti'"),
+    ],
+)
+def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert message in refused("study", "retrain", *words)
+
+
+def test_without_new_attacks_there_is_no_table_of_them(found: Taught) -> None:
+    rows = [found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])]
+    counts = replace(found.counts, left_out={"the same, consistently": "no failure"})
+    less = replace(found, rows=rows, counts=counts)
+    assert less.to_json()["left_out"] == {"the same, consistently": "no failure"}
+    assert less.rows[1].flat()["fresh_moved_ap50"] is None
+    told = retrain_report.told(less)
+    assert not any("Fresh" in sheet.title for sheet in told.sheets)
+    assert any("Fresh" in sheet.title for sheet in retrain_report.told(found).sheets)
+    assert "Left out: the same, consistently: no failure." in told.notes
+
+
+@pytest.mark.slow
+def test_the_whole_study_and_going_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    words = ["study", "retrain", "--quick", "--limit", "2", "--fresh", "1", "--benign-frames", "2", "--steps", "3"]
+    words += ["--train-steps", "2", "--workers", "1", "--bootstrap", "5", "--out", str(out), "--json"]
+    words += ["--states", "2"]
+    assert main(words) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert [r["name"] for r in data["rows"]] == [
+        "benign detector",
+        "retrained on benign re-rendered images",
+        "retrained, ours",
+    ]
+    assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (1, 2, 1.0)
+    assert json.loads((out / "study.json").read_text()) == data
+    assert (data["state_frames"], [row["arm"] for row in data["robust"]]) == (1, [BENIGN, "re-rendered", "ours"])
+    assert data["robust"][0]["failures_anywhere"] is not None
+    assert {row["goal"] for row in data["robust"]} == {None}
+    assert (out / "robust.csv").is_file()
+    folders = {path.name for path in (out / "arms").iterdir()}
+    assert folders == {"combo-2", "held-out", "held-out-re-rendered", "held-out-ours"}
+    learned, judged = ((out / "arms" / n / "frames" / "demo-000" / "benign.png") for n in ("combo-2", "held-out"))
+    assert learned.read_bytes() != judged.read_bytes()
+    settings = (out / "arms" / "held-out-ours" / "config.yaml").read_text()
+    assert f"detector: {out / 'retrained' / 'ours' / 'retrained.safetensors'}" in settings
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("done before")
+
+    (out / "study.json").unlink()
+    with monkeypatch.context() as patch:
+        for place, name in ((lessons, "train_on"), (retrain, "detect"), (Attack, "__call__")):
+            patch.setattr(place, name, never)
+        assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == data
+    kept = shutil.copytree(out / "kept", tmp_path / "kept")
+    assert main(["study", "retrain", "--from", str(kept), "--out", str(tmp_path / "again"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == data
+    for name in ("study.md", "study.csv", "robust.csv", "study.png"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+    # other weights: what was attacked with the old ones is no longer fresh
+    shutil.copy(out / "retrained" / "ours" / "retrained.safetensors", out / "retrained" / "re-rendered")
+    assert main(words) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows[1]["fresh_moved_ap50"] == rows[2]["fresh_moved_ap50"]
+    assert main([*words, "--limit", "1"]) == 2, "other frames to train on"
+    assert "other values of limit" in capsys.readouterr().err

@@ -1,0 +1,186 @@
+"""`drivesem study transfer`: attacked once, then asked; what stands beside, and what it says of the paper."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+
+from detectors.types import Detections
+from drivesem.attack.methods.base import Attack
+from drivesem.cli import main
+from drivesem.config.commands import Study
+from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
+from drivesem.run import looking
+from tools.experiments.detection import transfer
+from tools.experiments.detection.arms import PLACEBO, arms_of
+from tools.experiments.detection.report import OWN_PROTOCOL
+
+WORDS = ["study", "transfer", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
+ASKED = (
+    *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
+    *("recall_moved", "reference"),
+)
+"""What other programs read of a row."""
+
+
+def studied(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main([*WORDS, "--json", *map(str, words)]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study") / "transfer"
+    assert main([*WORDS, "--out", str(out)]) == 0
+    return out
+
+
+def test_rows_and_references(finished: Path) -> None:
+    data = json.loads((finished / "study.json").read_text())
+    rows = {row["name"]: row for row in data["rows"]}
+    assert list(rows) == ["squeezedet -> squeezedet", "squeezedet -> yolov3-slim"]
+    assert all(set(ASKED) <= set(row) for row in rows.values())
+    own, other = rows.values()
+    assert own["reference"] is other["reference"] is None  # the study's attack is not the paper's
+    for row in rows.values():
+        assert row["drop_moved"] == pytest.approx(row["benign_ap50"] - row["moved_ap50"], abs=1e-9)
+        assert row["rerendered_ap50"] == row["benign_ap50"], "nothing changed gives the photograph"
+        assert row["recall_moved"] == row["moved_recall"]
+        assert row["placebo_drop_moved"] is not None
+    assert (data["frames"], data["feasible_fraction"]) == (1, 1.0)
+    metrics = json.loads((finished / "arms" / "combo-2" / "metrics.json").read_text())
+    assert own["moved_ap50"] == pytest.approx(metrics["attacked"]["moved"]["ap50"], abs=1e-9)
+    assert (own["lost"], own["phantoms"]) == (metrics["lost_objects"], metrics["phantoms"])
+    assert own["broken_rate"] == metrics["successes_moved"]
+
+
+def test_files(finished: Path) -> None:
+    text = (finished / "study.md").read_text()
+    assert "## Car AP50, %; counterexamples of squeezedet" in text
+    assert "| yolov3-slim |" in text
+    assert "91.28" not in text
+    assert OWN_PROTOCOL in text
+    lines = list(csv.DictReader((finished / "study.csv").read_text().splitlines()))
+    assert [line["target"] for line in lines] == ["squeezedet", "yolov3-slim"]
+    assert min(cv2.imread(str(finished / "study.png")).shape[:2]) > 200
+    assert {path.name for path in (finished / "arms").iterdir()} == {"combo-2", f"combo-2-{PLACEBO}"}
+    assert (finished / "detections").is_dir()
+
+
+def test_under_the_papers_protocol_its_figures_stand_beside(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(finished, tmp_path / "transfer"))
+    monkeypatch.setattr(transfer, "follows_paper", lambda attack: attack.method == "si-fgsm")
+    own, other = studied(capsys, "--out", out)["rows"]
+    assert (own["reference_benign"], own["reference"]) == (PAPER_BENIGN, PAPER_COMBOS[2])
+    assert other["reference"] is None  # a narrow YOLOv3 is not the paper's
+    text = (out / "study.md").read_text()
+    assert "Ours, under the paper's protocol" in text
+    assert "91.28 to 87.50" in text
+
+
+def test_asked_again_nothing_is_attacked_or_looked_at(
+    finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The order of the detectors may change, and others may come."""
+
+    def never(*_: object) -> None:
+        raise AssertionError("done before")
+
+    monkeypatch.setattr(looking, "predict", never)
+    monkeypatch.setattr(Attack, "__call__", never)
+    before = json.loads((finished / "study.json").read_text())
+    assert studied(capsys, "--out", finished) == before
+    assert studied(capsys, "--out", finished, "--detectors", "yolov3-slim") == before
+
+
+def test_what_is_kept_tells_the_same_without_a_run(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also of a study that an earlier version finished: the same command keeps it."""
+    before = (finished / "study.json").read_bytes()
+    shutil.rmtree(finished / "kept")
+    studied(capsys, "--out", finished)
+    kept = Path(shutil.move(finished / "kept", tmp_path / "kept"))
+    assert main(["study", "transfer", "--from", str(kept), "--out", str(tmp_path / "again")]) == 0
+    assert (tmp_path / "again" / "study.json").read_bytes() == before
+    for name in ("study.md", "study.csv", "study.png"):
+        assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_a_detector_that_finds_nothing_has_nothing_to_lose(
+    finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Blind:
+        name, classes = "blind", ("Car",)
+
+        def forward(self, images: torch.Tensor) -> int:
+            return len(images)
+
+        def decode(self, raw: int) -> list[Detections]:
+            return [Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))] * raw
+
+    whole = looking.load_predictor
+    monkeypatch.setattr(
+        looking, "load_predictor", lambda name, *rest: Blind() if name == "onnx:a.onnx" else whole(name, *rest)
+    )
+    rows = studied(capsys, "--out", finished, "--detectors", "onnx:a.onnx")["rows"]
+    assert [row["target"] for row in rows] == ["squeezedet", "onnx:a.onnx"]
+    blind = rows[1]
+    assert (blind["benign_ap50"], blind["moved_ap50"], blind["drop_moved"]) == (0.0, 0.0, 0.0)
+    assert (blind["lost"], blind["lost_rate"], blind["broken_rate"]) == (0, None, 0.0)
+    assert blind["reference"] is None
+
+
+def test_each_source_has_an_arm_and_its_placebo() -> None:
+    study = Study(name="transfer", sources="squeezedet,yolov3-slim", steps=3)
+    arms = arms_of(study, Path("out"))
+    assert [arm.folder for arm in arms] == [
+        "combo-2",
+        "combo-2-placebo",
+        "combo-2-yolov3-slim",
+        "combo-2-yolov3-slim-placebo",
+    ]
+    assert [arm.config.detector for arm in arms] == ["squeezedet"] * 2 + ["yolov3-slim"] * 2
+    assert arms[3].config.like == "out/arms/combo-2-yolov3-slim"
+    assert len(arms_of(Study(name="transfer", controls=False), Path("out"))) == 1
+
+
+@pytest.mark.slow
+def test_two_sources_make_a_matrix(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("--out", finished, "--sources", "squeezedet,yolov3-slim")
+    rows = studied(capsys, *words)["rows"]
+    assert [(row["source"], row["target"]) for row in rows] == [
+        ("squeezedet", "squeezedet"),
+        ("squeezedet", "yolov3-slim"),
+        ("yolov3-slim", "squeezedet"),
+        ("yolov3-slim", "yolov3-slim"),
+    ]
+    settings = (finished / "arms" / "combo-2-yolov3-slim" / "config.yaml").read_text()
+    assert "detector: yolov3-slim" in settings
+    metrics = json.loads((finished / "arms" / "combo-2-yolov3-slim" / "metrics.json").read_text())
+    assert rows[3]["moved_ap50"] == pytest.approx(metrics["attacked"]["moved"]["ap50"], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--detectors", "squeezdet"], "--detectors: expected detectors (squeezedet, "),
+        (["--detectors", ","], "--detectors: expected detectors with commas"),
+        (["--sources", "squeezedet,squeezedet"], "--sources: expected each detector once, found squeezedet"),
+        (["--detector", "squeezdet"], "--detector: expected a detector"),
+        (["--t-star", "0"], "--t-star: expected a score"),
+    ],
+)
+def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    assert message in refused("study", "transfer", *words)

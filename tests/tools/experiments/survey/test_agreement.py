@@ -1,0 +1,35 @@
+"""Krippendorff's alpha: his own example, bounds, and what leaves it undefined."""
+
+from __future__ import annotations
+
+import pytest
+
+from tools.experiments.survey.agreement import alpha, interval, nominal
+
+# Four observers, twelve units, 0 where one said nothing (Krippendorff, Computing ... Alpha-Reliability, 2011).
+EXAMPLE = (
+    (1, 2, 3, 3, 2, 1, 4, 1, 2, 0, 0, 0),
+    (1, 2, 3, 3, 2, 2, 4, 1, 2, 5, 0, 3),
+    (0, 3, 3, 3, 2, 3, 4, 2, 2, 5, 1, 0),
+    (1, 2, 3, 3, 2, 4, 4, 1, 2, 5, 1, 0),
+)
+UNITS = [[value for value in unit if value] for unit in zip(*EXAMPLE, strict=True)]
+
+
+def test_the_published_example() -> None:
+    assert alpha(UNITS, nominal) == pytest.approx(0.743, abs=5e-4)
+    assert alpha(UNITS, interval) == pytest.approx(0.849, abs=5e-4)
+
+
+def test_bounds() -> None:
+    assert alpha([[1, 1], [5, 5, 5], [9, 9]], interval) == 1
+    # two people who always disagree: worse than chance
+    worst = alpha([["a", "b"], ["b", "a"]], nominal)
+    assert worst == pytest.approx(-0.5)
+    assert alpha([[2, 4], [4, 2], [2, 4]], interval) == alpha([[20, 40], [40, 20], [20, 40]], interval)
+
+
+def test_undefined() -> None:
+    assert alpha([], nominal) is None
+    assert alpha([["a"], []], nominal) is None
+    assert alpha([["a", "a"], ["a", "a"]], nominal) is None

@@ -1,0 +1,168 @@
+"""`drivesem realism` on hand-made runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivesem.cli import main
+from drivesem.evaluation.resampling import Interval
+from drivesem.run.results import dump_frame, load_frame
+from scene_ir import files
+from scene_ir.errors import ShapeError
+from tools.experiments.realism import comparison
+from tools.experiments.realism.comparison import rectangle_around, vehicles, window
+from tools.experiments.realism.measures import LEAST_PX
+
+
+@pytest.fixture
+def realism(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    def call(*words: object) -> dict[str, Any]:
+        capsys.readouterr()
+        assert main(["realism", "--bootstrap", "20", "--json", *map(str, words)]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def rows_of(data: dict[str, Any], **which: object) -> list[dict[str, Any]]:
+    return [row for row in data["rows"] if all(row[key] == value for key, value in which.items())]
+
+
+def test_identity(write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]) -> None:
+    run = write_run(tmp_path / "run", same=True)
+    data = realism(run, "--metrics", "psnr,ssim,perceptual,frechet")
+    for row in data["rows"]:
+        expected = {"psnr": None, "ssim": pytest.approx(1), "perceptual": 0, "frechet": 0}[row["metric"]]
+        assert row["value"] == expected
+        # draws of frames hold repetitions, and would lie farther apart than the sets
+        assert row["low"] == row["high"] == (None if row["metric"] == "frechet" else expected)
+    assert len(data["rows"]) == 2 * 4 * 3
+    assert {row["pictures"] for row in rows_of(data, region="boxes")} == {6}
+
+
+def test_figures(write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]) -> None:
+    runs = [write_run(tmp_path / name, params=params) for name, params in (("one", "rotate"), ("two", "mesh"))]
+    data = realism(*runs, "--metrics", "psnr,ssim,perceptual,frechet", "--out", tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "realism.json").read_text()) == data
+    assert [(one["run"], one["params"], one["frames"], one["vehicles"]) for one in data["runs"]] == [
+        ("one", "rotate", 3, 6),
+        ("two", "mesh", 3, 6),
+    ]
+    (psnr,) = rows_of(data, run="one", region="frame", metric="psnr", first="benign", second="attacked")
+    errors = []
+    for name in "abc":
+        before, after = (
+            files.read_image(runs[0] / "frames" / name / f"{file}.png").astype(float)
+            for file in ("benign", "counterexample")
+        )
+        errors.append(np.mean((before - after) ** 2))
+    assert psnr["value"] == pytest.approx(10 * np.log10(255**2 / np.mean(errors)))
+    assert psnr["median"] == pytest.approx(10 * np.log10(255**2 / np.median(errors)))
+    assert psnr["low"] <= psnr["value"] <= psnr["high"]
+    (boxes,) = rows_of(data, run="one", region="boxes", metric="psnr", first="benign", second="attacked")
+    assert boxes["value"] < psnr["value"]
+    for row in rows_of(data, metric="perceptual", second="attacked"):
+        assert 0 < row["low"] <= row["value"] <= row["high"]
+    lines = list(csv.DictReader((tmp_path / "out" / "realism.csv").read_text().splitlines()))
+    assert len(lines) == 2 * 3 * 3 * 3
+    equal = [line for line in lines if line["second"] == "rerendered"]
+    assert {line["psnr"] for line in equal} == {""}
+    assert {float(line["ssim"]) for line in equal} == {1.0}
+    # the second car stands where nothing changed, but for what the first one's rectangle shares with it
+    first, second = (
+        [float(x["perceptual"]) for x in lines if x["object"] == i and x["second"] == "attacked"] for i in "01"
+    )
+    assert min(first) > max(second)
+    assert "| one | rotate | frame | PSNR, dB | inf |" in (tmp_path / "out" / "realism.md").read_text()
+
+
+def test_successes_alone(
+    write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]
+) -> None:
+    run = write_run(tmp_path / "run")
+    assert realism(run, "--metrics", "psnr", "--successes")["runs"][0]["frames"] == 2
+    assert realism(run, "--metrics", "psnr", "--limit", "1")["runs"][0]["frames"] == 1
+
+
+def test_a_table_for_people(
+    write_run: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "run")
+    assert main(["realism", str(run), "--metrics", "ssim", "--bootstrap", "0"]) == 0
+    said = capsys.readouterr()
+    assert "distances between pictures" in said.out
+    assert str(run / "realism") in said.err.replace("\n", "")
+
+
+def test_windows() -> None:
+    rows, columns = window([(10, 20, 30.5, 40)], 200, 300)
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (LEAST_PX, LEAST_PX)
+    assert rows.start <= 20 < 40 <= rows.stop
+    assert columns.start == 0
+    both = window([(10, 20, 90, 40), (100.2, 10, 190.4, 150.6)], 200, 300)
+    assert both == (slice(10, 151), slice(10, 191))
+    outside = window([(290, 190, 400, 300)], 200, 300)
+    assert outside == (slice(200 - LEAST_PX, 200), slice(300 - LEAST_PX, 300))
+    with pytest.raises(ShapeError, match="at least 64 px"):
+        window([(0, 0, 1, 1)], 63, 300)
+
+
+def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
+    write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]
+) -> None:
+    nowhere, box = (0.0, 0.0, 0.0, 0.0), (210.0, 120.0, 290.0, 190.0)
+    assert window([box, nowhere], 200, 300) == window([nowhere, box], 200, 300) == window([box], 200, 300)
+    assert rectangle_around([nowhere, box]) == box
+    run = write_run(tmp_path / "run")
+    path = run / "frames" / "a" / "result.json"
+    result = load_frame(path)
+    benign, moved = result.targets_benign, result.targets_moved
+    left = (replace(moved[0], xyxy=nowhere, ignore=True), moved[1])
+    files.write_text(path, dump_frame(replace(result, targets_moved=left)))
+    assert vehicles(load_frame(path)) == list(zip(benign, left, strict=True))
+    assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 6
+    never = (replace(benign[0], xyxy=nowhere, ignore=True), benign[1])
+    files.write_text(path, dump_frame(replace(result, targets_benign=never, targets_moved=left)))
+    assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 5
+
+
+def test_bounds_of_psnr_swap_with_those_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small error is a large PSNR, and no error an infinite one."""
+    monkeypatch.setattr(comparison, "intervals", lambda *_: [Interval("", 25.0, 0.0, 100.0)])
+    part = comparison.Part(None, "", {"psnr": dict.fromkeys(comparison.PAIRS, 25.0)}, {})
+    row = comparison.rows([comparison.FrameParts("a", (part,))], ["psnr"], 1, 0)[0]
+    assert (row.low, row.high) == (pytest.approx(20 * np.log10(25.5)), None)
+
+
+def test_bad_input(
+    write_run: Callable[..., Path], tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
+    run = write_run(tmp_path / "run")
+
+    def says(*words: object) -> str:
+        line = refused("realism", *map(str, words))
+        (tmp_path / "empty").rmdir()
+        return line
+
+    assert "RUN: expected folders of drivesem attack, found nothing" in says()
+    assert "RUN: expected a folder of drivesem attack" in says(tmp_path)
+    assert "each run once" in says(run, run)
+    assert "--metrics: expected available, or psnr" in says(run, "--metrics", "psnr,beauty")
+    assert "alexnet-owt-*.pth" in says(run, "--metrics", "lpips-alex")
+    assert "--weights: expected a folder" in says(run, "--weights", run / "metrics.json")
+    assert "--limit: expected at least 1" in says(run, "--limit", "0")
+    assert "--bootstrap: expected at least 0" in says(run, "--bootstrap", "-1")
+    assert "--out: expected a folder" in says(run, "--out", run / "metrics.json")
+    files.write_png(run / "frames" / "a" / "rerender.png", np.zeros((70, 90, 3), np.uint8))
+    assert "expected pictures of one size" in says(run, "--metrics", "psnr")
+    (run / "frames" / "a" / "counterexample.png").write_bytes(b"no picture")
+    assert "counterexample.png: expected an image" in says(run, "--metrics", "psnr")

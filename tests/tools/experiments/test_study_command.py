@@ -1,0 +1,255 @@
+"""`drivesem study` on one embedded frame: files, figures, going on; each arm is an attack like any other."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import yaml
+
+from drivesem.cli import main
+from drivesem.config.commands import Study
+from drivesem.failures.second_renderer.base import NoSecondRendererError
+from drivesem.synth.write import Order, synthesise
+from tools.experiments.detection import asking as study_asking
+from tools.experiments.detection.arms import Arm, arms_of
+
+WORDS = ["study", "multi", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
+ASKED = (
+    *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
+    *("recall_moved", "reference"),
+)
+"""What other programs read of a row."""
+
+
+def first_arm(config: Study, out: Path) -> list[Arm]:
+    """Combination 1 and its controls."""
+    return arms_of(config, out)[:3]
+
+
+def study(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main(words) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture(autouse=True)
+def fewer_arms(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_asking, "arms_of", first_arm)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study_asking, "arms_of", first_arm)
+        assert main([*WORDS, "--out", str(out)]) == 0
+    return out
+
+
+def result(folder: Path) -> dict[str, Any]:
+    data = json.loads((folder / "frames" / "demo-000" / "result.json").read_text())
+    data.pop("seconds")
+    return data
+
+
+def test_files(finished: Path) -> None:
+    data = json.loads((finished / "study.json").read_text())
+    (row,) = data["rows"]
+    assert set(ASKED) <= set(row)
+    assert (row["name"], row["reference"]) == ("combo 1", None)  # the paper takes more steps
+    assert row["drop_moved"] == pytest.approx(row["benign_ap50"] - row["moved_ap50"], abs=1e-9)
+    assert (data["frames"], data["feasible_fraction"], data["frames_without_vehicles"]) == (1, 1.0, 0)
+    (line,) = csv.DictReader((finished / "study.csv").read_text().splitlines())
+    assert float(line["paper_ap50"]) == row["paper_ap50"]
+    assert "| combo 1 |" in (finished / "study.md").read_text()
+    assert min(cv2.imread(str(finished / "study.png")).shape[:2]) > 400
+    settings = yaml.safe_load((finished / "config.yaml").read_text())
+    assert (settings["name"], settings["steps"]) == ("multi", 1)
+
+
+def test_tables_come_again_from_what_is_kept(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows, intervals and p values to the last bit; and other draws give other intervals."""
+    words = ["study", "multi", "--from", str(finished / "kept"), "--json"]
+    assert study(words, capsys) == json.loads((finished / "study.json").read_text())
+    assert study([*words, "--out", str(tmp_path / "again")], capsys)["bootstrap"] == 5
+    again = {path.name: path.read_bytes() for path in (tmp_path / "again").iterdir()}
+    assert set(again) == {"study.md", "study.csv", "study.json", "study.png", "grades.csv"}
+    assert all(data == (finished / name).read_bytes() for name, data in again.items())
+    (row,) = study([*words, "--bootstrap", "0"], capsys)["rows"]
+    assert (row["drop_moved_low"], row["p"]) == (None, None)
+    assert main(["study", "multi", "--kept", str(finished / "kept")]) == 0
+    assert "combo 1" in capsys.readouterr().out
+
+
+def test_labels_come_again_from_what_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study_asking, "arms_of", lambda config, out: arms_of(config, out)[:1])
+    out = tmp_path / "labels"
+    data = study(["study", "labels", *WORDS[2:], "--out", str(out), "--json"], capsys)
+    assert data["label_sets"][0]["objects"] > 0
+    assert study(["study", "labels", "--from", str(out / "kept"), "--json"], capsys) == data
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["classification"], "settings.name: expected classification, found multi"),
+        (["single"], "settings.name: expected single, found multi"),
+        (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
+    ],
+)
+def test_what_cannot_be_told_again(
+    words: list[str], message: str, finished: Path, refused: Callable[..., str]
+) -> None:
+    assert message in refused("study", *words, "--from", str(finished / "kept"))
+
+
+@pytest.mark.parametrize(
+    ("folder", "message"), [(".", "study.json: expected a readable"), ("none", "--kept: expected")]
+)
+def test_a_folder_that_keeps_nothing(
+    folder: str, message: str, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    assert message in refused("study", "multi", "--from", str(tmp_path / folder))
+
+
+def test_what_arms_have_in_common_takes_room_once(finished: Path) -> None:
+    arms = sorted((finished / "arms").iterdir())
+    frames = [arm / "frames" / "demo-000" for arm in arms]
+    for name in ("benign.png", "scene/background.png"):
+        assert all((frame / name).samefile(frames[0] / name) for frame in frames)
+    assert not (frames[1] / "result.json").samefile(frames[0] / "result.json")
+
+
+def test_the_generator_draws_again_on_request(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "drawn"
+    shutil.copytree(finished, out)
+    (row,) = study([*WORDS, "--confirm", "--json", "--out", str(out)], capsys)["rows"]
+    drawn = json.loads((out / "arms" / "combo-1" / "confirm" / "confirm.json").read_text())
+    assert row["survive_share"] == drawn["survive"]
+    assert row["survive_failures"] == drawn["rows"][0]["failures"]
+    assert "| combo 1 |" in (out / "study.md").read_text().split("Failures that survive")[1]
+    assert study(["study", "multi", "--from", str(out / "kept"), "--json"], capsys)["rows"] == [row]
+
+
+def test_without_a_second_renderer_nothing_is_attacked(
+    tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nothing() -> None:
+        raise NoSecondRendererError("pyrender", "EGL or OSMesa", "neither")
+
+    monkeypatch.setattr("drivesem.failures.second_renderer.choose.shared_screen", nothing)
+    for _ in synthesise(Order(tmp_path / "data", 1, seed=3, split="heldout")):
+        pass
+    (tmp_path / "data" / "manifest.json").unlink()  # now nobody knows that they were generated
+    words = ["study", "multi", "--confirm", "--dataset", "kitti", "--root", str(tmp_path / "data")]
+    assert "expected EGL or OSMesa, found neither" in refused(*words, "--out", str(tmp_path / "out"))
+    assert not (tmp_path / "out" / "arms").exists()
+
+
+def test_the_placebo_is_as_large_as_the_attack(finished: Path) -> None:
+    attack, placebo = (result(finished / "arms" / name) for name in ("combo-1", "combo-1-placebo"))
+    sizes = [sorted(abs(c["value"]) for c in one["theta"]) for one in (attack, placebo)]
+    assert placebo["queries"] == 1
+    assert sum(sizes[0]) > 0
+    # projection onto what is feasible may have lessened it, and nothing else
+    assert all(small <= large + 1e-6 for large, small in zip(*sizes, strict=True))
+
+
+@pytest.mark.slow
+def test_an_arm_is_an_attack_like_any_other(finished: Path, tmp_path: Path) -> None:
+    """The same settings, by drivesem attack alone, give the same frame."""
+    words = ["attack", "--combo", "1", "--steps", "1", "--limit", "1", "--workers", "1", "--seed", "0"]
+    assert main([*words, "--out", str(tmp_path / "alone")]) == 0
+    assert result(tmp_path / "alone") == result(finished / "arms" / "combo-1")
+    for part in ("counterexample.png", "labels_moved.txt"):
+        alone, arm = (
+            f / "frames" / "demo-000" / part for f in (tmp_path / "alone", finished / "arms" / "combo-1")
+        )
+        assert alone.read_bytes() == arm.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_stopped_study_goes_on(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = Path(shutil.copytree(finished, tmp_path / "stopped"))
+    shutil.rmtree(out / "arms" / "combo-1-random" / "frames" / "demo-000")
+    (out / "study.json").unlink()
+    kept = out / "arms" / "combo-1" / "frames" / "demo-000" / "result.json"
+    # the placebo's size is of a run at another place: as it was set
+    for folder in out.glob("arms/*-placebo"):
+        text = (folder / "config.yaml").read_text()
+        (folder / "config.yaml").write_text(text.replace(str(finished), str(out)))
+    before = kept.stat().st_mtime_ns
+    data = study([*WORDS, "--out", str(out), "--json"], capsys)
+    assert kept.stat().st_mtime_ns == before
+    assert data == json.loads((finished / "study.json").read_text())
+
+
+def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*WORDS, "--out", str(finished), "--seed", "5"]) == 2
+    assert "other values of seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "NAME|single"),
+        (["fifty"], "fifty|invalid choice"),
+        (["single", "--steps", "0"], "--steps: expected at least 1, found 0"),
+        (["samples", "--queries", "0"], "--queries: expected at least 1, found 0"),
+        (["single", "--bootstrap", "-1"], "--bootstrap: expected at least 0"),
+        (["single", "--dataset", "kitti"], "--root: expected the folder of data set 'kitti'"),
+        (["single", "--t-star", "2"], "--t-star: expected a score"),
+        (["single", "--budget", "huge"], "--budget"),
+    ],
+)
+def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
+    line = refused("study", *words)
+    assert any(part in line for part in message.split("|"))
+
+
+@pytest.mark.slow
+def test_searches_of_one_parameter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first three arms: a search, its baseline and a gradient, within the passes that were asked for."""
+    words = ["study", "searches", "--params", "color", "--passes", "24", "--limit", "1", "--workers", "1"]
+    found = study([*words, "--bootstrap", "5", "--json", "--out", str(tmp_path / "a")], capsys)
+    assert [row["name"] for row in found["searches"]] == ["climb", "corners", "si-fgsm"]
+    assert all(row["passes"] <= 24 for row in found["grades"])
+    assert found["standing"][0]["objects"] == sum(
+        row["objects"] for row in found["standing"] if row["name"].startswith("distance")
+    )
+    assert (tmp_path / "a" / "standing.csv").is_file()
+    assert study(["study", "searches", "--from", str(tmp_path / "a" / "kept"), "--json"], capsys) == found
+
+
+@pytest.mark.slow
+def test_attribution_sums_to_the_difference_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "attribution"
+    words = ["study", "attribution", *WORDS[2:], "--json", "--out", str(out)]
+    data = study(words, capsys)
+    *factors, labels, total = data["rows"]
+    assert sum(row["points"] for row in factors) == pytest.approx(data["papers"] - data["ours"], abs=1e-9)
+    assert total["points"] == pytest.approx(data["papers"] - data["ours"], abs=1e-9)
+    assert labels["points"] == pytest.approx(factors[0]["points"] + factors[1]["points"], abs=1e-9)
+    assert {"study.md", "study.csv", "study.json", "study.png", "arms.csv"} <= {
+        path.name for path in out.iterdir()
+    }
+    done = {path: path.stat().st_mtime_ns for path in out.glob("arms/*/frames/*/result.json")}
+    assert len(done) == len(data["arms"]) == 13
+    assert study(words, capsys) == data
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    assert study(["study", "attribution", "--from", str(out / "kept"), "--json"], capsys) == data

@@ -1,0 +1,309 @@
+"""One fault a detector: bands for cars of all frames, searches in some of them, and rules of what all tell.
+
+A fault is drawn at random among those of its kind that hide few cars as photographed and some in Halton's draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from detectors.base import Detector, DetectorError
+from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
+from detectors.registry import load_detector
+from drivesem.analysis.holes.results import Samples
+from drivesem.attack.budgets import budget_of
+from drivesem.attack.objective import Objective
+from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.config.blocks import Scenes, shared
+from drivesem.config.commands import Bench
+from drivesem.config.errors import UsageError
+from drivesem.run.attack import Worker, grader_of
+from drivesem.run.records import dump_record, load_record
+from drivesem.scenes.sources import NoVehicleError, SceneSource
+from scene_ir import files
+from scene_ir.render.compositor import Compositor
+from scene_ir.types import SceneIR
+from tools.bench.planted.naming import looked_around
+from tools.bench.planted.pool import FramePool, hidden, sharpness
+from tools.bench.planted.remembering import Remembering
+from tools.bench.planted.yardstick import attack_settings, certain_of, methods_of, seen_without
+
+KINDS = tuple(
+    tuple(words.split("+"))
+    for words in (
+        *("height_px", "aspect", "across", "lightness", "contrast"),
+        *("aspect+lightness", "height_px+contrast", "height_px+lightness", "across+lightness"),
+        *("lightness+contrast", "across+contrast", "aspect+contrast"),
+    )
+)
+"""What faults are about, one detector each."""
+AS_PHOTOGRAPHED = 0.1
+"""Share of cars found as photographed that a fault may hide there, at most."""
+HIT = (0.02, 0.15)
+"""Share of cars in Halton's draws, of those that it does not hide as photographed, that a fault hides."""
+CARS, FRAMES = 8, 4
+"""Of so many cars in so many frames at least."""
+BY_ITSELF = 0.6
+"""Share of cars in Halton's draws that lie in any one band, at most; the others of a pair halve what it holds."""
+SAMPLES = 16
+"""States around each failure, which are pooled."""
+_TRIES = 4000
+_DIGITS = 4
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Planted:
+    """A fault of a detector. hit: share of Halton's pictures in which it hides a car; cars: of cars in them;
+    still: share of cars found as photographed that it hides there; sharp: of the cars in Halton's pictures that
+    lie in its bands by their labels, the share that it hides. A detector's boxes are not the labels: in a band
+    narrower than that difference few of them are lost.
+    """
+
+    fault: PlantedFault
+    hit: float
+    cars: float
+    still: float
+    sharp: float
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """Samples around a failure of one object."""
+
+    index: int
+    around: Samples
+
+
+@dataclass(frozen=True, slots=True)
+class AcrossAttempt:
+    """A search in one frame. fault: its text, empty without one; certain: cars lost for certain; found: of these,
+    those that the detector without the fault sees in the same picture; passes: of the search; looked: around each
+    of the certain ones.
+    """
+
+    frame: str
+    fault: str
+    method: str
+    certain: int
+    found: int
+    passes: int
+    looked: tuple[Looked, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AcrossFrame:
+    """What was found in one frame. asked: see `Across`."""
+
+    frame: str
+    asked: str
+    attempts: tuple[AcrossAttempt, ...]
+
+
+def plant_across(pools: Sequence[FramePool], names: Sequence[str], seed: int, nth: int = 0) -> Planted | None:
+    """The n-th fault of such features; None where none could be drawn. Equal arguments, equal faults."""
+    rows = [FEATURES.index(name) for name in names]
+    values, still, cars, frames = _reached(pools, rows)
+    if not len(values):
+        return None
+    rng = np.random.default_rng([seed, *"+".join(names).encode(), *([nth] if nth else [])])
+    for _ in range(_TRIES):
+        bands = np.array([_band(column, rng) for column in values.T])
+        each = (values >= bands[:, 0]) & (values <= bands[:, 1])
+        inside = each.all(1)
+        alone = each.mean(0)
+        if alone.max() > BY_ITSELF or inside.mean() > (alone.min() if len(rows) == 1 else 0.7 * alone.min()):
+            continue
+        if not 0.5 * HIT[0] <= inside.mean() <= 2 * HIT[1]:
+            continue
+        if _inside(still, bands).mean() > 2 * AS_PHOTOGRAPHED or len(np.unique(cars[inside])) < CARS:
+            continue
+        if len(np.unique(frames[inside])) < FRAMES:
+            continue
+        planted = _measured(
+            pools, PlantedFault(tuple(Band(n, *b) for n, b in zip(names, bands.tolist(), strict=True)))
+        )
+        if planted is not None:
+            return planted
+    return None
+
+
+def _reached(
+    pools: Sequence[FramePool], rows: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Features (K, F) of cars found in Halton's draws, and as photographed; of the former car and frame too."""
+    drawn, still, cars, frames = [], [], [], []
+    for number, pool in enumerate(pools):
+        for state in pool.states:
+            for car in state:
+                if car.margin > 0 and car.best is not None:
+                    drawn.append([car.best[row] for row in rows])
+                    cars.append(1000 * number + car.index)
+                    frames.append(number)
+        still += [
+            [car.best[row] for row in rows] for car in pool.looks[0] if car.margin > 0 and car.best is not None
+        ]
+    return np.array(drawn), np.array(still).reshape(-1, len(rows)), np.array(cars), np.array(frames)
+
+
+def _band(values: np.ndarray, rng: np.random.Generator) -> list[float]:
+    """Low and high between two quantiles of what is reached; half of the bands are open to one side."""
+    low, high = np.sort(rng.random(2))
+    side = rng.random()
+    low, high = (0.0 if side < 0.25 else low), (1.0 if side > 0.75 else high)
+    ends = np.quantile(values, [low, high])
+    beyond = 0.05 * (ends[1] - ends[0])
+    ends += [-beyond if low == 0 else 0.0, beyond if high == 1 else 0.0]
+    return [float(f"{end:.{_DIGITS}g}") for end in ends]
+
+
+def _inside(values: np.ndarray, bands: np.ndarray) -> np.ndarray:
+    return np.all((values >= bands[:, 0]) & (values <= bands[:, 1]), axis=1)
+
+
+def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> Planted | None:
+    """The fault and how often it hides what; None where that is too much or too little."""
+    pictures = hit = count = lost = found = still = 0
+    cars: set[tuple[str, int]] = set()
+    for pool in pools:
+        known, before = pool.found, pool.hidden_as_photographed(fault)
+        found, still = found + len(known), still + len(known & before)
+        own = [
+            (number, car)
+            for number, state in enumerate(pool.states)
+            for car in state
+            if car.margin > 0 and car.index not in before
+        ]
+        gone = hidden([car for _, car in own], fault, pool.t_star)
+        lost_here = [place for place, one in zip(own, gone, strict=True) if one]
+        cars |= {(pool.frame, car.index) for _, car in lost_here}
+        pictures, hit = pictures + len(pool.states), hit + len({number for number, _ in lost_here})
+        count, lost = count + len(own), lost + len(lost_here)
+    if not found or not count or still > AS_PHOTOGRAPHED * found or not HIT[0] <= lost / count <= HIT[1]:
+        return None
+    if len(cars) < CARS or len({frame for frame, _ in cars}) < FRAMES:
+        return None
+    return Planted(fault, hit / pictures, lost / count, still / found, sharpness(pools, fault))
+
+
+@dataclass(frozen=True)
+class Across:
+    """What one process needs. kept: folder of what is done; faults: in words."""
+
+    config: Bench
+    detector: Detector
+    workers: dict[str, Worker]
+    kept: Path | None
+    faults: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, config: Bench, faults: tuple[str, ...] = ()) -> Across:
+        """Raises UsageError or SceneError for settings that cannot be."""
+        methods = methods_of(config)
+        parse_params(config.params)
+        budget_of(config.budget)
+        try:
+            detector = load_detector(config.detector, config.device)
+        except DetectorError as error:
+            raise UsageError.of("--detector", "a detector with gradients", error) from error
+        first = Worker.of(attack_settings(config, methods[0]), detector)
+        workers = {method: first.beside(attack_settings(config, method)) for method in methods}
+        kept = None if config.out is None or config.out.endswith(".json") else Path(config.out)
+        return cls(config, detector, workers, kept, faults)
+
+    @property
+    def states(self) -> int:
+        """Of Halton's, a frame."""
+        assert self.config.across is not None
+        return self.config.across
+
+    @property
+    def source(self) -> SceneSource:
+        """Of the frames."""
+        return next(iter(self.workers.values())).source
+
+    def pool(self, name: str) -> FramePool:
+        """A frame's states; what another call has made with the same settings is read. Raises NoVehicleError."""
+        asked = self._asked(("params", "budget", "detector", "across"))
+        path = None if self.kept is None else self.kept / "pools" / name / "pool.json"
+        if (
+            path is not None
+            and self.config.resume
+            and path.is_file()
+            and files.read_text(path.with_name("asked")) == asked
+        ):
+            return load_record(path, FramePool, SCHEMA)
+        scene = self._scene(name)
+        space = ParameterSpace(scene, parse_params(self.config.params), budget_of(self.config.budget))
+        objective = Objective(Compositor(scene), space, Remembering(self.detector))
+        pool = FramePool.make(objective, name, self.config.seed, self.states)
+        if path is not None:
+            with files.whole_folder(path.parent) as part:
+                files.write_text(part / path.name, dump_record(pool, SCHEMA))
+                files.write_text(part / "asked", asked)
+        return pool
+
+    def judge(self, numbered: tuple[int, str]) -> AcrossFrame:
+        """Searches of a frame, by its number and name, for the faults whose turn it is."""
+        number, name = numbered
+        chosen = self.turn(number)
+        asked = self._asked(("params", "budget", "detector", "methods", "passes")) + repr(chosen)
+        path = None if self.kept is None else self.kept / "frames" / f"{name}.json"
+        if path is not None and self.config.resume and path.is_file():
+            known = load_record(path, AcrossFrame, SCHEMA)
+            if known.asked == asked:
+                return known
+        scene, shared_detector = self._scene(name), Remembering(self.detector)
+        attempts = tuple(
+            self._attempt(name, scene, fault, method, shared_detector)
+            for fault in chosen
+            for method in self.workers
+        )
+        judged = AcrossFrame(name, asked, attempts)
+        if path is not None:
+            files.write_text(path, dump_record(judged, SCHEMA))
+        return judged
+
+    def turn(self, number: int) -> list[str]:
+        """Faults that are searched for in the number-th frame, and "" for none: all, or `--faults` of them."""
+        every = [*self.faults, ""]
+        count = min(self.config.faults or len(every), len(every))
+        return [every[(number * count + k) % len(every)] for k in range(count)]
+
+    def _attempt(self, name: str, scene: SceneIR, fault: str, method: str, inner: Remembering) -> AcrossAttempt:
+        worker = self.workers[method]
+        detector = PlantedDetector(inner, PlantedFault.of(fault)).requires_grad_(False) if fault else inner
+        attacked = replace(worker, detector=detector, grader=grader_of(worker.config, detector)).search(
+            name, scene
+        )
+        certain = certain_of(attacked)
+        seen = seen_without(self.detector, attacked) if certain else ()
+        looked = tuple(
+            Looked(index, looked_around(attacked, index, SAMPLES, self.config.seed)) for index in certain
+        )
+        found = sum(index in seen for index in certain)
+        return AcrossAttempt(name, fault, method, len(certain), found, attacked.passes, looked)
+
+    def _scene(self, name: str) -> SceneIR:
+        scene = self.source.scene(name)
+        if not len(scene.objects):
+            raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
+        return scene
+
+    def _asked(self, names: Sequence[str]) -> str:
+        settings = shared(self.config, Scenes) | {name: getattr(self.config, name) for name in names}
+        return repr(sorted((key, str(value)) for key, value in settings.items() if key != "limit"))
+
+
+def pool_of(config: Bench) -> Callable[[str], FramePool]:
+    """`Across.pool` of another process."""
+    return Across.of(config).pool
+
+
+def judge_of(config: Bench, faults: tuple[str, ...]) -> Callable[[tuple[int, str]], AcrossFrame]:
+    """`Across.judge` of another process."""
+    return Across.of(config, faults).judge

@@ -1,0 +1,163 @@
+"""States of all frames, each shown once to the detector without a fault: what a fault does to it follows.
+
+Pictures, and what the detector says of them before a fault lowers scores, depend on no fault. So Halton's draws
+are made once, and serve for where faults are planted, for how often chance hits them, and as samples of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from detectors import boxes
+from detectors.base import lowered_probability
+from detectors.planted import BLIND_TO, FEATURES, Band, PlantedFault, features, seen_cars
+from detectors.types import CLASSES
+from drivesem.attack.objective import Objective
+from drivesem.evaluation.failures import IOU
+from drivesem.failures.neighbourhood import Everywhere, Sample
+from drivesem.failures.nuisances import Nuisances
+
+LOOKS = 4
+"""Draws of the camera before any change."""
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SeenCar:
+    """One car in one picture. index: of the object; described: its features as `FramePool.names` has them; margin:
+    in logits beyond t*, below 0 where the detector without a fault does not find it; told: of each car that its
+    predictions are about, as faults group them, the best score and that car's FEATURES.
+    """
+
+    index: int
+    described: tuple[float, ...]
+    margin: float
+    told: tuple[tuple[float, ...], ...]
+
+    @property
+    def best(self) -> tuple[float, ...] | None:
+        """FEATURES of the car that its best prediction is about; None where nothing meets it."""
+        return max(self.told)[1:] if self.told else None
+
+    def lost(self, fault: PlantedFault, t_star: float) -> bool:
+        """Whether the detector with a fault does not find it."""
+        return self.margin < 0 or self.hidden(fault, t_star)
+
+    def hidden(self, fault: PlantedFault, t_star: float) -> bool:
+        """Whether the fault hides it: it is found, and with the fault is not."""
+        return hidden([self], fault, t_star)[0]
+
+
+def hidden(cars: Sequence[SeenCar], fault: PlantedFault, t_star: float) -> list[bool]:
+    """Which cars a fault hides, see `SeenCar.hidden`."""
+    counts = [len(car.told) if car.margin > 0 else 0 for car in cars]
+    rows = [row for car, count in zip(cars, counts, strict=True) if count for row in car.told]
+    if not rows:
+        return [False] * len(cars)
+    told = torch.tensor(rows, dtype=torch.float64)
+    by = fault.depth * fault.share(told[:, [1 + FEATURES.index(name) for name in fault.names]].T)
+    still = (lowered_probability(told[:, 0], by) >= t_star).split(counts)
+    return [count > 0 and not bool(seen.any()) for count, seen in zip(counts, still, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class FramePool:
+    """A frame. looks: its cars as photographed, in `LOOKS` draws of the camera; states: at Halton's draws over all
+    of the bounds; t_star: of the detector.
+    """
+
+    frame: str
+    t_star: float
+    names: tuple[str, ...]
+    looks: tuple[tuple[SeenCar, ...], ...]
+    states: tuple[tuple[SeenCar, ...], ...]
+
+    @classmethod
+    def make(cls, objective: Objective, name: str, seed: int, states: int) -> FramePool:
+        """Of so many states; the same arguments give the same pool. name: the frame's. Raises RangeError where the
+        detector has no gradient, DetectorError where it does not tell its candidates.
+        """
+        everywhere = Everywhere(objective, objective.feasible_set(), Nuisances(), f"planted:{name}:{seed}")
+        cars = objective.benign.paper.category == CLASSES.index(BLIND_TO)
+        still = objective.space.theta0
+        # Numbers of looks lie beyond those of states: no draw of the camera is seen twice.
+        looked = [everywhere.sample_of(still, states + number) for number in range(LOOKS)]
+        drawn = [everywhere.sample(number) for number in range(states)]
+        seen = []
+        for samples in (*looked, *drawn):
+            of_cars = {index: sample for index, sample in samples.items() if bool(cars[index])}
+            seen.append(_seen(objective, of_cars, everywhere.margins(of_cars)))
+        names = next((tuple(sample.features) for samples in (*looked, *drawn) for sample in samples.values()), ())
+        return cls(name, objective.t_star, names, tuple(seen[:LOOKS]), tuple(seen[LOOKS:]))
+
+    def hidden_as_photographed(self, fault: PlantedFault) -> set[int]:
+        """Cars that the fault hides in any look before a change."""
+        cars = [car for look in self.looks for car in look]
+        return {car.index for car, lost in zip(cars, hidden(cars, fault, self.t_star), strict=True) if lost}
+
+    @property
+    def found(self) -> set[int]:
+        """Cars found in all looks."""
+        found = [{car.index for car in look if car.margin > 0} for look in self.looks]
+        return set.intersection(*found) if found else set()
+
+
+def bands_by_label(pools: Sequence[FramePool], fault: PlantedFault) -> tuple[Band, ...]:
+    """Where a fault hides cars in features of their labels: from the 5th to the 95th percentile over all states. A
+    detector's boxes grow and shrink with what it sees, and a fault goes by them. Empty where it hides none.
+    """
+    rows: list[list[float]] = []
+    for pool in pools:
+        cars = [car for state in (*pool.looks, *pool.states) for car in state]
+        for car, gone in zip(cars, hidden(cars, fault, pool.t_star), strict=True):
+            if gone:
+                rows.append([car.described[pool.names.index(name)] for name in fault.names])
+    if len(rows) < 2:
+        return ()
+    ends = torch.tensor(rows, dtype=torch.float64).quantile(torch.tensor([0.05, 0.95], dtype=torch.float64), 0)
+    named = zip(fault.names, *ends.tolist(), strict=True)
+    return tuple(Band(name, start, end) for name, start, end in named if start < end)
+
+
+def sharpness(pools: Sequence[FramePool], fault: PlantedFault) -> float:
+    """Share of the cars found at Halton's states, inside of a fault's bands by label, that it hides."""
+    bands = bands_by_label(pools, fault)
+    inside = lost = 0
+    for pool in (pool for pool in pools if pool.names):  # of a frame without cars there are none
+        rows = [pool.names.index(band.feature) for band in bands]
+        ends = [(row, band.low, band.high) for row, band in zip(rows, bands, strict=True)]
+        cars = [
+            car
+            for state in pool.states
+            for car in state
+            if car.margin > 0 and all(low <= car.described[row] <= high for row, low, high in ends)
+        ]
+        inside, lost = inside + len(cars), lost + sum(hidden(cars, fault, pool.t_star))
+    return lost / inside if inside else 0.0
+
+
+@torch.no_grad()
+def _seen(objective: Objective, samples: dict[int, Sample], margins: dict[int, float]) -> tuple[SeenCar, ...]:
+    if not samples:
+        return ()
+    exposure = next(iter(samples.values())).exposure
+    image, detector = exposure.picture, objective.differentiable
+    label = detector.classes.index(BLIND_TO)
+    told = detector.candidates(detector(image[None]))
+    placed, scores = told.boxes_of(label), told.log_scores[:, label].exp()
+    cars = seen_cars(placed, scores)
+    values = features(image[None], cars.boxes_xyxy[None])[:, 0].T  # (K, F)
+    found = []
+    for index, sample in samples.items():
+        truth = torch.stack([exposure.targets.boxes_xyxy[index], exposure.shown_xyxy[index]]).to(placed)
+        meets = (boxes.iou_matrix(truth, placed[cars.rows]) >= IOU).any(0)
+        groups = []
+        for car in cars.car[meets].unique().tolist():
+            best = float(scores[cars.rows][meets & (cars.car == car)].max())
+            groups.append(tuple(round(value, 6) for value in (best, *values[car].tolist())))
+        described = tuple(round(value, 6) for value in sample.features.values())
+        found.append(SeenCar(index, described, round(margins[index], 6), tuple(groups)))
+    return tuple(found)

@@ -1,0 +1,266 @@
+"""Who finds planted faults: failures that are certain, for each hundred passes of the detector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+
+from detectors.base import Detector, DetectorError, predict
+from detectors.planted import PlantedDetector
+from detectors.registry import load_detector
+from drivesem.attack.budgets import budget_of
+from drivesem.attack.objective import Objective
+from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.config.blocks import Scenes, shared
+from drivesem.config.commands import Attack, Bench, Holes
+from drivesem.config.errors import UsageError
+from drivesem.evaluation import failures
+from drivesem.failures.grades import Grade
+from drivesem.failures.rules import in_words
+from drivesem.run.attack import Worker, grader_of
+from drivesem.run.frame import AttackedScene
+from drivesem.scenes.sources import NoVehicleError
+from scene_ir import files
+from scene_ir.render.compositor import Compositor
+from tools.bench.planted.naming import agrees, told_of
+from tools.bench.planted.plant import KINDS, FaultKind, Planting, plant
+from tools.bench.planted.survey import FrameSurvey
+
+METHODS = tuple(name for name in get_args(get_type_hints(Attack)["method"]) if name != "placebo")
+"""Attacks that can be judged: a placebo needs a run to be like."""
+NO_FAULT = "none"
+"""Kind and rarity of attempts on the detector as it is, beside which names are to be seen."""
+SURE = (Grade.CERTAIN, Grade.CONFIRMED, Grade.SHARED)
+QUICK_KINDS = (KINDS[2], KINDS[-2])
+"""One easy, one rare: those that could be planted wherever that was tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One method on one fault of one frame. hit, sure: as of `Planting`. certain: cars lost for certain; found: of
+    these, those that the detector without the fault sees in the same picture; inside: of those, the ones inside of
+    the fault's region; passes: of the detector; seconds: of the search and of certificates. rule: what samples
+    around the first of those found say (`naming`), None where nobody asked; named, in_part: whether that is the
+    fault, or a feature of it; naming: passes that it took.
+    """
+
+    frame: str
+    kind: str
+    rarity: str
+    fault: str
+    hit: float
+    sure: float
+    method: str
+    certain: int
+    found: int
+    inside: int
+    passes: int
+    seconds: float
+    rule: str | None = None
+    named: bool = False
+    in_part: bool = False
+    naming: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedFrame:
+    """A frame. attempts: on all faults that could be planted; unplanted: kinds of the others."""
+
+    frame: str
+    attempts: tuple[Attempt, ...]
+    unplanted: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def of_json(cls, data: Mapping[str, Any]) -> JudgedFrame:
+        return cls(data["frame"], tuple(Attempt(**row) for row in data["attempts"]), tuple(data["unplanted"]))
+
+
+def methods_of(config: Bench) -> tuple[str, ...]:
+    """The methods that a command names. Raises UsageError for one that is not known."""
+    return _names_among(METHODS, "--methods", config.methods)
+
+
+def naming_of(config: Bench) -> tuple[str, ...]:
+    """Those of its methods whose failures are to be told by rules. Raises UsageError for another one."""
+    return () if config.naming is None else _names_among(methods_of(config), "--naming", config.naming)
+
+
+def _names_among(known: Sequence[str], setting: str, text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    if not names or not set(names) <= set(known):
+        raise UsageError(setting, f"names among {', '.join(known)}, with commas", repr(text))
+    return names
+
+
+def attack_settings(config: Bench, method: str) -> Attack:
+    """The settings of a method: nobody is asked but the detector itself."""
+    settings = Attack(
+        **shared(config, Scenes),
+        method=method,  # pyright: ignore[reportArgumentType]
+        params=config.params,
+        budget=config.budget,
+        passes=config.passes,
+        detector=config.detector,
+        device=config.device,
+        confirm=False,
+        peer="off",
+        workers=1,
+    )
+    settings.check()
+    return settings
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What one process needs. workers: by method; named: methods whose failures are to be told by rules; kept:
+    folder of what is done, by frame.
+    """
+
+    config: Bench
+    detector: Detector
+    workers: Mapping[str, Worker]
+    kinds: tuple[FaultKind, ...]
+    named: tuple[str, ...]
+    kept: Path | None
+
+    @classmethod
+    def of(cls, config: Bench) -> Yardstick:
+        """Raises UsageError or SceneError for settings that cannot be."""
+        methods = methods_of(config)
+        parse_params(config.params)
+        try:
+            detector = load_detector(config.detector, config.device)
+        except DetectorError as error:
+            raise UsageError.of("--detector", "a detector with gradients", error) from error
+        first = Worker.of(attack_settings(config, methods[0]), detector)
+        workers = {method: first.beside(attack_settings(config, method)) for method in methods}
+        kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
+        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, naming_of(config), kept)
+
+    def judge(self, name: str) -> JudgedFrame:
+        """All methods on all faults of a frame; what another call has done with the same settings is read."""
+        asked = {field.name: str(getattr(self.config, field.name)) for field in fields(Scenes)}
+        keys = ("methods", "passes", "params", "budget", "detector", "quick", "faults", "naming")
+        asked |= {key: getattr(self.config, key) for key in keys}
+        asked.pop("limit")
+        path = None if self.kept is None else self.kept / f"{name}.json"
+        if path is not None and self.config.resume and path.is_file():
+            known = files.read_json(path)
+            if known["asked"] == asked:
+                return JudgedFrame.of_json(known["judged"])
+        judged = self._judge(name)
+        if path is not None:
+            files.write_json(path, {"asked": asked, "judged": judged.to_json()})
+        return judged
+
+    def _judge(self, name: str) -> JudgedFrame:
+        scene = next(iter(self.workers.values())).source.scene(name)
+        if not len(scene.objects):
+            raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
+        space = ParameterSpace(scene, parse_params(self.config.params), budget_of(self.config.budget))
+        objective = Objective(Compositor(scene), space, self.detector)
+        survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)
+        attempts: list[Attempt] = []
+        unplanted: list[str] = []
+        planted = 0
+        for kind in self._kinds_of(name):
+            if planted == self.config.faults:
+                break
+            planting = plant(survey, kind, self.config.seed)
+            if planting is None:
+                unplanted.append(kind.text)
+                continue
+            planted += 1
+            detector = PlantedDetector(self.detector, planting.fault).requires_grad_(False)
+            for method, worker in self.workers.items():
+                grader = grader_of(worker.config, detector)
+                attacked = replace(worker, detector=detector, grader=grader).search(name, scene)
+                attempts.append(self._attempt(name, method, planting, survey, attacked))
+        attempts += [
+            self._control(name, method, self.workers[method].search(name, scene)) for method in self.named
+        ]
+        return JudgedFrame(name, tuple(attempts), tuple(unplanted))
+
+    def _kinds_of(self, name: str) -> list[FaultKind]:
+        """All, or with --faults easy and rare ones in turn, in an order of the frame's own."""
+        if self.config.faults is None:
+            return list(self.kinds)
+        rng = np.random.default_rng([self.config.seed, *name.encode()])
+        order = [self.kinds[i] for i in rng.permutation(len(self.kinds))]
+        easy, rare = ([kind for kind in order if kind.rarity == rarity] for rarity in ("easy", "rare"))
+        pairs = zip_longest(*((easy, rare) if rng.random() < 0.5 else (rare, easy)))
+        return [kind for pair in pairs for kind in pair if kind is not None]
+
+    def _attempt(
+        self, name: str, method: str, planting: Planting, survey: FrameSurvey, attacked: AttackedScene
+    ) -> Attempt:
+        certain = certain_of(attacked)
+        seen = seen_without(self.detector, attacked) if certain else ()
+        found = [index for index in certain if index in seen]
+        inside = survey.inside(planting.fault, attacked.search.theta) if found else None
+        attempt = Attempt(
+            frame=name,
+            kind=planting.kind.text,
+            rarity=planting.kind.rarity,
+            fault=planting.fault.text,
+            hit=planting.hit,
+            sure=planting.sure,
+            method=method,
+            certain=len(certain),
+            found=len(found),
+            inside=0 if inside is None else int(inside[found].sum()),
+            passes=attacked.passes,
+            seconds=round(attacked.seconds, 2),
+        )
+        if not found or method not in self.named:
+            return attempt
+        where, passes = told_of(attacked, found[0], Holes.samples, self.config.seed)
+        whole, in_part = agrees(where, planting.fault, survey.bands_by_label(planting.fault))
+        return replace(attempt, rule=in_words(where), named=whole, in_part=in_part, naming=passes)
+
+    def _control(self, name: str, method: str, attacked: AttackedScene) -> Attempt:
+        """The same without a fault: what is named then is not planted."""
+        certain = certain_of(attacked)
+        where, passes = told_of(attacked, certain[0], Holes.samples, self.config.seed) if certain else (None, 0)
+        return Attempt(
+            frame=name,
+            kind=NO_FAULT,
+            rarity=NO_FAULT,
+            fault="",
+            hit=0.0,
+            sure=0.0,
+            method=method,
+            certain=len(certain),
+            found=len(certain),
+            inside=0,
+            passes=attacked.passes,
+            seconds=round(attacked.seconds, 2),
+            rule=None if where is None else in_words(where),
+            naming=passes,
+        )
+
+
+def judge_of(config: Bench) -> Callable[[str], JudgedFrame]:
+    """`Yardstick.judge` of another process."""
+    return Yardstick.of(config).judge
+
+
+def certain_of(attacked: AttackedScene) -> list[int]:
+    """Objects that are lost for certain."""
+    return [f.index for f in attacked.failures if f.index is not None and f.grade in SURE]
+
+
+def seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:
+    """Objects that a detector finds in an attacked scene's picture."""
+    objective, rendered = attacked.objective, attacked.rendered
+    detections = objective.judged.detections(predict(detector, rendered.render.image[None])[0])
+    judgement = failures.judge(objective.judged.targets(rendered.moved.targets), detections, objective.t_star)
+    return tuple(judgement.found.nonzero()[:, 0].tolist())

@@ -1,0 +1,125 @@
+"""Gradients of margins beside slopes over steps: rows of a table, by parameter, distance and width."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.bench.reach.slopes import STEPS, Slopes
+
+Array = NDArray[np.float64]
+
+BANDS = ((0.0, 15.0), (15.0, 30.0), (30.0, np.inf))
+"""Distances of objects, m."""
+ALL = "all"
+_RESAMPLES = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """How well one list of slopes tells another. cosine: of the two, with its 95 % interval by bootstrap over
+    objects (None for fewer than 3); signs: share of slopes of the same sign; kept: the share of what the one says
+    that the other does (its regression on the one, which noise of the other does not lower).
+    """
+
+    cosine: float
+    low: float | None
+    high: float | None
+    signs: float
+    kept: float
+
+
+@dataclass(frozen=True, slots=True)
+class ReachRow:
+    """One parameter, band of distances and width. steps: half the width of differences, in steps of an attack;
+    objects, slopes: how many there are; point, smoothed: what gradients tell of the slopes over that width;
+    repeated: what the slopes of half the draws tell of those of the other half, which no gradient can be better
+    than by much.
+    """
+
+    row: str
+    distance: str
+    steps: int
+    objects: int
+    slopes: int
+    point: Told
+    smoothed: Told
+    repeated: Told
+
+
+def rows_of(frames: Sequence[Sequence[Slopes]], seed: int) -> tuple[ReachRow, ...]:
+    """Of all objects and then of each band of distances that has some; rows in the order of their appearance."""
+    names = tuple(dict.fromkeys(one.row for found in frames for one in found))
+    bands = [(ALL, 0.0, np.inf), *((_words(low, high), low, high) for low, high in BANDS)]
+    rows = []
+    for name in names:
+        for band, low, high in bands:
+            picked = [
+                (frame, one)
+                for frame, found in enumerate(frames)
+                for one in found
+                if one.row == name and low <= one.distance_m < high
+            ]
+            for place, steps in enumerate(STEPS):
+                row = _row(name, band, place, steps, picked, seed)
+                rows += [] if row is None else [row]
+    return tuple(rows)
+
+
+def told(slopes: Array, by: Array, owner: NDArray[np.int64], seed: int) -> Told:
+    """What `by` (S,) says of slopes (S,). owner (S,): the object of each."""
+    count = int(owner.max()) + 1
+    sums = np.stack([np.bincount(owner, part, count) for part in (slopes * by, slopes**2, by**2)])
+    low = high = None
+    if count >= 3:
+        generator = np.random.default_rng(seed)
+        weights = generator.multinomial(count, np.full(count, 1 / count), _RESAMPLES).astype(np.float64)
+        low, high = (float(q) for q in np.quantile(_cosine(sums @ weights.T), (0.025, 0.975)))
+    same = float((np.sign(slopes) == np.sign(by)).mean())
+    product, _, said = sums.sum(axis=1).tolist()
+    return Told(float(_cosine(sums.sum(axis=1))), low, high, same, product / max(said, 1e-30))
+
+
+def _row(
+    name: str, band: str, place: int, steps: int, picked: Sequence[tuple[int, Slopes]], seed: int
+) -> ReachRow | None:
+    owners: dict[tuple[int, int], int] = {}
+    columns: list[tuple[float, ...]] = []
+    owner: list[int] = []
+    for frame, one in picked:
+        wide, point, smoothed = (
+            np.array(kind[place], dtype=np.float64) for kind in (one.wide, one.point, one.smoothed)
+        )
+        halves = [half[~np.isnan(half)] for half in (wide[::2], wide[1::2])]
+        if not all(map(len, halves)):
+            continue
+        columns.append(tuple(float(np.nanmean(part)) for part in (wide, point, smoothed, *halves)))
+        owner.append(owners.setdefault((frame, one.object), len(owners)))
+    if not columns:
+        return None
+    wide, point, smoothed, even, odd = np.array(columns, dtype=np.float64).T
+    index = np.array(owner)
+    return ReachRow(
+        row=name,
+        distance=band,
+        steps=steps,
+        objects=len(owners),
+        slopes=len(wide),
+        point=told(wide, point, index, seed),
+        smoothed=told(wide, smoothed, index, seed),
+        repeated=told(even, odd, index, seed),
+    )
+
+
+def _cosine(sums: Array) -> Array:
+    """Of sums (3, ...) of products and of either's squares."""
+    return sums[0] / np.sqrt(np.maximum(sums[1] * sums[2], 1e-30))
+
+
+def _words(low: float, high: float) -> str:
+    if low == 0:
+        return f"under {high:g} m"
+    return f"over {low:g} m" if np.isinf(high) else f"{low:g} to {high:g} m"

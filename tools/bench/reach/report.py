@@ -1,0 +1,125 @@
+"""Reach for people and programs: a table, JSON, CSV, Markdown and a plot."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from drivesem.report.answer import Answer
+from drivesem.report.plots import COLOURS, STYLE
+from drivesem.report.tables import Sheet
+from scene_ir import files
+from tools.bench.reach.agreement import ALL, ReachRow, Told
+from tools.bench.reach.slopes import STEPS
+
+NAME = "reach"
+_KINDS = ("point", "smoothed", "repeated")
+_COLUMNS = (
+    "parameter",
+    "objects",
+    "steps",
+    "point: cosine",
+    "signs",
+    "kept",
+    "smoothed: cosine",
+    "signs ",
+    "kept ",
+    "repeated",
+)
+_NOTES = (
+    "Slopes of an object's margin (logits a step) over so many steps to either side, as far as bounds and what is "
+    "feasible allow, against its gradient; both are means over the same draws of a camera's small changes.",
+    "Point: the gradient at the photographed scene. Smoothed: the mean of gradients at random places nearby, 4 "
+    "steps apart. Cosine: of all objects' slopes and gradients, with 95 % by bootstrap over objects. Signs: % of "
+    "slopes of the gradient's sign; 50 is chance. Kept: how much of what the gradient promises the step does. "
+    "Repeated: the cosine of slopes in half of the draws and in the others; where low, slopes are mostly noise.",
+)
+
+
+def answer_of(out: Path, rows: Sequence[ReachRow], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
+    """What is said of all frames. facts: what stands before the rows in the JSON."""
+    everywhere = tuple(_line(row) for row in rows if row.distance == ALL)
+    sheets = [Sheet("Gradients and slopes of margins", _COLUMNS, everywhere), _by_distance(rows)]
+    return Answer(
+        out=out,
+        name=NAME,
+        heading="How far gradients hold",
+        data={**facts, "rows": [asdict(row) for row in rows]},
+        tables={NAME: [_flat(row) for row in rows]},
+        sheets=sheets,
+        notes=_NOTES,
+        picture=partial(write_reach, rows=[row for row in rows if row.distance == ALL]),
+        failed=failed,
+    )
+
+
+def write_reach(path: Path, rows: Sequence[ReachRow]) -> None:
+    """Cosines over the width of differences, a panel a parameter."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    names = tuple(dict.fromkeys(row.row for row in rows))
+    across = min(len(names), 4)
+    down = -(-len(names) // across)
+    series = tuple(zip(_KINDS, (COLOURS[0], COLOURS[1], COLOURS[6]), ("-o", "--s", ":"), strict=True))
+    with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
+        figure = Figure(figsize=(2.3 * across, 2.1 * down + 0.6), layout="constrained")
+        panels = list(figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).flat)
+        for panel, name in zip(panels, names, strict=False):
+            own = [row for row in rows if row.row == name]
+            for kind, colour, style in series:
+                values: list[Told] = [getattr(row, kind) for row in own]
+                places, cosines = [row.steps for row in own], [one.cosine for one in values]
+                panel.plot(places, cosines, style, color=colour, label=kind)
+            panel.axhline(0, color="#888888", linewidth=0.8)
+            panel.set_title(name, fontsize=9, loc="left")
+            panel.set_xscale("log", base=4)
+            panel.set_xticks(STEPS, [str(step) for step in STEPS])
+            panel.minorticks_off()
+            panel.set_ylim(-1.02, 1.02)
+        for panel in panels[len(names) :]:
+            panel.set_visible(False)
+        figure.supxlabel("steps to either side", fontsize=9)
+        figure.supylabel("cosine to the slope", fontsize=9)
+        first = figure.axes[0]
+        figure.legend(*first.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=9)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    files.write_bytes(path, buffer.getvalue())
+
+
+def _line(row: ReachRow) -> tuple[str, ...]:
+    said = [cell for one in (row.point, row.smoothed) for cell in _cells(one)]
+    return (row.row, str(row.objects), str(row.steps), *said, f"{row.repeated.cosine:.2f}")
+
+
+def _cells(one: Told) -> tuple[str, str, str]:
+    bounds = "" if one.low is None or one.high is None else f" [{one.low:.2f}, {one.high:.2f}]"
+    return (f"{one.cosine:.2f}{bounds}", f"{100 * one.signs:.0f}", f"{one.kept:.2f}")
+
+
+def _by_distance(rows: Sequence[ReachRow]) -> Sheet:
+    """Cosines and signs of point gradients, a pair of columns a band."""
+    bands = tuple(dict.fromkeys(row.distance for row in rows if row.distance != ALL))
+    known = {(row.row, row.steps, row.distance): row for row in rows}
+    lines = []
+    for name, steps in dict.fromkeys((row.row, row.steps) for row in rows):
+        line = [name, str(steps)]
+        for band in bands:
+            row = known.get((name, steps, band))
+            line += ["-", "-"] if row is None else [f"{row.point.cosine:.2f}", f"{100 * row.point.signs:.0f}"]
+        lines.append(tuple(line))
+    columns = [word for band in bands for word in (f"{band}: cosine", f"{band}: signs")]
+    return Sheet("Point gradients by distance", ("parameter", "steps", *columns), tuple(lines))
+
+
+def _flat(row: ReachRow) -> dict[str, Any]:
+    line: dict[str, Any] = {"parameter": row.row, "distance": row.distance, "steps": row.steps}
+    line |= {"objects": row.objects, "slopes": row.slopes}
+    for kind in _KINDS:
+        line |= {f"{kind}_{key}": value for key, value in asdict(getattr(row, kind)).items()}
+    return line

@@ -1,0 +1,152 @@
+"""What it costs to hand frames to Ray instead of to processes of one's own: small frames, in turn."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from detectors.base import Detector
+from detectors.registry import load_detector
+from drivesem.attack.methods.fgsm import FGSM
+from drivesem.attack.space import Parameter
+from drivesem.bench.scenes import bench_scene
+from drivesem.bench.tables import Columns
+from drivesem.bench.timing import Spread
+from drivesem.config.commands import Bench
+from drivesem.run.finished import PICTURES
+from drivesem.run.frame import FrameSettings, attack_scene, write_frame
+from drivesem.run.workers import outcomes
+from scene_ir import files
+from scene_ir.render.prepare import RenderSettings
+
+Engine = Literal["local", "ray"]
+FRAMES, QUICK_FRAMES = 200, 40
+"""Frames for each, where nobody says how many, and with --quick."""
+_ROUNDS, _QUICK_ROUNDS = 4, 2
+_CARS, _TRIANGLES, _SCALE = 2, 300, 0.5
+TITLE = "Frames shared by processes of this machine, and by Ray"
+COLUMNS: Columns = {
+    "engine": ("engine", "engine"),
+    "processes": ("processes", "processes"),
+    "frames": ("frames", "frames"),
+    "first_s": ("first start, s", "first start, s"),
+    "start_s": ("later starts, s", "start, s"),
+    "frame_ms": ("a frame, ms", "a frame, ms"),
+    "frame_iqr": ("IQR", "IQR"),
+    "own_ms": ("of it its own work, ms", "own work, ms"),
+    "own_iqr": ("IQR", None),
+    "over_ms": ("beside it, ms", "beside, ms"),
+    "same": ("frames as the other's", "same"),
+}
+METHOD = (
+    f"Streets of {_CARS} cars, {_SCALE:g} of KITTI's width, are made, attacked by one step of fgsm, and written, "
+    "by as many processes of either kind, in rounds in turn (local, ray, ray, local, ...). First start: until "
+    "the first frame begins, on a cluster that is begun for it; later starts: the same of the rounds, median. A "
+    "frame: from the first frame of a round to its last, for each frame and process, its own work included; "
+    "medians and quartiles over rounds, of its own work over frames. Beside it: the difference to the "
+    "mean of its own work."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One engine; see `METHOD`."""
+
+    engine: Engine
+    processes: int
+    frames: int
+    first_s: float
+    start_s: float
+    frame_ms: float
+    frame_iqr: float
+    own_ms: float
+    own_iqr: float
+    over_ms: float
+    same: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """start_s: until the first frame began; frame_ms: of a process for each frame; own_ms: of each frame; told:
+    what came of each, by number.
+    """
+
+    start_s: float
+    frame_ms: float
+    own_ms: list[float]
+    told: dict[int, str]
+
+
+def measure(config: Bench) -> Iterator[Row]:
+    """A row for each engine. Raises UsageError where there is no Ray."""
+    frames, count = (QUICK_FRAMES, _QUICK_ROUNDS) if config.quick else (FRAMES, _ROUNDS)
+    processes = config.processes
+    a_round = max((config.limit or frames) // count, 2 * processes)
+    engines: tuple[Engine, Engine] = ("local", "ray")
+    work, settings = _worker(config.detector), {engine: _settings(config, engine) for engine in engines}
+    first = {engine: _round(work, settings[engine], range(2 * processes)) for engine in engines}
+    rounds: dict[Engine, list[_Round]] = {engine: [] for engine in engines}
+    for number in range(count):
+        for engine in engines if number % 2 == 0 else engines[::-1]:
+            numbers = range(number * a_round, (number + 1) * a_round)
+            rounds[engine].append(_round(work, settings[engine], numbers))
+    told = {engine: {k: v for one in rounds[engine] for k, v in one.told.items()} for engine in engines}
+    same = sum(told["local"][number] == told["ray"][number] for number in told["local"])
+    for engine in engines:
+        times = rounds[engine]
+        frame = Spread.of([one.frame_ms for one in times])
+        own = Spread.of([ms for one in times for ms in one.own_ms])
+        mean = sum(sum(one.own_ms) for one in times) / sum(len(one.own_ms) for one in times)
+        yield Row(
+            engine=engine,
+            processes=processes,
+            frames=count * a_round,
+            first_s=round(first[engine].start_s, 2),
+            start_s=round(Spread.of([one.start_s for one in times]).median, 2),
+            frame_ms=round(frame.median, 1),
+            frame_iqr=round(frame.iqr, 1),
+            own_ms=round(own.median, 1),
+            own_iqr=round(own.iqr, 1),
+            over_ms=round(frame.median - mean, 1),
+            same=same,
+        )
+
+
+def _settings(config: Bench, engine: Engine) -> Bench:
+    address = config.address if engine == "ray" else None
+    return replace(config, engine=engine, address=address, workers=config.processes)
+
+
+def _round(work: Callable[[int], tuple[float, str]], config: Bench, numbers: range) -> _Round:
+    begun = time.perf_counter()
+    ends, own_ms, told = [], [], {}
+    build = partial(_worker, config.detector)
+    for number, outcome in outcomes(work, build, list(numbers), config, apart=True):
+        seconds, told[number] = outcome()
+        ends.append(time.perf_counter())
+        own_ms.append(1e3 * seconds)
+    start = ends[0] - own_ms[0] / 1e3
+    wall = 1e3 * (ends[-1] - start)
+    return _Round(start - begun, wall * config.processes / len(ends), own_ms, told)
+
+
+def _worker(name: str) -> Callable[[int], tuple[float, str]]:
+    return partial(_frame, detector=load_detector(name))
+
+
+def _frame(number: int, detector: Detector) -> tuple[float, str]:
+    """Seconds that a frame takes, and its picture's hash."""
+    begun = time.perf_counter()
+    scene = bench_scene(_CARS, _TRIANGLES, number, _SCALE).scene
+    params = (Parameter.TRANSLATE, Parameter.ROTATE)
+    settings = FrameSettings(FGSM(1), params, "moved", "objectness", RenderSettings(), number)
+    attacked = attack_scene(f"bench-{number}", scene, detector, settings)
+    with tempfile.TemporaryDirectory(prefix="drivesem-scale-") as folder:
+        write_frame(attacked, Path(folder) / "frame")
+        told = files.digest(Path(folder) / "frame" / PICTURES["attacked"])
+    return time.perf_counter() - begun, told
