@@ -6,17 +6,17 @@ Their message is one line: what was looked at, what was expected, what was found
 
 from __future__ import annotations
 
-_MOST = 500
+_MAX_CHARS = 500
 """Characters of each part of a message."""
 
 
-def shown(text: object, most: int = _MOST) -> str:
+def make_printable(text: object, max_chars: int = _MAX_CHARS) -> str:
     """A text as part of a line that people read: what no terminal prints is written as Python writes it, and of
     more than `most` characters the middle is left out.
     """
     told = str(text)
-    if len(told) > most:
-        told = f"{told[: most // 2]} ... {told[-(most // 4) :]} ({len(told):,} characters)"
+    if len(told) > max_chars:
+        told = f"{told[: max_chars // 2]} ... {told[-(max_chars // 4) :]} ({len(told):,} characters)"
     if told.isprintable():
         return told
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in told)
@@ -29,7 +29,9 @@ class SceneError(ValueError):
         self.field = field
         self.expected = expected
         self.actual = actual
-        super().__init__(f"{shown(field)}: expected {shown(expected)}, found {shown(actual)}")
+        super().__init__(
+            f"{make_printable(field)}: expected {make_printable(expected)}, found {make_printable(actual)}"
+        )
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
         """As processes hand errors to one another: `actual` as text, which always can be."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from scene_ir.errors import RangeError
 from scene_ir.geometry import to_clip
-from scene_ir.removal import uncovered
+from scene_ir.removal import complete_uncovered_sources
 from scene_ir.render import finish, model, texture
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import analytic_shadows
@@ -34,7 +34,7 @@ from scene_ir.types import (
 
 AWAY_M = 60.0
 """How far behind the camera vehicles stand that are not in a scene."""
-CHANGE = "change"
+CHANGE_KEY = "change"
 """Where a scene's provenance says what was done to it."""
 _NEUTRAL = 0.8
 """Of the templates' paint."""
@@ -61,45 +61,47 @@ class Vehicle:
     paint: tuple[float, float, float] | None = None
 
 
-def without(scene: SceneIR, row: int) -> SceneIR:
+def remove_vehicle(scene: SceneIR, row: int) -> SceneIR:
     """The scene with the vehicle in `row` and its shadow gone: background shows, and what it hid of others is
     completed (`scene_ir.removal`). Raises RangeError for a row that the scene does not have, or sources that it
     lacks.
     """
-    _check(scene, row)
+    _check_exchangeable(scene, row)
     objects = scene.objects
-    sources = list(uncovered(scene, {row}))
-    place = _away(scene, objects.translation)
-    sources[row] = _unseen(sources[row], place)
+    sources = list(complete_uncovered_sources(scene, {row}))
+    place = _away_position(scene, objects.translation)
+    sources[row] = _hidden_source(sources[row], place)
     translation = objects.translation.clone()
     translation[row] = place
-    return changed(
+    return record_exchange(
         scene, scene, replace(objects, translation=translation, source=tuple(sources)), f"objects[{row}] is gone"
     )
 
 
 @torch.no_grad()
-def with_vehicle(scene: SceneIR, vehicle: Vehicle) -> SceneIR:
+def add_vehicle(scene: SceneIR, vehicle: Vehicle) -> SceneIR:
     """The scene with one vehicle more, in a last row, in the scene's light and with a shadow. In the scene before
     it, that row stands behind the camera. Raises RangeError for sources that the scene lacks.
     """
-    _check(scene, None)
-    here, mesh = _drawn(scene, vehicle), len(scene.meshes)
-    place = _away(scene, scene.objects.translation)
+    _check_exchangeable(scene, None)
+    here, mesh = _render_vehicle(scene, vehicle), len(scene.meshes)
+    place = _away_position(scene, scene.objects.translation)
     padded = replace(scene, meshes=(*scene.meshes, here.mesh))
-    there = replace(_row(here, mesh, padded), translation=place[None], source=(_unseen(here.source, place),))
-    before = replace(padded, objects=_joined(scene.objects, there))
-    objects = _joined(scene.objects, _row(here, mesh, padded))
-    return changed(padded, before, objects, f"{vehicle.mesh.name} parks as objects[{len(scene.objects)}]")
+    there = replace(
+        _object_row(here, mesh, padded), translation=place[None], source=(_hidden_source(here.source, place),)
+    )
+    before = replace(padded, objects=_concatenate(scene.objects, there))
+    objects = _concatenate(scene.objects, _object_row(here, mesh, padded))
+    return record_exchange(padded, before, objects, f"{vehicle.mesh.name} parks as objects[{len(scene.objects)}]")
 
 
 @torch.no_grad()
-def with_other(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
+def replace_vehicle(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
     """The scene with another vehicle in the place of the one in `row`, which it keeps. Raises as `without`."""
-    _check(scene, row)
-    here = _drawn(scene, vehicle)
-    new = _row(here, len(scene.meshes), scene)
-    sources = list(uncovered(scene, {row}))
+    _check_exchangeable(scene, row)
+    here = _render_vehicle(scene, vehicle)
+    new = _object_row(here, len(scene.meshes), scene)
+    sources = list(complete_uncovered_sources(scene, {row}))
     sources[row] = here.source
     own = {}
     for name in _TENSORS:
@@ -107,20 +109,20 @@ def with_other(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
         own[name][row] = getattr(new, name)[0]
     objects = replace(scene.objects, source=tuple(sources), **own)
     wider = replace(scene, meshes=(*scene.meshes, here.mesh))
-    return changed(wider, scene, objects, f"{vehicle.mesh.name} in the place of objects[{row}]")
+    return record_exchange(wider, scene, objects, f"{vehicle.mesh.name} in the place of objects[{row}]")
 
 
 @torch.no_grad()
-def with_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
+def add_roof_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
     """The scene with a load on the roof of the vehicle in `row`, of which the photograph shows all else. load: a
     mesh in the unit box of that vehicle, and above it; it moves and bends with the vehicle. Raises as `without`.
     """
-    _check(scene, row)
+    _check_exchangeable(scene, row)
     objects, source = scene.objects, scene.objects.source[row]
     own = scene.meshes[int(objects.mesh_index[row])]
     bare = replace(objects, source=(), **{n: getattr(objects, n)[row : row + 1] for n in _TENSORS})
     bare = replace(bare, mesh_index=torch.zeros_like(bare.mesh_index))
-    top, body = (_alone(scene, bare, mesh) for mesh in (load, own))
+    top, body = (_render_object(scene, bare, mesh) for mesh in (load, own))
     size = (scene.camera.height, scene.camera.width)
     frame = (0, 0, size[1], size[0])
     nearer = texture.crop_of(top.nearness, frame, size) >= texture.crop_of(body.nearness, frame, size)
@@ -133,14 +135,14 @@ def with_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
     sources[row] = replace(source, foreground=Crop(values.to(scene.background).contiguous(), x0, y0))
     index = objects.mesh_index.clone()
     index[row] = len(scene.meshes)
-    loaded = replace(scene, meshes=(*scene.meshes, _together(own, load)))
+    loaded = replace(scene, meshes=(*scene.meshes, _merge_meshes(own, load)))
     words = f"{load.name} on the roof of objects[{row}]"
-    return changed(loaded, scene, replace(objects, mesh_index=index, source=tuple(sources)), words)
+    return record_exchange(loaded, scene, replace(objects, mesh_index=index, source=tuple(sources)), words)
 
 
-def changed(scene: SceneIR, before: SceneIR, objects: Objects, words: str) -> SceneIR:
+def record_exchange(scene: SceneIR, before: SceneIR, objects: Objects, words: str) -> SceneIR:
     """`scene` with other objects, after `before`. words: what was done, for people."""
-    said = {**scene.provenance, CHANGE: words}
+    said = {**scene.provenance, CHANGE_KEY: words}
     return replace(scene, objects=objects, before=before, provenance=said)
 
 
@@ -148,7 +150,7 @@ _TENSORS = tuple(entry.name for entry in fields(Objects) if entry.name != "sourc
 
 
 @dataclass(frozen=True, slots=True)
-class _Here:
+class _RenderedVehicle:
     """A vehicle as the scene shows it. mesh: in its own paint."""
 
     vehicle: Vehicle
@@ -156,7 +158,7 @@ class _Here:
     source: Source
 
 
-def _row(here: _Here, mesh: int, scene: SceneIR) -> Objects:
+def _object_row(here: _RenderedVehicle, mesh: int, scene: SceneIR) -> Objects:
     """The one row of a vehicle. Its label is made where labels are (`drivesem.attack.labels`): nothing yet."""
     vehicle, like = here.vehicle, scene.objects.translation
     return Objects(
@@ -174,30 +176,30 @@ def _row(here: _Here, mesh: int, scene: SceneIR) -> Objects:
     )
 
 
-def _joined(first: Objects, then: Objects) -> Objects:
+def _concatenate(first: Objects, then: Objects) -> Objects:
     rows = {name: torch.cat([getattr(first, name), getattr(then, name)]) for name in _TENSORS}
     return Objects(**rows, source=(*first.source, *then.source))
 
 
-def _drawn(scene: SceneIR, vehicle: Vehicle) -> _Here:
+def _render_vehicle(scene: SceneIR, vehicle: Vehicle) -> _RenderedVehicle:
     """A vehicle in the scene's light, as if it had been photographed: in the finish and the sunlight of the
     others, with a shadow as dark as theirs.
     """
-    mesh, sources = _painted(vehicle.mesh, vehicle.paint), scene.objects.source
-    here = _Here(vehicle, mesh, _blank(vehicle, mesh, _sunlight(scene)))
-    row = replace(_row(here, 0, scene), source=())
-    alone = _alone(scene, row, mesh)
-    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))[0]
+    mesh, sources = _apply_paint(vehicle.mesh, vehicle.paint), scene.objects.source
+    here = _RenderedVehicle(vehicle, mesh, _blank_source(vehicle, mesh, _sunlight(scene)))
+    row = replace(_object_row(here, 0, scene), source=())
+    alone = _render_object(scene, row, mesh)
+    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))[0]
     nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
     dark = 1.0 - shadow.values
     if dark.numel():
-        dark = dark * (_darkness([sources[i] for i in nearest]) / dark.max().clamp(min=_DARKEST))
+        dark = dark * (_shadow_darkness([sources[i] for i in nearest]) / dark.max().clamp(min=_DARKEST))
     source = replace(here.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark.clamp(0.0, 1.0)))
     return replace(here, source=source)
 
 
 @dataclass(frozen=True, slots=True)
-class _Alone:
+class _ObjectLayer:
     """One object drawn by itself. rgba: Crop (4, h, w), premultiplied; nearness: Crop (1, h, w), 1 / m, 0 beside
     it.
     """
@@ -206,9 +208,9 @@ class _Alone:
     nearness: Crop
 
 
-def _alone(scene: SceneIR, row: Objects, mesh: Mesh) -> _Alone:
+def _render_object(scene: SceneIR, row: Objects, mesh: Mesh) -> _ObjectLayer:
     """`row`, one object of `mesh` that no photograph shows, in the scene's light."""
-    compositor = Compositor(replace(scene, meshes=(mesh,), objects=row, front=(), before=None))
+    compositor = Compositor(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))
     compositor.sunlight.fill_(_sunlight(scene))
     layers = compositor.layers(compositor.scene.objects)
     (packed, size), (x0, y0) = layers.layout.spans()[0], layers.layout.rects[0, :2].tolist()
@@ -220,7 +222,7 @@ def _alone(scene: SceneIR, row: Objects, mesh: Mesh) -> _Alone:
     values = values.to(scene.background).contiguous()
     if values.numel():  # else it stands beside the picture
         values[:4] = kornia.filters.gaussian_blur2d(values[None, :4], (5, 5), (_LENS_PX, _LENS_PX), "replicate")[0]
-    return _Alone(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
+    return _ObjectLayer(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
 
 
 def _sunlight(scene: SceneIR) -> float:
@@ -233,7 +235,7 @@ def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, f
     """
     if not len(scene.objects):
         return 1.0, 0.0
-    objects, whole = scene.objects, Compositor(scene.at_rest())
+    objects, whole = scene.objects, Compositor(scene.unperturbed())
     gains, lifts = [], []
     for i, (surface, samples) in enumerate(zip(whole.fleet.surfaces, whole.samples(), strict=True)):
         found = finish.exposure(surface, samples)
@@ -260,14 +262,14 @@ def _road_light(scene: SceneIR, translation: Tensor, size_lhw: Tensor) -> float:
     return float(finish.light_of(shown).mean())
 
 
-def _blank(vehicle: Vehicle, mesh: Mesh, sunlight: float) -> Source:
+def _blank_source(vehicle: Vehicle, mesh: Mesh, sunlight: float) -> Source:
     translation = vehicle.translation
     nothing, ffd = Crop(translation.new_zeros(4, 1, 1), 0, 0), translation.new_zeros(LATTICE_POINTS, 3)
     paint = translation.new_tensor(vehicle.paint or (_NEUTRAL,) * 3)
     return Source(translation, vehicle.yaw, vehicle.size_lhw, ffd, nothing, None, _INFLATION_M, paint, sunlight)
 
 
-def _darkness(sources: Sequence[Source]) -> float:
+def _shadow_darkness(sources: Sequence[Source]) -> float:
     """How dark the shadow of the first that has one is where it is darkest, as a share; a plain street's where
     none has.
     """
@@ -275,7 +277,7 @@ def _darkness(sources: Sequence[Source]) -> float:
     return next((float((1.0 - s).mean(dim=0).max()) for s in shadows if s.numel()), _STREET_SHADOW)
 
 
-def _together(body: Mesh, load: Mesh) -> Mesh:
+def _merge_meshes(body: Mesh, load: Mesh) -> Mesh:
     """Two meshes in one unit box as one."""
     both = (body, load)
     grey = (
@@ -290,7 +292,7 @@ def _together(body: Mesh, load: Mesh) -> Mesh:
     )
 
 
-def _painted(mesh: Mesh, paint: tuple[float, float, float] | None) -> Mesh:
+def _apply_paint(mesh: Mesh, paint: tuple[float, float, float] | None) -> Mesh:
     if paint is None or mesh.colours is None:
         return mesh
     rows = mesh.faces[mesh.part == Part.PAINT].unique()
@@ -299,11 +301,11 @@ def _painted(mesh: Mesh, paint: tuple[float, float, float] | None) -> Mesh:
     return replace(mesh, colours=colours.clamp(0.0, 1.0))
 
 
-def _check(scene: SceneIR, row: int | None) -> None:
+def _check_exchangeable(scene: SceneIR, row: int | None) -> None:
     count = len(scene.objects)
     if scene.before is not None:
         raise RangeError(
-            "scene", "one in which no vehicle was exchanged yet", scene.provenance.get(CHANGE, "another")
+            "scene", "one in which no vehicle was exchanged yet", scene.provenance.get(CHANGE_KEY, "another")
         )
     if len(scene.objects.source) != count:
         raise RangeError("objects.source", "one entry an object", len(scene.objects.source))
@@ -311,7 +313,7 @@ def _check(scene: SceneIR, row: int | None) -> None:
         raise RangeError("objects", f"a row from 0 to {count - 1}" if count else "no row of none", row)
 
 
-def _away(scene: SceneIR, like: Tensor) -> Tensor:
+def _away_position(scene: SceneIR, like: Tensor) -> Tensor:
     """Where (3,) vehicles stand that are not in a scene: on its ground, behind the camera."""
     ground = scene.environment.ground.to(like)
     return torch.stack(
@@ -319,7 +321,7 @@ def _away(scene: SceneIR, like: Tensor) -> Tensor:
     )
 
 
-def _unseen(source: Source, place: Tensor) -> Source:
+def _hidden_source(source: Source, place: Tensor) -> Source:
     """The source of a vehicle that the picture does not show, since it stands at `place` (3,)."""
     nothing = Crop(source.foreground.values.new_zeros(4, 1, 1), 0, 0)
     return replace(source, translation=place, foreground=nothing, shadow=None, region=None)

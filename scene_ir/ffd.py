@@ -56,7 +56,7 @@ def to_symmetric(offsets: Tensor) -> Tensor:
     return grid[..., : LATTICE[2] // 2, :].reshape(*offsets.shape[:-2], SYMMETRIC_DIM)
 
 
-def low_modes() -> Tensor:
+def low_order_modes() -> Tensor:
     """Symmetric offsets (15, 96), at most 1, that bend a vehicle in the large: along and up by x, y, x^2,
     xy, y^2 of where a lattice point lies along and up; across by z times 1, x, y, x^2, y^2. None is a move.
     """

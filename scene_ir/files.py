@@ -38,37 +38,37 @@ if TYPE_CHECKING:
 _NPZ_LEVEL = 1
 """zlib level: float maps shrink hardly further at higher ones, and take several times as long."""
 
-_MOST_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 """Of a file that is read whole, and of all arrays of an NPZ."""
-_READ_AT_ONCE = 1 << 24
+_CHUNK_BYTES = 1 << 24
 """Bytes of a file that turns out longer than it said."""
-_MOST_PIXELS = 1 << 26
+_MAX_PIXELS = 1 << 26
 """Of an image: 8192 x 8192."""
-_MOST_YAML = 1 << 18
+_MAX_YAML_BYTES = 1 << 18
 """Bytes of a YAML file: settings are short, and reading is slow."""
-_INTEGERS = 1 << 63
+_INTEGER_LIMIT = 1 << 63
 """Integers lie below it, as in the arrays that are made of them."""
-_INTEGER_DIGITS = len(str(_INTEGERS))
-_YAML_DIGITS = 200
+_INTEGER_DIGITS = len(str(_INTEGER_LIMIT))
+_MAX_YAML_DIGITS = 200
 """Characters of an integer in YAML, which may be binary, with underscores."""
-_ODD = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
+_INVALID_ESCAPE = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
 """What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
 
 
-_LEFT = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
+_LEFTOVER_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
 
 
-def _sibling(path: Path) -> Path:
+def _temporary_path(path: Path) -> Path:
     """A free hidden name beside `path`, on the same file system, so that a rename is atomic."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
 
 
 def is_leftover(name: str) -> bool:
     """Whether a file or folder of this name is being written, or was when its process was killed."""
-    return _LEFT.fullmatch(name) is not None
+    return _LEFTOVER_NAME.fullmatch(name) is not None
 
 
-def leftovers(folder: Path) -> list[Path]:
+def find_leftovers(folder: Path) -> list[Path]:
     """Files and folders below `folder` that a process was writing when it was killed, the outermost of them; of
     processes that write now, too, which may end meanwhile.
     """
@@ -80,7 +80,7 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def name_write_errors(path: Path) -> Iterator[None]:
     """Inside, what the system says against writing `path` becomes a WriteError that names it, as it would be
     called in the end.
     """
@@ -89,7 +89,7 @@ def writing(path: Path) -> Iterator[None]:
     except WriteError:
         raise
     except OSError as error:
-        names = (found[1] if (found := _LEFT.fullmatch(part)) else part for part in path.parts)
+        names = (found[1] if (found := _LEFTOVER_NAME.fullmatch(part)) else part for part in path.parts)
         raise WriteError(str(Path(*names)), (error.strerror or str(error)).lower()) from error
 
 
@@ -97,8 +97,8 @@ def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` to `path` so that a reader sees the old file or the new one, never a part. Makes the folder.
     Raises WriteError; so do all that write here.
     """
-    temporary = _sibling(path)
-    with writing(path):
+    temporary = _temporary_path(path)
+    with name_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             temporary.write_bytes(data)
@@ -107,7 +107,7 @@ def write_bytes(path: Path, data: bytes) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def share_alike(folder: Path, other: Path) -> None:
+def hardlink_duplicates(folder: Path, other: Path) -> None:
     """Let files below `folder` that equal those of the same name below `other` take no room of their own: hard
     links, where the file system has them. Files of this project are replaced and never written into, so that a
     change of one stays away from the other.
@@ -116,7 +116,7 @@ def share_alike(folder: Path, other: Path) -> None:
         twin = other / path.relative_to(folder)
         if not twin.is_file() or path.samefile(twin) or not filecmp.cmp(path, twin, shallow=False):
             continue
-        temporary = _sibling(path)
+        temporary = _temporary_path(path)
         try:
             os.link(twin, temporary)
             os.replace(temporary, path)
@@ -164,27 +164,27 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 @contextmanager
-def whole_folder(folder: Path) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder beside `folder` that takes its name and place when the block ends without error."""
-    temporary = _sibling(folder)
-    with writing(folder):
+    temporary = _temporary_path(folder)
+    with name_write_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
     try:
         yield temporary
-        with writing(folder):
-            _put(temporary, folder)
+        with name_write_errors(folder):
+            _replace_folder(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _put(temporary: Path, folder: Path) -> None:
+def _replace_folder(temporary: Path, folder: Path) -> None:
     """`temporary` in the place of what has the name of `folder`, which is there again where that fails. Of two
     processes that do so at once, the later one's stays.
     """
     done = False
     while not done:
-        old = _sibling(folder)
+        old = _temporary_path(folder)
         with suppress(FileNotFoundError):
             os.replace(folder, old)
         try:
@@ -207,12 +207,12 @@ def _remove(path: Path) -> None:
         path.unlink()
 
 
-def digest(path: Path) -> str:
+def sha256_digest(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal. FormatError where it is missing or cannot be read."""
     return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
-def check_card(path: Path, data: bytes) -> None:
+def check_model_card(path: Path, data: bytes) -> None:
     """FormatError for weights, `data`, that are not those whose SHA-256 the model card beside them names."""
     card = path.with_suffix(".md")
     said, found = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card)), hashlib.sha256(data).hexdigest()
@@ -220,7 +220,7 @@ def check_card(path: Path, data: bytes) -> None:
         raise FormatError(str(path), f"the SHA-256 of {card.name}, {said[1] if said else 'which has none'}", found)
 
 
-def below(folder: Path, name: str) -> Path:
+def resolve_inside(folder: Path, name: str) -> Path:
     """The path of what another file names in `folder`. FormatError where it leads out of it: by an absolute name,
     `..`, or a link.
     """
@@ -239,10 +239,10 @@ def check_links(folder: Path) -> None:
         for name in (*folders, *names):
             path = Path(place, name)
             if path.is_symlink():
-                below(folder, str(path.relative_to(folder)))
+                resolve_inside(folder, str(path.relative_to(folder)))
 
 
-def check_regular(path: Path | str, most: int = _MOST_BYTES) -> int:
+def check_regular_file(path: Path | str, max_bytes: int = _MAX_BYTES) -> int:
     """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes.
     Its size.
     """
@@ -255,17 +255,17 @@ def check_regular(path: Path | str, most: int = _MOST_BYTES) -> int:
         raise FormatError(str(path), "a readable file", "is a directory")
     if not stat.S_ISREG(status.st_mode):
         raise FormatError(str(path), "a regular file", "a device, a pipe or a socket")
-    if status.st_size > most:
-        raise FormatError(str(path), f"at most {most:,} bytes", f"{status.st_size:,}")
+    if status.st_size > max_bytes:
+        raise FormatError(str(path), f"at most {max_bytes:,} bytes", f"{status.st_size:,}")
     return status.st_size
 
 
-def read_bytes(path: Path | str, most: int = _MOST_BYTES) -> bytes:
+def read_bytes(path: Path | str, max_bytes: int = _MAX_BYTES) -> bytes:
     """The bytes of a file. FormatError as `check_regular`, and where it cannot be read.
 
     Calls the system as seldom as can be: tens of thousands of small files are read at once.
     """
-    size = check_regular(path, most)
+    size = check_regular_file(path, max_bytes)
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
@@ -273,7 +273,7 @@ def read_bytes(path: Path | str, most: int = _MOST_BYTES) -> bytes:
             if len(data) != size:  # it changed meanwhile, or is longer than one call reads
                 parts = [data]
                 while parts[-1]:
-                    parts.append(os.read(descriptor, _READ_AT_ONCE))
+                    parts.append(os.read(descriptor, _CHUNK_BYTES))
                 data = b"".join(parts)
         finally:
             os.close(descriptor)
@@ -282,24 +282,24 @@ def read_bytes(path: Path | str, most: int = _MOST_BYTES) -> bytes:
         raise FormatError(str(path), "a readable file", (error.strerror or str(error)).lower()) from error
 
 
-def read_text(path: Path | str, most: int = _MOST_BYTES) -> str:
+def read_text(path: Path | str, max_bytes: int = _MAX_BYTES) -> str:
     """The text of a UTF-8 file. FormatError as `read_bytes`, and where it is no text."""
-    return text_of(read_bytes(path, most), path)
+    return decode_utf8(read_bytes(path, max_bytes), path)
 
 
-def read_gzip(path: Path, most: int = _MOST_BYTES) -> bytes:
+def read_gzip(path: Path, max_bytes: int = _MAX_BYTES) -> bytes:
     """What a gzip file holds. FormatError as `read_bytes`, where it is none, or holds more than `most` bytes."""
     try:
-        with gzip.GzipFile(fileobj=io.BytesIO(read_bytes(path, most))) as stream:
-            data = stream.read(most + 1)
+        with gzip.GzipFile(fileobj=io.BytesIO(read_bytes(path, max_bytes))) as stream:
+            data = stream.read(max_bytes + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise FormatError(str(path), "a gzip file", error) from error
-    if len(data) > most:
-        raise FormatError(str(path), f"at most {most:,} bytes, unpacked", "more")
+    if len(data) > max_bytes:
+        raise FormatError(str(path), f"at most {max_bytes:,} bytes, unpacked", "more")
     return data
 
 
-def text_of(data: bytes, path: Path | str) -> str:
+def decode_utf8(data: bytes, path: Path | str) -> str:
     """UTF-8 text. FormatError naming the file where it is none."""
     try:
         return data.decode("utf-8")
@@ -319,8 +319,8 @@ def read_json(path: Path) -> Any:
 def parse_json(text: str, where: str) -> Any:
     """The value of JSON text. where: the file. FormatError as `read_json`."""
     try:
-        value = json.loads(text, parse_int=_integer if _long_numbers(text) else None)
-        if _ODD.search(text):
+        value = json.loads(text, parse_int=_parse_integer if _has_long_numbers(text) else None)
+        if _INVALID_ESCAPE.search(text):
             _check_texts(value)
     except json.JSONDecodeError as error:
         raise FormatError(f"{where}:{error.lineno}:{error.colno}", "JSON", error.msg) from error
@@ -335,7 +335,7 @@ def parse_json(text: str, where: str) -> Any:
     return value
 
 
-def _long_numbers(text: str) -> bool:
+def _has_long_numbers(text: str) -> bool:
     """Whether there are as many digits in a row as an integer beyond 64 bits has: then each is looked at, which
     takes as long as all the rest of the reading.
     """
@@ -348,8 +348,8 @@ def _long_numbers(text: str) -> bool:
     return bool(digits.any())
 
 
-def _integer(text: str) -> int:
-    if len(text) > len(str(_INTEGERS)) + 1 or abs(int(text)) >= _INTEGERS:
+def _parse_integer(text: str) -> int:
+    if len(text) > len(str(_INTEGER_LIMIT)) + 1 or abs(int(text)) >= _INTEGER_LIMIT:
         raise ValueError(f"an integer of {len(text)} digits, too large for 64 bits")
     return int(text)
 
@@ -362,7 +362,7 @@ def _check_texts(value: Any) -> None:
         raise ValueError("text with a NUL character")
 
 
-class _Loader(yaml.SafeLoader):
+class _SafeYamlLoader(yaml.SafeLoader):
     """YAML without aliases, a few of which stand for gigabytes, and with integers that fit 64 bits."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -373,19 +373,19 @@ class _Loader(yaml.SafeLoader):
 
     def integer(self, node: Any) -> int:
         """What the text of a node says."""
-        if len(node.value) > _YAML_DIGITS:
+        if len(node.value) > _MAX_YAML_DIGITS:
             raise ValueError(f"an integer of {len(node.value)} digits, too large for 64 bits")
-        return _integer(str(self.construct_yaml_int(node)))
+        return _parse_integer(str(self.construct_yaml_int(node)))
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.integer)
+_SafeYamlLoader.add_constructor("tag:yaml.org,2002:int", _SafeYamlLoader.integer)
 
 
 def read_yaml(path: Path) -> Any:
     """The value in a YAML file. FormatError where it is none, or has aliases, deep nesting or huge integers."""
-    text = read_text(path, _MOST_YAML)
+    text = read_text(path, _MAX_YAML_BYTES)
     try:
-        return yaml.load(text, _Loader)  # a subclass of SafeLoader
+        return yaml.load(text, _SafeYamlLoader)  # a subclass of SafeLoader
     except RecursionError as error:
         raise FormatError(str(path), "YAML", "lists or mappings that are nested too deep") from error
     except (yaml.YAMLError, ValueError, AttributeError, TypeError) as error:
@@ -393,40 +393,40 @@ def read_yaml(path: Path) -> Any:
 
 
 @contextmanager
-def opened_image(path: Path, data: bytes | None = None) -> Iterator[Image]:
+def open_image(path: Path, data: bytes | None = None) -> Iterator[Image]:
     """Pillow's view of an image file, of which the header alone is read as yet. data: what is in it, where that is
     known. FormatError for no image, for one that would not fit, and for what Pillow raises inside.
     """
     from PIL import Image
 
     if data is None:
-        check_regular(path)
+        check_regular_file(path)
     try:
         with (
             warnings.catch_warnings(action="ignore"),
             Image.open(path if data is None else io.BytesIO(data)) as image,
         ):
             width, height = image.size
-            if width * height > _MOST_PIXELS:
-                raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", f"{width}x{height}")
+            if width * height > _MAX_PIXELS:
+                raise FormatError(str(path), f"an image of at most {_MAX_PIXELS:,} px", f"{width}x{height}")
             yield image
     except FormatError:
         raise
     except Image.DecompressionBombError as error:
-        raise FormatError(str(path), f"an image of at most {_MOST_PIXELS:,} px", "one of more") from error
+        raise FormatError(str(path), f"an image of at most {_MAX_PIXELS:,} px", "one of more") from error
     # its readers of damaged headers, EXIF among them, raise what their parts do
     except (OSError, ValueError, SyntaxError, ArithmeticError, LookupError, TypeError, struct.error) as error:
         found = f"{path.stat().st_size if data is None else len(data)} bytes that do not decode"
         raise FormatError(str(path), "an image", found) from error
 
 
-def check_pixels(path: Path, data: bytes) -> tuple[int, int]:
+def read_image_size(path: Path, data: bytes) -> tuple[int, int]:
     """Width and height that an image's header says. FormatError as `opened_image`."""
-    with opened_image(path, data) as image:
+    with open_image(path, data) as image:
         return image.size
 
 
-def check_text(field: str, text: str) -> None:
+def check_utf8(field: str, text: str) -> None:
     """FormatError naming the field for text that UTF-8 does not hold, as the names of some old files are."""
     try:
         text.encode()
@@ -461,7 +461,7 @@ def _decode(path: Path) -> np.ndarray:
     import cv2
 
     data = read_bytes(path)
-    check_pixels(path, data)
+    read_image_size(path, data)
     image = None
     if data and _is_whole(data):
         try:
@@ -512,10 +512,10 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             total = sum(member.file_size for member in archive.infolist())
-            if total > _MOST_BYTES:
-                raise FormatError(str(path), f"arrays of at most {_MOST_BYTES:,} bytes", f"{total:,}")
+            if total > _MAX_BYTES:
+                raise FormatError(str(path), f"arrays of at most {_MAX_BYTES:,} bytes", f"{total:,}")
             return {
-                member.filename.removesuffix(".npy"): _array(_unpacked(archive, member))
+                member.filename.removesuffix(".npy"): _parse_npy(_read_member(archive, member))
                 for member in archive.infolist()
             }
     except FormatError:
@@ -529,7 +529,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         raise FormatError(str(path), "an NPZ archive of arrays", reason) from error
 
 
-def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
     """The bytes of a member, of which no more are unpacked than the archive's list says that there are."""
     with archive.open(member) as stream:
         data = bytearray(stream.read(member.file_size))
@@ -537,7 +537,7 @@ def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
     return data
 
 
-def _array(data: bytearray) -> np.ndarray:
+def _parse_npy(data: bytearray) -> np.ndarray:
     """An array of its NPY file, in the same memory. ValueError where it is none, or of another size."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)

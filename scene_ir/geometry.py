@@ -14,7 +14,7 @@ def yaw_matrix(yaw: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*yaw.shape, 3, 3)
 
 
-def place(unit: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
+def place_vertices(unit: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
     """Unit-box vertices to camera space.
 
     unit: (..., V, 3); size_lhw: (..., 3) m; yaw: (...,) rad; translation: (..., 3) m, bottom-face centre
@@ -35,7 +35,7 @@ def project(points: Tensor, matrix: Tensor) -> Tensor:
     return clip[..., :2] / clip[..., 2:]
 
 
-def height_above(depth: Tensor, ground: Tensor, matrix: Tensor) -> Tensor:
+def height_above_ground(depth: Tensor, ground: Tensor, matrix: Tensor) -> Tensor:
     """Height (H, W) m, float64, above the ground plane of what is seen at `depth` (H, W) m; inf where that is inf.
 
     ground (4,): plane n.x + d = 0; matrix (3, 4).
@@ -60,7 +60,7 @@ _BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0
 def box_corners(size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
     """Corners (..., 8, 3) m of 3D boxes: bottom face first, in the order of KITTI's development kit."""
     corners = torch.tensor(_BOX_CORNERS, dtype=size_lhw.dtype, device=size_lhw.device).T
-    return place(corners.expand(*yaw.shape, 8, 3), size_lhw, yaw, translation)
+    return place_vertices(corners.expand(*yaw.shape, 8, 3), size_lhw, yaw, translation)
 
 
 def ground_footprint(size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ def clip_boxes(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
     return torch.minimum(boxes_xyxy.clamp(min=0), limit)
 
 
-def kept_within(values: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
+def clamp_inclusive(values: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
     """Values kept in [low, high]; their gradient is 1 there, at the bounds too, and 0 beyond. low, high: numbers,
     or tensors of the values' shape.
 
@@ -108,9 +108,9 @@ def kept_within(values: Tensor, low: float | Tensor, high: float | Tensor) -> Te
     return torch.where((values >= low) & (values <= high), values, kept) if values.requires_grad else kept
 
 
-def weld(vertices: Tensor, within: float = 1e-6) -> Tensor:
+def weld_vertices(vertices: Tensor, tolerance: float = 1e-6) -> Tensor:
     """Which place (V,) int64, counted from 0, each of the vertices (V, 3) is at: those at one place share it."""
-    keys = (vertices.detach() / within).round().to(torch.int64)
+    keys = (vertices.detach() / tolerance).round().to(torch.int64)
     return torch.unique(keys, dim=0, return_inverse=True)[1]
 
 

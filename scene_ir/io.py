@@ -34,10 +34,10 @@ from scene_ir.types import (
     Camera,
     Crop,
     Environment,
-    Front,
     Labels,
     Mesh,
     Objects,
+    Occluder,
     SceneIR,
     Source,
     check_shape,
@@ -93,7 +93,7 @@ _INTEGERS = ("mesh_index", "category", "occlusion")
 
 def save_scene(scene: SceneIR, folder: Path) -> None:
     """Write `scene` as `folder`, whole or not at all, in place of what was there. Gradients are not kept."""
-    with files.whole_folder(Path(folder)) as temporary:
+    with files.atomic_folder(Path(folder)) as temporary:
         arrays = {"depth": _array(scene.depth)}
         arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
         in_png = {}
@@ -118,10 +118,10 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
             "meshes": len(scene.meshes),
             "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
             "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
-            "front": [_front_record(i, front, arrays) for i, front in enumerate(scene.front)],
+            "front": [_front_record(i, front, arrays) for i, front in enumerate(scene.occluders)],
             "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
             "ignore": _numbers(scene.ignore),
-            "others": None if scene.others is None else _labels_record(scene.others),
+            "others": None if scene.other_labels is None else _labels_record(scene.other_labels),
             "before": scene.before is not None,
         }
         files.write_json(temporary / "scene.json", record)
@@ -149,7 +149,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
     root = _record(folder)
     camera = _camera(root["camera"])
     size = (camera.height, camera.width)
-    arrays = _Arrays(folder / "arrays.npz")
+    arrays = _NpzArrays(folder / "arrays.npz")
     images = {name: _load_image(folder, root["images"][name], arrays, size, name) for name in _IMAGES}
     sources = tuple(_load_source(i, node, arrays) for i, node in enumerate(root["sources"].items()))
     front = tuple(_load_front(i, node, arrays) for i, node in enumerate(root["front"].items()))
@@ -179,7 +179,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
     changed = root["version"].value > 3 and root["before"].flag()
     if changed and not with_before:
         raise FormatError(f"{root['before'].where}", "false, in the scene before another", "true")
-    before = _load(files.below(folder, "before"), with_before=False) if changed else None
+    before = _load(files.resolve_inside(folder, "before"), with_before=False) if changed else None
     return root.build(
         lambda: SceneIR(
             camera=camera,
@@ -191,9 +191,9 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             depth=arrays.tensor("depth", *size),
             ignore=ignore.tensor(ignore.rows(), 4),
             provenance=provenance,
-            front=front,
+            occluders=front,
             before=before,
-            others=_others(root),
+            other_labels=_others(root),
         )
     )
 
@@ -203,7 +203,7 @@ def load_camera(folder: Path) -> Camera:
     return _camera(_record(Path(folder))["camera"])
 
 
-def _camera(node: _Node) -> Camera:
+def _camera(node: _JsonNode) -> Camera:
     return node.build(
         lambda: Camera(
             node["intrinsics"].tensor(3, 3),
@@ -220,12 +220,12 @@ def count_objects(folder: Path) -> int:
     return root["objects"]["translation"].rows()
 
 
-def load_others(folder: Path) -> Labels | None:
+def load_other_labels(folder: Path) -> Labels | None:
     """`SceneIR.others` of the scene in `folder`, from its record alone. FormatError naming file and key."""
     return _others(_record(Path(folder)))
 
 
-def _others(root: _Node) -> Labels | None:
+def _others(root: _JsonNode) -> Labels | None:
     if "others" not in root.mapping() or root["others"].value is None:  # earlier scenes have no such key
         return None
     node = root["others"]
@@ -243,10 +243,10 @@ def _labels_record(labels: Labels) -> dict[str, Any]:
     return {"kind": list(labels.kind), **values}
 
 
-def _record(folder: Path) -> _Node:
+def _record(folder: Path) -> _JsonNode:
     """The record of a scene in this version of the schema."""
     path = folder / "scene.json"
-    root = _Node(str(path), files.read_json(path))
+    root = _JsonNode(str(path), files.read_json(path))
     root.expect("schema", SCHEMA)
     if root["version"].value not in _READ:
         raise FormatError(f"{root.where}: version", f"one of {', '.join(map(str, _READ))}", root["version"].value)
@@ -296,7 +296,7 @@ def _provenance(provenance: Mapping[str, str]) -> dict[str, str]:
     for key, value in provenance.items():
         if not isinstance(key, str) or not isinstance(value, str):
             raise FormatError(f"scene.provenance[{key!r}]", "text", repr(value))
-        files.check_text(f"scene.provenance[{key!r}]", key + value)
+        files.check_utf8(f"scene.provenance[{key!r}]", key + value)
     return dict(provenance)
 
 
@@ -315,23 +315,23 @@ def _source_record(index: int, source: Source, arrays: dict[str, np.ndarray]) ->
     return record
 
 
-def _front_record(index: int, front: Front, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+def _front_record(index: int, front: Occluder, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The JSON part of one thing in front; its crop goes into `arrays`."""
     arrays[f"front.{index}.foreground"] = _array(front.foreground.values)
     return {"depth_m": front.depth_m, "x0": front.foreground.x0, "y0": front.foreground.y0}
 
 
 @dataclass(frozen=True, slots=True)
-class _Node:
+class _JsonNode:
     """A value inside a JSON file that knows where it stands."""
 
     where: str
     value: Any
 
-    def __getitem__(self, key: str) -> _Node:
+    def __getitem__(self, key: str) -> _JsonNode:
         if key not in self.mapping():
             raise FormatError(f"{self.where}: {key}", "a value", "no such key")
-        return _Node(f"{self.where}: {key}", self.value[key])
+        return _JsonNode(f"{self.where}: {key}", self.value[key])
 
     def _require(self, kind: type | tuple[type, ...], name: str) -> Any:
         if not isinstance(self.value, kind) or isinstance(self.value, bool):
@@ -359,8 +359,8 @@ class _Node:
     def number(self) -> float:
         return float(self._require((int, float), "a number"))
 
-    def items(self) -> list[_Node]:
-        return [_Node(f"{self.where}[{i}]", v) for i, v in enumerate(self._require(list, "a list"))]
+    def items(self) -> list[_JsonNode]:
+        return [_JsonNode(f"{self.where}[{i}]", v) for i, v in enumerate(self._require(list, "a list"))]
 
     def _values(self) -> tuple[Any, torch.dtype | None]:
         if not isinstance(self.value, dict):
@@ -372,7 +372,7 @@ class _Node:
 
     def rows(self) -> int:
         """How many entries a tensor has along its first axis."""
-        return len(_Node(self.where, self._values()[0]).items())
+        return len(_JsonNode(self.where, self._values()[0]).items())
 
     def tensor(self, *shape: int, integer: bool = False) -> Tensor:
         """The nested lists as a tensor of `shape`."""
@@ -416,7 +416,7 @@ def _flatten(value: Any, flat: list[float], where: str) -> tuple[int, ...]:
     return ()
 
 
-class _Arrays:
+class _NpzArrays:
     """The arrays of one NPZ."""
 
     def __init__(self, path: Path) -> None:
@@ -442,7 +442,7 @@ class _Arrays:
         return tensor
 
 
-def _load_image(folder: Path, node: _Node, arrays: _Arrays, size_hw: tuple[int, int], name: str) -> Tensor:
+def _load_image(folder: Path, node: _JsonNode, arrays: _NpzArrays, size_hw: tuple[int, int], name: str) -> Tensor:
     if node.text() == "npz":
         return arrays.tensor(name, 3, *size_hw)
     if node.text() != "png":
@@ -450,7 +450,7 @@ def _load_image(folder: Path, node: _Node, arrays: _Arrays, size_hw: tuple[int, 
     return to_tensor(files.read_image(folder / f"{name}.png", size_hw))
 
 
-def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:
+def _load_source(index: int, node: _JsonNode, arrays: _NpzArrays) -> Source:
     def crop(name: str, channels: int) -> Crop:
         values = arrays.tensor(f"source.{index}.{name}", channels, None, None)
         return Crop(values, node[name]["x0"].integer(), node[name]["y0"].integer())
@@ -467,15 +467,15 @@ def _load_source(index: int, node: _Node, arrays: _Arrays) -> Source:
     )
 
 
-def _load_front(index: int, node: _Node, arrays: _Arrays) -> Front:
+def _load_front(index: int, node: _JsonNode, arrays: _NpzArrays) -> Occluder:
     values = arrays.tensor(f"front.{index}.foreground", 4, None, None)
     return node.build(
-        lambda: Front(Crop(values, node["x0"].integer(), node["y0"].integer()), node["depth_m"].number())
+        lambda: Occluder(Crop(values, node["x0"].integer(), node["y0"].integer()), node["depth_m"].number())
     )
 
 
 def _load_mesh(path: Path) -> Mesh:
-    return _Node(str(path), None).build(lambda: load_mesh(path))
+    return _JsonNode(str(path), None).build(lambda: load_mesh(path))
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
@@ -483,7 +483,7 @@ def to_uint8(image: Tensor) -> np.ndarray:
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
 
 
-def as_written(image: Tensor) -> Tensor:
+def round_to_8bit(image: Tensor) -> Tensor:
     """A picture with values in [0, 1] on the 8-bit grid, as it is once it is written and read."""
     return (image.clamp(0, 1) * 255).round() / 255
 

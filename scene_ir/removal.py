@@ -18,7 +18,7 @@ from scene_ir.types import Crop, Objects, SceneIR, Source
 _ROW = re.compile(r"objects\[(\d+)\](.*)", re.DOTALL)
 
 
-def without_objects(scene: SceneIR, rows: Collection[int], settings: RenderSettings | None = None) -> SceneIR:
+def remove_objects(scene: SceneIR, rows: Collection[int], settings: RenderSettings | None = None) -> SceneIR:
     """The scene without the vehicles in `rows` and without their shadows; the others move up, in order.
 
     What a removed vehicle hid of a farther one was known to be unseen because the nearer one's matte said so. That
@@ -36,17 +36,17 @@ def without_objects(scene: SceneIR, rows: Collection[int], settings: RenderSetti
         return scene
     sources = scene.objects.source
     if sources:
-        sources = uncovered(scene, rows, settings)
-    objects = _rows(scene.objects, kept, tuple(sources[row] for row in kept) if sources else ())
-    return replace(scene, objects=objects, provenance=_renumbered(scene.provenance, kept), before=None)
+        sources = complete_uncovered_sources(scene, rows, settings)
+    objects = _select_objects(scene.objects, kept, tuple(sources[row] for row in kept) if sources else ())
+    return replace(scene, objects=objects, provenance=_renumber_provenance(scene.provenance, kept), before=None)
 
 
-def _rows(objects: Objects, kept: Sequence[int], source: tuple[Source, ...]) -> Objects:
+def _select_objects(objects: Objects, kept: Sequence[int], source: tuple[Source, ...]) -> Objects:
     tensors = [f.name for f in fields(Objects) if f.name != "source"]
     return replace(objects, source=source, **{name: getattr(objects, name)[list(kept)] for name in tensors})
 
 
-def _renumbered(provenance: Mapping[str, str], kept: Sequence[int]) -> dict[str, str]:
+def _renumber_provenance(provenance: Mapping[str, str], kept: Sequence[int]) -> dict[str, str]:
     """What is told of `objects[i]` goes along with its object."""
     place = {row: i for i, row in enumerate(kept)}
     found = {}
@@ -60,11 +60,11 @@ def _renumbered(provenance: Mapping[str, str], kept: Sequence[int]) -> dict[str,
 
 
 @torch.no_grad()
-def uncovered(
+def complete_uncovered_sources(
     scene: SceneIR, removed: Collection[int], settings: RenderSettings | None = None
 ) -> tuple[Source, ...]:
     """The sources of all objects, those behind a removed one completed where it stood."""
-    photographed = scene.at_rest()
+    photographed = scene.unperturbed()
     objects, sources = photographed.objects, scene.objects.source
     order = blend.paint_order(
         objects.size_lhw, objects.yaw, objects.translation, surfaces.camera_centre(scene.camera.matrix)
@@ -73,7 +73,7 @@ def uncovered(
     frame_hw = (scene.camera.height, scene.camera.width)
     for place, row in enumerate(order):
         nearer = [sources[i].foreground for i in order[place + 1 :] if i in removed]
-        mask = _support(nearer, frame_hw)
+        mask = _opaque_mask(nearer, frame_hw)
         if row not in removed and bool(mask.any()):
             hidden[row] = mask
     if not hidden:
@@ -81,12 +81,12 @@ def uncovered(
     compositor = Compositor(photographed, settings)
     layers = compositor.layers(compositor.moved(photographed))
     return tuple(
-        _completed(source, layers, row, hidden[row]) if row in hidden else source
+        _complete_source(source, layers, row, hidden[row]) if row in hidden else source
         for row, source in enumerate(sources)
     )
 
 
-def _support(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tensor:
+def _opaque_mask(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tensor:
     """(H, W) bool: where any of the foregrounds, Crops (4, h, w), is not wholly transparent."""
     mask = torch.zeros(frame_hw, dtype=torch.bool)
     for crop in foregrounds:
@@ -94,7 +94,7 @@ def _support(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tensor:
     return mask
 
 
-def _completed(source: Source, layers: Layers, row: int, hidden: Tensor) -> Source:
+def _complete_source(source: Source, layers: Layers, row: int, hidden: Tensor) -> Source:
     """The source with its foreground as `layers` draw it where `hidden` (H, W), as it was elsewhere."""
     old = source.foreground
     packed, size = layers.layout.spans()[row]

@@ -195,7 +195,7 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
-class Front:
+class Occluder:
     """Something that is no vehicle and may stand in front of one: a person, a pole, a trunk. It never moves.
 
     foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity, in [0, 1]. depth_m: along the optical
@@ -307,9 +307,9 @@ class SceneIR:
     depth: Tensor
     ignore: Tensor
     provenance: Mapping[str, str] = field(default_factory=dict)
-    front: tuple[Front, ...] = ()
+    occluders: tuple[Occluder, ...] = ()
     before: SceneIR | None = None
-    others: Labels | None = None
+    other_labels: Labels | None = None
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width
@@ -318,13 +318,15 @@ class SceneIR:
         check_shape("scene.depth", self.depth, h, w)
         check_shape("scene.environment.sky", self.environment.sky, h, w)
         check_shape("scene.ignore", self.ignore, None, 4)
-        if self.others is not None:
-            check_shape("scene.ignore", self.ignore, len(self.others.ignore_xyxy) + len(self.others.kind), 4)
+        if self.other_labels is not None:
+            check_shape(
+                "scene.ignore", self.ignore, len(self.other_labels.ignore_xyxy) + len(self.other_labels.kind), 4
+            )
         check_indices("objects.mesh_index", self.objects.mesh_index, len(self.meshes))
         for i, source in enumerate(self.objects.source):
             for name in ("foreground", "shadow", "region"):
                 self._check_inside(f"objects.source[{i}].{name}", getattr(source, name))
-        for i, thing in enumerate(self.front):
+        for i, thing in enumerate(self.occluders):
             self._check_inside(f"scene.front[{i}].foreground", thing.foreground)
         if self.before is not None:
             if self.before.before is not None:
@@ -358,9 +360,9 @@ class SceneIR:
 
         A saved counterexample thus carries the scene that it was made from. Needs `objects.source`.
         """
-        return self.origin.at_rest()
+        return self.origin.unperturbed()
 
-    def at_rest(self) -> SceneIR:
+    def unperturbed(self) -> SceneIR:
         """The scene at theta0: every object at the geometry of its source, every code at 0. Vehicles that were
         exchanged, added or taken away stay so. Needs `objects.source`.
         """
@@ -414,11 +416,11 @@ class Labels:
         check_shape("labels.size_lhw", self.size_lhw, m, 3)
         check_shape("labels.ignore_xyxy", self.ignore_xyxy, None, 4)
 
-    def rows(self, kept: Sequence[int]) -> Labels:
+    def select(self, rows: Sequence[int]) -> Labels:
         """Some of the objects, and all regions."""
         columns = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
-        chosen = {name: getattr(self, name)[list(kept)] for name in columns}
-        return replace(self, kind=tuple(self.kind[row] for row in kept), **chosen)
+        chosen = {name: getattr(self, name)[list(rows)] for name in columns}
+        return replace(self, kind=tuple(self.kind[row] for row in rows), **chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -465,10 +467,10 @@ class Render:
     depth: Tensor
     object_id: Tensor
     opacity: tuple[Crop, ...]
-    drawn: Tensor | None = None
+    vehicle_regions: Tensor | None = None
 
 
-def scene_to(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
+def convert_scene(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
     """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`; as they
     are where that is None. What does not change is not copied.
     """
@@ -476,11 +478,11 @@ def scene_to(value: T, dtype: torch.dtype | None, device: torch.device | str | N
     if isinstance(value, Tensor):
         converted = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
     elif isinstance(value, tuple):
-        parts = tuple(scene_to(part, dtype, device) for part in value)
+        parts = tuple(convert_scene(part, dtype, device) for part in value)
         converted = value if all(a is b for a, b in zip(parts, value, strict=True)) else parts
     elif is_dataclass(value) and not isinstance(value, type):
         parts = {
-            f.name: scene_to(getattr(value, f.name), dtype, device)
+            f.name: convert_scene(getattr(value, f.name), dtype, device)
             for f in fields(value)
             if not isinstance(getattr(value, f.name), (int, float, str, Mapping, type(None)))
         }

@@ -17,7 +17,7 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 
 _DTYPES = {"F16": "<f2", "F32": "<f4"}
-SHIPPED = Path(__file__).parent / "derender" / "weights"
+SHIPPED_WEIGHTS = Path(__file__).parent / "derender" / "weights"
 _HEADER = 8
 """Bytes that tell the header's length."""
 
@@ -27,8 +27,8 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     weights of this package also where they are not those of their model card.
     """
     data = files.read_bytes(path)
-    if path.parent == SHIPPED:
-        files.check_card(path, data)
+    if path.parent == SHIPPED_WEIGHTS:
+        files.check_model_card(path, data)
     length = int.from_bytes(data[:_HEADER], "little")
     if len(data) < _HEADER or len(data) - _HEADER < length:
         raise FormatError(str(path), "a safetensors file", f"{len(data)} bytes, cut short")
@@ -43,10 +43,10 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
         raise FormatError(f"{path}: __metadata__", "texts by name", repr(metadata)[:60])
     body = memoryview(data)[_HEADER + length :]
-    return metadata, {name: _tensor(f"{path}: {name}", entry, body) for name, entry in header.items()}
+    return metadata, {name: _parse_tensor(f"{path}: {name}", entry, body) for name, entry in header.items()}
 
 
-def _tensor(where: str, entry: Any, body: memoryview) -> Tensor:
+def _parse_tensor(where: str, entry: Any, body: memoryview) -> Tensor:
     try:
         dtype = np.dtype(_DTYPES[entry["dtype"]])
         start, end = entry["data_offsets"]
@@ -58,7 +58,7 @@ def _tensor(where: str, entry: Any, body: memoryview) -> Tensor:
     return torch.from_numpy(values.astype(np.float32))
 
 
-def load_into(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+def load_weights(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     """Give a network the tensors of a file. FormatError naming file and key where they are another network's."""
     expected = {k: v for k, v in network.state_dict().items() if v.is_floating_point()}
     for name in sorted(expected.keys() ^ tensors.keys()):

@@ -66,7 +66,7 @@ def solve_sources(
     h, w) an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one
     Crop (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the
     background, it becomes the photograph (freed of the shadows). margins_px: for each object instead of
-    `settings.margin_px`. Of what stands in front, `scene.front`, the opacity is taken, and the colours are solved.
+    `settings.margin_px`. Of what stands in front, `scene.occluders`, the opacity is taken, and the colours are solved.
     """
     settings = settings or SolveSettings()
     count = len(scene.objects)
@@ -127,7 +127,7 @@ def _solve(
     nearest = drawn.nearest()
     count = len(objects)
     mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(count)]
-    mattes += [replace(f.foreground, values=f.foreground.values[3:].to(image)) for f in scene.front]
+    mattes += [replace(f.foreground, values=f.foreground.values[3:].to(image)) for f in scene.occluders]
     covered = torch.zeros(frame_hw, dtype=torch.bool)
     for matte in mattes:
         _window(covered[None], matte)[0] |= matte.values[0] > 0
@@ -142,7 +142,7 @@ def _solve(
         objects.yaw,
         objects.translation,
         surfaces.camera_centre(scene.camera.matrix),
-        blend.standing_footprints(scene.front, scene.camera.matrix),
+        blend.standing_footprints(scene.occluders, scene.camera.matrix),
     )
     behind_nearer = {
         i: texture.hidden_behind([mattes[j] for j in order[place + 1 :]], frame_hw, image)
@@ -151,7 +151,7 @@ def _solve(
     lit = [factors[i] if shadows[i] is not None else None for i in range(count)]
     blank = _lit_sources(scene, blank, mattes, lit, [behind_nearer[i] for i in range(count)], settings)
     solved: dict[int, Source] = {}
-    front = list(scene.front)
+    front = list(scene.occluders)
     for place, i in enumerate(order):
         nearer = torch.zeros(frame_hw, dtype=torch.bool)
         for j in order[place + 1 :]:
@@ -172,11 +172,11 @@ def _solve(
         rect = drawn.mesh.layout.rects[i].tolist()
         if not any(_meet(rect, mattes[j]) for j in order[place + 1 :]):
             continue  # nothing is solved against what it shows
-        one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)), front=())
+        one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)), occluders=())
         alone = Compositor(one, RenderSettings(settings.backend), hidden=[behind_nearer[i]])
         canvas = _with_layer(alone)
     sources = tuple(solved[i] for i in range(count))
-    return replace(scene, background=background, objects=replace(objects, source=sources), front=tuple(front))
+    return replace(scene, background=background, objects=replace(objects, source=sources), occluders=tuple(front))
 
 
 def _source(
@@ -209,7 +209,7 @@ def _lit_sources(
     for source, matte in zip(blank, mattes, strict=False):  # those of what stands in front come after
         colour = _window(scene.photograph, matte) * matte.values
         plain.append(replace(source, foreground=replace(matte, values=torch.cat([colour, matte.values]))))
-    whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), front=())
+    whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), occluders=())
     compositor = Compositor(whole, RenderSettings(settings.backend), hidden=hidden)
     samples = compositor.samples()
     seen = list(zip(compositor.fleet.surfaces, samples, strict=True))

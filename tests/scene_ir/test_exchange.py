@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from scene_ir.errors import FormatError, RangeError, ShapeError
-from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
+from scene_ir.exchange import CHANGE_KEY, Vehicle, add_roof_load, add_vehicle, remove_vehicle, replace_vehicle
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene
 from scene_ir.meshes.loads import LOADS, load
 from scene_ir.meshes.templates import template
-from scene_ir.removal import without_objects
+from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Category, SceneIR, scene_to
+from scene_ir.types import Category, SceneIR, convert_scene
 
 BEFORE_ANOTHER = torch.tensor([0.3, 1.65, 7.0])
 """A place nearer than all three cars, before the last."""
@@ -23,7 +23,7 @@ BEFORE_ANOTHER = torch.tensor([0.3, 1.65, 7.0])
 
 @pytest.fixture(scope="module")
 def scene(photographed: SceneIR) -> SceneIR:
-    return scene_to(photographed, torch.float32)
+    return convert_scene(photographed, torch.float32)
 
 
 def vehicle(place: torch.Tensor, paint: tuple[float, float, float] | None = (0.1, 0.1, 0.5)) -> Vehicle:
@@ -37,15 +37,15 @@ def picture(scene: SceneIR) -> torch.Tensor:
 
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_a_car_that_left_shows_what_its_removal_shows(scene: SceneIR, row: int) -> None:
-    left = without(scene, row)
-    assert torch.equal(picture(left), picture(without_objects(scene, [row])))
+    left = remove_vehicle(scene, row)
+    assert torch.equal(picture(left), picture(remove_objects(scene, [row])))
     assert len(left.objects) == len(scene.objects)
     assert left.origin is scene
     assert float(left.objects.translation[row, 2]) < 0
 
 
 def test_the_scene_before_is_drawn_too_and_the_other_way_refused(scene: SceneIR) -> None:
-    left = without(scene, 0)
+    left = remove_vehicle(scene, 0)
     compositor = Compositor(left)
     assert torch.equal(compositor.render(left.as_photographed()).image, picture(scene))
     assert not torch.equal(compositor.render(left).image, picture(scene))
@@ -54,7 +54,7 @@ def test_the_scene_before_is_drawn_too_and_the_other_way_refused(scene: SceneIR)
 
 
 def test_states_in_one_go_are_those_drawn_one_by_one(scene: SceneIR) -> None:
-    left = without(scene, 0)
+    left = remove_vehicle(scene, 0)
     compositor = Compositor(left)
     pairs = [(compositor, left), (compositor, left.as_photographed())]
     for (one, state), found in zip(pairs, render_batch(pairs), strict=True):
@@ -64,8 +64,8 @@ def test_states_in_one_go_are_those_drawn_one_by_one(scene: SceneIR) -> None:
 
 
 def test_a_vehicle_comes_where_none_was(scene: SceneIR) -> None:
-    empty = without_objects(scene, range(len(scene.objects)))
-    one = with_vehicle(empty, vehicle(torch.tensor([0.3, 1.65, 12.0])))
+    empty = remove_objects(scene, range(len(scene.objects)))
+    one = add_vehicle(empty, vehicle(torch.tensor([0.3, 1.65, 12.0])))
     assert len(one.objects) == 1
     assert not torch.equal(picture(one), picture(empty))
 
@@ -80,16 +80,16 @@ def test_numbers_of_any_precision_draw_the_same(scene: SceneIR) -> None:
 
 
 def test_at_rest_keeps_the_change_and_as_photographed_does_not(scene: SceneIR) -> None:
-    left = without(scene, 1)
+    left = remove_vehicle(scene, 1)
     moved = left.with_objects(yaw=left.objects.yaw + 0.1)
-    assert torch.equal(picture(moved.at_rest()), picture(left))
+    assert torch.equal(picture(moved.unperturbed()), picture(left))
     assert torch.equal(picture(moved.as_photographed()), picture(scene))
-    assert CHANGE in left.provenance
-    assert CHANGE not in moved.as_photographed().provenance
+    assert CHANGE_KEY in left.provenance
+    assert CHANGE_KEY not in moved.as_photographed().provenance
 
 
 def test_one_more_stands_there_and_hides_what_is_behind(scene: SceneIR) -> None:
-    more = with_vehicle(scene, vehicle(BEFORE_ANOTHER))
+    more = add_vehicle(scene, vehicle(BEFORE_ANOTHER))
     assert len(more.objects) == len(more.origin.objects) == len(scene.objects) + 1
     assert torch.equal(picture(more.origin), picture(scene))  # the photograph, to the bit
     shown = Compositor(more).render(more)
@@ -104,7 +104,7 @@ def test_one_more_stands_there_and_hides_what_is_behind(scene: SceneIR) -> None:
 
 
 def test_it_casts_a_shadow_and_wears_its_paint(scene: SceneIR) -> None:
-    blue, red = (with_vehicle(scene, vehicle(BEFORE_ANOTHER, p)) for p in ((0.05, 0.05, 0.7), (0.7, 0.05, 0.05)))
+    blue, red = (add_vehicle(scene, vehicle(BEFORE_ANOTHER, p)) for p in ((0.05, 0.05, 0.7), (0.7, 0.05, 0.05)))
     own = Compositor(blue).render(blue).object_id == 4
     less = picture(blue)[:, own].mean(1) - picture(red)[:, own].mean(1)
     assert less[2] > 0.1 > -0.1 > less[0]
@@ -127,14 +127,14 @@ def test_it_is_as_bright_as_the_road_is_there(scene: SceneIR) -> None:
     bright = {}
     for name, street in (("sun", scene), ("shade", shaded)):
         for side, place in (("left", left), ("right", right)):
-            rgba = with_vehicle(street, vehicle(place, (0.5, 0.5, 0.5))).objects.source[3].foreground.values
+            rgba = add_vehicle(street, vehicle(place, (0.5, 0.5, 0.5))).objects.source[3].foreground.values
             bright[name, side] = float(rgba[:3].sum() / rgba[3].sum())
     assert bright["shade", "right"] < 0.8 * bright["sun", "right"]
     assert bright["shade", "left"] > 0.9 * bright["sun", "left"]
 
 
 def test_another_takes_a_cars_place_and_its_row(scene: SceneIR) -> None:
-    other = with_other(scene, 1, vehicle(scene.objects.translation[1]))
+    other = replace_vehicle(scene, 1, vehicle(scene.objects.translation[1]))
     assert len(other.objects) == len(scene.objects)
     assert other.meshes[int(other.objects.mesh_index[1])].name == "hatchback-0"
     shown = Compositor(other).render(other)
@@ -142,7 +142,7 @@ def test_another_takes_a_cars_place_and_its_row(scene: SceneIR) -> None:
     kept = [0, 2]
     assert torch.equal(other.objects.translation[kept], scene.objects.translation[kept])
     # Nothing of the old car is left beside the new one.
-    bare = picture(without(scene, 1))
+    bare = picture(remove_vehicle(scene, 1))
     beside = (shown.object_id == 0) & (Compositor(scene).render(scene).object_id == 2)
     brighter = (shown.image - bare)[:, beside].clamp(min=0)
     assert beside.any()
@@ -152,7 +152,7 @@ def test_another_takes_a_cars_place_and_its_row(scene: SceneIR) -> None:
 def test_a_smaller_one_shows_what_the_old_car_hid(scene: SceneIR) -> None:
     row = 1
     small = replace(vehicle(scene.objects.translation[row]), size_lhw=torch.tensor([1.5, 0.8, 0.8]))
-    other, bare = with_other(scene, row, small), without(scene, row)
+    other, bare = replace_vehicle(scene, row, small), remove_vehicle(scene, row)
     shown, before = (Compositor(s).render(s) for s in (other, scene))
     behind = (before.object_id == row + 1) & (shown.object_id != row + 1) & (shown.object_id > 0)
     assert int(behind.sum()) > 20
@@ -160,13 +160,13 @@ def test_a_smaller_one_shows_what_the_old_car_hid(scene: SceneIR) -> None:
 
 
 def test_both_renderers_draw_the_same(scene: SceneIR) -> None:
-    for changed in (without(scene, 0), with_vehicle(scene, vehicle(BEFORE_ANOTHER))):
+    for changed in (remove_vehicle(scene, 0), add_vehicle(scene, vehicle(BEFORE_ANOTHER))):
         fast, slow = (Compositor(changed, RenderSettings(b)).render(changed).image for b in ("warp", "reference"))
         assert float((fast - slow).abs().max()) < 2e-3
 
 
 def test_a_new_car_moves_with_a_gradient(scene: SceneIR) -> None:
-    more = with_vehicle(scene, vehicle(BEFORE_ANOTHER))
+    more = add_vehicle(scene, vehicle(BEFORE_ANOTHER))
     yaw = more.objects.yaw.clone().requires_grad_(True)
     Compositor(more).render(more.with_objects(yaw=yaw)).image.sum().backward()
     assert yaw.grad is not None
@@ -174,14 +174,14 @@ def test_a_new_car_moves_with_a_gradient(scene: SceneIR) -> None:
 
 
 def test_a_file_keeps_both_scenes(scene: SceneIR, tmp_path: Path) -> None:
-    more = with_vehicle(scene, vehicle(BEFORE_ANOTHER))
+    more = add_vehicle(scene, vehicle(BEFORE_ANOTHER))
     moved = more.with_objects(yaw=more.objects.yaw + 0.05)
     save_scene(moved, tmp_path / "scene")
     back = load_scene(tmp_path / "scene")
-    assert back.provenance[CHANGE] == more.provenance[CHANGE]
+    assert back.provenance[CHANGE_KEY] == more.provenance[CHANGE_KEY]
     assert torch.equal(picture(back), picture(moved))
     assert torch.equal(picture(back.as_photographed()), picture(scene))
-    assert torch.equal(picture(back.at_rest()), picture(more))
+    assert torch.equal(picture(back.unperturbed()), picture(more))
 
 
 def test_a_scene_of_an_earlier_version_has_none_before(scene: SceneIR, tmp_path: Path) -> None:
@@ -198,19 +198,19 @@ def test_a_scene_of_an_earlier_version_has_none_before(scene: SceneIR, tmp_path:
 
 def test_what_cannot_be_changed_is_refused(scene: SceneIR) -> None:
     with pytest.raises(RangeError, match="row from 0 to 2"):
-        without(scene, 3)
+        remove_vehicle(scene, 3)
     with pytest.raises(RangeError, match="exchanged yet"):
-        without(without(scene, 0), 1)
+        remove_vehicle(remove_vehicle(scene, 0), 1)
     with pytest.raises(RangeError, match="one entry an object"):
-        with_vehicle(scene.with_objects(source=()), vehicle(BEFORE_ANOTHER))  # pyright: ignore[reportArgumentType]
+        add_vehicle(scene.with_objects(source=()), vehicle(BEFORE_ANOTHER))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ShapeError, match="before"):
-        replace(scene, before=without_objects(scene, [0]))
+        replace(scene, before=remove_objects(scene, [0]))
 
 
 def test_a_load_stands_on_its_car_and_nothing_else_changes(scene: SceneIR) -> None:
     row = 1
     box = load("crate", scene.meshes[row], scene.objects.size_lhw[row])
-    loaded = with_load(scene, row, box)
+    loaded = add_roof_load(scene, row, box)
     before, after = (Compositor(s).render(s) for s in (scene, loaded))
     changed = (before.image - after.image).abs().amax(0) > 1e-3
     assert int(changed.sum()) > 100
@@ -227,7 +227,7 @@ def test_a_load_stands_on_its_car_and_nothing_else_changes(scene: SceneIR) -> No
 
 
 def test_a_load_goes_where_its_car_goes(scene: SceneIR) -> None:
-    loaded = with_load(scene, 1, load("roof box", scene.meshes[1], scene.objects.size_lhw[1]))
+    loaded = add_roof_load(scene, 1, load("roof box", scene.meshes[1], scene.objects.size_lhw[1]))
     step = torch.zeros(3, 3)
     step[1, 0] = 0.5
     tops = []

@@ -28,17 +28,17 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
 
 def test_equal_files_are_one_file(folders: tuple[Path, Path]) -> None:
     first, second = folders
-    files.share_alike(second, first)
+    files.hardlink_duplicates(second, first)
     assert (second / "scene" / "same.txt").samefile(first / "scene" / "same.txt")
     assert (second / "other.txt").read_text() == "number 2"
     assert not (second / "other.txt").samefile(first / "other.txt")
     assert sorted(p.name for p in second.rglob("*") if p.is_file()) == ["other.txt", "own.txt", "same.txt"]
-    files.share_alike(second, first)  # again: nothing left to do
+    files.hardlink_duplicates(second, first)  # again: nothing left to do
 
 
 def test_replacing_one_leaves_the_other(folders: tuple[Path, Path]) -> None:
     first, second = folders
-    files.share_alike(second, first)
+    files.hardlink_duplicates(second, first)
     files.write_text(second / "scene" / "same.txt", "changed")
     assert (first / "scene" / "same.txt").read_text() == "the same"
 
@@ -52,7 +52,7 @@ def test_where_there_are_no_links_two_copies_stay(
         raise OSError("no links here")
 
     monkeypatch.setattr(os, "link", refuse)
-    files.share_alike(second, first)
+    files.hardlink_duplicates(second, first)
     assert (second / "scene" / "same.txt").read_text() == "the same"
     assert not (second / "scene" / "same.txt").samefile(first / "scene" / "same.txt")
     assert not [p for p in second.rglob("*") if p.name.endswith(".tmp")]
@@ -74,7 +74,7 @@ def test_a_folder_for_which_there_is_no_room_is_not_there(
     tmp_path: Path, full_disk: Callable[[int], AbstractContextManager[None]]
 ) -> None:
     def write() -> None:
-        with files.whole_folder(tmp_path / "frame") as part:
+        with files.atomic_folder(tmp_path / "frame") as part:
             files.write_text(part / "small.txt", "x")
             files.write_text(part / "large.txt", 2000 * "x")
 
@@ -96,12 +96,12 @@ def test_what_may_only_be_read_is_named(tmp_path: Path, call: str, monkeypatch: 
 
 def test_a_folder_in_what_may_only_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "mkdir", _reads_only)
-    with pytest.raises(WriteError, match="frame: expected"), files.whole_folder(tmp_path / "frame"):
+    with pytest.raises(WriteError, match="frame: expected"), files.atomic_folder(tmp_path / "frame"):
         raise AssertionError
 
 
 def _written(folder: Path, text: str) -> None:
-    with files.whole_folder(folder) as part:
+    with files.atomic_folder(folder) as part:
         files.write_text(part / "a.txt", text)
 
 
@@ -144,7 +144,7 @@ def test_of_two_that_write_a_folder_at_once_each_is_whole(tmp_path: Path) -> Non
 
 
 def test_errors_of_reading_inside_stay_what_they_are(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), files.whole_folder(tmp_path / "frame"):
+    with pytest.raises(FileNotFoundError), files.atomic_folder(tmp_path / "frame"):
         (tmp_path / "gone").read_bytes()
     assert not list(tmp_path.iterdir())
 
@@ -180,7 +180,7 @@ def test_leftovers_bear_folders_that_end_meanwhile(tmp_path: Path, monkeypatch: 
         return scan(path)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    assert files.leftovers(tmp_path) == [
+    assert files.find_leftovers(tmp_path) == [
         tmp_path / ".left.0123abcd.tmp",
         tmp_path / "frame" / ".part.4567abcd.tmp",
     ]

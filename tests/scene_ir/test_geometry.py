@@ -36,7 +36,7 @@ def conventions() -> str:
 )
 def test_front_and_side_of_a_turned_car(yaw: float, front: tuple[float, ...], left: tuple[float, ...]) -> None:
     unit = torch.tensor([[0.5, 0, 0], [0, 0, 0.5], [0, -1, 0]], dtype=torch.float64)
-    placed = geometry.place(unit, SIZE, f64(yaw)[0], f64(1, 1.5, 10))
+    placed = geometry.place_vertices(unit, SIZE, f64(yaw)[0], f64(1, 1.5, 10))
     expected = torch.tensor([front, left, (0, -1.5, 0)], dtype=torch.float64) + f64(1, 1.5, 10)
     torch.testing.assert_close(placed, expected, atol=1e-12, rtol=0)
 
@@ -118,7 +118,7 @@ def test_every_point_of_the_box_projects_into_its_image_box(
     size, place = f64(length, 1.5, 2.0), (f64(yaw), f64(x + dx, 1.6, z)[None])
     box = geometry.project_boxes(size[None], *place, MATRIX)[0]
     unit = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - f64(0.5, 1, 0.5)
-    pixels = geometry.project(geometry.place(unit, size, place[0][0], place[1][0]), MATRIX)
+    pixels = geometry.project(geometry.place_vertices(unit, size, place[0][0], place[1][0]), MATRIX)
     assert bool((pixels >= box[:2] - 1e-9).all())
     assert bool((pixels <= box[2:] + 1e-9).all())
 
@@ -144,7 +144,7 @@ def test_the_example_of_the_conventions_page() -> None:
     pose = (value["size_lhw"], value["yaw"], value["translation"])
     unit = torch.stack([value["front_unit"], value["roof_unit"]])
     placed = torch.stack([value["front_m"], value["roof_m"]])
-    torch.testing.assert_close(geometry.place(unit, *pose), placed, atol=5e-5, rtol=0)
+    torch.testing.assert_close(geometry.place_vertices(unit, *pose), placed, atol=5e-5, rtol=0)
     clip = geometry.to_clip(value["translation"], value["projection"])
     torch.testing.assert_close(clip, value["ground_centre_clip"], atol=5e-5, rtol=0)
     pixel = geometry.project(value["translation"], value["projection"])
@@ -180,9 +180,9 @@ def test_kept_within_passes_gradients_up_to_its_bounds(tensors: bool) -> None:
     """Whatever torch.clamp has there: codes and saturated pixels lie on bounds."""
     values = torch.tensor([-0.5, 0.0, 0.3, 1.0, 1.5], requires_grad=True)
     bounds = (torch.zeros(5), torch.ones(5)) if tensors else (0.0, 1.0)
-    kept = geometry.kept_within(values, *bounds)
+    kept = geometry.clamp_inclusive(values, *bounds)
     assert kept.tolist() == values.clamp(0, 1).tolist()
-    assert torch.equal(geometry.kept_within(values.detach(), *bounds), kept)
+    assert torch.equal(geometry.clamp_inclusive(values.detach(), *bounds), kept)
     kept.sum().backward()
     assert values.grad is not None
     assert values.grad.tolist() == [0, 1, 1, 1, 0]

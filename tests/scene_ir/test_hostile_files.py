@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from scene_ir import files, weights
-from scene_ir.errors import FormatError, shown
+from scene_ir.errors import FormatError, make_printable
 
 
 def png(width: int, height: int) -> bytes:
@@ -169,7 +169,7 @@ def test_arrays_come_back_and_can_be_written_to(tmp_path: Path, order: Any) -> N
 
 
 @pytest.mark.parametrize(
-    "read", [files.read_bytes, files.read_json, files.read_yaml, files.read_image, files.digest]
+    "read", [files.read_bytes, files.read_json, files.read_yaml, files.read_image, files.sha256_digest]
 )
 def test_only_regular_files(tmp_path: Path, read: Callable[[Path], Any]) -> None:
     (tmp_path / "zero").symlink_to("/dev/zero")
@@ -197,9 +197,9 @@ def test_names_stay_in_their_folder(tmp_path: Path) -> None:
     (folder / "in").symlink_to(folder / "a")
     for name in ("/etc/passwd", "..", "../x", "a/../../x", "", "out/x", "a\0"):
         with pytest.raises(FormatError, match="run"):
-            files.below(folder, name)
+            files.resolve_inside(folder, name)
     for name in ("a", "a/b.json", "in/b.json", "not there"):
-        assert files.below(folder, name) == folder / name
+        assert files.resolve_inside(folder, name) == folder / name
 
 
 @pytest.mark.parametrize(("place", "value", "said"), [(6, 1, "password"), (8, 97, "compression")])
@@ -248,7 +248,7 @@ def test_no_more_is_unpacked_than_the_archive_says(tmp_path: Path) -> None:
 def test_headers_of_pictures_that_pillow_stumbles_over(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(data)
-    for read in (lambda: files.check_pixels(path, data), lambda: files.read_image(path)):
+    for read in (lambda: files.read_image_size(path, data), lambda: files.read_image(path)):
         with pytest.raises(FormatError, match=r"a\.png: expected an image"):
             read()
     with pytest.raises(FormatError, match=r"a\.png: expected an image"):
@@ -257,7 +257,7 @@ def test_headers_of_pictures_that_pillow_stumbles_over(tmp_path: Path, data: byt
 
 def load(path: Path) -> None:
     """EXIF and pixels, as Pillow reads them."""
-    with files.opened_image(path) as image:
+    with files.open_image(path) as image:
         image.getexif()
         image.load()
 
@@ -274,9 +274,9 @@ def test_a_folder_of_links(tmp_path: Path) -> None:
 
 
 def test_weights_are_held_to_their_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in sorted(weights.SHIPPED.glob("*.safetensors")):
+    for path in sorted(weights.SHIPPED_WEIGHTS.glob("*.safetensors")):
         weights.read_weights(path)
-    data = next(weights.SHIPPED.glob("depth.safetensors")).read_bytes()
+    data = next(weights.SHIPPED_WEIGHTS.glob("depth.safetensors")).read_bytes()
     path, card = tmp_path / "a.safetensors", tmp_path / "a.md"
     path.write_bytes(data)
     monkeypatch.setattr(weights, "SHIPPED", tmp_path)
@@ -291,10 +291,10 @@ def test_weights_are_held_to_their_card(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_what_a_terminal_would_obey_is_written_out() -> None:
-    assert shown("\x1b]0;title\x07 \u202e ü \ud800") == "\\x1b]0;title\\x07 \\u202e ü \\ud800"
-    assert shown("x" * 500) == "x" * 500
-    assert len(shown("x" * 10**6)) < 600
-    assert "(1,000,000 characters)" in shown("x" * 10**6)
+    assert make_printable("\x1b]0;title\x07 \u202e ü \ud800") == "\\x1b]0;title\\x07 \\u202e ü \\ud800"
+    assert make_printable("x" * 500) == "x" * 500
+    assert len(make_printable("x" * 10**6)) < 600
+    assert "(1,000,000 characters)" in make_printable("x" * 10**6)
     error = FormatError("f" * 9000, "e" * 9000, "\x1b" * 9000)
     assert len(str(error)) < 4000
     assert str(error).isprintable()

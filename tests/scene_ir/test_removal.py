@@ -9,9 +9,9 @@ import torch
 
 from scene_ir.errors import RangeError
 from scene_ir.io import load_scene, save_scene
-from scene_ir.removal import without_objects
+from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import render
-from scene_ir.types import Objects, Render, SceneIR, Source, scene_to
+from scene_ir.types import Objects, Render, SceneIR, Source, convert_scene
 
 NEAR, FAR = 1, 2
 """Rows of two cars of which the first hides part of the second."""
@@ -19,7 +19,7 @@ NEAR, FAR = 1, 2
 
 @pytest.fixture(scope="module")
 def scene(photographed: SceneIR) -> SceneIR:
-    taken = scene_to(photographed, torch.float32)
+    taken = convert_scene(photographed, torch.float32)
     return replace(taken, provenance={"frame": "1", "objects[0].label": "4", "objects[2].label": "7"})
 
 
@@ -49,7 +49,7 @@ def rows_kept(objects: Objects, rows: list[int]) -> Objects:
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_the_background_shows_and_the_others_keep_every_bit(scene: SceneIR, row: int) -> None:
     shown = render([scene])[0]
-    left = without_objects(scene, [row])
+    left = remove_objects(scene, [row])
     after = picture(left)
     mine = region(scene, shown, row)
     assert mine.sum() > 100
@@ -63,7 +63,7 @@ def test_the_background_shows_and_the_others_keep_every_bit(scene: SceneIR, row:
 
 
 def test_without_any_the_background_is_left(scene: SceneIR) -> None:
-    empty = without_objects(scene, [0, 1, 2])
+    empty = remove_objects(scene, [0, 1, 2])
     assert len(empty.objects) == 0
     assert torch.equal(picture(empty), scene.background)
     assert not [key for key in empty.provenance if key.startswith("objects")]
@@ -71,7 +71,7 @@ def test_without_any_the_background_is_left(scene: SceneIR) -> None:
 
 def test_what_it_hid_is_completed(scene: SceneIR) -> None:
     before = render([scene])[0].opacity[FAR]
-    after = render([without_objects(scene, [NEAR])])[0].opacity[FAR - 1]
+    after = render([remove_objects(scene, [NEAR])])[0].opacity[FAR - 1]
     assert (after.x0, after.y0, after.values.shape) == (before.x0, before.y0, before.values.shape)
     torch.testing.assert_close(after.values, before.values, atol=0.02, rtol=0)
     forgetful = replace(scene, objects=rows_kept(scene.objects, [0, FAR]))
@@ -89,7 +89,7 @@ def whole(scene: SceneIR, source: Source) -> torch.Tensor:
 
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_only_what_it_hid_changes(scene: SceneIR, row: int) -> None:
-    left = without_objects(scene, [row]).objects
+    left = remove_objects(scene, [row]).objects
     rows = [i for i in range(3) if i != row]
     free = whole(scene, scene.objects.source[row])[3] == 0
     for place, other in enumerate(rows):
@@ -104,8 +104,8 @@ def test_only_what_it_hid_changes(scene: SceneIR, row: int) -> None:
 
 def test_one_after_the_other_or_together(scene: SceneIR) -> None:
     """The same but for what both hid, at the rim of one and inside the other."""
-    together = picture(without_objects(scene, [0, NEAR]))
-    one_by_one = picture(without_objects(without_objects(scene, [NEAR]), [0]))
+    together = picture(remove_objects(scene, [0, NEAR]))
+    one_by_one = picture(remove_objects(remove_objects(scene, [NEAR]), [0]))
     off = (together - one_by_one).abs().amax(dim=0)
     assert float(off.max()) < 0.1
     assert int((off > 2e-3).sum()) <= 10
@@ -116,15 +116,15 @@ def test_moves_do_not_matter(scene: SceneIR) -> None:
     shift = torch.tensor([[0.3, 0.0, 0.2]])
     moved = scene.with_objects(translation=scene.objects.translation + shift, yaw=scene.objects.yaw + 0.1)
     moved = moved.with_objects(texture_code=torch.full_like(moved.objects.texture_code, 0.3))
-    left, right = without_objects(moved, [NEAR]), without_objects(scene, [NEAR])
+    left, right = remove_objects(moved, [NEAR]), remove_objects(scene, [NEAR])
     for one, two in zip(left.objects.source, right.objects.source, strict=True):
         assert torch.equal(one.foreground.values, two.foreground.values)
     assert torch.equal(left.objects.translation, moved.objects.translation[[0, FAR]])
 
 
 def test_rows_in_the_provenance_move_up(scene: SceneIR) -> None:
-    assert without_objects(scene, [0]).provenance == {"frame": "1", "objects[1].label": "7"}
-    assert without_objects(scene, [NEAR]).provenance == {
+    assert remove_objects(scene, [0]).provenance == {"frame": "1", "objects[1].label": "7"}
+    assert remove_objects(scene, [NEAR]).provenance == {
         "frame": "1",
         "objects[0].label": "4",
         "objects[1].label": "7",
@@ -132,7 +132,7 @@ def test_rows_in_the_provenance_move_up(scene: SceneIR) -> None:
 
 
 def test_it_survives_a_file(scene: SceneIR, tmp_path: Path) -> None:
-    left = without_objects(scene, [NEAR])
+    left = remove_objects(scene, [NEAR])
     save_scene(left, tmp_path / "scene")
     assert torch.equal(picture(load_scene(tmp_path / "scene")), picture(left))
 
@@ -140,8 +140,8 @@ def test_it_survives_a_file(scene: SceneIR, tmp_path: Path) -> None:
 def test_nothing_to_remove_and_nothing_photographed(
     scene: SceneIR, street: Callable[[torch.dtype], SceneIR]
 ) -> None:
-    assert without_objects(scene, []) is scene
-    bare = without_objects(street(torch.float32), [0, 2])
+    assert remove_objects(scene, []) is scene
+    bare = remove_objects(street(torch.float32), [0, 2])
     assert bare.objects.source == ()
     assert len(bare.objects) == 1
 
@@ -149,4 +149,4 @@ def test_nothing_to_remove_and_nothing_photographed(
 @pytest.mark.parametrize("row", [-1, 3])
 def test_an_unknown_row_is_named(scene: SceneIR, row: int) -> None:
     with pytest.raises(RangeError, match=f"a row from 0 to 2, found {row}"):
-        without_objects(scene, [row])
+        remove_objects(scene, [row])

@@ -75,7 +75,7 @@ def rich_scene(seed: int = 0, count: int = 2, **changes: Any) -> SceneIR:
         depth=depth,
         ignore=rand(1, 4) * 9,
         provenance={"dataset": "kitti", "Straße": "läßt"},
-        others=Labels(
+        other_labels=Labels(
             ("Cyclist",), rand(1, 4), torch.tensor([torch.nan]), torch.tensor([3]), rand(1, 3), rand(1),
             rand(1, 3), torch.zeros(0, 4),
         ),
@@ -113,7 +113,7 @@ def float64_camera() -> Camera:
         pytest.param(rich_scene(count=0), id="no-objects"),
         pytest.param(rich_scene(camera=float64_camera()), id="float64-no-projection"),
         pytest.param(
-            rich_scene(ignore=torch.zeros(0, 4), others=None, meshes=rich_scene().meshes[::-1]), id="no-ignore"
+            rich_scene(ignore=torch.zeros(0, 4), other_labels=None, meshes=rich_scene().meshes[::-1]), id="no-ignore"
         ),
         pytest.param(
             rich_scene().with_objects(box2d=torch.tensor([[torch.nan] * 4, [-torch.inf, 0, 1, 2]])), id="nan"

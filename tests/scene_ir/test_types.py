@@ -185,7 +185,7 @@ BAD: list[tuple[Callable[..., Any], dict[str, Any], type[SceneError], str]] = [
     (scene, {"background": torch.zeros(H, W, 3)}, ShapeError, r"scene\.background"),
     (scene, {"depth": torch.zeros(1, H, W)}, ShapeError, r"scene\.depth: expected shape \(6, 8\)"),
     (scene, {"ignore": torch.zeros(4)}, ShapeError, r"scene\.ignore: expected shape \('\*', 4\)"),
-    (scene, {"others": labels()}, ShapeError, r"scene\.ignore: expected shape \(3, 4\), found \(0, 4\)"),
+    (scene, {"other_labels": labels()}, ShapeError, r"scene\.ignore: expected shape \(3, 4\), found \(0, 4\)"),
     (scene, {"camera": camera(width=9)}, ShapeError, r"scene\.photograph: expected shape \(3, 6, 9\)"),
     (scene, {"meshes": ()}, RangeError, r"objects\.mesh_index: expected indices in \[0, 0\)"),
     (
