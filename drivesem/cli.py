@@ -14,15 +14,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
+from functools import partial
 from types import FrameType
+from typing import Any
 
-from drivesem.config.blocks import Command, option
+from drivesem.config.blocks import CommandConfig, option
 from drivesem.config.commands import COMMANDS
 from drivesem.config.errors import UsageError
-from drivesem.config.parsing import parse
-from drivesem.run.allocation import keep_freed
+from drivesem.config.parsing import Commands, parse
+from drivesem.run.jobs import keep_freed
 from drivesem.run.lock import let_go
-from scene_ir.errors import shown
+from scene_ir.errors import make_printable
 
 _MODULES = "drivesem.commands.{}"
 _EXIT_BAD_INPUT = 2
@@ -37,24 +39,46 @@ _LONGEST_LINE = 2000
 """Characters: what is wrong with a file may be what it holds."""
 
 
+RunCommand = Callable[[Any], int]
+"""Runs a command with its settings and returns the exit code."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 141 nobody reads
-    on, 143 ended by SIGTERM.
+    """Run the command line `drivesem`. Returns the exit code, see `run_program`."""
+    return run_program(argv, COMMANDS, "drivesem", _load_command)
+
+
+def run_program(
+    argv: Sequence[str] | None, commands: Commands, prog: str, load_command: Callable[[str], RunCommand]
+) -> int:
+    """Run one command of a program.
+
+    Args:
+        argv: Words of the command line without the program's name; None for this process' own.
+        commands: Settings classes by command name.
+        prog: The program's name, for help and errors.
+        load_command: Imports the function that runs the command of a name.
+
+    Returns:
+        The exit code: 0 done, 1 a check failed, 2 bad input, 130 interrupted, 141 the reader closed the pipe, 143
+        ended by SIGTERM.
     """
     with _interrupted_once(last=argv is None):
-        return _main(argv)
+        return _run_program(sys.argv[1:] if argv is None else argv, commands, prog, load_command)
 
 
-def _main(argv: Sequence[str] | None) -> int:
+def _run_program(
+    words: Sequence[str], commands: Commands, prog: str, load_command: Callable[[str], RunCommand]
+) -> int:
     try:
-        config = parse(sys.argv[1:] if argv is None else argv)
+        config = parse(words, commands, prog)
         from drivesem.store import stored  # which needs numpy, and --help does not
 
         _tell_of_code(config)
         with let_go(), stored(config) as config:
-            return _run(config)
+            return _run(config, partial(load_command, words[0]))
     except KeyboardInterrupt as error:
-        sys.stderr.write("drivesem: interrupted; the same command goes on where it stopped\n")
+        sys.stderr.write(f"{prog}: interrupted; the same command goes on where it stopped\n")
         return _EXIT_ENDED if isinstance(error, _EndedError) else _EXIT_INTERRUPTED
     except BrokenPipeError:  # whoever reads what is printed has enough, as `head` has
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where the interpreter's last words go
@@ -63,7 +87,7 @@ def _main(argv: Sequence[str] | None) -> int:
         error = _of_detector(unknown) or unknown
         if not _is_bad_input(error):
             raise
-        sys.stderr.write(f"drivesem: {' '.join(shown(error, _LONGEST_LINE).split())}\n")
+        sys.stderr.write(f"drivesem: {' '.join(make_printable(error, _LONGEST_LINE).split())}\n")
         return _EXIT_BAD_INPUT
 
 
@@ -98,13 +122,13 @@ def _interrupted_once(last: bool) -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN if last and interrupted_s > -math.inf else handler)
 
 
-def _tell_of_code(config: Command) -> None:
+def _tell_of_code(config: CommandConfig) -> None:
     """Say which files' code will be run, by a setting that names such a detector."""
     for setting in fields(config):
         value = getattr(config, setting.name)
         for text in value if isinstance(value, tuple) else (value,):
             for word in _CODE.findall(text) if isinstance(text, str) else ():
-                sys.stderr.write(f"drivesem: {option(setting.name)}: runs the code in {shown(word)}\n")
+                sys.stderr.write(f"drivesem: {option(setting.name)}: runs the code in {make_printable(word)}\n")
 
 
 def _of_detector(error: Exception) -> UsageError | None:
@@ -129,11 +153,14 @@ def _is_bad_input(error: Exception) -> bool:
     return isinstance(error, tuple(kinds)) if kinds else False
 
 
-def _run(config: Command) -> int:
-    name = next(name for name, kind in COMMANDS.items() if type(config) is kind)
+def _load_command(name: str) -> RunCommand:
+    return importlib.import_module(_MODULES.format(name.replace("-", "_"))).run
+
+
+def _run(config: CommandConfig, load: Callable[[], RunCommand]) -> int:
     gc.disable()  # libraries make half a million objects as they load, and none of them is garbage
     try:
-        run: Callable[[Command], int] = importlib.import_module(_MODULES.format(name.replace("-", "_"))).run
+        run = load()
     finally:
         gc.enable()
     gc.freeze()

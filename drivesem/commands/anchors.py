@@ -6,14 +6,13 @@ from typing import Any
 
 from rich.table import Table
 
-from drivesem.config.commands import Anchors
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.config.commands import AnchorsConfig
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.training.anchors import fitted_anchors
 
 
-def run(config: Anchors) -> int:
+def run(config: AnchorsConfig) -> int:
     """Read the labels, fit, print; exit code 0. Raises UsageError or SceneError for bad input."""
     data = fitted_anchors(config)
     if config.json:
@@ -23,7 +22,9 @@ def run(config: Anchors) -> int:
 
 
 def _print(data: dict[str, Any], console: Console) -> None:
-    title = f"Anchors for {number_of(data['boxes'], 'box', 'boxes')} of {number_of(data['frames'], 'frame')}, px"
+    title = (
+        f"Anchors for {format_count(data['boxes'], 'box', 'boxes')} of {format_count(data['frames'], 'frame')}, px"
+    )
     table = Table(title=title, title_justify="left", min_width=min(len(title) + 4, console.width))
     for heading in ("", "mean best IoU", "width x height"):
         table.add_column(heading, justify="left")

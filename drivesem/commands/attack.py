@@ -6,18 +6,17 @@ from pathlib import Path
 
 from rich.table import Table
 
-from drivesem.config.commands import Attack
+from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.failures.grades import Grade, Kind
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.attack import attack_run
-from drivesem.run.report.grading import KINDS, NO_KIND
+from drivesem.run.report.page import KINDS, NO_KIND
 from drivesem.run.results import RunSummary
 
 
-def run(config: Attack) -> int:
+def run(config: AttackConfig) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
     summary = attack_run(config)
     if config.json:
@@ -46,16 +45,16 @@ def _print(summary: RunSummary, console: Console) -> None:
     console.print(table)
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
     console.print(
-        f"{number_of(summary.frames, 'frame')}, {number_of(summary.objects, 'vehicle')}: "
-        f"{sum(summary.lost_objects.values())} lost, {number_of(sum(summary.phantoms.values()), 'phantom')} by "
-        f"threshold, {number_of(summary.successes_moved, 'frame')} broken; "
-        f"feasible {feasible}; {number_of(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s"
+        f"{format_count(summary.frames, 'frame')}, {format_count(summary.objects, 'vehicle')}: "
+        f"{sum(summary.lost_objects.values())} lost, {format_count(sum(summary.phantoms.values()), 'phantom')} by "
+        f"threshold, {format_count(summary.successes_moved, 'frame')} broken; "
+        f"feasible {feasible}; {format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s"
     )
     console.print(told_grades(summary), soft_wrap=True)
     for note, frames in summary.grade_notes.items():
-        console.print(f"{number_of(frames, 'frame')}: {note}", soft_wrap=True)
+        console.print(f"{format_count(frames, 'frame')}: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:
-        console.print(f"{number_of(summary.frames_without_vehicles, 'frame')} without vehicles passed over")
+        console.print(f"{format_count(summary.frames_without_vehicles, 'frame')} without vehicles passed over")
     for name, reason in summary.frames_failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)
@@ -70,7 +69,7 @@ def told_grades(summary: RunSummary) -> str:
     kinds = {KINDS[Kind(name)]: count for name, count in summary.kinds.items() if count}
     without = failures - sum(kinds.values())
     unknown = (
-        f"; {number_of(summary.frames_ungraded, 'frame')} of unknown grade" if summary.frames_ungraded else ""
+        f"; {format_count(summary.frames_ungraded, 'frame')} of unknown grade" if summary.frames_ungraded else ""
     )
     kinds |= {NO_KIND: without} if without and not unknown else {}
     told = f" ({', '.join(f'{count} {name}' for name, count in kinds.items())})" if kinds else ""

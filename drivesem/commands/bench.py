@@ -16,13 +16,13 @@ from drivesem.bench import boxes, night, render, step
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
-from drivesem.config.commands import Bench
+from drivesem.config.commands import BenchConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.values import numbers
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from drivesem.report.terminal import Console
-from drivesem.run.ask import Bar, ask
 from drivesem.run.attack import select_frames
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.scenes.sources import open_source
 from scene_ir.errors import FormatError
 from tools.bench import climb, detector, memory, scale
@@ -36,12 +36,12 @@ _SECONDS = {"step": (36.0, 240.0), "render": (22.0, 240.0), "verbs": (6.0, 30.0)
 """Seconds for measuring, with --quick and without; imports and scenes take some more."""
 
 
-def run(config: Bench) -> int:
+def run(config: BenchConfig) -> int:
     """Measure, print, write; exit code 0. Raises UsageError or SceneError for bad input."""
     cars, _ = _sizes(config)
     if max(cars) > MOST_CARS:
         raise UsageError("--cars", f"at most {MOST_CARS}", max(cars))
-    measure: dict[str, Callable[[Bench, Console], Measured]] = {
+    measure: dict[str, Callable[[BenchConfig, Console], Measured]] = {
         "step": _step,
         "render": _render,
         "memory": _memory,
@@ -54,7 +54,7 @@ def run(config: Bench) -> int:
     return conduct(config, "drivesem bench", measure[config.what])
 
 
-def _step(config: Bench, console: Console) -> Measured:
+def _step(config: BenchConfig, console: Console) -> Measured:
     try:
         detector = load_detector(config.detector, config.device)
     except DetectorError as error:
@@ -74,7 +74,7 @@ def _step(config: Bench, console: Console) -> Measured:
     )
 
 
-def _boxes(config: Bench, path: Path, detector: Detector, console: Console) -> Measured:
+def _boxes(config: BenchConfig, path: Path, detector: Detector, console: Console) -> Measured:
     try:
         frames = boxes.frames_of(path, -(-config.frames // 4) if config.quick else config.frames)
     except FormatError as error:
@@ -88,7 +88,7 @@ def _boxes(config: Bench, path: Path, detector: Detector, console: Console) -> M
     )
 
 
-def _render(config: Bench, console: Console) -> Measured:
+def _render(config: BenchConfig, console: Console) -> Measured:
     sizes, usual = render.sizes(*_sizes(config)), render.usual(*_sizes(config))
     verbs = _dicts(render.measure_verbs(usual, _seconds("verbs", config), config.seed, config.device))
     measured = render.measure(sizes, _seconds("render", config), config.seed, config.device)
@@ -99,7 +99,7 @@ def _render(config: Bench, console: Console) -> Measured:
     )
 
 
-def _memory(config: Bench, console: Console) -> Measured:
+def _memory(config: BenchConfig, console: Console) -> Measured:
     if not memory.supported():
         raise UsageError("bench memory", "a system with /proc", sys.platform)
     if config.device != "cpu":
@@ -109,9 +109,9 @@ def _memory(config: Bench, console: Console) -> Measured:
     return Measured({"rows": rows, "method": memory.METHOD}, [Section(memory.TITLE, memory.COLUMNS, rows)])
 
 
-def _detector(config: Bench, console: Console) -> Measured:
+def _detector(config: BenchConfig, console: Console) -> Measured:
     """All that are shipped, or the one that was asked for."""
-    names = sorted(SHIPPED) if config.detector == Bench.detector else [config.detector]
+    names = sorted(SHIPPED) if config.detector == BenchConfig.detector else [config.detector]
     measured = detector.measure(names, _seconds("detector", config), config.seed, config.device)
     try:
         rows = _dicts(watched(measured, len(names) * len(detector.SIZES_HW), console))
@@ -120,7 +120,7 @@ def _detector(config: Bench, console: Console) -> Measured:
     return Measured({"rows": rows, "method": detector.METHOD}, [Section(detector.TITLE, detector.COLUMNS, rows)])
 
 
-def _climb(config: Bench, console: Console) -> Measured:
+def _climb(config: BenchConfig, console: Console) -> Measured:
     if config.device != "cpu":
         raise UsageError("--device", "cpu (the processor's time is measured)", config.device)
     try:
@@ -136,15 +136,17 @@ def _climb(config: Bench, console: Console) -> Measured:
     return Measured({"rows": rows, "method": climb.METHOD}, [Section(climb.TITLE, climb.COLUMNS, rows)])
 
 
-def _planted(config: Bench, console: Console) -> Measured:
+def _planted(config: BenchConfig, console: Console) -> Measured:
     return _planted_in_frames(config, console) if config.across is None else _planted_across(config, console)
 
 
-def _planted_across(config: Bench, console: Console) -> Measured:
+def _planted_across(config: BenchConfig, console: Console) -> Measured:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
     first = across.Across.of(config)
     names, _, failed = select_frames(first.source, config)
-    pooling = ask(names, first.pool, partial(across.pool_of, config), config, Bar("states", remaining=True))
+    pooling = run_frame_jobs(
+        names, first.pool, partial(across.pool_of, config), config, ProgressSettings("states", show_remaining=True)
+    )
     pools = [pooling.results[name] for name in names if name in pooling.results]
     kinds = across.KINDS[1::8] if config.quick else across.KINDS
     kinds = [(kind, nth) for nth in range(config.each) for kind in kinds]
@@ -155,7 +157,9 @@ def _planted_across(config: Bench, console: Console) -> Measured:
     second, frames = across.Across.of(config, texts), list(enumerate(pool.frame for pool in pools))
     frames = frames[: config.searched]
     build = partial(across.judge_of, config, texts)
-    asked = ask(frames, second.judge, build, config, Bar("searches", remaining=True), lambda job: job[1])
+    asked = run_frame_jobs(
+        frames, second.judge, build, config, ProgressSettings("searches", show_remaining=True), lambda job: job[1]
+    )
     judged = [asked.results[job] for job in frames if job in asked.results]
     rows = across_names.rows_of(faults, pools, judged, tuple(first.workers) if frames else ())
     told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
@@ -175,7 +179,7 @@ def _planted_across(config: Bench, console: Console) -> Measured:
     )
 
 
-def _planted_in_frames(config: Bench, console: Console) -> Measured:
+def _planted_in_frames(config: BenchConfig, console: Console) -> Measured:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
     judge = yardstick.Yardstick.of(config)
     names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)
@@ -183,10 +187,16 @@ def _planted_in_frames(config: Bench, console: Console) -> Measured:
     sought = min(config.faults or len(judge.kinds), len(judge.kinds))
     count = len(names) * (sought * len(methods) + len(judge.named))  # named ones once more without a fault
     console.print(
-        f"{number_of(count, 'attack')} of {number_of(config.passes, 'pass', 'passes')}: "
+        f"{format_count(count, 'attack')} of {format_count(config.passes, 'pass', 'passes')}: "
         f"about {_minutes(count * config.passes)}"
     )
-    asked = ask(names, judge.judge, partial(yardstick.judge_of, config), config, Bar("frames", remaining=True))
+    asked = run_frame_jobs(
+        names,
+        judge.judge,
+        partial(yardstick.judge_of, config),
+        config,
+        ProgressSettings("frames", show_remaining=True),
+    )
     judged = [asked.results[name] for name in names if name in asked.results]
     rows, kinds = summary.rows_of(judged, methods, config.seed), summary.kind_rows(judged, methods)
     return Measured(
@@ -204,17 +214,17 @@ def _planted_in_frames(config: Bench, console: Console) -> Measured:
     )
 
 
-def _night(config: Bench, console: Console) -> Measured:
+def _night(config: BenchConfig, console: Console) -> Measured:
     settings = night.settings_of(config)
     time_frame = night.timer_of(settings)
     names, without, failed = select_frames(open_source(settings), settings)
     count = config.count or len(names)
     chosen = night.spread(names, config.limit or night.FRAMES)
     console.print(
-        f"told by {len(chosen)} of {number_of(len(names), 'frame')} with vehicles; {without} without passed over"
+        f"told by {len(chosen)} of {format_count(len(names), 'frame')} with vehicles; {without} without passed over"
     )
     build = partial(night.timer_of, settings)
-    asked = ask(chosen, time_frame, build, config, Bar("frames", remaining=True))
+    asked = run_frame_jobs(chosen, time_frame, build, config, ProgressSettings("frames", show_remaining=True))
     spent = [one for one in asked.results.values() if one is not None]
     night.check_some(spent)
     processes = min(config.processes, len(chosen))
@@ -229,7 +239,7 @@ def _night(config: Bench, console: Console) -> Measured:
     )
 
 
-def _scale(config: Bench, console: Console) -> Measured:
+def _scale(config: BenchConfig, console: Console) -> Measured:
     rows = _dicts(watched(scale.measure(config), 2, console))
     return Measured({"rows": rows, "method": scale.METHOD}, [Section(scale.TITLE, scale.COLUMNS, rows)])
 
@@ -238,11 +248,11 @@ def _minutes(passes: int) -> str:
     return f"{passes * _SECONDS_A_PASS / 60:.0f} min of one core"
 
 
-def _sizes(config: Bench) -> tuple[list[int], list[int]]:
+def _sizes(config: BenchConfig) -> tuple[list[int], list[int]]:
     return numbers("--cars", config.cars), numbers("--triangles", config.triangles)
 
 
-def _seconds(name: str, config: Bench) -> float:
+def _seconds(name: str, config: BenchConfig) -> float:
     return _SECONDS[name][0 if config.quick else 1]
 
 

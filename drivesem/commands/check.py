@@ -11,12 +11,12 @@ from rich.text import Text
 
 from detectors.adapters.module import RAISES_NOTHING
 from detectors.base import DetectorError
-from detectors.check import Report, check_detector
+from detectors.check import ContractReport, check_detector
 from detectors.registry import load_predictor
-from drivesem.config.commands import Check
+from drivesem.config.commands import CheckConfig
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.answer import print_json
+from drivesem.report.tables import print_json
 from drivesem.report.terminal import Console
 
 LEAST_SIDE = 64
@@ -24,7 +24,7 @@ LEAST_SIDE = 64
 _STYLES = {"ok": "green", "failed": "bold red", "raised": "bold red", "not tried": "dim"}
 
 
-def run(config: Check) -> int:
+def run(config: CheckConfig) -> int:
     """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input, a
     detector whose code raises among it.
     """
@@ -43,7 +43,7 @@ def run(config: Check) -> int:
     else:
         _print(report, config, Console())
     if report.raised:
-        raise UsageError("--detector", RAISES_NOTHING, report.raised[0].said)
+        raise UsageError("--detector", RAISES_NOTHING, report.raised[0].detail)
     return 1 if report.failed else 0
 
 
@@ -55,14 +55,14 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _print(report: Report, config: Check, console: Console) -> None:
+def _print(report: ContractReport, config: CheckConfig, console: Console) -> None:
     kind = "with gradients" if report.gradients else "predicts only"
     table = Table(title=f"{config.detector} ({kind})", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("promise", "", "found"):
         table.add_column(heading)
     for finding in report.findings:
         style = _STYLES[finding.verdict]
-        table.add_row(finding.name, Text(finding.verdict, style), finding.said)
+        table.add_row(finding.name, Text(finding.verdict, style), finding.detail)
     console.print(table)
     tried = sum(finding.verdict != "not tried" for finding in report.findings)
     console.print(f"{tried - len(report.failed)} of {tried} kept, {len(report.failed)} broken", soft_wrap=True)

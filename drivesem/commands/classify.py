@@ -15,32 +15,31 @@ from drivesem.classify.page import shares
 from drivesem.classify.pictures import write_pictures
 from drivesem.classify.results import ClassifiedRun, ClassTally
 from drivesem.classify.training import train_run
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.config.devices import check_device
-from drivesem.report.answer import print_json
-from drivesem.report.tables import Sheet, number_of, percent
+from drivesem.report.tables import ReportTable, format_count, format_percent, print_json
 from drivesem.report.terminal import Console
-from drivesem.run.ask import say, say_end
+from drivesem.run.driver import print_output_folder, publish_report
 from drivesem.run.folder import claim, folder_of
 from drivesem.run.page import PAGE
 
 _ASKED = {"explain": explain_run, "holes": holes_run, "gate": gate_run}
 
 
-def run(config: Classify) -> int:
+def run(config: ClassifyConfig) -> int:
     """Draw, train, attack, or ask about a run; exit code 0, and 1 where a gate is not passed.
     Raises UsageError or SceneError for bad input."""
     check_device(config.device)
     if config.what in _ASKED:
         answer = _ASKED[config.what](config)
-        say(answer, config.json)
+        publish_report(answer, config.json)
         return 0 if answer.data.get("passed", True) else 1
     does = {"data": _data, "train": _train, "attack": _attack, "confirm": _confirm}
     does[config.what](config, Console(stderr=True) if config.json else Console())
     return 0
 
 
-def _data(config: Classify, console: Console) -> None:
+def _data(config: ClassifyConfig, console: Console) -> None:
     out = folder_of(config.out, Path("runs") / "classify-pictures")
     claim(out, config, ("train", "val", "test"))
     counts, failed = write_pictures(config, out)
@@ -48,37 +47,38 @@ def _data(config: Classify, console: Console) -> None:
     _end(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed}, failed)
 
 
-def _train(config: Classify, console: Console) -> None:
+def _train(config: ClassifyConfig, console: Console) -> None:
     data = train_run(config)
-    rows = tuple((str(e["epoch"]), f"{e['loss']:.4f}", percent(e["val"])) for e in data["epochs"])
-    sheet = Sheet(f"{config.network}: {config.layers} layers", ("epoch", "loss", "accuracy on val, %"), rows)
-    console.print(sheet.table(()))
+    rows = tuple((str(e["epoch"]), f"{e['loss']:.4f}", format_percent(e["val"])) for e in data["epochs"])
+    sheet = ReportTable(f"{config.network}: {config.layers} layers", ("epoch", "loss", "accuracy on val, %"), rows)
+    console.print(sheet.to_rich(()))
     for split, value in data["accuracy"].items():
-        low, high = (percent(end) for end in data["intervals"][split])
+        low, high = (format_percent(end) for end in data["intervals"][split])
         console.print(
-            f"accuracy on {split}: {percent(value)} % [{low}, {high}] of {data['pictures'][split]}", markup=False
+            f"accuracy on {split}: {format_percent(value)} % [{low}, {high}] of {data['pictures'][split]}",
+            markup=False,
         )
     _end(config, console, Path(data["weights"]), data, data["frames_failed"])
 
 
-def _attack(config: Classify, console: Console) -> None:
+def _attack(config: ClassifyConfig, console: Console) -> None:
     found = attack_run(config)
-    console.print(_table(found).table(("class",)))
+    console.print(_table(found).to_rich(("class",)))
     grades = found.grades
     console.print(
-        f"{number_of(found.pictures, 'picture')}, {number_of(found.queries, 'query', 'queries')}, "
-        f"{number_of(found.passes, 'pass', 'passes')} in {found.seconds:.0f} s: "
+        f"{format_count(found.pictures, 'picture')}, {format_count(found.queries, 'query', 'queries')}, "
+        f"{format_count(found.passes, 'pass', 'passes')} in {found.seconds:.0f} s: "
         f"{grades['threshold']} misclassified by threshold, {grades['certain']} for certain",
         soft_wrap=True,
     )
     _end(config, console, Path(found.out) / PAGE, found.to_json(), found.frames_failed)
 
 
-def _confirm(config: Classify, console: Console) -> None:
+def _confirm(config: ClassifyConfig, console: Console) -> None:
     found, facts = confirm_run(config)
-    console.print(_table(found).table(("class",)))
+    console.print(_table(found).to_rich(("class",)))
     lines = [
-        f"{facts['renderer']} agrees on {facts['agree']} of {number_of(facts['failures'], 'failure')}; "
+        f"{facts['renderer']} agrees on {facts['agree']} of {format_count(facts['failures'], 'failure')}; "
         f"{found.grades['certain']} are certain, {found.grades['confirmed']} confirmed"
     ]
     if facts["iou"]:
@@ -93,14 +93,14 @@ def _confirm(config: Classify, console: Console) -> None:
 
 
 def _end(
-    config: Classify, console: Console, written: Path, data: Mapping[str, Any], failed: Mapping[str, str]
+    config: ClassifyConfig, console: Console, written: Path, data: Mapping[str, Any], failed: Mapping[str, str]
 ) -> None:
-    say_end(written, console, failed)
+    print_output_folder(written, console, failed)
     if config.json:
         print_json(data)
 
 
-def _table(run: ClassifiedRun) -> Sheet:
+def _table(run: ClassifiedRun) -> ReportTable:
     def row(name: str, tally: ClassTally) -> tuple[str, ...]:
         return name, str(tally.pictures), *shares(tally), str(tally.certain), str(tally.confirmed)
 
@@ -108,4 +108,4 @@ def _table(run: ClassifiedRun) -> Sheet:
     title = f"{run.network} on {run.objects} objects: {run.method}, {' + '.join(run.params)}"
     columns = ("class", "pictures", "accuracy, %", "attacked, %", "certain", "confirmed")
     shown = len(columns) if run.grades["confirmed"] else len(columns) - 1
-    return Sheet(title, columns[:shown], tuple(row[:shown] for row in rows))
+    return ReportTable(title, columns[:shown], tuple(row[:shown] for row in rows))

@@ -8,17 +8,15 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from drivesem.config.commands import Convert
+from drivesem.config.commands import ConvertConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.values import class_map
 from drivesem.data.label_table import Written
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
-from drivesem.run.conversion import Conversion, convert
-from drivesem.run.labels import layout_of
+from drivesem.report.tables import format_count, print_json
+from drivesem.run.labels import Conversion, convert, layout_of
 
 
-def run(config: Convert) -> int:
+def run(config: ConvertConfig) -> int:
     """Convert; exit code 0. Raises UsageError or SceneError for bad input."""
     out = Path(config.out)
     if out.suffix.lower() == ".json":
@@ -65,4 +63,4 @@ def sentence(written: Written) -> str:
 
     parts = [f"lost: {listed(written.lost)}" if written.lost else "nothing lost"]
     parts += [f"assumed: {listed(written.assumed)}"] if written.assumed else []
-    return f"{number_of(written.files, 'file')}; {'; '.join(parts)}"
+    return f"{format_count(written.files, 'file')}; {'; '.join(parts)}"

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from drivesem.config.commands import Derender
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.config.commands import DerenderConfig
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.derender import derender_run
 from drivesem.scenes.sources import Photographs, SceneSource
 
 
-def run(config: Derender) -> int:
+def run(config: DerenderConfig) -> int:
     """Take apart the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console(stderr=True)
     found = derender_run(config, lambda source: _begin(source, config, console))
@@ -23,14 +22,16 @@ def run(config: Derender) -> int:
     lines = Console()
     for name, taken in found.frames.items():
         spent = "there before" if taken.seconds is None else f"{taken.seconds:.1f} s"
-        lines.print(f"{name}: {number_of(taken.objects, 'vehicle')}, {spent}", soft_wrap=True, highlight=False)
+        lines.print(f"{name}: {format_count(taken.objects, 'vehicle')}, {spent}", soft_wrap=True, highlight=False)
     for name, reason in found.failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
-    lines.print(f"{number_of(len(found.frames), 'scene')} in {found.out} ({found.seconds:.0f} s)", soft_wrap=True)
+    lines.print(
+        f"{format_count(len(found.frames), 'scene')} in {found.out} ({found.seconds:.0f} s)", soft_wrap=True
+    )
     return 0
 
 
-def _begin(source: SceneSource, config: Derender, console: Console) -> None:
+def _begin(source: SceneSource, config: DerenderConfig, console: Console) -> None:
     """Say what is known before the first frame."""
     if isinstance(source, Photographs) and config.photo is not None:
         focal = source.focal(next(source.identifiers()))

@@ -5,19 +5,18 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
-from drivesem.config.commands import Doctor
+from drivesem.config.commands import DoctorConfig
 from drivesem.doctor import PARTS, about, examine
-from drivesem.report.answer import print_json
-from drivesem.report.progress import progress_bar
-from drivesem.report.terminal import Console
+from drivesem.report.tables import print_json
+from drivesem.report.terminal import Console, progress_bar
 
 _LOOKS = {"works": "green", "missing": "yellow", "broken": "red"}
 
 
-def run(config: Doctor) -> int:
+def run(config: DoctorConfig) -> int:
     """Try all parts; exit code 0, or 1 where one does not work without which nothing does."""
     errors = Console(stderr=True)
-    with progress_bar(errors, stays=False, elapsed=False, hidden=not errors.is_terminal) as bar:
+    with progress_bar(errors, keep=False, show_elapsed=False, hidden=not errors.is_terminal) as bar:
         task = bar.add_task("trying parts", total=len(PARTS))
         found = examine(PARTS, lambda: bar.advance(task))
     fit = all(one.status == "works" for one in found if one.part.needed)

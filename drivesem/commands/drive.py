@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from drivesem.config.commands import Drive
+from drivesem.config.commands import DriveConfig
 from drivesem.report.terminal import Console
-from drivesem.run.ask import say
+from drivesem.run.driver import publish_report
 from drivesem.video.running import drive_run
 
 
-def run(config: Drive) -> int:
+def run(config: DriveConfig) -> int:
     """Attack a clip or go on with it; exit code 0. Raises UsageError or SceneError for bad input."""
     answer = drive_run(config)
-    say(answer, config.json, Console(stderr=True))
+    publish_report(answer, config.json, Console(stderr=True))
     return 0

@@ -9,21 +9,20 @@ from typing import Any
 
 from drivesem.attack.scene_edits import REMOVED, edited
 from drivesem.commands.render import picture_path
-from drivesem.config.commands import Edit
+from drivesem.config.commands import EditConfig
 from drivesem.config.edits import ALL, frame_edit, merged, parse_setting, read_frame_edit
 from drivesem.config.errors import UsageError
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.scenes.scene import Scene, free_folder
 from scene_ir import files
-from scene_ir.exchange import CHANGE
+from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene, save_scene
 
 _STAYS = "not the photograph: vehicles that were removed, exchanged, added, loaded or taken away stay so"
 
 
-def run(config: Edit) -> int:
+def run(config: EditConfig) -> int:
     """Edit a scene folder; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     folder = Path(config.scene)
@@ -33,8 +32,8 @@ def run(config: Edit) -> int:
     save = None if config.save is None else _save_path(Path(config.save), folder)
     edit = frame_edit("edit", _changes(config))
     scene = load_scene(folder)
-    result = edited(scene.at_rest(), edit, scene) if config.photographed else edited(scene, edit)
-    stays = config.photographed and not {CHANGE, REMOVED}.isdisjoint(scene.provenance)
+    result = edited(scene.unperturbed(), edit, scene) if config.photographed else edited(scene, edit)
+    stays = config.photographed and not {CHANGE_KEY, REMOVED}.isdisjoint(scene.provenance)
     notes = (*([_STAYS] if stays else []), *result.notes)
     for note in notes:
         sys.stderr.write(f"drivesem: {note}\n")
@@ -48,13 +47,13 @@ def run(config: Edit) -> int:
         found = {"scene": config.scene, **written, "objects": len(result.scene.objects), "notes": notes}
         print_json({**found, "seconds": seconds})
     else:
-        what = number_of(len(result.scene.objects), "vehicle")
+        what = format_count(len(result.scene.objects), "vehicle")
         what += f", {len(result.removed)} removed" if result.removed else ""
         Console().print(f"{' and '.join(written.values())}: {what} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 
-def _changes(config: Edit) -> dict[Any, Any]:
+def _changes(config: EditConfig) -> dict[Any, Any]:
     """The edits of file and command line as one mapping. FormatError or UsageError for what cannot be."""
     changes: dict[Any, Any] = {} if config.edits is None else read_frame_edit(Path(config.edits))
     for text in config.set:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from drivesem.analysis.evaluate.figures import evaluate_files
 from drivesem.analysis.evaluate.report import print_result
-from drivesem.config.commands import Eval
-from drivesem.report.answer import print_json
+from drivesem.config.commands import EvalConfig
+from drivesem.report.tables import print_json
 from drivesem.report.terminal import Console
 
 _FILE_WIDTH = 120
 """Characters a line of the tables where they go to a file and not to a terminal."""
 
 
-def run(config: Eval) -> int:
+def run(config: EvalConfig) -> int:
     """Evaluate and report; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
     console = Console(stderr=True)
     if config.detector is not None:

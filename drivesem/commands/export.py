@@ -7,16 +7,15 @@ from dataclasses import asdict
 from pathlib import Path
 
 from drivesem.commands.convert import sentence
-from drivesem.config.commands import Export
+from drivesem.config.commands import ExportConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.values import class_map
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.run.export import Tables, chosen, export_dataset
 from drivesem.run.finished import load_runs
 
 
-def run(config: Export) -> int:
+def run(config: ExportConfig) -> int:
     """Export; exit code 0. Raises UsageError or SceneError for bad input."""
     out = Path(config.out or "")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -37,11 +36,11 @@ def run(config: Export) -> int:
     return 0
 
 
-def _gltf(config: Export, out: Path) -> int:
+def _gltf(config: ExportConfig, out: Path) -> int:
     from drivesem.run.gltf import export_scenes
 
     written = export_scenes(Path(config.run or ""), out)
     if config.json:
         print_json({"out": str(out), "files": written})
-    sys.stderr.write(f"{number_of(len(written), 'scene')} in {out}\n")
+    sys.stderr.write(f"{format_count(len(written), 'scene')} in {out}\n")
     return 0

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from drivesem.analysis.gate.asking import gate_run
-from drivesem.config.commands import Gate
+from drivesem.config.commands import GateConfig
 from drivesem.config.devices import check_device
 from drivesem.report.terminal import Console
-from drivesem.run.ask import say
+from drivesem.run.driver import publish_report
 
 
-def run(config: Gate) -> int:
+def run(config: GateConfig) -> int:
     """Compare, report; exit code 0 where the gate is passed, 1 where it is not. Raises UsageError or SceneError
     for bad input.
     """
     check_device(config.device)
     passed, answer = gate_run(config)
-    say(answer, config.json, end=None if config.json else Console())
+    publish_report(answer, config.json, end=None if config.json else Console())
     return 0 if passed else 1

@@ -18,14 +18,13 @@ from detectors.base import DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
 from drivesem.attack.space import SIX, Parameter, StepSizes
-from drivesem.config.commands import Gradcheck
+from drivesem.config.commands import GradcheckConfig
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
-from drivesem.run.ask import Bar, ask, say_end
 from drivesem.run.attack import select_frames
+from drivesem.run.driver import ProgressSettings, print_output_folder, run_frame_jobs
 from drivesem.scenes.sources import SceneSource, open_source
 from scene_ir import files
 from scene_ir.raster.verbs import Backend
@@ -52,7 +51,7 @@ _FILE_WIDTH = 120
 _PACKAGES = ("drivesem", "torch", "kornia", "numpy", "warp-lang")
 
 
-def run(config: Gradcheck) -> int:
+def run(config: GradcheckConfig) -> int:
     """Check the scenes asked for; exit code 0 where all is inside the tolerance, 1 where something is not.
 
     Raises UsageError or SceneError for bad input.
@@ -97,13 +96,13 @@ def run(config: Gradcheck) -> int:
     return 0 if passed else 1
 
 
-def _reach(config: Gradcheck) -> int:
+def _reach(config: GradcheckConfig) -> int:
     """How far gradients of margins hold; exit code 0."""
     check_device(config.device)
     worker = ReachWorker.of(config)
     names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or _DEFAULT_SCENES))
-    bar = Bar("comparing gradients and slopes", remaining=True)
-    asked = ask(names, worker.measure, partial(measure_of, config), config, bar)
+    bar = ProgressSettings("comparing gradients and slopes", show_remaining=True)
+    asked = run_frame_jobs(names, worker.measure, partial(measure_of, config), config, bar)
     rows = rows_of_reach([asked.results[name] for name in names if name in asked.results], config.seed)
     if not rows:
         raise UsageError("gradcheck --reach", "at least one vehicle that the detector finds", "none")
@@ -125,7 +124,7 @@ def _reach(config: Gradcheck) -> int:
     else:
         answer.print(Console(width=None if sys.stdout.isatty() else _FILE_WIDTH))
     if config.out:
-        say_end(answer.out, Console(stderr=True), answer.failed)
+        print_output_folder(answer.out, Console(stderr=True), answer.failed)
     return 0
 
 
@@ -141,7 +140,7 @@ class _Task:
 class GradcheckWorker:
     """What one process needs: built once, used for many tasks. Raises UsageError or SceneError for bad input."""
 
-    def __init__(self, config: Gradcheck) -> None:
+    def __init__(self, config: GradcheckConfig) -> None:
         self.config = config
         check_device(config.device)
         self.source: SceneSource = open_source(config)
@@ -176,12 +175,12 @@ def _check_all(
         jobs = per_scene
     else:  # too few scenes to keep every process busy: each makes the scene ready for itself
         jobs = [(task,) for tasks in per_scene for task in tasks]
-    answers = ask(
+    answers = run_frame_jobs(
         jobs,
         worker,
         partial(GradcheckWorker, worker.config),
         worker.config,
-        Bar("checking gradients"),
+        ProgressSettings("checking gradients"),
         name=lambda tasks: tasks[0].identifier,
         size=len,
     )
@@ -209,7 +208,7 @@ def _detector(name: str, device: str) -> SqueezeDet:
     return detector
 
 
-def _print(rows: Sequence[GradcheckRow], config: Gradcheck, console: Console, scenes: int) -> None:
+def _print(rows: Sequence[GradcheckRow], config: GradcheckConfig, console: Console, scenes: int) -> None:
     title = f"gradients against central differences: {config.dataset}, "
     title += "1 scene" if scenes == 1 else f"the worst of {scenes} scenes"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -232,9 +231,7 @@ def _print(rows: Sequence[GradcheckRow], config: Gradcheck, console: Console, sc
     console.print(table)
     outside = sum(not row.passes(config.min_cosine, config.max_error) for row in rows)
     silent = sum(row.cosine is None for row in rows)
-    counts = (
-        f"{len(rows) - outside - silent} of {number_of(len(rows), 'row')} inside the tolerance, {outside} outside"
-    )
+    counts = f"{len(rows) - outside - silent} of {format_count(len(rows), 'row')} inside the tolerance, {outside} outside"
     counts += f", {silent} without effect" if silent else ""
     tolerance = f"cosine at least {config.min_cosine:g}, error at most {config.max_error:g}"
     console.print(f"{counts} ({tolerance})", soft_wrap=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from drivesem.analysis.holes.asking import holes_run
-from drivesem.config.commands import Holes
+from drivesem.config.commands import HolesConfig
 from drivesem.config.devices import check_device
 from drivesem.report.terminal import Console
-from drivesem.run.ask import say
+from drivesem.run.driver import publish_report
 
 
-def run(config: Holes) -> int:
+def run(config: HolesConfig) -> int:
     """Look around, report; exit code 0. Raises UsageError or SceneError for bad input."""
     check_device(config.device)
-    say(holes_run(config), config.json, end=None if config.json else Console())
+    publish_report(holes_run(config), config.json, end=None if config.json else Console())
     return 0

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from drivesem.config.commands import Presets
+from drivesem.config.commands import PresetsConfig
 from drivesem.config.parsing import commands_of
 from drivesem.config.presets import presets, remark
-from drivesem.report.answer import print_json
+from drivesem.report.tables import print_json
 from drivesem.report.terminal import Console
 
 
-def run(config: Presets) -> int:
+def run(config: PresetsConfig) -> int:
     """List; exit code 0. Raises UsageError for a preset that cannot be read."""
     rows = [(name, commands_of(str(path)), remark(path), str(path)) for name, path in presets().items()]
     if config.json:

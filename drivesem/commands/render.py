@@ -5,16 +5,15 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from drivesem.config.commands import Render
+from drivesem.config.commands import RenderConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.scenes.scene import load_scene
 from scene_ir import files
 
 
-def run(config: Render) -> int:
+def run(config: RenderConfig) -> int:
     """Render a scene folder; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     out = picture_path(config.out, Path(config.scene) / "render.png")
@@ -25,7 +24,7 @@ def run(config: Render) -> int:
         found = {"scene": config.scene, "out": str(out), "objects": len(scene), "seconds": seconds}
         print_json(found)
     else:
-        Console().print(f"{out}: {number_of(len(scene), 'vehicle')} ({seconds:.1f} s)", soft_wrap=True)
+        Console().print(f"{out}: {format_count(len(scene), 'vehicle')} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
-from drivesem.config.commands import Retrain
+from drivesem.config.commands import RetrainConfig
 from drivesem.config.devices import check_device
-from drivesem.report.answer import print_json
-from drivesem.report.tables import percent
+from drivesem.report.tables import format_percent, print_json
 from drivesem.report.terminal import Console
 from drivesem.training.retrain import RetrainRow, retrain_run
 
 
-def run(config: Retrain) -> int:
+def run(config: RetrainConfig) -> int:
     """Retrain, or go on with it; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console(stderr=True)
     check_device(config.device)
@@ -34,5 +33,5 @@ def _print(rows: Sequence[RetrainRow], console: Console) -> None:
         table.add_column(title, justify="right")
     for row in rows:
         numbers = (row.scores.ap50, row.scores.recall, row.scores.recall_at_t_star, row.broken)
-        table.add_row(f"{row.frames}, {row.labels}", row.detector, *(percent(number) for number in numbers))
+        table.add_row(f"{row.frames}, {row.labels}", row.detector, *(format_percent(number) for number in numbers))
     console.print(table)

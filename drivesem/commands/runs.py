@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from drivesem.commands.attack import told_grades
-from drivesem.config.commands import DEFAULT_COMBO, Attack, Runs
+from drivesem.config.commands import DEFAULT_COMBO, AttackConfig, RunsConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_of
 from drivesem.run.labels import frames_in
 from drivesem.run.lock import held_elsewhere, hold
-from drivesem.run.parts import merge
+from drivesem.run.merge import merge
 from drivesem.store import place
 from scene_ir import files
 
@@ -30,7 +29,7 @@ _HOME = "runs"
 """Where `drivesem attack` puts runs without --out."""
 
 
-def run(config: Runs) -> int:
+def run(config: RunsConfig) -> int:
     """Tell, merge or prune; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console()
     does = {"list": _list, "show": _show, "merge": _merge, "prune": _prune}
@@ -43,7 +42,7 @@ def run(config: Runs) -> int:
 _place = partial(place, setting=_SETTING)
 
 
-def _list(config: Runs, console: Console) -> dict[str, Any]:
+def _list(config: RunsConfig, console: Console) -> dict[str, Any]:
     found = [run for folder in config.folders or (_HOME,) for run in _runs_in(_place(folder))]
     rows = [_row(folder) for folder in found]
     for row in rows:
@@ -54,13 +53,13 @@ def _list(config: Runs, console: Console) -> dict[str, Any]:
 
 def _line(row: Mapping[str, Any]) -> str:
     """A run in words."""
-    grades, frames = row["grades"], number_of(row["frames"], "frame")
+    grades, frames = row["grades"], format_count(row["frames"], "frame")
     what = f"{row['params']} by {row['method']} on {row['detector']}, {row['mb']:.0f} MB"
     if grades is None:
         stands = "being made now" if row["running"] else "not finished (the same command goes on)"
         return f"{row['run']}: {frames}, {stands}; {what}"
     held = [f"{grades[grade]} {grade}" for grade in (Grade.CERTAIN, Grade.CONFIRMED) if grade in grades]
-    found = f"{', '.join(held)} of {number_of(grades.get(Grade.THRESHOLD, 0), 'failure')} by threshold"
+    found = f"{', '.join(held)} of {format_count(grades.get(Grade.THRESHOLD, 0), 'failure')} by threshold"
     return f"{row['run']}: {frames}, {found}; {what}"
 
 
@@ -96,15 +95,15 @@ def _figures(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _show(config: Runs, console: Console) -> dict[str, Any]:
+def _show(config: RunsConfig, console: Console) -> dict[str, Any]:
     told = []
     for folder in map(_place, config.folders):
-        usual = {field.name: field.default for field in fields(Attack)}
+        usual = {field.name: field.default for field in fields(AttackConfig)}
         settings = settings_of(attack_of(folder, _SETTING))
         asked = {key: value for key, value in settings.items() if value != usual[key]}
-        told.append({**_row(folder), "settings": asked, "left": len(files.leftovers(folder))})
+        told.append({**_row(folder), "settings": asked, "left": len(files.find_leftovers(folder))})
         console.print(
-            f"{folder}: {number_of(told[-1]['frames'], 'frame')}, {told[-1]['mb']:.0f} MB",
+            f"{folder}: {format_count(told[-1]['frames'], 'frame')}, {told[-1]['mb']:.0f} MB",
             soft_wrap=True,
             markup=False,
         )
@@ -113,22 +112,22 @@ def _show(config: Runs, console: Console) -> dict[str, Any]:
     return {"runs": told}
 
 
-def _merge(config: Runs, console: Console) -> dict[str, Any]:
+def _merge(config: RunsConfig, console: Console) -> dict[str, Any]:
     summary = merge([str(_place(folder)) for folder in config.folders], Path(config.out or ""), config.trust)
     console.print(told_grades(summary), soft_wrap=True)
     console.print(
-        f"{number_of(summary.frames, 'frame')} of {number_of(len(config.folders), 'run')} in {summary.out}",
+        f"{format_count(summary.frames, 'frame')} of {format_count(len(config.folders), 'run')} in {summary.out}",
         soft_wrap=True,
     )
     return summary.to_json()
 
 
-def _prune(config: Runs, console: Console) -> dict[str, Any]:
+def _prune(config: RunsConfig, console: Console) -> dict[str, Any]:
     removed: list[str] = []
     for folder in map(Path, config.folders):
         attack_of(folder, _SETTING)
         hold(folder)  # what another command is writing now is none of this
-        for path in files.leftovers(folder):
+        for path in files.find_leftovers(folder):
             # A question to the run writes below it, and holds the folder of its own answers alone.
             if any(held_elsewhere(parent) for parent in path.parents if parent.is_relative_to(folder)):
                 continue

@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from drivesem.config.commands import Synth
+from drivesem.config.commands import SynthConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.answer import print_json
-from drivesem.report.progress import progress_bar
-from drivesem.report.tables import number_of
-from drivesem.report.terminal import Console
+from drivesem.report.tables import format_count, print_json
+from drivesem.report.terminal import Console, progress_bar
 from drivesem.run.folder import folder_of
 from drivesem.run.lock import hold
 from drivesem.run.workers import mapping
@@ -22,7 +20,7 @@ _DRIVE_FRAMES = 10
 _SHEET_FRAMES = 8
 
 
-def order_of(config: Synth) -> Order:
+def order_of(config: SynthConfig) -> Order:
     """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
     out = folder_of(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
     virtual = config.layout.startswith("vkitti")
@@ -48,14 +46,14 @@ def order_of(config: Synth) -> Order:
     )
 
 
-def run(config: Synth) -> int:
+def run(config: SynthConfig) -> int:
     """Write the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     order = order_of(config)
     total = len(order.places())
     hold(order.out)
     done = synthesise(order, mapping(config))
-    with progress_bar(Console(stderr=True), remaining=True) as progress:
+    with progress_bar(Console(stderr=True), show_remaining=True) as progress:
         for _ in progress.track(done, total=total, description="making frames"):
             pass
     found: dict[str, object] = {"out": str(order.out), "frames": total}
@@ -67,7 +65,9 @@ def run(config: Synth) -> int:
     if config.json:
         print_json(found)
     else:
-        Console().print(f"{number_of(total, 'frame')} in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True)
+        Console().print(
+            f"{format_count(total, 'frame')} in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True
+        )
     return 0
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from drivesem.analysis.transfer.asking import transfer_run
-from drivesem.config.commands import Transfer
-from drivesem.run.ask import say
+from drivesem.config.commands import TransferConfig
+from drivesem.run.driver import publish_report
 
 
-def run(config: Transfer) -> int:
+def run(config: TransferConfig) -> int:
     """Look, count, report; exit code 0. Raises UsageError or SceneError for bad input."""
-    say(transfer_run(config), config.json)
+    publish_report(transfer_run(config), config.json)
     return 0

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from drivesem.analysis.verify.asking import WHOLE_RUN, verify_run
-from drivesem.config.commands import Verify
+from drivesem.config.commands import VerifyConfig
 from drivesem.config.devices import check_device
-from drivesem.report.answer import print_json
-from drivesem.report.tables import Sheet, number_of
+from drivesem.report.tables import ReportTable, format_count, print_json
 from drivesem.report.terminal import Console
-from drivesem.run.ask import say_end
-from drivesem.run.report.grading import UNKNOWN
+from drivesem.run.driver import print_output_folder
+from drivesem.run.report.page import UNKNOWN
 
 _MOST_SHOWN, _MOST_ALIKE = 30, 5
 """Differences that are told on a terminal, and of them those of one check of a frame; verify.json has them all."""
@@ -23,7 +22,7 @@ _UNSEALED = (
 )
 
 
-def run(config: Verify) -> int:
+def run(config: VerifyConfig) -> int:
     """Check, report; exit code 0, or 1 where something differs or a frame could not be read. Raises UsageError or
     SceneError for bad input.
     """
@@ -33,7 +32,7 @@ def run(config: Verify) -> int:
     if config.json:
         print_json(data)
     _print(data, console if config.json else Console())
-    say_end(out, console)
+    print_output_folder(out, console)
     return 0 if data["agree"] else 1
 
 
@@ -54,7 +53,9 @@ def _print(data: dict[str, Any], console: Console) -> None:
     )
     columns = ("check", "what holds where nothing differs", "compared", "differ", "in frames")
     console.print(
-        Sheet(f"{number_of(data['frames'], 'frame')} of {data['run']}", columns, rows).table(columns[:2])
+        ReportTable(f"{format_count(data['frames'], 'frame')} of {data['run']}", columns, rows).to_rich(
+            columns[:2]
+        )
     )
     told = _told_first(data["differences"])[:_MOST_SHOWN]
     for wrong in told:
@@ -64,7 +65,7 @@ def _print(data: dict[str, Any], console: Console) -> None:
     if left := len(data["differences"]) - len(told):
         console.print(f"and {left} more")
     if ungraded := data["frames_ungraded"]:
-        console.print(f"{number_of(ungraded, 'frame')}: {UNKNOWN}")
+        console.print(f"{format_count(ungraded, 'frame')}: {UNKNOWN}")
     for name, reason in data["frames_failed"].items():
         console.print(f"frame {name} could not be checked: {reason}", soft_wrap=True, markup=False)
     if not data["sealed"]:

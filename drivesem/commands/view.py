@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 import webbrowser
 
-from drivesem.config.commands import View
+from drivesem.config.commands import ViewConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.answer import print_json
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.viewer.frames import Shown, opened
 from drivesem.viewer.server import HOST, Server, Viewer
@@ -18,7 +17,7 @@ _PORT = 8321
 _TRIED = 20
 
 
-def run(config: View) -> int:
+def run(config: ViewConfig) -> int:
     """Serve until Ctrl-C; exit code 0. Raises UsageError or SceneError for bad input."""
     shown = opened(config)
     if config.window:
@@ -54,13 +53,13 @@ def _server(shown: Shown, port: int | None) -> Server:
     raise UsageError("--port", f"a free port of {HOST}", found)
 
 
-def _tell(server: Server, config: View) -> None:
+def _tell(server: Server, config: ViewConfig) -> None:
     frames = len(server.viewer.frames)
     if config.json:
         print_json({"url": server.url, "frames": frames, "detector": server.viewer.detector.name})
         sys.stdout.flush()
     else:
-        what = f"{number_of(frames, 'frame')}, {server.viewer.detector.name}"
+        what = f"{format_count(frames, 'frame')}, {server.viewer.detector.name}"
         Console(stderr=True).print(f"{server.url} ({what}); Ctrl-C ends it", soft_wrap=True, markup=False)
     if config.browser:
         webbrowser.open(server.url)

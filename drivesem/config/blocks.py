@@ -19,13 +19,13 @@ import tyro
 
 from drivesem.config.constraints import (
     POSITIVE,
-    Anywhere,
+    AllowsUrl,
     Constraint,
-    Of,
+    ForMethods,
+    NumberRange,
     OneOf,
     Parsed,
     Required,
-    Within,
     at_least,
 )
 from drivesem.config.errors import refuse
@@ -35,10 +35,12 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 Repeated = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 Count = Annotated[int, at_least(1)]
 NotNegative = Annotated[int, at_least(0)]
-Run = Annotated[str | None, Required("a folder of drivesem attack")]
-Place = Annotated[str | None, Anywhere()]
+RunFolder = Annotated[str | None, Required("a folder of drivesem attack")]
+FolderOrUrl = Annotated[str | None, AllowsUrl()]
 """A folder, or its URL."""
-Score = Annotated[float, Within(0, 1, "(]", "a score in (0, 1]")]
+CommandName = Annotated[str, tyro.conf.Fixed]
+"""The name under which a command was called: set by the parser, for classes that serve several commands."""
+Score = Annotated[float, NumberRange(0, 1, "(]", "a score in (0, 1]")]
 LabelMode = Literal["moved", "paper"]
 
 DEMO = "demo"
@@ -71,12 +73,12 @@ class Options:
         markers = constraints(type(self))
         for field in fields(self):
             value = getattr(self, field.name)
-            if not any(isinstance(marker, Anywhere) for marker in markers[field.name]):
+            if not any(isinstance(marker, AllowsUrl) for marker in markers[field.name]):
                 for text in value if isinstance(value, tuple) else (value,):
                     here = not (isinstance(text, str) and is_url(text))
                     refuse(not here, option(field.name), "what is on this machine (docs/scale.md)", text)
             for marker in markers[field.name]:
-                if isinstance(marker, Of):
+                if isinstance(marker, ForMethods):
                     if value != field.default:
                         marker.check(option(field.name), vars(self)["method"])
                 elif value is not None or isinstance(marker, Required):
@@ -99,13 +101,13 @@ def option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def shared(config: Options, block: type[Options]) -> dict[str, Any]:
+def shared_options(config: Options, block: type[Options]) -> dict[str, Any]:
     """The settings of one block, to make another command's of."""
     return {field.name: getattr(config, field.name) for field in fields(block)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Command(Options):
+class CommandConfig(Options):
     """The option that every command has."""
 
     json: Flag = False
@@ -113,7 +115,7 @@ class Command(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Output(Options):
+class OutputOptions(Options):
     """A folder of results that a second run goes on with."""
 
     out: str | None = None
@@ -123,7 +125,7 @@ class Output(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limit(Options):
+class LimitOption(Options):
     """How many frames."""
 
     limit: Count | None = None
@@ -132,7 +134,7 @@ class Limit(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seed(Options):
+class SeedOption(Options):
     """Where random numbers begin."""
 
     seed: int = 0
@@ -140,7 +142,7 @@ class Seed(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sharing(Options):
+class WorkerOptions(Options):
     """Frames that are shared by processes."""
 
     workers: Count | None = None
@@ -149,7 +151,7 @@ class Sharing(Options):
     """List a frame that cannot be used, or on which drivesem fails, in the results and go on with the rest."""
     engine: Literal["local", "ray"] = "local"
     """What shares the frames: processes of this machine, or of a Ray cluster (docs/scale.md)."""
-    address: Annotated[str | None, Anywhere()] = None
+    address: Annotated[str | None, AllowsUrl()] = None
     """Address of the Ray cluster, such as auto or ray://HOST:10001; by default one on this machine alone."""
 
     def check(self) -> None:
@@ -163,7 +165,7 @@ class Sharing(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Device(Options):
+class DeviceOption(Options):
     """Where networks run."""
 
     device: str = "cpu"
@@ -171,18 +173,18 @@ class Device(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameCommand(Device, Sharing, Seed, Limit, Output, Command):
+class FrameCommandConfig(DeviceOption, WorkerOptions, SeedOption, LimitOption, OutputOptions, CommandConfig):
     """What every command takes that works through frames into a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DataSource(Seed, Limit):
+class DataSourceOptions(SeedOption, LimitOption):
     """Frames: the embedded scenes, or a data set's."""
 
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """demo (generated scenes, needs no data), kitti, vkitti1, vkitti2, coco or yolo; photographs (without labels);
     scenes (of drivesem derender)."""
-    root: Place = None
+    root: FolderOrUrl = None
     """Folder of the data set, such as KITTI's with training/image_2, label_2 and calib, or its URL; one photograph
     or a folder of them; one scene or a folder of them."""
 
@@ -195,7 +197,7 @@ class DataSource(Seed, Limit):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenes(DataSource):
+class SceneOptions(DataSourceOptions):
     """Frames, and how photographs are taken apart."""
 
     split: str | None = None
@@ -205,9 +207,9 @@ class Scenes(DataSource):
     """Fit template, pose and shape to the photograph's silhouettes (data sets of photographs only)."""
     cache: str | None = None
     """A folder that keeps photographs as they were taken apart, for the next attack on them."""
-    cache_gb: Annotated[float, Within(0, ends="()", expected="a number above 0")] = 4.0
+    cache_gb: Annotated[float, NumberRange(0, ends="()", expected="a number above 0")] = 4.0
     """How large --cache may grow; what was not asked for longest goes first."""
-    focal: Annotated[float, Within(0, ends="()", expected="positive px")] | None = None
+    focal: Annotated[float, NumberRange(0, ends="()", expected="positive px")] | None = None
     """Focal length, px, of photographs that do not tell their camera (photographs, coco, yolo); by default EXIF's,
     or 0.58 of the longer side."""
     finder: str = FINDER
@@ -231,7 +233,7 @@ class Scenes(DataSource):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Threshold(Options):
+class ThresholdOption(Options):
     """When a detection counts."""
 
     t_star: Score | None = None
@@ -239,7 +241,7 @@ class Threshold(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tiles(Options):
+class TileOption(Options):
     """How ONNX detectors look."""
 
     tiles: Literal["auto", "off"] = "auto"
@@ -247,7 +249,7 @@ class Tiles(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Precision(Device):
+class PrecisionOptions(DeviceOption):
     """What networks compute in."""
 
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
@@ -260,7 +262,7 @@ class Precision(Device):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bootstrap(Options):
+class BootstrapOption(Options):
     """Intervals of figures."""
 
     bootstrap: NotNegative | None = None
@@ -268,7 +270,7 @@ class Bootstrap(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draws(Bootstrap, Seed):
+class SeededBootstrapOptions(BootstrapOption, SeedOption):
     """Intervals, where nothing else is random."""
 
     seed: int = 0
@@ -276,7 +278,7 @@ class Draws(Bootstrap, Seed):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asking(Bootstrap, Threshold, Tiles, Device, Sharing, Seed):
+class DetectionOptions(BootstrapOption, ThresholdOption, TileOption, DeviceOption, WorkerOptions, SeedOption):
     """How detectors are asked about pictures of runs."""
 
     t_star: Score | None = None
@@ -284,15 +286,15 @@ class Asking(Bootstrap, Threshold, Tiles, Device, Sharing, Seed):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinishedRun(Options):
+class RunOption(Options):
     """A run that a question is asked of."""
 
-    run: Run = None
+    run: RunFolder = None
     """Folder of a run of drivesem attack."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trust(Options):
+class TrustOption(Options):
     """Whether a run may bring code of its own."""
 
     trust: Flag = False
@@ -300,7 +302,7 @@ class Trust(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Regions(Options):
+class InferenceOptions(Options):
     """How detectors look at changed pictures."""
 
     whole: Flag = False
@@ -321,7 +323,7 @@ class Regions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Searching(Threshold, Precision):
+class SearchOptions(ThresholdOption, PrecisionOptions):
     """What is attacked, how far it may go, and what is raised."""
 
     detector: str = "squeezedet"
@@ -355,12 +357,12 @@ class Searching(Threshold, Precision):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attacking(Regions, Searching, Scenes):
+class SceneAttackOptions(InferenceOptions, SearchOptions, SceneOptions):
     """An attack, as far as a study gives it to all of its arms."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grading(Options):
+class GradingOptions(Options):
     """How sure failures must be: certificates and who else is asked."""
 
     draws: Annotated[int, at_least(CERTIFYING_DRAWS, "which a certificate's rule needs")] = CERTIFYING_DRAWS
@@ -381,7 +383,7 @@ class Grading(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training(Precision):
+class TrainingOptions(PrecisionOptions):
     """How weights are trained."""
 
     minutes: Annotated[float, at_least(0)] = 0.0

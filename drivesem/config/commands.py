@@ -6,7 +6,6 @@ This module is loaded by `drivesem --help`: it imports nothing heavy.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Annotated, Literal
@@ -19,33 +18,41 @@ from drivesem.config.blocks import (
     DEMO,
     FINDER,
     SCENES,
-    Asking,
-    Attacking,
-    Bootstrap,
-    Command,
+    BootstrapOption,
+    CommandConfig,
     Count,
-    Device,
-    Draws,
-    FinishedRun,
+    DetectionOptions,
+    DeviceOption,
     Flag,
-    FrameCommand,
-    Grading,
-    LabelMode,
+    FolderOrUrl,
+    FrameCommandConfig,
+    GradingOptions,
+    InferenceOptions,
     NotNegative,
-    Place,
-    Regions,
     Repeated,
-    Run,
-    Scenes,
-    Searching,
-    Sharing,
-    Threshold,
-    Tiles,
-    Training,
-    Trust,
+    RunFolder,
+    RunOption,
+    SceneAttackOptions,
+    SceneOptions,
+    SearchOptions,
+    ThresholdOption,
+    TileOption,
+    TrainingOptions,
+    TrustOption,
+    WorkerOptions,
     option,
 )
-from drivesem.config.constraints import POSITIVE, Anywhere, Folder, Of, OneOf, Parsed, Required, Within, at_least
+from drivesem.config.constraints import (
+    POSITIVE,
+    AllowsUrl,
+    ExistingFolder,
+    ForMethods,
+    NumberRange,
+    OneOf,
+    Parsed,
+    Required,
+    at_least,
+)
 from drivesem.config.errors import refuse
 from drivesem.config.values import class_map, is_url, numbers, part_of
 
@@ -69,19 +76,17 @@ Search = Literal[
 
 _NETWORK = "squeezenet"
 """The classifier that is attacked, or trained, where none is named."""
-_AGAIN = ("name", "kept", "out", "bootstrap", "json")
-"""Settings of a study that is told again."""
 
-_RunWords = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
-RunFolders = Annotated[_RunWords, Required("folders of drivesem attack", "RUN")]
-Share = Annotated[float, Within(0, 1, "()", "a share between 0 and 1")]
+RunArguments = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
+RunFolders = Annotated[RunArguments, Required("folders of drivesem attack", "RUN")]
+Fraction = Annotated[float, NumberRange(0, 1, "()", "a share between 0 and 1")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attack(Tiles, Grading, Attacking, FrameCommand):
+class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandConfig):
     """Find feasible changes of driving scenes that a detector gets wrong."""
 
-    combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
+    combo: Annotated[int, NumberRange(1, 4, expected="1, 2, 3 or 4")] | None = None
     """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
     """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size and
@@ -95,23 +100,25 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     passes: Annotated[Count, at_least(LEAST_PASSES, "which the search needs")] | None = None
     """Passes of the detector that a frame may take, a gradient counted as 3: methods take as many steps or queries
     as fit, whatever --steps says. By default only climb and corners count them, 90."""
-    queries: Annotated[Count, Of(COUNTED)] | None = None
+    queries: Annotated[Count, ForMethods(COUNTED)] | None = None
     """Of scw: gradients; of methods without gradient: renders that are judged; of subsets: both. By default 64."""
-    step_form: Annotated[Literal["raw", "l2"], Of(("sgd",))] = "l2"
+    step_form: Annotated[Literal["raw", "l2"], ForMethods(("sgd",))] = "l2"
     """Of sgd: the gradient as it is, or its direction, each parameter's as long as a step of si-fgsm."""
     rate: Annotated[
-        float, Of(("si-fgsm", "apgd", "sgd", "scw")), Within(0, ends="()", expected="a number above 0")
+        float,
+        ForMethods(("si-fgsm", "apgd", "sgd", "scw")),
+        NumberRange(0, ends="()", expected="a number above 0"),
     ] = 1.0
     """Of si-fgsm, apgd, sgd and scw: length of a (first) step in units of each parameter's own step."""
-    momentum: Annotated[float, Of(("si-fgsm", "sgd")), Within(0, 1)] = 0.0
+    momentum: Annotated[float, ForMethods(("si-fgsm", "sgd")), NumberRange(0, 1)] = 0.0
     """Of si-fgsm and sgd: what is left of earlier gradients after a step, 0 to 1 (MI-FGSM: 1)."""
-    norm: Annotated[Literal[1, 2], Of(("scw",))] = 2
+    norm: Annotated[Literal[1, 2], ForMethods(("scw",))] = 2
     """Of scw: the norm of the change that is kept small."""
-    restarts: Annotated[NotNegative, Of(RESTARTED)] = 0
+    restarts: Annotated[NotNegative, ForMethods(RESTARTED)] = 0
     """Of si-fgsm, apgd, fgsm, sgd and scw: how often to begin again at random near the photograph."""
-    scouts: Annotated[NotNegative, Of(RESTARTED)] = 0
+    scouts: Annotated[NotNegative, ForMethods(RESTARTED)] = 0
     """Of the same: how many samples of all the bounds are judged first; the attack begins at the best."""
-    like: Annotated[str, Of(("placebo",)), Folder("a run of drivesem attack")] | None = None
+    like: Annotated[str, ForMethods(("placebo",)), ExistingFolder("a run of drivesem attack")] | None = None
     """Of placebo, one random edit of each frame: the run whose counterexamples are as large."""
     range: Literal["bounds", "steps"] = "bounds"
     """Of methods without gradient: search all of the parameters' bounds, or what --steps steps reach."""
@@ -119,7 +126,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     """Stop a frame at its first success instead of using all steps or queries."""
     grade: bool = True
     """See how sure failures are; without, all are by threshold, and certificates take no time."""
-    changes: Annotated[str, Of(("climb", "corners"))] | None = None
+    changes: Annotated[str, ForMethods(("climb", "corners"))] | None = None
     """Of climb and corners, with --budget street: what else may change, with commas: leave (a car is gone), park
     (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried on what was
     found, within the same passes; the best is kept."""
@@ -134,7 +141,7 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
 
-    out: Place = None
+    out: FolderOrUrl = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     part: Annotated[str | None, Parsed(part_of)] = None
     """K/N, such as 2/4: the 2nd, 6th, 10th frame and so on, for one of four machines (drivesem runs merge)."""
@@ -164,24 +171,24 @@ class Attack(Tiles, Grading, Attacking, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drive(Tiles, Searching, FrameCommand):
+class DriveConfig(TileOption, SearchOptions, FrameCommandConfig):
     """Attack a whole clip: one change of each car over its whole track, and how long the detector misses it."""
 
-    clip: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="CLIP"), Anywhere()] = None
+    clip: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="CLIP"), AllowsUrl()] = None
     """A folder, or its URL: Virtual KITTI 1.3.1 or 2, KITTI's tracking benchmark, or what drivesem synth
     --sequence wrote (kitti, vkitti2); by default an embedded drive, made by code."""
     sequence: str | None = None
     """Which clip of the folder, such as 0003, 0001/clone or Scene01/clone; by default the first."""
-    combo: Annotated[int, Within(1, 4, expected="1, 2, 3 or 4")] | None = None
+    combo: Annotated[int, NumberRange(1, 4, expected="1, 2, 3 or 4")] | None = None
     """The paper's combinations, as of drivesem attack, instead of --params."""
     params: str | None = None
     """What may change, with commas, as of drivesem attack; by default color,translate,mesh. translate is a smooth
     path aside; all else is the same in all frames."""
     method: Literal["si-fgsm", "fgsm", "sgd", "random", "halton", "sobol", "cma-es"] = "si-fgsm"
     """si-fgsm, fgsm, sgd follow the gradient; the others ask only what the detector finds in the whole clip."""
-    queries: Annotated[Count, Of(COUNTED)] | None = None
+    queries: Annotated[Count, ForMethods(COUNTED)] | None = None
     """Of methods without gradient: whole clips that are judged, by default 64."""
-    bend: Annotated[int, Within(0, 5, expected="0 to 5")] = 3
+    bend: Annotated[int, NumberRange(0, 5, expected="0 to 5")] = 3
     """Degree of the polynomial of a car's path over time; 0 sets it aside by the same in all frames."""
     keys: Count = 8
     """Frames that a gradient step looks at, evenly spread; each step looks at others, in turn."""
@@ -200,157 +207,10 @@ class Drive(Tiles, Searching, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study(Bootstrap, Grading, Attacking, FrameCommand):
-    """The paper's experiments, and others: every arm an attack on the same frames."""
-
-    name: Annotated[
-        tyro.conf.Positional[
-            Literal[
-                "single",
-                "multi",
-                "grades",
-                "searches",
-                "samples",
-                "steps",
-                "labels",
-                "attribution",
-                "transfer",
-                "retrain",
-                "classification",
-            ]
-        ],
-        tyro.conf.arg(
-            metavar="{single,multi,grades,searches,samples,steps,labels,attribution,transfer,retrain,classification}"
-        ),
-    ]
-    """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
-    gradient, sampling and placebo; searches: which method finds failures that hold, at as many passes each;
-    samples: success against queries for each algorithm; steps: success against number and size of steps; labels:
-    what labels that stay behind make of an attack; attribution: which part of the paper's protocol takes how many
-    points; transfer: counterexamples of combination 2 before other
-    detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
-    counterexamples; classification: the paper's tables for image classifiers (docs/classify.md)."""
-    out: Place = None
-    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
-    kept: Annotated[str | None, Folder(), tyro.conf.arg(aliases=["--from"])] = None
-    """The folder OUT/kept of such a study, whose tables are told again; it
-    needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
-    quick: Flag = False
-    """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
-    retrain, which trains on other frames, in another."""
-    detector: str = "squeezedet"
-    """A shipped detector, a file, or another project's that has a gradient (docs/detectors.md)."""
-    bootstrap: NotNegative | None = None
-    """Draws of frames for intervals, by default 1000, of classification 200; 0 leaves them out."""
-    steps: Count = 10
-    """Steps of the attack; steps goes twice as far."""
-    queries: Count = 64
-    """Samples: queries of each method without gradient."""
-    passes: Annotated[int, at_least(LEAST_PASSES, "which the search needs")] = 90
-    """Searches, and retrain with climb: passes of the detector that each method may take for a frame, a gradient
-    counted as 3."""
-    pace: Annotated[str | None, Folder()] = None
-    """Searches: folder of such a study; each method takes as many more passes as fit into the seconds that the
-    slowest took there for a frame."""
-    params: str | None = None
-    """Searches, retrain: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by
-    default as combination 2."""
-    objective_labels: LabelMode = "moved"
-    """Labels the attacks aim at: moved with the cars, or the benign ones as in the paper (labels has both)."""
-    method: Literal["si-fgsm", "apgd", "climb"] = "si-fgsm"
-    """Single, multi, labels, transfer, retrain: the attack of all arms; si-fgsm is the paper's; climb, of retrain
-    alone, finds failures that hold."""
-    controls: bool = True
-    """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
-    seeds: Count | None = None
-    """Single, multi: seeds of random numbers for each control, by default 3, 1 with --quick. Retrain: seeds by
-    which benign, random, certain and consistent are trained, by default one."""
-    paper_protocol: bool = True
-    """Single, multi: beside each arm the same by the paper's exact protocol (--config paper), where the detector
-    has its loss."""
-    confirm: Flag = False
-    """Single, multi, labels: have a second renderer draw each attack's pictures again, as drivesem confirm does.
-    What is certain is drawn by it in any case."""
-    other_detector: str | None = None
-    """Attribution: a detector that is the paper's where ours is --detector, as one more factor."""
-    detectors: str = "squeezedet,yolov3-slim"
-    """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
-    sources: str | None = None
-    """Transfer: detectors that are attacked, with commas; by default --detector alone."""
-    benign_root: str | None = None
-    """Retrain: folders of further benign frames to train on, with commas; by default all of --root."""
-    held_out: str | None = None
-    """Retrain: folder of frames that are never trained on; by default a quarter of --root's."""
-    validation: str | None = None
-    """Retrain: folder of further frames, of the same layout, on which retrained detectors' t* is chosen; by
-    default the benign frames that judge them."""
-    arms: str | None = None
-    """Retrain: what is trained, with commas: benign, re-rendered, random, generator, ours, certain, consistent,
-    worst, paper (docs/study.md); by default re-rendered, ours and, without --quick, paper."""
-    states: NotNegative = 16
-    """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
-    consistency: Annotated[float, POSITIVE] = 1.0
-    """Retrain: weight of the further term of consistent, which compares margins of objects and of background in
-    a failure's two pictures, and of worst, which asks for the object in the worst of four and for nothing beside
-    it."""
-    fraction: Share = 0.25
-    """Retrain: share of the extra pictures among all that is shown; not of the paper's protocol."""
-    near: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.5
-    """Retrain: share of the states around a failure that lie near it."""
-    reattack: bool = True
-    """Retrain: attack held-out frames against each retrained detector too, not against the detector as it was
-    alone."""
-    benign_frames: Count | None = None
-    """Retrain: the first so many of these judge what is benign; by default 1000, 12 with --quick."""
-    fresh: Count | None = None
-    """Retrain: the first so many of these are attacked, with every detector; by default 200, 3 with --quick."""
-    train_steps: Count | None = None
-    """Retrain: steps of training; by default 1500, of the paper's protocol 6000; 40 with --quick."""
-    mix: Literal["add", "replace"] = "add"
-    """Retrain: counterexamples beside benign frames, or in the place of some; not of the paper's protocol."""
-    label_mode: LabelMode = "moved"
-    """Retrain: labels of counterexamples in training; not of the paper's protocol."""
-    networks: str = "squeezenet"
-    """Classification: networks to attack, with commas: squeezenet, or weights that classify train wrote."""
-    objects: str | None = None
-    """Classification: where objects come from, as in drivesem classify; --limit counts their pictures, by default
-    480, 36 with --quick, and --fresh those on which retrained networks are attacked, 232, 36 with --quick."""
-    backgrounds: Annotated[str, Folder("a folder of photographs")] | None = None
-    """Classification: photographs to put behind objects; by default pictures that are made."""
-    train_pictures: Count | None = None
-    """Classification: pictures to retrain on, of which half become counterexamples; by default 960, 144 with
-    --quick."""
-    tables: str | None = None
-    """Classification: which of them, with commas: degradation, parameters, hyperparameters, retraining,
-    robustness, worth, realism, transfer, pixels, sizes; by default all."""
-
-    def check(self) -> None:
-        super().check()
-        further = (self.held_out, self.benign_root) != (None, None)
-        refuse(
-            self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
-        )
-        beside = f"study {self.name}"
-        if self.kept is not None:
-            for field in fields(self):
-                value, alone = getattr(self, field.name), "none beside --kept, which has the study's own settings"
-                refuse(field.name not in _AGAIN and value != field.default, option(field.name), alone, value)
-        refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
-        divided = self.split is not None and self.name == "retrain"
-        refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)
-        other = self.other_detector is not None and self.name != "attribution"
-        refuse(other, "--other-detector", "study attribution", beside)
-        climbs = self.method == "climb" and self.name != "retrain"
-        refuse(climbs, "--method", "si-fgsm or apgd; climb with study retrain alone", self.method)
-        made = self.dataset == DEMO and self.validation is not None
-        refuse(made, "--validation", "none with the embedded frames", self.validation)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Derender(Scenes, FrameCommand):
+class DerenderConfig(SceneOptions, FrameCommandConfig):
     """Take photographs apart into scenes: vehicles, their shadows, and what stood behind them."""
 
-    out: Place = None
+    out: FolderOrUrl = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     photo: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="PHOTO")] = None
     """A photograph without labels, or a folder of them: vehicles are found by a detector and placed by a small
@@ -363,7 +223,7 @@ class Derender(Scenes, FrameCommand):
     """Fit template, pose and shape to the photograph's silhouettes."""
     fast: Flag = False
     """No fit: templates stay where the labels put them. The same as --no-fit."""
-    meshes: Annotated[str, Folder()] | None = None
+    meshes: Annotated[str, ExistingFolder()] | None = None
     """A folder of vehicle meshes (OBJ, GLB, PLY) to choose from beside the templates."""
     segmenter: str | None = None
     """An ONNX file of a segmentation network that maps sky, foliage and road, instead of the shipped one."""
@@ -390,17 +250,17 @@ class Derender(Scenes, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Transfer(Asking, FrameCommand):
+class TransferConfig(DetectionOptions, FrameCommandConfig):
     """Show the counterexamples of finished runs to other detectors: whose failures are shared?"""
 
-    run: Run = None
+    run: RunFolder = None
     """Folder of a run of drivesem attack; several with commas."""
     detectors: Annotated[str | None, Required("detectors with commas")] = None
     """Detectors to ask, with commas: shipped ones, files, or other projects' (docs/detectors.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain(Trust, Regions, Bootstrap, FinishedRun, FrameCommand):
+class ExplainConfig(TrustOption, InferenceOptions, BootstrapOption, RunOption, FrameCommandConfig):
     """Say why the counterexamples of a finished run fail: which parameter, which car, and how little is enough."""
 
     frame: str | None = None
@@ -420,17 +280,17 @@ class Explain(Trust, Regions, Bootstrap, FinishedRun, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Confirm(Trust, FinishedRun, FrameCommand):
+class ConfirmConfig(TrustOption, RunOption, FrameCommandConfig):
     """Draw a run's counterexamples again by a second renderer: which failures survive it?"""
 
-    run: Run = None
+    run: RunFolder = None
     """Folder of a run of drivesem attack. Generated frames are drawn by the generator, photographs by pyrender."""
-    root: Place = None
+    root: FolderOrUrl = None
     """Folder of the run's data set, or its URL, where it is no longer where the run found it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Holes(Trust, FrameCommand):
+class HolesConfig(TrustOption, FrameCommandConfig):
     """Look around the certain failures of runs: where, and how often, does the detector lose such an object?"""
 
     runs: RunFolders = ()
@@ -443,12 +303,12 @@ class Holes(Trust, FrameCommand):
     """States of every frame in which all objects change: they say where none is lost, for rules of many."""
     recheck: Count | None = None
     """Then so many inside of each rule by seeds of their own, of a hole's stated probability: does it hold?"""
-    reach: Annotated[float, Within(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
+    reach: Annotated[float, NumberRange(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
     """How far from the counterexample, as a share of each bound's width, within the bounds."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate(Trust, Bootstrap, Tiles, FrameCommand):
+class GateConfig(TrustOption, BootstrapOption, TileOption, FrameCommandConfig):
     """Compare two detectors around certain failures of runs: exit code 1 where the new one fails more often."""
 
     runs: RunFolders = ()
@@ -457,14 +317,14 @@ class Gate(Trust, Bootstrap, Tiles, FrameCommand):
     """The detector that stands: shipped, a file, or another project's; by default the runs' own."""
     after: Annotated[str | None, Required("the detector that is to take the place of --before")] = None
     """The one that is to take its place; it has to be named."""
-    tolerance: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.05
+    tolerance: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.05
     """By how much the share of lost objects may grow, of a hole, of a kind of failure, and of all."""
     samples: Count = 32
     """States around each failure, the same for both detectors."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(Command):
+class ReportConfig(CommandConfig):
     """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
 
     runs: RunFolders = ()
@@ -476,14 +336,14 @@ class Report(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Runs(Trust, Command):
+class RunsConfig(TrustOption, CommandConfig):
     """Tell what runs there are, make one of several parts, and remove what was never finished."""
 
     what: tyro.conf.Positional[Literal["list", "show", "merge", "prune"]] = "list"
     """list: the runs in folders, by default in runs; show: what was asked for and found; merge: one run, --out, of
     parts that were made with the same settings, on several machines for instance; prune: remove what commands left
     that were killed."""
-    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FOLDER..."), Anywhere()] = ()
+    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FOLDER..."), AllowsUrl()] = ()
     """Runs of drivesem attack, or their URLs; to list, folders that hold some."""
     out: str | None = None
     """Merge: the folder of the run that is made."""
@@ -503,122 +363,7 @@ class Runs(Trust, Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plausibility(FinishedRun, Command):
-    """How common the vehicles of a run stand and are built, before and after the attack, by KITTI's labels."""
-
-    out: str | None = None
-    """Folder for the results; by default plausibility in the run's folder."""
-    limit: Count | None = None
-    """Take the first N frames."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Realism(Draws, Command):
-    """How far re-renders and counterexamples are from their photographs: PSNR, SSIM, LPIPS, FID and their kin."""
-
-    runs: RunFolders = ()
-    """Folders of runs of drivesem attack; a table each."""
-    metrics: str = "available"
-    """With commas: psnr, ssim, perceptual, lpips-alex, lpips-vgg, lpips-squeeze, frechet, frechet-mobilenet,
-    frechet-inception, fid; or available: those whose weights are on disk (docs/realism.md)."""
-    weights: Annotated[str, Folder()] | None = None
-    """A folder of weight files, looked at before torch's own cache."""
-    fetch: Flag = False
-    """Download missing weights into torch's cache, from where their publishers keep them."""
-    successes: Flag = False
-    """Only frames in which the attack succeeded."""
-    limit: Count | None = None
-    """Take the first N frames of each run."""
-    out: str | None = None
-    """Folder for the results; by default realism in the first run's folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Worth(Draws, Command):
-    """Information worth of counterexamples, and what a second or retrained detector gained (section 3)."""
-
-    runs: _RunWords = ()
-    """Folders of runs of drivesem attack against one detector; each object and as many empty places are points."""
-    second: str | None = None
-    """A second detector, or a folder of drivesem retrain: the gain is what its worth is less."""
-    table: str | None = None
-    """Instead of runs, a classifier's answers: a CSV file of label, a probability a class, and distance or realism
-    where known."""
-    after: str | None = None
-    """The same table of a second or retrained classifier."""
-    study: str | None = None
-    """Instead of runs, the folder of a finished study, such as multi, single or retrain: of each arm how real
-    its pictures are, as drivesem realism tells it, and their worth; of retrain also what its detectors gained."""
-    metrics: str = "available"
-    """With --study, as of drivesem realism."""
-    bootstrap: NotNegative | None = None
-    """With --study: draws of frames for intervals of its distances, by default 200; 0 leaves them out."""
-    distance: str | None = None
-    """What realism is counted from: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none; by default
-    lpips-alex where its weights are on disk, else perceptual (docs/realism.md)."""
-    weights: Annotated[str, Folder()] | None = None
-    """A folder of weight files of that distance, looked at before torch's own cache."""
-    base: str = "e"
-    """Base of the logarithm: e, 2, 10 or another number above 1."""
-    limit: Count | None = None
-    """Take the first N frames of each run."""
-    device: str = "cpu"
-    """torch device of the second detector: cpu, cuda, cuda:1, ..."""
-    tiles: Literal["auto", "off"] = "auto"
-    """Of a second detector in ONNX: auto looks at the whole frame and at overlapping parts of it, enlarged."""
-    out: str | None = None
-    """Folder for the results; by default worth in the first run's folder, or beside the table."""
-
-    def check(self) -> None:
-        super().check()
-        given = sum((bool(self.runs), self.table is not None, self.study is not None))
-        ways = "folders of drivesem attack, or --table, or --study"
-        refuse(given != 1, "RUN", ways, "several of them" if given else "nothing")
-        refuse(self.after is not None and self.table is None, "--after", "--table beside it", "none")
-        twice = self.second is not None and self.table is not None
-        refuse(twice, "--second", "runs (--after is a second table)", f"--table {self.table}")
-        other = self.metrics != "available" and self.study is None
-        refuse(other, "--metrics", "--study beside it (drivesem realism measures runs)", "none")
-        drawn = self.bootstrap is not None and self.study is None
-        refuse(drawn, "--bootstrap", "--study beside it (worth itself has the jackknife's intervals)", "none")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Survey(Command):
-    """A page that asks people what they see and how real it looks, as the paper did; it needs no network."""
-
-    runs: RunFolders = ()
-    """Folders of runs of drivesem attack."""
-    items: Count = 15
-    """Counterexamples that are shown, as in the paper; successes before others, drawn at random."""
-    controls: NotNegative = 0
-    """Beside them so many re-renders without any change: what people say of nothing."""
-    seed: int = 0
-    """Seed of the draw; the page itself asks everybody in an order of their own."""
-    out: str | None = None
-    """Folder for survey.html and its key; by default survey in the first run's folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurveyResults(Draws, Command):
-    """What people said: share that was named rightly, realism, agreement."""
-
-    answers: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        tyro.conf.arg(metavar="CSV..."),
-        Required("files that the page of drivesem survey saved", "CSV"),
-    ] = ()
-    """Files that the page saved."""
-    survey: Annotated[str | None, Required("the folder of drivesem survey")] = None
-    """The folder of drivesem survey, or its key."""
-    bootstrap: NotNegative | None = None
-    """Draws of people for intervals, by default 200; 0 leaves them out."""
-    out: str | None = None
-    """Folder for the results; by default results beside the key."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verify(Trust, Device, Sharing, FinishedRun, Command):
+class VerifyConfig(TrustOption, DeviceOption, WorkerOptions, RunOption, CommandConfig):
     """Is a finished run what it says it is? Every frame computed again from its files; exit code 1 where not."""
 
     out: str | None = None
@@ -630,7 +375,7 @@ class Verify(Trust, Device, Sharing, FinishedRun, Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Command):
+class RenderConfig(CommandConfig):
     """Render a scene folder as it stands."""
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
@@ -640,7 +385,7 @@ class Render(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Edit(Command):
+class EditConfig(CommandConfig):
     """Change a scene folder by physical units, and render it."""
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
@@ -665,7 +410,7 @@ class Edit(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Trust, Threshold, Tiles, Device, Command):
+class ViewConfig(TrustOption, ThresholdOption, TileOption, DeviceOption, CommandConfig):
     """Open a page on which a scene or a counterexample moves as you move it, and the detector answers."""
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE|RUN")]
@@ -677,7 +422,7 @@ class View(Trust, Threshold, Tiles, Device, Command):
     """
     budget: str = "street"
     """How far sliders go: a preset, a YAML file, or NAME=VALUE with commas, as of drivesem attack."""
-    port: Annotated[int, Within(0, 65535, expected="0 (any that is free) to 65535")] | None = None
+    port: Annotated[int, NumberRange(0, 65535, expected="0 (any that is free) to 65535")] | None = None
     """Port of 127.0.0.1 to serve the page at; by default 8321, or the next that is free."""
     browser: bool = True
     """Open the page in the browser."""
@@ -686,10 +431,10 @@ class View(Trust, Threshold, Tiles, Device, Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synth(FrameCommand):
+class SynthConfig(FrameCommandConfig):
     """Make driving frames with exact ground truth by code."""
 
-    out: Place = None
+    out: FolderOrUrl = None
     """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
     frames: Count = 10
     """How many frames; each is made in every one of --variations."""
@@ -709,7 +454,7 @@ class Synth(FrameCommand):
     them."""
     cameras: Literal[1, 2] = 1
     """2: Virtual KITTI 2's right camera too."""
-    validation: Annotated[float, Within(0, 1, "[)", "a share in [0, 1)")] = 0.0
+    validation: Annotated[float, NumberRange(0, 1, "[)", "a share in [0, 1)")] = 0.0
     """Share of the frames that make up part val, from shapes that no frame of part train shows."""
     edits: str | None = None
     """A YAML file of changes to the scenes: vehicles moved, turned, bent, painted, removed; weather; foliage."""
@@ -730,7 +475,7 @@ class Synth(FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bench(Regions, Scenes, FrameCommand):
+class BenchConfig(InferenceOptions, SceneOptions, FrameCommandConfig):
     """Measure: an attack step, the renderer, memory, detectors, attacks on known faults, a night, a cluster."""
 
     what: tyro.conf.Positional[
@@ -799,46 +544,15 @@ class Bench(Regions, Scenes, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gradcheck(Scenes, FrameCommand):
-    """Compare gradients with central differences; exit code 1 where they disagree. One scene without --limit."""
-
-    detector: str = "squeezedet"
-    """Name of a shipped detector, or a .safetensors file of one."""
-    directions: Count = 2
-    """Random directions of each parameter along which differences are taken; each costs six renders a point."""
-    min_cosine: Annotated[float, Within(-1, 1)] = 0.99
-    """Least cosine between gradient and differences."""
-    max_error: Annotated[float, Within(0, ends="(]", expected="a positive number")] = 0.05
-    """Largest relative error of the gradient."""
-    reach: Flag = False
-    """Instead: how far the gradient of each object's margin tells what 1, 4 and 16 steps of an attack do to it, by
-    parameter and distance; some minutes a frame."""
-    draws: Annotated[Count, at_least(2, "of which two halves are compared")] = 4
-    """Of --reach: draws of a camera's small changes that margins and gradients are averaged over."""
-
-    def check(self) -> None:
-        super().check()
-        for name in ("directions", "min_cosine", "max_error"):
-            value = getattr(self, name)
-            refuse(
-                self.reach and value != getattr(Gradcheck, name),
-                f"--{name.replace('_', '-')}",
-                "no --reach beside it",
-                value,
-            )
-        refuse(not self.reach and self.draws != Gradcheck.draws, "--draws", "--reach beside it", self.draws)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Eval(Tiles, Sharing, Command):
+class EvalConfig(TileOption, WorkerOptions, CommandConfig):
     """Figures of detections against labels, as COCO, KITTI or VOC define them; or of a detector on a data set."""
 
-    gt: Place = None
+    gt: FolderOrUrl = None
     """Labels: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of
     drivesem attack."""
-    pred: Place = None
+    pred: FolderOrUrl = None
     """Detections: a folder of KITTI result files (with scores), COCO results, YOLO text files, or a run."""
-    pred_b: Place = None
+    pred_b: FolderOrUrl = None
     """A second set of detections of the same frames, compared with the first by a paired test."""
     protocol: Literal["coco", "kitti", "voc"] = "coco"
     """Which benchmark's rules."""
@@ -873,7 +587,7 @@ class Eval(Tiles, Sharing, Command):
     docs/detectors.md)."""
     dataset: Annotated[str, OneOf(DATASETS)] = "kitti"
     """Of --detector: kitti, vkitti1, vkitti2, coco or yolo."""
-    root: Place = None
+    root: FolderOrUrl = None
     """Of --detector: folder of the data set, or its URL."""
     limit: Count | None = None
     """Of --detector: the first N frames."""
@@ -894,7 +608,7 @@ class Eval(Tiles, Sharing, Command):
         which = "both" if self.gt else "neither"
         refuse(given == asked, "--gt and --pred, or --detector", "one or the other", which)
         refuse(asked and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
-        sharing = next((f.name for f in fields(Sharing) if getattr(self, f.name) != f.default), None)
+        sharing = next((f.name for f in fields(WorkerOptions) if getattr(self, f.name) != f.default), None)
         alone = sharing is not None and not asked
         refuse(alone, option(sharing or ""), "--detector beside it", "none")
         nowhere = self.pictures > 0 and (not asked or self.out is None)
@@ -902,7 +616,7 @@ class Eval(Tiles, Sharing, Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Anchors(Command):
+class AnchorsConfig(CommandConfig):
     """Anchor shapes for a data set, by k-means of its boxes with 1 - IoU as the distance."""
 
     dataset: Annotated[str, OneOf(DATASETS)] = "kitti"
@@ -922,7 +636,7 @@ class Anchors(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(Tiles, Device, Command):
+class CheckConfig(TileOption, DeviceOption, CommandConfig):
     """Does a detector keep its contract? Shapes, gradient, loss, decoding; exit code 1 where it does not."""
 
     detector: str
@@ -934,7 +648,7 @@ class Check(Tiles, Device, Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Convert(Command):
+class ConvertConfig(CommandConfig):
     """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, or to FiftyOne, and say what is lost."""
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
@@ -963,10 +677,10 @@ class Convert(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Command):
+class ExportConfig(CommandConfig):
     """Hand a run's counterexamples on: as training data with moved labels, as tables, or as 3D files."""
 
-    run: Run = None
+    run: RunFolder = None
     """Folder of a run of drivesem attack; for gltf also a scene of drivesem derender, or a folder of some."""
     out: Annotated[str | None, Required("a new or empty folder"), tyro.conf.arg(aliases=["-o"])] = None
     """Folder to write, new or empty."""
@@ -984,7 +698,7 @@ class Export(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Training, FrameCommand):
+class TrainConfig(TrainingOptions, FrameCommandConfig):
     """Train a detector; killed or stopped, the same command goes on and ends with the same weights."""
 
     detector: str = "squeezedet"
@@ -1022,7 +736,7 @@ class Train(Training, FrameCommand):
     """Views a step, over all processes."""
     optimiser: Literal["adamw", "sgd"] = "adamw"
     """sgd is with --momentum."""
-    momentum: Annotated[float, Within(0, 1, "[)")] = 0.9
+    momentum: Annotated[float, NumberRange(0, 1, "[)")] = 0.9
     """Of sgd."""
     rate: Annotated[float, POSITIVE] = 1e-3
     """Peak learning rate."""
@@ -1038,20 +752,20 @@ class Train(Training, FrameCommand):
     """Of --drops."""
     clip: Annotated[float, POSITIVE] = 50.0
     """Largest norm of a step's gradient."""
-    average: Annotated[float, Within(0, 1, "[)")] = 0.998
+    average: Annotated[float, NumberRange(0, 1, "[)")] = 0.998
     """Decay a step of the moving average of the weights, which is what is judged and kept."""
-    dropout: Annotated[float, Within(0, 1, "[)")] = 0.5
+    dropout: Annotated[float, NumberRange(0, 1, "[)")] = 0.5
     """Of detectors that have dropout."""
     evaluate_every: NotNegative = 500
     """Steps between evaluations on the held-out frames; 0 is at the end only."""
     thin: Annotated[int, POSITIVE] = 1
     """Judge by every n-th held-out frame until the best weights are written."""
-    semantic: Annotated[float, Within(0, 1, "[)")] = 0.0
+    semantic: Annotated[float, NumberRange(0, 1, "[)")] = 0.0
     """Share of the views that show a frame with its vehicles moved, turned, bent and painted at random, weather
     and foliage changed, by the project's own renderer; data sets with 3D boxes."""
     loaders: NotNegative = 0
     """Threads that make views ready ahead (where a GPU trains); 0 makes them between the steps."""
-    note: Annotated[str, Anywhere()] = ""
+    note: Annotated[str, AllowsUrl()] = ""
     """A remark on this run for the model card."""
 
     def check(self) -> None:
@@ -1067,7 +781,7 @@ class Train(Training, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retrain(Trust, Training, FrameCommand):
+class RetrainConfig(TrustOption, TrainingOptions, FrameCommandConfig):
     """Train a detector on with a run's counterexamples, and attack it again. Defaults: the paper's protocol."""
 
     run: str
@@ -1078,15 +792,15 @@ class Retrain(Trust, Training, FrameCommand):
     """Folder of that data set."""
     start: str | None = None
     """First weights: a shipped detector or a .safetensors file; by default the detector that the run attacked."""
-    fraction: Share = 0.25
+    fraction: Fraction = 0.25
     """Share of the training set that are counterexamples."""
     mix: Literal["replace", "add"] = "replace"
     """Counterexamples in the place of benign frames, drawn at random, or beside all of them."""
     label_mode: Literal["paper", "moved"] = "paper"
     """Labels of counterexamples in training: the benign ones as in the paper, or moved with the cars."""
-    ramp: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.0
+    ramp: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.0
     """Share of the steps over which counterexamples come in little by little; 0: all from the first step."""
-    validation: Share = 0.25
+    validation: Fraction = 0.25
     """Share of the run's frames that are never trained on: the table's figures are of these."""
     fresh: NotNegative | None = None
     """How many of those are attacked again, against the retrained detector; by default all, 0 is none."""
@@ -1104,7 +818,7 @@ class Retrain(Trust, Training, FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Classify(FrameCommand):
+class ClassifyConfig(FrameCommandConfig):
     """Image classifiers instead of detectors: objects whose shape, pose or light changes until a network errs."""
 
     what: tyro.conf.Positional[Literal["data", "train", "attack", "confirm", "explain", "holes", "gate"]]
@@ -1122,7 +836,7 @@ class Classify(FrameCommand):
     """Holes: further ones inside of the rule that was found, of its stated probability."""
     reach: Annotated[float, POSITIVE] = 0.6
     """Holes, gate: how far pitch, yaw and roll go either way from the pose that was found, rad."""
-    tolerance: Annotated[float, Within(0, 1, expected="a share from 0 to 1")] = 0.05
+    tolerance: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.05
     """Gate: by how much the share of misclassified poses may grow, of a failure, of a class, and of all."""
     objects: str | None = None
     """Where objects come from: ShapeNetCore v2's folder, or one of meshes by class; by default 12 classes that are
@@ -1131,7 +845,7 @@ class Classify(FrameCommand):
     """Attack: whose objects."""
     views: str = "forward,top,left,right"
     """From where each object is seen, with commas."""
-    backgrounds: Annotated[str, Folder("a folder of photographs")] | None = None
+    backgrounds: Annotated[str, ExistingFolder("a folder of photographs")] | None = None
     """Photographs to put behind objects; by default pictures that are made."""
     network: str = ""
     """Attack: squeezenet, weights that classify train wrote, or an ONNX file; train: squeezenet, vgg16,
@@ -1140,7 +854,7 @@ class Classify(FrameCommand):
     weights: str | None = None
     """Train: what the network begins with, such as torchvision's file; squeezenet needs none, and with --layers
     all others begin anew where none is named."""
-    data: Annotated[str, Folder("a folder of classify data")] | None = None
+    data: Annotated[str, ExistingFolder("a folder of classify data")] | None = None
     """Train: pictures that classify data wrote; by default they are made now."""
     layers: Literal["last", "all"] = "last"
     """Train: the last layer, on features that are computed once, as in the paper; or the whole network."""
@@ -1164,7 +878,7 @@ class Classify(FrameCommand):
     highest softmax of a wrong class is kept."""
     steps: Count = 5
     """Attack: steps along the gradient; an attack ends at the first that is misclassified."""
-    queries: Annotated[Count, Of(("random", "halton"))] = 5
+    queries: Annotated[Count, ForMethods(("random", "halton"))] = 5
     """Attack: samples of each picture."""
     step_vertex: Annotated[float, POSITIVE] | None = None
     """Attack: length of a step, in object sizes; by default the paper's for VGG-16, as are the next ones."""
@@ -1178,9 +892,9 @@ class Classify(FrameCommand):
     """Attack: how far pitch, yaw and roll may go, rad; of random and halton by default 0.75."""
     within_lighting: Annotated[float, POSITIVE] | None = None
     """Attack: how far the light may go."""
-    constant: Annotated[float, Of(("scw",)), POSITIVE] = 0.1
+    constant: Annotated[float, ForMethods(("scw",)), POSITIVE] = 0.1
     """Attack: what a logit counts beside the size of the change."""
-    norm: Annotated[Literal[1, 2], Of(("scw",))] = 2
+    norm: Annotated[Literal[1, 2], ForMethods(("scw",))] = 2
     """Attack: the norm of the change that is kept small."""
     draws: Annotated[int, at_least(CERTIFYING_DRAWS, "which a certificate's rule needs")] = CERTIFYING_DRAWS
     """Attack: draws before a change and after it, in which a failure must hold to be certain: right in 15 of 16,
@@ -1218,36 +932,41 @@ class Classify(FrameCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Doctor(Command):
+class DoctorConfig(CommandConfig):
     """Say what is installed, which optional parts work, what each missing one would give, and how to get it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Presets(Command):
+class PresetsConfig(CommandConfig):
     """List the presets that --config takes by name."""
 
 
-_ALL: tuple[type[Command], ...] = (
-    *(
-        Attack,
-        Drive,
-        Transfer,
-        Study,
-        Explain,
-        Confirm,
-        Holes,
-        Gate,
-        Report,
-        Runs,
-        Plausibility,
-        Realism,
-        Worth,
-        Survey,
-        SurveyResults,
-        Verify,
-    ),
-    *(Derender, Render, Edit, View, Synth, Bench, Gradcheck, Eval, Convert, Export, Check, Anchors, Train),
-    *(Retrain, Classify, Doctor, Presets),
-)
-COMMANDS = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", command.__name__).lower(): command for command in _ALL}
-"""Commands by name, in the order in which `drivesem --help` lists them."""
+COMMANDS: dict[str, type[CommandConfig]] = {
+    "attack": AttackConfig,
+    "drive": DriveConfig,
+    "transfer": TransferConfig,
+    "explain": ExplainConfig,
+    "confirm": ConfirmConfig,
+    "holes": HolesConfig,
+    "gate": GateConfig,
+    "report": ReportConfig,
+    "runs": RunsConfig,
+    "verify": VerifyConfig,
+    "derender": DerenderConfig,
+    "render": RenderConfig,
+    "edit": EditConfig,
+    "view": ViewConfig,
+    "synth": SynthConfig,
+    "bench": BenchConfig,
+    "eval": EvalConfig,
+    "convert": ConvertConfig,
+    "export": ExportConfig,
+    "check": CheckConfig,
+    "anchors": AnchorsConfig,
+    "train": TrainConfig,
+    "retrain": RetrainConfig,
+    "classify": ClassifyConfig,
+    "doctor": DoctorConfig,
+    "presets": PresetsConfig,
+}
+"""Commands by name."""

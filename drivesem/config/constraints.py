@@ -15,7 +15,7 @@ from drivesem.config.errors import refuse
 
 
 @dataclass(frozen=True)
-class Within:
+class NumberRange:
     """A number from `low` to `high`. ends: "[" and "]" where an end belongs to it, "(" and ")" where it does not;
     expected: what an error says, where the interval itself is not plain enough.
     """
@@ -32,12 +32,12 @@ class Within:
         refuse(not (above and below), setting, self.expected or interval, value)
 
 
-def at_least(low: int, why: str = "") -> Within:
+def at_least(low: int, why: str = "") -> NumberRange:
     """A number that is not below `low`. why: what an error adds."""
-    return Within(low, expected=f"at least {low}{why and f', {why}'}")
+    return NumberRange(low, expected=f"at least {low}{why and f', {why}'}")
 
 
-POSITIVE = Within(0, ends="(]", expected="a number above 0")
+POSITIVE = NumberRange(0, ends="(]", expected="a number above 0")
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class OneOf:
 
 
 @dataclass(frozen=True)
-class Folder:
+class ExistingFolder:
     """A folder that is there. expected: what an error says."""
 
     expected: str = "a folder"
@@ -82,7 +82,7 @@ class Required:
 
 
 @dataclass(frozen=True)
-class Of:
+class ForMethods:
     """A setting that only some values of --method have: with others it keeps its default."""
 
     methods: tuple[str, ...]
@@ -92,11 +92,11 @@ class Of:
 
 
 @dataclass(frozen=True)
-class Anywhere:
+class AllowsUrl:
     """A text that may be a URL; others name what is on this machine."""
 
     def check(self, setting: str, value: Any) -> None:
         """Any will do."""
 
 
-Constraint = Within | OneOf | Folder | Parsed | Required | Of | Anywhere
+Constraint = NumberRange | OneOf | ExistingFolder | Parsed | Required | ForMethods | AllowsUrl

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from scene_ir.errors import shown
+from scene_ir.errors import make_printable
 
 _TOLD = re.compile(r"(?:(.+?): )?expected (.+?), found (.+)", re.DOTALL)
 """How errors of `detectors` tell what is wrong: where, expected, found."""
@@ -19,7 +19,9 @@ class UsageError(ValueError):
         self.field = field
         self.expected = expected
         self.actual = str(actual)
-        super().__init__(f"{shown(field)}: expected {shown(expected)}, found {shown(actual)}")
+        super().__init__(
+            f"{make_printable(field)}: expected {make_printable(expected)}, found {make_printable(actual)}"
+        )
 
     @classmethod
     def of(cls, field: str, expected: str, error: Exception) -> UsageError:

@@ -9,14 +9,13 @@ import ast
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from drivesem.config.blocks import Command, option
-from drivesem.config.commands import COMMANDS
+from drivesem.config.blocks import CommandConfig, Options, option
 
 TOPICS: dict[str, tuple[str, ...]] = {
     "Find failures": ("attack", "drive", "report", "runs"),
@@ -75,18 +74,19 @@ _OWN = "options"
 _WIDEST, _INDENT = 100, 6
 
 
-def overview() -> str:
+def overview(commands: Mapping[str, type[CommandConfig]], prog: str) -> str:
     """Commands by topic, each with a line, and examples."""
     lines = ["Find out where a driving detector breaks: semantic counterexamples by gradient.", ""]
-    lines += ["usage: drivesem COMMAND [options]; drivesem COMMAND --help lists them", ""]
+    lines += [f"usage: {prog} COMMAND [options]; {prog} COMMAND --help lists them", ""]
     width = _width()
-    for topic, names in TOPICS.items():
+    ours = prog == "drivesem"
+    for topic, names in (TOPICS if ours else {"Commands": tuple(commands)}).items():
         lines.append(topic)
         for name in names:
-            lines += _wrapped(_brief(COMMANDS[name]), width, f"  {name:<15} ", " " * 18)
+            lines += _wrapped(_brief(commands[name]), width, f"  {name:<15} ", " " * 18)
         lines.append("")
     lines.append("Examples")
-    for words, meaning in EXAMPLES:
+    for words, meaning in EXAMPLES if ours else ():
         lines += [f"  {words}", *_wrapped(meaning, width, " " * _INDENT)]
     lines += ["", "docs/commands.md tells exit codes, shell completion, and what a run holds"]
     return "\n".join(lines) + "\n"
@@ -101,22 +101,22 @@ def _wrapped(text: str, width: int, first: str = "", rest: str | None = None) ->
     return textwrap.wrap(text, width, initial_indent=first, subsequent_indent=indent)
 
 
-def _brief(kind: type[Command]) -> str:
+def _brief(kind: type[CommandConfig]) -> str:
     """The first sentence of a command's docstring, without its full stop."""
     return " ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip(".")
 
 
-def command_help(name: str) -> str:
+def command_help(name: str, commands: Mapping[str, type[CommandConfig]], prog: str) -> str:
     """Usage, what the command does, and its options in groups."""
-    kind = COMMANDS[name]
+    kind = commands[name]
     hints = get_type_hints(kind, include_extras=True)
     told = {field.name: _Told.of(field, hints[field.name], _texts(kind)) for field in fields(kind)}
     positional = [one.names for one in told.values() if one.positional]
     positional += ["RUN"] if "run" in told else []
-    usage = " ".join(["usage: drivesem", name, *positional, "[options]"])
+    usage = " ".join([f"usage: {prog}", name, *positional, "[options]"])
     width = _width()
     lines = [usage, "", *_wrapped(" ".join((kind.__doc__ or "").split()), width), ""]
-    for title, group in grouped(name):
+    for title, group in grouped(kind):
         lines.append(f"{title}:")
         for one in (told[field] for field in group):
             lines += [f"  {one.names}", *_wrapped(one.text, width, " " * _INDENT)]
@@ -125,9 +125,9 @@ def command_help(name: str) -> str:
     return "\n".join([*lines, *_wrapped(config, width)]) + "\n"
 
 
-def grouped(name: str) -> list[tuple[str, tuple[str, ...]]]:
+def grouped(kind: type[CommandConfig]) -> list[tuple[str, tuple[str, ...]]]:
     """The fields of a command by the title of their group, each once, in the order of the groups."""
-    own = [field.name for field in fields(COMMANDS[name])]
+    own = [field.name for field in fields(kind) if str(field.type) != "CommandName"]
     shared = {field for group in GROUPS.values() for field in group}
     groups = [(_OWN, tuple(field for field in own if field not in shared))]
     groups += [(title, tuple(field for field in group if field in own)) for title, group in GROUPS.items()]
@@ -187,11 +187,11 @@ def _value(hint: Any) -> str:
     return {int: "N", float: "NUMBER"}.get(kind, "TEXT")
 
 
-def _texts(kind: type[Command]) -> dict[str, str]:
+def _texts(kind: type[CommandConfig]) -> dict[str, str]:
     """The docstrings of a command's fields: of a field that is declared twice, its own."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
-        if base.__module__.startswith("drivesem."):
+        if issubclass(base, Options):
             texts |= _written(base.__module__).get(base.__name__, {})
     return texts
 

@@ -8,14 +8,14 @@ import io
 import math
 import re
 import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import Field, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import tyro
 
-from drivesem.config.blocks import Command, option
+from drivesem.config.blocks import CommandConfig, option
 from drivesem.config.commands import COMMANDS
 from drivesem.config.errors import UsageError
 from drivesem.config.help import command_help, overview
@@ -23,69 +23,82 @@ from drivesem.config.presets import preset_path, presets
 from drivesem.version import __version__
 from scene_ir.errors import FormatError
 
-_DESCRIPTION = "Find out where a driving detector breaks: semantic counterexamples by gradient."
-_ANY = f"one of {', '.join(COMMANDS)} (drivesem alone says what each does)"
 _HELP = ("--help", "-h")
 _FOR = "for"
 """Key of a preset: the commands that it is for. A setting that only some of them have is left out for others."""
 
 
-def parse(argv: Sequence[str]) -> Command:
-    """The settings that `argv` asks for. Raises UsageError; SystemExit(0) after `--help` and `--version`."""
+Commands = Mapping[str, type[CommandConfig]]
+
+
+def parse(argv: Sequence[str], commands: Commands = COMMANDS, prog: str = "drivesem") -> CommandConfig:
+    """The settings that `argv` gives.
+
+    Args:
+        argv: Words of the command line, without the program's name.
+        commands: Settings classes by command name.
+        prog: The program's name, for help and errors.
+
+    Raises:
+        UsageError: For an unknown command or option, or a bad value.
+        SystemExit: With code 0 after `--help` and `--version`.
+    """
     words = list(argv)
     if not words or words[0] in _HELP:
-        sys.stdout.write(overview())
+        sys.stdout.write(overview(commands, prog))
         raise SystemExit(0)
     if words[0] == "--version":
-        sys.stdout.write(f"drivesem {__version__}\n")
+        sys.stdout.write(f"{prog} {__version__}\n")
         raise SystemExit(0)
-    if words[0] in COMMANDS and any(word in _HELP for word in words[1:]):
-        sys.stdout.write(command_help(words[0]))
+    if words[0] in commands and any(word in _HELP for word in words[1:]):
+        sys.stdout.write(command_help(words[0], commands, prog))
         raise SystemExit(0)
-    if words[0] in COMMANDS:
-        words = [words[0], *_with_presets(words[0], _with_run(words[0], words[1:]))]
+    if words[0] in commands:
+        words = [words[0], *_with_presets(words[0], _with_run(words[0], words[1:], commands), commands)]
     elif not words[0].startswith("-"):
-        raise UsageError("command", _ANY, _meant(words[0], COMMANDS))
+        raise UsageError("command", f"one of {', '.join(commands)} ({prog} --help describes them)", _meant(words[0], commands))
     captured = io.StringIO()
     try:
         with contextlib.redirect_stderr(captured):
-            config: Command = tyro.extras.subcommand_cli_from_dict(  # pyright: ignore[reportAssignmentType]
-                COMMANDS, prog="drivesem", description=_DESCRIPTION, args=words
+            config: CommandConfig = tyro.extras.subcommand_cli_from_dict(  # pyright: ignore[reportAssignmentType]
+                dict(commands), prog=prog, args=words
             )
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        _refuse_unknown(words)
-        raise _refused(words[0], _unboxed(captured.getvalue())) from None
+        _refuse_unknown(words, commands, prog)
+        raise _refused(f"{prog} {words[0]}", _unboxed(captured.getvalue())) from None
+    named = {field.name: words[0] for field in fields(config) if str(field.type) == "CommandName"}
+    config = replace(config, **named)
     config.check()
     return config
 
 
-def _refuse_unknown(words: Sequence[str]) -> None:
+def _refuse_unknown(words: Sequence[str], commands: Commands, prog: str) -> None:
     """Raises UsageError for the first option that the command does not have."""
-    if words[0] not in COMMANDS:
+    if words[0] not in commands:
         return
-    settings = fields(COMMANDS[words[0]])
+    settings = fields(commands[words[0]])
     known = {"--help", *(option(field.name) for field in settings)}
     known |= {option(f"no-{field.name}") for field in settings if str(field.type) == "bool"}
-    known |= _aliases(words[0])
+    known |= _aliases(commands[words[0]])
     for word in words[1:]:
         name = word.partition("=")[0]
         if name.startswith("--") and name.replace("_", "-") not in known:
-            expected = f"an option of drivesem {words[0]} (its --help lists them)"
+            expected = f"an option of {prog} {words[0]} (its --help lists them)"
             raise UsageError("command line", expected, _meant(name, known))
 
 
-def _aliases(command: str) -> set[str]:
+def _aliases(command: type[CommandConfig]) -> set[str]:
     """Other names of a command's options."""
-    kinds = get_type_hints(COMMANDS[command], include_extras=True).values()
+    kinds = get_type_hints(command, include_extras=True).values()
     markers = (marker for kind in kinds for marker in getattr(kind, "__metadata__", ()))
     return {name for marker in markers for name in getattr(marker, "aliases", None) or ()}
 
 
-def _positional(command: str) -> set[str]:
+def _positional(command: type[CommandConfig]) -> set[str]:
     """Settings of a command that are words without an option."""
-    kinds = get_type_hints(COMMANDS[command], include_extras=True)
+    kinds = get_type_hints(command, include_extras=True)
     return {name for name, kind in kinds.items() if "Positional" in repr(getattr(kind, "__metadata__", ()))}
 
 
@@ -97,11 +110,11 @@ def _refused(command: str, text: str) -> UsageError:
         return UsageError(choice[2], f"one of {', '.join(known)}", _meant(choice[1], known))
     stray = re.search(r"Unrecognized options: (.*)", text)
     if stray is not None:
-        return UsageError("command line", f"options of drivesem {command} (its --help lists them)", stray[1])
-    missing = re.search(r"Required options.*? Missing from drivesem \S+: (\{[^}]*\}|[^\s,]+)", text)
+        return UsageError("command line", f"options of {command} (its --help lists them)", stray[1])
+    missing = re.search(r"Required options.*? Missing from .*?: (\{[^}]*\}|[^\s,]+)", text)
     if missing is not None:
-        return UsageError(missing[1], f"a value (drivesem {command} --help says which)", "none")
-    return UsageError("command line", "known options (see drivesem --help)", text)
+        return UsageError(missing[1], f"a value ({command} --help says which)", "none")
+    return UsageError("command line", "known options (its --help lists them)", text)
 
 
 def _meant(word: str, known: Iterable[str]) -> str:
@@ -110,15 +123,15 @@ def _meant(word: str, known: Iterable[str]) -> str:
     return f"{word}; did you mean {near[0]}?" if near else word
 
 
-def _with_run(command: str, words: list[str]) -> list[str]:
+def _with_run(command: str, words: list[str], commands: Commands) -> list[str]:
     """The run that a question is asked of may stand first, without its option's name."""
-    takes_runs = any(field.name == "run" for field in fields(COMMANDS[command]))
+    takes_runs = any(field.name == "run" for field in fields(commands[command]))
     if takes_runs and words and not words[0].startswith("-"):
         return [f"{option('run')}={words[0]}", *words[1:]]
     return words
 
 
-def _with_presets(command: str, words: list[str]) -> list[str]:
+def _with_presets(command: str, words: list[str], commands: Commands) -> list[str]:
     """Replace `--config FILE` by the file's settings, in front, so that the command line wins."""
     named: list[str] = []
     rest: list[str] = []
@@ -129,7 +142,7 @@ def _with_presets(command: str, words: list[str]) -> list[str]:
             path = path if equals or not left else left.pop(0)
             if not path:
                 raise UsageError("--config", _presets_for(command), "nothing")
-            named += preset_words(path, command)
+            named += preset_words(path, command, commands)
         else:
             rest.append(f"{word}{equals}{path}")
     return named + rest
@@ -143,7 +156,7 @@ def _unboxed(text: str) -> str:
     return " ".join(message.split()) or "an unknown command"
 
 
-def preset_words(path: str, command: str) -> list[str]:
+def preset_words(path: str, command: str, commands: Commands = COMMANDS) -> list[str]:
     """The settings of a YAML preset as command-line words, so that both are checked by one parser.
 
     Raises UsageError naming the file, and the key where there is one.
@@ -153,19 +166,19 @@ def preset_words(path: str, command: str) -> list[str]:
         raise UsageError("--config", _presets_for(command), _meant(given, _names_for(command)))
     loaded = _mapping(path)
     wanted = loaded.pop(_FOR, command)
-    commands = wanted if isinstance(wanted, list) else [wanted]
-    if not all(name in list(COMMANDS) for name in commands):
+    wanted_by = wanted if isinstance(wanted, list) else [wanted]
+    if not all(name in {*COMMANDS, *commands} for name in wanted_by):
         raise UsageError(f"{path}: {_FOR}", f"commands: {', '.join(COMMANDS)}", repr(wanted))
-    if command not in commands:
-        raise UsageError(path, f"a preset for drivesem {command}", f"one for {', '.join(commands)}")
-    own = {field.name: field for field in fields(COMMANDS[command])}
-    known = dict.fromkeys([*own, *(field.name for name in commands for field in fields(COMMANDS[name]))])
+    if command not in wanted_by:
+        raise UsageError(path, f"a preset for drivesem {command}", f"one for {', '.join(wanted_by)}")
+    own = {field.name: field for field in fields(commands[command])}
+    known = dict.fromkeys([*own, *(field.name for name in wanted_by for field in fields((dict(COMMANDS) | dict(commands))[name]))])
     words: list[str] = []
     for key, value in loaded.items():
         name = str(key).replace("-", "_")
         if name not in known:
             raise UsageError(f"{path}: {key}", f"one of {', '.join(known)}", "an unknown key")
-        if name in own and name not in _positional(command):
+        if name in own and name not in _positional(commands[command]):
             words += _words(path, own[name], value)
         elif name in own and value not in (None, []):
             raise UsageError(f"{path}: {key}", "nothing: it stands on the command line, without an option", value)

@@ -8,10 +8,10 @@ from collections.abc import Collection
 
 import yaml
 
-from drivesem.config.blocks import Command, Options, option
+from drivesem.config.blocks import CommandConfig, Options, option
 
 
-def command_line(command: str, config: Command, presentation: Collection[str] = ()) -> str:
+def command_line(command: str, config: CommandConfig, presentation: Collection[str] = ()) -> str:
     """The command line that gives this configuration, without the settings named in `presentation`."""
     words = ["drivesem", command]
     for setting in dataclasses.fields(config):

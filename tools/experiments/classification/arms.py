@@ -11,12 +11,13 @@ from typing import Any
 from drivesem.classify.attack import WRITTEN, Attacker, frames_of
 from drivesem.classify.pictures import Shown
 from drivesem.classify.results import ClassifiedFrame
-from drivesem.config.commands import Classify, Study
+from drivesem.config.commands import ClassifyConfig
 from drivesem.config.presets import presets
-from drivesem.run.ask import Bar, ask
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import ARMS, FRAMES, SHARING, claim
 from drivesem.run.frame import RESULT
 from scene_ir import files
+from tools.experiments.settings import StudyConfig
 
 GRADIENT = ("si-fgsm", "sgd", "scw")
 _SAMPLES: dict[str, dict[str, Any]] = {
@@ -41,7 +42,7 @@ NAMES = {
 class Arm:
     """One attack. config: its settings, with its folder; shown: its pictures."""
 
-    config: Classify
+    config: ClassifyConfig
     shown: tuple[Shown, ...]
 
     @property
@@ -62,10 +63,10 @@ def preset(network: str, strategy: str) -> Mapping[str, Any]:
     return {key: value for key, value in settings.items() if key != "for"}
 
 
-def attack_of(study: Study, out: Path, name: str, network: str, **settings: Any) -> Classify:
+def attack_of(study: StudyConfig, out: Path, name: str, network: str, **settings: Any) -> ClassifyConfig:
     """The settings of an arm. network: the shipped one's name, or a file."""
     shared = {one: getattr(study, one) for one in ("objects", "backgrounds", "seed", "device", *SHARING)}
-    config = Classify(what="attack", out=str(out / ARMS / name), network=network, grade=False, **shared)
+    config = ClassifyConfig(what="attack", out=str(out / ARMS / name), network=network, grade=False, **shared)
     return replace(config, **settings)
 
 
@@ -86,7 +87,7 @@ class _Attackers:
         self._kept[place].attack(shown, arm.out)
 
 
-def run_arms(arms: Sequence[Arm], study: Study, title: str) -> dict[str, str]:
+def run_arms(arms: Sequence[Arm], study: StudyConfig, title: str) -> dict[str, str]:
     """Attack all pictures of all arms, as far as that is not done: those that could not be, and why.
 
     Raises UsageError or SceneError.
@@ -100,4 +101,6 @@ def run_arms(arms: Sequence[Arm], study: Study, title: str) -> dict[str, str]:
         if not (arm.out / FRAMES / one.identifier / RESULT).is_file()
     ]
     build = partial(_Attackers, tuple(arms))
-    return ask(jobs, build(), build, study, Bar(title, remaining=True), lambda job: job[1].identifier).failed
+    return run_frame_jobs(
+        jobs, build(), build, study, ProgressSettings(title, show_remaining=True), lambda job: job[1].identifier
+    ).failed

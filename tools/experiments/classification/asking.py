@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from drivesem.config.commands import Study
-from drivesem.report.answer import Answer
+from drivesem.report.tables import AnalysisReport
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
 from tools.experiments.classification.kept import keep_results, load_results
 from tools.experiments.classification.lab import PICTURES, TABLES, Lab
@@ -14,6 +13,7 @@ from tools.experiments.classification.looking import LOOKED
 from tools.experiments.classification.results import Facts, Results
 from tools.experiments.classification.tables import ORDERS, tables_of
 from tools.experiments.detection.kept_rows import KEPT, command_of
+from tools.experiments.settings import StudyConfig
 
 _WRITTEN = (
     *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
@@ -34,7 +34,7 @@ _NOTE = (
 )
 
 
-def study_run(study: Study) -> Answer:
+def study_run(study: StudyConfig) -> AnalysisReport:
     """Run or continue it, and write what is said; tell one that was kept, and write it where --out is given.
 
     Raises UsageError or SceneError for bad input.
@@ -52,7 +52,7 @@ def study_run(study: Study) -> Answer:
     return answer
 
 
-def _again(study: Study, folder: Path) -> Answer:
+def _again(study: StudyConfig, folder: Path) -> AnalysisReport:
     results = load_results(folder)
     if study.bootstrap is not None:
         told = replace(results.facts.study, bootstrap=study.bootstrap)
@@ -63,9 +63,9 @@ def _again(study: Study, folder: Path) -> Answer:
     return answer
 
 
-def _answer(results: Results, out: Path) -> Answer:
+def _answer(results: Results, out: Path) -> AnalysisReport:
     found, facts = tables_of(results), results.facts
-    return Answer(
+    return AnalysisReport(
         out=out,
         name="study",
         heading="Image classifiers",
@@ -81,11 +81,11 @@ def _answer(results: Results, out: Path) -> Answer:
             },
             "frames_failed": facts.failed,
         },
-        tables={one.name: one.rows for one in found if one.rows},
-        sheets=[one.sheet() for one in found],
+        csv_tables={one.name: one.rows for one in found if one.rows},
+        tables=[one.sheet() for one in found],
         notes=[_NOTE.format(draws=results.drawing.draws), *(note for one in found for note in one.notes)],
-        words=_WORDS,
-        printed=[one.sheet(classes=False) for one in found if one.name != ORDERS],
-        lead=[f"`{command_of(facts.study)}`", ""],
+        text_columns=_WORDS,
+        printed_tables=[one.sheet(classes=False) for one in found if one.name != ORDERS],
+        intro=[f"`{command_of(facts.study)}`", ""],
         failed=facts.failed,
     )

@@ -120,7 +120,7 @@ def keep_results(folder: Path, results: Results) -> None:
         for place, row in enumerate(rows.tolist())
     )
     sets = (SetRow(*key, distance) for key, distance in results.sets.items())
-    with files.whole_folder(folder) as into:
+    with files.atomic_folder(folder) as into:
         files.write_json(into / STUDY, {"schema": _SCHEMA, "facts": facts, "certain": certain})
         write_rows(into / _ANSWERS, AnswersRow, answers)
         write_rows(into / _DISTANCES, DistanceRow, distances)

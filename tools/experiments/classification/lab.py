@@ -17,14 +17,14 @@ from torch import Tensor
 from drivesem.analysis.transfer.asking import words
 from drivesem.classify.attack import report_run
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.networks.loading import load_classifier, ready, save_classifier
+from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import ObjectSet, Split
 from drivesem.classify.paper import NETWORKS
 from drivesem.classify.pictures import Shown, Studio, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.training import embedded, fit_last
-from drivesem.config.commands import Classify, Study
+from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.run.folder import FRAMES, RETRAINED, folder_of
 from scene_ir import files
@@ -34,6 +34,7 @@ from tools.experiments.classification.figures import keeping_shares
 from tools.experiments.classification.looking import LOOKED, Eyes, apart, kept
 from tools.experiments.realism.asking import AVAILABLE, chosen
 from tools.experiments.realism.measures import load
+from tools.experiments.settings import StudyConfig
 from tools.experiments.worth.measures import Floats
 
 PICTURES = "pictures"
@@ -64,7 +65,7 @@ class Lab:
     what they are for; failed: pictures that could not be used, and why.
     """
 
-    study: Study
+    study: StudyConfig
     out: Path
     objects: ObjectSet
     eyes: tuple[Eyes, ...]
@@ -76,7 +77,7 @@ class Lab:
     failed: dict[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
-    def of(cls, study: Study) -> Lab:
+    def of(cls, study: StudyConfig) -> Lab:
         """Raises UsageError or SceneError for settings, objects or networks that cannot be used."""
         wanted = tuple(words(study.tables)) if study.tables is not None else TABLES
         if not wanted or not set(wanted) <= set(TABLES):
@@ -288,7 +289,7 @@ def _some(objects: ObjectSet, split: Split, size: int, seed: int) -> tuple[Shown
     return tuple(every[place] for place in keeping_shares(labels, size, np.random.default_rng(seed)))
 
 
-def _eyes_of(study: Study, classes: tuple[str, ...], out: Path) -> tuple[Eyes, ...]:
+def _eyes_of(study: StudyConfig, classes: tuple[str, ...], out: Path) -> tuple[Eyes, ...]:
     specs = words(study.networks)
     names = [Path(spec).stem for spec in specs]
     if not specs or len(set(names)) < len(names):
@@ -311,11 +312,11 @@ def retrained(
     if not path.is_file():
         learner = copy.deepcopy(network)
         learner.last.requires_grad_(True)
-        config = Classify(what="train", epochs=EPOCHS, layers="last")
+        config = ClassifyConfig(what="train", epochs=EPOCHS, layers="last")
         truth = labels.to(device)
         known, labelled = {"train": features, "val": features}, {"train": truth, "val": truth}
         fit_last(learner, known, labelled, config, torch.Generator().manual_seed(seed), onward=True)
-        save_classifier(ready(learner, device), path, {"trained_on": str(len(labels))})
+        save_classifier(prepare_for_inference(learner, device), path, {"trained_on": str(len(labels))})
     return load_classifier(str(path), network.classes, device)
 
 

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.training import embedded
-from drivesem.report.progress import training_bar
-from drivesem.report.terminal import Console
-from drivesem.run.looking import weights_digest
+from drivesem.report.terminal import Console, training_bar
+from drivesem.run.detection_cache import weights_digest
 from scene_ir import files
 from tools.experiments.realism.comparison import Measures
 from tools.experiments.realism.frechet import Gaussian, frechet

@@ -12,7 +12,6 @@ from typing import TypeVar
 import numpy as np
 
 from drivesem.classify.objects.types import SPLITS
-from drivesem.config.commands import Study
 from drivesem.evaluation.resampling import DRAWS
 from scene_ir.errors import FormatError
 from tools.experiments.classification import pixels
@@ -21,6 +20,7 @@ from tools.experiments.classification.figures import Answers, Drawing
 from tools.experiments.classification.lab import BENIGN, LEARNT, Lab
 from tools.experiments.classification.looking import between
 from tools.experiments.realism.measures import METRICS, missing, psnr_db
+from tools.experiments.settings import StudyConfig
 from tools.experiments.worth.measures import Floats, Points, classified
 from tools.experiments.worth.runs import PREFERRED
 
@@ -50,7 +50,7 @@ class Facts:
     failed: pictures that could not be used, and why.
     """
 
-    study: Study
+    study: StudyConfig
     classes: tuple[str, ...]
     networks: tuple[Network, ...]
     tables: tuple[str, ...]
@@ -65,7 +65,7 @@ class Facts:
     failed: dict[str, str]
 
     @classmethod
-    def of(cls, study: Study, lab: Lab) -> Facts:
+    def of(cls, study: StudyConfig, lab: Lab) -> Facts:
         """Of a study whose attacks and networks are done. study: its settings, as they were typed."""
         deep = [eyes.name for eyes in lab.deep]
 

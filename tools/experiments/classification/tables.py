@@ -12,7 +12,7 @@ import numpy as np
 from drivesem.classify.objects.types import CLASSES, SPLITS
 from drivesem.classify.paper import NETWORKS, REMARKS, figures
 from drivesem.evaluation.resampling import Interval
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import ReportTable
 from tools.experiments.classification import pixels
 from tools.experiments.classification.arms import GRADIENT, NAMES, STRATEGIES, preset
 from tools.experiments.classification.figures import Answers, verdict
@@ -63,11 +63,13 @@ class Table:
     orders: Sequence[Row] = ()
     plain: bool = False
 
-    def sheet(self, classes: bool = True) -> Sheet:
+    def sheet(self, classes: bool = True) -> ReportTable:
         """For people. classes: whether each class has its column."""
         columns = [name for name in self.columns if classes or name not in CLASSES]
         lines = [tuple(self._cell(row, name) for name in columns) for row in (*self.rows, *self.reference)]
-        return Sheet(self.title, tuple(_HEADS.get(name, NAMES.get(name, name)) for name in columns), tuple(lines))
+        return ReportTable(
+            self.title, tuple(_HEADS.get(name, NAMES.get(name, name)) for name in columns), tuple(lines)
+        )
 
     def _cell(self, row: Row, name: str) -> str:
         value = row.get(name)

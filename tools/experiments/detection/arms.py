@@ -1,219 +1,286 @@
-"""What each study compares: arms, their controls, and the paper's figures."""
+"""The arms of each study: attacks and their controls on the same frames, run or continued frame by frame."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from drivesem.analysis.transfer.asking import detector_names, short_names
 from drivesem.attack.methods.base import GRADIENT_PASSES
 from drivesem.attack.space import SIX, Parameter
-from drivesem.config.blocks import Attacking, Grading, Sharing, shared
-from drivesem.config.commands import COMBO_NUMBERS, DEFAULT_COMBO, Attack, Study
+from drivesem.attack.targets import JudgedClasses
+from drivesem.config.blocks import GradingOptions, SceneAttackOptions, WorkerOptions, shared_options
+from drivesem.config.commands import COMBO_NUMBERS, DEFAULT_COMBO, AttackConfig
 from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
+from drivesem.run.attack import WRITTEN, Worker, attack_frames, select_frames
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
+from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, claim
+from drivesem.run.frame import RESULT
 from drivesem.run.protocol import PROTOCOL, follows_paper
+from drivesem.run.results import FrameResult, RunSummary, load_frame
+from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
 from scene_ir.errors import FormatError
+from tools.experiments.settings import StudyConfig
 
-QUICK_FRAMES, FRAMES = 6, 200
-"""Frames of a study with --quick, and without."""
-DRAWS = 1000
-"""Of frames, for a study's intervals."""
-RANDOM, PLACEBO = "random", "placebo"
-"""Controls: the best of as many random samples as the attack takes steps, of the box that those steps reach; and
-one random edit as large as the attack's own."""
-SEEDS = 3
-"""Of random numbers, for each control of a full study."""
-PAPERS = "paper's protocol"
-_LONGER = 4
-"""Steps of Auto-PGD in the study `multi`, in multiples of --steps: enough for its own steps to grow short."""
-FIGURES = "study.json"
-"""A study's figures, in its folder."""
-SEARCHES = ("climb", "corners", "si-fgsm", "apgd", "halton", "cma-es")
-"""Methods of the study `searches`; the placebo is as large as what the first finds."""
-_FAR = 2
-"""Steps of the study `steps`, in multiples of --steps: far enough to see where more are of no use."""
+PLACEBO, RANDOM = "placebo", "random"
+"""Controls: one random edit as large as the attack's own; and the best of as many random samples as the attack
+takes steps, from the box that those steps can reach."""
+PAPER_PROTOCOL = "paper's protocol"
+STUDY_JSON = "study.json"
+"""A study's metrics, in its folder."""
+SEARCH_METHODS = ("climb", "corners", "si-fgsm", "apgd", "halton", "cma-es")
+"""Methods of the study `searches`; the placebo is as large as the edits of the first."""
+_QUICK_FRAMES, _FRAMES = 6, 200
+_DRAWS = 1000
+_CONTROL_SEEDS = 3
+_APGD_FACTOR = 4
+"""Steps of Auto-PGD, in multiples of --steps: enough for its step size to shrink."""
+_STEPS_FACTOR = 2
+"""Steps of the study `steps`, in multiples of --steps: enough to see where more are of no use."""
+_FREE_SETTINGS = (*PRESENTATION, "like")
+"""Settings of an arm that may differ when a study is continued: its folder may have moved."""
 
 
 @dataclass(frozen=True, slots=True)
-class Arm:
-    """One attack on all frames. folder: of its run; reference: the paper's mAP after it, a fraction; control:
-    RANDOM or PLACEBO where it stands beside the arm named `of`.
-    """
+class AttackArm:
+    """One attack on all frames of a study."""
 
     name: str
+    """Name in tables."""
     folder: str
-    config: Attack
+    """Folder of its run, inside `arms`."""
+    config: AttackConfig
+    """Settings of the attack."""
     reference: float | None = None
+    """The paper's mAP after this attack, a fraction."""
     control: str | None = None
-    of: str | None = None
+    """RANDOM or PLACEBO, of a control."""
+    control_of: str | None = None
+    """Name of the arm that a control belongs to."""
 
 
-def attack_of(study: Study) -> Attack:
-    """The attack that a study's arms vary."""
-    limit = study.limit or (QUICK_FRAMES if study.quick else FRAMES)
-    alike = shared(study, Attacking) | shared(study, Grading) | shared(study, Sharing)
-    # A study that confirms asks `drivesem confirm` of its arms; what is certain is confirmed anyway.
-    return Attack(**alike | {"limit": limit, "method": study.method, "confirm": Attack.confirm})
+@dataclass(frozen=True, slots=True)
+class ArmRun:
+    """The finished run of an arm."""
+
+    arm: AttackArm
+    """The arm."""
+    summary: RunSummary
+    """Totals of its run."""
+    results: tuple[FrameResult, ...]
+    """Results of the frames that all arms have, in the same order."""
+    judged: JudgedClasses
+    """Classes of its detector that count."""
 
 
-def draws_of(study: Study) -> int:
-    """Of frames, for intervals."""
-    return DRAWS if study.bootstrap is None else study.bootstrap
+@dataclass(frozen=True, slots=True)
+class StudyArms:
+    """The finished runs of all arms."""
+
+    runs: tuple[ArmRun, ...]
+    """One run for each arm."""
+    without_vehicles: int
+    """Frames skipped for lack of vehicles."""
+    failed: dict[str, str]
+    """Reason by frame that could not be used."""
 
 
-def arms_of(study: Study, out: Path) -> list[Arm]:
-    """The arms of a study that writes into `out`; a placebo comes after the arm whose size it takes."""
-    base = attack_of(study)
-    if study.name in ("single", "multi"):
-        ours = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in SIX]
-        if study.name == "multi":
-            ours = [_combo(base, number) for number in COMBO_NUMBERS]
-        arms = [*ours, *(_papers(ours) if _has_papers(study) else [])]
-        if study.name == "multi" and study.method == "si-fgsm":
-            longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_LONGER * study.steps)
-            arms.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
-        seeds = study.seeds or (1 if study.quick else SEEDS)
-        return _controlled(arms, out, seeds=seeds) if study.controls else arms
-    if study.name == "grades":
-        return _grades(base, out)
-    if study.name == "searches":
-        return _searches(base, study, out)
-    if study.name == "samples":
-        return _samples(replace(base, combo=DEFAULT_COMBO), study)
-    if study.name == "transfer":
-        sources = _sources(base, study)
-        return _controlled(sources, out, (PLACEBO,)) if study.controls else sources
-    if study.name == "steps":
-        steps = _FAR * study.steps
-        far = replace(base, combo=DEFAULT_COMBO, method="si-fgsm", steps=steps, early_stop=True)
-        rates = (0.5, 1.0, 2.0) if study.quick else (0.25, 0.5, 1.0, 2.0, 4.0)
-        return [_arm(f"rate {rate:g}", replace(far, rate=rate)) for rate in rates]
-    return _labels(base, study.quick)
+@dataclass(frozen=True, slots=True)
+class AttackTotals:
+    """Totals over the attacks of a study."""
+
+    frames: int
+    """Frames that all arms have."""
+    pictures: int
+    """Attacked pictures of all arms."""
+    feasible: int
+    """Attacked pictures that pass the independent feasibility check."""
+    without_vehicles: int
+    """Frames skipped for lack of vehicles."""
+    failed: dict[str, str]
+    """Reason by frame that could not be used."""
+
+    @classmethod
+    def from_arms(cls, arms: StudyArms) -> AttackTotals:
+        """Count the results of finished arms."""
+        feasible = [result.feasible for run in arms.runs for result in run.results]
+        frames = len(arms.runs[0].results)
+        return cls(frames, len(feasible), sum(feasible), arms.without_vehicles, arms.failed)
 
 
-def _arm(name: str, config: Attack, reference: float | None = None) -> Arm:
-    """reference: the paper's figure; it stands beside the paper's own protocol only."""
-    return Arm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference if follows_paper(config) else None)
+def feasible_share(*attacks: AttackTotals) -> float | None:
+    """Share of attacked pictures that are feasible, a fraction; None without pictures."""
+    pictures = sum(one.pictures for one in attacks)
+    return sum(one.feasible for one in attacks) / pictures if pictures else None
 
 
-def _combo(base: Attack, number: int) -> Arm:
+def base_attack(study: StudyConfig) -> AttackConfig:
+    """The attack that the arms of a study vary."""
+    limit = study.limit or (_QUICK_FRAMES if study.quick else _FRAMES)
+    common: dict[str, Any] = {}
+    for block in (SceneAttackOptions, GradingOptions, WorkerOptions):
+        common |= shared_options(study, block)
+    # --confirm of a study re-tests whole arms; certain failures are confirmed in any case.
+    return AttackConfig(**common | {"limit": limit, "method": study.method, "confirm": AttackConfig.confirm})
+
+
+def bootstrap_draws(study: StudyConfig) -> int:
+    """Bootstrap draws of frames for intervals."""
+    return _DRAWS if study.bootstrap is None else study.bootstrap
+
+
+def build_arms(study: StudyConfig, out: Path) -> list[AttackArm]:
+    """The arms of a study that writes into `out`; a placebo follows the arm whose edits it matches in size."""
+    base = base_attack(study)
+    combo = replace(base, combo=DEFAULT_COMBO)
+    match study.name:
+        case "single" | "multi":
+            return _paper_arms(base, study, out)
+        case "grades":
+            return _grade_arms(base, out)
+        case "searches":
+            return _search_arms(base, study, out)
+        case "samples":
+            return _sample_arms(combo, study)
+        case "transfer":
+            sources = _source_arms(base, study)
+            return _add_controls(sources, out, (PLACEBO,)) if study.controls else sources
+        case "steps":
+            config = replace(combo, method="si-fgsm", steps=_STEPS_FACTOR * study.steps, early_stop=True)
+            rates = (0.5, 1.0, 2.0) if study.quick else (0.25, 0.5, 1.0, 2.0, 4.0)
+            return [_arm(f"rate {rate:g}", replace(config, rate=rate)) for rate in rates]
+        case _:
+            return _label_arms(base, study.quick)
+
+
+def _arm(name: str, config: AttackConfig, reference: float | None = None) -> AttackArm:
+    """An arm; the paper's number stands only next to the paper's own protocol."""
+    return AttackArm(name, re.sub(r"[^a-z0-9.]+", "-", name), config, reference if follows_paper(config) else None)
+
+
+def _combo_arm(base: AttackConfig, number: int) -> AttackArm:
     return _arm(f"combo {number}", replace(base, combo=number), PAPER_COMBOS[number])
 
 
-def _has_papers(study: Study) -> bool:
-    """Whether the paper's protocol can stand beside: its loss is that of this project's own architectures."""
-    elsewhere = ":" in study.detector or study.detector.endswith(".onnx")
-    return study.paper_protocol and not elsewhere and not follows_paper(attack_of(study))
+def _paper_arms(base: AttackConfig, study: StudyConfig, out: Path) -> list[AttackArm]:
+    """The six parameters or the four combinations, by our protocol and by the paper's, with controls."""
+    ours = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in SIX]
+    if study.name == "multi":
+        ours = [_combo_arm(base, number) for number in COMBO_NUMBERS]
+    arms = list(ours)
+    # the paper's loss exists for this project's own architectures only
+    foreign = ":" in study.detector or study.detector.endswith(".onnx")
+    if study.paper_protocol and not foreign and not follows_paper(base):
+        protocol: dict[str, Any] = PROTOCOL
+        references = {f"combo {number}": value for number, value in PAPER_COMBOS.items()} | PAPER_SINGLE
+        arms += [
+            _arm(f"{arm.name}, {PAPER_PROTOCOL}", replace(arm.config, **protocol), references[arm.name])
+            for arm in ours
+        ]
+    if study.name == "multi" and study.method == "si-fgsm":
+        longer = replace(base, combo=DEFAULT_COMBO, method="apgd", steps=_APGD_FACTOR * study.steps)
+        arms.append(_arm(f"combo {DEFAULT_COMBO}, apgd", longer))
+    seeds = study.seeds or (1 if study.quick else _CONTROL_SEEDS)
+    return _add_controls(arms, out, seeds=seeds) if study.controls else arms
 
 
-def _papers(arms: Sequence[Arm]) -> list[Arm]:
-    """The same by the paper's exact protocol."""
-    papers: dict[str, Any] = PROTOCOL
-    references = {f"combo {number}": value for number, value in PAPER_COMBOS.items()} | PAPER_SINGLE
-    return [_arm(f"{a.name}, {PAPERS}", replace(a.config, **papers), references[a.name]) for a in arms]
-
-
-def matching(config: Attack) -> str:
-    """The control that has as many chances as an attack: one draw, or the best of as many where the best of all
-    iterates is kept.
-    """
+def matching_control(config: AttackConfig) -> str:
+    """The control with as many chances as an attack: RANDOM if the best iterate counts, PLACEBO if the last."""
     return RANDOM if config.keep == "best" else PLACEBO
 
 
-def _controlled(
-    arms: Sequence[Arm], out: Path, kinds: Sequence[str] = (RANDOM, PLACEBO), seeds: int = 1
-) -> list[Arm]:
-    """Each arm, followed by its controls, by so many seeds. Random samples are of attacks that keep the best."""
-    found: list[Arm] = []
+def _add_controls(
+    arms: Sequence[AttackArm], out: Path, kinds: Sequence[str] = (RANDOM, PLACEBO), seeds: int = 1
+) -> list[AttackArm]:
+    """Each arm followed by its controls, by `seeds` seeds; RANDOM only for attacks that keep the best iterate."""
+    controlled: list[AttackArm] = []
     for arm in arms:
-        # As the run's own settings say it: relative to where the command is called.
-        size_of = os.path.join(out, "arms", arm.folder)
+        # relative to the working directory, as in the settings of the run
         configs = {
             RANDOM: replace(arm.config, method="random", range="steps", queries=arm.config.steps),
-            PLACEBO: replace(arm.config, method="placebo", like=size_of),
+            PLACEBO: replace(arm.config, method="placebo", like=os.path.join(out, ARMS, arm.folder)),
         }
-        found.append(arm)
-        for kind in (kind for kind in kinds if kind == PLACEBO or matching(arm.config) == kind):
+        controlled.append(arm)
+        for kind in kinds:
+            if kind == RANDOM and matching_control(arm.config) != RANDOM:
+                continue
             for number in range(seeds):
                 name, folder = f"{arm.name} {kind}", f"{arm.folder}-{kind}"
                 if number:
                     name, folder = f"{name} {number + 1}", f"{folder}-{number + 1}"
                 config = replace(configs[kind], seed=arm.config.seed + number)
-                found.append(Arm(name, folder, config, control=kind, of=arm.name))
-    return found
+                controlled.append(AttackArm(name, folder, config, control=kind, control_of=arm.name))
+    return controlled
 
 
-def _sources(base: Attack, study: Study) -> list[Arm]:
-    """The default combination against each source: the arm of the first has the name that `multi` gives it."""
+def _source_arms(base: AttackConfig, study: StudyConfig) -> list[AttackArm]:
+    """The default combination on each source detector; the first has the folder that `multi` gives it."""
     sources = detector_names(study.sources or study.detector, "--sources")
     arms = []
     for place, (source, short) in enumerate(zip(sources, short_names(sources), strict=True)):
-        arm = _combo(replace(base, detector=source), DEFAULT_COMBO)
+        arm = _combo_arm(replace(base, detector=source), DEFAULT_COMBO)
         folder = arm.folder if place == 0 else f"{arm.folder}-{re.sub(r'[^a-zA-Z0-9.]+', '-', short)}"
         arms.append(replace(arm, name=short, folder=folder))
     return arms
 
 
-def _grades(base: Attack, out: Path) -> list[Arm]:
-    """How sure failures are: si-FGSM, Auto-PGD with time for its steps to grow short, samples that take as many
-    passes as si-FGSM's gradients, and a placebo as large as either attack, for three sets of parameters.
-    """
-    sets = {
+def _grade_arms(base: AttackConfig, out: Path) -> list[AttackArm]:
+    """For three parameter sets: si-FGSM and longer Auto-PGD with placebos, and samples at si-FGSM's budget."""
+    parameter_sets = {
         f"combo {DEFAULT_COMBO}": replace(base, combo=DEFAULT_COMBO),
         "weather": replace(base, params=Parameter.WEATHER.value),
         "all six": replace(base, params=",".join(p.value for p in SIX)),
     }
-    arms: list[Arm] = []
-    for name, config in sets.items():
-        apgd = replace(config, method="apgd", steps=_LONGER * base.steps)
+    arms: list[AttackArm] = []
+    for name, config in parameter_sets.items():
+        attacks = [
+            _arm(name, replace(config, method="si-fgsm")),
+            _arm(f"{name}, apgd", replace(config, method="apgd", steps=_APGD_FACTOR * base.steps)),
+        ]
         halton = replace(config, method="halton", queries=GRADIENT_PASSES * base.steps)
-        arms += _controlled([_arm(name, replace(config, method="si-fgsm"))], out, (PLACEBO,))
-        arms += _controlled([_arm(f"{name}, apgd", apgd)], out, (PLACEBO,))
-        arms.append(_arm(f"{name}, halton", halton))
+        arms += [*_add_controls(attacks, out, (PLACEBO,)), _arm(f"{name}, halton", halton)]
     return arms
 
 
-def _searches(base: Attack, study: Study, out: Path) -> list[Arm]:
-    """Methods that look for failures of the same parameters, at as many passes each, or at as many seconds."""
-    combo = DEFAULT_COMBO if study.params is None else None
-    config = replace(base, combo=combo, params=study.params)
-    passes = dict.fromkeys(SEARCHES, study.passes) if study.pace is None else _paced(study.passes, study.pace)
-    first, *others = (_arm(name, replace(config, method=name, passes=passes[name])) for name in SEARCHES)
-    (searching, placebo) = _controlled([first], out, (PLACEBO,))
+def _search_arms(base: AttackConfig, study: StudyConfig, out: Path) -> list[AttackArm]:
+    """Search methods on the same parameters, at equal passes or, with --pace, in equal time."""
+    config = replace(base, combo=DEFAULT_COMBO if study.params is None else None, params=study.params)
+    passes = dict.fromkeys(SEARCH_METHODS, study.passes)
+    if study.pace is not None:
+        passes = _passes_for_equal_time(study.passes, Path(study.pace) / STUDY_JSON)
+    first, *others = (_arm(name, replace(config, method=name, passes=passes[name])) for name in SEARCH_METHODS)
+    searching, placebo = _add_controls([first], out, (PLACEBO,))
     return [searching, *others, replace(placebo, config=replace(placebo.config, passes=None))]
 
 
-def _paced(passes: int, folder: str) -> dict[str, int]:
-    """Passes by method, of which as many take as long as the slowest method's, by what a study's frames took."""
-    study = Path(folder) / FIGURES
+def _passes_for_equal_time(passes: int, study: Path) -> dict[str, int]:
+    """Passes by method that take as long as the slowest method's, by the seconds per frame of an earlier study."""
     try:
         rows = {row["name"]: float(row["seconds"]) for row in files.read_json(study)["searches"]}
-        seconds = {name: rows[name] for name in SEARCHES}
+        seconds = {name: rows[name] for name in SEARCH_METHODS}
     except (TypeError, KeyError, ValueError) as error:
-        raise FormatError(f"{study}: searches", f"seconds of {', '.join(SEARCHES)}", error) from error
+        raise FormatError(f"{study}: searches", f"seconds of {', '.join(SEARCH_METHODS)}", error) from error
     if not all(0 < own < math.inf for own in seconds.values()):
         raise FormatError(f"{study}: searches", "positive seconds", seconds)
     slowest = max(seconds.values())
     return {name: round(passes * slowest / own) for name, own in seconds.items()}
 
 
-def _samples(base: Attack, study: Study) -> list[Arm]:
-    """Each method until its first success. Without gradient it looks where the steps of si-FGSM may lead; the full
-    study also lets it look in all of the bounds.
-    """
+def _sample_arms(base: AttackConfig, study: StudyConfig) -> list[AttackArm]:
+    """Each method up to its first success; gradient-free ones in the reach of si-FGSM, then in all of the bounds."""
     arms = [
         _arm("si-fgsm", replace(base, method="si-fgsm", early_stop=True)),
         _arm("apgd", replace(base, method="apgd", early_stop=True)),
         _arm("fgsm", replace(base, method="fgsm")),
     ]
-    searches = ("random", "halton", "sobol", "cma-es")
-    for method in searches:
+    for method in ("random", "halton", "sobol", "cma-es"):
         search = replace(base, method=method, queries=study.queries, early_stop=True)
         arms.append(_arm(method, replace(search, range="steps")))
         if not study.quick:
@@ -223,12 +290,86 @@ def _samples(base: Attack, study: Study) -> list[Arm]:
     return arms
 
 
-def _labels(base: Attack, quick: bool) -> list[Arm]:
-    """Attacks that aim at the benign labels, as the paper's do, and one that aims at labels that move."""
-    stay = replace(base, objective_labels="paper")
-    arms = [_arm("translate", replace(stay, params="translate"))]
-    if not quick:
-        arms.append(_arm("rotate", replace(stay, params="rotate")))
-    arms += [_combo(stay, number) for number in ((DEFAULT_COMBO,) if quick else COMBO_NUMBERS)]
-    aimed = _arm(f"combo {DEFAULT_COMBO}, moved", replace(base, combo=DEFAULT_COMBO, objective_labels="moved"))
-    return [replace(arm, reference=None) for arm in arms] + [aimed]
+def _label_arms(base: AttackConfig, quick: bool) -> list[AttackArm]:
+    """Attacks on the benign labels, as in the paper, and one on labels that move with the cars."""
+    fixed = replace(base, objective_labels="paper")
+    arms = [
+        _arm(name, replace(fixed, params=name)) for name in (("translate",) if quick else ("translate", "rotate"))
+    ]
+    arms += [_combo_arm(fixed, number) for number in ((DEFAULT_COMBO,) if quick else COMBO_NUMBERS)]
+    moved = _arm(f"combo {DEFAULT_COMBO}, moved", replace(base, combo=DEFAULT_COMBO, objective_labels="moved"))
+    return [replace(arm, reference=None) for arm in arms] + [moved]
+
+
+def run_arms(arms: Sequence[AttackArm], workers: Sequence[Worker], out: Path) -> StudyArms:
+    """Run or continue all arms, in the folder `arms` of `out`; each scene is de-rendered once.
+
+    Args:
+        arms: The arms.
+        workers: One worker for each arm, from `build_workers`.
+        out: Folder of the study.
+
+    Raises:
+        UsageError: Settings that do not fit a run that is there.
+        SceneError: A frame that cannot be used, without --keep-going.
+    """
+    first = workers[0]
+    names, without_vehicles, failed = select_frames(first.source, first.config)
+    folders = [out / ARMS / arm.folder for arm in arms]
+    for worker, folder in zip(workers, folders, strict=True):
+        claim(folder, worker.config, WRITTEN, _FREE_SETTINGS)
+    jobs = run_frame_jobs(
+        [name for name in names if not all(_is_done(folder, name) for folder in folders)],
+        partial(_attack_frame, workers=workers, folders=folders),
+        partial(_build_frame_worker, arms, folders),
+        first.config,
+        ProgressSettings(f"frames, {len(arms)} attacks each"),
+    )
+    failed |= jobs.failed
+    empty = {name for name, has_vehicles in jobs.results.items() if not has_vehicles}
+    names = [name for name in names if name not in failed and name not in empty]
+    runs = []
+    for arm, worker, folder in zip(arms, workers, folders, strict=True):
+        summary = attack_frames(worker, names, folder)
+        results = tuple(load_frame(folder / FRAMES / name / RESULT) for name in names)
+        runs.append(ArmRun(arm, summary, results, JudgedClasses.of(worker.detector)))
+    return StudyArms(tuple(runs), without_vehicles + len(empty), dict(sorted(failed.items())))
+
+
+def build_workers(arms: Sequence[AttackArm]) -> list[Worker]:
+    """One worker for each arm; all share one scene source, and arms on the same detector share that.
+
+    Raises UsageError or SceneError for settings that cannot be used.
+    """
+    first: dict[str, Worker] = {}
+    source: SceneSource | None = None
+    for config in (arm.config for arm in arms):
+        if config.detector not in first:
+            worker = Worker.of(config)
+            source = source or worker.source
+            first[config.detector] = replace(worker, source=source)
+    return [first[arm.config.detector].beside(arm.config) for arm in arms]
+
+
+def _attack_frame(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> bool:
+    """Attack one frame by all arms that have not done so, in order; False if it has no vehicle."""
+    scene = workers[0].source.scene(name)
+    for worker, folder in zip(workers, folders, strict=True):
+        if _is_done(folder, name):
+            continue
+        try:
+            worker.attack_scene(name, scene, folder)
+        except NoVehicleError:
+            return False
+        # photograph and background, which all arms share, are most of a frame's folder
+        if folder != folders[0] and _is_done(folders[0], name):
+            files.hardlink_duplicates(folder / FRAMES / name, folders[0] / FRAMES / name)
+    return True
+
+
+def _build_frame_worker(arms: Sequence[AttackArm], folders: Sequence[Path]) -> Callable[[str], bool]:
+    return partial(_attack_frame, workers=build_workers(arms), folders=folders)
+
+
+def _is_done(folder: Path, name: str) -> bool:
+    return (folder / FRAMES / name / RESULT).is_file()

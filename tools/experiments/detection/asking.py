@@ -12,34 +12,40 @@ from drivesem.analysis.confirm.asking import confirm_run
 from drivesem.analysis.confirm.report import Confirmation
 from drivesem.analysis.transfer.asking import DETECTIONS
 from drivesem.analysis.transfer.plot import write_heatmap
-from drivesem.config.commands import Confirm, Study
+from drivesem.config.commands import ConfirmConfig
 from drivesem.failures.second_renderer.choose import SecondRenderers
-from drivesem.report.answer import Answer
+from drivesem.report.tables import AnalysisReport
 from drivesem.report.terminal import Console
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
 from drivesem.training.known import warn_of_overlaps
 from tools.experiments.detection import report, retrain, retrain_report, transfer
-from tools.experiments.detection.arms import FIGURES, arms_of, attack_of, draws_of
-from tools.experiments.detection.attribution import Plan, attributed, write_waterfall
-from tools.experiments.detection.attribution import told as told_of_factors
+from tools.experiments.detection.arms import STUDY_JSON, base_attack, bootstrap_draws, build_arms
+from tools.experiments.detection.attribution import AttributionPlan, attribute_drop, write_waterfall
+from tools.experiments.detection.attribution import attribution_text as told_of_factors
 from tools.experiments.detection.counts import StudyCounts
-from tools.experiments.detection.grades import grades_of
+from tools.experiments.detection.grades import count_grades
 from tools.experiments.detection.kept import keep, load_kept
 from tools.experiments.detection.kept_retrain import keep_retrain, load_retrain
 from tools.experiments.detection.kept_rows import KEPT, command_of
 from tools.experiments.detection.kept_transfer import keep_transfer, load_transfer
-from tools.experiments.detection.labels import label_frames, label_sets
-from tools.experiments.detection.largest import largest, write_largest
+from tools.experiments.detection.labels import compare_frame_labels, compare_labels
+from tools.experiments.detection.largest import find_largest_changes, write_largest_changes
 from tools.experiments.detection.lessons import CACHE, FRAMES, POOL
 from tools.experiments.detection.plots import write_plot
-from tools.experiments.detection.report import Findings, Told
+from tools.experiments.detection.report import StudyResults, StudyText
 from tools.experiments.detection.robust import STATES
-from tools.experiments.detection.rows import rows_of
-from tools.experiments.detection.running import Ran, run_arms, workers_of
-from tools.experiments.detection.searches import costs_of, depths_of, seen_of, standing_of
-from tools.experiments.detection.success import against, curve_of
-from tools.experiments.detection.taught import RetrainCounts, taught
-from tools.experiments.detection.transfer import TransferCounts, matrix_of
+from tools.experiments.detection.rows import compare_arms
+from tools.experiments.detection.running import StudyArms, build_workers, run_arms
+from tools.experiments.detection.searches import (
+    count_withstanding,
+    find_detected_objects,
+    load_depths,
+    search_costs,
+)
+from tools.experiments.detection.success import compare_success, success_curve
+from tools.experiments.detection.taught import RetrainingCounts, summarise_retraining
+from tools.experiments.detection.transfer import TransferCounts, build_matrix
+from tools.experiments.settings import StudyConfig
 
 _PICTURE, _LARGEST = "study.png", "largest.jpg"
 _TABLES = (
@@ -50,7 +56,7 @@ _TABLES = (
     ),
 )
 _WRITTEN = (
-    *(_PICTURE, FIGURES, _LARGEST),
+    *(_PICTURE, STUDY_JSON, _LARGEST),
     *_TABLES,
     *(ARMS, KEPT, DETECTIONS, RETRAINED, CACHE, FRAMES, POOL, STATES),
 )
@@ -64,7 +70,7 @@ _FREE_IN_RETRAIN = (
 """Of retrain: other frames to train on would make other detectors."""
 
 
-def study_run(config: Study) -> Answer:
+def study_run(config: StudyConfig) -> AnalysisReport:
     """Run or continue a study, and write what is said of it; tell one that was kept, and write it where --out is
     given. Raises UsageError or SceneError for bad input.
     """
@@ -78,7 +84,7 @@ def study_run(config: Study) -> Answer:
     return answer
 
 
-def _again(config: Study, folder: Path) -> Answer:
+def _again(config: StudyConfig, folder: Path) -> AnalysisReport:
     """The tables of a study that was kept."""
     out = folder_of(config.out, folder)
     settings, told = _AGAIN.get(config.name, _kept)(folder, config.name)
@@ -89,16 +95,16 @@ def _again(config: Study, folder: Path) -> Answer:
     return answer
 
 
-_Found = tuple[dict[str, Any], Told, Callable[[Path], None]]
+_Found = tuple[dict[str, Any], StudyText, Callable[[Path], None]]
 """A study's figures for JSON, its text, and what draws its picture."""
 
 
-def _answer(study: Study, out: Path, found: _Found) -> Answer:
+def _answer(study: StudyConfig, out: Path, found: _Found) -> AnalysisReport:
     data, told, draw = found
-    return report.answer_of(told, out, data, command_of(study), draw)
+    return report.build_report(told, out, data, command_of(study), draw)
 
 
-_Kept = tuple[Study, Callable[[Study], _Found]]
+_Kept = tuple[StudyConfig, Callable[[StudyConfig], _Found]]
 """Settings of a study that was kept, and what is found with such settings."""
 
 
@@ -122,102 +128,113 @@ _AGAIN = {"transfer": _kept_transfer, "retrain": _kept_retrain}
 """Studies that keep more than arms."""
 
 
-def _arms(config: Study, out: Path, console: Console) -> _Found:
+def _arms(config: StudyConfig, out: Path, console: Console) -> _Found:
     """Attacks side by side."""
-    arms = arms_of(config, out)
-    workers = workers_of(arms)
+    arms = build_arms(config, out)
+    workers = build_workers(arms)
     claim(out, config, _WRITTEN, _FREE)
     if config.confirm:  # before hours of attacks: whether the frames can be drawn again
         SecondRenderers(workers[0].config.dataset, workers[0].config.root).check()
     ran = run_arms(arms, workers, out)
-    counts = StudyCounts.of(ran)
+    counts = StudyCounts.from_arms(ran)
     if config.name == "searches":
-        counts = replace(counts, seen=seen_of(ran.runs[0], depths_of(ran.runs[0], out)))
+        counts = replace(counts, seen=find_detected_objects(ran.runs[0], load_depths(ran.runs[0], out)))
     elif config.name == "labels":
-        counts = replace(counts, labels={one.arm.name: label_frames(one) for one in ran.runs})
+        counts = replace(counts, labels={one.arm.name: compare_frame_labels(one) for one in ran.runs})
     confirmed = _confirmed(config, ran, out)
-    write_largest(out / _LARGEST, largest(ran.runs, out))
+    write_largest_changes(out / _LARGEST, find_largest_changes(ran.runs, out))
     keep(out / KEPT, config, counts, confirmed)
     return _found(config, counts, confirmed)
 
 
-def _found(config: Study, counts: StudyCounts, confirmed: Mapping[str, Confirmation]) -> _Found:
+def _found(config: StudyConfig, counts: StudyCounts, confirmed: Mapping[str, Confirmation]) -> _Found:
     """What follows from what is kept."""
     if config.name == "attribution":
-        found = attributed(config, Plan.of(config, attack_of(config)), counts, draws_of(config))
+        found = attribute_drop(
+            config, AttributionPlan.from_study(config, base_attack(config)), counts, bootstrap_draws(config)
+        )
         return found.to_json(), told_of_factors(found), partial(write_waterfall, found=found)
     return _text(replace(_findings(config, counts), confirmed=confirmed))
 
 
-def _text(found: Findings) -> _Found:
-    return found.to_json(), report.told(found), partial(write_plot, found=found)
+def _text(found: StudyResults) -> _Found:
+    return found.to_json(), report.study_text(found), partial(write_plot, found=found)
 
 
-def _confirmed(config: Study, ran: Ran, out: Path) -> dict[str, Confirmation]:
+def _confirmed(config: StudyConfig, ran: StudyArms, out: Path) -> dict[str, Confirmation]:
     """What second renderers' pictures say of each arm that is no control, where that is asked."""
     if not config.confirm:
         return {}
-    shared = Confirm(workers=config.workers, device=config.device, keep_going=config.keep_going)
+    shared = ConfirmConfig(workers=config.workers, device=config.device, keep_going=config.keep_going)
     arms = [run.arm for run in ran.runs if run.arm.control is None]
     return {arm.name: confirm_run(replace(shared, run=str(out / ARMS / arm.folder)))[0] for arm in arms}
 
 
-def _attribution(config: Study, out: Path, console: Console) -> _Found:
+def _attribution(config: StudyConfig, out: Path, console: Console) -> _Found:
     """What lies between ours and the paper's protocol."""
-    arms = Plan.of(config, attack_of(config)).arms()
-    workers = workers_of(arms)
+    arms = AttributionPlan.from_study(config, base_attack(config)).arms()
+    workers = build_workers(arms)
     claim(out, config, _WRITTEN, _FREE)
-    counts = StudyCounts.of(run_arms(arms, workers, out))
+    counts = StudyCounts.from_arms(run_arms(arms, workers, out))
     keep(out / KEPT, config, counts, {})
     return _found(config, counts, {})
 
 
-def _transfer(config: Study, out: Path, console: Console) -> _Found:
+def _transfer(config: StudyConfig, out: Path, console: Console) -> _Found:
     """Counterexamples before other detectors."""
-    arms = arms_of(config, out)
-    workers = workers_of(arms)
-    asked = transfer.detectors_asked(config, out)
+    arms = build_arms(config, out)
+    workers = build_workers(arms)
+    asked = transfer.load_targets(config, out)
     claim(out, config, _WRITTEN, (*_FREE, "detectors", "sources"))
     counts = transfer.run(config, arms, workers, asked, out)
     keep_transfer(out / KEPT, config, counts)
     return _transferred(config, counts)
 
 
-def _transferred(config: Study, counts: TransferCounts) -> _Found:
-    found = matrix_of(config, counts)
-    return found.to_json(), transfer.told(found), partial(write_heatmap, rows=[one.row for one in found.rows])
+def _transferred(config: StudyConfig, counts: TransferCounts) -> _Found:
+    found = build_matrix(config, counts)
+    return (
+        found.to_json(),
+        transfer.transfer_text(found),
+        partial(write_heatmap, rows=[one.row for one in found.rows]),
+    )
 
 
-def _retrain(config: Study, out: Path, console: Console) -> _Found:
+def _retrain(config: StudyConfig, out: Path, console: Console) -> _Found:
     """Detectors trained on with counterexamples."""
-    ready = retrain.prepare(config, out)
+    ready = retrain.prepare_retraining(config, out)
     claim(out, config, _WRITTEN, _FREE_IN_RETRAIN)
-    counts = retrain.run(config, ready, out, console)
+    counts = retrain.run_retraining(config, ready, out, console)
     keep_retrain(out / KEPT, config, counts)
     return _retrained(config, counts)
 
 
-def _retrained(config: Study, counts: RetrainCounts) -> _Found:
-    found = taught(config, counts)
-    return found.to_json(), retrain_report.told(found), partial(retrain_report.write_plot, found=found)
+def _retrained(config: StudyConfig, counts: RetrainingCounts) -> _Found:
+    found = summarise_retraining(config, counts)
+    return found.to_json(), retrain_report.retraining_text(found), partial(retrain_report.write_plot, found=found)
 
 
 _STUDIES = {"attribution": _attribution, "transfer": _transfer, "retrain": _retrain}
 """Studies that are more than attacks side by side."""
 
 
-def _findings(config: Study, counts: StudyCounts) -> Findings:
-    draws, arms = draws_of(config), counts.arms
-    grades = [grades_of(one, draws, config.seed) for one in arms if one.graded]
-    labels = [label_sets(name, frames) for name, frames in counts.labels.items()]
-    found = Findings(config, draws, counts, rows_of(arms, draws, config.seed), grades=grades, label_sets=labels)
+def _findings(config: StudyConfig, counts: StudyCounts) -> StudyResults:
+    draws, arms = bootstrap_draws(config), counts.arms
+    grades = [count_grades(one, draws, config.seed) for one in arms if one.graded]
+    labels = [compare_labels(name, frames) for name, frames in counts.labels.items()]
+    found = StudyResults(
+        config, draws, counts, compare_arms(arms, draws, config.seed), grades=grades, label_sets=labels
+    )
     if config.name == "searches":
-        costs, standing = costs_of(arms, counts.seen, draws, config.seed), standing_of(arms, counts.seen)
+        costs, standing = (
+            search_costs(arms, counts.detected_objects, draws, config.seed),
+            count_withstanding(arms, counts.detected_objects),
+        )
         return replace(found, costs=costs, standing=standing)
     if config.name not in ("samples", "steps"):
         return found
-    found = replace(found, curves=[curve_of(one, draws, config.seed) for one in arms])
+    found = replace(found, curves=[success_curve(one, draws, config.seed) for one in arms])
     if config.name == "steps":
         return found
-    beside = {one.arm.name: against(arms[0], config.steps, one, draws, config.seed) for one in arms}
+    beside = {one.arm.name: compare_success(arms[0], config.steps, one, draws, config.seed) for one in arms}
     return replace(found, beside=beside, within=config.steps)

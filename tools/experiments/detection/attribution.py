@@ -19,18 +19,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivesem.analysis.transfer.report import bounded
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.commands import DEFAULT_COMBO, Attack, Study
+from drivesem.attack.targets import HEADLINE
+from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.evaluation.resampling import Figure, Interval, differences, holm
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
 from drivesem.report.plots import COLOURS, STYLE
-from drivesem.report.tables import Sheet, number_of, percent
+from drivesem.report.tables import ReportTable, format_count, format_percent
 from drivesem.run.protocol import PROTOCOL
 from scene_ir import files
-from tools.experiments.detection.arms import PAPERS, Arm
+from tools.experiments.detection.arms import PAPER_PROTOCOL, AttackArm
 from tools.experiments.detection.counts import StudyCounts
-from tools.experiments.detection.report import Told, heading
-from tools.experiments.detection.rows import Figures, feasible_fraction
+from tools.experiments.detection.report import StudyText, heading
+from tools.experiments.detection.rows import ArmMetrics, feasible_fraction
+from tools.experiments.settings import StudyConfig
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,52 +54,52 @@ _Arms = frozenset[str]
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class AttributionPlan:
     """Factors in their order, and the attack of each set of them."""
 
     factors: tuple[str, ...]
-    ours: Attack
+    ours: AttackConfig
     other_detector: str | None
 
     @classmethod
-    def of(cls, study: Study, base: Attack) -> Plan:
+    def from_study(cls, study: StudyConfig, base: AttackConfig) -> AttributionPlan:
         """base: what the study gives all arms; its settings that are factors are ours and the paper's here."""
-        default = Attack()
+        default = AttackConfig()
         own = {name: getattr(default, name) for name in _SETTINGS.values()}
         ours = replace(base, combo=DEFAULT_COMBO, method="si-fgsm", grade=False, **own)
         factors = (COUNTED, *_SETTINGS, *([_DETECTOR] if study.other_detector else []))
         return cls(factors, ours, study.other_detector)
 
-    def config(self, papers: _Arms) -> Attack:
+    def config(self, papers: _Arms) -> AttackConfig:
         """The attack where so many factors are the paper's."""
         changes: dict[str, Any] = {name: PROTOCOL[name] for f, name in _SETTINGS.items() if f in papers}
         if _DETECTOR in papers:
             changes["detector"] = self.other_detector
         return replace(self.ours, **changes)
 
-    def ways(self) -> list[list[_Arms]]:
+    def paths(self) -> list[list[_Arms]]:
         """From none to all, in the factors' order and in the reverse."""
         orders = (self.factors, self.factors[::-1])
         return [[frozenset(order[:k]) for k in range(len(order) + 1)] for order in orders]
 
-    def arms(self) -> list[Arm]:
+    def arms(self) -> list[AttackArm]:
         """Each attack once: of both ways, and of each factor alone."""
-        first, second = self.ways()
+        first, second = self.paths()
         asked = [first[0], first[-1], *first[1:-1], *second[1:-1], *(frozenset([f]) for f in self.factors)]
-        named = {self.name(papers): papers for papers in asked}
+        named = {self.arm_name(papers): papers for papers in asked}
         folders = {name: re.sub(r"[^a-z0-9]+", "-", name) for name in named}
-        return [Arm(name, folders[name], self.config(papers)) for name, papers in named.items()]
+        return [AttackArm(name, folders[name], self.config(papers)) for name, papers in named.items()]
 
-    def name(self, papers: _Arms) -> str:
+    def arm_name(self, papers: _Arms) -> str:
         """Of the arm whose attack this is: labels that count make no other."""
         changed = [f for f in self.factors[1:] if f in papers]
         if len(changed) in (0, len(self.factors) - 1):
-            return PAPERS if changed else OURS
+            return PAPER_PROTOCOL if changed else OURS
         return ", ".join(changed)
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class FactorShare:
     """One factor, or some together, fractions of 1. alone: points that it adds to ours; points: its mean on both
     ways, of which `ways` are the two; p: of the permutation test of `points`, Holm's, None where it is not tested.
     """
@@ -106,15 +107,15 @@ class Share:
     name: str
     alone: Interval
     points: Interval
-    ways: tuple[float | None, float | None]
+    path_points: tuple[float | None, float | None]
     p: float | None = None
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON."""
         found: dict[str, Any] = {"name": self.name}
         for key, one in (("alone", self.alone), ("points", self.points)):
             found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
-        return found | {"in_order": self.ways[0], "in_reverse": self.ways[1], "p": self.p}
+        return found | {"in_order": self.path_points[0], "in_reverse": self.path_points[1], "p": self.p}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,17 +124,17 @@ class Attribution:
     the ways begin and end; shares: of the factors in their order; labels: of both kinds together; total: of all.
     """
 
-    study: Study
+    study: StudyConfig
     draws: int
     counts: StudyCounts
-    falls: Mapping[str, Mapping[str, Interval]]
+    drops: Mapping[str, Mapping[str, Interval]]
     ours: float | None
     papers: float | None
-    shares: Sequence[Share]
-    labels: Share
-    total: Share
+    shares: Sequence[FactorShare]
+    labels: FactorShare
+    total: FactorShare
 
-    def rows(self) -> list[Share]:
+    def rows(self) -> list[FactorShare]:
         """As they are told."""
         return [*self.shares, self.labels, self.total]
 
@@ -142,27 +143,27 @@ class Attribution:
         return heading(self.study, self.draws, self.counts) | {
             "ours": self.ours,
             "papers": self.papers,
-            "rows": [share.flat() for share in self.rows()],
-            "arms": self.flat_arms(),
+            "rows": [share.to_row() for share in self.rows()],
+            "arms": self.arm_rows(),
         }
 
-    def flat_arms(self) -> list[dict[str, Any]]:
+    def arm_rows(self) -> list[dict[str, Any]]:
         """The falls of each arm."""
         found: list[dict[str, Any]] = []
         for run in self.counts.arms:
             line: dict[str, Any] = {"name": run.arm.name, "feasible_fraction": feasible_fraction(run.frames)}
-            for mode, one in self.falls[run.arm.name].items():
+            for mode, one in self.drops[run.arm.name].items():
                 line |= {f"drop_{mode}": one.value, f"drop_{mode}_low": one.low, f"drop_{mode}_high": one.high}
             found.append(line)
         return found
 
 
-class _Measures:
+class _DropMeasurements:
     """Falls of AP50 of all arms, and what they differ by: all of the same draws of frames."""
 
-    def __init__(self, plan: Plan, counts: StudyCounts, draws: int, seed: int) -> None:
+    def __init__(self, plan: AttributionPlan, counts: StudyCounts, draws: int, seed: int) -> None:
         self._plan, self._draws, self._seed = plan, draws, seed
-        self._figures = {run.arm.name: Figures.of(run).of_ap50() for run in counts.arms}
+        self._figures = {run.arm.name: ArmMetrics.from_runs(run).ap50_only() for run in counts.arms}
         self._detector = {run.arm.name: run.arm.config.detector for run in counts.arms}
 
     def falls(self, name: str) -> dict[str, Interval]:
@@ -171,7 +172,7 @@ class _Measures:
 
     def fall(self, papers: _Arms) -> float | None:
         """At one stop on a way."""
-        figures = self._figures[self._plan.name(papers)]
+        figures = self._figures[self._plan.arm_name(papers)]
         before, after = figures.before[0].value(), self._after(papers).value()
         return None if before is None or after is None else before - after
 
@@ -192,7 +193,7 @@ class _Measures:
         for one, other in steps:
             more.append(self._after(one))
             less.append(self._after(other))
-            names = [self._plan.name(papers) for papers in (one, other)]
+            names = [self._plan.arm_name(papers) for papers in (one, other)]
             if len({self._detector[name] for name in names}) > 1:
                 befores = [self._figures[name].before[0] for name in names]
                 less.append(befores[0])
@@ -206,15 +207,15 @@ class _Measures:
 
     def _after(self, papers: _Arms) -> Figure:
         mode = "paper" if COUNTED in papers else "moved"
-        return self._figures[self._plan.name(papers)].after[mode][0]
+        return self._figures[self._plan.arm_name(papers)].after[mode][0]
 
 
-def attributed(study: Study, plan: Plan, counts: StudyCounts, draws: int) -> Attribution:
+def attribute_drop(study: StudyConfig, plan: AttributionPlan, counts: StudyCounts, draws: int) -> Attribution:
     """What each factor takes, of the arms of a plan."""
-    measures, ways = _Measures(plan, counts, draws, study.seed), plan.ways()
+    measures, ways = _DropMeasurements(plan, counts, draws, study.seed), plan.paths()
     none, everything = ways[0][0], ways[0][-1]
 
-    def share(name: str, factors: Sequence[str], test: bool = False) -> tuple[Share, float | None]:
+    def share(name: str, factors: Sequence[str], test: bool = False) -> tuple[FactorShare, float | None]:
         size = len(factors)
         steps = [
             next((way[k], way[k + size]) for k in range(len(way) - size) if way[k + size] - way[k] == {*factors})
@@ -223,7 +224,7 @@ def attributed(study: Study, plan: Plan, counts: StudyCounts, draws: int) -> Att
         points, p = measures.more(steps, test)
         alone, _ = measures.more([(none, frozenset(factors))], test=False)
         in_order, in_reverse = (measures.step(*step) for step in steps)
-        return Share(name, alone, points, (in_order, in_reverse)), p
+        return FactorShare(name, alone, points, (in_order, in_reverse)), p
 
     found = [share(factor, [factor], test=True) for factor in plan.factors]
     adjusted = holm([p for _, p in found])
@@ -231,7 +232,7 @@ def attributed(study: Study, plan: Plan, counts: StudyCounts, draws: int) -> Att
         study=study,
         draws=draws,
         counts=counts,
-        falls={run.arm.name: measures.falls(run.arm.name) for run in counts.arms},
+        drops={run.arm.name: measures.falls(run.arm.name) for run in counts.arms},
         ours=measures.fall(none),
         papers=measures.fall(everything),
         shares=[replace(one, p=p) for (one, _), p in zip(found, adjusted, strict=True)],
@@ -240,32 +241,32 @@ def attributed(study: Study, plan: Plan, counts: StudyCounts, draws: int) -> Att
     )
 
 
-def told(found: Attribution) -> Told:
+def attribution_text(found: Attribution) -> StudyText:
     """The study as text."""
-    tables = {"study": [one.flat() for one in found.rows()], "arms": found.flat_arms()}
+    tables = {"study": [one.to_row() for one in found.rows()], "arms": found.arm_rows()}
     sheets = [_shares(found), _arms(found)]
-    return Told(found.study.name, sheets, sheets[:1], notes(found), tables, (_FACTOR, "the paper's"))
+    return StudyText(found.study.name, sheets, sheets[:1], notes(found), tables, (_FACTOR, "the paper's"))
 
 
-def _shares(found: Attribution) -> Sheet:
+def _shares(found: Attribution) -> ReportTable:
     lines = []
     for one in found.rows():
-        ways = ("-" if value is None else f"{100 * value:.1f}" for value in one.ways)
+        ways = ("-" if value is None else f"{100 * value:.1f}" for value in one.path_points)
         p = "-" if one.p is None else f"{one.p:.3f}"
         lines.append((one.name, bounded(one.alone), bounded(one.points), *ways, p))
     columns = (_FACTOR, "added to ours alone", "points", "in this order", "in the reverse", "p")
-    ends = f"from {percent(found.ours)}, ours, to {percent(found.papers)}, the {PAPERS}"
-    return Sheet(f"How far {HEADLINE} AP50 falls, points: {ends}", columns, tuple(lines))
+    ends = f"from {format_percent(found.ours)}, ours, to {format_percent(found.papers)}, the {PAPER_PROTOCOL}"
+    return ReportTable(f"How far {HEADLINE} AP50 falls, points: {ends}", columns, tuple(lines))
 
 
-def _arms(found: Attribution) -> Sheet:
+def _arms(found: Attribution) -> ReportTable:
     lines = []
     for run in found.counts.arms:
-        falls = found.falls[run.arm.name]
-        share = percent(feasible_fraction(run.frames))
+        falls = found.drops[run.arm.name]
+        share = format_percent(feasible_fraction(run.frames))
         lines.append((run.arm.name, bounded(falls["moved"]), bounded(falls["paper"]), share))
     columns = ("the paper's", "falls, moved labels", "falls, benign labels", "feasible, %")
-    return Sheet("Arms, by what in them is the paper's", columns, tuple(lines))
+    return ReportTable("Arms, by what in them is the paper's", columns, tuple(lines))
 
 
 def notes(found: Attribution) -> list[str]:
@@ -281,7 +282,7 @@ def notes(found: Attribution) -> list[str]:
         "Virtual KITTI.",
     ]
     if found.counts.without_vehicles:
-        lines.append(f"{number_of(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
+        lines.append(f"{format_count(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
     return lines + [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
 
 
@@ -318,7 +319,7 @@ def _draw(axes: Axes, found: Attribution) -> None:
     axes.bar(last, at, color=COLOURS[0])
     axes.text(last, at, f"{at:.1f}", ha="center", va="bottom")
     axes.axhline(0, color=COLOURS[6], linewidth=0.8)
-    names = [OURS, *(share.name for share in found.shares), PAPERS]
+    names = [OURS, *(share.name for share in found.shares), PAPER_PROTOCOL]
     axes.set_xticks(range(last + 1), [name.replace(" ", "\n") for name in names])
     axes.set_ylabel("fall of AP50, points")
     axes.set_title("From ours to the paper's protocol; lines: 95 % of draws of frames", loc="left", fontsize=11)

@@ -11,25 +11,25 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from detectors.types import CLASSES
-from drivesem.attack.judging import HEADLINE
+from drivesem.attack.targets import HEADLINE
 from drivesem.evaluation.matches import Matches
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
-from tools.experiments.detection.arms import Arm
+from tools.experiments.detection.arms import AttackArm
 from tools.experiments.detection.labels import FrameLabels
-from tools.experiments.detection.running import ArmRun, Ran
+from tools.experiments.detection.running import ArmRun, StudyArms
 
 
 @dataclass(frozen=True, slots=True)
-class CountedFailure:
+class FailureRecord:
     """One failure. index: the lost object; error: its kind as `truth.kinds` names it; asked: whether a second
     renderer was.
     """
 
-    index: int | None
-    error: str | None
+    object_index: int | None
+    kind: str | None
     grade: str | None
-    asked: bool
+    second_rendered: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +46,11 @@ class FrameCounts:
     success_paper: bool
     success_moved: bool
     size: float
-    judged: int
-    failures: tuple[CountedFailure, ...]
+    judged_objects: int
+    failures: tuple[FailureRecord, ...]
 
     @classmethod
-    def of(cls, result: FrameResult, names: Sequence[str]) -> FrameCounts:
+    def from_result(cls, result: FrameResult, names: Sequence[str]) -> FrameCounts:
         """names: of the judged classes."""
         judged = [b for b in result.targets_benign if not b.ignore and b.index is not None and b.label in names]
         return cls(
@@ -61,10 +61,10 @@ class FrameCounts:
             feasible=result.feasible,
             success_paper=result.success_paper,
             success_moved=result.success_moved,
-            size=size_of(result),
+            size=change_size(result),
             judged=len(judged),
             failures=tuple(
-                CountedFailure(f.index, f.error, f.grade, f.second is not None) for f in result.failures
+                FailureRecord(f.index, f.error, f.grade, f.second is not None) for f in result.failures
             ),
         )
 
@@ -73,13 +73,13 @@ class FrameCounts:
 class ArmCounts:
     """One arm. before: detections in the photographs; after: in the attacked pictures, by label mode."""
 
-    arm: Arm
+    arm: AttackArm
     frames: tuple[FrameCounts, ...]
     before: Matches
     after: Mapping[str, Matches]
 
     @classmethod
-    def of(cls, run: ArmRun) -> ArmCounts:
+    def from_run(cls, run: ArmRun) -> ArmCounts:
         """What came of it."""
         names, label = run.judged.names, run.judged.names.index(HEADLINE)
         benign = [run.judged.targets(as_targets(r.targets_benign, CLASSES)) for r in run.results]
@@ -88,7 +88,7 @@ class ArmCounts:
         attacked = [as_detections(r.detections_attacked, names) for r in run.results]
         return cls(
             arm=run.arm,
-            frames=tuple(FrameCounts.of(result, names) for result in run.results),
+            frames=tuple(FrameCounts.from_result(result, names) for result in run.results),
             before=Matches.of(benign, photographs, label),
             after={
                 "paper": Matches.of(benign, attacked, label),
@@ -103,10 +103,10 @@ class ArmCounts:
 
 
 @dataclass(frozen=True, slots=True)
-class SeenObject:
+class DetectedObject:
     """An object that the detector finds in the photograph. index: in the scene; height_px: of its box."""
 
-    index: int
+    object_index: int
     height_px: float
     depth_m: float
 
@@ -120,13 +120,13 @@ class StudyCounts:
     arms: tuple[ArmCounts, ...]
     without_vehicles: int
     failed: Mapping[str, str]
-    seen: Mapping[str, tuple[SeenObject, ...]] = field(default_factory=dict)
+    detected_objects: Mapping[str, tuple[DetectedObject, ...]] = field(default_factory=dict)
     labels: Mapping[str, tuple[FrameLabels, ...]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, ran: Ran) -> StudyCounts:
+    def from_arms(cls, ran: StudyArms) -> StudyCounts:
         """Of finished runs, without what only some studies ask for."""
-        return cls(tuple(map(ArmCounts.of, ran.runs)), ran.without_vehicles, ran.failed)
+        return cls(tuple(map(ArmCounts.from_run, ran.runs)), ran.without_vehicles, ran.failed)
 
     @property
     def frames(self) -> list[FrameCounts]:
@@ -134,7 +134,7 @@ class StudyCounts:
         return [frame for arm in self.arms for frame in arm.frames]
 
 
-def size_of(result: FrameResult) -> float:
+def change_size(result: FrameResult) -> float:
     """Norm of a frame's theta, each coordinate in units of its bounds."""
     values = [c.value / (c.upper - c.lower) for c in result.theta if c.upper > c.lower]
     return float(np.linalg.norm(values))

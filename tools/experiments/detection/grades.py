@@ -11,8 +11,8 @@ import numpy as np
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import Interval, intervals, rate
 from drivesem.failures.grades import Grade, Kind
-from drivesem.run.tally import at_least
-from tools.experiments.detection.counts import ArmCounts, CountedFailure
+from drivesem.run.summary import at_least
+from tools.experiments.detection.counts import ArmCounts, FailureRecord
 
 SURVIVE = "survive"
 
@@ -33,10 +33,10 @@ class ArmGrades:
     counts: dict[Grade, int]
     rates: dict[Grade, Interval]
     kinds: dict[Kind, dict[Grade, int]]
-    asked: int
+    second_rendered: int
     survive: Interval
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
         found: dict[str, Any] = {
             "name": self.name,
@@ -51,26 +51,26 @@ class ArmGrades:
         found |= {f"{kind}_{grade}": n for kind, by_grade in self.kinds.items() for grade, n in by_grade.items()}
         one = self.survive
         return found | {
-            "asked": self.asked,
+            "asked": self.second_rendered,
             SURVIVE: one.value,
             f"{SURVIVE}_low": one.low,
             f"{SURVIVE}_high": one.high,
         }
 
 
-def grades_of(run: ArmCounts, draws: int, seed: int) -> ArmGrades:
+def count_grades(run: ArmCounts, draws: int, seed: int) -> ArmGrades:
     """Of an arm all of whose frames are graded."""
     frames = run.frames
-    objects = np.array([frame.judged for frame in frames], np.float64)
+    objects = np.array([frame.judged_objects for frame in frames], np.float64)
 
-    def counted(rule: Callable[[CountedFailure], bool]) -> Floats:
+    def counted(rule: Callable[[FailureRecord], bool]) -> Floats:
         return np.array([sum(map(rule, frame.failures)) for frame in frames], np.float64)
 
     def of_kind(kind: Kind, grade: Grade) -> int:
-        return sum(f.error == kind and at_least(grade)(f) for frame in frames for f in frame.failures)
+        return sum(f.kind == kind and at_least(grade)(f) for frame in frames for f in frame.failures)
 
     hits = {grade: counted(at_least(grade)) for grade in Grade}
-    asked = counted(lambda failure: failure.asked)
+    asked = counted(lambda failure: failure.second_rendered)
     figures = [rate(str(grade), hits[grade], objects) for grade in Grade]
     figures.append(rate(SURVIVE, hits[Grade.CONFIRMED], asked))
     *rates, survive = intervals(figures, len(frames), draws, np.random.default_rng(seed))
@@ -83,6 +83,6 @@ def grades_of(run: ArmCounts, draws: int, seed: int) -> ArmGrades:
         counts={grade: int(hits[grade].sum()) for grade in Grade},
         rates=dict(zip(Grade, rates, strict=True)),
         kinds={kind: {grade: of_kind(kind, grade) for grade in Grade} for kind in Kind},
-        asked=int(asked.sum()),
+        second_rendered=int(asked.sum()),
         survive=survive,
     )

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Literal
 
 from drivesem.analysis.confirm.report import Confirmation, Share
-from drivesem.config.commands import Study
 from drivesem.failures.grades import Grade, Kind
 from drivesem.run.records import load_record
 from scene_ir import files
 from scene_ir.errors import FormatError
-from tools.experiments.detection.arms import PLACEBO, RANDOM, Arm, attack_of
-from tools.experiments.detection.attribution import Plan
-from tools.experiments.detection.counts import ArmCounts, CountedFailure, FrameCounts, SeenObject, StudyCounts
+from tools.experiments.detection.arms import PLACEBO, RANDOM, AttackArm, base_attack
+from tools.experiments.detection.attribution import AttributionPlan
+from tools.experiments.detection.counts import ArmCounts, DetectedObject, FailureRecord, FrameCounts, StudyCounts
 from tools.experiments.detection.kept_rows import (
     MOST,
     MOST_DRAWS,
@@ -40,7 +39,8 @@ from tools.experiments.detection.kept_rows import (
     settings_of,
     write_rows,
 )
-from tools.experiments.detection.labels import OVERLAPS, FrameLabels, Mistakes
+from tools.experiments.detection.labels import OVERLAPS, FrameLabels, LabelFailures
+from tools.experiments.settings import StudyConfig
 
 _SCHEMA = 1
 _FRAMES, _DETECTIONS = "frames.csv", "detections.csv.gz"
@@ -149,8 +149,8 @@ class Survivors:
 class _Head:
     """study.json."""
 
-    settings: Study
-    arms: tuple[Arm, ...]
+    settings: StudyConfig
+    arms: tuple[AttackArm, ...]
     frames: tuple[str, ...]
     frames_without_vehicles: int
     frames_failed: dict[str, str]
@@ -161,12 +161,12 @@ class _Head:
 class Kept:
     """A study that was kept. confirmed: of its arms, where second renderers were asked."""
 
-    settings: Study
+    settings: StudyConfig
     counts: StudyCounts
     confirmed: Mapping[str, Confirmation]
 
 
-def keep(folder: Path, study: Study, counts: StudyCounts, confirmed: Mapping[str, Confirmation]) -> None:
+def keep(folder: Path, study: StudyConfig, counts: StudyCounts, confirmed: Mapping[str, Confirmation]) -> None:
     """Write it whole. counts: what came of the study's arms."""
     head = {
         "schema": _SCHEMA,
@@ -185,13 +185,13 @@ def keep(folder: Path, study: Study, counts: StudyCounts, confirmed: Mapping[str
     }
     frames, detections = _rows(counts.arms)
     failures = (
-        FailureRow(one.arm.name, frame.identifier, f.index, f.error, f.grade, f.asked)
+        FailureRow(one.arm.name, frame.identifier, f.object_index, f.kind, f.grade, f.second_rendered)
         for one in counts.arms
         for frame in one.frames
         for f in frame.failures
     )
-    seen = (ObjectRow(name, *astuple(one)) for name, objects in counts.seen.items() for one in objects)
-    with files.whole_folder(folder) as into:
+    seen = (ObjectRow(name, *astuple(one)) for name, objects in counts.detected_objects.items() for one in objects)
+    with files.atomic_folder(folder) as into:
         files.write_json(into / STUDY, head)
         write_rows(into / _FRAMES, FrameRow, frames)
         write_rows(into / _DETECTIONS, DetectionRow, detections)
@@ -235,7 +235,7 @@ def _write_labels(folder: Path, counts: StudyCounts) -> None:
     failed = (
         LabelFailureRow(arm, frame, iou, *astuple(own))
         for arm, frame, one in told
-        for iou, own in one.mistakes.items()
+        for iou, own in one.failures.items()
     )
     write_rows(folder / _LABELS, LabelRow, objects)
     write_rows(folder / _LABEL_FAILURES, LabelFailureRow, failed)
@@ -287,13 +287,17 @@ def _check_head(head: _Head, name: str, where: str) -> None:
     study, arms = head.settings, [arm.name for arm in head.arms]
     check_settings(study, name, where)
     require(any(arm.control is None for arm in head.arms), f"{where}: arms", "one that is no control", "none")
-    needed = [arm.name for arm in Plan.of(study, attack_of(study)).arms()] if name == "attribution" else []
+    needed = (
+        [arm.name for arm in AttributionPlan.from_study(study, base_attack(study)).arms()]
+        if name == "attribution"
+        else []
+    )
     missing = [arm for arm in needed if arm not in arms]
     require(not missing, f"{where}: arms", f"one named {missing[:1]}", "none")
     for place, arm in enumerate(head.arms):
         here = f"{where}: arms[{place}]"
         require(arms.index(arm.name) == place, f"{here}.name", "each name once", arm.name)
-        beside = (None, RANDOM, PLACEBO) if arm.of in arms else (None,)
+        beside = (None, RANDOM, PLACEBO) if arm.control_of in arms else (None,)
         require(arm.control in beside, f"{here}.control", "random or placebo of an arm, or null", arm.control)
         require(arm.reference is None or 0 <= arm.reference <= 1, f"{here}.reference", "0 to 1", arm.reference)
         for key, value in (("steps", arm.config.steps), ("queries", arm.config.queries)):
@@ -336,7 +340,7 @@ def _frames(path: Path, head: _Head) -> dict[_Key, FrameRow]:
     return found
 
 
-def _frame(row: FrameRow, failures: Sequence[CountedFailure]) -> FrameCounts:
+def _frame(row: FrameRow, failures: Sequence[FailureRecord]) -> FrameCounts:
     return FrameCounts(row.frame, **{key: getattr(row, key) for key in _SHARED}, failures=tuple(failures))
 
 
@@ -357,8 +361,8 @@ def _detections(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[tuple[str, 
     return found
 
 
-def _failures(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[_Key, list[CountedFailure]]:
-    found: dict[_Key, list[CountedFailure]] = {key: [] for key in frames}
+def _failures(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[_Key, list[FailureRecord]]:
+    found: dict[_Key, list[FailureRecord]] = {key: [] for key in frames}
     for where, row in read_rows(path, FailureRow):
         require((row.arm, row.frame) in found, where, f"an arm and a frame of {_FRAMES}", (row.arm, row.frame))
         require(0 <= (row.object or 0) < MOST, f"{where}: object", "at least 0", row.object)
@@ -366,27 +370,27 @@ def _failures(path: Path, frames: Mapping[_Key, FrameRow]) -> dict[_Key, list[Co
             require(
                 value is None or value in map(str, known), f"{where}: {name}", f"one of {', '.join(known)}", value
             )
-        found[row.arm, row.frame].append(CountedFailure(row.object, row.kind, row.grade, row.asked))
+        found[row.arm, row.frame].append(FailureRecord(row.object, row.kind, row.grade, row.asked))
     return found
 
 
-def _seen(path: Path, frames: Sequence[str]) -> dict[str, tuple[SeenObject, ...]]:
-    found: dict[str, list[SeenObject]] = {name: [] for name in frames}
+def _seen(path: Path, frames: Sequence[str]) -> dict[str, tuple[DetectedObject, ...]]:
+    found: dict[str, list[DetectedObject]] = {name: [] for name in frames}
     for where, row in read_rows(path, ObjectRow):
         require(row.frame in found, f"{where}: frame", f"a frame of {STUDY}", row.frame)
         require(0 <= row.object < MOST, f"{where}: object", "at least 0", row.object)
-        known = [one.index for one in found[row.frame]]
+        known = [one.object_index for one in found[row.frame]]
         require(row.object not in known, f"{where}: object", "each once a frame", row.object)
         for name in ("height_px", "depth_m"):
             require(getattr(row, name) >= 0, f"{where}: {name}", "at least 0", getattr(row, name))
-        found[row.frame].append(SeenObject(row.object, row.height_px, row.depth_m))
+        found[row.frame].append(DetectedObject(row.object, row.height_px, row.depth_m))
     return {name: tuple(objects) for name, objects in found.items()}
 
 
 def _labels(folder: Path, head: _Head) -> dict[str, tuple[FrameLabels, ...]]:
     keys = [(arm.name, frame) for arm in head.arms for frame in head.frames]
     overlaps: dict[_Key, dict[int, float]] = {key: {} for key in keys}
-    mistakes: dict[_Key, dict[float, Mistakes]] = {key: {} for key in keys}
+    mistakes: dict[_Key, dict[float, LabelFailures]] = {key: {} for key in keys}
     for where, row in read_rows(folder / _LABELS, LabelRow):
         own = overlaps.get((row.arm, row.frame))
         require(own is not None, where, f"an arm and a frame of {STUDY}", (row.arm, row.frame))
@@ -399,7 +403,7 @@ def _labels(folder: Path, head: _Head) -> dict[str, tuple[FrameLabels, ...]]:
         require(row.iou in OVERLAPS, f"{where}: iou", f"one of {', '.join(map(str, OVERLAPS))}", row.iou)
         check_count(f"{where}: lost_paper", row.lost_paper)
         check_count(f"{where}: lost_only_unmoved", row.lost_only_unmoved, row.lost_paper)
-        one = Mistakes(row.paper, row.moved, row.lost_paper, row.lost_only_unmoved)
+        one = LabelFailures(row.paper, row.moved, row.lost_paper, row.lost_only_unmoved)
         mistakes[row.arm, row.frame][row.iou] = one
     for key, own in mistakes.items():
         missing = [iou for iou in OVERLAPS if iou not in own]

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from drivesem.config.commands import Study
 from drivesem.run.records import load_record
 from scene_ir import files
 from tools.experiments.detection.counts import StudyCounts
@@ -33,10 +32,11 @@ from tools.experiments.detection.kept_rows import (
     write_rows,
 )
 from tools.experiments.detection.kept_transfer import check_attacks, read_pairs, write_pairs
-from tools.experiments.detection.lessons import BENIGN, lessons_of
-from tools.experiments.detection.robust import KINDS, Counted, FrameStates
-from tools.experiments.detection.running import AttackFacts
-from tools.experiments.detection.taught import RetrainCounts, SeenBenign
+from tools.experiments.detection.lessons import BENIGN, build_retraining_arms
+from tools.experiments.detection.robust import KINDS, FailureCounts, FrameStateCounts
+from tools.experiments.detection.running import AttackTotals
+from tools.experiments.detection.taught import BenignMatches, RetrainingCounts
+from tools.experiments.settings import StudyConfig
 
 _SCHEMA = 1
 _BENIGN, _DETECTIONS, _STATES = "benign.csv", "benign_detections.csv.gz", "states.csv.gz"
@@ -80,34 +80,34 @@ class StatesRow:
 class _Head:
     """study.json. detectors: t* by name, of the detector as it was, then of the lessons."""
 
-    settings: Study
+    settings: StudyConfig
     attack: str
-    learned: AttackFacts
-    judged: AttackFacts
+    learned: AttackTotals
+    judged: AttackTotals
     shown: dict[str, int]
     benign: int
     detectors: dict[str, float]
     left_out: dict[str, str]
 
 
-def keep_retrain(folder: Path, study: Study, counts: RetrainCounts) -> None:
+def keep_retrain(folder: Path, study: StudyConfig, counts: RetrainingCounts) -> None:
     """Write it whole."""
     head = {
         "schema": _SCHEMA,
         "settings": settings_of(study),
         "attack": counts.attack,
-        "learned": asdict(counts.learned),
-        "judged": asdict(counts.judged),
-        "shown": dict(counts.shown),
-        "benign": counts.benign,
-        "detectors": {name: one.t_star for name, one in counts.seen.items()},
+        "learned": asdict(counts.training_attacks),
+        "judged": asdict(counts.test_attacks),
+        "shown": dict(counts.counterexamples),
+        "benign": counts.benign_training_frames,
+        "detectors": {name: one.t_star for name, one in counts.benign_matches.items()},
         "left_out": dict(counts.left_out),
     }
-    cars = map(int, counts.seen[BENIGN].matches.objects)
+    cars = map(int, counts.benign_matches[BENIGN].matches.objects)
     benign = (BenignRow(*row) for row in zip(counts.benign_frames, cars, strict=True))
     detections = (
         BenignDetectionRow(detector, name, *row)
-        for detector, one in counts.seen.items()
+        for detector, one in counts.benign_matches.items()
         for name, rows in zip(counts.benign_frames, marked(one.matches, one.matches.telling()), strict=True)
         for row in rows
     )
@@ -115,10 +115,10 @@ def keep_retrain(folder: Path, study: Study, counts: RetrainCounts) -> None:
         StatesRow(frame.identifier, kind, name, one.cars, one.lost[place], one.pictures, one.phantoms[place])
         for frame in counts.states
         for kind, one in frame.counts.items()
-        for place, name in enumerate(counts.seen)
+        for place, name in enumerate(counts.benign_matches)
     )
-    fresh = StudyCounts(tuple(counts.fresh), counts.judged.without_vehicles, counts.judged.failed)
-    with files.whole_folder(folder) as into:
+    fresh = StudyCounts(tuple(counts.fresh), counts.test_attacks.without_vehicles, counts.test_attacks.failed)
+    with files.atomic_folder(folder) as into:
         files.write_json(into / STUDY, head)
         write_rows(into / _BENIGN, BenignRow, benign)
         write_rows(into / _DETECTIONS, BenignDetectionRow, detections)
@@ -128,7 +128,7 @@ def keep_retrain(folder: Path, study: Study, counts: RetrainCounts) -> None:
         keep(into / _FRESH, study, fresh, {})
 
 
-def load_retrain(folder: Path) -> tuple[Study, RetrainCounts]:
+def load_retrain(folder: Path) -> tuple[StudyConfig, RetrainingCounts]:
     """What `keep_retrain` wrote. Raises FormatError naming file, and row or field."""
     where = str(folder / STUDY)
     check_name(folder / STUDY, "retrain")
@@ -145,14 +145,14 @@ def load_retrain(folder: Path) -> tuple[Study, RetrainCounts]:
     frames = len(fresh[0].frames)
     require(frames == head.judged.frames, f"{where}: judged.frames", str(frames), head.judged.frames)
     cars = _benign(folder / _BENIGN)
-    return head.settings, RetrainCounts(
+    return head.settings, RetrainingCounts(
         attack=head.attack,
-        learned=head.learned,
-        judged=head.judged,
-        shown=head.shown,
-        benign=head.benign,
+        training_attacks=head.learned,
+        test_attacks=head.judged,
+        counterexamples=head.shown,
+        benign_training_frames=head.benign,
         benign_frames=tuple(cars),
-        seen=_seen(folder / _DETECTIONS, head.detectors, cars),
+        benign_matches=_seen(folder / _DETECTIONS, head.detectors, cars),
         known=known,
         fresh=fresh,
         left_out=head.left_out,
@@ -163,7 +163,7 @@ def load_retrain(folder: Path) -> tuple[Study, RetrainCounts]:
 def _check_head(head: _Head, where: str) -> list[str]:
     """The names of the detectors."""
     check_settings(head.settings, "retrain", where)
-    lessons = [one.name for one in lessons_of(head.settings) if one.name in head.shown]
+    lessons = [one.name for one in build_retraining_arms(head.settings) if one.name in head.shown]
     require(lessons == list(head.shown), f"{where}: shown", "lessons of these settings", list(head.shown))
     names = [BENIGN, *lessons]
     found = list(head.detectors)
@@ -188,7 +188,7 @@ def _benign(path: Path) -> dict[str, int]:
     return found
 
 
-def _seen(path: Path, detectors: Mapping[str, float], cars: Mapping[str, int]) -> dict[str, SeenBenign]:
+def _seen(path: Path, detectors: Mapping[str, float], cars: Mapping[str, int]) -> dict[str, BenignMatches]:
     found: dict[tuple[str, str], list[Marked]] = {(name, frame): [] for name in detectors for frame in cars}
     for where, row in read_rows(path, BenignDetectionRow):
         key = (row.detector, row.frame)
@@ -198,12 +198,12 @@ def _seen(path: Path, detectors: Mapping[str, float], cars: Mapping[str, int]) -
         found[key].append((row.score, row.benign))
     objects = list(cars.values())
     return {
-        name: SeenBenign(matches_of([found[name, frame] for frame in cars], objects, f"{path}: {name}"), t_star)
+        name: BenignMatches(matches_of([found[name, frame] for frame in cars], objects, f"{path}: {name}"), t_star)
         for name, t_star in detectors.items()
     }
 
 
-def _states(path: Path, names: Sequence[str]) -> list[FrameStates]:
+def _states(path: Path, names: Sequence[str]) -> list[FrameStateCounts]:
     """Of each frame that has any, in the order of the file; digests and notes of the run are not kept."""
     rows: dict[str, dict[str, dict[str, StatesRow]]] = {}
     for where, row in read_rows(path, StatesRow):
@@ -216,18 +216,18 @@ def _states(path: Path, names: Sequence[str]) -> list[FrameStates]:
         check_count(f"{where}: lost", row.lost, row.cars)
         check_count(f"{where}: phantoms", row.phantoms, row.pictures)
         known[row.detector] = row
-    found: list[FrameStates] = []
+    found: list[FrameStateCounts] = []
     for frame, kinds in rows.items():
         counts = {kind: _counted(f"{path}: {frame}, {kind}", own, names) for kind, own in kinds.items()}
-        found.append(FrameStates(frame, "", counts, ""))
+        found.append(FrameStateCounts(frame, "", counts, ""))
     return found
 
 
-def _counted(where: str, rows: Mapping[str, StatesRow], names: Sequence[str]) -> Counted:
+def _counted(where: str, rows: Mapping[str, StatesRow], names: Sequence[str]) -> FailureCounts:
     missing = [name for name in names if name not in rows]
     require(not missing, where, f"a row of {missing[:1]}", "none")
     own = [rows[name] for name in names]
     cars, pictures = own[0].cars, own[0].pictures
     alike = all((row.cars, row.pictures) == (cars, pictures) for row in own)
     require(alike, where, "as many cars and pictures before all detectors", "other numbers")
-    return Counted(cars, tuple(row.lost for row in own), pictures, tuple(row.phantoms for row in own))
+    return FailureCounts(cars, tuple(row.lost for row in own), pictures, tuple(row.phantoms for row in own))

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from drivesem.config.commands import Study
 from drivesem.config.errors import UsageError
 from drivesem.config.text import command_line
 from drivesem.evaluation.coco import IOU_THRESHOLDS
@@ -20,7 +19,8 @@ from drivesem.evaluation.matches import TRUE, Matches
 from drivesem.run.records import dump_rows, load_rows
 from scene_ir import files
 from scene_ir.errors import FormatError
-from tools.experiments.detection.arms import draws_of
+from tools.experiments.detection.arms import bootstrap_draws
+from tools.experiments.settings import StudyConfig
 
 KEPT = "kept"
 """The folder, in the study's."""
@@ -41,12 +41,12 @@ Marked = tuple[float, str]
 """A detection's score and its marks: a letter for each of IOU_THRESHOLDS, without what repeats at the end."""
 
 
-def settings_of(study: Study) -> dict[str, Any]:
+def settings_of(study: StudyConfig) -> dict[str, Any]:
     """Those that are kept."""
     return {name: value for name, value in asdict(study).items() if name not in NOT_TOLD}
 
 
-def command_of(study: Study) -> str:
+def command_of(study: StudyConfig) -> str:
     """What repeats it, as it is typed."""
     return command_line("study", study, (*NOT_TOLD, "name")).replace("study", f"study {study.name}", 1)
 
@@ -59,7 +59,7 @@ def check_name(path: Path, name: str) -> None:
     require(data is None or data == name, f"{path}: settings.name", name, data)
 
 
-def check_settings(study: Study, name: str, where: str) -> None:
+def check_settings(study: StudyConfig, name: str, where: str) -> None:
     """Raises FormatError unless these are the settings of a study of that name."""
     require(study.name == name, f"{where}: settings.name", name, study.name)
     try:
@@ -67,7 +67,7 @@ def check_settings(study: Study, name: str, where: str) -> None:
     except UsageError as error:
         raise FormatError(f"{where}: settings: {error.field}", error.expected, error.actual) from error
     require(study.seed >= 0, f"{where}: settings.seed", "at least 0", study.seed)
-    draws = draws_of(study)
+    draws = bootstrap_draws(study)
     require(draws <= MOST_DRAWS, f"{where}: settings.bootstrap", f"at most {MOST_DRAWS}", draws)
 
 
@@ -130,7 +130,7 @@ def write_rows(path: Path, kind: type[Any], rows: Iterable[Any]) -> None:
 def read_rows(path: Path, kind: type[T]) -> Iterator[tuple[str, T]]:
     """What `write_rows` wrote, each with its place."""
     if path.suffix == ".gz":
-        text = files.text_of(files.read_gzip(path, MOST_BYTES), path)
+        text = files.decode_utf8(files.read_gzip(path, MOST_BYTES), path)
     else:
         text = files.read_text(path, MOST_BYTES)
     return load_rows(text, kind, str(path))

@@ -13,8 +13,7 @@ from typing import Literal
 
 from detectors.types import CLASSES
 from drivesem.analysis.transfer.matrix import FrameLosses, PairCounts, ShownRun, Target
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.commands import Study
+from drivesem.attack.targets import HEADLINE
 from drivesem.run.records import load_record
 from scene_ir import files
 from tools.experiments.detection.kept_rows import (
@@ -32,8 +31,9 @@ from tools.experiments.detection.kept_rows import (
     settings_of,
     write_rows,
 )
-from tools.experiments.detection.running import AttackFacts
-from tools.experiments.detection.transfer import AskedArm, TransferCounts
+from tools.experiments.detection.running import AttackTotals
+from tools.experiments.detection.transfer import TransferCounts, TransferSource
+from tools.experiments.settings import StudyConfig
 
 _SCHEMA = 1
 _PAIRS, _FRAMES, _OBJECTS, _DETECTIONS = "pairs.json", "frames.csv", "objects.csv.gz", "detections.csv.gz"
@@ -286,13 +286,13 @@ def _detections(path: Path, frames: Mapping[_Key, PairRow]) -> _Detected:
 class _Head:
     """study.json."""
 
-    settings: Study
-    attacks: AttackFacts
-    sources: tuple[AskedArm, ...]
+    settings: StudyConfig
+    attacks: AttackTotals
+    sources: tuple[TransferSource, ...]
     failed: dict[str, str]
 
 
-def keep_transfer(folder: Path, study: Study, counts: TransferCounts) -> None:
+def keep_transfer(folder: Path, study: StudyConfig, counts: TransferCounts) -> None:
     """Write it whole."""
     head = {
         "schema": _SCHEMA,
@@ -301,12 +301,12 @@ def keep_transfer(folder: Path, study: Study, counts: TransferCounts) -> None:
         "sources": [asdict(one) for one in counts.sources],
         "failed": dict(counts.failed),
     }
-    with files.whole_folder(folder) as into:
+    with files.atomic_folder(folder) as into:
         files.write_json(into / STUDY, head)
         write_pairs(into, counts.pairs)
 
 
-def load_transfer(folder: Path) -> tuple[Study, TransferCounts]:
+def load_transfer(folder: Path) -> tuple[StudyConfig, TransferCounts]:
     """What `keep_transfer` wrote. Raises FormatError naming file, and row or field."""
     where = str(folder / STUDY)
     check_name(folder / STUDY, "transfer")
@@ -329,7 +329,7 @@ def load_transfer(folder: Path) -> tuple[Study, TransferCounts]:
     return head.settings, TransferCounts(head.attacks, head.sources, pairs, head.failed)
 
 
-def check_attacks(where: str, attacks: AttackFacts) -> None:
+def check_attacks(where: str, attacks: AttackTotals) -> None:
     """Raises FormatError unless it can be."""
     for name in ("frames", "pictures", "without_vehicles"):
         check_count(f"{where}.{name}", getattr(attacks, name))

@@ -13,7 +13,7 @@ import torch
 
 from detectors import boxes
 from detectors.types import CLASSES
-from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.targets import JudgedClasses
 from drivesem.evaluation import failures
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
@@ -25,7 +25,7 @@ _QUANTILES = {"median": 0.5, "5 %": 0.05, "least": 0.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Mistakes:
+class LabelFailures:
     """A frame at one IoU. paper, moved: whether it fails by either labels; lost_paper: objects that are lost by
     the paper's, lost_only_unmoved: and not by moved ones.
     """
@@ -43,11 +43,11 @@ class FrameLabels:
     """
 
     iou: Mapping[int, float]
-    mistakes: Mapping[float, Mistakes]
+    failures: Mapping[float, LabelFailures]
 
 
 @dataclass(frozen=True, slots=True)
-class Counted:
+class CounterexampleCounts:
     """Counterexamples at one IoU. paper, moved: frames that fail by either labels; only_unmoved: by paper's and
     not by moved ones; lost_paper, lost_only_unmoved: the same of lost objects.
     """
@@ -60,7 +60,7 @@ class Counted:
 
 
 @dataclass(frozen=True, slots=True)
-class LabelSets:
+class LabelComparison:
     """One arm. iou: quantiles of the overlap of both labels, over objects that neither ignores; below: share of
     them that overlap less than each of OVERLAPS; counted: by IoU.
     """
@@ -70,14 +70,14 @@ class LabelSets:
     objects: int
     iou: dict[str, float | None]
     below: dict[float, float | None]
-    counted: dict[float, Counted]
+    counts: dict[float, CounterexampleCounts]
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name."""
         found: dict[str, Any] = {"name": self.name, "frames": self.frames, "objects": self.objects}
         found |= {f"iou_{name.replace(' ', '').replace('%', '_percent')}": v for name, v in self.iou.items()}
         for overlap in OVERLAPS:
-            at, one = f"at_{overlap:g}", self.counted[overlap]
+            at, one = f"at_{overlap:g}", self.counts[overlap]
             found |= {
                 f"below_{overlap:g}": self.below[overlap],
                 f"counterexamples_paper_{at}": one.paper,
@@ -89,7 +89,7 @@ class LabelSets:
         return found
 
 
-def label_frames(run: ArmRun) -> tuple[FrameLabels, ...]:
+def compare_frame_labels(run: ArmRun) -> tuple[FrameLabels, ...]:
     """Of an arm's frames, in their order."""
     return tuple(
         FrameLabels(_overlaps(result), {o: _mistakes(result, run.judged, run.summary.t_star, o) for o in OVERLAPS})
@@ -97,17 +97,17 @@ def label_frames(run: ArmRun) -> tuple[FrameLabels, ...]:
     )
 
 
-def label_sets(name: str, frames: Sequence[FrameLabels]) -> LabelSets:
+def compare_labels(name: str, frames: Sequence[FrameLabels]) -> LabelComparison:
     """Both label sets of the arm of that name, and what each makes of its counterexamples."""
     found = np.array([iou for frame in frames for iou in frame.iou.values()])
     count = len(found)
-    return LabelSets(
+    return LabelComparison(
         name=name,
         frames=len(frames),
         objects=count,
         iou={name: float(np.quantile(found, q)) if count else None for name, q in _QUANTILES.items()},
         below={overlap: float((found < overlap).mean()) if count else None for overlap in OVERLAPS},
-        counted={overlap: _counted([frame.mistakes[overlap] for frame in frames]) for overlap in OVERLAPS},
+        counts={overlap: _counted([frame.failures[overlap] for frame in frames]) for overlap in OVERLAPS},
     )
 
 
@@ -125,7 +125,7 @@ def _overlaps(result: FrameResult) -> dict[int, float]:
     return dict(zip(pairs, boxes.iou_matrix(before, after).diagonal().tolist(), strict=True))
 
 
-def _mistakes(result: FrameResult, judged: JudgedClasses, t_star: float, overlap: float) -> Mistakes:
+def _mistakes(result: FrameResult, judged: JudgedClasses, t_star: float, overlap: float) -> LabelFailures:
     benign = judged.targets(as_targets(result.targets_benign, CLASSES))
     before = as_detections(result.detections_rerendered, judged.names)
     after = as_detections(result.detections_attacked, judged.names)
@@ -133,11 +133,11 @@ def _mistakes(result: FrameResult, judged: JudgedClasses, t_star: float, overlap
     targets = judged.targets(as_targets(result.targets_moved, CLASSES))
     by_moved = failures.find(benign, before, targets, after, t_star, overlap)
     only = len(set(by_paper.lost) - set(by_moved.lost))
-    return Mistakes(by_paper.success, by_moved.success, len(by_paper.lost), only)
+    return LabelFailures(by_paper.success, by_moved.success, len(by_paper.lost), only)
 
 
-def _counted(frames: Sequence[Mistakes]) -> Counted:
-    return Counted(
+def _counted(frames: Sequence[LabelFailures]) -> CounterexampleCounts:
+    return CounterexampleCounts(
         paper=sum(one.paper for one in frames),
         moved=sum(one.moved for one in frames),
         only_unmoved=sum(one.paper and not one.moved for one in frames),

@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 
 from drivesem.report.drawing import MARGIN_PX, PAPER, TEXT_PX, paste, write_picture, write_text
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from drivesem.run.folder import ARMS
 from drivesem.run.results import FrameResult
 from scene_ir import files
-from tools.experiments.detection.counts import size_of
+from tools.experiments.detection.counts import change_size
 from tools.experiments.detection.running import ArmRun
 
-SHOWN = 10
+MAX_CHANGES = 10
 WIDTH_PX = 800
 """Of each of both pictures."""
 _LINE_PX = TEXT_PX + 8
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class LargeChange:
     """One frame of one arm. size: norm of theta, each coordinate in units of its bounds."""
 
     arm: str
@@ -33,22 +33,22 @@ class Change:
     size: float
 
 
-def largest(runs: Sequence[ArmRun], out: Path) -> list[Change]:
+def find_largest_changes(runs: Sequence[ArmRun], out: Path) -> list[LargeChange]:
     """The SHOWN largest changes of arms that are no controls, the largest first; of one frame only one."""
-    found: dict[str, Change] = {}
+    found: dict[str, LargeChange] = {}
     for run in runs:
         if run.arm.control is not None:
             continue
         for result in run.results:
             folder = out / ARMS / run.arm.folder / "frames" / result.identifier
-            change = Change(run.arm.name, folder, result, size_of(result))
+            change = LargeChange(run.arm.name, folder, result, change_size(result))
             known = found.get(result.identifier)
             if change.size > 0 and (known is None or change.size > known.size):
                 found[result.identifier] = change
-    return sorted(found.values(), key=lambda c: (-c.size, c.result.identifier))[:SHOWN]
+    return sorted(found.values(), key=lambda c: (-c.size, c.result.identifier))[:MAX_CHANGES]
 
 
-def write_largest(path: Path, changes: Sequence[Change]) -> None:
+def write_largest_changes(path: Path, changes: Sequence[LargeChange]) -> None:
     """Photographs to the left, counterexamples to the right, a row for each change. None: no file."""
     rows = [_row(change) for change in changes]
     if not rows:
@@ -62,14 +62,14 @@ def write_largest(path: Path, changes: Sequence[Change]) -> None:
     write_picture(path, canvas)
 
 
-def _row(change: Change) -> np.ndarray:
+def _row(change: LargeChange) -> np.ndarray:
     pictures = [_shrunk(files.read_image(change.folder / name)) for name in ("benign.png", "counterexample.png")]
     high = max(map(len, pictures))
     row = np.empty((high + _LINE_PX, 2 * WIDTH_PX + 3 * MARGIN_PX, 3), np.uint8)
     row[:] = PAPER
     result = change.result
     lost = sum(failure.kind == "lost" for failure in result.failures)
-    told = f"{lost} lost, {number_of(len(result.failures) - lost, 'phantom')}"
+    told = f"{lost} lost, {format_count(len(result.failures) - lost, 'phantom')}"
     write_text(row, (MARGIN_PX, 0), f"{result.identifier}, {change.arm}: size {change.size:.2f}, {told}")
     for column, picture in enumerate(pictures):
         paste(row, (MARGIN_PX + column * (WIDTH_PX + MARGIN_PX), _LINE_PX), picture)

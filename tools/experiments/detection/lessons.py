@@ -13,7 +13,7 @@ from rich.progress import track
 from detectors.registry import SHIPPED, save_detector
 from detectors.training import Sample
 from drivesem.config.blocks import DEMO
-from drivesem.config.commands import DEFAULT_COMBO, Retrain, Study
+from drivesem.config.commands import DEFAULT_COMBO, RetrainConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.values import size_hw
 from drivesem.data.joined import open_folders
@@ -32,7 +32,8 @@ from drivesem.training.frames import FrameStore
 from drivesem.training.mixture import Mixture
 from drivesem.training.retraining import WEIGHTS, broken, shares_of, startable, train_on
 from scene_ir.types import SceneIR
-from tools.experiments.detection.arms import PLACEBO, Arm, attack_of
+from tools.experiments.detection.arms import PLACEBO, AttackArm, base_attack
+from tools.experiments.settings import StudyConfig
 
 BENIGN = "benign detector"
 CACHE, FRAMES, POOL = "cache", "frames", "pool"
@@ -40,7 +41,7 @@ CACHE, FRAMES, POOL = "cache", "frames", "pool"
 Pictures = Stage | Literal["random", "generator", "around"]
 """Of an attacked frame; random edits of the same size, by the compositor or the generator; states around a certain
 failure."""
-TAUGHT: dict[str, tuple[str, Pictures]] = {
+RETRAINING_ARMS: dict[str, tuple[str, Pictures]] = {
     "benign": ("retrained on benign frames alone", "benign"),
     "re-rendered": ("retrained on benign re-rendered images", "rerender"),
     "random": ("retrained on random edits", "random"),
@@ -66,7 +67,7 @@ _PAPER_AFTER = (0.7276, 0.8473)
 """The paper's mAP on counterexamples against the detector as it was, and on benign frames, before retraining and
 after: a quarter of 6,339 frames replaced, 6,000 steps. Its detector before is one that 24,000 steps on benign
 frames, rendered again, have made."""
-OURS = Retrain(
+OURS = RetrainConfig(
     run="",
     mix="add",
     label_mode="moved",
@@ -83,7 +84,7 @@ _QUICK = {"steps": 40, "window": "640x224", "warmup": 10}
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
+class RetrainingArm:
     """One retraining. folder: short name; pictures: what is shown among benign frames; reference: the paper's mAP
     on counterexamples and on benign frames, of what the paper has, too; arm: of TAUGHT, whose seeds are told
     together; weight: of the arm's further term, 0 for none.
@@ -92,13 +93,13 @@ class Lesson:
     name: str
     folder: str
     pictures: Pictures
-    config: Retrain
+    config: RetrainConfig
     reference: tuple[float, float] | None
     arm: str
     weight: float = 0.0
 
     @property
-    def run(self) -> str:
+    def run_name(self) -> str:
         """Folder of the attack on held-out frames, against its detector."""
         return f"{HELD_OUT}-{self.folder}"
 
@@ -112,20 +113,20 @@ class Lesson:
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class FrameDivision:
     """Frames to train on and frames to judge by. learned, judged: names of those that may be attacked, None where
     all of a source may; benign: to train on, None for the attacked ones' photographs; held_out: to judge by, None
     where they are yet to be made.
     """
 
-    learned: tuple[str, ...] | None
-    judged: tuple[str, ...] | None
-    benign: tuple[Dataset, tuple[str, ...]] | None
-    held_out: tuple[Dataset, tuple[str, ...]] | None
+    training: tuple[str, ...] | None
+    test: tuple[str, ...] | None
+    benign_training: tuple[Dataset, tuple[str, ...]] | None
+    benign_test: tuple[Dataset, tuple[str, ...]] | None
 
 
 @dataclass(frozen=True, slots=True)
-class Among:
+class FrameSubset:
     """The frames of a source that have these names."""
 
     source: SceneSource
@@ -144,17 +145,17 @@ class Among:
         return self.source.scene(identifier)
 
 
-def arms_asked(study: Study) -> tuple[str, ...]:
+def retraining_arm_names(study: StudyConfig) -> tuple[str, ...]:
     """The arms that are trained, in the order of TAUGHT. UsageError for a name that is none of them."""
     if study.arms is None:
         return tuple(name for name in _BY_DEFAULT if not (study.quick and name == "paper"))
     asked = [part.strip() for part in study.arms.split(",") if part.strip()]
-    if not asked or not set(asked) <= set(TAUGHT):
-        raise UsageError("--arms", f"some of {', '.join(TAUGHT)}, with commas", repr(study.arms))
-    return tuple(name for name in TAUGHT if name in asked)
+    if not asked or not set(asked) <= set(RETRAINING_ARMS):
+        raise UsageError("--arms", f"some of {', '.join(RETRAINING_ARMS)}, with commas", repr(study.arms))
+    return tuple(name for name in RETRAINING_ARMS if name in asked)
 
 
-def lessons_of(study: Study) -> list[Lesson]:
+def build_retraining_arms(study: StudyConfig) -> list[RetrainingArm]:
     """What is trained. All but the paper's protocol differ in their pictures alone, and in a further term."""
     ours = replace(
         OURS,
@@ -168,70 +169,72 @@ def lessons_of(study: Study) -> list[Lesson]:
         loss="quality" if study.detector in SHIPPED else "published",
         **(_QUICK if study.quick else {}),
     )
-    paper = Retrain(run="", seed=study.seed, device=study.device)
+    paper = RetrainConfig(run="", seed=study.seed, device=study.device)
     if study.train_steps is not None:
         ours, paper = (replace(one, steps=study.train_steps) for one in (ours, paper))
     references = {"re-rendered": _PAPER_BEFORE, "paper": _PAPER_AFTER}
     lessons = []
-    for arm in arms_asked(study):
-        title, pictures = TAUGHT[arm]
+    for arm in retraining_arm_names(study):
+        title, pictures = RETRAINING_ARMS[arm]
         config = paper if arm == "paper" else ours
         weight = study.consistency if arm in _TERMS else 0.0
         for turn in range(study.seeds or 1 if arm in REPEATED else 1):
             name, folder = (f"{title}, seed {study.seed + turn}", f"{arm}-seed{turn}") if turn else (title, arm)
             own = replace(config, seed=study.seed + turn)
-            lessons.append(Lesson(name, folder, pictures, own, references.get(arm), arm, weight))
+            lessons.append(RetrainingArm(name, folder, pictures, own, references.get(arm), arm, weight))
     return lessons
 
 
-def reference_of(name: str, lessons: Sequence[Lesson], study: Study) -> tuple[float, float] | None:
+def paper_reference(name: str, lessons: Sequence[RetrainingArm], study: StudyConfig) -> tuple[float, float] | None:
     """The paper's mAP on counterexamples and on benign frames, of a detector by name; None where it has none, or
     where the study's attack is another than the paper's.
     """
-    if not follows_paper(learning_arm(study).config):
+    if not follows_paper(training_attack(study).config):
         return None
     return next((lesson.reference for lesson in lessons if lesson.name == name), _PAPER_BEFORE)
 
 
-def learning_arm(study: Study) -> Arm:
+def training_attack(study: StudyConfig) -> AttackArm:
     """The attack on the frames to train on."""
     limit = study.limit or (_QUICK_ATTACKED if study.quick else _ATTACKED)
     passes = study.passes if study.method == "climb" else None
-    config = replace(attack_of(study), params=study.params, limit=limit, passes=passes)
+    config = replace(base_attack(study), params=study.params, limit=limit, passes=passes)
     if study.params is not None:
-        return Arm(study.params, "attacked", config)
-    return Arm(f"combo {DEFAULT_COMBO}", f"combo-{DEFAULT_COMBO}", replace(config, combo=DEFAULT_COMBO))
+        return AttackArm(study.params, "attacked", config)
+    return AttackArm(f"combo {DEFAULT_COMBO}", f"combo-{DEFAULT_COMBO}", replace(config, combo=DEFAULT_COMBO))
 
 
-def placebo_arm(arm: Arm, out: Path) -> Arm:
+def placebo_attack(arm: AttackArm, out: Path) -> AttackArm:
     """Random edits of the same frames, each as large as the attack's."""
     config = replace(arm.config, method="placebo", passes=None, like=str(out / ARMS / arm.folder))
-    return Arm(f"{arm.name} {PLACEBO}", f"{arm.folder}-{PLACEBO}", config, control=PLACEBO, of=arm.name)
+    return AttackArm(
+        f"{arm.name} {PLACEBO}", f"{arm.folder}-{PLACEBO}", config, control=PLACEBO, control_of=arm.name
+    )
 
 
-def judging_arms(study: Study, lessons: Sequence[Lesson], out: Path) -> list[Arm]:
+def test_attacks(study: StudyConfig, lessons: Sequence[RetrainingArm], out: Path) -> list[AttackArm]:
     """The same attack on held-out frames: against the detector as it was, then against each retrained one."""
-    base = replace(learning_arm(study).config, limit=study.fresh or (3 if study.quick else 200))
+    base = replace(training_attack(study).config, limit=study.fresh or (3 if study.quick else 200))
     if study.dataset == DEMO:
         base = replace(base, seed=study.seed + 1)  # other streets
     else:
         base = replace(base, root=study.held_out or study.root)
-    arms = [Arm(BENIGN, HELD_OUT, base)]
+    arms = [AttackArm(BENIGN, HELD_OUT, base)]
     for lesson in lessons if study.reattack else ():
-        retrained = replace(base, detector=str(weights_of(out, lesson)))
-        arms.append(Arm(lesson.name, lesson.run, retrained))
+        retrained = replace(base, detector=str(weights_path(out, lesson)))
+        arms.append(AttackArm(lesson.name, lesson.run_name, retrained))
     return arms
 
 
-def weights_of(out: Path, lesson: Lesson) -> Path:
+def weights_path(out: Path, lesson: RetrainingArm) -> Path:
     """Where a lesson's weights lie."""
     return out / RETRAINED / lesson.folder / WEIGHTS
 
 
-def parts_of(study: Study) -> Parts:
+def divide_frames(study: StudyConfig) -> FrameDivision:
     """Which frames are for what. Raises UsageError where there are too few, SceneError for a bad folder."""
     if study.dataset == DEMO:
-        return Parts(None, None, None, None)
+        return FrameDivision(None, None, None, None)
     trained_on = [
         Path(part).resolve() for part in (study.root or "", *(study.benign_root or "").split(",")) if part
     ]
@@ -261,10 +264,10 @@ def parts_of(study: Study) -> Parts:
         benign = dataset, dataset.identifiers if learned is None else learned
     if benign is not None and not benign[1]:
         raise UsageError("--benign-root", "at least one frame", "none")
-    return Parts(learned, judged, benign, (held_out, kept[: benign_count(study)]))
+    return FrameDivision(learned, judged, benign, (held_out, kept[: benign_count(study)]))
 
 
-def benign_count(study: Study) -> int:
+def benign_count(study: StudyConfig) -> int:
     """How many held-out frames judge what is benign."""
     return study.benign_frames or (12 if study.quick else 1000)
 
@@ -279,20 +282,22 @@ def _divided(names: Sequence[str], seed: int) -> tuple[tuple[str, ...], tuple[st
     return learned, tuple(name for i, name in enumerate(names) if i in kept)
 
 
-def among(workers: Sequence[Worker], names: Sequence[str] | None) -> list[Worker]:
+def limit_sources(workers: Sequence[Worker], names: Sequence[str] | None) -> list[Worker]:
     """The workers, their sources limited to these frames; as they are where there is nothing to limit."""
     if names is None:
         return list(workers)
     chosen = frozenset(names)
-    return [replace(worker, source=Among(worker.source, chosen)) for worker in workers]
+    return [replace(worker, source=FrameSubset(worker.source, chosen)) for worker in workers]
 
 
-def held_out_frames(study: Study, parts: Parts, classes: Sequence[str], out: Path, console: Console) -> FrameStore:
+def held_out_frames(
+    study: StudyConfig, parts: FrameDivision, classes: Sequence[str], out: Path, console: Console
+) -> FrameStore:
     """What benign figures are of, decoded. Beside the embedded scenes they are frames of the generator, made
     first, of shapes that no training frame has.
     """
-    if parts.held_out is not None:
-        dataset, names = parts.held_out
+    if parts.benign_test is not None:
+        dataset, names = parts.benign_test
         return FrameStore(dataset, names, out / CACHE / "held_out", classes)
     from drivesem.synth.write import Order, synthesise
 
@@ -304,7 +309,7 @@ def held_out_frames(study: Study, parts: Parts, classes: Sequence[str], out: Pat
     return FrameStore(made, made.identifiers[: order.frames], out / CACHE / "held_out", classes)
 
 
-def validation_frames(study: Study, classes: Sequence[str], out: Path) -> FrameStore | None:
+def validation_frames(study: StudyConfig, classes: Sequence[str], out: Path) -> FrameStore | None:
     """What retrained detectors' t* is chosen on, decoded; None where no such frames were named."""
     if study.validation is None:
         return None
@@ -313,17 +318,17 @@ def validation_frames(study: Study, classes: Sequence[str], out: Path) -> FrameS
 
 
 def benign_samples(
-    parts: Parts, frames: Sequence[AttackedFrame], classes: Sequence[str], out: Path
+    parts: FrameDivision, frames: Sequence[AttackedFrame], classes: Sequence[str], out: Path
 ) -> Sequence[Sample]:
     """Benign frames to train on: those of a data set, decoded, or the photographs of the attacked ones."""
-    if parts.benign is None:
+    if parts.benign_training is None:
         return AttackedSamples(frames, "benign", "paper", classes)
-    dataset, names = parts.benign
+    dataset, names = parts.benign_training
     return FrameStore(dataset, names, out / CACHE / "train", classes)
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class TrainingPictures:
     """Where the pictures of lessons come from. frames: of the attack; random: the same of its placebo, where there
     is one; worker: that attacked; second: second renderers; folder: keeps what is drawn; near: share of the states
     around a failure that lie near.
@@ -337,13 +342,13 @@ class Taken:
     seed: int
     near: float
 
-    def around(self, config: Retrain, classes: Sequence[str]) -> AroundFailures:
+    def around(self, config: RetrainConfig, classes: Sequence[str]) -> AroundFailures:
         """Certain failures and what lies around them."""
         attack, params, detector = self.worker.config, self.worker.params, self.worker.detector
         pace, folder = config.batch * config.fraction, self.folder / "around"
         return AroundFailures(self.frames, attack, params, detector, folder, classes, pace, self.seed, self.near)
 
-    def missing(self, lesson: Lesson) -> str | None:
+    def missing(self, lesson: RetrainingArm) -> str | None:
         """Why a lesson cannot be held; None where it can. Raises UsageError where no counterexample breaks the
         detector.
         """
@@ -354,7 +359,7 @@ class Taken:
             return "no generator made these frames"
         return None
 
-    def shown(self, lesson: Lesson, classes: Sequence[str]) -> Sequence[Sample]:
+    def samples(self, lesson: RetrainingArm, classes: Sequence[str]) -> Sequence[Sample]:
         """What a lesson shows among benign frames: of the frames that break the detector, or around failures."""
         mode = lesson.config.label_mode
         failed = broken(self.frames, mode, "--limit")
@@ -369,10 +374,10 @@ class Taken:
         return AttackedSamples(failed, lesson.pictures, mode, classes)
 
 
-def learn(
-    study: Study,
-    lesson: Lesson,
-    taken: Taken,
+def train_arm(
+    study: StudyConfig,
+    lesson: RetrainingArm,
+    taken: TrainingPictures,
     benign: Callable[[Sequence[str]], Sequence[Sample]],
     weights: Path,
     console: Console,
@@ -383,7 +388,7 @@ def learn(
     if weights.is_file():
         return
     detector = startable(study.detector, study.device, "--detector")
-    shown = taken.shown(lesson, detector.classes)
+    shown = taken.samples(lesson, detector.classes)
     mixture = Mixture(benign(detector.classes), shown, shares_of(lesson.config))
     beside = None
     if lesson.weight and isinstance(shown, AroundFailures):

@@ -14,10 +14,10 @@ from drivesem.report.paper import PAPER_BENIGN
 from drivesem.report.plots import COLOURS, LINES, STYLE
 from scene_ir import files
 from tools.experiments.detection.grades import ArmGrades
-from tools.experiments.detection.labels import OVERLAPS, LabelSets
-from tools.experiments.detection.report import Findings
-from tools.experiments.detection.rows import StudyRow
-from tools.experiments.detection.success import Curve
+from tools.experiments.detection.labels import OVERLAPS, LabelComparison
+from tools.experiments.detection.report import StudyResults
+from tools.experiments.detection.rows import ArmComparison
+from tools.experiments.detection.success import SuccessCurve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +35,7 @@ _GROUP_WIDTH = 0.8
 """Of the bars of a group, in units of the distance from group to group."""
 
 
-def write_plot(path: Path, found: Findings) -> None:
+def write_plot(path: Path, found: StudyResults) -> None:
     """The study's own question as a PNG."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -61,7 +61,7 @@ def write_plot(path: Path, found: Findings) -> None:
     files.write_bytes(path, buffer.getvalue())
 
 
-def _falls(axes: Axes, rows: Sequence[StudyRow]) -> None:
+def _falls(axes: Axes, rows: Sequence[ArmComparison]) -> None:
     """Bars of points of AP50 by arm; the paper's as marks."""
     series: dict[str, list[Interval | None]] = {
         "attack, benign labels": [row.drops["paper"]["ap50"] for row in rows],
@@ -125,13 +125,13 @@ def bars(axes: Axes, series: Mapping[str, Sequence[Interval | None]]) -> None:
                 axes.plot([place] * 2, [100 * one.low, 100 * one.high], color=_BLACK, linewidth=1.1, zorder=3)
 
 
-def _success(axes: Axes, curves: Sequence[Curve]) -> None:
+def _success(axes: Axes, curves: Sequence[SuccessCurve]) -> None:
     """Shares of broken frames over queries; a band for the first arm only, lest they cover each other."""
     for i, curve in enumerate(curves):
-        queries = range(1, curve.most + 1)
+        queries = range(1, curve.max_queries + 1)
         values = [100 * (one.value or 0.0) for one in curve.shares]
         colour, style = COLOURS[i % len(COLOURS)], LINES[i // len(COLOURS) % len(LINES)]
-        marker = "o" if curve.most == 1 else None
+        marker = "o" if curve.max_queries == 1 else None
         axes.step(
             queries, values, style, where="post", color=colour, label=curve.name, linewidth=1.8, marker=marker
         )
@@ -139,7 +139,7 @@ def _success(axes: Axes, curves: Sequence[Curve]) -> None:
         if i == 0 and None not in low and None not in high:
             bottom, top = ([100 * (v or 0.0) for v in side] for side in (low, high))
             axes.fill_between(queries, bottom, top, step="post", color=colour, alpha=0.15, linewidth=0)
-    most = max(curve.most for curve in curves)
+    most = max(curve.max_queries for curve in curves)
     axes.set_xscale("log", base=2)
     ticks = [2**k for k in range(most.bit_length()) if 2**k <= most]
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
@@ -147,12 +147,12 @@ def _success(axes: Axes, curves: Sequence[Curve]) -> None:
     axes.set_title(f"Frames broken; band: 95 % of draws, {curves[0].name}", loc="left", fontsize=11)
 
 
-def _label_sets(axes: Axes, sets: Sequence[LabelSets]) -> None:
+def _label_sets(axes: Axes, sets: Sequence[LabelComparison]) -> None:
     """Shares of frames that fail, by label set and IoU."""
     series = [
-        *((f"benign labels, {o:g}", [s.counted[o].paper for s in sets]) for o in OVERLAPS),
-        *((f"benign only, {o:g}", [s.counted[o].only_unmoved for s in sets]) for o in OVERLAPS),
-        *((f"moved labels, {o:g}", [s.counted[o].moved for s in sets]) for o in OVERLAPS),
+        *((f"benign labels, {o:g}", [s.counts[o].paper for s in sets]) for o in OVERLAPS),
+        *((f"benign only, {o:g}", [s.counts[o].only_unmoved for s in sets]) for o in OVERLAPS),
+        *((f"moved labels, {o:g}", [s.counts[o].moved for s in sets]) for o in OVERLAPS),
     ]
     width = _GROUP_WIDTH / len(series)
     for i, (name, counts) in enumerate(series):

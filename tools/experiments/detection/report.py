@@ -9,21 +9,20 @@ from typing import Any
 
 from drivesem.analysis.confirm.report import Confirmation
 from drivesem.analysis.transfer.report import bounded
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.commands import Study
+from drivesem.attack.targets import HEADLINE
 from drivesem.evaluation.resampling import Difference, Interval
-from drivesem.failures.certificate import Rule
+from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grades import Grade, Kind
-from drivesem.report.answer import Answer
 from drivesem.report.paper import PAPER_BENIGN
-from drivesem.report.tables import Sheet, number_of, percent
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
 from tools.experiments.detection.arms import PLACEBO, RANDOM
 from tools.experiments.detection.counts import StudyCounts
 from tools.experiments.detection.grades import ArmGrades
-from tools.experiments.detection.labels import OVERLAPS, LabelSets
-from tools.experiments.detection.rows import FIGURES, MODES, StudyRow, feasible_fraction
-from tools.experiments.detection.searches import SearchCost, Standing
-from tools.experiments.detection.success import Curve
+from tools.experiments.detection.labels import OVERLAPS, LabelComparison
+from tools.experiments.detection.rows import METRIC_NAMES, MODES, ArmComparison, feasible_fraction
+from tools.experiments.detection.searches import SearchCost, WithstandingObjects
+from tools.experiments.detection.success import SuccessCurve
+from tools.experiments.settings import StudyConfig
 
 OWN_PROTOCOL = (
     "Ours, own protocol: not comparable with the paper's figures, which stand beside its own protocol only "
@@ -36,21 +35,21 @@ _MARKS = (1, 2, 5, 10, 20, 64)
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StudyText:
     """A study as text. short: the tables of `sheets` that a terminal shows; tables: rows of CSV files by name;
     words: columns of words, the others hold numbers; unbroken: those that a terminal does not wrap.
     """
 
     study: str
-    sheets: Sequence[Sheet]
-    short: Sequence[Sheet]
+    sheets: Sequence[ReportTable]
+    short: Sequence[ReportTable]
     notes: Sequence[str]
     tables: Mapping[str, Sequence[Mapping[str, Any]]]
     words: Collection[str]
     unbroken: Collection[str] = ()
 
 
-def heading(study: Study, draws: int, counts: StudyCounts) -> dict[str, Any]:
+def heading(study: StudyConfig, draws: int, counts: StudyCounts) -> dict[str, Any]:
     """What the JSON object of a study of arms begins with."""
     return {
         "study": study.name,
@@ -64,43 +63,43 @@ def heading(study: Study, draws: int, counts: StudyCounts) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Findings:
+class StudyResults:
     """All that a study found. curves, beside: of studies of success; beside: by arm, what the first arm breaks
     within `within` queries less what that arm does at its end. label_sets: of the study `labels`. confirmed: what
     second renderers' pictures say, by arm. grades: how sure failures are, of every arm, controls included. costs,
     standing: of the study `searches`.
     """
 
-    study: Study
+    study: StudyConfig
     draws: int
     counts: StudyCounts
-    rows: Sequence[StudyRow]
-    curves: Sequence[Curve] = ()
-    beside: Mapping[str, Difference] | None = None
+    rows: Sequence[ArmComparison]
+    curves: Sequence[SuccessCurve] = ()
+    advantages: Mapping[str, Difference] | None = None
     within: int = 0
-    label_sets: Sequence[LabelSets] = ()
+    label_sets: Sequence[LabelComparison] = ()
     confirmed: Mapping[str, Confirmation] = field(default_factory=dict)
     grades: Sequence[ArmGrades] = ()
     costs: Sequence[SearchCost] = ()
-    standing: Sequence[Standing] = ()
+    withstanding: Sequence[WithstandingObjects] = ()
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        data = heading(self.study, self.draws, self.counts) | {"rows": self.flat_rows()}
+        data = heading(self.study, self.draws, self.counts) | {"rows": self.arm_rows()}
         if self.curves:
             data["curves"] = [point for curve in self.curves for point in curve.to_json()]
         if self.label_sets:
-            data["label_sets"] = [one.flat() for one in self.label_sets]
+            data["label_sets"] = [one.to_row() for one in self.label_sets]
         if self.grades:
-            data["grades"] = [one.flat() for one in self.grades]
+            data["grades"] = [one.to_row() for one in self.grades]
         if self.costs:
-            data["searches"] = [one.flat() for one in self.costs]
-            data["standing"] = [one.flat() for one in self.standing]
+            data["searches"] = [one.to_row() for one in self.costs]
+            data["standing"] = [one.to_row() for one in self.withstanding]
         return data
 
-    def flat_rows(self) -> list[dict[str, Any]]:
+    def arm_rows(self) -> list[dict[str, Any]]:
         """Numbers of each row by name, with those of the second renderer where it was asked."""
-        rows = [row.flat() for row in self.rows]
+        rows = [row.to_row() for row in self.rows]
         for row in rows:
             if row["name"] in self.confirmed:
                 share = self.confirmed[row["name"]].shares[0]
@@ -109,9 +108,9 @@ class Findings:
         return rows
 
 
-def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
+def sheets(found: StudyResults, whole: bool = True) -> list[ReportTable]:
     """The study's own question first. whole: with the figures that only some ask for."""
-    tables: list[Sheet] = []
+    tables: list[ReportTable] = []
     if found.curves:
         tables.append(_success(found))
     if found.label_sets:
@@ -119,7 +118,7 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
     if found.grades and (whole or found.study.name in ("grades", "searches")):
         tables += [_grades(found.grades) if whole else _grades_short(found.grades), _kinds(found.grades)]
     if found.costs:
-        tables += [_costs(found.costs), _standing(found.standing)]
+        tables += [_costs(found.costs), _standing(found.withstanding)]
     tables.append(_precision(found.rows))
     if any(row.controls for row in found.rows):
         tables.append(_controls(found.rows))
@@ -128,22 +127,25 @@ def sheets(found: Findings, whole: bool = True) -> list[Sheet]:
     return [*tables, *([_further(found.rows)] if whole else []), _frames(found.rows)]
 
 
-def _precision(rows: Sequence[StudyRow]) -> Sheet:
+def _precision(rows: Sequence[ArmComparison]) -> ReportTable:
     told = any(row.run.arm.reference is not None for row in rows)
     columns = [_ARM, "benign", *(f"{mode} labels" for mode in MODES), *(f"falls, {mode}" for mode in MODES)]
     lines = []
     for row in rows:
         reference = row.run.arm.reference
-        cells = [row.name, *(percent(scores.ap50) for scores in (row.benign, row.paper, row.moved))]
+        cells = [row.name, *(format_percent(scores.ap50) for scores in (row.benign, row.paper, row.moved))]
         cells += [bounded(row.drops[mode]["ap50"]) for mode in MODES]
         if told:
-            cells += [percent(reference), "-" if reference is None else f"{100 * (PAPER_BENIGN - reference):.1f}"]
+            cells += [
+                format_percent(reference),
+                "-" if reference is None else f"{100 * (PAPER_BENIGN - reference):.1f}",
+            ]
         lines.append(tuple(cells))
     columns += ["mAP there", "falls there"] if told else []
-    return Sheet(f"{HEADLINE} AP50, %", tuple(columns), tuple(lines))
+    return ReportTable(f"{HEADLINE} AP50, %", tuple(columns), tuple(lines))
 
 
-def _controls(rows: Sequence[StudyRow]) -> Sheet:
+def _controls(rows: Sequence[ArmComparison]) -> ReportTable:
     kinds = [kind for kind in (RANDOM, PLACEBO) if any(kind in row.controls for row in rows)]
     tested = any(row.p is not None for row in rows)
     lines = []
@@ -153,16 +155,16 @@ def _controls(rows: Sequence[StudyRow]) -> Sheet:
             control = row.controls.get(kind)
             cells.append("-" if control is None else bounded(control.drops["moved"]["ap50"]))
             effect = "-" if control is None else bounded(row.effects[kind]["moved"].interval)
-            cells.append(f"{effect} *" if kind == row.matching else effect)
+            cells.append(f"{effect} *" if kind == row.matching_control else effect)
         size = row.controls[PLACEBO].size if PLACEBO in row.controls else None
         cells.append("-" if size is None else f"{size:.2f}")
         lines.append((*cells, *([] if not tested else ["-" if row.p is None else f"{row.p:.3f}"])))
     columns = [column for kind in kinds for column in (f"{kind} falls", f"attack less {kind}")]
     columns += [f"size of {PLACEBO}", *(["p of *"] if tested else [])]
-    return Sheet("Controls: AP50, moved labels, points", (_ARM, *columns), tuple(lines))
+    return ReportTable("Controls: AP50, moved labels, points", (_ARM, *columns), tuple(lines))
 
 
-def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
+def _confirmed(confirmed: Mapping[str, Confirmation]) -> ReportTable:
     lines = []
     for name, one in confirmed.items():
         cells = [name, str(one.frames)]
@@ -171,17 +173,17 @@ def _confirmed(confirmed: Mapping[str, Confirmation]) -> Sheet:
             cells.append(f"{value} of {share.failures}" if share.failures else "-")
         lines.append(tuple(cells))
     names = next(iter(confirmed.values())).shares
-    return Sheet(
+    return ReportTable(
         "Failures that survive a second renderer, %",
         (_ARM, "drawn", *(s.name for s in names)),
         tuple(lines),
     )
 
 
-def _grades(grades: Sequence[ArmGrades]) -> Sheet:
+def _grades(grades: Sequence[ArmGrades]) -> ReportTable:
     lines = []
     for one in grades:
-        survive = f"{bounded(one.survive)} of {one.asked}" if one.asked else "-"
+        survive = f"{bounded(one.survive)} of {one.second_rendered}" if one.second_rendered else "-"
         cells = [one.name, str(one.frames), str(one.objects), str(one.passes)]
         cells += [str(one.counts[grade]) for grade in Grade]
         lines.append((*cells, bounded(one.rates[Grade.CERTAIN]), survive))
@@ -194,26 +196,26 @@ def _grades(grades: Sequence[ArmGrades]) -> Sheet:
         "certain, % of objects",
         "confirmed, % of certain",
     )
-    return Sheet("Failures by grade, each with those above it", columns, tuple(lines))
+    return ReportTable("Failures by grade, each with those above it", columns, tuple(lines))
 
 
-def _grades_short(grades: Sequence[ArmGrades]) -> Sheet:
+def _grades_short(grades: Sequence[ArmGrades]) -> ReportTable:
     """The same for a terminal: counts in one column."""
     lines = []
     for one in grades:
-        survive = f"{bounded(one.survive)} of {one.asked}" if one.asked else "-"
+        survive = f"{bounded(one.survive)} of {one.second_rendered}" if one.second_rendered else "-"
         counts = _by_grade([one.counts[grade] for grade in Grade])
         lines.append((one.name, counts, str(one.objects), bounded(one.rates[Grade.CERTAIN]), survive))
     columns = (_ARM, "failures", "objects", "certain, % of objects", "confirmed, % of certain")
-    return Sheet(f"Failures by grade: {' / '.join(Grade)}", columns, tuple(lines))
+    return ReportTable(f"Failures by grade: {' / '.join(Grade)}", columns, tuple(lines))
 
 
-def _kinds(grades: Sequence[ArmGrades]) -> Sheet:
+def _kinds(grades: Sequence[ArmGrades]) -> ReportTable:
     told = (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)
     lines = [
         (one.name, *(_by_grade([one.kinds[kind][grade] for grade in told]) for kind in Kind)) for one in grades
     ]
-    return Sheet(f"Kinds of failure: {' / '.join(told)}", (_ARM, *map(str, Kind)), tuple(lines))
+    return ReportTable(f"Kinds of failure: {' / '.join(told)}", (_ARM, *map(str, Kind)), tuple(lines))
 
 
 def _by_grade(counts: Sequence[int]) -> str:
@@ -221,7 +223,7 @@ def _by_grade(counts: Sequence[int]) -> str:
     return " / ".join(map(str, counts)) if any(counts) else "-"
 
 
-def _costs(costs: Sequence[SearchCost]) -> Sheet:
+def _costs(costs: Sequence[SearchCost]) -> ReportTable:
     lines = []
     for one in costs:
         ahead = "-" if one.ahead is None else bounded(one.ahead.interval)
@@ -233,7 +235,7 @@ def _costs(costs: Sequence[SearchCost]) -> Sheet:
         "certain a minute",
         f"{costs[0].name} less this, % of objects",
     )
-    return Sheet("What certain failures cost", columns, tuple(lines))
+    return ReportTable("What certain failures cost", columns, tuple(lines))
 
 
 def _number(one: Interval) -> str:
@@ -243,83 +245,83 @@ def _number(one: Interval) -> str:
     return f"{one.value:.2f} [{one.low:.2f}, {one.high:.2f}]"
 
 
-def _standing(classes: Sequence[Standing]) -> Sheet:
-    lines = [(one.name, str(one.objects), str(one.lost), bounded(one.standing)) for one in classes]
-    return Sheet(
+def _standing(classes: Sequence[WithstandingObjects]) -> ReportTable:
+    lines = [(one.name, str(one.objects), str(one.lost), bounded(one.share)) for one in classes]
+    return ReportTable(
         "Objects that no method brings to fall for certain",
         (_CLASS, "found", "lost to any", "standing, %"),
         tuple(lines),
     )
 
 
-def _further(rows: Sequence[StudyRow]) -> Sheet:
+def _further(rows: Sequence[ArmComparison]) -> ReportTable:
     lines = []
     for row in rows:
-        for key, name in FIGURES.items():
+        for key, name in METRIC_NAMES.items():
             if key == "ap50":
                 continue
             scores = (getattr(one, key) for one in (row.benign, row.paper, row.moved))
             falls = (bounded(row.drops[mode][key]) for mode in MODES)
-            lines.append((row.name, name, *map(percent, scores), *falls))
+            lines.append((row.name, name, *map(format_percent, scores), *falls))
     columns = (_ARM, _MEASURE, "benign", *MODES, *(f"falls, {mode}" for mode in MODES))
-    return Sheet(f"{HEADLINE}, further figures, %", columns, tuple(lines))
+    return ReportTable(f"{HEADLINE}, further figures, %", columns, tuple(lines))
 
 
-def _frames(rows: Sequence[StudyRow]) -> Sheet:
+def _frames(rows: Sequence[ArmComparison]) -> ReportTable:
     controls = [name for name in (RANDOM, PLACEBO) if any(name in row.controls for row in rows)]
     lines = []
     for row in rows:
-        flat = row.flat()
+        flat = row.to_row()
         keys = [f"successes_{mode}" for mode in MODES] + [f"{name}_successes_moved" for name in controls]
         counts = [flat.get(key) for key in ("frames", *keys, "queries")]
         # An arm may have none of the controls that another has; of several seeds there is a mean.
         told = ["-" if count is None else f"{round(count, 1):.15g}" for count in counts]
-        lines.append((row.name, *told[:3], bounded(row.share_broken("moved")), *told[3:]))
+        lines.append((row.name, *told[:3], bounded(row.broken_share("moved")), *told[3:]))
     columns = (_ARM, "frames", *MODES, "moved, %", *controls, "queries")
-    return Sheet(
+    return ReportTable(
         "Frames in which something was lost or made up (in brackets Wilson's 95 %)", columns, tuple(lines)
     )
 
 
-def _success(found: Findings) -> Sheet:
-    most = max(curve.most for curve in found.curves)
+def _success(found: StudyResults) -> ReportTable:
+    most = max(curve.max_queries for curve in found.curves)
     marks = [mark for mark in _MARKS if mark <= most]
     lines = []
     for curve in found.curves:
-        shares = [bounded(curve.at(mark)) if mark <= curve.most else "-" for mark in marks]
-        last = bounded(curve.at(curve.most))
-        mean = "-" if curve.mean is None else f"{curve.mean:.1f}"
-        cells = [curve.name, *shares, f"{last} of {curve.most}", mean]
-        if found.beside is not None:
-            one = found.beside[curve.name]
+        shares = [bounded(curve.at(mark)) if mark <= curve.max_queries else "-" for mark in marks]
+        last = bounded(curve.at(curve.max_queries))
+        mean = "-" if curve.mean_queries is None else f"{curve.mean_queries:.1f}"
+        cells = [curve.name, *shares, f"{last} of {curve.max_queries}", mean]
+        if found.advantages is not None:
+            one = found.advantages[curve.name]
             cells.append(bounded(one.interval))
         lines.append(tuple(cells))
     columns = [_ARM, *(f"{mark}" for mark in marks), "at the end", "mean queries"]
-    if found.beside is not None:
+    if found.advantages is not None:
         columns.append(f"{found.curves[0].name} in {found.within}, less this at the end")
-    return Sheet("Frames broken after so many queries, %", tuple(columns), tuple(lines))
+    return ReportTable("Frames broken after so many queries, %", tuple(columns), tuple(lines))
 
 
-def _label_sets(sets: Sequence[LabelSets]) -> Sheet:
+def _label_sets(sets: Sequence[LabelComparison]) -> ReportTable:
     lines = []
     for one in sets:
         iou = ("-" if value is None else f"{value:.3f}" for value in one.iou.values())
-        lines.append((one.name, str(one.objects), *iou, *(percent(one.below[o]) for o in OVERLAPS)))
+        lines.append((one.name, str(one.objects), *iou, *(format_percent(one.below[o]) for o in OVERLAPS)))
     columns = (_ARM, "objects", *sets[0].iou, *(f"below {o:g}, %" for o in OVERLAPS))
-    return Sheet("IoU of benign and moved labels", columns, tuple(lines))
+    return ReportTable("IoU of benign and moved labels", columns, tuple(lines))
 
 
-def _counterexamples(sets: Sequence[LabelSets]) -> Sheet:
+def _counterexamples(sets: Sequence[LabelComparison]) -> ReportTable:
     lines = [
         (one.name, f"{overlap:g}", *(str(count) for count in (one.frames, *astuple(at))))
         for one in sets
-        for overlap, at in one.counted.items()
+        for overlap, at in one.counts.items()
     ]
     columns = (_ARM, "IoU", "frames", "paper", "moved", "paper only", "lost, paper", "lost, paper only")
-    return Sheet("Counterexamples by benign (paper) and by moved labels", columns, tuple(lines))
+    return ReportTable("Counterexamples by benign (paper) and by moved labels", columns, tuple(lines))
 
 
-def notes(found: Findings) -> list[str]:
+def notes(found: StudyResults) -> list[str]:
     """What the columns mean."""
     spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
     told = [
@@ -364,7 +366,7 @@ def notes(found: Findings) -> list[str]:
             "brackets Wilson's 95 %. Second only: of frames that did not fail before."
         )
     if found.grades:
-        rule = Rule(found.study.draws)
+        rule = CertificateRule(found.study.draws)
         told.append(
             f"Certain: right in {rule.before} of {rule.draws} draws of a camera's small changes before, wrong in "
             f"{rule.after} of {rule.draws} after. "
@@ -382,42 +384,44 @@ def notes(found: Findings) -> list[str]:
     if unknown:
         told.append(f"Grades unknown, of an older version or without them: {', '.join(unknown)}.")
     share = feasible_fraction(found.counts.frames)
-    told.append(f"Feasible by the independent check: {percent(share)} % of all attacked frames.")
+    told.append(f"Feasible by the independent check: {format_percent(share)} % of all attacked frames.")
     if found.counts.without_vehicles:
-        told.append(f"{number_of(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
+        told.append(f"{format_count(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
     told += [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
     return told
 
 
-def told(found: Findings) -> Told:
+def study_text(found: StudyResults) -> StudyText:
     """The tables of all arms."""
-    tables = {"study": found.flat_rows()}
+    tables = {"study": found.arm_rows()}
     if found.curves:
         tables["curves"] = [point for curve in found.curves for point in curve.to_json()]
     if found.label_sets:
-        tables["label_sets"] = [one.flat() for one in found.label_sets]
+        tables["label_sets"] = [one.to_row() for one in found.label_sets]
     if found.grades:
-        tables["grades"] = [one.flat() for one in found.grades]
+        tables["grades"] = [one.to_row() for one in found.grades]
     if found.costs:
-        tables["searches"] = [one.flat() for one in found.costs]
-        tables["standing"] = [one.flat() for one in found.standing]
-    return Told(found.study.name, sheets(found), sheets(found, whole=False), notes(found), tables, _WORDS, _WORDS)
+        tables["searches"] = [one.to_row() for one in found.costs]
+        tables["standing"] = [one.to_row() for one in found.withstanding]
+    return StudyText(
+        found.study.name, sheets(found), sheets(found, whole=False), notes(found), tables, _WORDS, _WORDS
+    )
 
 
-def answer_of(
-    told: Told, out: Path, data: Mapping[str, Any], command: str, picture: Callable[[Path], object] | None
-) -> Answer:
+def build_report(
+    told: StudyText, out: Path, data: Mapping[str, Any], command: str, picture: Callable[[Path], object] | None
+) -> AnalysisReport:
     """A study in its folder. data: its JSON; command: what repeats it; picture: draws it."""
-    return Answer(
+    return AnalysisReport(
         out=out,
         name="study",
         heading=f"Study: {told.study}",
-        lead=[f"    {command}", ""],
+        intro=[f"    {command}", ""],
         data=data,
-        tables=told.tables,
-        sheets=told.sheets,
-        printed=[replace(sheet, looks={"unbroken": told.unbroken}) for sheet in told.short],
+        csv_tables=told.tables,
+        tables=told.sheets,
+        printed_tables=[replace(sheet, looks={"unbroken": told.unbroken}) for sheet in told.short],
         notes=told.notes,
-        words=told.words,
+        text_columns=told.words,
         picture=picture,
     )

@@ -19,29 +19,29 @@ import numpy as np
 from detectors.base import Predictor
 from detectors.registry import load_detector
 from drivesem.attack.feasible.bounds import Limits
-from drivesem.attack.judging import t_star_of
 from drivesem.attack.space import Parameter
-from drivesem.config.commands import Attack, Study
+from drivesem.attack.targets import t_star_of
+from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import LEVEL, Interval
-from drivesem.failures.certificate import Camera, Exposure
-from drivesem.failures.grades import SECOND
-from drivesem.failures.neighbourhood import NEAR, Everywhere, Neighbourhood
+from drivesem.failures.certificate import NuisanceCamera, SampleImage
+from drivesem.failures.grades import AGREEMENT_RULE
+from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood, SceneSampler
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.second_renderer.choose import SecondRenderers
-from drivesem.run.ask import Bar, KeptFrames
 from drivesem.run.attack import params_of
-from drivesem.run.finished import Run
+from drivesem.run.detection_cache import weights_digest
+from drivesem.run.driver import FrameResultCache, ProgressSettings
+from drivesem.run.finished import Run, rebuilt
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
-from drivesem.run.looking import weights_digest
-from drivesem.run.rebuilt import rebuilt
 from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import load_frame
-from drivesem.run.tally import certain_losses
+from drivesem.run.summary import certain_losses
 from scene_ir import files
 from scene_ir.errors import SceneError
 from scene_ir.io import load_scene
+from tools.experiments.settings import StudyConfig
 
 ANYWHERE, REDRAWN, AROUND = "anywhere", "redrawn", "around"
 """States anywhere; some of them by the second renderer; states around certain failures."""
@@ -60,12 +60,12 @@ GOAL = {
 SCHEMA = 1
 ROBUST, STATES = "robust.json", "states"
 """The file that marks a frame as done, and the folder of all of them."""
-_REDRAWN_SHARE = SECOND[1] / 16
+_REDRAWN_SHARE = AGREEMENT_RULE[1] / 16
 """Of the states: as many as grading has a second renderer draw of its draws."""
 
 
 @dataclass(frozen=True, slots=True)
-class Counted:
+class FailureCounts:
     """Of one kind of states. cars: how often a car counts; lost: how often it is not found, by detector; pictures;
     phantoms: in how many of these something is reported where nothing is, by detector.
     """
@@ -77,29 +77,29 @@ class Counted:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameStates:
+class FrameStateCounts:
     """One frame. source: digest of the run's result; counts: by kind of states; note: why no second renderer drew,
     empty where one did.
     """
 
     identifier: str
     source: str
-    counts: dict[str, Counted]
+    counts: dict[str, FailureCounts]
     note: str
 
 
-class Judge:
+class StateEvaluator:
     """What one process needs: built once, used for many frames. run: an attack on held-out frames, against the
     first of the detectors; states: of each frame.
     """
 
-    def __init__(self, run: Run, attack: Attack, detectors: Sequence[str], states: int, out: Path) -> None:
+    def __init__(self, run: Run, attack: AttackConfig, detectors: Sequence[str], states: int, out: Path) -> None:
         self.run, self.attack, self.states, self.out = run, attack, states, out
         self.params: tuple[Parameter, ...] = params_of(attack)
         # A run's scenes are read to the CPU.
         self.detectors: list[Predictor] = [load_detector(name) for name in detectors]
         self.second = SecondRenderers(attack.dataset, attack.root)
-        self._cameras: list[Camera] = []
+        self._cameras: list[NuisanceCamera] = []
 
     def __call__(self, name: str) -> None:
         """One frame, from the run's folder to its own."""
@@ -108,73 +108,73 @@ class Judge:
         objective, found = rebuilt(result, source, self.attack, self.params, self.detectors[0])
         limits = Limits(joint_weather=result.joint_weather)
         feasible = objective.feasible_set(limits, self.attack.project == "bounds")
-        nuisances, stream = Nuisances.of(self.attack.nuisances), f"judging:{name}:{self.attack.seed}"
-        anywhere = Everywhere(objective, feasible, nuisances, stream)
+        nuisances, stream = Nuisances.parse(self.attack.nuisances), f"judging:{name}:{self.attack.seed}"
+        anywhere = SceneSampler(objective, feasible, nuisances, stream)
         counts, note = {}, ""
         cars = anywhere.judged
         asked = self.attack.t_star
         self._cameras = [replace(anywhere.camera, detector=d, t_star=t_star_of(d, asked)) for d in self.detectors]
-        seen = [self._seen(anywhere.exposed(number), cars) for number in range(self.states)]
+        seen = [self._seen(anywhere.render(number), cars) for number in range(self.states)]
         counts[ANYWHERE] = self._counted(seen)
         try:
             second = self.second.of(name, load_scene(source / "scene"))
-            camera, again = replace(anywhere.camera, renderer=second), range(redrawn_of(self.states))
-            counts[REDRAWN] = self._counted([self._seen(anywhere.exposed(n, camera), cars) for n in again])
+            camera, again = replace(anywhere.camera, renderer=second), range(redrawn_count(self.states))
+            counts[REDRAWN] = self._counted([self._seen(anywhere.render(n, camera), cars) for n in again])
         except SceneError as error:
             note = f"no second renderer: expected {error.expected}, found {error.actual}"
         around = []
         for index in [one.index for one in certain_losses(result) if one.index is not None]:
             near = Neighbourhood(objective, feasible, found, index, nuisances, f"{stream}:{index}")
-            samples = (near.sample(n, 1.0 if n % 2 == 0 else NEAR) for n in range(self.states))
-            around += [self._seen(one.exposure, [index]) for one in samples if one is not None]
+            samples = (near.sample(n, 1.0 if n % 2 == 0 else NEAR_REACH) for n in range(self.states))
+            around += [self._seen(one.image, [index]) for one in samples if one is not None]
         counts[AROUND] = self._counted(around)
-        kept = FrameStates(name, files.digest(source / RESULT), counts, note)
-        with files.whole_folder(self.out / FRAMES / name) as part:
+        kept = FrameStateCounts(name, files.sha256_digest(source / RESULT), counts, note)
+        with files.atomic_folder(self.out / FRAMES / name) as part:
             files.write_text(part / ROBUST, dump_record(kept, SCHEMA))
 
-    def _seen(self, exposure: Exposure, cars: Sequence[int]) -> tuple[int, list[int], list[bool]]:
+    def _seen(self, exposure: SampleImage, cars: Sequence[int]) -> tuple[int, list[int], list[bool]]:
         """Cars that count in a picture; by detector, how many of them it does not find, and whether it reports
         what is not there.
         """
         counted = [index for index in cars if not bool(exposure.targets.ignore[index])]
         lost, phantoms = [], []
         for camera in self._cameras:
-            judged = camera.see(exposure).judged
-            lost.append(sum(not bool(judged.found[index]) for index in counted))
+            judged = camera.detect(exposure).outcome
+            lost.append(sum(not bool(judged.detected[index]) for index in counted))
             phantoms.append(bool(judged.background))
         return len(counted), lost, phantoms
 
-    def _counted(self, seen: Sequence[tuple[int, list[int], list[bool]]]) -> Counted:
+    def _counted(self, seen: Sequence[tuple[int, list[int], list[bool]]]) -> FailureCounts:
         lost = np.array([lost for _, lost, _ in seen]).reshape(-1, len(self.detectors)).sum(0)
         phantoms = np.array([phantoms for _, _, phantoms in seen]).reshape(-1, len(self.detectors)).sum(0)
         cars = sum(count for count, _, _ in seen)
-        return Counted(cars, tuple(map(int, lost)), len(seen), tuple(map(int, phantoms)))
+        return FailureCounts(cars, tuple(map(int, lost)), len(seen), tuple(map(int, phantoms)))
 
 
-def redrawn_of(states: int) -> int:
+def redrawn_count(states: int) -> int:
     """How many of so many states a second renderer draws again."""
     return max(round(_REDRAWN_SHARE * states), 1)
 
 
-def states_of(
-    run: Run, attack: Attack, detectors: Sequence[str], study: Study, out: Path
-) -> tuple[list[FrameStates], dict[str, str]]:
+def evaluate_states(
+    run: Run, attack: AttackConfig, detectors: Sequence[str], study: StudyConfig, out: Path
+) -> tuple[list[FrameStateCounts], dict[str, str]]:
     """Show states of a run's frames to detectors, or go on with it; and frames that could not be used, with
     reasons. What is kept belongs to these detectors, as they are.
     """
     seen = [(weights_digest(one), t_star_of(one, attack.t_star)) for one in map(load_detector, detectors)]
     name = hashlib.sha256(repr((seen, study.states)).encode()).hexdigest()[:16]
     folder = out / STATES / name
-    build = partial(Judge, run, attack, detectors, study.states, folder)
+    build = partial(StateEvaluator, run, attack, detectors, study.states, folder)
     names = [frame.result.identifier for frame in run.frames]
-    read = partial(load_record, kind=FrameStates, schema=SCHEMA)
-    return KeptFrames(run.folder, folder, ROBUST, read).ask(
-        names, build(), build, study, Bar("asking all detectors", remaining=True)
+    read = partial(load_record, kind=FrameStateCounts, schema=SCHEMA)
+    return FrameResultCache(run.folder, folder, ROBUST, read).run(
+        names, build(), build, study, ProgressSettings("asking all detectors", show_remaining=True)
     )
 
 
 @dataclass(frozen=True, slots=True)
-class RobustRow:
+class RobustnessRow:
     """One arm, its seeds together. failures: by kind of states, the share of cars that are not found; fewer: by
     kind and the arm beside, the share of that arm's failures that this one is without, paired over frames;
     phantoms: the share of pictures anywhere that have any; ap50_falls: on benign frames, from the detector as it
@@ -189,7 +189,7 @@ class RobustRow:
     ap50_falls: float | None
     short_of: tuple[str, ...] | None
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name: fractions of 1, None where there is nothing to count."""
         found: dict[str, Any] = {"arm": self.arm, "name": self.title, "ap50_falls": self.ap50_falls}
         told = {f"failures_{kind}": one for kind, one in self.failures.items()} | {"phantoms": self.phantoms}
@@ -199,13 +199,13 @@ class RobustRow:
         return found | {"goal": None if self.short_of is None else not self.short_of}
 
 
-def rows_of(
-    frames: Sequence[FrameStates],
+def compare_robustness(
+    frames: Sequence[FrameStateCounts],
     arms: Sequence[tuple[str, str]],
     falls: Mapping[str, Sequence[float | None]],
     draws: int,
     seed: int,
-) -> list[RobustRow]:
+) -> list[RobustnessRow]:
     """A row an arm. arms: arm and title of each detector, in the order in which they were asked; falls: of AP50,
     by arm, of each seed.
     """
@@ -226,7 +226,7 @@ def rows_of(
         }
         phantoms = _shares(frames, ANYWHERE, own, weights, "phantoms")
         known = [one for one in falls[arm] if one is not None]
-        row = RobustRow(
+        row = RobustnessRow(
             arm,
             arms[own[0]][1],
             {kind: _interval(kind, *shares[kind, arm]) for kind in KINDS},
@@ -243,7 +243,7 @@ def rows_of(
     return [replace(row, short_of=_short_of(row, by_arm)) if row in aimed else row for row in rows]
 
 
-def _short_of(row: RobustRow, by_arm: Mapping[str, RobustRow]) -> tuple[str, ...]:
+def _short_of(row: RobustnessRow, by_arm: Mapping[str, RobustnessRow]) -> tuple[str, ...]:
     """What GOAL asks for and is not so."""
     own, (benign, random) = row.failures[ANYWHERE], (by_arm[name].failures[ANYWHERE] for name in CONTROLS)
     less = row.fewer[ANYWHERE, CONTROLS[0]].value
@@ -264,7 +264,7 @@ def _below(one: Interval, other: Interval) -> bool:
 
 
 def _shares(
-    frames: Sequence[FrameStates], kind: str, columns: Sequence[int], weights: Floats, what: str = "lost"
+    frames: Sequence[FrameStateCounts], kind: str, columns: Sequence[int], weights: Floats, what: str = "lost"
 ) -> tuple[Floats, Floats]:
     """The share () of cars lost, or of pictures with phantoms, a mean over detectors; and the same of each draw
     (draws,). nan where nothing counts.

@@ -21,17 +21,17 @@ from drivesem.evaluation.resampling import (
     wilson,
 )
 from drivesem.report.paper import PAPER_BENIGN
-from tools.experiments.detection.arms import matching
+from tools.experiments.detection.arms import matching_control
 from tools.experiments.detection.counts import ArmCounts, FrameCounts
 
-FIGURES = {"ap50": "AP50", "ap70": "AP70", "ap": "AP50:95", "recall": "recall"}
+METRIC_NAMES = {"ap50": "AP50", "ap70": "AP70", "ap": "AP50:95", "recall": "recall"}
 """Fields of `RowScores`, whose fall is told, and their names for people."""
 MODES = ("paper", "moved")
 _SINGLE_OVERLAPS = {"ap50": 0.5, "ap70": 0.7}
 
 
 @dataclass(frozen=True, slots=True)
-class RowScores:
+class HeadlineScores:
     """HEADLINE's figures, fractions of 1, as `coco.ClassScores` has them; None where there is no object to find,
     or where they are not told.
     """
@@ -42,13 +42,13 @@ class RowScores:
     recall: float | None = None
 
     @classmethod
-    def of(cls, figures: Sequence[Figure]) -> RowScores:
+    def from_metrics(cls, figures: Sequence[Figure]) -> HeadlineScores:
         """Those of them that are there."""
         return cls(**{figure.name: figure.value() for figure in figures})
 
 
 @dataclass(frozen=True, slots=True)
-class StudyRow:
+class ArmComparison:
     """One arm, or one control by its seeds. benign, paper, moved: HEADLINE's figures in the photographs, and after
     the attack by either label mode. drops: by mode and figure, from benign to attacked. effects: by control and
     mode, how far AP50 falls below the control's. controls: their own rows. size: of a control's edits, relative to
@@ -57,12 +57,12 @@ class StudyRow:
     """
 
     runs: Sequence[ArmCounts]
-    benign: RowScores
-    paper: RowScores
-    moved: RowScores
+    benign: HeadlineScores
+    paper: HeadlineScores
+    moved: HeadlineScores
     drops: dict[str, dict[str, Interval]]
     effects: dict[str, dict[str, Difference]]
-    controls: dict[str, StudyRow]
+    controls: dict[str, ArmComparison]
     size: float | None = None
     p: float | None = None
 
@@ -72,17 +72,17 @@ class StudyRow:
         return self.runs[0]
 
     @property
-    def matching(self) -> str | None:
+    def matching_control(self) -> str | None:
         """The control with as many chances, where it was run."""
-        kind = matching(self.run.arm.config)
+        kind = matching_control(self.run.arm.config)
         return kind if kind in self.controls else None
 
-    def broken(self, mode: str) -> float:
+    def mean_broken_frames(self, mode: str) -> float:
         """Frames in which something was lost or made up."""
         found = [getattr(frame, f"success_{mode}") for run in self.runs for frame in run.frames]
         return sum(found) / len(self.runs)
 
-    def share_broken(self, mode: str) -> Interval:
+    def broken_share(self, mode: str) -> Interval:
         """Of the first seed's frames, with Wilson's 95 %, which also holds of a dozen frames."""
         found = [getattr(frame, f"success_{mode}") for frame in self.run.frames]
         if not found:
@@ -94,7 +94,7 @@ class StudyRow:
         """The arm's."""
         return self.run.arm.name
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
         arm, frames = self.run.arm, self.run.frames
         found: dict[str, Any] = {
@@ -112,7 +112,7 @@ class StudyRow:
             "objects": int(self.run.before.objects.sum()),
             "successes_paper": sum(f.success_paper for f in frames),
             "successes_moved": sum(f.success_moved for f in frames),
-            "control": self.matching,
+            "control": self.matching_control,
             "p": self.p,
             "queries": sum(f.queries for f in frames),
             "feasible_fraction": feasible_fraction(frames),
@@ -121,7 +121,7 @@ class StudyRow:
             found[f"benign_{key}"] = getattr(self.benign, key)
             found |= {f"{mode}_{key}": getattr(getattr(self, mode), key) for mode in MODES}
         for mode, falls in self.drops.items():
-            broken = self.share_broken(mode)
+            broken = self.broken_share(mode)
             found |= {f"broken_{mode}": broken.value, f"broken_{mode}_low": broken.low}
             found[f"broken_{mode}_high"] = broken.high
             for key, one in falls.items():
@@ -129,7 +129,7 @@ class StudyRow:
                 found |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
         for name, row in self.controls.items():
             found |= {f"{name}_{mode}_ap50": getattr(row, mode).ap50 for mode in MODES}
-            found |= {f"{name}_successes_moved": row.broken("moved"), f"{name}_seeds": len(row.runs)}
+            found |= {f"{name}_successes_moved": row.mean_broken_frames("moved"), f"{name}_seeds": len(row.runs)}
             found |= {f"{name}_size": row.size}
             for mode in MODES:
                 told = {f"{name}_drop_{mode}": row.drops[mode]["ap50"]}
@@ -139,7 +139,7 @@ class StudyRow:
         return found
 
 
-def rows_of(runs: Sequence[ArmCounts], draws: int, seed: int) -> list[StudyRow]:
+def compare_arms(runs: Sequence[ArmCounts], draws: int, seed: int) -> list[ArmComparison]:
     """A row for each arm that is no control. draws: of the bootstrap over frames; all rows see the same."""
     rows = []
     for run in runs:
@@ -147,7 +147,7 @@ def rows_of(runs: Sequence[ArmCounts], draws: int, seed: int) -> list[StudyRow]:
             continue
         beside: dict[str, list[ArmCounts]] = {}
         for other in runs:
-            if other.arm.control and other.arm.of == run.arm.name:
+            if other.arm.control and other.arm.control_of == run.arm.name:
                 beside.setdefault(other.arm.control, []).append(other)
         rows.append(_row(run, beside, draws, seed))
     effects = [None if row.matching is None else row.effects[row.matching]["moved"].p for row in rows]
@@ -164,26 +164,26 @@ def feasible_fraction(frames: Sequence[_Checked]) -> float | None:
     return sum(frame.feasible for frame in frames) / len(frames) if frames else None
 
 
-def _row(run: ArmCounts, beside: Mapping[str, Sequence[ArmCounts]], draws: int, seed: int) -> StudyRow:
-    mine = Figures.of(run)
+def _row(run: ArmCounts, beside: Mapping[str, Sequence[ArmCounts]], draws: int, seed: int) -> ArmComparison:
+    mine = ArmMetrics.from_runs(run)
     controls, effects = {}, {}
     for name, others in beside.items():
-        theirs = Figures.of(*others).of_ap50()
+        theirs = ArmMetrics.from_runs(*others).ap50_only()
         sizes = [relative_size(other.frames, run.frames) for other in others]
         known = [size for size in sizes if size is not None]
         row = _told(others, theirs, draws, seed)
         controls[name] = replace(row, size=float(np.mean(known)) if known else None)
-        effects[name] = {mode: mine.falls(theirs, mode, draws, seed) for mode in MODES}
+        effects[name] = {mode: mine.drop_beyond(theirs, mode, draws, seed) for mode in MODES}
     return replace(_told([run], mine, draws, seed), controls=controls, effects=effects)
 
 
-def _told(runs: Sequence[ArmCounts], figures: Figures, draws: int, seed: int) -> StudyRow:
+def _told(runs: Sequence[ArmCounts], figures: ArmMetrics, draws: int, seed: int) -> ArmComparison:
     """Without its controls."""
-    return StudyRow(
+    return ArmComparison(
         runs=runs,
-        benign=RowScores.of(figures.before),
-        paper=RowScores.of(figures.after["paper"]),
-        moved=RowScores.of(figures.after["moved"]),
+        benign=HeadlineScores.from_metrics(figures.before),
+        paper=HeadlineScores.from_metrics(figures.after["paper"]),
+        moved=HeadlineScores.from_metrics(figures.after["moved"]),
         drops={mode: figures.drops(mode, draws, seed) for mode in MODES},
         effects={},
         controls={},
@@ -191,7 +191,7 @@ def _told(runs: Sequence[ArmCounts], figures: Figures, draws: int, seed: int) ->
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class ArmMetrics:
     """An arm's figures, to be weighed by frames: before the attack, and after it by label mode."""
 
     before: list[Figure]
@@ -199,15 +199,17 @@ class Figures:
     frames: int
 
     @classmethod
-    def of(cls, *runs: ArmCounts) -> Figures:
+    def from_runs(cls, *runs: ArmCounts) -> ArmMetrics:
         """Of several, such as seeds, the means."""
         before = _means([_figures(run.before) for run in runs])
         after = {mode: _means([_figures(run.after[mode]) for run in runs]) for mode in MODES}
         return cls(before, after, len(runs[0].frames))
 
-    def of_ap50(self) -> Figures:
+    def ap50_only(self) -> ArmMetrics:
         """That alone: of a control nothing else is told."""
-        return Figures(self.before[:1], {mode: figures[:1] for mode, figures in self.after.items()}, self.frames)
+        return ArmMetrics(
+            self.before[:1], {mode: figures[:1] for mode, figures in self.after.items()}, self.frames
+        )
 
     def drops(self, mode: str, draws: int, seed: int) -> dict[str, Interval]:
         """How far each figure falls, by figure; paired over frames."""
@@ -215,7 +217,7 @@ class Figures:
         fallen = differences(self.after[mode], self.before, self.frames, draws, rng, test=False)
         return {one.name: one.interval for one in fallen}
 
-    def falls(self, control: Figures, mode: str, draws: int, seed: int) -> Difference:
+    def drop_beyond(self, control: ArmMetrics, mode: str, draws: int, seed: int) -> Difference:
         """How far AP50 falls below the control's; paired over frames."""
         mine, theirs = self.after[mode][0], control.after[mode][0]
         # One attack beside each seed of the control.

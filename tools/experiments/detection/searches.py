@@ -18,9 +18,9 @@ from drivesem.failures.grades import Grade
 from drivesem.run.folder import ARMS, FRAMES
 from drivesem.run.frame import as_detections, as_targets
 from drivesem.run.results import FrameResult
-from drivesem.run.tally import at_least, certain_losses
+from drivesem.run.summary import at_least, certain_losses
 from scene_ir.io import load_scene
-from tools.experiments.detection.counts import ArmCounts, FrameCounts, SeenObject
+from tools.experiments.detection.counts import ArmCounts, DetectedObject, FrameCounts
 from tools.experiments.detection.running import ArmRun
 
 _HEIGHTS_PX = (25.0, 40.0, 80.0)
@@ -42,7 +42,7 @@ class SearchCost:
     per_minute: Interval
     ahead: Difference | None
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON."""
         found: dict[str, Any] = {"name": self.name, "seconds": self.seconds}
         for key, one in (("per_100_passes", self.per_100_passes), ("per_minute", self.per_minute)):
@@ -53,7 +53,7 @@ class SearchCost:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class WithstandingObjects:
     """Objects of a class by size or distance, of those that the detector finds as photographed. lost: for certain,
     to any arm; standing: the share that none brought to fall, with Wilson's interval.
     """
@@ -63,16 +63,16 @@ class Standing:
     lost: int
 
     @property
-    def standing(self) -> Interval:
+    def share(self) -> Interval:
         """The share that withstood; None where there are no objects."""
         if not self.objects:
             return Interval(self.name, None, None, None)
         kept = self.objects - self.lost
         return Interval(self.name, kept / self.objects, *wilson(kept, self.objects))
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON."""
-        one = self.standing
+        one = self.share
         return {
             "name": self.name,
             "objects": self.objects,
@@ -83,11 +83,11 @@ class Standing:
         }
 
 
-_Seen = Mapping[str, Sequence[SeenObject]]
+_Seen = Mapping[str, Sequence[DetectedObject]]
 """By frame, as `seen_of` gives them."""
 
 
-def costs_of(runs: Sequence[ArmCounts], seen: _Seen, draws: int, seed: int) -> list[SearchCost]:
+def search_costs(runs: Sequence[ArmCounts], seen: _Seen, draws: int, seed: int) -> list[SearchCost]:
     """Of arms on the same frames, the first of which the others are compared with."""
     first = _certain(runs[0].frames)
     objects = np.array([len(seen[frame.identifier]) for frame in runs[0].frames], np.float64)
@@ -104,7 +104,7 @@ def costs_of(runs: Sequence[ArmCounts], seen: _Seen, draws: int, seed: int) -> l
     return found
 
 
-def depths_of(run: ArmRun, out: Path) -> dict[str, list[float]]:
+def load_depths(run: ArmRun, out: Path) -> dict[str, list[float]]:
     """Distances, m, of the objects of each frame by name, as photographed. out: the study's folder."""
     frames = out / ARMS / run.arm.folder / FRAMES
     names = [result.identifier for result in run.results]
@@ -112,23 +112,25 @@ def depths_of(run: ArmRun, out: Path) -> dict[str, list[float]]:
     return {name: scene.objects.translation[:, 2].tolist() for name, scene in scenes}
 
 
-def seen_of(run: ArmRun, depths: Mapping[str, Sequence[float]]) -> dict[str, tuple[SeenObject, ...]]:
+def find_detected_objects(
+    run: ArmRun, depths: Mapping[str, Sequence[float]]
+) -> dict[str, tuple[DetectedObject, ...]]:
     """The judged objects of each frame that the detector finds in the photograph. depths: as of `depths_of`."""
     return {
         result.identifier: tuple(
-            SeenObject(i, height, depths[result.identifier][i]) for i, height in _objects(run, result).items()
+            DetectedObject(i, height, depths[result.identifier][i]) for i, height in _objects(run, result).items()
         )
         for result in run.results
     }
 
 
-def standing_of(runs: Sequence[ArmCounts], seen: _Seen) -> list[Standing]:
+def count_withstanding(runs: Sequence[ArmCounts], seen: _Seen) -> list[WithstandingObjects]:
     """By size and by distance, of all arms that are no controls."""
     searching = [run for run in runs if run.arm.control is None]
     told: list[tuple[float, float, bool]] = []
     for place, frame in enumerate(searching[0].frames):
-        lost = {failure.index for run in searching for failure in certain_losses(run.frames[place])}
-        told += [(one.height_px, one.depth_m, one.index in lost) for one in seen[frame.identifier]]
+        lost = {failure.object_index for run in searching for failure in certain_losses(run.frames[place])}
+        told += [(one.height_px, one.depth_m, one.object_index in lost) for one in seen[frame.identifier]]
     by_height = _classes("height", "px", _HEIGHTS_PX, [(height, lost) for height, _, lost in told])
     by_depth = _classes("distance", "m", _DEPTHS_M, [(depth, lost) for _, depth, lost in told])
     return [_standing("all", [lost for _, _, lost in told]), *by_height, *by_depth]
@@ -151,7 +153,9 @@ def _objects(run: ArmRun, result: FrameResult) -> Mapping[int, float]:
     }
 
 
-def _classes(name: str, unit: str, edges: Sequence[float], of: Sequence[tuple[float, bool]]) -> list[Standing]:
+def _classes(
+    name: str, unit: str, edges: Sequence[float], of: Sequence[tuple[float, bool]]
+) -> list[WithstandingObjects]:
     """Objects (value, lost) between edges, and beyond them."""
     bounds = (-np.inf, *edges, np.inf)
     found = []
@@ -162,5 +166,5 @@ def _classes(name: str, unit: str, edges: Sequence[float], of: Sequence[tuple[fl
     return found
 
 
-def _standing(name: str, lost: Sequence[bool]) -> Standing:
-    return Standing(name, len(lost), sum(lost))
+def _standing(name: str, lost: Sequence[bool]) -> WithstandingObjects:
+    return WithstandingObjects(name, len(lost), sum(lost))

@@ -18,19 +18,19 @@ from tools.experiments.detection.counts import ArmCounts, FrameCounts
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class SuccessCurve:
     """One arm. most: the queries it may take; shares: by queries (1 to most), with bounds over frames; mean:
     queries of a frame, those that were not broken with all of theirs.
     """
 
     name: str
-    most: int
+    max_queries: int
     shares: tuple[Interval, ...]
-    mean: float | None
+    mean_queries: float | None
 
     def at(self, queries: int) -> Interval:
         """After so many queries, or all of them where there are fewer."""
-        return self.shares[min(queries, self.most) - 1]
+        return self.shares[min(queries, self.max_queries) - 1]
 
     def to_json(self) -> list[dict[str, Any]]:
         """A row for each number of queries."""
@@ -45,16 +45,16 @@ def first_successes(frames: Sequence[FrameCounts]) -> Floats:
     return np.array([f.queries if f.success_moved else np.inf for f in frames], np.float64)
 
 
-def curve_of(run: ArmCounts, draws: int, seed: int) -> Curve:
+def success_curve(run: ArmCounts, draws: int, seed: int) -> SuccessCurve:
     """An arm's curve, with bootstrap intervals over frames."""
-    first, most = first_successes(run.frames), most_queries(run)
+    first, most = first_successes(run.frames), query_limit(run)
     figures = [_share(first <= q) for q in range(1, most + 1)]
     shares = intervals(figures, len(first), draws, np.random.default_rng(seed))
     mean = float(np.mean([f.queries for f in run.frames])) if run.frames else None
-    return Curve(run.arm.name, most, tuple(shares), mean)
+    return SuccessCurve(run.arm.name, most, tuple(shares), mean)
 
 
-def most_queries(run: ArmCounts) -> int:
+def query_limit(run: ArmCounts) -> int:
     """How many queries an arm may take."""
     config = run.arm.config
     if config.method == "fgsm":
@@ -62,7 +62,7 @@ def most_queries(run: ArmCounts) -> int:
     return config.queries or config.steps
 
 
-def against(run: ArmCounts, queries: int, other: ArmCounts, draws: int, seed: int) -> Difference:
+def compare_success(run: ArmCounts, queries: int, other: ArmCounts, draws: int, seed: int) -> Difference:
     """The share that `run` breaks within so many queries (second), less what `other` does with all of its own
     (first); paired over frames.
     """

@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 from drivesem.analysis.transfer.matrix import AP50, BROKEN, PairCounts, TransferRow, figures_of, row_of
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.commands import Study
+from drivesem.attack.targets import HEADLINE
 from drivesem.evaluation.coco import ClassScores
 from drivesem.evaluation.matches import Matches
 from drivesem.evaluation.resampling import Figure, Interval, differences, intervals
 from tools.experiments.detection import lessons as plan
 from tools.experiments.detection import robust
-from tools.experiments.detection.arms import draws_of
+from tools.experiments.detection.arms import bootstrap_draws
 from tools.experiments.detection.counts import ArmCounts
-from tools.experiments.detection.lessons import BENIGN, Lesson
-from tools.experiments.detection.rows import MODES, Figures, StudyRow, rows_of
-from tools.experiments.detection.running import AttackFacts, feasible_of
+from tools.experiments.detection.lessons import BENIGN, RetrainingArm
+from tools.experiments.detection.rows import MODES, ArmComparison, ArmMetrics, compare_arms
+from tools.experiments.detection.running import AttackTotals, feasible_share
+from tools.experiments.settings import StudyConfig
 
 
 @dataclass(frozen=True, slots=True)
-class SeenBenign:
+class BenignMatches:
     """A detector on benign frames: what it finds of HEADLINE, and the score from which its detections count."""
 
     matches: Matches
@@ -33,7 +33,7 @@ class SeenBenign:
 
 
 @dataclass(frozen=True, slots=True)
-class RetrainCounts:
+class RetrainingCounts:
     """What the tables are computed from. attack: the name of that on frames to train on; learned, judged: attacks
     on these, and on held-out ones; shown: by lesson that was held, how many different counterexamples; benign:
     frames to train on beside them; left_out: arms that could not be trained, what could not be judged, and why.
@@ -43,20 +43,20 @@ class RetrainCounts:
     """
 
     attack: str
-    learned: AttackFacts
-    judged: AttackFacts
-    shown: Mapping[str, int]
-    benign: int
+    training_attacks: AttackTotals
+    test_attacks: AttackTotals
+    counterexamples: Mapping[str, int]
+    benign_training_frames: int
     benign_frames: tuple[str, ...]
-    seen: Mapping[str, SeenBenign]
+    benign_matches: Mapping[str, BenignMatches]
     known: Sequence[PairCounts]
     fresh: Sequence[ArmCounts]
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
-    states: Sequence[robust.FrameStates] = ()
+    states: Sequence[robust.FrameStateCounts] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class DetectorResult:
     """One detector. benign: HEADLINE's figures on held-out benign frames; spread: their AP50 with bounds; known:
     the counterexamples against the detector as it was; fresh: those against this one. drops: of AP50 and recall on
     benign frames, from the detector as it was; gains: of AP50 by label mode, on known and on fresh ones, over what
@@ -70,16 +70,16 @@ class Judged:
     benign: ClassScores
     spread: dict[str, Interval]
     known: TransferRow
-    fresh: StudyRow | None
+    fresh: ArmComparison | None
     drops: dict[str, Interval]
     gains: dict[str, dict[str, Interval]]
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
         counterexamples, benign = self.reference or (None, None)
         theirs, fresh = (
             self.known.flat(),
-            defaultdict[str, Any](lambda: None, self.fresh.flat() if self.fresh else {}),
+            defaultdict[str, Any](lambda: None, self.fresh.to_row() if self.fresh else {}),
         )
         found: dict[str, Any] = {
             "name": self.name,
@@ -115,20 +115,20 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class Taught:
+class RetrainingResults:
     """All that the study found. lessons: those that were held; chances: how likely each arm fails a car."""
 
-    study: Study
+    study: StudyConfig
     draws: int
-    counts: RetrainCounts
-    lessons: Sequence[Lesson]
-    rows: Sequence[Judged]
-    chances: Sequence[robust.RobustRow] = ()
+    counts: RetrainingCounts
+    arms: Sequence[RetrainingArm]
+    rows: Sequence[DetectorResult]
+    robustness: Sequence[robust.RobustnessRow] = ()
 
     @property
-    def attacks(self) -> tuple[AttackFacts, AttackFacts]:
+    def attacks(self) -> tuple[AttackTotals, AttackTotals]:
         """On frames to train on, and on held-out ones."""
-        return self.counts.learned, self.counts.judged
+        return self.counts.training_attacks, self.counts.test_attacks
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
@@ -140,40 +140,46 @@ class Taught:
             "benign_frames": self.rows[0].benign_frames,
             "frames_without_vehicles": learned.without_vehicles + judged.without_vehicles,
             "frames_failed": {**learned.failed, **judged.failed},
-            "feasible_fraction": feasible_of(learned, judged),
+            "feasible_fraction": feasible_share(learned, judged),
             "bootstrap": self.draws,
             "attacked_to_train_on": learned.frames,
-            "benign_to_train_on": self.counts.benign,
+            "benign_to_train_on": self.counts.benign_training_frames,
             "training": {
-                lesson.name: {"counterexamples": self.counts.shown[lesson.name], **_training(lesson)}
-                for lesson in self.lessons
+                lesson.name: {"counterexamples": self.counts.counterexamples[lesson.name], **_training(lesson)}
+                for lesson in self.arms
             },
-            "rows": [row.flat() for row in self.rows],
+            "rows": [row.to_row() for row in self.rows],
             "left_out": dict(self.counts.left_out),
             "state_frames": len(self.counts.states),
             "states": self.study.states,
-            "robust": [row.flat() for row in self.chances],
+            "robust": [row.to_row() for row in self.robustness],
         }
 
 
-def _training(lesson: Lesson) -> dict[str, Any]:
+def _training(lesson: RetrainingArm) -> dict[str, Any]:
     told = ("seed", "steps", "batch", "window", "scale", "rate", "fraction", "mix", "loss", "precision")
     return {"pictures": lesson.pictures, "labels": lesson.labels, "weight": lesson.weight} | {
         key: getattr(lesson.config, key) for key in told
     }
 
 
-def taught(study: Study, counts: RetrainCounts) -> Taught:
+def summarise_retraining(study: StudyConfig, counts: RetrainingCounts) -> RetrainingResults:
     """What follows from it."""
-    draws = draws_of(study)
-    lessons = [lesson for lesson in plan.lessons_of(study) if lesson.name in counts.shown]
+    draws = bootstrap_draws(study)
+    lessons = [lesson for lesson in plan.build_retraining_arms(study) if lesson.name in counts.counterexamples]
     rows = _rows_of(study, lessons, counts, draws)
-    return Taught(study, draws, counts, lessons, rows, _robust_rows(lessons, rows, counts, draws, study.seed))
+    return RetrainingResults(
+        study, draws, counts, lessons, rows, _robust_rows(lessons, rows, counts, draws, study.seed)
+    )
 
 
 def _robust_rows(
-    lessons: Sequence[Lesson], rows: Sequence[Judged], counts: RetrainCounts, draws: int, seed: int
-) -> list[robust.RobustRow]:
+    lessons: Sequence[RetrainingArm],
+    rows: Sequence[DetectorResult],
+    counts: RetrainingCounts,
+    draws: int,
+    seed: int,
+) -> list[robust.RobustnessRow]:
     """How likely each arm fails a car: the detector as it was, then the lessons, their seeds together."""
     if not counts.states:
         return []
@@ -181,18 +187,20 @@ def _robust_rows(
     falls: dict[str, list[float | None]] = {}
     for (arm, _), row in zip(arms, rows, strict=True):
         falls.setdefault(arm, []).append(row.drops[AP50].value)
-    return robust.rows_of(counts.states, arms, falls, draws, seed)
+    return robust.compare_robustness(counts.states, arms, falls, draws, seed)
 
 
-def _rows_of(study: Study, lessons: Sequence[Lesson], counts: RetrainCounts, draws: int) -> list[Judged]:
+def _rows_of(
+    study: StudyConfig, lessons: Sequence[RetrainingArm], counts: RetrainingCounts, draws: int
+) -> list[DetectorResult]:
     """A row for each detector."""
-    fresh = rows_of(counts.fresh, draws, study.seed)
-    figures = [Figures.of(one).after for one in counts.fresh]
+    fresh = compare_arms(counts.fresh, draws, study.seed)
+    figures = [ArmMetrics.from_runs(one).after for one in counts.fresh]
     known = [row_of(pair, draws, study.seed) for pair in counts.known]
-    benign = {name: figures_of(one.matches) for name, one in counts.seen.items()}
+    benign = {name: figures_of(one.matches) for name, one in counts.benign_matches.items()}
     frames = len(counts.benign_frames)
     found = []
-    for i, (name, one) in enumerate(counts.seen.items()):
+    for i, (name, one) in enumerate(counts.benign_matches.items()):
         gains = {
             "known": {
                 m: _gain(known[0].figures[m], known[i].figures[m], known[i].frames, draws, study) for m in MODES
@@ -200,7 +208,7 @@ def _rows_of(study: Study, lessons: Sequence[Lesson], counts: RetrainCounts, dra
         }
         again = i < len(figures)
         if again:
-            attacked = counts.judged.frames
+            attacked = counts.test_attacks.frames
             gains["fresh"] = {m: _gain(figures[0][m], figures[i][m], attacked, draws, study) for m in MODES}
         rng = np.random.default_rng(study.seed)
         fallen = differences(benign[name], benign[BENIGN], frames, draws, rng)
@@ -209,11 +217,11 @@ def _rows_of(study: Study, lessons: Sequence[Lesson], counts: RetrainCounts, dra
             "known": _spread(known[i].figures["moved"], known[i].frames, draws, study),
         }
         if again:
-            spread["fresh"] = _spread(figures[i]["moved"], counts.judged.frames, draws, study)
+            spread["fresh"] = _spread(figures[i]["moved"], counts.test_attacks.frames, draws, study)
         found.append(
-            Judged(
+            DetectorResult(
                 name=name,
-                reference=plan.reference_of(name, lessons, study),
+                reference=plan.paper_reference(name, lessons, study),
                 t_star=one.t_star,
                 benign_frames=frames,
                 benign=one.matches.scores(one.t_star),
@@ -227,12 +235,14 @@ def _rows_of(study: Study, lessons: Sequence[Lesson], counts: RetrainCounts, dra
     return found
 
 
-def _gain(before: Sequence[Figure], after: Sequence[Figure], frames: int, draws: int, study: Study) -> Interval:
+def _gain(
+    before: Sequence[Figure], after: Sequence[Figure], frames: int, draws: int, study: StudyConfig
+) -> Interval:
     """How far the first figure, AP50, rises; paired over frames."""
     (one,) = differences(before[:1], after[:1], frames, draws, np.random.default_rng(study.seed))
     return one.interval
 
 
-def _spread(figures: Sequence[Figure], frames: int, draws: int, study: Study) -> Interval:
+def _spread(figures: Sequence[Figure], frames: int, draws: int, study: StudyConfig) -> Interval:
     (one,) = intervals(figures[:1], frames, draws, np.random.default_rng(study.seed))
     return one

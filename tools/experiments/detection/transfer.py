@@ -23,20 +23,21 @@ from drivesem.analysis.transfer.matrix import (
 )
 from drivesem.analysis.transfer.report import bounded
 from drivesem.analysis.transfer.report import sheets as matrix_sheets
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.blocks import Asking
-from drivesem.config.commands import DEFAULT_COMBO, Attack, Study
+from drivesem.attack.targets import HEADLINE
+from drivesem.config.blocks import DetectionOptions
+from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.evaluation.resampling import Interval, differences
 from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
-from drivesem.report.tables import Sheet, number_of, percent
+from drivesem.report.tables import ReportTable, format_count, format_percent
 from drivesem.run.attack import Worker
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS
 from drivesem.run.protocol import follows_paper
-from tools.experiments.detection.arms import Arm, draws_of
-from tools.experiments.detection.report import OWN_PROTOCOL, Told
+from tools.experiments.detection.arms import AttackArm, bootstrap_draws
+from tools.experiments.detection.report import OWN_PROTOCOL, StudyText
 from tools.experiments.detection.rows import MODES
-from tools.experiments.detection.running import AttackFacts, feasible_of, run_arms
+from tools.experiments.detection.running import AttackTotals, feasible_share, run_arms
+from tools.experiments.settings import StudyConfig
 
 _SIDES = ("source", "target")
 _LABELS = "labels"
@@ -44,7 +45,7 @@ _WORDS = (*_SIDES, _LABELS)
 
 
 @dataclass(frozen=True, slots=True)
-class Before:
+class SourceTargetResult:
     """Counterexamples of one source before one target. placebo: what one random edit as large as the attack's does
     there, where controls are asked for; beyond: how far AP50 falls below it, by label mode, paired over frames;
     reference: the paper's mAP of such a pair, benign and attacked.
@@ -55,7 +56,7 @@ class Before:
     beyond: Mapping[str, Interval]
     reference: tuple[float, float] | None
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
         there, attacked = self.reference or (None, None)
         found = self.row.flat() | {
@@ -76,7 +77,7 @@ class Before:
 
 
 @dataclass(frozen=True, slots=True)
-class AskedArm:
+class TransferSource:
     """An arm that is no control, by its name; placebo: of the arm beside it, None without; references: the paper's
     mAP of a pair with it by the target's name, benign and attacked.
     """
@@ -92,20 +93,20 @@ class TransferCounts:
     could not be used, and why.
     """
 
-    attacks: AttackFacts
-    sources: tuple[AskedArm, ...]
+    attacks: AttackTotals
+    sources: tuple[TransferSource, ...]
     pairs: Sequence[PairCounts]
     failed: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Matrix:
+class TransferMatrix:
     """All that the study found."""
 
-    study: Study
+    study: StudyConfig
     draws: int
     counts: TransferCounts
-    rows: Sequence[Before]
+    rows: Sequence[SourceTargetResult]
 
     @property
     def failed(self) -> dict[str, str]:
@@ -120,13 +121,13 @@ class Matrix:
             "frames": self.rows[0].row.frames,
             "frames_without_vehicles": self.counts.attacks.without_vehicles,
             "frames_failed": self.failed,
-            "feasible_fraction": feasible_of(self.counts.attacks),
+            "feasible_fraction": feasible_share(self.counts.attacks),
             "bootstrap": self.draws,
-            "rows": [one.flat() for one in self.rows],
+            "rows": [one.to_row() for one in self.rows],
         }
 
 
-def detectors_asked(study: Study, out: Path) -> list[Asked]:
+def load_targets(study: StudyConfig, out: Path) -> list[Asked]:
     """The sources, then the others that are to be asked. Raises UsageError for what is no detector."""
     named = detector_names(study.detectors)
     sources = detector_names(study.sources or study.detector, "--sources")
@@ -134,7 +135,7 @@ def detectors_asked(study: Study, out: Path) -> list[Asked]:
 
 
 def run(
-    study: Study, arms: Sequence[Arm], workers: Sequence[Worker], asked: Sequence[Asked], out: Path
+    study: StudyConfig, arms: Sequence[AttackArm], workers: Sequence[Worker], asked: Sequence[Asked], out: Path
 ) -> TransferCounts:
     """Attack, then ask. asked: as `detectors_asked` gives them. Raises UsageError or SceneError for bad input."""
     ran = run_arms(arms, workers, out)
@@ -143,18 +144,18 @@ def run(
     pairs, failed = pairs_of(named, asked, _settings(study))
     sources = []
     for arm in (arm for arm in arms if arm.control is None):
-        placebo = next((one.name for one in arms if one.of == arm.name), None)
+        placebo = next((one.name for one in arms if one.control_of == arm.name), None)
         references = {target.name: _reference(arm.config, target) for target in asked}
         told = {name: one for name, one in references.items() if one is not None}
-        sources.append(AskedArm(arm.name, placebo, told))
-    return TransferCounts(AttackFacts.of(ran), tuple(sources), pairs, failed)
+        sources.append(TransferSource(arm.name, placebo, told))
+    return TransferCounts(AttackTotals.from_arms(ran), tuple(sources), pairs, failed)
 
 
-def matrix_of(study: Study, counts: TransferCounts) -> Matrix:
+def build_matrix(study: StudyConfig, counts: TransferCounts) -> TransferMatrix:
     """What follows from it."""
-    draws = draws_of(study)
+    draws = bootstrap_draws(study)
     rows = {(one.source.name, one.target.name): row_of(one, draws, study.seed) for one in counts.pairs}
-    found: list[Before] = []
+    found: list[SourceTargetResult] = []
     for source in counts.sources:
         for target in dict.fromkeys(name for _, name in rows):
             row = rows[source.name, target]
@@ -162,8 +163,8 @@ def matrix_of(study: Study, counts: TransferCounts) -> Matrix:
             beyond = {}
             if placebo is not None:
                 beyond = {mode: _beyond(row, placebo, mode, draws, study.seed) for mode in MODES}
-            found.append(Before(row, placebo, beyond, source.references.get(target)))
-    return Matrix(study, draws, counts, found)
+            found.append(SourceTargetResult(row, placebo, beyond, source.references.get(target)))
+    return TransferMatrix(study, draws, counts, found)
 
 
 def _beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed: int) -> Interval:
@@ -172,8 +173,8 @@ def _beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed:
     return one.interval
 
 
-def _settings(study: Study) -> Asking:
-    return Asking(
+def _settings(study: StudyConfig) -> DetectionOptions:
+    return DetectionOptions(
         seed=study.seed,
         workers=study.workers,
         device=study.device,
@@ -181,7 +182,7 @@ def _settings(study: Study) -> Asking:
     )
 
 
-def _reference(attack: Attack, target: Asked) -> tuple[float, float] | None:
+def _reference(attack: AttackConfig, target: Asked) -> tuple[float, float] | None:
     """The paper's mAP under its own protocol: of the SqueezeDet that was attacked, and of a whole YOLOv3."""
     if not follows_paper(attack):
         return None
@@ -190,36 +191,36 @@ def _reference(attack: Attack, target: Asked) -> tuple[float, float] | None:
     return PAPER_TRANSFER if type(target.predictor) is YoloV3 else None
 
 
-def told(found: Matrix) -> Told:
+def transfer_text(found: TransferMatrix) -> StudyText:
     """The study as text."""
     sources = list(dict.fromkeys(one.row.source.name for one in found.rows))
     short = [_plain(sheet(found.rows), sources) for sheet in (_precision, _falls, _broken)]
     further = matrix_sheets([one.row for one in found.rows])[0]
     whole = [*short, replace(further, title=f"{HEADLINE}, further figures, %")]
-    tables = {"study": [one.flat() for one in found.rows]}
-    return Told(found.study.name, whole, short, notes(found), tables, _WORDS, _SIDES)
+    tables = {"study": [one.to_row() for one in found.rows]}
+    return StudyText(found.study.name, whole, short, notes(found), tables, _WORDS, _SIDES)
 
 
-def _plain(sheet: Sheet, sources: Sequence[str]) -> Sheet:
+def _plain(sheet: ReportTable, sources: Sequence[str]) -> ReportTable:
     """The source in the title where there is one only, instead of in each row."""
     if len(sources) > 1:
         return sheet
     title = f"{sheet.title}; counterexamples of {sources[0]}"
-    return Sheet(title, sheet.columns[1:], tuple(row[1:] for row in sheet.rows))
+    return ReportTable(title, sheet.columns[1:], tuple(row[1:] for row in sheet.rows))
 
 
-def _precision(rows: Sequence[Before]) -> Sheet:
+def _precision(rows: Sequence[SourceTargetResult]) -> ReportTable:
     lines, told = [], _has_references(rows)
     for one in rows:
         row, there = one.row, one.reference or (None, None)
         scores = (row.benign, row.rerendered, row.paper, row.moved)
-        cells = (*_sides(row), *(percent(s.headline.ap50) for s in scores))
-        lines.append((*cells, *map(percent, there)) if told else cells)
+        cells = (*_sides(row), *(format_percent(s.headline.ap50) for s in scores))
+        lines.append((*cells, *map(format_percent, there)) if told else cells)
     columns = (*_SIDES, "benign", "re-rendered", *MODES, *(["benign there", "attacked there"] if told else []))
-    return Sheet(f"{HEADLINE} AP50, %", columns, tuple(lines))
+    return ReportTable(f"{HEADLINE} AP50, %", columns, tuple(lines))
 
 
-def _falls(rows: Sequence[Before]) -> Sheet:
+def _falls(rows: Sequence[SourceTargetResult]) -> ReportTable:
     controlled = any(one.placebo is not None for one in rows)
     lines, told = [], _has_references(rows)
     for one in rows:
@@ -233,10 +234,10 @@ def _falls(rows: Sequence[Before]) -> Sheet:
         lines.append(tuple(cells))
     columns = [*_SIDES, *MODES, *(["placebo, moved", "attack less placebo"] if controlled else [])]
     columns += ["there"] if told else []
-    return Sheet(f"{HEADLINE} AP50 falls, points", tuple(columns), tuple(lines))
+    return ReportTable(f"{HEADLINE} AP50 falls, points", tuple(columns), tuple(lines))
 
 
-def _has_references(rows: Sequence[Before]) -> bool:
+def _has_references(rows: Sequence[SourceTargetResult]) -> bool:
     return any(one.reference is not None for one in rows)
 
 
@@ -248,7 +249,7 @@ def _fall(row: TransferRow, mode: str) -> Interval:
     return next(one for one in row.drops[mode] if one.name == AP50)
 
 
-def _broken(rows: Sequence[Before]) -> Sheet:
+def _broken(rows: Sequence[SourceTargetResult]) -> ReportTable:
     lines = []
     for row in (one.row for one in rows):
         lost, shared, frames = (
@@ -256,10 +257,10 @@ def _broken(rows: Sequence[Before]) -> Sheet:
         )
         lines.append((*_sides(row), bounded(row.shares[BROKEN]), lost, str(row.phantoms), shared, frames))
     columns = (*_SIDES, "frames broken", "lost", "phantoms", "lost too", "frames too")
-    return Sheet("Frames broken, %, and what was lost or made up; moved labels", columns, tuple(lines))
+    return ReportTable("Frames broken, %, and what was lost or made up; moved labels", columns, tuple(lines))
 
 
-def notes(found: Matrix) -> list[str]:
+def notes(found: TransferMatrix) -> list[str]:
     """What the columns mean."""
     spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
     stars = "; ".join(dict.fromkeys(f"{o.row.target.name} {o.row.target.t_star:.3f}" for o in found.rows))
@@ -288,8 +289,10 @@ def notes(found: Matrix) -> list[str]:
         f"on: {stars}.",
     ]
     attacks = found.counts.attacks
-    lines.append(f"Feasible by the independent check: {percent(feasible_of(attacks))} % of all attacked frames.")
+    lines.append(
+        f"Feasible by the independent check: {format_percent(feasible_share(attacks))} % of all attacked frames."
+    )
     if attacks.without_vehicles:
-        lines.append(f"{number_of(attacks.without_vehicles, 'frame')} without vehicles passed over.")
+        lines.append(f"{format_count(attacks.without_vehicles, 'frame')} without vehicles passed over.")
     lines += [f"{name} could not be used: {reason}" for name, reason in found.failed.items()]
     return lines

@@ -10,11 +10,9 @@ import numpy as np
 from torch import Tensor
 
 from drivesem.attack.space import behind_camera
-from drivesem.config.commands import Plausibility as Config
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet, number_of
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.finished import Frame, Run, load_runs
 from drivesem.run.folder import folder_of
 from scene_ir.errors import ShapeError
@@ -22,6 +20,7 @@ from scene_ir.io import load_scene
 from scene_ir.types import Labels, SceneIR
 from tools.experiments.plausibility.percentiles import NAMES, UNUSUAL, Plausibility, plausibility
 from tools.experiments.plausibility.weather import CODES, Weather, weather_of
+from tools.experiments.settings import PlausibilityConfig as Config
 
 LOWEST = "lowest"
 _BEFORE, _AFTER = "labels_paper.txt", "labels_moved.txt"
@@ -45,7 +44,7 @@ class FramePair:
     weather: Weather | None = None
 
 
-def plausibility_run(config: Config) -> Answer:
+def plausibility_run(config: Config) -> AnalysisReport:
     """Look up all vehicles of a run, and write what is said. Raises UsageError or SceneError for bad input."""
     (run,) = load_runs([config.run or ""], config.limit)
     out = folder_of(config.out, run.folder / "plausibility")
@@ -55,20 +54,20 @@ def plausibility_run(config: Config) -> Answer:
     data = {"run": str(run.folder), **summary(pairs)}
     least = tuple((row["frame"], _shown(row["before"]), _shown(row["after"])) for row in data["by_frame"])
     figures = _sheet(data)
-    answer = Answer(
+    answer = AnalysisReport(
         out=out,
         name="plausibility",
         heading="Plausibility",
         data=data,
-        tables={"plausibility": _vehicles(pairs)},
-        sheets=[
+        csv_tables={"plausibility": _vehicles(pairs)},
+        tables=[
             figures,
-            Sheet("least common vehicle of each frame", ("frame", "before", "after"), least),
+            ReportTable("least common vehicle of each frame", ("frame", "before", "after"), least),
             *_weather_sheet(pairs),
         ],
-        printed=[figures, *_weather_sheet(pairs)],
+        printed_tables=[figures, *_weather_sheet(pairs)],
         notes=[_NOTE],
-        only_json=True,
+        json_only=True,
     )
     answer.write()
     return answer
@@ -163,7 +162,7 @@ def _vehicles(pairs: Sequence[FramePair]) -> list[dict[str, Any]]:
     return lines
 
 
-def _weather_sheet(pairs: Sequence[FramePair]) -> list[Sheet]:
+def _weather_sheet(pairs: Sequence[FramePair]) -> list[ReportTable]:
     """A line a frame whose weather was changed, the least likely first; no sheet where none was."""
     known = [(pair.identifier, pair.weather) for pair in pairs if pair.weather is not None]
     known.sort(key=lambda frame: -frame[1].share)
@@ -172,11 +171,11 @@ def _weather_sheet(pairs: Sequence[FramePair]) -> list[Sheet]:
         for name, weather in known
     )
     columns = ("frame", *CODES, "of what there may be, %", "by")
-    return [Sheet("weather, and what of it comes together", columns, rows)] if rows else []
+    return [ReportTable("weather, and what of it comes together", columns, rows)] if rows else []
 
 
-def _sheet(data: dict[str, Any]) -> Sheet:
-    title = f"{number_of(data['frames'], 'frame')}: percentiles by KITTI's labels"
+def _sheet(data: dict[str, Any]) -> ReportTable:
+    title = f"{format_count(data['frames'], 'frame')}: percentiles by KITTI's labels"
     columns = ("figure", "vehicles", "median before", "after", "unusual before, %", "after, %", "largest fall")
     rows = tuple(
         (
@@ -190,7 +189,7 @@ def _sheet(data: dict[str, Any]) -> Sheet:
         )
         for row in data["rows"]
     )
-    return Sheet(title, columns, rows)
+    return ReportTable(title, columns, rows)
 
 
 def _shown(value: float | None, factor: float = 1.0) -> str:

@@ -10,16 +10,15 @@ from typing import Any
 
 from rich.progress import track
 
-from drivesem.config.commands import Realism
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import AnalysisReport, ReportTable
 from drivesem.report.terminal import Console
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import folder_of
 from tools.experiments.realism.comparison import PAIRS, FrameParts, RealismRow, frame_parts, rows
 from tools.experiments.realism.measures import METRICS, load, missing, psnr_db
+from tools.experiments.settings import RealismConfig
 
 AVAILABLE = "available"
 _WORDS = ("run", "parameters", "where", "metric")
@@ -35,7 +34,7 @@ _NOTE = (
 )
 
 
-def realism_run(config: Realism) -> Answer:
+def realism_run(config: RealismConfig) -> AnalysisReport:
     """Measure pictures of runs, and write what is said of them. Raises UsageError or SceneError for bad input."""
     runs = load_runs(config.runs, config.limit, "RUN")
     folder = None if config.weights is None else Path(config.weights)
@@ -62,18 +61,18 @@ def realism_run(config: Realism) -> Answer:
         "bootstrap": draws,
         "unavailable": absent,
     }
-    answer = Answer(
+    answer = AnalysisReport(
         out=out,
         name="realism",
         heading="Realism",
         data=data,
-        tables={"realism": _parts(runs, frames, names)},
-        sheets=[_sheet(table, len(runs) > 1)],
+        csv_tables={"realism": _parts(runs, frames, names)},
+        tables=[_sheet(table, len(runs) > 1)],
         notes=[_NOTE],
-        words=_WORDS,
+        text_columns=_WORDS,
         failed=absent,
-        failure="left out",
-        only_json=True,
+        failure_text="left out",
+        json_only=True,
     )
     answer.write()
     return answer
@@ -129,7 +128,7 @@ def _parts(
     return lines
 
 
-def _sheet(table: Sequence[tuple[Run, RealismRow]], several: bool) -> Sheet:
+def _sheet(table: Sequence[tuple[Run, RealismRow]], several: bool) -> ReportTable:
     """A line a run, region and metric; pairs stand beside one another."""
     columns = ("run", "parameters", "where", "metric", *(_between(*pair) for pair in PAIRS), "pictures")
     lines: dict[tuple[str, ...], list[str]] = {}
@@ -140,7 +139,7 @@ def _sheet(table: Sequence[tuple[Run, RealismRow]], several: bool) -> Sheet:
         cells.insert(-1, shown(row))
     rows = [(*key, *cells) for key, cells in lines.items()]
     cut = 0 if several else 2
-    return Sheet("distances between pictures", columns[cut:], tuple(row[cut:] for row in rows))
+    return ReportTable("distances between pictures", columns[cut:], tuple(row[cut:] for row in rows))
 
 
 def _between(first: str, second: str) -> str:

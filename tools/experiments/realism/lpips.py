@@ -35,7 +35,7 @@ def published_heads(net: str) -> list[Tensor]:
     with resources.as_file(
         resources.files("tools.experiments.realism") / "weights" / "lpips-0.1.safetensors"
     ) as path:
-        files.check_card(path, files.read_bytes(path))
+        files.check_model_card(path, files.read_bytes(path))
         tensors = load_file(path)
     return [tensors[f"{net}.lin{i}"] for i in range(len(TRUNKS[net]().taps))]
 

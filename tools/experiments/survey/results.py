@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from drivesem.config.commands import SurveyResults
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet, number_of
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.folder import folder_of
+from tools.experiments.settings import SurveyResultsConfig
 from tools.experiments.survey.page import (
     KEY,
     Response,
@@ -34,7 +33,7 @@ _NOTE = (
 )
 
 
-def survey_results(config: SurveyResults) -> Answer:
+def survey_results(config: SurveyResultsConfig) -> AnalysisReport:
     """Read and count answers, and write what is said of them. Raises UsageError or SceneError for bad input."""
     place = Path(config.survey or "")
     key = place / KEY if place.is_dir() else place
@@ -53,23 +52,23 @@ def survey_results(config: SurveyResults) -> Answer:
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     data = {"survey": name, "bootstrap": draws, **summary(items, answers, draws, config.seed), "paper": _PAPER}
     figures = _figures(data)
-    answer = Answer(
+    answer = AnalysisReport(
         out=out,
         name="survey",
         heading="Survey",
         data=data,
-        tables={"survey": data["items"]},
-        sheets=[figures, _items(data)],
-        printed=[figures],
+        csv_tables={"survey": data["items"]},
+        tables=[figures, _items(data)],
+        printed_tables=[figures],
         notes=[_NOTE],
-        words=_WORDS,
-        only_json=True,
+        text_columns=_WORDS,
+        json_only=True,
     )
     answer.write()
     return answer
 
 
-def _figures(data: Mapping[str, Any]) -> Sheet:
+def _figures(data: Mapping[str, Any]) -> ReportTable:
     kinds = data["kinds"]
     lines = (
         ("pictures", "items", 1, 0),
@@ -85,7 +84,7 @@ def _figures(data: Mapping[str, Any]) -> Sheet:
     rows = tuple(
         (what, *(_cell(kinds[kind], key, factor, digits) for kind in kinds)) for what, key, factor, digits in lines
     )
-    return Sheet(f"what {number_of(data['people'], 'person says', 'people say')}", ("what", *kinds), rows)
+    return ReportTable(f"what {format_count(data['people'], 'person says', 'people say')}", ("what", *kinds), rows)
 
 
 def _cell(figures: Mapping[str, Any], key: str, factor: float, digits: int) -> str:
@@ -97,9 +96,9 @@ def _cell(figures: Mapping[str, Any], key: str, factor: float, digits: int) -> s
     return f"{shown(figures[key])} ({shown(figures[f'{key}_low'])} to {shown(figures[f'{key}_high'])})"
 
 
-def _items(data: Mapping[str, Any]) -> Sheet:
+def _items(data: Mapping[str, Any]) -> ReportTable:
     columns = ("item", "kind", "frame", "truth", "answers", "named rightly, %", "realism, mean", "median")
     keys = (("named_right", 100, 0), ("realism_mean", 1, 2), ("realism_median", 1, 1))
     facts = ("item", "kind", "frame", "truth", "answers")
     rows = tuple((*(str(one[f]) for f in facts), *(_cell(one, *key) for key in keys)) for one in data["items"])
-    return Sheet("picture by picture", columns, rows)
+    return ReportTable("picture by picture", columns, rows)

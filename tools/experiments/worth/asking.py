@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.config.commands import Worth
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, Interval
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import AnalysisReport, ReportTable
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import folder_of
 from scene_ir import files
 from scene_ir.errors import FormatError
 from tools.experiments.realism.comparison import frame_parts
 from tools.experiments.realism.measures import load
+from tools.experiments.settings import WorthConfig
 from tools.experiments.worth.by_arm import by_arm
 from tools.experiments.worth.measures import (
     MEMBERSHIPS,
@@ -64,7 +63,7 @@ class Entry:
     second: Points | None
 
 
-def worth_run(config: Worth) -> Answer:
+def worth_run(config: WorthConfig) -> AnalysisReport:
     """Count, and write what is said of it. Raises UsageError or SceneError for bad input."""
     base = math.e if config.base == "e" else _number(config.base)
     first = Path(config.table).parent if config.table is not None else Path(config.study or config.runs[0])
@@ -88,16 +87,16 @@ def worth_run(config: Worth) -> Answer:
     facts |= {"distance": distance, "detectors": names}
     settings = [Setting(kind, w, base) for w in weighted for kind in MEMBERSHIPS]
     rows = [row for entry in entries for setting in settings for row in _rows(entry, setting, names)]
-    answer = Answer(
+    answer = AnalysisReport(
         out=out,
         name="worth",
         heading="Information worth",
         data={**facts, "rows": rows},
-        tables={"worth": rows},
-        sheets=[_sheet(rows)],
+        csv_tables={"worth": rows},
+        tables=[_sheet(rows)],
         notes=[_NOTE],
-        words=_WORDS,
-        only_json=True,
+        text_columns=_WORDS,
+        json_only=True,
     )
     answer.write()
     return answer
@@ -113,7 +112,9 @@ def _number(text: str) -> float:
     return value
 
 
-def _runs(runs: Sequence[Run], config: Worth, distance: str | None, out: Path) -> tuple[list[Entry], list[str]]:
+def _runs(
+    runs: Sequence[Run], config: WorthConfig, distance: str | None, out: Path
+) -> tuple[list[Entry], list[str]]:
     """Photographs and counterexamples of each run, and the names of the detectors."""
     attacked = sorted({one.detector for one in runs})
     if len(attacked) > 1:
@@ -216,7 +217,7 @@ def _rows(entry: Entry, setting: Setting, names: Sequence[str]) -> list[dict[str
     return found
 
 
-def _sheet(rows: Sequence[Mapping[str, Any]]) -> Sheet:
+def _sheet(rows: Sequence[Mapping[str, Any]]) -> ReportTable:
     columns = ("set", "detector", "membership", "realism weight", "worth", "gain", "points")
     lines = []
     for row in rows:
@@ -226,4 +227,4 @@ def _sheet(rows: Sequence[Mapping[str, Any]]) -> Sheet:
         weight = "yes" if row["realism_weight"] else "no"
         cells = (shown, "") if row["what"] == "worth" else ("", shown)
         lines.append((row["set"], row["detector"], row["membership"], weight, *cells, str(row["points"])))
-    return Sheet("information worth", columns, tuple(lines))
+    return ReportTable("information worth", columns, tuple(lines))

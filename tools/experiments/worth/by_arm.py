@@ -9,12 +9,10 @@ from typing import Any
 
 from rich.progress import track
 
-from drivesem.config.commands import Worth
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import Interval
-from drivesem.report.answer import Answer
 from drivesem.report.paper import PAPER_FID, PAPER_LPIPS
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import AnalysisReport, ReportTable
 from drivesem.report.terminal import Console
 from drivesem.run.finished import Run, load_runs
 from drivesem.run.folder import ARMS, CONFIG, HELD_OUT, RETRAINED
@@ -23,6 +21,7 @@ from scene_ir import files
 from tools.experiments.realism.asking import REGION, chosen, shown
 from tools.experiments.realism.comparison import FrameParts, RealismRow, frame_parts, rows
 from tools.experiments.realism.measures import METRICS, load
+from tools.experiments.settings import WorthConfig
 from tools.experiments.worth.measures import MEMBERSHIPS, Setting, gain_of, worth_of
 from tools.experiments.worth.runs import SHOWN, SecondDetector, distances_of, own_points, realism_of
 
@@ -87,7 +86,7 @@ def _bounded(name: str, one: Interval) -> dict[str, float | None]:
     return {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
 
 
-def by_arm(config: Worth, base: float, draws: int, distance: str | None, out: Path) -> Answer:
+def by_arm(config: WorthConfig, base: float, draws: int, distance: str | None, out: Path) -> AnalysisReport:
     """All that is said of the study's arms. base: of the logarithm; distance: behind realism.
 
     Raises UsageError for a folder that is none of a finished study.
@@ -149,7 +148,7 @@ def _parts(run: Run, metrics: Sequence[str], folder: Path | None) -> list[FrameP
     return [frame_parts(frame, measures) for frame in looked]
 
 
-def _seconds(config: Worth, study: Path, out: Path) -> dict[str, SecondDetector]:
+def _seconds(config: WorthConfig, study: Path, out: Path) -> dict[str, SecondDetector]:
     """By name: --second, or else those that the study retrained."""
     if config.second is not None:
         return {config.second: SecondDetector(config.second, config, out)}
@@ -158,33 +157,33 @@ def _seconds(config: Worth, study: Path, out: Path) -> dict[str, SecondDetector]
 
 
 def _answer(
-    config: Worth,
+    config: WorthConfig,
     arms: Sequence[ArmFigures],
     gains: Sequence[Gain],
     metrics: Sequence[str],
     absent: Mapping[str, str],
     distance: str | None,
     out: Path,
-) -> Answer:
+) -> AnalysisReport:
     flat, told = [one.flat() for one in arms], [one.flat() for one in gains]
     reference = {"lpips": PAPER_LPIPS, "fid": PAPER_FID}
     data = {"base": config.base, "distance": distance, "reference": reference, "rows": flat, "gains": told}
-    return Answer(
+    return AnalysisReport(
         out=out,
         name="arms",
         heading="Realism and information worth by arm",
         data=data | {"unavailable": dict(absent)},
-        tables={"arms": flat, **({"gains": told} if told else {})},
-        sheets=[_realism(arms, metrics), _worth(arms), *([_gains(gains)] if gains else [])],
+        csv_tables={"arms": flat, **({"gains": told} if told else {})},
+        tables=[_realism(arms, metrics), _worth(arms), *([_gains(gains)] if gains else [])],
         notes=[_NOTE],
-        words=_WORDS,
+        text_columns=_WORDS,
         failed=absent,
-        failure="left out",
-        only_json=True,
+        failure_text="left out",
+        json_only=True,
     )
 
 
-def _realism(arms: Sequence[ArmFigures], metrics: Sequence[str]) -> Sheet:
+def _realism(arms: Sequence[ArmFigures], metrics: Sequence[str]) -> ReportTable:
     """The paper's two figures stand in the columns of their names, also where nothing of ours does."""
     columns = [name for name in METRICS if name in metrics or name in _PAPER]
     lines = []
@@ -197,10 +196,10 @@ def _realism(arms: Sequence[ArmFigures], metrics: Sequence[str]) -> Sheet:
     lines.append(("the paper", "-", *theirs))
     units = [METRICS[name] for name in columns]
     heads = (f"{metric.name}, {metric.unit}" if metric.unit else metric.name for metric in units)
-    return Sheet("Photograph and counterexample", ("arm", "where", *heads), tuple(lines))
+    return ReportTable("Photograph and counterexample", ("arm", "where", *heads), tuple(lines))
 
 
-def _worth(arms: Sequence[ArmFigures]) -> Sheet:
+def _worth(arms: Sequence[ArmFigures]) -> ReportTable:
     lines, heads = [], []
     for one in arms:
         heads = [
@@ -210,10 +209,10 @@ def _worth(arms: Sequence[ArmFigures]) -> Sheet:
         detector = Path(one.run.detector)
         name = detector.parent.name if detector.name == WEIGHTS else str(detector)
         lines.append((one.run.name, name, *map(_number, one.worth.values())))
-    return Sheet("Information worth", ("arm", "detector", *heads), tuple(lines))
+    return ReportTable("Information worth", ("arm", "detector", *heads), tuple(lines))
 
 
-def _gains(gains: Sequence[Gain]) -> Sheet:
+def _gains(gains: Sequence[Gain]) -> ReportTable:
     lines = [
         (
             *(one.arm, one.second, one.setting.kind, "yes" if one.setting.weighted else "no"),
@@ -222,7 +221,7 @@ def _gains(gains: Sequence[Gain]) -> Sheet:
         for one in gains
     ]
     columns = ("arm", "second detector", "membership", "realism weight", "worth before it", "gain")
-    return Sheet("Information gain on counterexamples", columns, tuple(lines))
+    return ReportTable("Information gain on counterexamples", columns, tuple(lines))
 
 
 def _number(one: Interval) -> str:

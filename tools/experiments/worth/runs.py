@@ -11,19 +11,19 @@ import torch
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections
 from drivesem.analysis.transfer.asking import DETECTIONS
-from drivesem.attack.judging import JudgedClasses, t_star_of
-from drivesem.config.blocks import Sharing
-from drivesem.config.commands import Worth
+from drivesem.attack.targets import JudgedClasses, t_star_of
+from drivesem.config.blocks import WorkerOptions
 from drivesem.config.errors import UsageError
+from drivesem.run.detection_cache import Memory, Order, look
 from drivesem.run.finished import METRICS as RUN_FIGURES
 from drivesem.run.finished import Frame, Run
 from drivesem.run.frame import as_detections, as_targets
-from drivesem.run.looking import Memory, Order, look
 from drivesem.run.results import BoxRecord
 from drivesem.training.retraining import WEIGHTS
 from scene_ir import files
 from tools.experiments.realism.comparison import FrameParts
 from tools.experiments.realism.measures import METRICS, missing
+from tools.experiments.settings import WorthConfig
 from tools.experiments.worth.measures import Floats, Points, detected, joined, realism
 
 PREFERRED = ("lpips-alex", "perceptual")
@@ -32,7 +32,7 @@ SHOWN = {"benign": "photographs", "attacked": "counterexamples"}
 """Pictures of a run whose objects are points, and what people call them."""
 
 
-def distance_of(config: Worth) -> str | None:
+def distance_of(config: WorthConfig) -> str | None:
     """The distance behind realism, None for none. Raises UsageError for what is no distance."""
     folder = None if config.weights is None else Path(config.weights)
     if config.distance == "none":
@@ -95,11 +95,11 @@ def _points(frame: Frame, picture: str, found: Detections, t_star: float, rho: F
 class SecondDetector:
     """Another detector, or the same one retrained: what it finds is remembered by the pictures' content."""
 
-    def __init__(self, second: str, config: Worth, out: Path) -> None:
+    def __init__(self, second: str, config: WorthConfig, out: Path) -> None:
         """second: a detector, or a folder of `drivesem retrain`. Raises UsageError for what is neither."""
         path = Path(second)
         name = str(path / WEIGHTS) if (path / WEIGHTS).is_file() else second
-        self._settings = Sharing(workers=1)
+        self._settings = WorkerOptions(workers=1)
         self._order = Order(name, config.device, config.tiles, out / DETECTIONS)
         try:
             self._predictor = self._order.load()
