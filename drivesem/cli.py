@@ -23,7 +23,7 @@ from drivesem.config.commands import COMMANDS
 from drivesem.config.errors import UsageError
 from drivesem.config.parsing import Commands, parse
 from drivesem.run.jobs import keep_freed
-from drivesem.run.lock import let_go
+from drivesem.run.lock import release_folder_locks
 from scene_ir.errors import make_printable
 
 _MODULES = "drivesem.commands.{}"
@@ -75,7 +75,7 @@ def _run_program(
         from drivesem.store import stored  # which needs numpy, and --help does not
 
         _tell_of_code(config)
-        with let_go(), stored(config) as config:
+        with release_folder_locks(), stored(config) as config:
             return _run(config, partial(load_command, words[0]))
     except KeyboardInterrupt as error:
         sys.stderr.write(f"{prog}: interrupted; the same command goes on where it stopped\n")

@@ -20,7 +20,7 @@ from drivesem.config.devices import check_device
 from drivesem.report.tables import ReportTable, format_count, format_percent, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.driver import print_output_folder, publish_report
-from drivesem.run.folder import claim, folder_of
+from drivesem.run.folder import claim_folder, resolve_output_folder
 from drivesem.run.page import PAGE
 
 _ASKED = {"explain": explain_run, "holes": holes_run, "gate": gate_run}
@@ -40,8 +40,8 @@ def run(config: ClassifyConfig) -> int:
 
 
 def _data(config: ClassifyConfig, console: Console) -> None:
-    out = folder_of(config.out, Path("runs") / "classify-pictures")
-    claim(out, config, ("train", "val", "test"))
+    out = resolve_output_folder(config.out, Path("runs") / "classify-pictures")
+    claim_folder(out, config, ("train", "val", "test"))
     counts, failed = write_pictures(config, out)
     console.print(f"pictures: {', '.join(f'{count} {split}' for split, count in counts.items())}")
     _end(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed}, failed)

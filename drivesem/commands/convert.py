@@ -13,7 +13,7 @@ from drivesem.config.errors import UsageError
 from drivesem.config.values import class_map
 from drivesem.data.label_table import Written
 from drivesem.report.tables import format_count, print_json
-from drivesem.run.labels import Conversion, convert, layout_of
+from drivesem.run.labels import Conversion, convert, detect_labels_layout
 
 
 def run(config: ConvertConfig) -> int:
@@ -27,7 +27,7 @@ def run(config: ConvertConfig) -> int:
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("--out", "a new or empty folder", config.out)
     source = Path(config.source)
-    layout = layout_of(source) if config.from_format == "auto" else config.from_format
+    layout = detect_labels_layout(source) if config.from_format == "auto" else config.from_format
     conversion = Conversion(
         to_format=config.to_format,
         from_format=layout,

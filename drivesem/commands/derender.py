@@ -7,14 +7,14 @@ from dataclasses import asdict
 from drivesem.config.commands import DerenderConfig
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
-from drivesem.run.derender import derender_run
+from drivesem.run.derender import derender_frames
 from drivesem.scenes.sources import Photographs, SceneSource
 
 
 def run(config: DerenderConfig) -> int:
     """Take apart the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console(stderr=True)
-    found = derender_run(config, lambda source: _begin(source, config, console))
+    found = derender_frames(config, lambda source: _begin(source, config, console))
     if config.json:
         frames = {name: asdict(taken) for name, taken in found.frames.items()}
         print_json({"out": str(found.out), "frames": frames, "failed": found.failed, "seconds": found.seconds})

@@ -17,9 +17,9 @@ from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_of
-from drivesem.run.labels import frames_in
-from drivesem.run.lock import held_elsewhere, hold
-from drivesem.run.merge import merge
+from drivesem.run.labels import list_frames
+from drivesem.run.lock import acquire_folder_lock, is_locked_elsewhere
+from drivesem.run.merge import merge_runs
 from drivesem.store import place
 from scene_ir import files
 
@@ -78,12 +78,12 @@ def _row(folder: Path) -> dict[str, Any]:
     return {
         "run": str(folder),
         "finished": bool(figures),
-        "running": not figures and held_elsewhere(folder),
+        "running": not figures and is_locked_elsewhere(folder),
         "detector": attack.detector,
         "dataset": attack.dataset,
         "params": ",".join(figures.get("params", ())) or attack.params or f"combo {attack.combo or DEFAULT_COMBO}",
         "method": attack.method,
-        "frames": len(frames_in(folder)),
+        "frames": len(list_frames(folder)),
         "grades": figures.get("grades"),
         "mb": round(size / 1e6, 1),
     }
@@ -113,7 +113,7 @@ def _show(config: RunsConfig, console: Console) -> dict[str, Any]:
 
 
 def _merge(config: RunsConfig, console: Console) -> dict[str, Any]:
-    summary = merge([str(_place(folder)) for folder in config.folders], Path(config.out or ""), config.trust)
+    summary = merge_runs([str(_place(folder)) for folder in config.folders], Path(config.out or ""), config.trust)
     console.print(told_grades(summary), soft_wrap=True)
     console.print(
         f"{format_count(summary.frames, 'frame')} of {format_count(len(config.folders), 'run')} in {summary.out}",
@@ -126,10 +126,10 @@ def _prune(config: RunsConfig, console: Console) -> dict[str, Any]:
     removed: list[str] = []
     for folder in map(Path, config.folders):
         attack_of(folder, _SETTING)
-        hold(folder)  # what another command is writing now is none of this
+        acquire_folder_lock(folder)  # what another command is writing now is none of this
         for path in files.find_leftovers(folder):
             # A question to the run writes below it, and holds the folder of its own answers alone.
-            if any(held_elsewhere(parent) for parent in path.parents if parent.is_relative_to(folder)):
+            if any(is_locked_elsewhere(parent) for parent in path.parents if parent.is_relative_to(folder)):
                 continue
             removed.append(str(path))
             if config.dry:

@@ -9,9 +9,9 @@ from drivesem.config.commands import SynthConfig
 from drivesem.config.errors import UsageError
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console, progress_bar
-from drivesem.run.folder import folder_of
-from drivesem.run.lock import hold
-from drivesem.run.workers import mapping
+from drivesem.run.folder import resolve_output_folder
+from drivesem.run.lock import acquire_folder_lock
+from drivesem.run.workers import make_parallel_map
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, synthesise
 
@@ -22,7 +22,7 @@ _SHEET_FRAMES = 8
 
 def order_of(config: SynthConfig) -> Order:
     """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
-    out = folder_of(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
+    out = resolve_output_folder(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
     virtual = config.layout.startswith("vkitti")
     for name in ("meshes", "assets"):
         folder = getattr(config, name)
@@ -51,8 +51,8 @@ def run(config: SynthConfig) -> int:
     start = time.perf_counter()
     order = order_of(config)
     total = len(order.places())
-    hold(order.out)
-    done = synthesise(order, mapping(config))
+    acquire_folder_lock(order.out)
+    done = synthesise(order, make_parallel_map(config))
     with progress_bar(Console(stderr=True), show_remaining=True) as progress:
         for _ in progress.track(done, total=total, description="making frames"):
             pass

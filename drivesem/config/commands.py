@@ -475,72 +475,47 @@ class SynthConfig(FrameCommandConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchConfig(InferenceOptions, SceneOptions, FrameCommandConfig):
-    """Measure: an attack step, the renderer, memory, detectors, attacks on known faults, a night, a cluster."""
+class BenchOptions(InferenceOptions, SceneOptions, FrameCommandConfig):
+    """What benchmarks have in common."""
 
-    what: tyro.conf.Positional[
-        Literal["step", "render", "memory", "detector", "climb", "planted", "night", "scale"]
-    ] = "step"
-    """step: a whole attack step beside the detector alone; render: the renderer beside its reference; memory: peak
-    memory above the detector's own; detector: forward, backward and decoding of each detector; climb: a search by
-    climb, and the parts of its passes; planted: how many faults that were planted into the detector each attack
-    finds (docs/planted.md), minutes a frame; night: how long an attack on all frames of --root takes, told by
-    some; scale: frames shared by Ray beside frames shared by processes of this machine."""
     quick: Flag = False
-    """Fewer repetitions: some 50 s; planted: two faults a frame."""
+    """Measure with fewer repetitions."""
     cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
-    """How many cars, 1 to 16, with commas."""
+    """Numbers of cars, 1 to 16, with commas."""
     triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
     """Triangles a car, with commas."""
-    boxes: str | None = None
-    """Step: a tar archive of KITTI's label_2 and calib; measure with vehicles where its labels have them."""
-    frames: Count = 40
-    """Step: how many frames of --boxes; with --quick a quarter of them."""
     threads: Count | None = None
-    """Threads of torch and of the kernels; by default as many as torch chooses."""
+    """Threads of torch and of the kernels (default: as many as torch chooses)."""
     detector: str = "squeezedet"
-    """Name of a shipped detector, or a .safetensors file of one."""
+    """Shipped detector, or a .safetensors file of one."""
     markdown: str | None = None
-    """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
-    methods: str = "climb,corners,si-fgsm,halton,cma-es"
-    """Planted: attacks to judge, with commas (drivesem attack --method)."""
-    passes: Annotated[int, at_least(LEAST_PASSES)] = 90
-    """Climb and planted: passes of the detector that each attack may take, a gradient counted as 3."""
-    params: str = "color,weather,foliage,translate,rotate,mesh"
-    """Climb and planted: what attacks may move, with commas."""
-    faults: Count | None = None
-    """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
-    budget: str = "paper"
-    """Planted: how far attacks may go (drivesem attack --budget)."""
-    across: Count | None = None
-    """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
-    many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
-    each: Count = 1
-    """Planted, with --across: so many faults of each kind."""
-    searched: NotNegative | None = None
-    """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
-    naming: str | None = None
-    """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
-    whether that is the fault; the same of the detector without a fault."""
+    """Markdown file whose section on this benchmark is rewritten (docs/benchmarks.md)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchConfig(BenchOptions):
+    """Measure attack steps, rendering and run time on this machine."""
+
+    what: tyro.conf.Positional[Literal["step", "render", "night"]] = "step"
+    """step: a whole attack step, compared with the detector alone; render: the renderer, compared with its
+    reference; night: an estimate of how long an attack on all frames of --root takes."""
+    boxes: str | None = None
+    """Of step: a tar archive of KITTI's label_2 and calib, whose vehicles are measured."""
+    frames: Count = 40
+    """Of step: frames of --boxes; a quarter of them with --quick."""
     limit: Count | None = None
-    """Planted: the first N frames, by default 3. Night: N frames that tell, by default 20, evenly from all. Scale:
-    so many frames for each, by default 200."""
+    """Of night: frames to measure, evenly spread (default: 20)."""
     count: Count | None = None
-    """Night: how many frames to foretell; by default all that have vehicles."""
+    """Of night: frames to estimate for (default: all that have vehicles)."""
     attack: str | None = None
-    """Night: a preset of drivesem attack (YAML), by default its defaults, but for data, device and workers."""
+    """Of night: preset or YAML file of `drivesem attack` (default: its defaults; data, device and workers are
+    given here)."""
 
     def check(self) -> None:
         super().check()
         refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
-        refuse(
-            self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
-        )
-        refuse(
-            self.across is None and self.searched is not None, "--searched", "--across beside it", self.searched
-        )
-        only = "--dataset demo, but for bench planted and bench night"
-        refuse(self.what not in ("planted", "night") and self.dataset != DEMO, "--dataset", only, self.dataset)
+        demo = self.what == "night" or self.dataset == DEMO
+        refuse(not demo, "--dataset", "--dataset demo, but for bench night", self.dataset)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,7 +56,9 @@ def parse(argv: Sequence[str], commands: Commands = COMMANDS, prog: str = "drive
     if words[0] in commands:
         words = [words[0], *_with_presets(words[0], _with_run(words[0], words[1:], commands), commands)]
     elif not words[0].startswith("-"):
-        raise UsageError("command", f"one of {', '.join(commands)} ({prog} --help describes them)", _meant(words[0], commands))
+        raise UsageError(
+            "command", f"one of {', '.join(commands)} ({prog} --help describes them)", _meant(words[0], commands)
+        )
     captured = io.StringIO()
     try:
         with contextlib.redirect_stderr(captured):
@@ -172,7 +174,9 @@ def preset_words(path: str, command: str, commands: Commands = COMMANDS) -> list
     if command not in wanted_by:
         raise UsageError(path, f"a preset for drivesem {command}", f"one for {', '.join(wanted_by)}")
     own = {field.name: field for field in fields(commands[command])}
-    known = dict.fromkeys([*own, *(field.name for name in wanted_by for field in fields((dict(COMMANDS) | dict(commands))[name]))])
+    known = dict.fromkeys(
+        [*own, *(field.name for name in wanted_by for field in fields((dict(COMMANDS) | dict(commands))[name]))]
+    )
     words: list[str] = []
     for key, value in loaded.items():
         name = str(key).replace("-", "_")

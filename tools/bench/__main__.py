@@ -7,32 +7,38 @@ Each prints its tables, with method, machine and versions, and writes its sectio
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import tyro
 from rich.console import Console
 
 from detectors.base import DetectorError
-from detectors.registry import load_predictor
+from detectors.registry import SHIPPED, load_detector, load_predictor
+from drivesem.attack.space import parse_params
 from drivesem.bench import render
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, targets_of, watched
 from drivesem.bench.tables import Section
+from drivesem.cli import run_program
+from drivesem.config.blocks import CommandConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.values import numbers
-from drivesem.run.allocation import keep_freed
+from drivesem.report.tables import format_count
+from drivesem.run.attack import select_frames
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from scene_ir.derender.derender import DerenderSettings
-from scene_ir.errors import SceneError
 from tools.bench import (
+    climb,
     depth,
     derender,
     devices,
     evaluation,
     foliage,
     found,
+    gradcheck,
     install,
     label_free,
     memory,
@@ -40,50 +46,40 @@ from tools.bench import (
     parts,
     redraw,
     rivals,
+    scale,
     synth,
     viewer,
     weather,
 )
-from tools.bench.settings import BenchTool
+from tools.bench import detector as detectors
+from tools.bench.planted import across, across_names, summary, yardstick
+from tools.bench.settings import BenchTool, DetectorBenchConfig, GradcheckConfig
 
 _PROGRAM = "python -m tools.bench"
 _RIVAL_SECONDS = (16.0, 180.0)
 """Seconds for measuring renderers, with --quick and without; imports and scenes take some more."""
-_EXIT_BAD_INPUT = 2
+_DETECTOR_SECONDS = (20.0, 90.0)
+"""The same for measuring detectors."""
+_SECONDS_A_PASS = 0.5
+"""Of an attack on a frame as large as KITTI's, with its certificates and its share of the frame's survey."""
+_PLANTED_FRAMES = 3
+"""Frames of `bench planted`, where nobody says how many."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Returns the exit code: 0 done, 2 bad input, which one line tells."""
-    config = tyro.cli(BenchTool, prog=_PROGRAM, args=argv)
-    keep_freed()
-    try:
-        return run(config)
-    except (UsageError, SceneError, DetectorError, OSError) as error:
-        sys.stderr.write(f"{_PROGRAM}: {' '.join(str(error).split())}\n")
-        return _EXIT_BAD_INPUT
+    """Run one benchmark. Returns the exit code: 0 done, 1 a check failed, 2 bad input."""
+    return run_program(argv, BENCHMARKS, _PROGRAM, _load_benchmark)
 
 
-def run(config: BenchTool) -> int:
+def _load_benchmark(name: str) -> Callable[[Any], int]:
+    return gradcheck.run if name == "gradcheck" else partial(_run, _MEASURES[name])
+
+
+def _run(measure: Callable[[Any, Console], Measured], config: BenchTool | DetectorBenchConfig) -> int:
     """Measure, print, write; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
-    config.check()
-    measure: dict[str, Callable[[BenchTool, Console], Measured]] = {
-        "derender": _derender,
-        "parts": _parts,
-        "depth": _depth,
-        "found": _found,
-        "label-free": _label_free,
-        "moves": _moves,
-        "redraw": _redraw,
-        "weather": _weather,
-        "foliage": _foliage,
-        "synth": _synth,
-        "rivals": _rivals,
-        "devices": _devices,
-        "eval": _eval,
-        "viewer": _viewer,
-        "install": _install,
-    }
-    return conduct(config, _PROGRAM, measure[config.what])
+    if max(numbers("--cars", config.cars)) > MOST_CARS:
+        raise UsageError("--cars", f"at most {MOST_CARS}", max(numbers("--cars", config.cars)))
+    return conduct(config, _PROGRAM, measure)
 
 
 def _derender(config: BenchTool, console: Console) -> Measured:
@@ -191,10 +187,7 @@ def _synth(config: BenchTool, console: Console) -> Measured:
 
 
 def _rivals(config: BenchTool, console: Console) -> Measured:
-    cars = numbers("--cars", config.cars)
-    if max(cars) > MOST_CARS:
-        raise UsageError("--cars", f"at most {MOST_CARS}", max(cars))
-    sizes = render.sizes(cars, numbers("--triangles", config.triangles))
+    sizes = render.sizes(numbers("--cars", config.cars), numbers("--triangles", config.triangles))
     measured = rivals.measure(sizes, _RIVAL_SECONDS[0 if config.quick else 1], config.seed, config.device)
     return _measured(rivals, {"rows": [asdict(row) for row in watched(measured, 2 * len(sizes), console)]})
 
@@ -234,6 +227,136 @@ def _install(config: BenchTool, console: Console) -> Measured:
     return Measured({**fields, "method": install.METHOD}, sections)
 
 
+def _memory(config: DetectorBenchConfig, console: Console) -> Measured:
+    if not memory.supported():
+        raise UsageError("bench memory", "a system with /proc", sys.platform)
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu (the memory of a GPU is not measured)", config.device)
+    cases = memory.cases(numbers("--cars", config.cars), numbers("--triangles", config.triangles), config.quick)
+    rows = _dicts(watched(memory.measure(cases, config.seed, config.detector), len(cases), console))
+    return Measured({"rows": rows, "method": memory.METHOD}, [Section(memory.TITLE, memory.COLUMNS, rows)])
+
+
+def _detector(config: DetectorBenchConfig, console: Console) -> Measured:
+    """All that are shipped, or the one that was asked for."""
+    names = sorted(SHIPPED) if config.detector == DetectorBenchConfig.detector else [config.detector]
+    measured = detectors.measure(names, _DETECTOR_SECONDS[0 if config.quick else 1], config.seed, config.device)
+    try:
+        rows = _dicts(watched(measured, len(names) * len(detectors.SIZES_HW), console))
+    except DetectorError as error:
+        raise UsageError.of("--detector", "a detector with gradients", error) from error
+    return Measured(
+        {"rows": rows, "method": detectors.METHOD}, [Section(detectors.TITLE, detectors.COLUMNS, rows)]
+    )
+
+
+def _climb(config: DetectorBenchConfig, console: Console) -> Measured:
+    if config.device != "cpu":
+        raise UsageError("--device", "cpu (the processor's time is measured)", config.device)
+    try:
+        by_precision = {
+            name: load_detector(config.detector, gradient_precision=dtype)
+            for name, dtype in climb.PRECISIONS.items()
+        }
+    except DetectorError as error:
+        raise UsageError.of("--detector", "a detector with gradients", error) from error
+    cars, params = numbers("--cars", config.cars), parse_params(config.params)
+    measured = climb.measure(cars, params, config.passes, 4 if config.quick else 20, by_precision, config.seed)
+    rows = _dicts(watched(measured, len(cars) * len(by_precision), console))
+    return Measured({"rows": rows, "method": climb.METHOD}, [Section(climb.TITLE, climb.COLUMNS, rows)])
+
+
+def _planted(config: DetectorBenchConfig, console: Console) -> Measured:
+    return _planted_in_frames(config, console) if config.across is None else _planted_across(config, console)
+
+
+def _planted_across(config: DetectorBenchConfig, console: Console) -> Measured:
+    config = replace(config, limit=config.limit or _PLANTED_FRAMES)
+    first = across.Across.of(config)
+    names, _, failed = select_frames(first.source, config)
+    pooling = run_frame_jobs(
+        names, first.pool, partial(across.pool_of, config), config, ProgressSettings("states", show_remaining=True)
+    )
+    pools = [pooling.results[name] for name in names if name in pooling.results]
+    kinds = across.KINDS[1::8] if config.quick else across.KINDS
+    kinds = [(kind, nth) for nth in range(config.each) for kind in kinds]
+    planted = [across.plant_across(pools, kind, config.seed, nth) for kind, nth in kinds]
+    faults = [one for one in planted if one is not None]
+    console.print(f"{len(faults)} of {len(kinds)} faults could be planted")
+    texts = tuple(one.fault.text for one in faults)
+    second, frames = across.Across.of(config, texts), list(enumerate(pool.frame for pool in pools))
+    frames = frames[: config.searched]
+    build = partial(across.judge_of, config, texts)
+    asked = run_frame_jobs(
+        frames, second.judge, build, config, ProgressSettings("searches", show_remaining=True), lambda job: job[1]
+    )
+    judged = [asked.results[job] for job in frames if job in asked.results]
+    rows = across_names.rows_of(faults, pools, judged, tuple(first.workers) if frames else ())
+    told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
+    summed += across_names.chance_rows(pools, config.seed, across_names.SHAMS)
+    return Measured(
+        {
+            "rows": told,
+            "summary": summed,
+            "unplanted": ["+".join(kind) for (kind, _), one in zip(kinds, planted, strict=True) if one is None],
+            "failed": failed | pooling.failed | asked.failed,
+            "method": across_names.METHOD,
+        },
+        [
+            Section(across_names.TITLE, across_names.COLUMNS, told),
+            Section(across_names.SUMMARY_TITLE, across_names.SUMMARY_COLUMNS, summed),
+        ],
+    )
+
+
+def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> Measured:
+    config = replace(config, limit=config.limit or _PLANTED_FRAMES)
+    judge = yardstick.Yardstick.of(config)
+    names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)
+    methods = yardstick.methods_of(config)
+    sought = min(config.faults or len(judge.kinds), len(judge.kinds))
+    count = len(names) * (sought * len(methods) + len(judge.named))  # named ones once more without a fault
+    console.print(
+        f"{format_count(count, 'attack')} of {format_count(config.passes, 'pass', 'passes')}: "
+        f"about {_minutes(count * config.passes)}"
+    )
+    asked = run_frame_jobs(
+        names,
+        judge.judge,
+        partial(yardstick.judge_of, config),
+        config,
+        ProgressSettings("frames", show_remaining=True),
+    )
+    judged = [asked.results[name] for name in names if name in asked.results]
+    rows, kinds = summary.rows_of(judged, methods, config.seed), summary.kind_rows(judged, methods)
+    return Measured(
+        {
+            "rows": rows,
+            "kinds": kinds,
+            "attempts": [asdict(attempt) for frame in judged for attempt in frame.attempts],
+            "failed": failed | asked.failed,
+            "method": summary.METHOD,
+        },
+        [
+            Section(summary.TITLE, summary.COLUMNS, rows),
+            Section(summary.KINDS_TITLE, summary.kind_columns(methods), kinds),
+        ],
+    )
+
+
+def _scale(config: DetectorBenchConfig, console: Console) -> Measured:
+    rows = _dicts(watched(scale.measure(config), 2, console))
+    return Measured({"rows": rows, "method": scale.METHOD}, [Section(scale.TITLE, scale.COLUMNS, rows)])
+
+
+def _minutes(passes: int) -> str:
+    return f"{passes * _SECONDS_A_PASS / 60:.0f} min of one core"
+
+
+def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
+    return [asdict(row) for row in rows]
+
+
 def _measured(benchmark: Any, fields: dict[str, Any]) -> Measured:
     """What a benchmark, one of the modules here, found; its table shows the summary, where there is one."""
     rows = fields.get("summary", fields["rows"])
@@ -254,6 +377,35 @@ def _sheets(config: BenchTool) -> Path | None:
     targets = targets_of(config)
     return None if targets is None else targets[0].with_suffix("")
 
+
+_MEASURES: dict[str, Callable[[Any, Console], Measured]] = {
+    "derender": _derender,
+    "parts": _parts,
+    "depth": _depth,
+    "found": _found,
+    "label-free": _label_free,
+    "moves": _moves,
+    "redraw": _redraw,
+    "weather": _weather,
+    "foliage": _foliage,
+    "synth": _synth,
+    "rivals": _rivals,
+    "devices": _devices,
+    "eval": _eval,
+    "viewer": _viewer,
+    "install": _install,
+    "memory": _memory,
+    "detector": _detector,
+    "climb": _climb,
+    "planted": _planted,
+    "scale": _scale,
+}
+BENCHMARKS: dict[str, type[CommandConfig]] = {
+    "gradcheck": GradcheckConfig,
+    **dict.fromkeys(_MEASURES, BenchTool),
+    **dict.fromkeys(("memory", "detector", "climb", "planted", "scale"), DetectorBenchConfig),
+}
+"""Settings of each benchmark."""
 
 if __name__ == "__main__":
     raise SystemExit(main())

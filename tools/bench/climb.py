@@ -17,11 +17,11 @@ from drivesem.bench.scenes import bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.views import DrawnViews
+from drivesem.failures.views import NuisanceMarginOracle
 from drivesem.run.frame import FrameSettings, attack_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import SceneIR, scene_to
+from scene_ir.types import SceneIR, convert_scene
 
 TITLE = "A search by climb"
 COLUMNS: Columns = {
@@ -70,7 +70,7 @@ def measure(
 ) -> Iterator[ClimbRow]:
     """A row for each number of cars and each of `detectors`, which are named by what they compute in."""
     for count in cars:
-        scene = scene_to(bench_scene(count, _TRIANGLES, seed).scene, torch.float32, "cpu")
+        scene = convert_scene(bench_scene(count, _TRIANGLES, seed).scene, torch.float32, "cpu")
         for precision, detector in detectors.items():
             parts = _parts(scene, params, repetitions, detector, seed)
             settings = FrameSettings(Climb(passes), params, "moved", "objectness", RenderSettings(), seed)
@@ -92,22 +92,22 @@ def _parts(
     """Milliseconds of each part, each time at another place."""
     space, compositor = ParameterSpace(scene, params), Compositor(scene)
     objective = Objective(compositor, space, detector)
-    views, feasible = DrawnViews.of(objective, Nuisances(), "bench"), objective.feasible_set()
+    views, feasible = NuisanceMarginOracle.for_objective(objective, Nuisances(), "bench"), objective.feasible_set()
     generator = torch.Generator().manual_seed(seed)
     weights = torch.ones(len(views.judged))
     times: dict[str, list[float]] = {}
     for i in range(repetitions + _DRAWS):
         share = torch.rand(space.dim, generator=generator).to(space.lower)
         theta = feasible.project(space.lower + share * (space.upper - space.lower)).theta
-        draw = views.draw(i % _DRAWS)
-        perturbed = draw.scene(space.apply(scene, theta))
+        draw = views.sample(i % _DRAWS)
+        perturbed = draw.perturb_scene(space.apply(scene, theta))
         with torch.no_grad():
             image = compositor.render(perturbed).image
-            picture = draw.picture(image)
+            picture = draw.degrade_image(image)
         parts: dict[str, Callable[[], object]] = {
             "render_ms": partial(compositor.render, perturbed),
-            "picture_ms": partial(draw.picture, image),
-            "detector_ms": partial(detector.glance, picture[None]),
+            "picture_ms": partial(draw.degrade_image, image),
+            "detector_ms": partial(detector.forward_for_search, picture[None]),
             "pass_ms": partial(views.margins, theta, i % _DRAWS),
         }
         with torch.no_grad():

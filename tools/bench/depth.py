@@ -18,7 +18,9 @@ from drivesem.config.blocks import DEMO
 from drivesem.data.registry import open_dataset
 from drivesem.report.drawing import write_picture
 from drivesem.synth.frames import SynthSettings, generate_frame
-from scene_ir.derender import depth, maps, segment
+from scene_ir.derender import depth
+from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import segmentation as segment
 from scene_ir.derender.derender import derender
 from scene_ir.geometry import to_clip
 from scene_ir.io import to_uint8

@@ -487,7 +487,7 @@ def shadows(scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequenc
     seen = np.zeros(before.image.shape[:2], bool)
     for track in gone:
         seen |= share_of(before, track) > 0
-    beside = ~silhouette.grow(seen, _GROW_PX)
+    beside = ~silhouette.grow_mask(seen, _GROW_PX)
     bright = [frame.image.max(axis=2).astype(np.float32) + 1 for frame in (before, empty)]
     true = (bright[0] < _SHADED * bright[1]) & beside
     factor = np.ones(seen.shape, np.float32)
@@ -545,15 +545,15 @@ def changed_region(before: SynthFrame, after: SynthFrame, tracks: Sequence[int])
     for track in tracks:
         seen |= (share_of(before, track) > 0) | (share_of(after, track) > 0)
     apart = np.abs(before.image.astype(np.int16) - after.image).max(axis=2) > _CHANGED_LEVELS
-    return silhouette.grow(seen, _GROW_PX) | apart
+    return silhouette.grow_mask(seen, _GROW_PX) | apart
 
 
 def _zones(case: Case, region: Mask) -> dict[str, Mask]:
     """The parts of a move's region: each pixel lies in one."""
     new, old = (share_of(frame, case.move.track) >= 0.5 for frame in (case.moved, case.before))
-    inside = silhouette.grow(new, -_OUTLINE_PX)
-    outline = silhouette.grow(new, _OUTLINE_PX) & ~inside
-    uncovered = silhouette.grow(old, _GROW_PX) & ~outline & ~inside
+    inside = silhouette.grow_mask(new, -_OUTLINE_PX)
+    outline = silhouette.grow_mask(new, _OUTLINE_PX) & ~inside
+    uncovered = silhouette.grow_mask(old, _GROW_PX) & ~outline & ~inside
     unseen = never_seen(case)
     masks = (inside & ~unseen, inside & unseen, outline, uncovered, ~(inside | outline | uncovered))
     return {name: mask & region for name, mask in zip(ZONES, masks, strict=True)}
@@ -598,7 +598,7 @@ def _identity(compositor: Compositor) -> tuple[float, bool]:
         for crop, where in reached:
             h, w = where.shape
             touched[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] |= where.numpy()
-    for crop in (thing.foreground for thing in scene.front):
+    for crop in (thing.foreground for thing in scene.occluders):
         h, w = crop.values.shape[1:]
         touched[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] |= crop.values[3].numpy() > 0
     apart = (image - scene.photograph).double().numpy().transpose(1, 2, 0)
@@ -628,14 +628,14 @@ def silhouettes(
         if track in tracks:
             i = list(tracks).index(track)
             place, yaw, stretch = _pose_errors(scene, i, truth)
-            mesh = silhouette.iou(meshes[i], seen, hidden)
-            matte = silhouette.iou(drawn == i + 1, seen)
+            mesh = silhouette.mask_iou(meshes[i], seen, hidden)
+            matte = silhouette.mask_iou(drawn == i + 1, seen)
         start = None
         if labels is not None:
             k = rows.index(track)
-            kind = silhouette.candidates(labels.kind[k], labels.size_lhw[k].tolist())[0]
-            placed = silhouette.placed(kind, labels.translation[k], labels.yaw[k], labels.size_lhw[k])
-            start = round(silhouette.iou(silhouette.silhouettes([placed], frame.camera)[0], seen, hidden), 4)
+            kind = silhouette.rank_template_kinds(labels.kind[k], labels.size_lhw[k].tolist())[0]
+            placed = silhouette.place_mesh(kind, labels.translation[k], labels.yaw[k], labels.size_lhw[k])
+            start = round(silhouette.mask_iou(silhouette.render_silhouettes([placed], frame.camera)[0], seen, hidden), 4)
         yield Shape(
             track=track,
             kind=truth.actor.kind,
@@ -669,7 +669,7 @@ def _meshes_seen(compositor: Compositor) -> list[Mask]:
     found = [np.zeros((camera.height, camera.width), bool) for _ in range(len(objects))]
     if not found:
         return found
-    drawn = compositor.draw(objects)
+    drawn = compositor.find_visible(objects)
     rects = drawn.mesh.layout.rects.tolist()
     for mask, (span, size), (x0, y0, x1, y1) in zip(found, drawn.mesh.layout.spans(), rects, strict=True):
         mask[y0:y1, x0:x1] = (drawn.coverage[span] >= 0.5).reshape(size).numpy()
@@ -786,7 +786,7 @@ def _outlines(scene: SceneIR) -> list[Mask]:
     o = scene.objects
     meshes = [scene.meshes[int(i)] for i in o.mesh_index]
     parts = zip(meshes, o.translation, o.yaw, o.size_lhw, o.ffd, strict=True)
-    return silhouette.silhouettes([silhouette.Placement(*part) for part in parts], scene.camera)
+    return silhouette.render_silhouettes([silhouette.Placement(*part) for part in parts], scene.camera)
 
 
 def _reach_px(alpha: Crop, outline: Mask) -> float:
@@ -797,7 +797,7 @@ def _reach_px(alpha: Crop, outline: Mask) -> float:
     beyond = cv2.distanceTransform((~outline).astype(np.uint8), cv2.DIST_L2, 5)
     h, w = alpha.values.shape[1:]
     far = beyond[alpha.y0 : alpha.y0 + h, alpha.x0 : alpha.x0 + w][alpha.values[0].numpy() > 0].max(initial=0)
-    _, top, _, bottom = silhouette.extent(outline)
+    _, top, _, bottom = silhouette.mask_bounds(outline)
     most = max(settings.max_inflation * (bottom - top), settings.min_reach_px)
     return float(np.clip(far + 1.5, settings.min_reach_px, most))
 

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from detectors.base import Detector, RawPredictions
+from detectors.base import AnchorPredictions, Detector
 from detectors.registry import load_detector
 from drivesem.bench.scenes import bench_scene
 from drivesem.bench.tables import Columns
@@ -132,7 +132,7 @@ def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: fl
 
 
 @torch.no_grad()
-def _judge(detector: Detector, image: Tensor) -> RawPredictions:
+def _judge(detector: Detector, image: Tensor) -> AnchorPredictions:
     return detector(image)
 
 

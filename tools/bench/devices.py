@@ -24,7 +24,7 @@ from drivesem.synth import frames as generated
 from drivesem.synth.frames import SPLITS, SynthSettings
 from scene_ir.derender.derender import derender
 from scene_ir.render.compositor import Compositor
-from scene_ir.types import Frame, SceneIR, scene_to
+from scene_ir.types import Frame, SceneIR, convert_scene
 from tools.bench.weather import rendered, tensor_of
 
 TITLE = "A GPU beside the processor"
@@ -127,7 +127,7 @@ def _row(state: str, scene: SceneIR, number: int, there: Detector, here: Detecto
 
 
 def _objective(scene: SceneIR, state: str, detector: Detector, device: str) -> Objective:
-    scene = scene_to(scene, torch.float32, device)
+    scene = convert_scene(scene, torch.float32, device)
     return Objective(Compositor(scene), ParameterSpace(scene, parse_params(STATES[state])), detector)
 
 

@@ -72,7 +72,7 @@ def rows_of(pool: str, number: int, plan: Plan, sheets: Path | None = None) -> l
     scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
     compositor = Compositor(scene)
     leaves = (scene.environment.foliage_map >= 0.5).numpy()
-    stands = (compositor.crowns[:2].sum(0) >= 0.5).numpy()
+    stands = (compositor.crown_maps[:2].sum(0) >= 0.5).numpy()
     zones = [leaves & stands, leaves & ~stands]
     rows, strips = [], []
     for name, edit in CODES.items():

@@ -21,18 +21,18 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.registry import load_predictor
 from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.labels import Labeller, MovedLabels
+from drivesem.attack.labels import Labeller, SceneLabels
 from drivesem.attack.scene_edits import moved
 from drivesem.bench.tables import Columns
-from drivesem.config.blocks import Scenes
+from drivesem.config.blocks import SceneOptions
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.evaluation.resampling import wilson
-from drivesem.run.workers import outcomes
+from drivesem.run.workers import run_jobs
 from drivesem.scenes.sources import SceneSource, open_source
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene
-from scene_ir.removal import without_objects
+from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor, render
 from scene_ir.types import Category, SceneIR
 from tools.bench.found_sheet import failure_sheet
@@ -97,7 +97,7 @@ def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str
     """
     judge = _FoundJudge(config, sheets)
     names = judge.names()
-    for name, outcome in outcomes(judge.frame, partial(_in_process, config, sheets), names, config):
+    for name, outcome in run_jobs(judge.frame, partial(_in_process, config, sheets), names, config):
         yield name, outcome()
 
 
@@ -112,7 +112,7 @@ def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[
 
 def source_of(config: BenchTool) -> SceneSource:
     """The scenes that are asked for: of a data set, or a folder of them."""
-    asked = Scenes(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
+    asked = SceneOptions(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
     return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 
@@ -225,7 +225,7 @@ def failures(car: CarRow) -> list[str]:
 
 
 def _emptied(scene: SceneIR) -> Tensor:
-    empty = without_objects(scene, range(len(scene.objects)))
+    empty = remove_objects(scene, range(len(scene.objects)))
     with torch.no_grad():
         return render([empty])[0].image
 
@@ -275,12 +275,12 @@ class Moves:
         changed = moved(self._scene, FrameEdit(edits))
         return None if check_places(self._scene, changed, range(len(self._scene.objects))) else changed
 
-    def _drawn(self, changed: SceneIR) -> tuple[Tensor, MovedLabels]:
+    def _drawn(self, changed: SceneIR) -> tuple[Tensor, SceneLabels]:
         with torch.no_grad():
             drawn = self._compositor.render(changed)
             return drawn.image, self._labeller.moved(changed, drawn)
 
-    def _as_visible(self, labels: MovedLabels, row: int) -> bool:
+    def _as_visible(self, labels: SceneLabels, row: int) -> bool:
         """Whether a car is about as much in the picture as before, and hidden by others no more."""
         objects = self._scene.objects
         cut = float(labels.truncation[row] - objects.truncation[row]) > _MORE_CUT

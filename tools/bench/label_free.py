@@ -18,7 +18,7 @@ from torch import Tensor
 from detectors.boxes import iou_matrix
 from drivesem.bench.tables import Columns
 from drivesem.config.blocks import DEMO
-from drivesem.run.workers import outcomes
+from drivesem.run.workers import run_jobs
 from scene_ir.derender.derender import VEHICLES, DerenderSettings, placements
 from scene_ir.types import Camera, Frame, Labels
 from tools.bench.settings import BenchTool
@@ -89,7 +89,7 @@ def names(config: BenchTool) -> list[str]:
 def measure(config: BenchTool) -> Iterator[tuple[str, FrameRows]]:
     """Frame by frame, in the order in which they are done. config: dataset, root, frames, seed, workers. Raises
     SceneError for a frame that cannot be used."""
-    for name, outcome in outcomes(
+    for name, outcome in run_jobs(
         _LabelFreeJudge(config).frame, partial(_in_process, config), names(config), config
     ):
         yield name, outcome()

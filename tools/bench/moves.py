@@ -20,7 +20,7 @@ from detectors.boxes import iou_matrix
 from detectors.registry import load_predictor
 from drivesem.attack.budgets import PAPER, PRESETS, STREET
 from drivesem.bench.tables import Columns
-from drivesem.run.workers import outcomes
+from drivesem.run.workers import run_jobs
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, SynthFrame, Truth, render_frame
 from scene_ir import files
@@ -112,7 +112,7 @@ def names(config: BenchTool, frames: int) -> list[str]:
 def measure(config: BenchTool, frames: int, sheets: Path | None = None) -> Iterator[list[MovedRow]]:
     """The rows of each frame. sheets: a folder that gets a picture of each."""
     build = partial(_MovesJudge, config, sheets)
-    for _, outcome in outcomes(build(), build, names(config, frames), config):
+    for _, outcome in run_jobs(build(), build, names(config, frames), config):
         yield outcome()
 
 

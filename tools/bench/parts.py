@@ -11,8 +11,13 @@ from typing import Any
 from unittest.mock import patch
 
 from drivesem.bench.tables import Columns
-from scene_ir.derender import behind, depth, front, paint, segment, shadow, silhouette, stand
+from scene_ir.derender import background_fill as behind
+from scene_ir.derender import depth, shadow, silhouette
 from scene_ir.derender import derender as taking
+from scene_ir.derender import occluders as front
+from scene_ir.derender import paint_mask as paint
+from scene_ir.derender import segmentation as segment
+from scene_ir.derender import template_choice as stand
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.types import Frame
 from tools.bench.label_free import frame_of, names

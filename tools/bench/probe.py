@@ -157,7 +157,7 @@ def _peak_kb() -> int:
 
 def main(words: list[str]) -> None:
     """Run what the words ask for and leave the result in the file."""
-    from drivesem.run.allocation import keep_freed
+    from drivesem.run.jobs import keep_freed
     from scene_ir.files import write_json
 
     keep_freed()

@@ -24,7 +24,7 @@ from detectors.registry import load_predictor
 from drivesem.bench.tables import Columns
 from drivesem.failures.second_renderer.photograph import PhotographRedraw
 from drivesem.report.drawing import PAPER, write_text
-from drivesem.run.workers import outcomes
+from drivesem.run.workers import run_jobs
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, SceneIR
@@ -80,7 +80,7 @@ def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str
     """
     judge = _RedrawJudge(config, sheets)
     names = names_of(config)
-    for name, outcome in outcomes(judge.frame, partial(_in_process, config, sheets), names, config):
+    for name, outcome in run_jobs(judge.frame, partial(_in_process, config, sheets), names, config):
         yield name, outcome()
 
 

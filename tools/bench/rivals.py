@@ -16,7 +16,7 @@ from drivesem.bench.render import SceneSize, Times, rounded, timed
 from drivesem.bench.scenes import BenchScene, Placed, bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Budget, Clock
-from scene_ir.types import scene_to
+from scene_ir.types import convert_scene
 from tools.bench import renderers
 from tools.bench.renderers import RenderTask
 
@@ -86,7 +86,7 @@ def measure(sizes: Sequence[SceneSize], seconds: float, seed: int, device: str) 
 
 
 def _task(bench: BenchScene, seed: int, device: str) -> RenderTask:
-    scene = scene_to(bench.scene, torch.float32, device)
+    scene = convert_scene(bench.scene, torch.float32, device)
     placed = Placed.of(scene)
     generator = torch.Generator().manual_seed(seed)
     colours = torch.rand(placed.points.shape, generator=generator).to(placed.points)
@@ -176,8 +176,8 @@ def _measure_rival(name: str, task: tuple[SceneSize, int, RenderTask], seconds: 
 def _to(task: RenderTask, device: str) -> RenderTask:
     return replace(
         task,
-        placed=scene_to(task.placed, torch.float32, device),
-        camera=scene_to(task.camera, torch.float32, device),
+        placed=convert_scene(task.placed, torch.float32, device),
+        camera=convert_scene(task.camera, torch.float32, device),
         colours=task.colours.to(device),
         weight=task.weight.to(device),
     )

@@ -17,12 +17,12 @@ from drivesem.attack.space import Parameter
 from drivesem.bench.scenes import bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
-from drivesem.config.commands import Bench
 from drivesem.run.finished import PICTURES
 from drivesem.run.frame import FrameSettings, attack_scene, write_frame
-from drivesem.run.workers import outcomes
+from drivesem.run.workers import run_jobs
 from scene_ir import files
 from scene_ir.render.prepare import RenderSettings
+from tools.bench.settings import DetectorBenchConfig
 
 Engine = Literal["local", "ray"]
 FRAMES, QUICK_FRAMES = 200, 40
@@ -82,7 +82,7 @@ class _Round:
     told: dict[int, str]
 
 
-def measure(config: Bench) -> Iterator[Row]:
+def measure(config: DetectorBenchConfig) -> Iterator[Row]:
     """A row for each engine. Raises UsageError where there is no Ray."""
     frames, count = (QUICK_FRAMES, _QUICK_ROUNDS) if config.quick else (FRAMES, _ROUNDS)
     processes = config.processes
@@ -117,16 +117,16 @@ def measure(config: Bench) -> Iterator[Row]:
         )
 
 
-def _settings(config: Bench, engine: Engine) -> Bench:
+def _settings(config: DetectorBenchConfig, engine: Engine) -> DetectorBenchConfig:
     address = config.address if engine == "ray" else None
     return replace(config, engine=engine, address=address, workers=config.processes)
 
 
-def _round(work: Callable[[int], tuple[float, str]], config: Bench, numbers: range) -> _Round:
+def _round(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range) -> _Round:
     begun = time.perf_counter()
     ends, own_ms, told = [], [], {}
     build = partial(_worker, config.detector)
-    for number, outcome in outcomes(work, build, list(numbers), config, apart=True):
+    for number, outcome in run_jobs(work, build, list(numbers), config, in_subprocess=True):
         seconds, told[number] = outcome()
         ends.append(time.perf_counter())
         own_ms.append(1e3 * seconds)
@@ -148,5 +148,5 @@ def _frame(number: int, detector: Detector) -> tuple[float, str]:
     attacked = attack_scene(f"bench-{number}", scene, detector, settings)
     with tempfile.TemporaryDirectory(prefix="drivesem-scale-") as folder:
         write_frame(attacked, Path(folder) / "frame")
-        told = files.digest(Path(folder) / "frame" / PICTURES["attacked"])
+        told = files.sha256_digest(Path(folder) / "frame" / PICTURES["attacked"])
     return time.perf_counter() - begun, told

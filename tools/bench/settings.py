@@ -4,39 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated
 
-import tyro
-
-from drivesem.config.blocks import DEMO, SOURCES, Count, DataSource, Flag, FrameCommand, Tiles
-from drivesem.config.constraints import OneOf, Parsed
+from drivesem.config.blocks import (
+    DEMO,
+    SOURCES,
+    CommandName,
+    Count,
+    DataSourceOptions,
+    Flag,
+    FrameCommandConfig,
+    NotNegative,
+    SceneOptions,
+    TileOption,
+)
+from drivesem.config.commands import LEAST_PASSES, BenchOptions
+from drivesem.config.constraints import NumberRange, OneOf, Parsed, at_least
 from drivesem.config.errors import refuse
 from drivesem.config.values import numbers
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchTool(Tiles, DataSource, FrameCommand):
+class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
 
-    what: tyro.conf.Positional[
-        Literal[
-            "derender",
-            "parts",
-            "depth",
-            "found",
-            "label-free",
-            "moves",
-            "redraw",
-            "weather",
-            "foliage",
-            "synth",
-            "rivals",
-            "devices",
-            "eval",
-            "viewer",
-            "install",
-        ]
-    ] = "derender"
+    what: CommandName = ""
     """derender: de-rendered generated frames beside the generator's truth; parts: where the
     time of that goes, with a fit and with --fast; depth: how far surroundings are, beside
     the generator's truth, a laser, and in fog; found: whether a detector finds removed
@@ -88,3 +80,78 @@ class BenchTool(Tiles, DataSource, FrameCommand):
         refuse(self.fast and self.what != "derender", "--fast", "derender before it", self.what)
         both = self.what != "depth" and self.scenes is not None and self.dataset != DEMO
         refuse(both, "--scenes", "no --dataset beside it", f"--dataset {self.dataset}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorBenchConfig(BenchOptions):
+    """Measure memory, detectors, attacks on planted faults, and a cluster."""
+
+    what: CommandName = ""
+    """memory: peak memory above the detector's own; detector: forward, backward and decoding of each detector;
+    climb: a search by climb, and the parts of its passes; planted: how many faults that were planted into the
+    detector each attack finds (docs/planted.md), minutes a frame; scale: frames shared by Ray beside frames shared
+    by processes of this machine."""
+    methods: str = "climb,corners,si-fgsm,halton,cma-es"
+    """Planted: attacks to judge, with commas (drivesem attack --method)."""
+    passes: Annotated[int, at_least(LEAST_PASSES)] = 90
+    """Climb and planted: passes of the detector that each attack may take, a gradient counted as 3."""
+    params: str = "color,weather,foliage,translate,rotate,mesh"
+    """Climb and planted: what attacks may move, with commas."""
+    faults: Count | None = None
+    """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    budget: str = "paper"
+    """Planted: how far attacks may go (drivesem attack --budget)."""
+    across: Count | None = None
+    """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
+    many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
+    each: Count = 1
+    """Planted, with --across: so many faults of each kind."""
+    searched: NotNegative | None = None
+    """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
+    naming: str | None = None
+    """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
+    whether that is the fault; the same of the detector without a fault."""
+    limit: Count | None = None
+    """Planted: the first N frames, by default 3. Scale: so many frames for each, by default 200."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(
+            self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
+        )
+        refuse(
+            self.across is None and self.searched is not None, "--searched", "--across beside it", self.searched
+        )
+        demo = self.what == "planted" or self.dataset == DEMO
+        refuse(not demo, "--dataset", "--dataset demo, but for planted", self.dataset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradcheckConfig(SceneOptions, FrameCommandConfig):
+    """Compare gradients with central differences; exit code 1 where they disagree. One scene without --limit."""
+
+    detector: str = "squeezedet"
+    """Name of a shipped detector, or a .safetensors file of one."""
+    directions: Count = 2
+    """Random directions of each parameter along which differences are taken; each costs six renders a point."""
+    min_cosine: Annotated[float, NumberRange(-1, 1)] = 0.99
+    """Least cosine between gradient and differences."""
+    max_error: Annotated[float, NumberRange(0, ends="(]", expected="a positive number")] = 0.05
+    """Largest relative error of the gradient."""
+    reach: Flag = False
+    """Instead: how far the gradient of each object's margin tells what 1, 4 and 16 steps of an attack do to it, by
+    parameter and distance; some minutes a frame."""
+    draws: Annotated[Count, at_least(2, "of which two halves are compared")] = 4
+    """Of --reach: draws of a camera's small changes that margins and gradients are averaged over."""
+
+    def check(self) -> None:
+        super().check()
+        for name in ("directions", "min_cosine", "max_error"):
+            value = getattr(self, name)
+            refuse(
+                self.reach and value != getattr(GradcheckConfig, name),
+                f"--{name.replace('_', '-')}",
+                "no --reach beside it",
+                value,
+            )
+        refuse(not self.reach and self.draws != GradcheckConfig.draws, "--draws", "--reach beside it", self.draws)

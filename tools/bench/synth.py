@@ -13,8 +13,8 @@ import numpy as np
 import psutil
 
 from drivesem.bench.tables import Columns
-from drivesem.config.blocks import Sharing
-from drivesem.run.workers import mapping
+from drivesem.config.blocks import WorkerOptions
+from drivesem.run.workers import make_parallel_map
 from drivesem.synth.variations import MIXED
 from drivesem.synth.write import Order, synthesise
 
@@ -72,7 +72,7 @@ def _row(layout: str, workers: int, frames: int, seed: int) -> SynthRow:
             # A single process is a child too, so that what this one has loaded does not count.
             done = [
                 time.perf_counter() - start
-                for _ in synthesise(order, mapping(Sharing(workers=workers), apart=True))
+                for _ in synthesise(order, make_parallel_map(WorkerOptions(workers=workers), in_subprocess=True))
             ]
     warm = min(2 * workers, frames - 1)
     return SynthRow(

@@ -6,7 +6,7 @@ import torch
 from drivesem.bench.render import SceneSize
 from drivesem.bench.scenes import Placed, bench_scene
 from scene_ir.raster import verbs
-from scene_ir.types import scene_to
+from scene_ir.types import convert_scene
 from tools.bench import renderers, rivals
 from tools.bench.renderers import RenderTask
 
@@ -23,7 +23,7 @@ def test_the_own_verbs_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _task(cars: int) -> RenderTask:
-    scene = scene_to(bench_scene(cars, 600).scene, torch.float32)
+    scene = convert_scene(bench_scene(cars, 600).scene, torch.float32)
     placed = Placed.of(scene)
     weight = torch.ones(scene.camera.height, scene.camera.width, 3)
     return RenderTask(placed, scene.camera, torch.rand(placed.points.shape), weight)
@@ -39,7 +39,7 @@ def test_other_renderers_draw_the_same_cars(name: str) -> None:
         pytest.skip(f"{name}: {error}")
     placed, camera = task.placed, task.camera
     everything = torch.tensor([[0, placed.faces.shape[0]]])
-    frame = verbs.Layout.of(torch.tensor([[0, 0, camera.width, camera.height]]))
+    frame = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, camera.width, camera.height]]))
     own = int((verbs.rasterize(placed.clip, placed.faces, everything, frame).face >= 0).sum())
     assert renderer.hits(renderer.forward()) == pytest.approx(own, rel=0.02)
 

@@ -8,14 +8,14 @@ from collections.abc import Callable
 import pytest
 
 from drivesem.cli import main
-from drivesem.config.commands import Bench
+from tools.bench.settings import DetectorBenchConfig
 from tools.bench import scale
 
 
 def test_rounds_are_in_turn_and_their_figures_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, range]] = []
 
-    def one(work: Callable[[int], tuple[float, str]], config: Bench, numbers: range) -> scale._Round:
+    def one(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range) -> scale._Round:
         asked.append((config.engine, numbers))
         n, slow = len(asked), config.engine == "ray"
         told = {number: "another" if slow and number == 4 else f"{number}" for number in numbers}
@@ -23,7 +23,7 @@ def test_rounds_are_in_turn_and_their_figures_are_medians(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(scale, "_round", one)
     monkeypatch.setattr(scale, "_worker", lambda name: None)
-    local, ray = scale.measure(Bench(what="scale", limit=16, workers=2))
+    local, ray = scale.measure(DetectorBenchConfig(what="scale", limit=16, workers=2))
     assert [engine for engine, _ in asked] == ["local", "ray", *["local", "ray", "ray", "local"] * 2]
     assert [numbers for engine, numbers in asked if engine == "ray"][1:] == [
         range(k, k + 4) for k in (0, 4, 8, 12)
@@ -34,7 +34,7 @@ def test_rounds_are_in_turn_and_their_figures_are_medians(monkeypatch: pytest.Mo
     assert ray.over_ms == pytest.approx(26.5)
     assert local.same == ray.same == 15
     asked.clear()
-    assert next(scale.measure(Bench(what="scale", quick=True, workers=1))).frames == 40
+    assert next(scale.measure(DetectorBenchConfig(what="scale", quick=True, workers=1))).frames == 40
 
 
 @pytest.mark.slow

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.space import SIX, Parameter
+from drivesem.attack.space import PAPER_PARAMETERS, Parameter
 from drivesem.cli import main
-from drivesem.commands import gradcheck as gradcheck_command
-from drivesem.config.commands import Gradcheck
 from drivesem.config.parsing import parse
 from scene_ir.types import Camera, Mesh, SceneIR
 from tools.bench import gradcheck
+from tools.bench import gradcheck as gradcheck_command
 from tools.bench.gradcheck import LOSS, PICTURE, Differences, GradcheckRow, rows_of, worst
+from tools.bench.settings import GradcheckConfig
 
 COUNT, OUTPUTS = 12, gradcheck.FUNCTIONALS + 1
 
@@ -126,9 +126,9 @@ def test_functionals_are_smooth() -> None:
 
 
 def test_options() -> None:
-    assert parse(["gradcheck"]) == Gradcheck()
+    assert parse(["gradcheck"]) == GradcheckConfig()
     words = ["gradcheck", "--limit", "2", "--min-cosine", "0.999", "--max-error", "0.01", "--directions", "5"]
-    assert parse(words) == Gradcheck(limit=2, min_cosine=0.999, max_error=0.01, directions=5)
+    assert parse(words) == GradcheckConfig(limit=2, min_cosine=0.999, max_error=0.01, directions=5)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_a_whole_check_passes(capsys: pytest.CaptureFixture[str], tmp_path: Path
     assert summary == json.loads((tmp_path / "out" / "gradcheck.json").read_text())
     assert summary["passed"] is True
     names = {row["name"] for row in summary["rows"]}
-    assert names == {*(p.value for p in SIX), "combo 2 detector loss"}
+    assert names == {*(p.value for p in PAPER_PARAMETERS), "combo 2 detector loss"}
     assert len(summary["rows"]) == len(summary["scenes"]["street"]) == 2 * 2 * (2 * 6 + 1)
     silent = {row["name"] for row in summary["rows"] if row["cosine"] is None}
     assert silent == {"foliage"}, "a street without leaves"

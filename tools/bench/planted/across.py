@@ -15,13 +15,12 @@ from detectors.base import Detector, DetectorError
 from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
 from drivesem.analysis.holes.results import Samples
-from drivesem.attack.budgets import budget_of
+from drivesem.attack.budgets import parse_budget
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
-from drivesem.config.blocks import Scenes, shared
-from drivesem.config.commands import Bench
+from drivesem.config.blocks import SceneOptions, shared_options
 from drivesem.config.errors import UsageError
-from drivesem.run.attack import Worker, grader_of
+from drivesem.run.attack import Worker, build_grader
 from drivesem.run.records import dump_record, load_record
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
@@ -31,6 +30,7 @@ from tools.bench.planted.naming import looked_around
 from tools.bench.planted.pool import FramePool, hidden, sharpness
 from tools.bench.planted.remembering import Remembering
 from tools.bench.planted.yardstick import attack_settings, certain_of, methods_of, seen_without
+from tools.bench.settings import DetectorBenchConfig
 
 KINDS = tuple(
     tuple(words.split("+"))
@@ -194,18 +194,18 @@ def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> Planted | None
 class Across:
     """What one process needs. kept: folder of what is done; faults: in words."""
 
-    config: Bench
+    config: DetectorBenchConfig
     detector: Detector
     workers: dict[str, Worker]
     kept: Path | None
     faults: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, config: Bench, faults: tuple[str, ...] = ()) -> Across:
+    def of(cls, config: DetectorBenchConfig, faults: tuple[str, ...] = ()) -> Across:
         """Raises UsageError or SceneError for settings that cannot be."""
         methods = methods_of(config)
         parse_params(config.params)
-        budget_of(config.budget)
+        parse_budget(config.budget)
         try:
             detector = load_detector(config.detector, config.device)
         except DetectorError as error:
@@ -238,11 +238,11 @@ class Across:
         ):
             return load_record(path, FramePool, SCHEMA)
         scene = self._scene(name)
-        space = ParameterSpace(scene, parse_params(self.config.params), budget_of(self.config.budget))
+        space = ParameterSpace(scene, parse_params(self.config.params), parse_budget(self.config.budget))
         objective = Objective(Compositor(scene), space, Remembering(self.detector))
         pool = FramePool.make(objective, name, self.config.seed, self.states)
         if path is not None:
-            with files.whole_folder(path.parent) as part:
+            with files.atomic_folder(path.parent) as part:
                 files.write_text(part / path.name, dump_record(pool, SCHEMA))
                 files.write_text(part / "asked", asked)
         return pool
@@ -276,8 +276,8 @@ class Across:
 
     def _attempt(self, name: str, scene: SceneIR, fault: str, method: str, inner: Remembering) -> AcrossAttempt:
         worker = self.workers[method]
-        detector = PlantedDetector(inner, PlantedFault.of(fault)).requires_grad_(False) if fault else inner
-        attacked = replace(worker, detector=detector, grader=grader_of(worker.config, detector)).search(
+        detector = PlantedDetector(inner, PlantedFault.parse(fault)).requires_grad_(False) if fault else inner
+        attacked = replace(worker, detector=detector, grader=build_grader(worker.config, detector)).search(
             name, scene
         )
         certain = certain_of(attacked)
@@ -295,15 +295,15 @@ class Across:
         return scene
 
     def _asked(self, names: Sequence[str]) -> str:
-        settings = shared(self.config, Scenes) | {name: getattr(self.config, name) for name in names}
+        settings = shared_options(self.config, SceneOptions) | {name: getattr(self.config, name) for name in names}
         return repr(sorted((key, str(value)) for key, value in settings.items() if key != "limit"))
 
 
-def pool_of(config: Bench) -> Callable[[str], FramePool]:
+def pool_of(config: DetectorBenchConfig) -> Callable[[str], FramePool]:
     """`Across.pool` of another process."""
     return Across.of(config).pool
 
 
-def judge_of(config: Bench, faults: tuple[str, ...]) -> Callable[[tuple[int, str]], AcrossFrame]:
+def judge_of(config: DetectorBenchConfig, faults: tuple[str, ...]) -> Callable[[tuple[int, str]], AcrossFrame]:
     """`Across.judge` of another process."""
     return Across.of(config, faults).judge

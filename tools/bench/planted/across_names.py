@@ -11,7 +11,7 @@ import numpy as np
 from detectors.planted import PlantedFault
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import wilson
-from drivesem.failures.rules import Flags, Floats, Where, cover, in_words
+from drivesem.failures.rules import Flags, Floats, Intervals, fit_rule_list, format_rule
 from tools.bench.planted.across import AcrossFrame, Planted
 from tools.bench.planted.naming import agrees
 from tools.bench.planted.pool import FramePool, bands_by_label, hidden
@@ -77,11 +77,11 @@ class Evidence:
     objects: np.ndarray
     passes: int
 
-    def rules(self) -> list[Where]:
+    def rules(self) -> list[Intervals]:
         """Pooled ones, the one that tells most first."""
         if not self.fails.any():
             return []
-        return [rule.where for rule in cover(self.columns, self.fails, self.objects)]
+        return [rule.intervals for rule in fit_rule_list(self.columns, self.fails, self.objects)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +233,7 @@ def _row(one: Planted | None, by: str, evidence: Evidence, pools: Sequence[Frame
         failures=int(evidence.fails.sum()),
         objects=len(np.unique(evidence.objects[evidence.fails])),
         passes=evidence.passes,
-        rules=tuple(map(in_words, rules)),
+        rules=tuple(map(format_rule, rules)),
         named=whole,
         in_part=in_part,
         further=len(rules) - (one is not None and bool(rules)),

@@ -9,7 +9,7 @@ from drivesem.analysis.holes.frame import samples_around
 from drivesem.analysis.holes.results import Samples
 from drivesem.failures.neighbourhood import Neighbourhood
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.rules import fit, overlap
+from drivesem.failures.rules import fit_rule, overlap
 from drivesem.run.frame import AttackedScene
 
 ENOUGH = 0.5
@@ -21,7 +21,7 @@ Where = Mapping[str, tuple[float, float]]
 def told_of(attacked: AttackedScene, index: int, samples: int, seed: int) -> tuple[Where, int]:
     """A rule from so many samples around the failure of one object, and the passes that they took."""
     around = looked_around(attacked, index, samples, seed)
-    return fit(around.columns(), around.failing).where if around.margins else {}, len(around.margins)
+    return fit_rule(around.columns(), around.failing).intervals if around.margins else {}, len(around.margins)
 
 
 def looked_around(attacked: AttackedScene, index: int, samples: int, seed: int) -> Samples:
@@ -38,4 +38,4 @@ def agrees(where: Where, fault: PlantedFault, bands: Sequence[Band]) -> tuple[bo
     """
     true = {band.feature: (band.low, band.high) for band in bands}
     right = [name for name in where if name in true and overlap({name: where[name]}, {name: true[name]}) >= ENOUGH]
-    return bool(right) and set(right) == set(where) == set(fault.names), bool(right)
+    return bool(right) and set(right) == set(where) == set(fault.feature_names), bool(right)

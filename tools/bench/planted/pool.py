@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 
 from detectors import boxes
-from detectors.base import lowered_probability
-from detectors.planted import BLIND_TO, FEATURES, Band, PlantedFault, features, seen_cars
+from detectors.base import lower_probability
+from detectors.planted import BLIND_TO, FEATURES, Band, PlantedFault, compute_features, group_cars
 from detectors.types import CLASSES
 from drivesem.attack.objective import Objective
 from drivesem.evaluation.failures import IOU
-from drivesem.failures.neighbourhood import Everywhere, Sample
+from drivesem.failures.neighbourhood import ObjectSample, SceneSampler
 from drivesem.failures.nuisances import Nuisances
 
 LOOKS = 4
@@ -58,8 +58,8 @@ def hidden(cars: Sequence[SeenCar], fault: PlantedFault, t_star: float) -> list[
     if not rows:
         return [False] * len(cars)
     told = torch.tensor(rows, dtype=torch.float64)
-    by = fault.depth * fault.share(told[:, [1 + FEATURES.index(name) for name in fault.names]].T)
-    still = (lowered_probability(told[:, 0], by) >= t_star).split(counts)
+    by = fault.depth * fault.membership(told[:, [1 + FEATURES.index(name) for name in fault.feature_names]].T)
+    still = (lower_probability(told[:, 0], by) >= t_star).split(counts)
     return [count > 0 and not bool(seen.any()) for count, seen in zip(counts, still, strict=True)]
 
 
@@ -80,11 +80,11 @@ class FramePool:
         """Of so many states; the same arguments give the same pool. name: the frame's. Raises RangeError where the
         detector has no gradient, DetectorError where it does not tell its candidates.
         """
-        everywhere = Everywhere(objective, objective.feasible_set(), Nuisances(), f"planted:{name}:{seed}")
+        everywhere = SceneSampler(objective, objective.feasible_set(), Nuisances(), f"planted:{name}:{seed}")
         cars = objective.benign.paper.category == CLASSES.index(BLIND_TO)
         still = objective.space.theta0
         # Numbers of looks lie beyond those of states: no draw of the camera is seen twice.
-        looked = [everywhere.sample_of(still, states + number) for number in range(LOOKS)]
+        looked = [everywhere.sample_at(still, states + number) for number in range(LOOKS)]
         drawn = [everywhere.sample(number) for number in range(states)]
         seen = []
         for samples in (*looked, *drawn):
@@ -114,11 +114,11 @@ def bands_by_label(pools: Sequence[FramePool], fault: PlantedFault) -> tuple[Ban
         cars = [car for state in (*pool.looks, *pool.states) for car in state]
         for car, gone in zip(cars, hidden(cars, fault, pool.t_star), strict=True):
             if gone:
-                rows.append([car.described[pool.names.index(name)] for name in fault.names])
+                rows.append([car.described[pool.names.index(name)] for name in fault.feature_names])
     if len(rows) < 2:
         return ()
     ends = torch.tensor(rows, dtype=torch.float64).quantile(torch.tensor([0.05, 0.95], dtype=torch.float64), 0)
-    named = zip(fault.names, *ends.tolist(), strict=True)
+    named = zip(fault.feature_names, *ends.tolist(), strict=True)
     return tuple(Band(name, start, end) for name, start, end in named if start < end)
 
 
@@ -140,19 +140,21 @@ def sharpness(pools: Sequence[FramePool], fault: PlantedFault) -> float:
 
 
 @torch.no_grad()
-def _seen(objective: Objective, samples: dict[int, Sample], margins: dict[int, float]) -> tuple[SeenCar, ...]:
+def _seen(
+    objective: Objective, samples: dict[int, ObjectSample], margins: dict[int, float]
+) -> tuple[SeenCar, ...]:
     if not samples:
         return ()
-    exposure = next(iter(samples.values())).exposure
-    image, detector = exposure.picture, objective.differentiable
+    exposure = next(iter(samples.values())).image
+    image, detector = exposure.image, objective.differentiable
     label = detector.classes.index(BLIND_TO)
     told = detector.candidates(detector(image[None]))
-    placed, scores = told.boxes_of(label), told.log_scores[:, label].exp()
-    cars = seen_cars(placed, scores)
-    values = features(image[None], cars.boxes_xyxy[None])[:, 0].T  # (K, F)
+    placed, scores = told.boxes_for_class(label), told.log_scores[:, label].exp()
+    cars = group_cars(placed, scores)
+    values = compute_features(image[None], cars.boxes_xyxy[None])[:, 0].T  # (K, F)
     found = []
     for index, sample in samples.items():
-        truth = torch.stack([exposure.targets.boxes_xyxy[index], exposure.shown_xyxy[index]]).to(placed)
+        truth = torch.stack([exposure.targets.boxes_xyxy[index], exposure.visible_xyxy[index]]).to(placed)
         meets = (boxes.iou_matrix(truth, placed[cars.rows]) >= IOU).any(0)
         groups = []
         for car in cars.car[meets].unique().tolist():

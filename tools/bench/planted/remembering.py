@@ -9,13 +9,13 @@ from typing import Any
 from torch import Tensor
 
 from detectors.base import Detector
-from detectors.wrapping import Wrapping
+from detectors.wrapping import DetectorWrapper
 
 _MOST = 96
 """Pictures whose predictions are kept, half a megabyte each: those that searches of one frame share."""
 
 
-class Remembering(Wrapping):
+class Remembering(DetectorWrapper):
     """`inner`, which is asked once for each picture without a gradient. asked: how often it was."""
 
     def __init__(self, inner: Detector) -> None:

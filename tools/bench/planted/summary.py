@@ -9,7 +9,7 @@ import numpy as np
 
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import DRAWS, intervals, rate
-from drivesem.failures.rules import in_words
+from drivesem.failures.rules import format_rule
 from tools.bench.planted.yardstick import NO_FAULT, JudgedFrame
 
 METHOD = (
@@ -111,7 +111,7 @@ def _row(judged: Sequence[JudgedFrame], method: str, rarity: str, seed: int) -> 
         "inside_share": sum(attempt.inside for attempt in own) / found if found else None,
         "certain": sum(attempt.certain for attempt in own),
         "asked": sum(attempt.rule is not None for attempt in own),
-        "told": sum(attempt.rule not in (None, in_words({})) for attempt in own),
+        "told": sum(attempt.rule not in (None, format_rule({})) for attempt in own),
         "named": sum(attempt.named for attempt in own),
         "in_part": sum(attempt.in_part for attempt in own),
         "naming": sum(attempt.naming for attempt in own),

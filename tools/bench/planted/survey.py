@@ -11,14 +11,14 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from detectors import boxes
-from detectors.base import lowered_probability
-from detectors.planted import BLIND_TO, FEATURES, OF_THE_PICTURE, Band, PlantedFault, features, seen_cars
+from detectors.base import lower_probability
+from detectors.planted import BLIND_TO, FEATURES, PIXEL_FEATURES, Band, PlantedFault, compute_features, group_cars
 from detectors.types import CLASSES
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.objective import Objective
 from drivesem.evaluation.failures import IOU
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.second_renderer.compositor import CompositorDraw
+from drivesem.failures.second_renderer.compositor import CompositorRenderer
 from scene_ir.types import SceneIR
 
 HALTON = 128
@@ -55,13 +55,13 @@ class Sighting:
         detector = objective.differentiable
         label = detector.classes.index(BLIND_TO)
         told = detector.candidates(detector(image[None]))
-        placed, scores = told.boxes_of(label), told.log_scores[:, label].exp()
-        cars = seen_cars(placed, scores)
+        placed, scores = told.boxes_for_class(label), told.log_scores[:, label].exp()
+        cars = group_cars(placed, scores)
         own = scores[cars.rows]
         meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= IOU
         meets &= (own >= objective.t_star) & ~ignore.to(meets.device)[:, None]
-        values = features(image[None], cars.boxes_xyxy[None])[:, 0]
-        labelled = features(image[None], labels_xyxy.to(image)[None])[:, 0]
+        values = compute_features(image[None], cars.boxes_xyxy[None])[:, 0]
+        labelled = compute_features(image[None], labels_xyxy.to(image)[None])[:, 0]
         return cls(values, cars.car, own, meets, labelled, objective.t_star)
 
     @property
@@ -82,9 +82,9 @@ class Sighting:
 
     def lost(self, fault: PlantedFault) -> Tensor:
         """Objects (N,) bool that are found, and are not with the fault."""
-        rows = [FEATURES.index(name) for name in fault.names]
-        by = fault.depth * fault.share(self.values[rows])
-        still = lowered_probability(self.scores, by[self.car]) >= self.t_star
+        rows = [FEATURES.index(name) for name in fault.feature_names]
+        by = fault.depth * fault.membership(self.values[rows])
+        still = lower_probability(self.scores, by[self.car]) >= self.t_star
         return self.meets.any(1) & ~(self.meets & still).any(1)
 
 
@@ -102,10 +102,10 @@ class SeenFrame:
         objective = self.objective
         scene = objective.space.apply(objective.space.scene, theta)
         image = scene.photograph
-        if set(names) & set(OF_THE_PICTURE):
+        if set(names) & set(PIXEL_FEATURES):
             image = objective.compositor.render(scene).image.clamp(0, 1)
         labels = objective.labeller.moved(scene)
-        return features(image[None], labels.boxes_xyxy.to(image)[None], names)[:, 0]
+        return compute_features(image[None], labels.boxes_xyxy.to(image)[None], names)[:, 0]
 
     def sighting(self, theta: Tensor) -> Sighting:
         """What the detector sees at a feasible theta (D,)."""
@@ -119,14 +119,14 @@ class SeenFrame:
             yield self._sighting(scene, f"planted:{name}:{seed}", number)
 
     def _sighting(self, scene: SceneIR, stream: str | None = None, number: int = 0) -> Sighting:
-        renderer = CompositorDraw(self.objective.compositor, self.objective.labeller)
+        renderer = CompositorRenderer(self.objective.compositor, self.objective.labeller)
         if stream is None:
             drawn = renderer.redraw(scene)
             image, at = drawn.image, drawn.targets.boxes_xyxy
         else:
-            draw = Nuisances().draw(stream, number, scene)
-            drawn = renderer.redraw(draw.scene(scene))
-            image, at = draw.picture(drawn.image), draw.boxes(drawn.targets.boxes_xyxy)
+            draw = Nuisances().sample(stream, number, scene)
+            drawn = renderer.redraw(draw.perturb_scene(scene))
+            image, at = draw.degrade_image(drawn.image), draw.transform_boxes(drawn.targets.boxes_xyxy)
         count = len(self.judged)
         return Sighting.of(self.objective, image, at[:count], drawn.targets.ignore[:count] | ~self.judged)
 
@@ -187,8 +187,8 @@ class FrameSurvey:
         """Whether each object (N,) is a car inside of the fault's bands at a feasible theta (D,), by labels and
         picture, and by how far the detector's boxes are off as photographed. No detector is asked.
         """
-        rows = [FEATURES.index(name) for name in fault.names]
-        values = self.factor[rows] * self.frame.labelled(theta, fault.names) + self.shift[rows]
+        rows = [FEATURES.index(name) for name in fault.feature_names]
+        values = self.factor[rows] * self.frame.labelled(theta, fault.feature_names) + self.shift[rows]
         return self.frame.judged & fault.contains(values)
 
     def blind(self, fault: PlantedFault, theta: Tensor) -> Tensor:
@@ -200,13 +200,13 @@ class FrameSurvey:
         draws and corners. A detector's boxes grow and shrink with what it sees, and a fault goes by them. Empty
         where it hides none.
         """
-        rows = [FEATURES.index(name) for name in fault.names]
+        rows = [FEATURES.index(name) for name in fault.feature_names]
         hidden = [state.labelled[rows][:, state.lost(fault)] for state in (*self.halton, *self.corners)]
         values = torch.cat(hidden, 1)
         if values.shape[1] < 2:
             return ()
         low, high = values.quantile(torch.tensor([0.05, 0.95]).to(values), 1).tolist()
-        named = zip(fault.names, low, high, strict=True)
+        named = zip(fault.feature_names, low, high, strict=True)
         return tuple(Band(name, start, end) for name, start, end in named if start < end)
 
     def rarity(self, fault: PlantedFault) -> float:

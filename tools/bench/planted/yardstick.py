@@ -13,16 +13,16 @@ import numpy as np
 from detectors.base import Detector, DetectorError, predict
 from detectors.planted import PlantedDetector
 from detectors.registry import load_detector
-from drivesem.attack.budgets import budget_of
+from drivesem.attack.budgets import parse_budget
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
-from drivesem.config.blocks import Scenes, shared
-from drivesem.config.commands import Attack, Bench, Holes
+from drivesem.config.blocks import SceneOptions, shared_options
+from drivesem.config.commands import AttackConfig, HolesConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation import failures
 from drivesem.failures.grades import Grade
-from drivesem.failures.rules import in_words
-from drivesem.run.attack import Worker, grader_of
+from drivesem.failures.rules import format_rule
+from drivesem.run.attack import Worker, build_grader
 from drivesem.run.frame import AttackedScene
 from drivesem.scenes.sources import NoVehicleError
 from scene_ir import files
@@ -30,8 +30,9 @@ from scene_ir.render.compositor import Compositor
 from tools.bench.planted.naming import agrees, told_of
 from tools.bench.planted.plant import KINDS, FaultKind, Planting, plant
 from tools.bench.planted.survey import FrameSurvey
+from tools.bench.settings import DetectorBenchConfig
 
-METHODS = tuple(name for name in get_args(get_type_hints(Attack)["method"]) if name != "placebo")
+METHODS = tuple(name for name in get_args(get_type_hints(AttackConfig)["method"]) if name != "placebo")
 """Attacks that can be judged: a placebo needs a run to be like."""
 NO_FAULT = "none"
 """Kind and rarity of attempts on the detector as it is, beside which names are to be seen."""
@@ -83,12 +84,12 @@ class JudgedFrame:
         return cls(data["frame"], tuple(Attempt(**row) for row in data["attempts"]), tuple(data["unplanted"]))
 
 
-def methods_of(config: Bench) -> tuple[str, ...]:
+def methods_of(config: DetectorBenchConfig) -> tuple[str, ...]:
     """The methods that a command names. Raises UsageError for one that is not known."""
     return _names_among(METHODS, "--methods", config.methods)
 
 
-def naming_of(config: Bench) -> tuple[str, ...]:
+def naming_of(config: DetectorBenchConfig) -> tuple[str, ...]:
     """Those of its methods whose failures are to be told by rules. Raises UsageError for another one."""
     return () if config.naming is None else _names_among(methods_of(config), "--naming", config.naming)
 
@@ -100,10 +101,10 @@ def _names_among(known: Sequence[str], setting: str, text: str) -> tuple[str, ..
     return names
 
 
-def attack_settings(config: Bench, method: str) -> Attack:
+def attack_settings(config: DetectorBenchConfig, method: str) -> AttackConfig:
     """The settings of a method: nobody is asked but the detector itself."""
-    settings = Attack(
-        **shared(config, Scenes),
+    settings = AttackConfig(
+        **shared_options(config, SceneOptions),
         method=method,  # pyright: ignore[reportArgumentType]
         params=config.params,
         budget=config.budget,
@@ -124,7 +125,7 @@ class Yardstick:
     folder of what is done, by frame.
     """
 
-    config: Bench
+    config: DetectorBenchConfig
     detector: Detector
     workers: Mapping[str, Worker]
     kinds: tuple[FaultKind, ...]
@@ -132,7 +133,7 @@ class Yardstick:
     kept: Path | None
 
     @classmethod
-    def of(cls, config: Bench) -> Yardstick:
+    def of(cls, config: DetectorBenchConfig) -> Yardstick:
         """Raises UsageError or SceneError for settings that cannot be."""
         methods = methods_of(config)
         parse_params(config.params)
@@ -147,7 +148,7 @@ class Yardstick:
 
     def judge(self, name: str) -> JudgedFrame:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
-        asked = {field.name: str(getattr(self.config, field.name)) for field in fields(Scenes)}
+        asked = {field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)}
         keys = ("methods", "passes", "params", "budget", "detector", "quick", "faults", "naming")
         asked |= {key: getattr(self.config, key) for key in keys}
         asked.pop("limit")
@@ -165,7 +166,7 @@ class Yardstick:
         scene = next(iter(self.workers.values())).source.scene(name)
         if not len(scene.objects):
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
-        space = ParameterSpace(scene, parse_params(self.config.params), budget_of(self.config.budget))
+        space = ParameterSpace(scene, parse_params(self.config.params), parse_budget(self.config.budget))
         objective = Objective(Compositor(scene), space, self.detector)
         survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)
         attempts: list[Attempt] = []
@@ -181,7 +182,7 @@ class Yardstick:
             planted += 1
             detector = PlantedDetector(self.detector, planting.fault).requires_grad_(False)
             for method, worker in self.workers.items():
-                grader = grader_of(worker.config, detector)
+                grader = build_grader(worker.config, detector)
                 attacked = replace(worker, detector=detector, grader=grader).search(name, scene)
                 attempts.append(self._attempt(name, method, planting, survey, attacked))
         attempts += [
@@ -222,14 +223,16 @@ class Yardstick:
         )
         if not found or method not in self.named:
             return attempt
-        where, passes = told_of(attacked, found[0], Holes.samples, self.config.seed)
+        where, passes = told_of(attacked, found[0], HolesConfig.samples, self.config.seed)
         whole, in_part = agrees(where, planting.fault, survey.bands_by_label(planting.fault))
-        return replace(attempt, rule=in_words(where), named=whole, in_part=in_part, naming=passes)
+        return replace(attempt, rule=format_rule(where), named=whole, in_part=in_part, naming=passes)
 
     def _control(self, name: str, method: str, attacked: AttackedScene) -> Attempt:
         """The same without a fault: what is named then is not planted."""
         certain = certain_of(attacked)
-        where, passes = told_of(attacked, certain[0], Holes.samples, self.config.seed) if certain else (None, 0)
+        where, passes = (
+            told_of(attacked, certain[0], HolesConfig.samples, self.config.seed) if certain else (None, 0)
+        )
         return Attempt(
             frame=name,
             kind=NO_FAULT,
@@ -243,12 +246,12 @@ class Yardstick:
             inside=0,
             passes=attacked.passes,
             seconds=round(attacked.seconds, 2),
-            rule=None if where is None else in_words(where),
+            rule=None if where is None else format_rule(where),
             naming=passes,
         )
 
 
-def judge_of(config: Bench) -> Callable[[str], JudgedFrame]:
+def judge_of(config: DetectorBenchConfig) -> Callable[[str], JudgedFrame]:
     """`Yardstick.judge` of another process."""
     return Yardstick.of(config).judge
 

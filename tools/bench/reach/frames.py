@@ -12,29 +12,29 @@ import torch
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
-from drivesem.attack.space import SIX, ParameterSpace
-from drivesem.config.blocks import Scenes
-from drivesem.config.commands import Gradcheck
+from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
+from drivesem.config.blocks import SceneOptions
 from drivesem.config.errors import UsageError
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.views import DrawnViews
+from drivesem.failures.views import NuisanceMarginOracle
 from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
 from tools.bench.reach.slopes import Slopes, measure, probes
+from tools.bench.settings import GradcheckConfig
 
 
 @dataclass(frozen=True)
 class ReachWorker:
     """What one process needs. kept: folder of what is done, by frame; None keeps nothing."""
 
-    config: Gradcheck
+    config: GradcheckConfig
     source: SceneSource
     detector: Detector
     kept: Path | None
 
     @classmethod
-    def of(cls, config: Gradcheck) -> ReachWorker:
+    def of(cls, config: GradcheckConfig) -> ReachWorker:
         """Raises UsageError or SceneError for settings that cannot be."""
         source = open_source(config)
         try:
@@ -47,7 +47,9 @@ class ReachWorker:
 
     def measure(self, name: str) -> tuple[Slopes, ...]:
         """Of a frame; what another call has done with the same settings is read."""
-        asked: dict[str, Any] = {field.name: str(getattr(self.config, field.name)) for field in fields(Scenes)}
+        asked: dict[str, Any] = {
+            field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)
+        }
         asked |= {"detector": self.config.detector, "draws": self.config.draws}
         asked.pop("limit")
         path = None if self.kept is None else self.kept / f"{name}.json"
@@ -64,15 +66,15 @@ class ReachWorker:
         scene = self.source.scene(name)
         if not len(scene.objects):
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
-        space = ParameterSpace(scene, SIX)
+        space = ParameterSpace(scene, PAPER_PARAMETERS)
         objective = Objective(Compositor(scene), space, self.detector)
-        views = DrawnViews.of(objective, Nuisances(), f"reach:{name}:{self.config.seed}")
+        views = NuisanceMarginOracle.for_objective(objective, Nuisances(), f"reach:{name}:{self.config.seed}")
         generator = torch.Generator().manual_seed(self.config.seed)
         tried = probes(space, generator)
         return measure(views, objective.feasible_set(), tried, self.config.draws, generator)
 
 
-def measure_of(config: Gradcheck) -> Callable[[str], tuple[Slopes, ...]]:
+def measure_of(config: GradcheckConfig) -> Callable[[str], tuple[Slopes, ...]]:
     """`ReachWorker.measure` of another process."""
     return ReachWorker.of(config).measure
 

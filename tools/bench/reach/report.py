@@ -9,9 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.report.answer import Answer
 from drivesem.report.plots import COLOURS, STYLE
-from drivesem.report.tables import Sheet
+from drivesem.report.tables import AnalysisReport, ReportTable
 from scene_ir import files
 from tools.bench.reach.agreement import ALL, ReachRow, Told
 from tools.bench.reach.slopes import STEPS
@@ -40,17 +39,19 @@ _NOTES = (
 )
 
 
-def answer_of(out: Path, rows: Sequence[ReachRow], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
+def answer_of(
+    out: Path, rows: Sequence[ReachRow], facts: Mapping[str, Any], failed: Mapping[str, str]
+) -> AnalysisReport:
     """What is said of all frames. facts: what stands before the rows in the JSON."""
     everywhere = tuple(_line(row) for row in rows if row.distance == ALL)
-    sheets = [Sheet("Gradients and slopes of margins", _COLUMNS, everywhere), _by_distance(rows)]
-    return Answer(
+    sheets = [ReportTable("Gradients and slopes of margins", _COLUMNS, everywhere), _by_distance(rows)]
+    return AnalysisReport(
         out=out,
         name=NAME,
         heading="How far gradients hold",
         data={**facts, "rows": [asdict(row) for row in rows]},
-        tables={NAME: [_flat(row) for row in rows]},
-        sheets=sheets,
+        csv_tables={NAME: [_flat(row) for row in rows]},
+        tables=sheets,
         notes=_NOTES,
         picture=partial(write_reach, rows=[row for row in rows if row.distance == ALL]),
         failed=failed,
@@ -102,7 +103,7 @@ def _cells(one: Told) -> tuple[str, str, str]:
     return (f"{one.cosine:.2f}{bounds}", f"{100 * one.signs:.0f}", f"{one.kept:.2f}")
 
 
-def _by_distance(rows: Sequence[ReachRow]) -> Sheet:
+def _by_distance(rows: Sequence[ReachRow]) -> ReportTable:
     """Cosines and signs of point gradients, a pair of columns a band."""
     bands = tuple(dict.fromkeys(row.distance for row in rows if row.distance != ALL))
     known = {(row.row, row.steps, row.distance): row for row in rows}
@@ -114,7 +115,7 @@ def _by_distance(rows: Sequence[ReachRow]) -> Sheet:
             line += ["-", "-"] if row is None else [f"{row.point.cosine:.2f}", f"{100 * row.point.signs:.0f}"]
         lines.append(tuple(line))
     columns = [word for band in bands for word in (f"{band}: cosine", f"{band}: signs")]
-    return Sheet("Point gradients by distance", ("parameter", "steps", *columns), tuple(lines))
+    return ReportTable("Point gradients by distance", ("parameter", "steps", *columns), tuple(lines))
 
 
 def _flat(row: ReachRow) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator)
         signs = 2.0 * torch.randint(2, (LATTICE_DIRECTIONS, size), generator=generator) - 1
         for k, direction in enumerate(signs):
             yield _probe(space, row, f"random {k}", where, step * direction)
-        for k, direction in enumerate(ffd.low_modes()):
+        for k, direction in enumerate(ffd.low_order_modes()):
             yield _probe(space, "mesh, low bends", f"bend {k}", where, step * direction)
         return
     for k, direction in enumerate(torch.eye(size)):

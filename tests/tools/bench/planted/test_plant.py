@@ -65,8 +65,8 @@ def test_a_sighting_tells_what_a_fault_hides() -> None:
     assert sighting.single.tolist() == [False, False]
     assert sighting.main[FEATURES.index("aspect"), 0] == 1.5
     assert sighting.main[:, 1].isnan().all()
-    assert sighting.lost(PlantedFault.of("aspect=1:2")).tolist() == [False, False]
-    assert sighting.lost(PlantedFault.of("aspect=1:4")).tolist() == [True, False]
+    assert sighting.lost(PlantedFault.parse("aspect=1:2")).tolist() == [False, False]
+    assert sighting.lost(PlantedFault.parse("aspect=1:4")).tolist() == [True, False]
 
 
 def test_the_yardstick_has_easy_and_rare_faults_of_every_feature() -> None:
@@ -84,7 +84,7 @@ def test_what_is_planted_keeps_its_promises(seed: int, kind: FaultKind) -> None:
     if made is None:  # what is rare may be out of the reach of so few trials
         assert kind.rarity == "rare"
         return
-    assert made.fault.names == kind.features
+    assert made.fault.feature_names == kind.features
     least, most = HITS[kind.rarity]
     assert least <= made.hit <= most
     assert made.hit == frame.rarity(made.fault)
@@ -99,7 +99,7 @@ def test_bands_by_label_are_those_of_the_labels_of_hidden_cars() -> None:
     (band,) = frame.bands_by_label(fault)
     assert band.feature == "aspect"
     assert aspect - 0.15 < band.low < band.high < aspect + 0.15
-    assert frame.bands_by_label(PlantedFault.of("aspect=50:60")) == ()
+    assert frame.bands_by_label(PlantedFault.parse("aspect=50:60")) == ()
 
 
 def test_equal_arguments_give_equal_faults() -> None:
@@ -108,7 +108,7 @@ def test_equal_arguments_give_equal_faults() -> None:
     assert made is not None
     assert made == plant(frame, kind, 3)
     assert made != plant(frame, kind, 4)
-    assert PlantedFault.of(made.fault.text) == made.fault
+    assert PlantedFault.parse(made.fault.text) == made.fault
 
 
 def test_every_kind_can_be_planted() -> None:

@@ -71,7 +71,7 @@ def test_faults_hide_few_cars_as_photographed_and_some_others(
 ) -> None:
     one = plant_across(pools, kind, 0)
     assert one is not None
-    assert one.fault.names == kind
+    assert one.fault.feature_names == kind
     assert one == plant_across(pools, kind, 0)
     assert one != plant_across(pools, kind, 1)
     assert one.still <= AS_PHOTOGRAPHED
@@ -118,7 +118,7 @@ def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
 
 
 def test_searches_bring_their_samples_and_their_passes(pools: list[FramePool]) -> None:
-    fault = PlantedFault.of("height_px=30:40")
+    fault = PlantedFault.parse("height_px=30:40")
     around = Samples(NAMES, ((35.0, 1.5, 0.5, 0.3, 0.2, 0.1),) * 3, (-1.0, -1.0, 2.0))
     attempt = AcrossAttempt("003", fault.text, "climb", 1, 1, 24, (Looked(2, around),))
     others = [replace(attempt, fault=""), replace(attempt, method="halton")]
@@ -133,7 +133,7 @@ def test_searches_bring_their_samples_and_their_passes(pools: list[FramePool]) -
 
 
 def test_cars_that_are_hidden_as_photographed_are_no_evidence(pools: list[FramePool]) -> None:
-    fault = PlantedFault.of("height_px=30:40")
+    fault = PlantedFault.parse("height_px=30:40")
     evidence = drawn_evidence(fault, pools, 12)
     before = sum(len(pool.hidden_as_photographed(fault)) for pool in pools)
     assert before > 0
@@ -147,7 +147,7 @@ def test_chance_has_no_name(pools: list[FramePool]) -> None:
 
 
 def test_rows_are_summed_by_what_named_them() -> None:
-    fault = PlantedFault.of("height_px=30:40")
+    fault = PlantedFault.parse("height_px=30:40")
     one = NameRow(fault.text, "climb", 0.2, 0.1, 0.0, 0.5, 9, 4, 300, ("a", "b"), True, True, 1)
     blunt = replace(one, named=False, rules=(), further=0, passes=100, sharp=0.1)
     planted, sharp, none = summary_rows([one, blunt, replace(one, fault="", sharp=None, further=2)])

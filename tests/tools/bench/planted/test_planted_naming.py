@@ -7,7 +7,7 @@ import pytest
 from detectors.planted import Band, PlantedFault
 from tools.bench.planted.naming import agrees
 
-PAIR = PlantedFault.of("aspect=1:2,lightness=0.2:0.4")
+PAIR = PlantedFault.parse("aspect=1:2,lightness=0.2:0.4")
 BANDS = (Band("aspect", 1.1, 1.9), Band("lightness", 0.2, 0.4))
 
 
@@ -28,4 +28,4 @@ def test_a_rule_names_a_fault(where: dict[str, tuple[float, float]], whole: bool
 
 
 def test_a_fault_that_hides_nothing_is_not_named() -> None:
-    assert agrees({"aspect": (1.0, 2.0)}, PlantedFault.of("aspect=1:2"), ()) == (False, False)
+    assert agrees({"aspect": (1.0, 2.0)}, PlantedFault.parse("aspect=1:2"), ()) == (False, False)

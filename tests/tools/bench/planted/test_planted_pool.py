@@ -12,7 +12,7 @@ from detectors.planted import PlantedDetector, PlantedFault
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace
-from drivesem.failures.neighbourhood import Everywhere
+from drivesem.failures.neighbourhood import SceneSampler
 from drivesem.failures.nuisances import Nuisances
 from drivesem.run.records import dump_record, load_record
 from drivesem.synth.demo import demo_scene
@@ -21,7 +21,7 @@ from tools.bench.planted.pool import SCHEMA, FramePool, SeenCar, bands_by_label
 from tools.bench.planted.remembering import Remembering
 
 NAMES = ("height_px", "lightness")
-DARK = PlantedFault.of("lightness=0.1:0.3")
+DARK = PlantedFault.parse("lightness=0.1:0.3")
 
 
 def car(lightness: float, score: float = 0.9, index: int = 0, *others: tuple[float, ...]) -> SeenCar:
@@ -54,7 +54,7 @@ def test_bands_by_label_are_where_cars_are_hidden() -> None:
     assert (band.low, band.high) == pytest.approx((0.13, 0.31), abs=0.03)  # edges are soft
     assert pool.found == {0, 1}
     assert pool.hidden_as_photographed(DARK) == {1}
-    assert bands_by_label([pool], PlantedFault.of("lightness=0.8:0.9")) == ()
+    assert bands_by_label([pool], PlantedFault.parse("lightness=0.8:0.9")) == ()
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +81,10 @@ def test_what_a_fault_hides_is_what_its_detector_does_not_find(objective: Object
     hidden = seen = 0
     for number, state in enumerate(pool.states):
         shades = [one.best[3] for one in state if one.margin > 0.5 and one.best is not None]
-        fault = PlantedFault.of(f"lightness={shades[0] - 0.08:.4f}:{shades[0] + 0.08:.4f}")
+        fault = PlantedFault.parse(f"lightness={shades[0] - 0.08:.4f}:{shades[0] + 0.08:.4f}")
         planted = PlantedDetector(objective.differentiable, fault).requires_grad_(False)
         with_fault = Objective(objective.compositor, objective.space, planted)
-        everywhere = Everywhere(with_fault, with_fault.feasible_set(), Nuisances(), "planted:demo-000:0")
+        everywhere = SceneSampler(with_fault, with_fault.feasible_set(), Nuisances(), "planted:demo-000:0")
         margins = everywhere.margins(everywhere.sample(number))
         for one in state:
             if one.index in margins:  # it is found as photographed with the fault too

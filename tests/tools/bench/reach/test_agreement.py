@@ -81,7 +81,7 @@ def test_an_answer_has_tables_and_a_picture(tmp_path: Path) -> None:
     heading, *lines = (tmp_path / "reach.csv").read_text().splitlines()
     assert len(lines) == len(rows())
     assert "point_cosine" in heading
-    everywhere, by_distance = answer.sheets
+    everywhere, by_distance = answer.tables
     assert [row[2] for row in everywhere.rows] == [str(steps) for steps in STEPS]
     assert [row[1] for row in by_distance.rows] == [str(steps) for steps in STEPS]
     assert by_distance.rows[1][-2:] == ("-", "-")

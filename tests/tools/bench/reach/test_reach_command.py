@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from drivesem.cli import main
-from drivesem.config.commands import Gradcheck
 from drivesem.config.parsing import parse
 from tools.bench.reach.frames import ReachWorker
 from tools.bench.reach.slopes import Slopes
+from tools.bench.settings import GradcheckConfig
 
 WORDS = ("gradcheck", "--reach", "--draws", "2", "--limit", "2", "--workers", "1")
 SLOPES = Slopes(
@@ -35,7 +35,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_options() -> None:
-    assert parse(list(WORDS)) == Gradcheck(reach=True, draws=2, limit=2, workers=1)
+    assert parse(list(WORDS)) == GradcheckConfig(reach=True, draws=2, limit=2, workers=1)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def measured(
 
 def test_a_probe_is_one_step_of_each_object_in_a_coordinate_of_its_own(space: ParameterSpace) -> None:
     names = [probe.name for probe in tried(space)]
-    assert len(names) == len(set(names)) == 5 + 4 + 2 + 1 + LATTICE_DIRECTIONS + len(ffd.low_modes())
+    assert len(names) == len(set(names)) == 5 + 4 + 2 + 1 + LATTICE_DIRECTIONS + len(ffd.low_order_modes())
     for probe in tried(space):
         assert len(probe.ways) == (1 if probe.row == "weather" else 2)
         steps = probe.ways.abs() / space.step
