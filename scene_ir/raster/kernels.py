@@ -22,9 +22,9 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, halves, launch, start_warp, threads
-from scene_ir.raster.layout import Fragments, Layout, Plan, version_of
-from scene_ir.raster.plan import gpu_lanes, int32_faces, outline_cuts, parts_on_gpu, share_on_cpu
+from scene_ir.raster.launch import array, launch, split_range, start_warp, threads
+from scene_ir.raster.layout import Fragments, PixelLayout, RasterPlan, tensor_version
+from scene_ir.raster.plan import gpu_lanes, gpu_parts, int32_faces, split_for_threads, split_outlines
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
 from scene_ir.raster.reference import SLACK_PX as _SLACK_PX
 from scene_ir.raster.reference import SNAP_PX as _SNAP_PX
@@ -1126,8 +1126,8 @@ def coverage_backward_kernel(
 
 
 def rasterize(
-    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
-) -> tuple[Tensor, Tensor, Plan]:
+    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
+) -> tuple[Tensor, Tensor, RasterPlan]:
     """See `verbs.rasterize`. Returns face (T,) int32, depth (T,) and what `antialias` can use again."""
     plan = _plan(clip, faces, face_ranges, layout, near, cull)
     size = layout.size
@@ -1151,7 +1151,7 @@ def rasterize(
             array(keys),
         ]
         launch(rasterize_kernel, plan.cuts, inputs, (), clip.device)
-        launch(unpack_kernel, halves(size), [array(keys), array(face), array(depth)], (), clip.device)
+        launch(unpack_kernel, split_range(size), [array(keys), array(face), array(depth)], (), clip.device)
     return face, depth, plan
 
 
@@ -1169,7 +1169,7 @@ def texture(image: Tensor, uv: Tensor, clamp: bool) -> Tensor:
     return _Texture.apply(image, strides, (crop, ends[0]), ends[1], uv, clamp)
 
 
-def texture_packed(values: Tensor, crops: Layout, layout: Layout, uv: Tensor, clamp: bool) -> Tensor:
+def texture_packed(values: Tensor, crops: PixelLayout, layout: PixelLayout, uv: Tensor, clamp: bool) -> Tensor:
     """See `verbs.texture_packed`."""
     channels = values.shape[1]
     return _Texture.apply(values, (channels, 1, channels), (crops.rects, crops.offsets), layout.offsets, uv, clamp)
@@ -1188,7 +1188,7 @@ class _Interpolate(torch.autograd.Function):
         out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
         hits = [array(fragments.face), *_layout(fragments.layout)]
         inputs = [*hits, *_corners(clip, faces), _floats(attributes), array(out)]
-        launch(interpolate_kernel, halves(out.shape[0] if out.numel() else 0), inputs, (), out.device)
+        launch(interpolate_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
         return out
 
     @staticmethod
@@ -1216,7 +1216,7 @@ class _Texture(torch.autograd.Function):
         ctx.strides, ctx.clamp = strides, clamp
         out = uv.new_zeros(uv.shape[0], strides[0])
         inputs = [*_sampling(texels, strides, crops, offsets, uv), clamp, array(out)]
-        launch(texture_kernel, halves(out.shape[0] if out.numel() else 0), inputs, (), out.device)
+        launch(texture_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
         return out
 
     @staticmethod
@@ -1232,7 +1232,7 @@ class _Texture(torch.autograd.Function):
             *(array(grad_uv, wp.vec2f), array(grad_texels.view(-1))),
         ]
         count = uv.shape[0] if grad_out.numel() else 0
-        edges = _one(count) if with_texels else halves(count)
+        edges = _one(count) if with_texels else split_range(count)
         launch(texture_backward_kernel, edges, inputs, (), uv.device)
         return grad_texels if with_texels else None, None, None, None, grad_uv if with_uv else None, None
 
@@ -1241,7 +1241,7 @@ class _Antialias(torch.autograd.Function):
     @staticmethod
     def forward(ctx, fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
         plan = fragments.plan
-        if plan is None or not plan.fits(clip):
+        if plan is None or not plan.matches(clip):
             plan = _plan(clip, faces, fragments.face_ranges, fragments.layout, fragments.near, fragments.cull)
         size, like = fragments.face.shape[0], fragments.face
         coverage = torch.empty(size, dtype=clip.dtype, device=clip.device)
@@ -1284,24 +1284,24 @@ def _one(count: int) -> list[int]:
 
 def _words(size: int) -> list[int]:
     """Shares of the words of 64 bits that hold `size` bits."""
-    return [*(edge // 64 for edge in halves(size)[:-1]), (size + 63) // 64]
+    return [*(edge // 64 for edge in split_range(size)[:-1]), (size + 63) // 64]
 
 
 def _plan(
-    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
-) -> Plan:
+    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
+) -> RasterPlan:
     """How the threads share the draws, and where the vertices fall."""
     if clip.device.type == "cpu":
-        rows, cuts = share_on_cpu(layout, face_ranges, cull, threads())
+        rows, cuts = split_for_threads(layout, face_ranges, cull, threads())
         parts, lanes = torch.tensor(rows, dtype=torch.int32).view(-1, 11), 1
-        outlines = outline_cuts(rows, len(cuts) - 1)
+        outlines = split_outlines(rows, len(cuts) - 1)
     else:
-        parts, lanes = parts_on_gpu(layout, face_ranges, cull), gpu_lanes(faces, layout.rects.shape[0])
+        parts, lanes = gpu_parts(layout, face_ranges, cull), gpu_lanes(faces, layout.rects.shape[0])
         cuts = outlines = [0, parts.shape[0] * lanes]
     boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
     inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
-    launch(corner_kernel, halves(clip.shape[0]), inputs, (), clip.device)
-    return Plan(parts, lanes, cuts, outlines, boxes, clip.detach(), version_of(clip))
+    launch(corner_kernel, split_range(clip.shape[0]), inputs, (), clip.device)
+    return RasterPlan(parts, lanes, cuts, outlines, boxes, clip.detach(), tensor_version(clip))
 
 
 def _front_first(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
@@ -1322,11 +1322,11 @@ def _corners(clip: Tensor, faces: Tensor) -> list[Any]:
     return [array(clip.contiguous(), wp.vec3f), array(int32_faces(faces), wp.vec3i)]
 
 
-def _boxes(plan: Plan) -> Any:
+def _boxes(plan: RasterPlan) -> Any:
     return array(plan.boxes, wp.vec4i)
 
 
-def _layout(layout: Layout) -> list[Any]:
+def _layout(layout: PixelLayout) -> list[Any]:
     return [array(layout.rects.contiguous()), array(layout.offsets.contiguous())]
 
 

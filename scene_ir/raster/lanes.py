@@ -19,17 +19,21 @@ start_warp()
 
 # The kernels name many arrays. By default LLVM gives up before it has compared whether so many might overlap, and
 # whether so many indices might overflow; a CPU that compares a hundred addresses once a launch does not feel it.
-_PATIENCE = ("vectorize-memory-check-threshold", "memory-check-merge-threshold", "vectorize-scev-check-threshold")
-OPTIONS: dict[str, Any] = {
+_CHECK_LIMITS = (
+    "vectorize-memory-check-threshold",
+    "memory-check-merge-threshold",
+    "vectorize-scev-check-threshold",
+)
+SIMD_OPTIONS: dict[str, Any] = {
     "fuse_fp": True,
     "fast_math": False,
     "enable_backward": False,
     "cpu_compiler_flags": " ".join(
-        [wp.config.cpu_compiler_flags or "-march=native", *(f"-mllvm=-{name}=1000" for name in _PATIENCE)]
+        [wp.config.cpu_compiler_flags or "-march=native", *(f"-mllvm=-{name}=1000" for name in _CHECK_LIMITS)]
     ),
 }
 """Options of modules made of these."""
-wp.set_module_options(OPTIONS)
+wp.set_module_options(SIMD_OPTIONS)
 
 
 @wp.func_native("return ((const float*)values.data)[i];")
@@ -89,5 +93,5 @@ def log_(x: wp.float32):
 
 
 @wp.func
-def total(x: wp.vec3f):
+def sum3(x: wp.vec3f):
     return x[0] + x[1] + x[2]

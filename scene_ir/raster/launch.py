@@ -19,13 +19,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
-_WORTH = 32768
+_MIN_PIXELS = 32768
 """Less work than this many pixels, of some 10 ns each, is not worth a second thread: to wake one up takes up to
 150 microseconds. What takes several kernels is handed over once, by `share`."""
 
 
 @contextmanager
-def without_stderr() -> Iterator[None]:
+def suppress_stderr() -> Iterator[None]:
     """Drops what native code writes to the standard error stream meanwhile."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -46,7 +46,7 @@ def start_warp() -> None:
     # one static variable: with several threads one finds another's pointer, or none, and crashes (Warp 1.19).
     wp.config.enable_tiles_in_stack_memory = None
     # On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
-    with nullcontext() if torch.cuda.is_available() else without_stderr():
+    with nullcontext() if torch.cuda.is_available() else suppress_stderr():
         wp.init()
 
 
@@ -60,20 +60,20 @@ def threads() -> int:
     return min(torch.get_num_threads(), 16)
 
 
-def halves(count: int) -> list[int]:
+def split_range(count: int) -> list[int]:
     """Edges of about equal ranges of [0, count), one a thread."""
-    parts = threads() if count >= _WORTH else 1
+    parts = threads() if count >= _MIN_PIXELS else 1
     return [count * i // parts for i in range(parts + 1)]
 
 
-def between(edges: Sequence[int], weights: Sequence[float] | None = None) -> list[int]:
+def split_by_work(edges: Sequence[int], weights: Sequence[float] | None = None) -> list[int]:
     """Of ascending edges those that split their ranges between the threads most evenly.
 
     weights: the work of each range, by default its length.
     """
     work = [float(b - a) for a, b in itertools.pairwise(edges)] if weights is None else list(weights)
     parts, total = threads(), sum(work)
-    if parts < 2 or total < _WORTH or len(work) < 2:
+    if parts < 2 or total < _MIN_PIXELS or len(work) < 2:
         return [edges[0], edges[-1]]
     cuts, done, wanted = [edges[0]], 0.0, total / parts
     for i, share in enumerate(work):
@@ -83,12 +83,12 @@ def between(edges: Sequence[int], weights: Sequence[float] | None = None) -> lis
     return [*cuts, edges[-1]] if edges[-1] > cuts[-1] else cuts
 
 
-def load(kernel: Any) -> None:
+def load_kernel(kernel: Any) -> None:
     """Compile or load a kernel's module for the CPU, once, before several threads ask for it."""
     wp.load_module(kernel.module, "cpu")
 
 
-def share(work: Callable[[int, int], None], edges: Sequence[int]) -> None:
+def run_in_threads(work: Callable[[int, int], None], edges: Sequence[int]) -> None:
     """Call `work(start, end)` for the ranges between ascending `edges`, each in a thread of its own.
 
     For work that launches several kernels in turn, on the CPU; those kernels must have been loaded.
@@ -121,14 +121,14 @@ def launch(
         device = torch.device(wp.device_to_torch(next(i.device for i in inputs if isinstance(i, wp.array))))
     if device.type != "cpu":
         where, stream = wp.device_from_torch(device), wp.stream_from_torch(device)
-        _run(kernel, edges[0], edges[-1] - edges[0], inputs, where, stream)
+        _launch_range(kernel, edges[0], edges[-1] - edges[0], inputs, where, stream)
         return
     if len(edges) > 2:
-        load(kernel)
-    share(lambda start, end: _run(kernel, start, end - start, inputs, "cpu", None), edges)
+        load_kernel(kernel)
+    run_in_threads(lambda start, end: _launch_range(kernel, start, end - start, inputs, "cpu", None), edges)
 
 
-def _run(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any, stream: Any) -> None:
+def _launch_range(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any, stream: Any) -> None:
     wp.launch(kernel, dim=count, inputs=[start, *inputs], device=device, stream=stream)
 
 
@@ -139,7 +139,7 @@ def array(values: Tensor, dtype: Any = None) -> Any:
     it does so once for a dtype and shape, but for the number of rows, and then the result is copied.
     """
     key = values.dtype, dtype, values.shape[1:]
-    seen = _seen.get(key)
+    seen = _array_templates.get(key)
     if seen is not None and values.is_contiguous():
         kind, head = seen
         made = kind.from_buffer_copy(head)
@@ -150,15 +150,15 @@ def array(values: Tensor, dtype: Any = None) -> Any:
     made: Any = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     # Of a single vector Warp makes an array of one: only where the first side is the rows' can it be replaced.
     if seen is None and values.ndim and values.is_contiguous() and made.shape[0] == values.shape[0] > 1:
-        _seen[key] = type(made), bytes(made)
+        _array_templates[key] = type(made), bytes(made)
     return made
 
 
-_seen: dict[tuple[torch.dtype, Any, torch.Size], tuple[Any, bytes]] = {}
+_array_templates: dict[tuple[torch.dtype, Any, torch.Size], tuple[Any, bytes]] = {}
 """Arrays as Warp made them, by the dtypes of tensor and kernel, and the shape of a row."""
 
 
-class Filled:
+class KernelStruct:
     """A struct of arrays for a kernel, in the form that is made fastest; it keeps their tensors."""
 
     def __init__(self, kind: Any) -> None:
@@ -168,15 +168,15 @@ class Filled:
     def __ctype__(self) -> Any:
         return self._ctype
 
-    def put(self, name: str, values: Tensor) -> None:
+    def set_array(self, name: str, values: Tensor) -> None:
         """The array of that name."""
         self._held[name] = values
         setattr(self._ctype, name, array(values, self._kind.vars[name].type.dtype))
 
 
-def filled(kind: Any, *tensors: Tensor) -> Filled:
+def make_struct(kind: Any, *tensors: Tensor) -> KernelStruct:
     """A struct of arrays, one a tensor, in the order of its fields."""
-    out = Filled(kind)
+    out = KernelStruct(kind)
     for name, values in zip(kind.vars, tensors, strict=True):
-        out.put(name, values)
+        out.set_array(name, values)
     return out

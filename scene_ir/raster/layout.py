@@ -12,7 +12,7 @@ from scene_ir.types import check_shape
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class PixelLayout:
     """The rectangle of the image that each draw covers; the pixels of all draws lie packed one after the other.
 
     rects: (N, 4) int64 px, half-open (x0, y0, x1, y1), empty where x1 <= x0 or y1 <= y0. offsets: (N + 1,) int64,
@@ -32,7 +32,7 @@ class Layout:
             raise RangeError("layout.offsets", "running pixel counts of layout.rects", self.offsets.tolist())
 
     @classmethod
-    def of(cls, rects: Tensor) -> Layout:
+    def from_rects(cls, rects: Tensor) -> PixelLayout:
         """The layout of rectangles (N, 4) int64 px, half-open (x0, y0, x1, y1)."""
         check_shape("layout.rects", rects, None, 4, floating=False)
         rects = rects.to(torch.int64)
@@ -42,7 +42,7 @@ class Layout:
         return layout
 
     @classmethod
-    def of_pixels(cls, pixels: Tensor) -> Layout:
+    def from_pixels(cls, pixels: Tensor) -> PixelLayout:
         """That of draws of a pixel each, (T, 2) (x, y), whole numbers."""
         rects = torch.empty(len(pixels), 4, dtype=torch.int64, device=pixels.device)
         rects[:, :2] = pixels
@@ -57,14 +57,14 @@ class Layout:
         """The number T of packed pixels."""
         return int(self.offsets[-1])
 
-    def draw(self) -> Tensor:
+    def draw_index(self) -> Tensor:
         """The draw (T,) int64 that each packed pixel belongs to."""
         count = self.rects.shape[0]
         return torch.repeat_interleave(torch.arange(count, device=self.rects.device), self.offsets.diff())
 
-    def pixels(self) -> Tensor:
+    def pixel_xy(self) -> Tensor:
         """Image coordinates (T, 2) int64 px, (x, y), of each packed pixel."""
-        draw = self.draw()
+        draw = self.draw_index()
         within = torch.arange(draw.shape[0], device=draw.device) - self.offsets[draw]
         x0, y0, x1, _ = self.rects[draw].unbind(-1)
         width = x1 - x0
@@ -78,7 +78,7 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class RasterPlan:
     """What the fast backend prepares for `rasterize` and uses again for `antialias`.
 
     parts: (P, 11) int32, draws or bands of their rows: the draw's x0, y0, x1, y1; the first row and the end; the
@@ -97,13 +97,13 @@ class Plan:
     clip: Tensor
     version: int
 
-    def fits(self, clip: Tensor) -> bool:
+    def matches(self, clip: Tensor) -> bool:
         """Whether `clip` is what this was made of, not changed since."""
         same = self.clip.data_ptr() == clip.data_ptr() and self.clip.shape == clip.shape
-        return same and self.clip.stride() == clip.stride() and self.version == version_of(clip)
+        return same and self.clip.stride() == clip.stride() and self.version == tensor_version(clip)
 
 
-def version_of(tensor: Tensor) -> int:
+def tensor_version(tensor: Tensor) -> int:
     """Counts torch's changes to a tensor; -1 for tensors of inference mode, which have no count."""
     return -1 if tensor.is_inference() else tensor._version
 
@@ -116,13 +116,13 @@ class Fragments:
     None. plan: what the fast backend uses again, or None.
     """
 
-    layout: Layout
+    layout: PixelLayout
     face: Tensor
     depth: Tensor
     face_ranges: Tensor
     near: float
     cull: Tensor | None = None
-    plan: Plan | None = None
+    plan: RasterPlan | None = None
 
 
 def _offsets(rects: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from scene_ir.raster.layout import Layout, version_of
+from scene_ir.raster.layout import PixelLayout, tensor_version
 
 V = TypeVar("V")
 
@@ -17,7 +17,7 @@ _TRIANGLE_WORK = 1.5
 """What a triangle costs `rasterize`, in pixels of a draw, measured on a CPU with triangles of a few pixels."""
 _OUTLINE_WORK = 10.0
 """The same for `antialias`, which looks at few of the pixels."""
-_WORTH = 10_000.0
+_MIN_WORK = 10_000.0
 """Less work than this is not worth a second thread: handing over costs some 50 microseconds."""
 _TOLERANCE = 0.1
 """A thread may have this share more or less than the others before a draw is cut in two."""
@@ -25,7 +25,7 @@ _GPU_LANES = 8192
 """At most this many GPU threads share the triangles of a draw."""
 
 
-class _Remembered(Generic[V]):
+class _TensorCache(Generic[V]):
     """What `compute` says of a tensor, asked once while the tensor lives and torch sees no change of it."""
 
     def __init__(self, compute: Callable[[Tensor], V]) -> None:
@@ -37,10 +37,10 @@ class _Remembered(Generic[V]):
             return self._compute(tensor)
         key = id(tensor)
         kept = self._kept.get(key)
-        if kept is not None and kept[0]() is tensor and kept[1] == version_of(tensor):
+        if kept is not None and kept[0]() is tensor and kept[1] == tensor_version(tensor):
             return kept[2]
         value = self._compute(tensor)
-        self._kept[key] = (weakref.ref(tensor, lambda _: self._kept.pop(key, None)), version_of(tensor), value)
+        self._kept[key] = (weakref.ref(tensor, lambda _: self._kept.pop(key, None)), tensor_version(tensor), value)
         return value
 
 
@@ -49,24 +49,24 @@ def _index_range(faces: Tensor) -> tuple[int, int]:
     return int(low), int(high)
 
 
-_ranges = _Remembered(_index_range)
-_narrowed = _Remembered(lambda faces: faces.to(torch.int32).contiguous())
+_index_ranges = _TensorCache(_index_range)
+_int32_copies = _TensorCache(lambda faces: faces.to(torch.int32).contiguous())
 
 
 def index_range(faces: Tensor) -> tuple[int, int]:
     """The lowest and the highest index in faces (F, 3), F > 0."""
-    return _ranges(faces)
+    return _index_ranges(faces)
 
 
 def int32_faces(faces: Tensor) -> Tensor:
     """Faces (F, 3) as contiguous int32, themselves where they are that."""
     if faces.dtype == torch.int32 and faces.is_contiguous():
         return faces
-    return _narrowed(faces)
+    return _int32_copies(faces)
 
 
-def share_on_cpu(
-    layout: Layout, face_ranges: Tensor, cull: Tensor | None, threads: int
+def split_for_threads(
+    layout: PixelLayout, face_ranges: Tensor, cull: Tensor | None, threads: int
 ) -> tuple[list[list[int]], list[int]]:
     """Rows of Plan.parts, those without pixels left out, and where the threads' shares begin, for `rasterize`.
 
@@ -80,8 +80,8 @@ def share_on_cpu(
         )
         if rect[2] > rect[0] and rect[3] > rect[1]
     ]
-    total = sum(_work(rect, faces, rect[1]) for rect, _, faces, _ in draws)
-    shares = max(1, min(threads, int(total / _WORTH) + 1))
+    total = sum(_row_work(rect, faces, rect[1]) for rect, _, faces, _ in draws)
+    shares = max(1, min(threads, int(total / _MIN_WORK) + 1))
     target = total / shares
     parts: list[list[int]] = []
     cuts, done = [0], 0.0
@@ -89,7 +89,7 @@ def share_on_cpu(
         x0, y0, x1, y1 = rect
         row = y0
         while row < y1:
-            room, left = target * len(cuts) - done, _work(rect, faces, row)
+            room, left = target * len(cuts) - done, _row_work(rect, faces, row)
             end = y1
             if len(cuts) < shares and left - room > _TOLERANCE * target:
                 end = row + round((y1 - row) * max(room, 0.0) / left)
@@ -107,7 +107,7 @@ def share_on_cpu(
     return parts, [*cuts, len(parts)]
 
 
-def outline_cuts(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
+def split_outlines(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
     """Where up to `shares` shares of the rows of Plan.parts begin and end, even for `antialias`."""
     work = [_OUTLINE_WORK * max(p[8] - p[7], 0) + (p[5] - p[4]) * (p[2] - p[0]) for p in parts]
     total, done, cuts = sum(work), 0.0, [0]
@@ -118,12 +118,12 @@ def outline_cuts(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
     return [*cuts, len(parts)]
 
 
-def _work(rect: Sequence[int], faces: Sequence[int], row: int) -> float:
+def _row_work(rect: Sequence[int], faces: Sequence[int], row: int) -> float:
     """What the rows from `row` on of a draw cost, in pixels."""
     return _TRIANGLE_WORK * max(faces[1] - faces[0], 0) + (rect[3] - row) * (rect[2] - rect[0])
 
 
-def parts_on_gpu(layout: Layout, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
+def gpu_parts(layout: PixelLayout, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
     """Plan.parts, one a draw, without waiting for the device."""
     flag = torch.zeros_like(face_ranges[:, :1]) if cull is None else cull.to(face_ranges)[:, None]
     first = layout.offsets[:-1, None]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.raster.layout import Fragments, PixelLayout
 
 PAIRS_PER_CHUNK = 1 << 21
 """Triangle-pixel pairs looked at together: bounds the memory to a few hundred MB."""
@@ -28,20 +28,22 @@ SNAP_PX = 1e-9
 
 
 def rasterize(
-    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
+    clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
 ) -> tuple[Tensor, Tensor, None]:
     """See `verbs.rasterize`. Returns face (T,) int32, depth (T,), and nothing to use again."""
     size, none = layout.size, faces.shape[0]
     depth = clip.new_full((size,), torch.inf)
     face = torch.full((size,), none, dtype=torch.int64, device=clip.device)
-    for jobs in _chunks(_Jobs.of(clip, faces, face_ranges, layout, near, cull), lines_along=None):
+    for jobs in _split_chunks(
+        _TriangleJobs.from_mesh(clip, faces, face_ranges, layout, near, cull), lines_along=None
+    ):
         bounds = jobs.bounds
         width = (bounds[:, 2] - bounds[:, 0]).clamp(min=0)
-        job, within = _expand(width * (bounds[:, 3] - bounds[:, 1]).clamp(min=0))
+        job, within = _expand_counts(width * (bounds[:, 3] - bounds[:, 1]).clamp(min=0))
         x = bounds[job, 0] + within % width[job]
         y = bounds[job, 1] + within // width[job]
         normal, sign = jobs.normal[job], jobs.sign[job, None]  # (P, 3, 3), (P, 1)
-        edge = _edge(normal, x, y) * sign  # (P, 3)
+        edge = _edge_values(normal, x, y) * sign  # (P, 3)
         # The pixel on an edge goes to the triangle on one side of it: the normals of the two are opposite.
         facing = normal * sign[..., None]
         first = torch.where(facing[..., 0] != 0, facing[..., 0], facing[..., 1])
@@ -63,8 +65,8 @@ def interpolate(fragments: Fragments, clip: Tensor, faces: Tensor, attributes: T
     out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
     hit = (fragments.face >= 0).nonzero()[:, 0]
     corners = faces.to(torch.int64)[fragments.face[hit].to(torch.int64)]  # (P, 3)
-    x, y = fragments.layout.pixels()[hit].unbind(-1)
-    edge = _edge(_normals(clip.to(torch.float64)[corners]), x, y)
+    x, y = fragments.layout.pixel_xy()[hit].unbind(-1)
+    edge = _edge_values(_edge_normals(clip.to(torch.float64)[corners]), x, y)
     weight = edge / edge.sum(dim=1, keepdim=True)  # (P, 3)
     values = (weight[..., None] * attributes.to(torch.float64)[corners]).sum(dim=1)
     return out.index_put((hit,), values.to(attributes.dtype))
@@ -74,15 +76,15 @@ def texture(image: Tensor, uv: Tensor, clamp: bool) -> Tensor:
     """See `verbs.texture`."""
     height, width = image.shape[1:]
     rect = torch.tensor([[0, 0, width, height]], device=uv.device).expand(uv.shape[0], 4)
-    return _sample(image.flatten(1).T, rect, torch.zeros_like(rect[:, 0]), uv, clamp)
+    return _sample_crops(image.flatten(1).T, rect, torch.zeros_like(rect[:, 0]), uv, clamp)
 
 
-def texture_packed(values: Tensor, crops: Layout, layout: Layout, uv: Tensor, clamp: bool) -> Tensor:
+def texture_packed(values: Tensor, crops: PixelLayout, layout: PixelLayout, uv: Tensor, clamp: bool) -> Tensor:
     """See `verbs.texture_packed`."""
-    draw = layout.draw()
+    draw = layout.draw_index()
     filled = (crops.offsets.diff() > 0)[draw].nonzero()[:, 0]
     draw = draw[filled]
-    sampled = _sample(values, crops.rects[draw], crops.offsets[draw], uv[filled], clamp)
+    sampled = _sample_crops(values, crops.rects[draw], crops.offsets[draw], uv[filled], clamp)
     return values.new_zeros(uv.shape[0], values.shape[1]).index_put((filled,), sampled)
 
 
@@ -91,8 +93,8 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
     layout, size = fragments.layout, fragments.face.shape[0]
     hit = fragments.face >= 0
     pixel = torch.arange(size, device=clip.device)
-    xy = layout.pixels()
-    rect = layout.rects[layout.draw()]
+    xy = layout.pixel_xy()
+    rect = layout.rects[layout.draw_index()]
     change = []  # (T,) each: how much a pixel loses or gains towards one of its four neighbours
     for axis, step in ((0, torch.ones_like(pixel)), (1, rect[:, 2] - rect[:, 0])):
         start = pixel[xy[:, axis] + 1 < rect[:, 2 + axis]]
@@ -107,7 +109,7 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
         b = corners.gather(1, ((edge + 2) % 3)[:, None])[:, 0]
         points = clip.to(torch.float64)
         normal = _cross(points[a], points[b])
-        e_inner, e_outer = (_edge(normal[:, None], *xy[p].unbind(-1))[:, 0] for p in (inner, outer))
+        e_inner, e_outer = (_edge_values(normal[:, None], *xy[p].unbind(-1))[:, 0] for p in (inner, outer))
         t = e_inner / (e_inner - e_outer)
         zero = torch.zeros(size, dtype=torch.float64, device=clip.device)
         changed, amount = torch.where(t < 0.5, inner, outer), torch.where(t < 0.5, 0.5 - t, t - 0.5)
@@ -132,11 +134,11 @@ def _outline_edges(
     best_t = torch.full((start.shape[0],), -1.0, dtype=torch.float32, device=clip.device)
     best_edge = torch.full((start.shape[0],), -1, dtype=torch.int64, device=clip.device)
     ranges, near, cull = fragments.face_ranges, fragments.near, fragments.cull
-    jobs_all = _Jobs.of(clip.detach(), faces, ranges, layout, near, cull)
+    jobs_all = _TriangleJobs.from_mesh(clip.detach(), faces, ranges, layout, near, cull)
     hit = fragments.face >= 0
-    for jobs in _chunks(jobs_all, lines_along=1 - axis):
+    for jobs in _split_chunks(jobs_all, lines_along=1 - axis):
         lines = (jobs.bounds[:, 3 - axis] - jobs.bounds[:, 1 - axis]).clamp(min=0)
-        job, within = _expand(lines)
+        job, within = _expand_counts(lines)
         line = jobs.bounds[job, 1 - axis] + within
         normal = jobs.normal[job] * jobs.sign[job, None, None]
         slope = normal[..., axis]  # the edge function along the line is slope * s + base
@@ -177,7 +179,7 @@ def _outline_edges(
 
 
 @dataclass(frozen=True, slots=True)
-class _Jobs:
+class _TriangleJobs:
     """Triangles to draw, one entry (J,) for each draw and each of its faces, without those that are not seen."""
 
     face: Tensor  # (J,) index into faces
@@ -189,13 +191,19 @@ class _Jobs:
     sign: Tensor  # (J,) of det
 
     @classmethod
-    def of(
-        cls, clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: Layout, near: float, cull: Tensor | None
-    ) -> _Jobs:
-        draw, within = _expand(face_ranges.diff(dim=1)[:, 0].clamp(min=0))
+    def from_mesh(
+        cls,
+        clip: Tensor,
+        faces: Tensor,
+        face_ranges: Tensor,
+        layout: PixelLayout,
+        near: float,
+        cull: Tensor | None,
+    ) -> _TriangleJobs:
+        draw, within = _expand_counts(face_ranges.diff(dim=1)[:, 0].clamp(min=0))
         face = face_ranges[draw, 0] + within
         corner = clip.to(torch.float64)[faces.to(torch.int64)[face]]  # (J, 3, 3)
-        normal = _normals(corner)
+        normal = _edge_normals(corner)
         det = (corner[:, 0, 0] * normal[:, 0, 0] + corner[:, 0, 1] * normal[:, 0, 1]) + (
             corner[:, 0, 2] * normal[:, 0, 2]
         )
@@ -204,7 +212,7 @@ class _Jobs:
         if cull is not None:
             seen &= (det < 0) | ~cull[draw]
         rect = layout.rects[draw]
-        jobs = (face, rect, layout.offsets[draw], _bounds(corner, rect, near), normal, det, det.sign())
+        jobs = (face, rect, layout.offsets[draw], _pixel_bounds(corner, rect, near), normal, det, det.sign())
         return cls(*(field[seen] for field in jobs))
 
     def pixel(self, job: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -213,7 +221,7 @@ class _Jobs:
         return self.offset[job] + (y - rect[:, 1]) * (rect[:, 2] - rect[:, 0]) + (x - rect[:, 0])
 
 
-def _chunks(jobs: _Jobs, lines_along: int | None) -> Iterator[_Jobs]:
+def _split_chunks(jobs: _TriangleJobs, lines_along: int | None) -> Iterator[_TriangleJobs]:
     """The jobs in order, cut where their pixels (or lines along an axis, where one is given) fill a chunk."""
     extent = (jobs.bounds[:, 2:] - jobs.bounds[:, :2]).clamp(min=0)
     work = (extent.prod(dim=1) if lines_along is None else extent[:, lines_along]).cumsum(0)
@@ -221,7 +229,7 @@ def _chunks(jobs: _Jobs, lines_along: int | None) -> Iterator[_Jobs]:
     _, counts = torch.unique_consecutive(chunk, return_counts=True)
     fields = (jobs.face, jobs.rect, jobs.offset, jobs.bounds, jobs.normal, jobs.det, jobs.sign)
     for parts in zip(*(field.split(counts.tolist()) for field in fields), strict=True):
-        yield _Jobs(*parts)
+        yield _TriangleJobs(*parts)
 
 
 def first_largest(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -234,7 +242,7 @@ def first_largest(values: Tensor) -> tuple[Tensor, Tensor]:
     return best, index
 
 
-def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
+def _expand_counts(counts: Tensor) -> tuple[Tensor, Tensor]:
     """For counts (J,): the owner (P,) of each of their sum's elements, and the element's place (P,) there."""
     owner = torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
     start = counts.cumsum(0) - counts
@@ -253,17 +261,17 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
-def _normals(corner: Tensor) -> Tensor:
+def _edge_normals(corner: Tensor) -> Tensor:
     """Normals (..., 3, 3) of the edge functions opposite to each corner (..., 3, 3)."""
     return _cross(corner[..., [1, 2, 0], :], corner[..., [2, 0, 1], :])
 
 
-def _edge(normal: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _edge_values(normal: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Edge functions (P, E) with normals (P, E, 3) at pixels x, y (P,)."""
     return (normal[..., 0] * x[:, None] + normal[..., 1] * y[:, None]) + normal[..., 2]
 
 
-def _bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
+def _pixel_bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
     """Pixels (J, 4), half-open, inside rect (J, 4), that hold the part with w >= near of triangles (J, 3, 3)."""
     after = corner[:, [1, 2, 0]]
     w, w_after = corner[..., 2], after[..., 2]
@@ -282,7 +290,7 @@ def _bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
     return torch.cat([first, last], dim=1).to(torch.int64)
 
 
-def _weights(t: Tensor) -> Tensor:
+def _catmull_rom_weights(t: Tensor) -> Tensor:
     """Catmull-Rom weights (T, 4) of the pixels at -1, 0, 1, 2 for a sample at t (T,) in [0, 1)."""
     return torch.stack(
         [
@@ -295,7 +303,7 @@ def _weights(t: Tensor) -> Tensor:
     )
 
 
-def _sample(texels: Tensor, rect: Tensor, offset: Tensor, uv: Tensor, clamp: bool) -> Tensor:
+def _sample_crops(texels: Tensor, rect: Tensor, offset: Tensor, uv: Tensor, clamp: bool) -> Tensor:
     """Catmull-Rom samples (T, C) at uv (T, 2) px of crops that lie at rect (T, 4) of the frame, each with its own
     texels, row-major from `offset` (T,) in texels (S, C). Computed in float64."""
     size = rect[:, 2:] - rect[:, :2]
@@ -303,7 +311,7 @@ def _sample(texels: Tensor, rect: Tensor, offset: Tensor, uv: Tensor, clamp: boo
     local = (uv.to(torch.float64) - rect[:, :2]).maximum(torch.full_like(size, -4).double())
     local = local.minimum((size + 3).double())
     first = local.detach().floor()
-    weight_x, weight_y = (_weights((local - first)[:, axis]) for axis in (0, 1))
+    weight_x, weight_y = (_catmull_rom_weights((local - first)[:, axis]) for axis in (0, 1))
     out = torch.zeros(uv.shape[0], texels.shape[1], dtype=torch.float64, device=uv.device)
     for row in range(4):
         for column in range(4):

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.raster.layout import Fragments, PixelLayout
 from scene_ir.raster.plan import index_range
 from scene_ir.types import check_finite, check_shape
 
@@ -27,7 +27,7 @@ __all__ = [
     "Backend",
     "Border",
     "Fragments",
-    "Layout",
+    "PixelLayout",
     "antialias",
     "bounding_rects",
     "interpolate",
@@ -47,7 +47,7 @@ def rasterize(
     clip: Tensor,
     faces: Tensor,
     face_ranges: Tensor,
-    layout: Layout,
+    layout: PixelLayout,
     backend: Backend = "warp",
     near: float = NEAR_M,
     cull: bool | Tensor = False,
@@ -74,8 +74,8 @@ def rasterize(
     if not all(0 <= end <= faces.shape[0] for pair in ranges for end in pair):
         raise RangeError("raster.face_ranges", f"indices in [0, {faces.shape[0]}]", ranges)
     face_ranges = face_ranges.to(torch.int64)
-    culled = _culled(cull, face_ranges)
-    face, depth, plan = _module(backend).rasterize(clip.detach(), faces, face_ranges, layout, near, culled)
+    culled = _cull_flags(cull, face_ranges)
+    face, depth, plan = _backend_module(backend).rasterize(clip.detach(), faces, face_ranges, layout, near, culled)
     return Fragments(layout, face, depth, face_ranges, near, culled, plan)
 
 
@@ -89,7 +89,7 @@ def interpolate(
     _check_mesh(clip, faces, backend)
     check_shape("raster.attributes", attributes, clip.shape[0], None)
     _check_dtype("raster.attributes", attributes, clip.dtype)
-    return _module(backend).interpolate(fragments, clip, faces, attributes)
+    return _backend_module(backend).interpolate(fragments, clip, faces, attributes)
 
 
 def texture(image: Tensor, uv: Tensor, backend: Backend = "warp", border: Border = "clamp") -> Tensor:
@@ -107,14 +107,14 @@ def texture(image: Tensor, uv: Tensor, backend: Backend = "warp", border: Border
         raise ShapeError("raster.image", "at least one pixel", tuple(image.shape))
     _check_backend(backend, uv)
     _check_dtype("raster.image", image, uv.dtype)
-    return _module(backend).texture(image, uv, border == "clamp")
+    return _backend_module(backend).texture(image, uv, border == "clamp")
 
 
 def texture_packed(
     values: Tensor,
     crop_rects: Tensor,
     crop_offsets: Tensor,
-    layout: Layout,
+    layout: PixelLayout,
     uv: Tensor,
     backend: Backend = "warp",
     border: Border = "zero",
@@ -125,7 +125,7 @@ def texture_packed(
     (x0, y0, x1, y1), where each crop lies in the frame; crop_offsets: (N + 1,) int64 (both as in `Layout`).
     uv: (T, 2) px of the *frame* -> (T, C). Samples of an empty crop are 0. Differentiable to uv and values.
     """
-    crops = Layout(crop_rects, crop_offsets)
+    crops = PixelLayout(crop_rects, crop_offsets)
     if crops.rects.shape[0] != layout.rects.shape[0]:
         raise ShapeError("raster.crop_rects", f"{layout.rects.shape[0]} crops, one a draw", crops.rects.shape[0])
     check_shape("raster.values", values, crops.size, None)
@@ -134,7 +134,7 @@ def texture_packed(
         raise RangeError("raster.border", "clamp or zero", border)
     _check_backend(backend, uv)
     _check_dtype("raster.values", values, uv.dtype)
-    return _module(backend).texture_packed(values, crops, layout, uv, border == "clamp")
+    return _backend_module(backend).texture_packed(values, crops, layout, uv, border == "clamp")
 
 
 def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backend = "warp") -> Tensor:
@@ -150,7 +150,7 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backen
     high-performance differentiable rendering".
     """
     _check_mesh(clip, faces, backend)
-    return _module(backend).antialias(fragments, clip, faces)
+    return _backend_module(backend).antialias(fragments, clip, faces)
 
 
 def bounding_rects(
@@ -180,7 +180,7 @@ def bounding_rects(
     return rects.to(clip.device)
 
 
-def _module(backend: Backend) -> ModuleType:
+def _backend_module(backend: Backend) -> ModuleType:
     """The implementation; Warp is imported here, so that only who uses it pays for it."""
     if backend == "warp":
         from scene_ir.raster import kernels
@@ -207,7 +207,7 @@ def _check_finite(name: str, values: Tensor) -> None:
         check_finite(name, values)
 
 
-def _culled(cull: bool | Tensor, face_ranges: Tensor) -> Tensor | None:
+def _cull_flags(cull: bool | Tensor, face_ranges: Tensor) -> Tensor | None:
     """Which draws (N,) bool lose their back faces; None where none does."""
     if isinstance(cull, Tensor):
         check_shape("raster.cull", cull, face_ranges.shape[0], floating=False)

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from scene_ir.geometry import ground_footprint
-from scene_ir.raster.layout import Layout
+from scene_ir.raster.layout import PixelLayout
 from scene_ir.raster.verbs import Backend
 from scene_ir.render.model import SATURATED
-from scene_ir.types import Front
+from scene_ir.types import Occluder
 
 _STANDING_M = 0.4
 """Width of what stands in front of vehicles, on the ground: about a person's."""
@@ -28,15 +28,15 @@ class Plan:
     """What is blended where. order: the layers back to front; spans, shadow_spans: of each draw; empty rectangles
     are left out of `order` and `shadows`, the draws that have a shadow."""
 
-    layout: Layout
-    shadow_layout: Layout
+    layout: PixelLayout
+    shadow_layout: PixelLayout
     order: tuple[int, ...]
     shadows: tuple[int, ...]
     spans: tuple[Span, ...]
     shadow_spans: tuple[Span, ...]
 
     @classmethod
-    def of(cls, layout: Layout, shadow_layout: Layout, order: Sequence[int]) -> Plan:
+    def of(cls, layout: PixelLayout, shadow_layout: PixelLayout, order: Sequence[int]) -> Plan:
         """order: all layers, back to front."""
         spans, shadow_spans = _spans(layout), _spans(shadow_layout)
         drawn = tuple(i for i in order if min(spans[i][2]) > 0)
@@ -49,7 +49,7 @@ class Plan:
         return [size[0] * size[1] for _, _, size in self.spans]
 
 
-def _spans(layout: Layout) -> tuple[Span, ...]:
+def _spans(layout: PixelLayout) -> tuple[Span, ...]:
     """Where the packed pixels of each draw go."""
     out: list[Span] = []
     for (packed, size), (x0, y0, _, _) in zip(layout.spans(), layout.rects.tolist(), strict=True):
@@ -128,7 +128,7 @@ def composite(
     return image, nearest, number
 
 
-def shown_rects(layout: Layout, shown: Tensor) -> Tensor:
+def shown_rects(layout: PixelLayout, shown: Tensor) -> Tensor:
     """Of each draw the rectangle (N, 4) int64 px, half-open, of its pixels where any of `shown` (T, C) is true,
     and of one more around them, which the smallest change may show. Empty where nothing is.
     """
@@ -146,7 +146,7 @@ def shown_rects(layout: Layout, shown: Tensor) -> Tensor:
     return torch.tensor(rects, dtype=torch.int64).reshape(-1, 4)
 
 
-def _stack(layout: Layout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+def _stack(layout: PixelLayout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
     return torch.tensor(order, dtype=torch.int32, device=layout.rects.device), layout.rects, layout.offsets
 
 
@@ -243,7 +243,7 @@ def _with_standing(order: list[int], corners: np.ndarray, standing: np.ndarray, 
     return found
 
 
-def standing_footprints(front: Sequence[Front], matrix: Tensor) -> np.ndarray:
+def standing_footprints(front: Sequence[Occluder], matrix: Tensor) -> np.ndarray:
     """Corners (K, 4, 2) m, (x, z), of small squares where things stand. matrix: (3, 4) of the camera."""
     inverse = np.linalg.inv(matrix[:, :3].detach().cpu().double().numpy())
     centre = -inverse @ matrix[:, 3].detach().cpu().double().numpy()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import weld
+from scene_ir.geometry import weld_vertices
 from scene_ir.raster.verbs import Backend
 
 WALK = 4
@@ -36,7 +36,7 @@ class Edges:
         """vertices (V, 3): at one place they are one. looks (F, C): of faces' materials. An
         edge is creased between two that differ, or whose normals' product is less than `crease_cos`.
         """
-        corners = weld(vertices)[faces]
+        corners = weld_vertices(vertices)[faces]
         ends = torch.stack([corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]], dim=-1).reshape(-1, 2)
         low, high = ends.amin(dim=1), ends.amax(dim=1)
         _, owner, counts = torch.unique(low * len(vertices) + high, return_inverse=True, return_counts=True)

@@ -13,10 +13,10 @@ from functools import lru_cache
 import torch
 
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.raster.layout import Layout
+from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
 from scene_ir.render.environment import apply_foliage, apply_weather, shadow_softening
-from scene_ir.render.prepare import Layers, Pack, Prepared, RenderSettings, active, joined
+from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
 from scene_ir.render.sun import Sun
 from scene_ir.render.texture import Regions
 from scene_ir.types import Crop, Objects, Render, SceneIR
@@ -27,7 +27,7 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
     return [Compositor(scene, settings).render(scene) for scene in scenes]
 
 
-class Compositor(Prepared):
+class Compositor(PreparedScene):
     """Draws perturbations of one scene; keeps what no parameter touches."""
 
     _fixed: fast.Fixed | None = None
@@ -41,12 +41,12 @@ class Compositor(Prepared):
                 self._fixed = fast.Fixed.of(self)
         return self._fixed
 
-    def layers(self, objects: Objects, sun: Sun | None = None) -> Layers:
+    def layers(self, objects: Objects, sun: Sun | None = None) -> ObjectLayers:
         """The objects drawn one by one, not yet blended. sun: as of `sun_of`."""
         fixed = self.fixed
         if fixed is None:
-            return reference.layers(self, objects, self.draw(objects, sun), sun)
-        return _layers([self], self.pack, fixed, [objects], [sun])[0]
+            return reference.layers(self, objects, self.find_visible(objects, sun), sun)
+        return _layers([self], self.batch, fixed, [objects], [sun])[0]
 
     def render(self, perturbed: SceneIR) -> Render:
         """The picture of a perturbed scene; with nothing perturbed, the photograph. Where vehicles were exchanged,
@@ -60,7 +60,7 @@ class Compositor(Prepared):
         if perturbed.before is not None and self.scene.before is None:
             raise RangeError("scene", "a state of the compositor's own", "one with vehicles exchanged")
         objects = self.moved(perturbed)
-        sun = self.sun_of(perturbed.environment)
+        sun = self.perturbed_sun(perturbed.environment)
         return self.compose(perturbed, objects, self.layers(objects, sun) if len(objects) else None)
 
     def moved(self, perturbed: SceneIR) -> Objects:
@@ -71,17 +71,17 @@ class Compositor(Prepared):
         names = ("translation", "yaw", "size_lhw", "ffd", "texture_code")
         return replace(self.scene.objects, **{name: getattr(objects, name).to(self.like) for name in names})
 
-    def compose(self, perturbed: SceneIR, objects: Objects, layers: Layers | None) -> Render:
+    def compose(self, perturbed: SceneIR, objects: Objects, layers: ObjectLayers | None) -> Render:
         """The picture of drawn objects. perturbed: for its environment; layers: None where there are no
         objects."""
         environment, backend = perturbed.environment, self.settings.backend
-        weather, foliage = active(environment.weather), active(environment.foliage)
+        weather, foliage = is_active(environment.weather), is_active(environment.foliage)
         canvas = self.canvas if weather else self.canvas[:3]
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
-            canvas = torch.cat([apply_foliage(canvas[:3], changed, self.crowns, backend), canvas[3:]])
-        if self.standing is not None:
-            layers = self.standing.before(layers, canvas[:3] - self.canvas[:3] if foliage else None)
+            canvas = torch.cat([apply_foliage(canvas[:3], changed, self.crown_maps, backend), canvas[3:]])
+        if self.occluders is not None:
+            layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if foliage else None)
         drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
         behind = self.scene.environment
         if layers is None:
@@ -91,9 +91,9 @@ class Compositor(Prepared):
             opacity: tuple[Crop, ...] = ()
         else:
             factors = layers.shadow
-            sun = self.sun_of(environment)
+            sun = self.perturbed_sun(environment)
             if sun is not None:
-                own = self.casts[layers.shadow_layout.draw()]
+                own = self.shadow_is_own[layers.shadow_layout.draw_index()]
                 factors = (factors - (1.0 - factors) * own * (sun.shade - 1.0)).clamp(min=0.0)
             if weather:
                 factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self.like))
@@ -108,7 +108,7 @@ class Compositor(Prepared):
             plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
-            number = number if self.standing is None else number.masked_fill(number > len(objects), 0)
+            number = number if self.occluders is None else number.masked_fill(number > len(objects), 0)
             if weather:  # what stands before the sky is not covered with it, nor what stands on a wet road wet
                 shows = blend.uncovered(layers.opacity, plan, self.frame_hw)
                 behind = replace(
@@ -132,41 +132,41 @@ class Compositor(Prepared):
 
 def _layers(
     members: Sequence[Compositor],
-    pack: Pack,
+    pack: SceneBatch,
     fixed: fast.Fixed,
     objects: Sequence[Objects],
     suns: Sequence[Sun | None],
-) -> list[Layers]:
+) -> list[ObjectLayers]:
     """The layers of each member by the fast kernels, all of them in one go."""
-    drawn = pack.draw(objects, suns, with_ground=False)
+    drawn = pack.find_visible(objects, suns, with_ground=False)
     code = None
-    if any(active(o.texture_code) for o in objects):
+    if any(is_active(o.texture_code) for o in objects):
         regions = [m.regions for m in members]
         code = fast.Code(
-            joined([o.texture_code for o in objects]),
-            joined([m.paint_lightness for m in members]),
+            concat([o.texture_code for o in objects]),
+            concat([m.paint_lightness for m in members]),
             Regions.joined([r for r in regions if r is not None]),
         )
-    yaw = joined([o.yaw for o in objects])
+    yaw = concat([o.yaw for o in objects])
     colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, code)
     if len(members) == 1:
-        return [Layers(drawn.mesh.layout, colour, opacity, depth, drawn.ground_layout, shadow)]
+        return [ObjectLayers(drawn.mesh.layout, colour, opacity, depth, drawn.patch_layout, shadow)]
     layouts, grounds = (
-        [Layout.of(rects) for rects in whole_layout.rects.split(pack.counts)]
-        for whole_layout in (drawn.mesh.layout, drawn.ground_layout)
+        [PixelLayout.from_rects(rects) for rects in whole_layout.rects.split(pack.counts)]
+        for whole_layout in (drawn.mesh.layout, drawn.patch_layout)
     )
     sizes, ground_sizes = [part.size for part in layouts], [part.size for part in grounds]
     parts = zip(
         layouts, colour.split(sizes), opacity.split(sizes), depth.split(sizes), grounds,
         shadow.split(ground_sizes), strict=True,
     )  # fmt: skip
-    return [Layers(*part) for part in parts]
+    return [ObjectLayers(*part) for part in parts]
 
 
 @lru_cache(maxsize=2)
-def _together(members: tuple[Compositor, ...]) -> tuple[Pack, fast.Fixed]:
+def _together(members: tuple[Compositor, ...]) -> tuple[SceneBatch, fast.Fixed]:
     """Compositors, all of them with fast kernels, as one."""
-    return Pack(members), fast.Fixed.pack([m.fixed for m in members if m.fixed is not None])
+    return SceneBatch(members), fast.Fixed.pack([m.fixed for m in members if m.fixed is not None])
 
 
 def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
@@ -181,6 +181,6 @@ def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
     if not together:
         return [c.render(scene) for c, scene in pairs]
     objects = [c.moved(scene) for c, scene in pairs]
-    suns = [c.sun_of(scene.environment) for c, scene in pairs]
+    suns = [c.perturbed_sun(scene.environment) for c, scene in pairs]
     layers = _layers(members, *_together(members), objects, suns)
     return [c.compose(p, o, part) for (c, p), o, part in zip(pairs, objects, layers, strict=True)]

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import height_above, kept_within
-from scene_ir.push_pull import push_pull
+from scene_ir.geometry import clamp_inclusive, height_above_ground
+from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.texture import lab, rgb_of, smoothstep
@@ -54,7 +54,7 @@ def crowns_of(scene: SceneIR) -> Tensor:
     """
     amount, photo = scene.environment.foliage_map, scene.background
     gaps = _leaf_gaps(*amount.shape).to(photo)
-    height = height_above(scene.depth, scene.environment.ground, scene.camera.matrix)
+    height = height_above_ground(scene.depth, scene.environment.ground, scene.camera.matrix)
     standing = (height / model.GRASS_M).clamp(0.0, 1.0).to(photo)
     known = (1.0 - amount.clamp(0.0, 1.0)).square().float().cpu().numpy()
     behind = push_pull(np.ascontiguousarray(photo.permute(1, 2, 0).float().cpu().numpy()), known)
@@ -90,8 +90,8 @@ def apply_foliage(
 def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
     """The leaf model on rows (R, 3); maps (R, 5): of `crowns_of`."""
     hue, shift, density = code.unbind(-1)
-    lightness, a, b = lab(kept_within(rgb, 0.0, 1.0)).unbind(-1)
-    level = kept_within(lightness / 100.0, *model.LEVEL)
+    lightness, a, b = lab(clamp_inclusive(rgb, 0.0, 1.0)).unbind(-1)
+    level = clamp_inclusive(lightness / 100.0, *model.LEVEL)
     lifted = torch.sigmoid(torch.logit(level) + model.LEAF_LIGHTNESS * shift)
     chroma = (1.0 + model.LEAF_CHROMA * hue) * (lifted / level).sqrt()
     level = lifted

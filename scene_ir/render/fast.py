@@ -13,9 +13,9 @@ from torch import Tensor
 
 from scene_ir.raster import verbs
 from scene_ir.render import channels, texture
-from scene_ir.render.prepare import Drawn, Prepared
-from scene_ir.render.prepare import photographed as photographed_at
-from scene_ir.render.surfaces import shifted
+from scene_ir.render.prepare import PreparedScene, VisibleSurfaces
+from scene_ir.render.prepare import at_photographed_pose as photographed_at
+from scene_ir.render.surfaces import offset_indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,24 +39,24 @@ class Fixed:
     unproject: Tensor
 
     @classmethod
-    def of(cls, prepared: Prepared) -> Fixed:
+    def of(cls, prepared: PreparedScene) -> Fixed:
         """Of one scene."""
-        fleet, base, count = prepared.fleet, prepared.base, len(prepared.scene.objects)
+        fleet, base, count = prepared.object_surfaces, prepared.base_geometry, len(prepared.scene.objects)
         assert prepared.texels is not None
         assert prepared.shadows is not None
         height, width = prepared.frame_hw
         return cls(
             faces=fleet.faces.to(torch.int32).contiguous(),
-            beside=fleet.beside.to(torch.int32).contiguous(),
+            beside=fleet.neighbours.to(torch.int32).contiguous(),
             base_clip=base.clip,
-            base=torch.stack([base.cos, fleet.paint, prepared.height], dim=1),
-            own=prepared.all_attributes(prepared.sharp, torch.zeros_like(prepared.height)),
+            base=torch.stack([base.facing_cos, fleet.paint, prepared.vertex_height], dim=1),
+            own=prepared.completion_attributes(prepared.sharp_normals, torch.zeros_like(prepared.vertex_height)),
             texels=(
                 prepared.texels.values[: int(prepared.texels.offsets[count])],
                 prepared.texels.rects[:count],
                 prepared.texels.offsets[: count + 1],
             ),
-            patches=prepared.pack.patches([photographed_at(prepared.scene.objects)]),
+            patches=prepared.batch.patch_matrices([photographed_at(prepared.scene.objects)]),
             dark=(
                 torch.nn.functional.pad(prepared.shadows.values, (0, 1)),
                 prepared.shadows.rects,
@@ -73,8 +73,8 @@ class Fixed:
             return parts[0]
         plain = ("base_clip", "base", "own", "patches", "frame_wh", "unproject")
         return cls(
-            faces=torch.cat(shifted([p.faces for p in parts], [p.base_clip.shape[0] for p in parts])),
-            beside=torch.cat(shifted([p.beside for p in parts], [p.faces.shape[0] for p in parts])),
+            faces=torch.cat(offset_indices([p.faces for p in parts], [p.base_clip.shape[0] for p in parts])),
+            beside=torch.cat(offset_indices([p.beside for p in parts], [p.faces.shape[0] for p in parts])),
             texels=_packed([p.texels for p in parts]),
             dark=_packed([p.dark for p in parts]),
             **{name: torch.cat([getattr(p, name) for p in parts]) for name in plain},
@@ -100,7 +100,7 @@ class Code:
 
 def photographed(
     fixed: Fixed,
-    drawn: Drawn,
+    drawn: VisibleSurfaces,
     reach_px: Sequence[float],
     yaw: Tensor,
     code: Code | None,
@@ -137,18 +137,26 @@ def photographed(
         return painted(mesh, look, fill), painted(halo, anchor, torch.zeros_like(fill))
 
     geometry = drawn.geometry
-    assert geometry.inside is not None
+    assert geometry.pixel_to_patch is not None
     assert geometry.lights is not None
-    then = fixed.patches @ geometry.inside
+    then = fixed.patches @ geometry.pixel_to_patch
     setting = Setting(
         fragments=drawn.mesh,
-        ground=drawn.ground_layout,
-        inside=geometry.inside.detach(),
+        ground=drawn.patch_layout,
+        inside=geometry.pixel_to_patch.detach(),
         reach_px=reach_px,
         painter=paint if code is not None else None,
         **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name != "patches"},
     )
     codes = code.values if code is not None else yaw.new_zeros(0)
     return Photographed.apply(
-        geometry.clip, geometry.cos, geometry.brighter, drawn.coverage, yaw, then, codes, geometry.lights, setting
+        geometry.clip,
+        geometry.facing_cos,
+        geometry.brightening,
+        drawn.coverage,
+        yaw,
+        then,
+        codes,
+        geometry.lights,
+        setting,
     )

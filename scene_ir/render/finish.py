@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir.render import texture
-from scene_ir.render.surfaces import Surface
+from scene_ir.render.surfaces import TemplateSurface
 from scene_ir.types import Part
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class _Web:
     bonds: scipy.sparse.csc_array
 
 
-def base_paint(surface: Surface, samples: Samples) -> Tensor | None:
+def base_paint(surface: TemplateSurface, samples: Samples) -> Tensor | None:
     """The paint (3,) RGB as the photograph shows it most: the median in CIE L*a*b*; None where it shows none."""
     part = surface.part.cpu().numpy()
     clear = (part[samples.vertex] == Part.PAINT).all(axis=1) & (samples.weight > 0.5)
@@ -92,7 +92,7 @@ def base_paint(surface: Surface, samples: Samples) -> Tensor | None:
     return texture.rgb_exact(lab.median(dim=0).values[None])[0].clamp(0.0, 1.0)
 
 
-def sunlight(seen: Sequence[tuple[Surface, Samples]], expected: Sequence[float | None]) -> float:
+def sunlight(seen: Sequence[tuple[TemplateSurface, Samples]], expected: Sequence[float | None]) -> float:
     """How strongly the sun lights a frame's vehicles, as `texture.shade` counts it: the strength for which sides
     of a vehicle that face it and others are of one colour, for most vehicles, not far from what is expected.
 
@@ -117,7 +117,7 @@ def sunlight(seen: Sequence[tuple[Surface, Samples]], expected: Sequence[float |
     return float(_STRENGTHS[int(cost.argmin())])
 
 
-def exposure(surface: Surface, samples: Samples) -> tuple[float, float] | None:
+def exposure(surface: TemplateSurface, samples: Samples) -> tuple[float, float] | None:
     """Gain and lift of `texture.finished` for another vehicle in the same light: the median over what is not
     paint, whose colour templates know; None where too little of it is seen.
     """
@@ -130,7 +130,7 @@ def exposure(surface: Surface, samples: Samples) -> tuple[float, float] | None:
     return float(np.clip(gain, _LEAST_GAIN, _MOST_GAIN[1])), lift
 
 
-def fitted(surface: Surface, samples: Samples) -> Array:
+def fitted(surface: TemplateSurface, samples: Samples) -> Array:
     """For each vertex (V, 4) the gains (3) and the lift of `texture.finished`.
 
     The lift is how bright the vehicle's darkest parts are, by haze and by what they mirror; paint has none.
@@ -168,7 +168,7 @@ def light_of(display: Array) -> Array:
     return -np.log(1.0 - np.clip(display, _DARKEST / 2, _BRIGHTEST))
 
 
-def _lift(surface: Surface, samples: Samples) -> float:
+def _lift(surface: TemplateSurface, samples: Samples) -> float:
     """How much brighter the darkest of the vehicle, paint apart, is than its template's darkest."""
     part = surface.part.cpu().numpy()[samples.vertex[:, 0]]
     clear = (samples.weight > 0.5) & (part != Part.PAINT)

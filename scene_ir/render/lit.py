@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import kept_within, to_clip, weld
+from scene_ir.geometry import clamp_inclusive, to_clip, weld_vertices
 from scene_ir.raster import verbs
-from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.raster.layout import Fragments, PixelLayout
 from scene_ir.render.borders import Edges, Sight, borders, rims
 from scene_ir.render.looks import FINE, Looks, Ways
 from scene_ir.types import Camera, check_finite, check_shape
@@ -110,7 +110,7 @@ class LitMesh:
         if x1 <= x0 or y1 <= y0:
             return vertices.new_zeros(4, 0, 0), 0, 0
         fragments = verbs.rasterize(
-            clip, self.faces, torch.tensor([[0, len(self.faces)]]), Layout.of(looks * rects), backend
+            clip, self.faces, torch.tensor([[0, len(self.faces)]]), PixelLayout.from_rects(looks * rects), backend
         )
         coverage = verbs.antialias(fragments, clip, self.faces, backend)
         seen = Looks.of(fragments, looks)
@@ -134,7 +134,7 @@ class LitMesh:
         attributes = torch.cat([corners.reshape(-1, 3), normals], dim=1)
         flat = torch.arange(3 * len(self.faces)).reshape(-1, 3)
         own = clip.index_select(0, self.faces.reshape(-1)) * clip.new_tensor([FINE, FINE, 1.0])
-        layout = Layout.of_pixels((FINE * at.to(torch.float64)).round())
+        layout = PixelLayout.from_pixels((FINE * at.to(torch.float64)).round())
         fragments = Fragments(layout, face.to(torch.int32), at[:, 0], torch.tensor([[0, len(self.faces)]]), 0.0)
         point, normal = verbs.interpolate(fragments, own, flat, attributes, backend).split(3, dim=1)
         materials = self.materials
@@ -146,7 +146,7 @@ class LitMesh:
             materials.shininess.to(clip).index_select(0, face),
             lights,
         )
-        return (GAMMA * kept_within(light, _DARKEST, 1).log()).exp()  # `**` takes almost twice as long
+        return (GAMMA * clamp_inclusive(light, _DARKEST, 1).log()).exp()  # `**` takes almost twice as long
 
     def corners(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of vertices (V, 3) in camera space each face's corners (F, 3, 3); their unit normals (3F, 3), towards
@@ -226,7 +226,7 @@ class _Over(torch.autograd.Function):
 
 def _smoothed(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs (Q,), (Q,) int64: a corner (3 * face + place) and a face that its normal is averaged over."""
-    welded = weld(vertices)[faces].reshape(-1)  # (3F,)
+    welded = weld_vertices(vertices)[faces].reshape(-1)  # (3F,)
     order = torch.argsort(welded, stable=True)
     counts = torch.bincount(welded)
     begins = counts.cumsum(0) - counts

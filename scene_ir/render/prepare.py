@@ -25,16 +25,16 @@ from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
 from scene_ir.render.environment import crowns_of, sky_colour
 from scene_ir.render.sun import Sun
-from scene_ir.render.surfaces import Fleet, Rig, Surface
+from scene_ir.render.surfaces import ObjectSurfaces, TemplateSurface, VertexPlacement
 from scene_ir.render.texture import Regions, Texels, smoothstep
-from scene_ir.types import Crop, Environment, Objects, SceneIR, scene_to
+from scene_ir.types import Crop, Environment, Objects, SceneIR, convert_scene
 
-HALO_MAX_PX = 64.0
+MAX_HALO_PX = 64.0
 """However near a vehicle is, its halo reaches no farther: of a car that fills the picture's height this is a
 sixth."""
 
 
-_MOST_SAMPLES, _GOLDEN = 5000, 0.6180339887
+_MAX_SAMPLES, _GOLDEN = 5000, 0.6180339887
 """Pixels of one object that its finish is read off, some for each vertex; steps by the golden section spread
 them."""
 _PATCH_MARGIN_PX = 4
@@ -54,47 +54,47 @@ class RenderSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Layers:
+class ObjectLayers:
     """The objects of one scene, drawn but not yet blended.
 
     layout: crops of the objects; colour (T, 4): premultiplied RGB and opacity / depth; opacity (T,); depth (T,) m.
     shadow_layout, shadow (Ts, 3): the shadows' crops and factors.
     """
 
-    layout: verbs.Layout
+    layout: verbs.PixelLayout
     colour: Tensor
     opacity: Tensor
     depth: Tensor
-    shadow_layout: verbs.Layout
+    shadow_layout: verbs.PixelLayout
     shadow: Tensor
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class OccluderLayers:
     """What stands in front of vehicles, as layers after theirs. footprints (K, 4, 2) m, see `blend`; layout,
     colour (T, 4), opacity (T,), depth (T,) m as in `Layers`; pixel (T,) int64: of the frame, for each of theirs.
     """
 
     footprints: np.ndarray
-    layout: verbs.Layout
+    layout: verbs.PixelLayout
     colour: Tensor
     opacity: Tensor
     depth: Tensor
     pixel: Tensor
 
     @classmethod
-    def of(cls, scene: SceneIR, like: Tensor) -> Standing:
+    def from_scene(cls, scene: SceneIR, like: Tensor) -> OccluderLayers:
         """Of a scene's `front`. `like`: a tensor of the dtype and device to work in."""
-        texels = Texels.pack([f.foreground for f in scene.front], like)
-        layout = verbs.Layout.of(texels.rects)
-        rgba, draw = texels.values, layout.draw()
-        depth = like.new_tensor([f.depth_m for f in scene.front])[draw]
+        texels = Texels.pack([f.foreground for f in scene.occluders], like)
+        layout = verbs.PixelLayout.from_rects(texels.rects)
+        rgba, draw = texels.values, layout.draw_index()
+        depth = like.new_tensor([f.depth_m for f in scene.occluders])[draw]
         colour = torch.cat([rgba[:, :3], rgba[:, 3:] / depth[:, None]], dim=1)
-        x, y = layout.pixels().unbind(1)
-        footprints = blend.standing_footprints(scene.front, scene.camera.matrix)
+        x, y = layout.pixel_xy().unbind(1)
+        footprints = blend.standing_footprints(scene.occluders, scene.camera.matrix)
         return cls(footprints, layout, colour, rgba[:, 3], depth, y * scene.camera.width + x)
 
-    def before(self, layers: Layers | None, change: Tensor | None) -> Layers:
+    def append_to(self, layers: ObjectLayers | None, change: Tensor | None) -> ObjectLayers:
         """Layers of objects, if there are any, and these after them. change: (3, H, W), what the season does to
         the background, and so to these."""
         colour = self.colour
@@ -102,10 +102,10 @@ class Standing:
             moved = change.flatten(1)[:, self.pixel].T * self.opacity[:, None]
             colour = torch.cat([colour[:, :3] + moved, colour[:, 3:]], dim=1)
         if layers is None:
-            nothing = verbs.Layout.of(self.layout.rects[:0])
-            return Layers(self.layout, colour, self.opacity, self.depth, nothing, colour[:0, :3])
-        return Layers(
-            verbs.Layout.of(torch.cat([layers.layout.rects, self.layout.rects])),
+            nothing = verbs.PixelLayout.from_rects(self.layout.rects[:0])
+            return ObjectLayers(self.layout, colour, self.opacity, self.depth, nothing, colour[:0, :3])
+        return ObjectLayers(
+            verbs.PixelLayout.from_rects(torch.cat([layers.layout.rects, self.layout.rects])),
             torch.cat([layers.colour, colour]),
             torch.cat([layers.opacity, self.opacity]),
             torch.cat([layers.depth, self.depth]),
@@ -115,40 +115,40 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True)
-class Geometry:
+class PlacedGeometry:
     """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the
     camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.brightened`, by what the
     objects turned since the photograph. lights (N, 4) and inside (N, 3, 3) float64, of the fast kernels alone: the
     sun on each object, and from a pixel (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways."""
 
     clip: Tensor
-    cos: Tensor
-    ground_clip: Tensor
-    brighter: Tensor
+    facing_cos: Tensor
+    patch_clip: Tensor
+    brightening: Tensor
     lights: Tensor | None = None
-    inside: Tensor | None = None
+    pixel_to_patch: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class VisibleSurfaces:
     """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo;
     ground_layout: of the patches; ground: what was found there, None where the fast kernels find out themselves.
     """
 
-    geometry: Geometry
+    geometry: PlacedGeometry
     mesh: verbs.Fragments
     coverage: Tensor
     reach_px: tuple[float, ...]
-    ground_layout: verbs.Layout
-    ground: verbs.Fragments | None
+    patch_layout: verbs.PixelLayout
+    patch_fragments: verbs.Fragments | None
 
-    def nearest(self) -> Tensor:
+    def nearest_hits(self) -> Tensor:
         """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo
         reaches."""
         return surfaces.nearest_hits(self.mesh, self.reach_px)
 
 
-class Prepared:
+class PreparedScene:
     """One scene, made ready to draw its perturbations: all that no parameter touches.
 
     A perturbed scene may differ from `scene` in objects.translation, yaw, size_lhw, ffd, texture_code and in
@@ -166,7 +166,7 @@ class Prepared:
         whole_patches: keep all of the ground that a vehicle may darken, not only what its source's shadow does."""
         self.settings = settings or RenderSettings()
         if self.settings.backend == "warp":
-            scene = scene_to(scene, torch.float32)
+            scene = convert_scene(scene, torch.float32)
         self.scene = scene
         self._whole_patches = whole_patches
         self.like = scene.photograph
@@ -174,50 +174,52 @@ class Prepared:
         self.centre = surfaces.camera_centre(scene.camera.matrix).to(self.like)
         self.unproject = torch.linalg.inv(scene.camera.matrix[:, :3]).to(self.like)
         self.air = sky_colour(scene.photograph, scene.environment.sky)
-        self._crowns: Tensor | None = None
+        self._crown_maps: Tensor | None = None
         inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
         self.canvas = torch.cat([scene.background, inverse.to(self.like)[None]])
-        self.standing = Standing.of(scene, self.like) if scene.front else None
-        self.footprints = None if self.standing is None else self.standing.footprints
+        self.occluders = OccluderLayers.from_scene(scene, self.like) if scene.occluders else None
+        self.footprints = None if self.occluders is None else self.occluders.footprints
         with torch.no_grad():
             self._prepare(scene.objects, hidden)
 
     def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
         """Everything that hangs on the unperturbed objects: normals, and what the photograph knows."""
-        base = photographed(objects)
+        base = at_photographed_pose(objects)
         meshes = [self.scene.meshes[int(i)] for i in objects.mesh_index]
         if self.settings.lod:
-            heights = self._height_px(base)
+            heights = self._heights_px(base)
             meshes = [detail(mesh, height) for mesh, height in zip(meshes, heights, strict=True)]
-        picked = [Surface.of(mesh, self.like.dtype) for mesh in meshes]
-        self.fleet = Fleet.of(picked, self.like)
-        local = self.fleet.local(base.ffd, base.size_lhw)
-        self.sharp, self.smooth = self.fleet.normals(local)
+        picked = [TemplateSurface.from_mesh(mesh, self.like.dtype) for mesh in meshes]
+        self.object_surfaces = ObjectSurfaces.from_surfaces(picked, self.like)
+        local = self.object_surfaces.local_vertices(base.ffd, base.size_lhw)
+        self.sharp_normals, self.smooth_normals = self.object_surfaces.normals(local)
         inflation = self.like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
         self.halo = inflation * self.scene.camera.matrix[0, 0].to(self.like)
-        self.sun_offset = surfaces.sun_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
-        self.corners = surfaces.shadow_corners(base.size_lhw, self.sun_offset)
+        self.base_shadow_offset = surfaces.shadow_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
+        self.patch_corners = surfaces.shadow_corners(base.size_lhw, self.base_shadow_offset)
         if objects.source and not self._whole_patches:
-            self.corners = self._trimmed_corners(objects, base)
-        self.outwards = surfaces.outwards(self.corners, base.size_lhw, self.sun_offset)
-        self._lit: Tensor | None = None
-        self._casts: Tensor | None = None
+            self.patch_corners = self._trimmed_corners(objects, base)
+        self.corner_outwardness = surfaces.outwardness(self.patch_corners, base.size_lhw, self.base_shadow_offset)
+        self._base_sun_exposure: Tensor | None = None
+        self._shadow_is_own: Tensor | None = None
         self.base_yaw = base.yaw
         self.sunlight = self.like.new_tensor([s.sunlight for s in objects.source] or [model.SUNLIGHT] * len(base))
-        self.rig: Rig | None = None
+        self.placement: VertexPlacement | None = None
         if self.settings.backend == "warp" and len(base):
             follows = self.sunlight if objects.source else torch.zeros_like(self.sunlight)
             environment = self.scene.environment
-            self.rig = Rig.of(self.fleet, base, self.smooth, self.scene.camera, environment.sun, follows)
-        self.size = base.size_lhw
+            self.placement = VertexPlacement.from_objects(
+                self.object_surfaces, base, self.smooth_normals, self.scene.camera, environment.sun, follows
+            )
+        self.base_size_lhw = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
         # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
-        self.pack = Pack([weakref.proxy(self)])
-        self.base = self._place(base)
-        self.height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self.like.new_zeros(0)
+        self.batch = SceneBatch([weakref.proxy(self)])
+        self.base_geometry = self._place(base)
+        self.vertex_height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self.like.new_zeros(0)
         self.texels, self.shadows, self.regions = None, None, None
         self._finish: Tensor | None = None
-        self._drawn: Drawn | None = None  # until the finish is found
+        self._base_visible: VisibleSurfaces | None = None  # until the finish is found
         self.paint_lightness = self._base_lightness(objects)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
@@ -225,7 +227,7 @@ class Prepared:
     def _trimmed_corners(self, objects: Objects, base: Objects) -> Tensor:
         """The patches (N, 4, 2) m, cut down to what the photographed shadows darken."""
         height, width = self.frame_hw
-        corners = self.corners.clone()
+        corners = self.patch_corners.clone()
         for i, source in enumerate(objects.source):
             if source.shadow is None or source.shadow.values.numel() == 0:
                 continue
@@ -238,7 +240,7 @@ class Prepared:
                 continue
             steps = x.new_tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
             pixels = (torch.stack([x, y], dim=1)[:, None] + steps).reshape(-1, 2).to(self.like)
-            found = surfaces.on_ground(
+            found = surfaces.pixels_to_ground(
                 pixels,
                 self.unproject,
                 self.centre,
@@ -251,26 +253,28 @@ class Prepared:
             low = torch.maximum(found.amin(dim=0), corners[i].amin(dim=0))
             high = torch.minimum(found.amax(dim=0), corners[i].amax(dim=0))
             if bool((high > low).all()):
-                corners[i] = surfaces.rectangle(low, high)
+                corners[i] = surfaces.rectangle_corners(low, high)
         return corners
 
-    def _height_px(self, objects: Objects) -> list[float]:
+    def _heights_px(self, objects: Objects) -> list[float]:
         """How high the objects are in the image at their nearest point, at least."""
         middle = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2]
         nearest = (middle - 0.5 * objects.size_lhw[:, [0, 2]].norm(dim=1)).clamp(min=1.0)
         return (self.scene.camera.matrix[1, 1].to(nearest) * objects.size_lhw[:, 1] / nearest).tolist()
 
     def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
-        drawn = self.draw(base)
-        self._drawn = drawn
-        mirrored = self.fleet.place(
-            self.fleet.local(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
+        drawn = self.find_visible(base)
+        self._base_visible = drawn
+        mirrored = self.object_surfaces.place(
+            self.object_surfaces.local_vertices(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
         )
         self.mirror_clip = surfaces.project_vertices(mirrored, self.scene.camera)
-        flipped = surfaces.rotate(self.smooth * self.like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.fleet.owner])
-        self.mirror_cos = surfaces.facing(mirrored, flipped, self.centre)
+        flipped = surfaces.rotate_y(
+            self.smooth_normals * self.like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.object_surfaces.owner]
+        )
+        self.mirror_cos = surfaces.facing_cosine(mirrored, flipped, self.centre)
         order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self.centre, self.footprints)
-        nearer = [thing.foreground for thing in (*objects.source, *self.scene.front)]
+        nearer = [thing.foreground for thing in (*objects.source, *self.scene.occluders)]
         mattes = [replace(crop, values=crop.values[3:]) for crop in nearer]
         crops = []
         rects = drawn.mesh.layout.rects.tolist()
@@ -284,7 +288,7 @@ class Prepared:
             depth = Crop(drawn.mesh.depth[packed].reshape(1, *size), x0, y0)
             crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self.frame_hw))
         self.texels = Texels.pack(crops + crops, self.like)
-        self.shadows = Texels.pack([_darkness(s.shadow, self.frame_hw) for s in objects.source], self.like)
+        self.shadows = Texels.pack([_shadow_darkness(s.shadow, self.frame_hw) for s in objects.source], self.like)
         blank = Crop(self.like.new_zeros(1, 0, 0), 0, 0)
         self.regions = Regions(
             Texels.pack([s.region or blank for s in objects.source], self.like),
@@ -295,10 +299,10 @@ class Prepared:
     def finish(self) -> Tensor:
         """(V, 4): gains (3) and lift that make the templates' colours the vehicles'; found on first use."""
         if self._finish is None:
-            parts = zip(self.fleet.surfaces, self.samples(), strict=True)
+            parts = zip(self.object_surfaces.surfaces, self.sample_photograph(), strict=True)
             found = [torch.from_numpy(finish.fitted(surface, samples)) for surface, samples in parts]
             self._finish = torch.cat(found).to(self.like)
-            self._drawn = None
+            self._base_visible = None
         return self._finish
 
     def _base_lightness(self, objects: Objects) -> Tensor:
@@ -311,8 +315,8 @@ class Prepared:
 
     def _template_paint(self) -> Tensor:
         """The mean colour (N, 3) of the templates' paint."""
-        fleet = self.fleet
-        total = self.size.new_zeros(len(self.size), 3)
+        fleet = self.object_surfaces
+        total = self.base_size_lhw.new_zeros(len(self.base_size_lhw), 3)
         total = total.index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
         count = total.new_zeros(len(total)).index_add(0, fleet.owner, fleet.paint)
         return total / count.clamp(min=1e-3)[:, None]
@@ -321,55 +325,63 @@ class Prepared:
         """The paint (N, 3) of the objects as the photograph shows it, by their `samples`; the templates' where it
         shows none."""
         paint = self._template_paint()
-        for i, (surface, own) in enumerate(zip(self.fleet.surfaces, samples, strict=True)):
+        for i, (surface, own) in enumerate(zip(self.object_surfaces.surfaces, samples, strict=True)):
             found = finish.base_paint(surface, own)
             if found is not None:
                 paint[i] = found.to(paint)
         return paint
 
-    def _place(self, objects: Objects) -> Geometry:
-        return self.pack.place([objects], [None], with_ground=True)
+    def _place(self, objects: Objects) -> PlacedGeometry:
+        return self.batch.place([objects], [None], with_ground=True)
 
-    def draw(self, objects: Objects, sun: Sun | None = None) -> Drawn:
+    def find_visible(self, objects: Objects, sun: Sun | None = None) -> VisibleSurfaces:
         """Find which surfaces the pixels see. sun: as of `sun_of`."""
-        return self.pack.draw([objects], [sun])
+        return self.batch.find_visible([objects], [sun])
 
-    def sun_of(self, environment: Environment) -> Sun | None:
+    def perturbed_sun(self, environment: Environment) -> Sun | None:
         """The sun of a perturbed scene; None where it is the photograph's."""
-        if not len(self.sunlight) or not active(environment.light):
+        if not len(self.sunlight) or not is_active(environment.light):
             return None
         return Sun.of(replace(self.scene.environment, light=environment.light), self.like, self.sunlight.mean())
 
-    def local(self, objects: Objects) -> Tensor:
+    def local_vertices(self, objects: Objects) -> Tensor:
         """Vertices (V, 3) m in their objects' frames."""
-        shapes = ((objects.ffd, self._base_ffd), (objects.size_lhw, self.size))
+        shapes = ((objects.ffd, self._base_ffd), (objects.size_lhw, self.base_size_lhw))
         changed = any(now.requires_grad or not torch.equal(now, then) for now, then in shapes)
-        return self.fleet.local(objects.ffd, objects.size_lhw) if changed else self._base_local
+        return self.object_surfaces.local_vertices(objects.ffd, objects.size_lhw) if changed else self._base_local
 
-    def brighter(self, objects: Objects, sun: Sun | None = None) -> Tensor:
+    def compute_brightening(self, objects: Objects, sun: Sun | None = None) -> Tensor:
         """By how much (V,) the surfaces are brighter than in the photograph, since they or the sun turned, or its
         light changed: see `texture.brightened`."""
         turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
         if not objects.source or not (turned or sun is not None):
-            return self.like.new_zeros(self.fleet.owner.shape[0])
-        if self._lit is None:
-            self._lit = self._sun_on(self.base_yaw)
-        sunlight = self.fleet.spread(self.sunlight)
-        then = model.AMBIENT[0] + model.AMBIENT[1] * (0.5 - 0.5 * self.smooth[:, 1]) + sunlight * self._lit
-        now = self._sun_on(objects.yaw, sun)
-        more = now - self._lit if sun is None else now - self._lit + (sun.strength - 1.0) * now
-        return texture.brightened(sunlight * more / then, self.fleet.paint)
+            return self.like.new_zeros(self.object_surfaces.owner.shape[0])
+        if self._base_sun_exposure is None:
+            self._base_sun_exposure = self._sun_exposure(self.base_yaw)
+        sunlight = self.object_surfaces.per_vertex(self.sunlight)
+        then = (
+            model.AMBIENT[0]
+            + model.AMBIENT[1] * (0.5 - 0.5 * self.smooth_normals[:, 1])
+            + sunlight * self._base_sun_exposure
+        )
+        now = self._sun_exposure(objects.yaw, sun)
+        more = (
+            now - self._base_sun_exposure
+            if sun is None
+            else now - self._base_sun_exposure + (sun.strength - 1.0) * now
+        )
+        return texture.brightened(sunlight * more / then, self.object_surfaces.paint)
 
-    def _sun_on(self, yaw: Tensor, moved: Sun | None = None) -> Tensor:
+    def _sun_exposure(self, yaw: Tensor, moved: Sun | None = None) -> Tensor:
         """How squarely (V,) the sun meets the surfaces of objects that stand at yaw (N,)."""
         direction = self.scene.environment.sun.to(self.like) if moved is None else moved.direction
         sun = direction.expand(len(yaw), 3)
-        x, y, z = self.fleet.spread(surfaces.rotate(sun, -yaw)).unbind(-1)
+        x, y, z = self.object_surfaces.per_vertex(surfaces.rotate_y(sun, -yaw)).unbind(-1)
         # Written out: sums along an axis may differ in their last bit with the number of rows.
-        soft = self.smooth[:, 0] * x + self.smooth[:, 1] * y + self.smooth[:, 2] * z
+        soft = self.smooth_normals[:, 0] * x + self.smooth_normals[:, 1] * y + self.smooth_normals[:, 2] * z
         return texture.sunward(soft)
 
-    def ground(self, objects: Objects, sun: Sun | None = None) -> Tensor:
+    def place_patches(self, objects: Objects, sun: Sun | None = None) -> Tensor:
         """Clip coordinates (4N, 3) of the corners of the shadows' patches.
 
         A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
@@ -377,13 +389,15 @@ class Prepared:
         the sun moves, only shadows that are the objects' own follow (`casts`).
         """
         ground = self.scene.environment.ground
-        offset = surfaces.sun_offset(self.scene.environment.sun, objects.yaw, self.size[:, 1])
+        offset = surfaces.shadow_offset(self.scene.environment.sun, objects.yaw, self.base_size_lhw[:, 1])
         if sun is not None:
-            offset = offset + self.casts * (
-                surfaces.sun_offset(sun.direction, objects.yaw, self.size[:, 1]) - offset
+            offset = offset + self.shadow_is_own * (
+                surfaces.shadow_offset(sun.direction, objects.yaw, self.base_size_lhw[:, 1]) - offset
             )
-        corners = self.corners + self.outwards[..., None] * (offset - self.sun_offset)[:, None]
-        more = (objects.size_lhw / self.size - 1.0)[:, None, ::2]
+        corners = (
+            self.patch_corners + self.corner_outwardness[..., None] * (offset - self.base_shadow_offset)[:, None]
+        )
+        more = (objects.size_lhw / self.base_size_lhw - 1.0)[:, None, ::2]
         # Softly no less than 0, and 0 where it is 0: a patch that shrank would leave its photographed rim behind.
         soft = torch.full_like(more, model.SHRUNK)
         more = 0.5 * (more + (more.square() + soft.square()).sqrt() - soft.square().sqrt())
@@ -391,40 +405,45 @@ class Prepared:
         corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
 
-    def patched(self, sun: Sun | None) -> tuple[Tensor, ...]:
+    def patch_inputs(self, sun: Sun | None) -> tuple[Tensor, ...]:
         """What the kernels take of the patches besides poses: the tensors of `kernels.patches.Photographed`."""
-        count, environment = len(self.size), self.scene.environment
+        count, environment = len(self.base_size_lhw), self.scene.environment
         direction, ground = (t.to(self.like) for t in (environment.sun, environment.ground))
-        casts = self.like.new_zeros(count) if sun is None else self.casts[:, 0].contiguous()
+        casts = self.like.new_zeros(count) if sun is None else self.shadow_is_own[:, 0].contiguous()
         return (
-            *(self.corners.contiguous(), self.outwards.contiguous(), self.sun_offset.contiguous(), self.size),
+            *(
+                self.patch_corners.contiguous(),
+                self.corner_outwardness.contiguous(),
+                self.base_shadow_offset.contiguous(),
+                self.base_size_lhw,
+            ),
             *(direction.expand(count, 3).contiguous(), ground.expand(count, 4).contiguous()),
             *(self.scene.camera.matrix.to(self.like).expand(count, 3, 4).contiguous(), casts),
         )
 
     @property
-    def crowns(self) -> Tensor:
+    def crown_maps(self) -> Tensor:
         """Of `environment.crowns_of`; found on first use."""
-        if self._crowns is None:
-            self._crowns = crowns_of(self.scene)
-        return self._crowns
+        if self._crown_maps is None:
+            self._crown_maps = crowns_of(self.scene)
+        return self._crown_maps
 
     @property
-    def casts(self) -> Tensor:
+    def shadow_is_own(self) -> Tensor:
         """(N, 1): 1 where the photographed shadow is that of the object's box in the scene's sun, 0 where it is
         much else's too, such as a house's, or the picture's border cuts it; found on first use."""
-        if self._casts is None:
+        if self._shadow_is_own is None:
             with torch.no_grad():
-                self._casts = self._found_casts()
-        return self._casts
+                self._shadow_is_own = self._compare_shadows()
+        return self._shadow_is_own
 
-    def _found_casts(self) -> Tensor:
+    def _compare_shadows(self) -> Tensor:
         source, casts = self.scene.objects.source, self.like.new_ones(len(self.scene.objects), 1)
         if not source:
             return casts
-        drawn = self.draw(photographed(self.scene.objects))
-        density, rects = self.ground_density(drawn), drawn.ground_layout.rects.tolist()
-        for i, (packed, size) in enumerate(drawn.ground_layout.spans()):
+        drawn = self.find_visible(at_photographed_pose(self.scene.objects))
+        density, rects = self.patch_density(drawn), drawn.patch_layout.rects.tolist()
+        for i, (packed, size) in enumerate(drawn.patch_layout.spans()):
             shadow = source[i].shadow
             if shadow is None or not shadow.values.numel() or not min(size):
                 continue
@@ -436,7 +455,7 @@ class Prepared:
             casts[i] = float(alike >= model.OWN_SHADOW and not cut)
         return casts
 
-    def shadowless(self) -> list[bool]:
+    def objects_without_shadow(self) -> list[bool]:
         """Which objects darken no ground."""
         source = self.scene.objects.source
         count = len(self.scene.objects)
@@ -447,33 +466,35 @@ class Prepared:
         if not objects.source:
             return [0.0] * len(objects)
         distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
-        halo = self.halo * (objects.size_lhw / self.size).detach().amax(dim=1)
-        return (halo / distance).clamp(max=HALO_MAX_PX).tolist()
+        halo = self.halo * (objects.size_lhw / self.base_size_lhw).detach().amax(dim=1)
+        return (halo / distance).clamp(max=MAX_HALO_PX).tolist()
 
-    def own_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
+    def template_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.PLAIN): the templates' own looks. normals (V, 3); depth (V,) m."""
-        shares = torch.stack([self.fleet.paint, self.fleet.glass, depth, self.height], dim=1)
-        return torch.cat([self.fleet.colours, normals, shares], dim=1)
+        shares = torch.stack(
+            [self.object_surfaces.paint, self.object_surfaces.glass, depth, self.vertex_height], dim=1
+        )
+        return torch.cat([self.object_surfaces.colours, normals, shares], dim=1)
 
-    def all_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
+    def completion_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.OWN): `own_attributes`, and what completes a photographed vehicle."""
-        own = self.own_attributes(normals, depth)
+        own = self.template_attributes(normals, depth)
         return torch.cat([own, self.mirror_clip, self.mirror_cos[:, None], self.finish], dim=1)
 
-    def normals(self, objects: Objects) -> Tensor:
+    def rotated_normals(self, objects: Objects) -> Tensor:
         """Unit normals (V, 3) of objects where they stand, with sharp edges."""
-        return surfaces.rotate(self.sharp, self.fleet.spread(objects.yaw))
+        return surfaces.rotate_y(self.sharp_normals, self.object_surfaces.per_vertex(objects.yaw))
 
-    def lights(self, sun: Sun | None = None) -> Tensor:
+    def object_lights(self, sun: Sun | None = None) -> Tensor:
         """(N, 4): direction and strength of the sun on each object."""
         direction = self.scene.environment.sun.to(self.like) if sun is None else sun.direction
         strength = self.sunlight if sun is None else self.sunlight * sun.strength
         return torch.cat([direction.expand(len(strength), 3), strength[:, None]], dim=1)
 
-    def own_colour(self, xy: Tensor, owner: Tensor, own: Tensor, sun: Sun | None = None) -> Tensor:
+    def shade_template(self, xy: Tensor, owner: Tensor, own: Tensor, sun: Sun | None = None) -> Tensor:
         """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
         `own_attributes` (K, ...)."""
-        light = self.lights(sun).index_select(0, owner)
+        light = self.object_lights(sun).index_select(0, owner)
         albedo, normal = own[:, : channels.NORMAL], own[:, channels.NORMAL : channels.OWN_PAINT]
         sheen, height = own[:, channels.OWN_PAINT : channels.OWN_DEPTH], own[:, channels.OWN_HEIGHT]
         ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self.unproject.T
@@ -482,13 +503,17 @@ class Prepared:
         return texture.shade(normal, to_eye, albedo, sheen, height, light[:, :3], light[:, 3])
 
     @torch.no_grad()
-    def photographed_paint(self) -> list[Crop]:
+    def project_paint(self) -> list[Crop]:
         """For each object, where its foreground is: Crop (1, h, w), 1 where the mesh at its place in the
         photograph is paint, 0 where not; beyond the mesh as at its nearest pixel."""
-        objects = photographed(self.scene.objects)
-        drawn = self.draw(objects)
+        objects = at_photographed_pose(self.scene.objects)
+        drawn = self.find_visible(objects)
         dense = verbs.interpolate(
-            drawn.mesh, drawn.geometry.clip, self.fleet.faces, self.fleet.paint[:, None], self.settings.backend
+            drawn.mesh,
+            drawn.geometry.clip,
+            self.object_surfaces.faces,
+            self.object_surfaces.paint[:, None],
+            self.settings.backend,
         )
         out = []
         for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
@@ -506,15 +531,15 @@ class Prepared:
         return out
 
     @torch.no_grad()
-    def samples(self) -> list[finish.Samples]:
+    def sample_photograph(self) -> list[finish.Samples]:
         """What the photograph shows of each object, beside its template in daylight: a row a pixel, of large
         objects about `_MOST_SAMPLES` pixels, spread evenly."""
-        objects, drawn = photographed(self.scene.objects), self._drawn
+        objects, drawn = at_photographed_pose(self.scene.objects), self._base_visible
         if drawn is None:
-            drawn = self.draw(objects)
+            drawn = self.find_visible(objects)
         layout, count = drawn.mesh.layout, len(objects)
         pixel = (drawn.mesh.face >= 0).nonzero()[:, 0]
-        owner, xy = layout.draw()[pixel], layout.pixels()[pixel].to(self.like)
+        owner, xy = layout.draw_index()[pixel], layout.pixel_xy()[pixel].to(self.like)
         assert self.texels is not None
         counts = torch.bincount(owner, minlength=2 * count)
         seen = self.texels.sample(xy, counts, self.settings.backend, "clamp")
@@ -525,53 +550,57 @@ class Prepared:
         # By their places within the object, so that others beside it change nothing.
         size = torch.bincount(owner[plain], minlength=count)
         place = torch.arange(len(plain), device=plain.device) - (size.cumsum(0) - size)[owner[plain]]
-        chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MOST_SAMPLES / size.clamp(min=1))[owner[plain]]]
+        chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MAX_SAMPLES / size.clamp(min=1))[owner[plain]]]
         pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
-        corner = self.fleet.faces[drawn.mesh.face[pixel].long()]
-        share = surfaces.weights_at(drawn.geometry.clip[corner], xy).to(self.like)
-        looks = self.own_attributes(self.normals(objects), drawn.geometry.clip[:, 2])
-        own = torch.cat([looks, drawn.geometry.cos[:, None]], dim=1)
+        corner = self.object_surfaces.faces[drawn.mesh.face[pixel].long()]
+        share = surfaces.perspective_weights(drawn.geometry.clip[corner], xy).to(self.like)
+        looks = self.template_attributes(self.rotated_normals(objects), drawn.geometry.clip[:, 2])
+        own = torch.cat([looks, drawn.geometry.facing_cos[:, None]], dim=1)
         own = (own[corner] * share[..., None]).sum(dim=1)
         weight = weight * smoothstep(own[:, channels.PLAIN], *model.SQUARE)
-        template = self.own_colour(xy, owner, own)
+        template = self.shade_template(xy, owner, own)
         normal = torch.nn.functional.normalize(own[:, channels.NORMAL : channels.OWN_PAINT], dim=-1, eps=1e-6)
         sun = self.scene.environment.sun.to(self.like)
         sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
         columns = (corner, share, template, seen[:, : channels.ALPHA], sky, lit - sky, weight)
         out = []
-        for i, (start, _) in enumerate(self.fleet.vertex_ranges.tolist()):
+        for i, (start, _) in enumerate(self.object_surfaces.vertex_ranges.tolist()):
             mine = (owner == i) & (weight > 0.0)
             vertex, *values = (c[mine].cpu().numpy() for c in columns)
             out.append(finish.Samples(vertex - start, *(v.astype(np.float64) for v in values)))
         return out
 
-    def ground_density(self, drawn: Drawn) -> Tensor:
+    def patch_density(self, drawn: VisibleSurfaces) -> Tensor:
         """How much the objects' boxes darken the pixels (Ts,) of their patches, in [0, 1]."""
-        clip = drawn.geometry.ground_clip
-        assert drawn.ground is not None
-        faces, _, _ = patch_faces(self.corners.shape[0], clip.device)
-        corners = self.corners.reshape(-1, 2).contiguous()
-        local = verbs.interpolate(drawn.ground, clip, faces, corners, self.settings.backend)
-        owner = drawn.ground_layout.draw()
-        density = surfaces.shadow_density(local, self.size[owner], self.sun_offset[owner])
-        return density * (drawn.ground.face >= 0)
+        clip = drawn.geometry.patch_clip
+        assert drawn.patch_fragments is not None
+        faces, _, _ = patch_faces(self.patch_corners.shape[0], clip.device)
+        corners = self.patch_corners.reshape(-1, 2).contiguous()
+        local = verbs.interpolate(drawn.patch_fragments, clip, faces, corners, self.settings.backend)
+        owner = drawn.patch_layout.draw_index()
+        density = surfaces.shadow_density(local, self.base_size_lhw[owner], self.base_shadow_offset[owner])
+        return density * (drawn.patch_fragments.face >= 0)
 
 
-class Pack:
+class SceneBatch:
     """Prepared scenes whose objects are drawn in one go: each stage passes once over all pixels, of however many
     scenes.
 
     A scene may occur more than once, for several perturbations of one scene.
     """
 
-    def __init__(self, members: Sequence[Prepared]) -> None:
+    def __init__(self, members: Sequence[PreparedScene]) -> None:
         self._members = tuple(members)
         self._backend: verbs.Backend = members[0].settings.backend
-        rigs = [m.rig for m in members if m.rig is not None]
-        self._rig = Rig.pack(rigs) if rigs else None
-        self._faces, self._vertex_ranges, self._face_ranges = Fleet.joined([m.fleet for m in members])
-        self._ranges = torch.tensor(self._face_ranges, dtype=torch.int64, device=self._faces.device).reshape(-1, 2)
-        closed = [s.closed for m in members for s in m.fleet.surfaces]
+        rigs = [m.placement for m in members if m.placement is not None]
+        self._placement = VertexPlacement.concat(rigs) if rigs else None
+        self._faces, self._vertex_ranges, self._face_ranges = ObjectSurfaces.concat_faces(
+            [m.object_surfaces for m in members]
+        )
+        self._face_range_tensor = torch.tensor(
+            self._face_ranges, dtype=torch.int64, device=self._faces.device
+        ).reshape(-1, 2)
+        closed = [s.closed for m in members for s in m.object_surfaces.surfaces]
         self._cull = torch.tensor(closed, dtype=torch.bool, device=self._faces.device)
         self.counts = [len(m.scene.objects) for m in members]
         cameras = [m.scene.camera for m in members]
@@ -581,50 +610,59 @@ class Pack:
         self._patches = patch_faces(sum(self.counts), self._faces.device)
         self._patch_ranges = [[4 * i, 4 * i + 4] for i in range(sum(self.counts))]
         self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self.counts))]
-        self._shadowless = torch.tensor([s for m in members for s in m.shadowless()], dtype=torch.bool)
-        self._ground: tuple[Tensor, ...] | None = None
+        self._shadowless = torch.tensor([s for m in members for s in m.objects_without_shadow()], dtype=torch.bool)
+        self._still_patch_inputs: tuple[Tensor, ...] | None = None
 
-    def place(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool) -> Geometry:
+    def place(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool) -> PlacedGeometry:
         """Where the vertices of perturbed objects, of each member, come to lie, and the light on them.
         with_ground: the patches by plain torch."""
-        if self._rig is None:
+        if self._placement is None:
             ((m,), (o,), (sun,)) = self._members, objects, suns
             matrix = m.scene.camera.matrix.to(m.like)
-            clip, cos = surfaces.place(m.local(o), m.smooth, m.fleet.owner, o, matrix, m.centre)
-            return Geometry(clip, cos, m.ground(o, sun), m.brighter(o, sun))
+            clip, cos = surfaces.place_vertices(
+                m.local_vertices(o), m.smooth_normals, m.object_surfaces.owner, o, matrix, m.centre
+            )
+            return PlacedGeometry(clip, cos, m.place_patches(o, sun), m.compute_brightening(o, sun))
         lit = list(zip(self._members, objects, suns, strict=True))
-        lights = joined([m.lights(sun) for m, _, sun in lit])
+        lights = concat([m.object_lights(sun) for m, _, sun in lit])
         ffd, size, yaw, translation = (
-            joined([getattr(o, name) for o in objects]) for name in ("ffd", "size_lhw", "yaw", "translation")
+            concat([getattr(o, name) for o in objects]) for name in ("ffd", "size_lhw", "yaw", "translation")
         )
-        clip, cos, brighter, _ = surfaces.placed(self._rig, ffd, size, yaw, translation, lights)
+        clip, cos, brighter, _ = surfaces.place_with_kernels(self._placement, ffd, size, yaw, translation, lights)
         if with_ground:
-            return Geometry(clip, cos, joined([m.ground(o, sun) for m, o, sun in lit]), brighter, lights)
-        inside, _, ground = surfaces.patches(yaw, translation, size, lights, self._grounds(suns))
-        return Geometry(clip, cos, ground, brighter, lights, inside)
+            return PlacedGeometry(
+                clip, cos, concat([m.place_patches(o, sun) for m, o, sun in lit]), brighter, lights
+            )
+        inside, _, ground = surfaces.place_patches(yaw, translation, size, lights, self._patch_inputs(suns))
+        return PlacedGeometry(clip, cos, ground, brighter, lights, inside)
 
-    def patches(self, objects: Sequence[Objects]) -> Tensor:
+    def patch_matrices(self, objects: Sequence[Objects]) -> Tensor:
         """(N, 3, 3) float64: from a patch's (s, t, 1), 0 to 1 both ways, to its clip coordinates, under the
         photographed sun."""
-        lights, fixed = joined([m.lights() for m in self._members]), self._grounds([None] * len(objects))
-        yaw, place, size = (joined([getattr(o, n) for o in objects]) for n in ("yaw", "translation", "size_lhw"))
-        return surfaces.patches(yaw, place, size, lights, fixed)[1]
+        lights, fixed = (
+            concat([m.object_lights() for m in self._members]),
+            self._patch_inputs([None] * len(objects)),
+        )
+        yaw, place, size = (concat([getattr(o, n) for o in objects]) for n in ("yaw", "translation", "size_lhw"))
+        return surfaces.place_patches(yaw, place, size, lights, fixed)[1]
 
-    def _grounds(self, suns: Sequence[Sun | None]) -> tuple[Tensor, ...]:
+    def _patch_inputs(self, suns: Sequence[Sun | None]) -> tuple[Tensor, ...]:
         """What of the shadows' patches poses do not touch; kept where no sun moves."""
-        if self._ground is None or any(sun is not None for sun in suns):
-            parts = [m.patched(sun) for m, sun in zip(self._members, suns, strict=True)]
-            found = tuple(joined(rows) for rows in zip(*parts, strict=True))
+        if self._still_patch_inputs is None or any(sun is not None for sun in suns):
+            parts = [m.patch_inputs(sun) for m, sun in zip(self._members, suns, strict=True)]
+            found = tuple(concat(rows) for rows in zip(*parts, strict=True))
             if any(sun is not None for sun in suns):
                 return found
-            self._ground = found
-        return self._ground
+            self._still_patch_inputs = found
+        return self._still_patch_inputs
 
     def reach_px(self, objects: Sequence[Objects]) -> list[float]:
         """How far the halo of each object reaches beyond its mesh."""
         return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
 
-    def draw(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool = True) -> Drawn:
+    def find_visible(
+        self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool = True
+    ) -> VisibleSurfaces:
         """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
         backend, reach = self._backend, self.reach_px(objects)
         geometry = self.place(objects, suns, with_ground)
@@ -632,27 +670,29 @@ class Pack:
             geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
             [2.0 + r for r in reach],
         )  # fmt: skip
-        layout = verbs.Layout.of(rects)
-        mesh = verbs.rasterize(geometry.clip, self._faces, self._ranges, layout, backend, cull=self._cull)
+        layout = verbs.PixelLayout.from_rects(rects)
+        mesh = verbs.rasterize(
+            geometry.clip, self._faces, self._face_range_tensor, layout, backend, cull=self._cull
+        )
         coverage = verbs.antialias(mesh, geometry.clip, self._faces, backend=backend)
         faces, _, face_ranges = self._patches
         patch_rects = surfaces.crop_rects(
-            geometry.ground_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
+            geometry.patch_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
         )
         patch_rects[self._shadowless] = 0
-        ground_layout = verbs.Layout.of(patch_rects)
+        ground_layout = verbs.PixelLayout.from_rects(patch_rects)
         ground = None
         if with_ground:
-            ground = verbs.rasterize(geometry.ground_clip, faces, face_ranges, ground_layout, backend)
-        return Drawn(geometry, mesh, coverage, tuple(reach), ground_layout, ground)
+            ground = verbs.rasterize(geometry.patch_clip, faces, face_ranges, ground_layout, backend)
+        return VisibleSurfaces(geometry, mesh, coverage, tuple(reach), ground_layout, ground)
 
 
-def joined(parts: Sequence[Tensor]) -> Tensor:
+def concat(parts: Sequence[Tensor]) -> Tensor:
     """Several scenes' rows, one after the other."""
     return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
-def photographed(objects: Objects) -> Objects:
+def at_photographed_pose(objects: Objects) -> Objects:
     """The objects at the geometry of their sources."""
     if not objects.source:
         return objects
@@ -662,7 +702,7 @@ def photographed(objects: Objects) -> Objects:
     )
 
 
-def _darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
+def _shadow_darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
     """What a shadow takes away, (3, h, w), continued a little beyond the frame, since the lookups' kernel reaches
     there."""
     if shadow is None or shadow.values.numel() == 0:
@@ -680,6 +720,6 @@ def patch_faces(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
     return faces, torch.cat([4 * start, 4 * start + 4], dim=1), torch.cat([2 * start, 2 * start + 2], dim=1)
 
 
-def active(code: Tensor) -> bool:
+def is_active(code: Tensor) -> bool:
     """Whether a code has to be applied: it is not 0, or somebody wants its gradient."""
     return code.requires_grad or bool((code.detach() != 0).any())

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import kept_within
+from scene_ir.geometry import clamp_inclusive
 from scene_ir.raster import verbs
 from scene_ir.render import channels, model, surfaces, texture
-from scene_ir.render.prepare import Drawn, Layers, Prepared, active, patch_faces
+from scene_ir.render.prepare import ObjectLayers, PreparedScene, VisibleSurfaces, is_active, patch_faces
 from scene_ir.render.sun import Sun
 from scene_ir.render.texture import smoothstep
 from scene_ir.types import Objects
@@ -66,7 +66,9 @@ class _Fringe:
     weight: Tensor
 
     @classmethod
-    def of(cls, layout: verbs.Layout, hit: Tensor, coverage: Tensor, mesh_pixel: Tensor, owner: Tensor) -> _Fringe:
+    def of(
+        cls, layout: verbs.PixelLayout, hit: Tensor, coverage: Tensor, mesh_pixel: Tensor, owner: Tensor
+    ) -> _Fringe:
         """hit, coverage, owner (T,): of all packed pixels; mesh_pixel (Rm,) int64: those that have a row."""
         row = (coverage.detach()[mesh_pixel] < 1).nonzero()[:, 0]
         pixel = mesh_pixel[row]
@@ -95,20 +97,22 @@ class _Fringe:
         return known.index_add(0, self.row, (1.0 - self.own)[:, None] * (mean - known[self.row]))
 
 
-def layers(prepared: Prepared, objects: Objects, drawn: Drawn, sun: Sun | None = None) -> Layers:
+def layers(
+    prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, sun: Sun | None = None
+) -> ObjectLayers:
     """`layers` in plain torch."""
     rows = _rows(prepared, drawn, bool(objects.source))
     size = drawn.mesh.layout.size
     if objects.source:
         shaded = _photographed_rows(prepared, objects, drawn, rows, sun)
     else:
-        plain = prepared.own_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
+        plain = prepared.template_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
         own = _mesh_attributes(prepared, drawn, rows, plain)
-        colour = kept_within(prepared.own_colour(rows.xy, rows.owner, own, sun), 0.0, 1.0)
+        colour = clamp_inclusive(prepared.shade_template(rows.xy, rows.owner, own, sun), 0.0, 1.0)
         z = own[:, channels.OWN_DEPTH]
         shaded = _Shaded(colour, torch.ones_like(z), z, own[:, channels.OWN_PAINT], own[:, channels.OWN_HEIGHT])
     colour, depth = shaded.colour, shaded.depth
-    if active(objects.texture_code):
+    if is_active(objects.texture_code):
         code, base = objects.texture_code.index_select(0, rows.owner), prepared.paint_lightness[rows.owner]
         colour = texture.apply_texture_code(colour, shaded.opacity, code, shaded.paint, shaded.height, base)
     opacity = shaded.opacity * rows.share
@@ -117,28 +121,28 @@ def layers(prepared: Prepared, objects: Objects, drawn: Drawn, sun: Sun | None =
     z = torch.full_like(drawn.mesh.depth, torch.inf).scatter_reduce(
         0, rows.pixel, depth.detach(), "amin", include_self=True
     )
-    return Layers(
+    return ObjectLayers(
         drawn.mesh.layout,
         packed.new_zeros(size, 4).index_add(0, rows.pixel, packed),
         opacity.new_zeros(size).index_add(0, rows.pixel, opacity),
         z,
-        drawn.ground_layout,
+        drawn.patch_layout,
         _shadow_factors(prepared, objects, drawn),
     )
 
 
-def _rows(prepared: Prepared, drawn: Drawn, with_halo: bool) -> _Rows:
+def _rows(prepared: PreparedScene, drawn: VisibleSurfaces, with_halo: bool) -> _Rows:
     layout = drawn.mesh.layout
     count = layout.rects.shape[0]
     covered = drawn.coverage.detach()
     hit = drawn.mesh.face >= 0
     mesh_pixel = (hit | (covered > 0)).nonzero()[:, 0]
-    owner = layout.draw()
+    owner = layout.draw_index()
     pixel, share = mesh_pixel, drawn.coverage.index_select(0, mesh_pixel)
     counts = torch.bincount(owner[mesh_pixel], minlength=count)
     anchor = mesh_pixel[:0]
     if with_halo:
-        nearest = drawn.nearest()
+        nearest = drawn.nearest_hits()
         halo_pixel = ((nearest >= 0) & (covered < 1)).nonzero()[:, 0]
         pixel = torch.cat([mesh_pixel, halo_pixel])
         share = torch.cat([share, 1.0 - drawn.coverage.index_select(0, halo_pixel)])
@@ -154,28 +158,30 @@ def _rows(prepared: Prepared, drawn: Drawn, with_halo: bool) -> _Rows:
     return _Rows(pixel, rows_owner, xy.to(prepared.like), share, counts, mesh_pixel.shape[0], fringe, anchor)
 
 
-def _mesh_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
+def _mesh_attributes(prepared: PreparedScene, drawn: VisibleSurfaces, rows: _Rows, attributes: Tensor) -> Tensor:
     """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
     dense = verbs.interpolate(
-        drawn.mesh, drawn.geometry.clip, prepared.fleet.faces, attributes, prepared.settings.backend
+        drawn.mesh, drawn.geometry.clip, prepared.object_surfaces.faces, attributes, prepared.settings.backend
     )
     return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
 
-def _averaged_attributes(prepared: Prepared, drawn: Drawn, rows: _Rows, attributes: Tensor) -> Tensor:
+def _averaged_attributes(
+    prepared: PreparedScene, drawn: VisibleSurfaces, rows: _Rows, attributes: Tensor
+) -> Tensor:
     """`_mesh_attributes`, but the mean over the pixels, at `model.SUBPIXELS`: what is thinner than a pixel would
     else be a row of dots. A place that is not reached counts as the pixel's centre."""
-    fleet, clip = prepared.fleet, drawn.geometry.clip.double()
+    fleet, clip = prepared.object_surfaces, drawn.geometry.clip.double()
     face = drawn.mesh.face[rows.pixel[: rows.mesh_rows]].long()
     hit = (face >= 0).nonzero()[:, 0]
     centre, start = rows.xy[hit].double(), face[hit]
     total = clip.new_zeros(len(hit), attributes.shape[1])
     for place in model.SUBPIXELS:
         xy = centre + clip.new_tensor(place) / 16.0
-        found = _walked(start, xy, clip.detach(), fleet.faces, fleet.beside)
+        found = _walked(start, xy, clip.detach(), fleet.faces, fleet.neighbours)
         xy = torch.where(found[:, None] < 0, centre, xy)
         corner = fleet.faces[torch.where(found < 0, start, found)]
-        share = surfaces.weights_at(clip[corner], xy)
+        share = surfaces.perspective_weights(clip[corner], xy)
         total = total + (share[..., None] * attributes.double()[corner]).sum(dim=1)
     mean = clip.new_zeros(len(face), attributes.shape[1]).index_copy(0, hit, total / len(model.SUBPIXELS))
     return rows.fringe.fill(mean.to(attributes))
@@ -201,11 +207,20 @@ def _walked(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tenso
 
 
 def _photographed_rows(
-    prepared: Prepared, objects: Objects, drawn: Drawn, rows: _Rows, sun: Sun | None
+    prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, rows: _Rows, sun: Sun | None
 ) -> _Shaded:
     """All rows, coloured by the photograph, and completed where it did not see the mesh."""
-    geometry, base, fleet, m = drawn.geometry, prepared.base, prepared.fleet, rows.mesh_rows
-    turn = torch.stack([geometry.cos - base.cos, base.cos, fleet.paint, prepared.height, geometry.brighter], dim=1)
+    geometry, base, fleet, m = drawn.geometry, prepared.base_geometry, prepared.object_surfaces, rows.mesh_rows
+    turn = torch.stack(
+        [
+            geometry.facing_cos - base.facing_cos,
+            base.facing_cos,
+            fleet.paint,
+            prepared.vertex_height,
+            geometry.brightening,
+        ],
+        dim=1,
+    )
 
     attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
     dense = verbs.interpolate(drawn.mesh, geometry.clip, fleet.faces, attributes, prepared.settings.backend)
@@ -249,7 +264,7 @@ def _photographed_rows(
         colour = colour.index_add(0, need, filled[:, None] * completed)
         opacity = opacity.index_add(0, need, filled)
     assert prepared.regions is not None
-    if active(objects.texture_code) and bool(prepared.regions.known.any()):
+    if is_active(objects.texture_code) and bool(prepared.regions.known.any()):
         unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
         found = prepared.regions.texels.sample_parts(uv, rows.counts, prepared.settings.backend)[:, 0]
         paint = texture.paint_share(paint, found, unseen, prepared.regions.known[rows.owner])
@@ -257,9 +272,9 @@ def _photographed_rows(
 
 
 def _completion(
-    prepared: Prepared,
+    prepared: PreparedScene,
     objects: Objects,
-    drawn: Drawn,
+    drawn: VisibleSurfaces,
     rows: _Rows,
     need: Tensor,
     cos_now: Tensor,
@@ -270,10 +285,10 @@ def _completion(
 
     cos_now: (Rm,) towards the camera.
     """
-    attributes = prepared.all_attributes(prepared.normals(objects), drawn.geometry.clip[:, 2])
+    attributes = prepared.completion_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
     own = _averaged_attributes(prepared, drawn, rows, attributes)[need]
     gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
-    colour = texture.finished(prepared.own_colour(rows.xy[need], rows.owner[need], own, sun), gain, lift)
+    colour = texture.finished(prepared.shade_template(rows.xy[need], rows.owner[need], own, sun), gain, lift)
     clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
     z = clip[:, 2]
     safe = z.clamp(min=model.NEAREST_MIRRORED_M)
@@ -293,29 +308,29 @@ def _completion(
     )
     rgb, alpha = seen[:, : channels.ALPHA], seen[:, channels.ALPHA : channels.HIDDEN]
     straight = rgb / alpha.clamp(min=model.LEAST_MIRRORED_ALPHA)
-    return colour + weight[:, None] * (kept_within(straight, 0.0, 1.0) - colour)
+    return colour + weight[:, None] * (clamp_inclusive(straight, 0.0, 1.0) - colour)
 
 
-def _shadow_factors(prepared: Prepared, objects: Objects, drawn: Drawn) -> Tensor:
+def _shadow_factors(prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces) -> Tensor:
     """Factors (Ts, 3) on the ground, of all patches."""
-    clip, layout = drawn.geometry.ground_clip, drawn.ground_layout
-    assert drawn.ground is not None
+    clip, layout = drawn.geometry.patch_clip, drawn.patch_layout
+    assert drawn.patch_fragments is not None
     if layout.size == 0:
         return clip.new_zeros(0, 3)
     faces, _, _ = patch_faces(len(objects), clip.device)
     if not objects.source:
-        return (1.0 - prepared.ground_density(drawn))[:, None].expand(-1, 3)
-    base = prepared.base.ground_clip
+        return (1.0 - prepared.patch_density(drawn))[:, None].expand(-1, 3)
+    base = prepared.base_geometry.patch_clip
     fixed = torch.cat([base - clip, base[:, 2:]], dim=1)
-    dense = verbs.interpolate(drawn.ground, clip, faces, fixed, prepared.settings.backend)
-    hit = (drawn.ground.face >= 0).nonzero()[:, 0]
-    xy = layout.pixels()[hit].to(prepared.like)
+    dense = verbs.interpolate(drawn.patch_fragments, clip, faces, fixed, prepared.settings.backend)
+    hit = (drawn.patch_fragments.face >= 0).nonzero()[:, 0]
+    xy = layout.pixel_xy()[hit].to(prepared.like)
     wanted = xy + _lookup(dense.index_select(0, hit), xy)[:, :2]
     height, width = prepared.frame_hw
     # Constant from the border on, where `_darkness` repeats it: clamping two pixels beyond leaves no kink.
     uv = wanted.clamp(min=-2.0).minimum(wanted.new_tensor([width + 1.0, height + 1.0]))
     assert prepared.shadows is not None
-    owner = layout.draw()[hit]
+    owner = layout.draw_index()[hit]
     rect = prepared.shadows.rects[owner]
     reached = ((uv > rect[:, :2] - 2) & (uv < rect[:, 2:] + 1)).all(dim=1).nonzero()[:, 0]
     hit, uv, wanted = hit[reached], uv.index_select(0, reached), wanted.index_select(0, reached)

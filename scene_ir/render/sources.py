@@ -18,11 +18,11 @@ from torch import Tensor
 from scene_ir.errors import ShapeError
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
-from scene_ir.raster.layout import Layout
+from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, finish, model, surfaces, texture
 from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import Drawn, RenderSettings
-from scene_ir.render.surfaces import nearest_true
+from scene_ir.render.prepare import RenderSettings, VisibleSurfaces
+from scene_ir.render.surfaces import nearest_true_pixel
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _EXTENSION_PX = 4.5
@@ -123,8 +123,8 @@ def _solve(
     blank = [_source(scene, i, alphas[i], shadows[i], margins_px[i], settings) for i in range(len(objects))]
     staged = scene.with_objects(source=tuple(blank))  # type: ignore[arg-type]
     compositor = Compositor(staged, RenderSettings(settings.backend), whole_patches=True)
-    drawn = compositor.draw(compositor.scene.objects)
-    nearest = drawn.nearest()
+    drawn = compositor.find_visible(compositor.scene.objects)
+    nearest = drawn.nearest_hits()
     count = len(objects)
     mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(count)]
     mattes += [replace(f.foreground, values=f.foreground.values[3:].to(image)) for f in scene.occluders]
@@ -211,8 +211,8 @@ def _lit_sources(
         plain.append(replace(source, foreground=replace(matte, values=torch.cat([colour, matte.values]))))
     whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), occluders=())
     compositor = Compositor(whole, RenderSettings(settings.backend), hidden=hidden)
-    samples = compositor.samples()
-    seen = list(zip(compositor.fleet.surfaces, samples, strict=True))
+    samples = compositor.sample_photograph()
+    seen = list(zip(compositor.object_surfaces.surfaces, samples, strict=True))
     strength = finish.sunlight(seen, [_by_shadow(s, scene.environment.sun) for s in shadows])
     paint = compositor.base_paint(samples)
     return [replace(s, paint=paint[i], sunlight=strength) for i, s in enumerate(blank)]
@@ -240,7 +240,7 @@ def _meet(rect: Sequence[int], matte: Crop) -> bool:
     return bool(h and w) and across and matte.y0 <= rect[3] and rect[1] <= matte.y0 + h
 
 
-def _cut(alpha: Crop, drawn: Drawn, nearest: Tensor, index: int, like: Tensor) -> Crop:
+def _cut(alpha: Crop, drawn: VisibleSurfaces, nearest: Tensor, index: int, like: Tensor) -> Crop:
     """The matte where mesh and halo carry it, trimmed to where it is above 0 and what it may be continued to."""
     packed, size = drawn.mesh.layout.spans()[index]
     x0, y0, x1, y1 = drawn.mesh.layout.rects[index].tolist()
@@ -263,17 +263,17 @@ def _trimmed(crop: Crop, keep: Tensor, grow: int = 0) -> Crop:
 
 def _shadow_crops(
     compositor: Compositor,
-    drawn: Drawn,
+    drawn: VisibleSurfaces,
     shadows: list[Crop | None],
     covered: Tensor,
     settings: SolveSettings,
 ) -> list[Crop]:
     """The shadows' factors (3, h, w) on the patches that carry them, continued under the vehicles."""
-    density = compositor.ground_density(drawn)
-    assert drawn.ground is not None
+    density = compositor.patch_density(drawn)
+    assert drawn.patch_fragments is not None
     out = []
-    for i, (packed, size) in enumerate(drawn.ground_layout.spans()):
-        x0, y0 = drawn.ground_layout.rects[i, :2].tolist()
+    for i, (packed, size) in enumerate(drawn.patch_layout.spans()):
+        x0, y0 = drawn.patch_layout.rects[i, :2].tolist()
         shadow = shadows[i]
         if shadow is None or min(size) == 0:
             out.append(Crop(density.new_ones(3, 0, 0), x0, y0))
@@ -285,7 +285,7 @@ def _shadow_crops(
         expected = density[packed].reshape(size)
         if settings.complete_shadows:
             dark = _continue_shadow(dark, expected, covered[y0 : rect[3], x0 : rect[2]])
-        hit = (drawn.ground.face[packed] >= 0).reshape(1, *size)
+        hit = (drawn.patch_fragments.face[packed] >= 0).reshape(1, *size)
         dark = dark * (hit & (dark.amax(dim=0, keepdim=True) > 0.5 / _LEVELS))
         out.append(_trimmed(Crop(1.0 - dark, x0, y0), dark.amax(dim=0) > 0))
     return out
@@ -371,7 +371,7 @@ def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, cove
     solid = (seen & (raised > 0.5)).numpy()
     if bool(seen.all()) or not solid.any():
         return replace(matte, values=values)
-    distance, index = (torch.from_numpy(part) for part in nearest_true(solid))
+    distance, index = (torch.from_numpy(part) for part in nearest_true_pixel(solid))
     straight = (colour / raised.clamp(min=0.5)).flatten(1)[:, index]
     rect = (matte.x0, matte.y0, matte.x0 + w, matte.y0 + h)
     filled = texture.crop_of(coverage, rect, (image.shape[1], image.shape[2])).to(values)
@@ -385,7 +385,7 @@ def _plausible(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
     nearest pixel that is all vehicle, `solid` (h, w), and a little beyond."""
     if not bool(solid.any()):
         return torch.zeros_like(goal), torch.ones_like(goal)
-    index = torch.from_numpy(nearest_true(solid.numpy())[1])
+    index = torch.from_numpy(nearest_true_pixel(solid.numpy())[1])
     inside = goal.flatten(1)[:, index]
     low = (torch.minimum(goal, inside) - _COLOUR_SLACK).clamp(min=0.0)
     return low, (torch.maximum(goal, inside) + _COLOUR_SLACK).clamp(max=1.0)
@@ -407,7 +407,7 @@ def _with_layer(alone: Compositor) -> Tensor:
     """The background of a scene of one object with that object laid over it, without its shadow."""
     objects, background = alone.scene.objects, alone.scene.background
     layers = alone.layers(objects)
-    no_shadow = Layout.of(layers.shadow_layout.rects * 0)
+    no_shadow = PixelLayout.from_rects(layers.shadow_layout.rects * 0)
     plan = blend.Plan.of(layers.layout, no_shadow, range(len(objects)))
     what = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
     return blend.composite(background, alone.scene.depth, what, plan, False, alone.settings.backend)[0]

@@ -28,14 +28,14 @@ CREASE_RAD = 0.7
 tools."""
 SHADOW_MARGIN_M = 0.8
 """How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
-_UNSHARED = 1 << 15
+_GRAIN_SIZE = 1 << 15
 """So many values torch computes in one thread (ATen's GRAIN_SIZE)."""
-_WELD = 1e-5
+_WELD_DISTANCE = 1e-5
 """Vertices of the unit box nearer than this are one point."""
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class TemplateSurface:
     """A mesh made ready to draw, sharp edges split.
 
     unit (V, 3), faces (F, 3) int64; beside (F, 3) int64: the face across the edge that is opposite to each corner,
@@ -46,7 +46,7 @@ class Surface:
 
     unit: Tensor
     faces: Tensor
-    beside: Tensor
+    neighbours: Tensor
     weights: Tensor
     mirror_weights: Tensor
     weld: Tensor
@@ -57,16 +57,20 @@ class Surface:
     closed: bool
 
     @classmethod
-    def of(cls, mesh: Mesh, dtype: torch.dtype) -> Surface:
+    def from_mesh(cls, mesh: Mesh, dtype: torch.dtype) -> TemplateSurface:
         """The surface of `mesh`; prepared once a mesh and kept while few others are used."""
-        return _surface(mesh.vertices, mesh.faces, mesh.part, mesh.colours, dtype)
+        return _build_surface(mesh.vertices, mesh.faces, mesh.part, mesh.colours, dtype)
 
 
 @lru_cache(maxsize=128)
-def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | None, dtype: torch.dtype) -> Surface:
+def _build_surface(
+    vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | None, dtype: torch.dtype
+) -> TemplateSurface:
     points = vertices.detach().cpu().numpy().astype(np.float64)
     triangles = faces.cpu().numpy()
-    weld = np.unique(np.round(points / _WELD).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+    weld = np.unique(np.round(points / _WELD_DISTANCE).astype(np.int64), axis=0, return_inverse=True)[1].reshape(
+        -1
+    )
     normals = _crease_normals(points, triangles, weld)
     corner = triangles.reshape(-1)
     key = np.concatenate([corner[:, None], np.round(normals * 500).astype(np.int64)], axis=1)
@@ -78,18 +82,20 @@ def _surface(vertices: Tensor, faces: Tensor, part: Tensor, colours: Tensor | No
     grey = torch.full((len(points), 3), 0.7) if colours is None else colours.detach().cpu()
     kinds = part.cpu()
     tensors = (
-        unit, new_faces, torch.as_tensor(_beside(weld[triangles])), lattice_weights(unit),
+        unit, new_faces, torch.as_tensor(_face_neighbours(weld[triangles])), lattice_weights(unit),
         lattice_weights(mirror), torch.as_tensor(weld)[origin],
         grey[origin].to(dtype),
-        _share(new_faces, kinds == Part.PAINT, unit), _share(new_faces, kinds == Part.GLASS, unit),
+        _part_share(new_faces, kinds == Part.PAINT, unit), _part_share(new_faces, kinds == Part.GLASS, unit),
         torch.zeros(len(first), dtype=torch.int64).index_copy(
             0, new_faces.reshape(-1).flip(0), kinds.repeat_interleave(3).flip(0)
         ),
     )  # fmt: skip
-    return Surface(*(t.to(vertices.device) for t in tensors), closed=_closed(points[triangles], weld[triangles]))
+    return TemplateSurface(
+        *(t.to(vertices.device) for t in tensors), closed=_is_closed(points[triangles], weld[triangles])
+    )
 
 
-def _beside(faces: np.ndarray) -> np.ndarray:
+def _face_neighbours(faces: np.ndarray) -> np.ndarray:
     """See `Surface.beside`. faces (F, 3): of welded points."""
     edges = np.sort(
         np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1
@@ -103,7 +109,7 @@ def _beside(faces: np.ndarray) -> np.ndarray:
     return beside.reshape(-1, 3)
 
 
-def _closed(corners: np.ndarray, faces: np.ndarray) -> bool:
+def _is_closed(corners: np.ndarray, faces: np.ndarray) -> bool:
     """Whether faces (F, 3) of welded points bound volumes and look outwards, so that their backs are never seen.
 
     corners (F, 3, 3): where the faces' corners lie. Each edge must be passed once in each direction, and every
@@ -143,7 +149,7 @@ def _crease_normals(points: np.ndarray, faces: np.ndarray, weld: np.ndarray) -> 
     return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
 
 
-def _share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
+def _part_share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
     """The share (V,) of the faces around each vertex that are of one part."""
     index = faces.reshape(-1)
     flags = is_part.to(like.dtype).repeat_interleave(3)
@@ -151,31 +157,31 @@ def _share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
     return like.new_zeros(like.shape[0]).index_add(0, index, flags) / total.clamp(min=1.0)
 
 
-def shifted(numbers: Sequence[Tensor], counts: Sequence[int]) -> list[Tensor]:
+def offset_indices(numbers: Sequence[Tensor], counts: Sequence[int]) -> list[Tensor]:
     """Numbers of what lies in several sets, so many in each, once these lie one after the other; -1 stays."""
     return [torch.where(n < 0, n, n + sum(counts[:i])) for i, n in enumerate(numbers)]
 
 
 @dataclass(frozen=True, slots=True)
-class Fleet:
+class ObjectSurfaces:
     """The surfaces of N objects, one after the other.
 
     owner (V,) int64: the object of each vertex; vertex_ranges, face_ranges (N, 2) int64; faces (F, 3) int64 into
     the V vertices; beside (F, 3) int64, see `Surface`, into the F faces; colours (V, 3); paint, glass (V,).
     """
 
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[TemplateSurface, ...]
     owner: Tensor
     vertex_ranges: Tensor
     face_ranges: Tensor
     faces: Tensor
-    beside: Tensor
+    neighbours: Tensor
     colours: Tensor
     paint: Tensor
     glass: Tensor
 
     @classmethod
-    def of(cls, surfaces: Sequence[Surface], like: Tensor) -> Fleet:
+    def from_surfaces(cls, surfaces: Sequence[TemplateSurface], like: Tensor) -> ObjectSurfaces:
         """`like`: a tensor of the dtype and device to work in."""
         device = like.device
         ends = np.cumsum([0] + [s.unit.shape[0] for s in surfaces])
@@ -188,8 +194,8 @@ class Fleet:
         def packed(parts: list[Tensor], *shape: int) -> Tensor:
             return torch.cat(parts) if parts else like.new_zeros(shape)
 
-        faces = shifted([s.faces for s in surfaces], counts.tolist())
-        beside = shifted([s.beside for s in surfaces], [s.faces.shape[0] for s in surfaces])
+        faces = offset_indices([s.faces for s in surfaces], counts.tolist())
+        beside = offset_indices([s.neighbours for s in surfaces], [s.faces.shape[0] for s in surfaces])
         return cls(
             tuple(surfaces),
             torch.repeat_interleave(torch.arange(len(surfaces)), counts).to(device),
@@ -203,7 +209,7 @@ class Fleet:
         )
 
     @staticmethod
-    def joined(fleets: Sequence[Fleet]) -> tuple[Tensor, list[list[int]], list[list[int]]]:
+    def concat_faces(fleets: Sequence[ObjectSurfaces]) -> tuple[Tensor, list[list[int]], list[list[int]]]:
         """Faces (F, 3) of several fleets' vertices, one after the other; vertex and face ranges of all objects."""
         vertex_ranges: list[list[int]] = []
         face_ranges: list[list[int]] = []
@@ -216,16 +222,16 @@ class Fleet:
             triangles += fleet.faces.shape[0]
         return torch.cat(faces), vertex_ranges, face_ranges
 
-    def local(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
+    def local_vertices(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
         """Vertices (V, 3) m in their objects' frames. ffd (N, P, 3); size_lhw (N, 3) m; mirrored: left and right
         swapped."""
         parts = []
         for i, surface in enumerate(self.surfaces):
             if mirrored:
                 unit = surface.unit * surface.unit.new_tensor([1.0, 1.0, -1.0])
-                unit = unit + _Bend.apply(ffd[i], surface.mirror_weights)
+                unit = unit + _LatticeBend.apply(ffd[i], surface.mirror_weights)
             else:
-                unit = surface.unit + _Bend.apply(ffd[i], surface.weights)
+                unit = surface.unit + _LatticeBend.apply(ffd[i], surface.weights)
             parts.append(unit * size_lhw[i])
         return torch.cat(parts) if parts else ffd.new_zeros(0, 3)
 
@@ -242,17 +248,17 @@ class Fleet:
             return local, local
         return torch.cat(sharp), torch.cat(smooth)
 
-    def spread(self, values: Tensor) -> Tensor:
+    def per_vertex(self, values: Tensor) -> Tensor:
         """Values (N, ...) of the objects at their vertices (V, ...)."""
         return values.index_select(0, self.owner)
 
     def place(self, local: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
         """Camera-space points (V, 3) m of local ones. yaw (N,) rad; translation (N, 3) m."""
-        return rotate(local, self.spread(yaw)) + self.spread(translation)
+        return rotate_y(local, self.per_vertex(yaw)) + self.per_vertex(translation)
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class VertexPlacement:
     """What placing vertices by kernels takes besides poses. unit (V, 3); weights: of each object, (v, P); normal
     (V, 3) unit, local; owner (V,) int32; paint (V,); ffd (N, P, 3) and bent (V, 3): the photograph's offsets, and
     what they are at the vertices; lit (V,): how squarely its sun meets them; sunlight (N,): how strong that is, 0
@@ -265,16 +271,16 @@ class Rig:
     normal: Tensor
     owner: Tensor
     paint: Tensor
-    ffd: Tensor
-    bent: Tensor
-    lit: Tensor
+    base_ffd: Tensor
+    base_bend: Tensor
+    base_exposure: Tensor
     sunlight: Tensor
     matrix: Tensor
     centre: Tensor
-    edges: list[int]
+    vertex_edges: list[int]
 
     @classmethod
-    def pack(cls, rigs: Sequence[Rig]) -> Rig:
+    def concat(cls, rigs: Sequence[VertexPlacement]) -> VertexPlacement:
         """Several scenes' objects, one after the other."""
         if len(rigs) == 1:
             return rigs[0]
@@ -282,10 +288,10 @@ class Rig:
         shifts = [sum(counts[:i]) for i in range(len(counts))]
         edges = [0]
         for rig in rigs:
-            edges += [edges[-1] + e for e in rig.edges[1:]]
+            edges += [edges[-1] + e for e in rig.vertex_edges[1:]]
         plain = ("unit", "normal", "paint", "ffd", "lit", "sunlight", "matrix", "centre")
         return cls(
-            bent=torch.cat([r.bent for r in rigs], 1),
+            bent=torch.cat([r.base_bend for r in rigs], 1),
             weights=tuple(w for r in rigs for w in r.weights),
             owner=torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
             edges=edges,
@@ -293,7 +299,9 @@ class Rig:
         )
 
     @classmethod
-    def of(cls, fleet: Fleet, base: Objects, normal: Tensor, camera: Camera, sun: Tensor, sunlight: Tensor) -> Rig:
+    def from_objects(
+        cls, fleet: ObjectSurfaces, base: Objects, normal: Tensor, camera: Camera, sun: Tensor, sunlight: Tensor
+    ) -> VertexPlacement:
         """Of one scene's objects, as photographed. normal (V, 3), welded; sun (3,) and sunlight (N,): the
         photograph's."""
         count, like = len(base), normal
@@ -311,32 +319,32 @@ class Rig:
             centre=camera_centre(camera.matrix).to(like).expand(count, 3).contiguous(),
             edges=[0, *fleet.vertex_ranges[:, 1].tolist()],
         )
-        rig = replace(rig, bent=rig.bend(base.ffd), ffd=base.ffd)
+        rig = replace(rig, bent=rig.bend_vertices(base.ffd), ffd=base.ffd)
         lights = torch.cat([sun.to(like).expand(count, 3), sunlight[:, None]], dim=1)
         poses = base.ffd, base.size_lhw, base.yaw, base.translation
-        return replace(rig, lit=placed(rig, *poses, lights)[3]) if count else rig
+        return replace(rig, lit=place_with_kernels(rig, *poses, lights)[3]) if count else rig
 
-    def bend(self, ffd: Tensor) -> Tensor:
+    def bend_vertices(self, ffd: Tensor) -> Tensor:
         """What offsets (N, P, 3) are at the vertices, as fractions of the unit box: rows x, y, z (3, V), which a
         product with three rows gives three times as fast as one with three columns.
         """
-        if torch.equal(ffd, self.ffd):
-            return self.bent
+        if torch.equal(ffd, self.base_ffd):
+            return self.base_bend
         linear = torch.nn.functional.linear
         parts = [linear(own.T.contiguous(), weights) for own, weights in zip(ffd, self.weights, strict=True)]
         return torch.cat(parts, 1)
 
-    def unbend(self, to_bent: Tensor) -> Tensor:
+    def bend_gradient(self, to_bent: Tensor) -> Tensor:
         """A gradient to that (3, V), as one to offsets (N, P, 3)."""
         parts = [
             (to_bent[:, a:b].contiguous() @ w).T
-            for (a, b), w in zip(itertools.pairwise(self.edges), self.weights, strict=True)
+            for (a, b), w in zip(itertools.pairwise(self.vertex_edges), self.weights, strict=True)
         ]
         return torch.stack(parts)
 
 
-def placed(
-    rig: Rig, ffd: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor, lights: Tensor
+def place_with_kernels(
+    rig: VertexPlacement, ffd: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor, lights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """By the kernels, in float32: clip coordinates (V, 3) of objects' vertices, the cosines (V,) of their normals
     to the camera, how much brighter they are (V,), see `texture.brightened`, and how squarely the sun meets them
@@ -349,7 +357,7 @@ def placed(
     return found
 
 
-def patches(
+def place_patches(
     yaw: Tensor, translation: Tensor, size_lhw: Tensor, lights: Tensor, fixed: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """By the kernels: from a pixel (x, y, 1) to its place (s, t, 1) / w on an object's patch of ground (N, 3, 3)
@@ -363,19 +371,19 @@ def patches(
     return found
 
 
-def place(
+def place_vertices(
     local: Tensor, normal: Tensor, owner: Tensor, objects: Objects, matrix: Tensor, centre: Tensor
 ) -> tuple[Tensor, Tensor]:
     """In plain torch: clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals
     (V, 3) to the camera. owner (V,) int64; matrix (3, 4), centre (3,) m of the camera.
     """
     turn = objects.yaw.index_select(0, owner)
-    points = rotate(local, turn) + objects.translation.index_select(0, owner)
+    points = rotate_y(local, turn) + objects.translation.index_select(0, owner)
     clip = points @ matrix[:, :3].T + matrix[:, 3]
-    return clip, facing(points, rotate(normal, turn), centre)
+    return clip, facing_cosine(points, rotate_y(normal, turn), centre)
 
 
-class _Bend(torch.autograd.Function):
+class _LatticeBend(torch.autograd.Function):
     """weights (V, 64) @ offsets (64, 3), in the order of operands that is several times faster for three
     columns."""
 
@@ -389,14 +397,14 @@ class _Bend(torch.autograd.Function):
         return (grad_outputs[0].T.contiguous() @ ctx.weights).T, None
 
 
-def rotate(local: Tensor, yaw: Tensor) -> Tensor:
+def rotate_y(local: Tensor, yaw: Tensor) -> Tensor:
     """Vectors (V, 3) turned about the camera's y axis, each by its own yaw (V,) rad."""
     cos, sin = torch.cos(yaw), torch.sin(yaw)
     x, y, z = local.unbind(-1)
     return torch.stack([cos * x + sin * z, y, cos * z - sin * x], dim=-1)
 
 
-def facing(points: Tensor, normals: Tensor, centre: Tensor) -> Tensor:
+def facing_cosine(points: Tensor, normals: Tensor, centre: Tensor) -> Tensor:
     """Cosine (V,) between normals (V, 3) and the way to the camera at `centre` (3,), points (V, 3) m."""
     towards = centre - points
     return (towards * normals).sum(-1) / towards.norm(dim=-1).clamp(min=1e-6)
@@ -407,12 +415,12 @@ def camera_centre(matrix: Tensor) -> Tensor:
     return -torch.linalg.solve(matrix[:, :3], matrix[:, 3])
 
 
-def sun_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
+def shadow_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
     """How far (N, 2) m, (x, z) in the objects' frames, the shadow of a point at `height_m` (N,) falls. sun
     (3,)."""
     away = -sun / (-sun[1]).clamp(min=model.LEAST_SINE)
     world = torch.stack([away[0].expand_as(yaw), torch.zeros_like(yaw), away[2].expand_as(yaw)], dim=-1)
-    offset = rotate(world, -yaw)[:, [0, 2]] * height_m[:, None]
+    offset = rotate_y(world, -yaw)[:, [0, 2]] * height_m[:, None]
     length = offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     return offset * (length.clamp(max=model.SUN_OFFSET_MAX_M) / length)
 
@@ -420,10 +428,10 @@ def sun_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
 def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
     """Corners (N, 4, 2) m, (x, z) in the objects' frames, of the ground patches that hold the shadows."""
     half = size_lhw[:, [0, 2]] / 2 + SHADOW_MARGIN_M
-    return rectangle(-half + offset.clamp(max=0.0), half + offset.clamp(min=0.0))
+    return rectangle_corners(-half + offset.clamp(max=0.0), half + offset.clamp(min=0.0))
 
 
-def outwards(points: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
+def outwardness(points: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
     """How far out (N, K) along their shadows' offsets (N, 2) m points (N, K, 2) m lie: 0 in the objects' middle, 1
     where the shadow of the roof's far edge ends. Linear in the points, which are (x, z) in the objects' frames."""
     length = offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
@@ -432,14 +440,14 @@ def outwards(points: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
     return (points * along[:, None]).sum(dim=-1) / (edge + length)
 
 
-def rectangle(low: Tensor, high: Tensor) -> Tensor:
+def rectangle_corners(low: Tensor, high: Tensor) -> Tensor:
     """Corners (..., 4, 2), one after the other, of rectangles from low to high (..., 2)."""
     x = torch.stack([low[..., 0], high[..., 0], high[..., 0], low[..., 0]], dim=-1)
     z = torch.stack([low[..., 1], low[..., 1], high[..., 1], high[..., 1]], dim=-1)
     return torch.stack([x, z], dim=-1)
 
 
-def on_ground(
+def pixels_to_ground(
     pixels: Tensor, unproject: Tensor, centre: Tensor, translation: Tensor, yaw: Tensor, ground: Tensor
 ) -> Tensor | None:
     """Points (K, 2) m, (x, z) in an object's frame, that pixels (K, 2) show of the ground at its foot.
@@ -455,7 +463,7 @@ def on_ground(
     if not bool(((distance > 0) & (along.abs() > 1e-6)).all()):
         return None
     points = centre + distance[:, None] * ray - translation
-    return rotate(points, -yaw.expand(len(points)))[:, [0, 2]]
+    return rotate_y(points, -yaw.expand(len(points)))[:, [0, 2]]
 
 
 def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: Tensor) -> Tensor:
@@ -464,7 +472,7 @@ def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: T
     flat = torch.stack([corners[..., 0], torch.zeros_like(corners[..., 0]), corners[..., 1]], dim=-1).reshape(
         -1, 3
     )
-    turned = rotate(flat, yaw.repeat_interleave(4))
+    turned = rotate_y(flat, yaw.repeat_interleave(4))
     x, _, z = turned.unbind(-1)
     y = -(ground[0] * x + ground[2] * z) / ground[1]
     return torch.stack([x, y, z], dim=-1) + translation.repeat_interleave(4, dim=0)
@@ -484,18 +492,20 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
         apart = (q.clamp(min=0.0).square().sum(-1) + 1e-6).sqrt()
         return apart + q.amax(dim=-1).clamp(max=0.0)
 
-    contact = _sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
+    contact = _thread_invariant_sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
     shares = ((0.25, 0.97), (0.55, 0.92), (0.9, 0.72))
-    cast = torch.stack([_sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares])
+    cast = torch.stack(
+        [_thread_invariant_sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares]
+    )
     lit = 1.0 - (1.0 - cast).prod(dim=0)
     return 1.0 - (1.0 - 0.72 * contact) * (1.0 - 0.55 * lit)
 
 
-def _sigmoid(values: Tensor) -> Tensor:
+def _thread_invariant_sigmoid(values: Tensor) -> Tensor:
     """Of any shape, alike for any number of threads: where torch shares values out, the last ones of each share
     are rounded otherwise.
     """
-    return torch.cat([part.sigmoid() for part in values.flatten().split(_UNSHARED)]).view_as(values)
+    return torch.cat([part.sigmoid() for part in values.flatten().split(_GRAIN_SIZE)]).view_as(values)
 
 
 def crop_rects(
@@ -569,14 +579,14 @@ def nearest_hits(
         if beside.all():
             nearest[start:end] = -1
             continue
-        distance, index = nearest_true(~beside)
+        distance, index = nearest_true_pixel(~beside)
         index += start
         index[distance > reach_px[i]] = -1
         nearest[start:end].copy_(torch.from_numpy(index.reshape(-1)))
     return nearest
 
 
-def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_true_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance (h, w) px to the nearest true pixel of a mask (h, w) that has one, and that pixel's flat index."""
     distance, labels = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
@@ -588,7 +598,7 @@ def nearest_true(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(distance), pixel_of.take(numbers)
 
 
-def weights_at(corners: Tensor, xy: Tensor) -> Tensor:
+def perspective_weights(corners: Tensor, xy: Tensor) -> Tensor:
     """Perspective-correct weights (K, 3) of corners, clip coordinates (K, 3, 3) of triangles, at pixels xy."""
     ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1).double()
     a, b, c = corners.double().unbind(dim=1)

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_ir.geometry import kept_within
+from scene_ir.geometry import clamp_inclusive
 from scene_ir.raster import verbs
 from scene_ir.render import model
-from scene_ir.render.surfaces import nearest_true
+from scene_ir.render.surfaces import nearest_true_pixel
 from scene_ir.types import Crop, Source
 
 _PAD = 2
@@ -76,7 +76,7 @@ class Texels:
         """Catmull-Rom lookups (R, C) at uv (R, 2) px of the frame, the rows grouped by object, counts (N,) of
         each."""
         zero = torch.zeros_like(counts)
-        layout = verbs.Layout.of(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
+        layout = verbs.PixelLayout.from_rects(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
         return verbs.texture_packed(self.values, self.rects, self.offsets, layout, uv, backend, border)
 
     def sample_parts(self, uv: Tensor, counts: Tensor, backend: verbs.Backend) -> Tensor:
@@ -166,7 +166,7 @@ def continued(values: Tensor, known: Tensor) -> Tensor:
     mask = known.cpu().numpy()
     if not mask.any():
         return values
-    index = torch.from_numpy(nearest_true(mask)[1]).to(values.device)
+    index = torch.from_numpy(nearest_true_pixel(mask)[1]).to(values.device)
     return values.flatten(1)[:, index]
 
 
@@ -250,7 +250,7 @@ def apply_texture_code(
     if index.numel() == 0:
         return colour
     alpha = opacity[index]
-    straight = kept_within(colour[index] / alpha.clamp(min=model.LEAST_ALPHA)[:, None], 0.0, 1.0)
+    straight = clamp_inclusive(colour[index] / alpha.clamp(min=model.LEAST_ALPHA)[:, None], 0.0, 1.0)
     arguments = (height[index], base_lightness[index])
     change = _paint(straight, code[index], *arguments) - _paint(
         straight, torch.zeros_like(code[index]), *arguments
@@ -262,14 +262,14 @@ def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) ->
     """The paint model: a curve in CIE L*, shifts of a* and b*, and a veil of dust. rgb (R, 3), code (R, 5)."""
     lightness, a, b = lab(rgb).unbind(-1)
     shift, red, yellow, gloss, dirt = code.unbind(-1)
-    level = kept_within(lightness / 100.0, *model.LEVEL)
+    level = clamp_inclusive(lightness / 100.0, *model.LEVEL)
     glossy = gloss * model.GLOSS_GAIN * (lightness - base_lightness) / model.GLOSSY_L
     level = torch.sigmoid(torch.logit(level) + model.LIGHTNESS_GAIN * shift + glossy)
     room = 4.0 * level * (1.0 - level)
     red, yellow = a + model.CHROMA_GAIN * red * room, b + model.CHROMA_GAIN * yellow * room
     changed = torch.stack([100.0 * level, red, yellow], dim=-1)
     out = rgb_of(changed)
-    veil = (dirt * model.DIRT_GAIN * (1.0 - model.CLEAN_ROOF * kept_within(height, 0.0, 1.0)))[:, None]
+    veil = (dirt * model.DIRT_GAIN * (1.0 - model.CLEAN_ROOF * clamp_inclusive(height, 0.0, 1.0)))[:, None]
     return out + veil * (out.new_tensor(model.DUST_RGB) - out)
 
 
@@ -325,7 +325,7 @@ def shade(
     foot, *heights = model.OCCLUDED
     occluded = foot + (1.0 - foot) * smoothstep(height, *heights)
     diffuse = daylight(normal, sun, sunlight) * occluded
-    cos = kept_within((normal * to_eye).sum(-1), 0.0, 1.0)
+    cos = clamp_inclusive((normal * to_eye).sum(-1), 0.0, 1.0)
     mirror = 2.0 * cos[:, None] * normal - to_eye
     sky_up = -mirror[:, 1]
     ground, horizon, zenith = (
@@ -338,7 +338,7 @@ def shade(
     least, more = model.GLASS_MIRRORS
     mirrored = model.PAINT_MIRRORS * paint * fresnel + glass * (least + more * fresnel)
     strength = mirrored * (0.5 + 0.5 * occluded)
-    glint = kept_within((mirror * sun).sum(-1), 0.0, 1.0).pow(40) * (
+    glint = clamp_inclusive((mirror * sun).sum(-1), 0.0, 1.0).pow(40) * (
         model.GLINT[0] * paint + model.GLINT[1] * glass
     )
     lit = albedo * diffuse[:, None]

@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, between, filled, launch, start_warp
+from scene_ir.raster.launch import array, launch, make_struct, split_by_work, start_warp
 from scene_ir.render import model
 
 start_warp()
@@ -365,7 +365,12 @@ class Blend(torch.autograd.Function):
         over = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
         under_shadow, under_layer = torch.empty_like(factor), torch.empty_like(colour)
         inputs = [
-            *(filled(Stack, *shadows), filled(Stack, *layers), array(factor, wp.vec3f), array(colour, wp.vec4f)),
+            *(
+                make_struct(Stack, *shadows),
+                make_struct(Stack, *layers),
+                array(factor, wp.vec3f),
+                array(colour, wp.vec4f),
+            ),
             *(array(opacity), array(depth), clamped, array(image), array(nearest), array(number)),
             *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over)),
         ]
@@ -394,7 +399,7 @@ class Blend(torch.autograd.Function):
         grad_factor, grad_colour = torch.empty_like(factor), torch.empty_like(under_layer)
         grad_opacity = torch.empty_like(opacity)
         inputs = [
-            *(filled(Stack, *shadows), filled(Stack, *layers), array(factor, wp.vec3f), array(opacity)),
+            *(make_struct(Stack, *shadows), make_struct(Stack, *layers), array(factor, wp.vec3f), array(opacity)),
             *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over), array(grad_image)),
             *(array(grad), array(grad_factor, wp.vec3f), array(grad_colour, wp.vec4f), array(grad_opacity)),
         ]
@@ -412,4 +417,4 @@ def row_edges(height: int, rects: np.ndarray) -> list[int]:
     np.add.at(change, rects[:, 1], width)
     np.add.at(change, rects[:, 3], -width)
     first, last = int(rects[:, 1].min()), int(rects[:, 3].max())
-    return between(list(range(first, last + 1)), change.cumsum()[first:last].tolist())
+    return split_by_work(list(range(first, last + 1)), change.cumsum()[first:last].tolist())

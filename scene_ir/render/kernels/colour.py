@@ -15,12 +15,12 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, log_, store, store3
-from scene_ir.raster.launch import halves, launch, start_warp
+from scene_ir.raster.lanes import SIMD_OPTIONS, exp_, load, load3, log_, store, store3
+from scene_ir.raster.launch import launch, split_range, start_warp
 from scene_ir.render import model
 
 start_warp()
-wp.set_module_options(OPTIONS)
+wp.set_module_options(SIMD_OPTIONS)
 
 SHARPNESS, BEYOND = model.GAMUT_SHARPNESS, math.exp(-model.GAMUT_SHARPNESS)
 GLOSS_PER_L = model.GLOSS_GAIN / model.GLOSSY_L
@@ -355,7 +355,7 @@ class _Paint(torch.autograd.Function):
     def forward(ctx: Any, *rows: Tensor) -> Tensor:
         given = [row.detach().contiguous() for row in rows]
         out = torch.empty_like(given[0])
-        launch(paint_kernel, halves(out.shape[0]), [array(t) for t in (*given, out)])
+        launch(paint_kernel, split_range(out.shape[0]), [array(t) for t in (*given, out)])
         ctx.save_for_backward(*given)
         return out
 
@@ -366,7 +366,7 @@ class _Paint(torch.autograd.Function):
         rows = given[0].shape[0]
         grads = given[0].new_empty(12, rows)
         inputs = [*(array(t) for t in (*given, grad)), rows]
-        launch(paint_adjoint_kernel, halves(rows), inputs, [array(grads)])
+        launch(paint_adjoint_kernel, split_range(rows), inputs, [array(grads)])
         return grads[9:].T, grads[0], grads[4:9].T, grads[1], grads[2], grads[3]
 
 

@@ -17,8 +17,8 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.lanes import OPTIONS, exp_, load, load3, store, store3, total
-from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.raster.lanes import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
+from scene_ir.raster.launch import launch, split_range, start_warp, threads
 from scene_ir.render import model
 from scene_ir.render.kernels.colour import (
     array,
@@ -35,7 +35,7 @@ from scene_ir.render.kernels.colour import (
 from scene_ir.types import Environment
 
 start_warp()
-wp.set_module_options(OPTIONS)
+wp.set_module_options(SIMD_OPTIONS)
 
 FOG, RAIN, NEAREST = model.FOG_EXTINCTION_PER_M, model.RAIN_EXTINCTION_PER_M, 1.0 / model.HAZE_CAP_M
 VEIL_BEND = model.VEIL_BEND**2
@@ -273,11 +273,11 @@ def before_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array
     change = cover_change(x, sky, settings)
     covered = x + overcast * change
     rain = model.DAMP * wp.dot(g, damp_change(grown(covered, gain)))
-    wetted = g + damping * ((DAMP * g + DAMP_GREY * total(g) * LUMA) - g)
+    wetted = g + damping * ((DAMP * g + DAMP_GREY * sum3(g) * LUMA) - g)
     time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, GAIN_SLOPE, 1))
     timed = grown(wetted, gain)
     flat = (1.0 - sky) * timed
-    grey_slope = FLAT_GREY * total(flat) + model.COVER_STRUCTURE * sky * total(timed)
+    grey_slope = FLAT_GREY * sum3(flat) + model.COVER_STRUCTURE * sky * sum3(timed)
     out = timed + overcast * ((FLAT * flat + grey_slope * LUMA) - timed)
     g_sky = overcast * wp.dot(timed, cover_change(x, 1.0, settings) - cover_change(x, 0.0, settings))
     return out, wp.vec3f(rain, time, model.OVERCAST * wp.dot(timed, change)), g_sky
@@ -557,7 +557,7 @@ def _rows(values: Tensor, above: float) -> tuple[int, int]:
 
 
 def _ranges(first: int, last: int) -> list[int]:
-    return [first + edge for edge in halves(last - first)]
+    return [first + edge for edge in split_range(last - first)]
 
 
 class _Scratch(threading.local):

@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, filled, launch, start_warp
+from scene_ir.raster.launch import array, launch, make_struct, start_warp
 from scene_ir.render import model
 
 start_warp()
@@ -236,7 +236,11 @@ class Patch(torch.autograd.Function):
         count, like = len(yaw), yaw
         clip = like.new_empty(count, 4, 3)
         patch, inside = (like.new_empty(count, 3, 3, dtype=torch.float64) for _ in range(2))
-        inputs = [filled(Photographed, *fixed), filled(Poses, *poses), filled(Found, clip, patch, inside)]
+        inputs = [
+            make_struct(Photographed, *fixed),
+            make_struct(Poses, *poses),
+            make_struct(Found, clip, patch, inside),
+        ]
         launch(patch_kernel, [0, count], inputs, (), like.device)
         ctx.kept = fixed, poses, clip, patch, inside
         ctx.mark_non_differentiable(patch, clip)
@@ -247,7 +251,11 @@ class Patch(torch.autograd.Function):
     def backward(ctx: Any, grad_inside: Tensor, *_: Tensor):
         fixed, poses, clip, patch, inside = ctx.kept
         to = [torch.zeros_like(t, dtype=torch.float64) for t in poses]
-        inputs = [filled(Photographed, *fixed), filled(Poses, *poses), filled(Found, clip, patch, inside)]
-        inputs = [*inputs, array(grad_inside.contiguous(), wp.mat33d), filled(ToPoses, *to)]
+        inputs = [
+            make_struct(Photographed, *fixed),
+            make_struct(Poses, *poses),
+            make_struct(Found, clip, patch, inside),
+        ]
+        inputs = [*inputs, array(grad_inside.contiguous(), wp.mat33d), make_struct(ToPoses, *to)]
         launch(patch_backward_kernel, [0, len(poses[0])], inputs, (), grad_inside.device)
         return *(t.to(poses[0].dtype) for t in to), None

@@ -17,8 +17,16 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, between, filled, halves, launch, load, share
-from scene_ir.raster.layout import Fragments, Layout
+from scene_ir.raster.launch import (
+    array,
+    launch,
+    load_kernel,
+    make_struct,
+    run_in_threads,
+    split_by_work,
+    split_range,
+)
+from scene_ir.raster.layout import Fragments, PixelLayout
 from scene_ir.render import channels, surfaces
 from scene_ir.render.kernels import ground, shading
 
@@ -36,7 +44,7 @@ class Setting:
     """
 
     fragments: Fragments
-    ground: Layout
+    ground: PixelLayout
     inside: Tensor
     reach_px: Sequence[float]
     faces: Tensor
@@ -63,7 +71,7 @@ class _Parts:
         ]
         # A GPU works on all at once; a painter is torch's.
         whole = s.faces.device.type != "cpu" or code is not None
-        self.edges = [0, count] if whole else between(list(range(count + 1)), work)
+        self.edges = [0, count] if whole else split_by_work(list(range(count + 1)), work)
 
 
 @dataclass(slots=True)
@@ -107,14 +115,16 @@ class Photographed(torch.autograd.Function):
         mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
-        pixels = filled(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
-        vertices = filled(shading.Vertices, s.faces, s.beside, clip, facing, brighter, s.base_clip, s.base, s.own)
-        photograph = filled(
+        pixels = make_struct(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
+        vertices = make_struct(
+            shading.Vertices, s.faces, s.beside, clip, facing, brighter, s.base_clip, s.base, s.own
+        )
+        photograph = make_struct(
             shading.Photograph, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
         )
-        looks = filled(shading.Looks, found, look, mesh, halo, fill)
-        layers = filled(shading.Layers, colour, opacity, depth)
-        patches = filled(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
+        looks = make_struct(shading.Looks, found, look, mesh, halo, fill)
+        layers = make_struct(shading.Layers, colour, opacity, depth)
+        patches = make_struct(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
         shadows = [array(ground_table, wp.vec4i), patches]
         tables = [
             [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
@@ -146,16 +156,16 @@ class Photographed(torch.autograd.Function):
                 launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
 
         for kernel in (shading.look_kernel, ground.shadow_kernel):
-            load(kernel)
-        share(work, parts.edges)
+            load_kernel(kernel)
+        run_in_threads(work, parts.edges)
         kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs, leaning)
         if s.painter is not None:
             with torch.enable_grad():
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
                 kept.painted = leaves, s.painter(*leaves, table, nearest)
             for name, painted in zip(("mesh", "halo"), kept.painted[1], strict=True):
-                looks.put(name, painted.detach().contiguous())
-            launch(shading.combine_kernel, halves(size), [pixels, looks, layers], (), device)
+                looks.set_array(name, painted.detach().contiguous())
+            launch(shading.combine_kernel, split_range(size), [pixels, looks, layers], (), device)
         ctx.setting, ctx.kept = s, kept
         ctx.mark_non_differentiable(depth)
         return colour, opacity, depth, shadow
@@ -179,8 +189,8 @@ class Photographed(torch.autograd.Function):
         grad_then = torch.zeros_like(s.inside)
         grad_turn = torch.zeros_like(kept.turn, dtype=torch.float64)
         grad_sun = torch.zeros(len(kept.turn), 4, dtype=torch.float64, device=device)
-        to_layers = filled(shading.Layers, grad_colour, grad_opacity, grad_opacity)  # depth has no gradient
-        grads = filled(
+        to_layers = make_struct(shading.Layers, grad_colour, grad_opacity, grad_opacity)  # depth has no gradient
+        grads = make_struct(
             *(shading.Gradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
             *(grad_clip, grad_facing, grad_brighter, grad_turn, grad_sun),
         )
@@ -213,17 +223,19 @@ class Photographed(torch.autograd.Function):
 
         grad_code = None
         if kept.painted is not None:
-            launch(shading.combine_backward_kernel, halves(size), [pixels, looks, to_layers, grads], (), device)
+            launch(
+                shading.combine_backward_kernel, split_range(size), [pixels, looks, to_layers, grads], (), device
+            )
             leaves, painted = kept.painted
             grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
                 painted, leaves, (grad_mesh, grad_halo), allow_unused=True
             )
             grad_fill.copy_(torch.zeros_like(grad_fill) if to_fill is None else to_fill)
             grad_mesh, grad_halo = grad_mesh.contiguous(), grad_halo.contiguous()
-            grads.put("mesh", grad_mesh)
-            grads.put("halo", grad_halo)
+            grads.set_array("mesh", grad_mesh)
+            grads.set_array("halo", grad_halo)
             grad_look.copy_(more)
-        share(work, parts.edges)
+        run_in_threads(work, parts.edges)
         turn = kept.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter

@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import between, filled, halves, launch, start_warp
+from scene_ir.raster.launch import launch, make_struct, split_by_work, split_range, start_warp
 from scene_ir.render import model
 
 start_warp()
@@ -200,8 +200,8 @@ class Place(torch.autograd.Function):
         templates, poses = _inputs(rig, bend, *kept)
         launch(
             place_kernel,
-            halves(count),
-            [templates, poses, filled(Places, clip, facing, lit, brighter)],
+            split_range(count),
+            [templates, poses, make_struct(Places, clip, facing, lit, brighter)],
             (),
             like.device,
         )
@@ -222,11 +222,11 @@ class Place(torch.autograd.Function):
         to_bend = like.new_empty(3, count)
         pose, to_size, to_lights = like.new_zeros(objects, 11, dtype=torch.float64).split([4, 3, 4], 1)
         pose, to_size, to_lights = pose.contiguous(), to_size.contiguous(), to_lights.contiguous()
-        to = filled(ToPoses, to_bend, pose, to_size, to_lights)
-        places = filled(Places, grads[0], grads[1], grads[1], grads[2])
+        to = make_struct(ToPoses, to_bend, pose, to_size, to_lights)
+        places = make_struct(Places, grads[0], grads[1], grads[1], grads[2])
         launch(
             place_backward_kernel,
-            between(rig.edges),
+            split_by_work(rig.edges),
             [*_inputs(rig, ctx.bend, *ctx.kept), places, to],
             (),
             like.device,
@@ -239,5 +239,5 @@ class Place(torch.autograd.Function):
 def _inputs(
     rig: Any, bend: Tensor, turn: Tensor, translation: Tensor, size: Tensor, lights: Tensor
 ) -> tuple[Any, Any]:
-    templates = filled(Templates, rig.unit, bend, rig.normal, rig.owner, rig.paint, rig.lit)
-    return templates, filled(Poses, turn, translation, size, rig.matrix, rig.centre, rig.sunlight, lights)
+    templates = make_struct(Templates, rig.unit, bend, rig.normal, rig.owner, rig.paint, rig.lit)
+    return templates, make_struct(Poses, turn, translation, size, rig.matrix, rig.centre, rig.sunlight, lights)

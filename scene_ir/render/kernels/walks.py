@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from scene_ir.raster.launch import array, halves, launch, start_warp
+from scene_ir.raster.launch import array, launch, split_range, start_warp
 from scene_ir.raster.plan import int32_faces
 
 start_warp()
@@ -137,5 +137,5 @@ def walked(
         *(array(here), array(goal), array(start, wp.vec3d), array(end, wp.vec3d)),
         *(array(face), array(share), array(edge), array(goes_on), array(plane, wp.vec3d), array(met)),
     ]
-    launch(walk_kernel, halves(count), inputs, (), points.device)
+    launch(walk_kernel, split_range(count), inputs, (), points.device)
     return face, share, edge, goes_on.bool(), plane, met.bool()

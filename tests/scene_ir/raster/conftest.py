@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_ir.geometry import place, to_clip
+from scene_ir.geometry import place_vertices, to_clip
 from scene_ir.meshes.lod import simplify
 from scene_ir.meshes.templates import template, typical_size_lhw
 from scene_ir.raster import verbs
@@ -43,7 +43,7 @@ class Crowd:
     def drawn(self, cull: bool) -> NDArray[np.float32]:
         """Depth (H, W) m by the fast backend, inf where nothing is hit."""
         clip, faces = self.packed()
-        layout = verbs.Layout.of(torch.tensor([[0, 0, WIDTH, HEIGHT]]))
+        layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, WIDTH, HEIGHT]]))
         found = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout, cull=cull)
         return found.depth.view(HEIGHT, WIDTH).numpy()
 
@@ -65,7 +65,7 @@ def crowd() -> Callable[[int], Crowd]:
                 x, z, yaw = 1.8 + u, 0.5 + 3.0 * w, math.pi / 2 + 0.1 * torch.rand(1, generator=generator)
             size = torch.tensor([typical_size_lhw(kind)])
             centre = torch.tensor([[x, 1.65 + 0.4 * v, z]])
-            points.append(place(mesh.vertices.to(torch.float32)[None], size, yaw, centre)[0])
+            points.append(place_vertices(mesh.vertices.to(torch.float32)[None], size, yaw, centre)[0])
         intrinsics = torch.tensor([[FOCAL, 0, WIDTH / 2 - 0.3], [0, FOCAL, HEIGHT * 0.4], [0, 0, 1]])
         return Crowd(tuple(points), tuple(m.faces for m in meshes), intrinsics)
 

@@ -12,7 +12,7 @@ BOTH = pytest.mark.parametrize("backend", ["reference", "warp"])
 
 def coverage_of(uvw, faces, backend="reference", size=(12, 14), near=verbs.NEAR_M):
     clip = torch.cat([uvw[:, :2] * uvw[:, 2:], uvw[:, 2:]], dim=1)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, size[1], size[0]]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, size[1], size[0]]]))
     faces = torch.as_tensor(faces)
     found = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout, backend, near)
     return verbs.antialias(found, clip, faces, backend).view(size)
@@ -97,7 +97,7 @@ def test_nothing_is_blended_at_the_border_of_a_draw(backend):
 def test_near_plane_is_no_outline(backend):
     # A ground strip that starts behind the camera: where the near plane cuts it, coverage stays hard.
     clip = torch.tensor([[-60.0, 5.0, -1.0], [40.0, 5.0, -1.0], [190.0, 54.0, 9.0], [170.0, 54.0, 9.0]])
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 41, 40]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 41, 40]]))
     faces = torch.tensor(QUAD)
     found = verbs.rasterize(clip, faces, torch.tensor([[0, 2]]), layout, backend, 0.5)
     coverage = verbs.antialias(found, clip, faces, backend)
@@ -115,7 +115,7 @@ def test_a_ball_is_covered_as_by_supersampling(triangles):
     factor = 16
     fine = torch.cat([(uvw[:, :2] + 0.5) * factor - 0.5, uvw[:, 2:]], dim=1)
     clip = torch.cat([fine[:, :2] * fine[:, 2:], fine[:, 2:]], dim=1).float()
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 42 * factor, 32 * factor]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 42 * factor, 32 * factor]]))
     found = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout)
     exact = (found.face >= 0).double().view(32, factor, 42, factor).mean(dim=(1, 3))
     hard = (exact >= 0.5).double()

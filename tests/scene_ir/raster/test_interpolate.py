@@ -9,7 +9,7 @@ from scene_ir.raster import verbs
 BOTH = pytest.mark.parametrize("backend", ["reference", "warp"])
 FACES = torch.tensor([[0, 1, 2], [1, 3, 2]])
 RANGES = torch.tensor([[0, 2]])
-LAYOUT = verbs.Layout.of(torch.tensor([[0, 0, 12, 10]]))
+LAYOUT = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 12, 10]]))
 
 
 def quad(dtype=torch.float32):
@@ -24,7 +24,7 @@ def test_attributes_linear_in_space_are_recovered_exactly(backend):
     found = verbs.rasterize(clip, FACES, RANGES, LAYOUT, backend)
     values = verbs.interpolate(found, clip, FACES, torch.cat([clip, torch.ones(4, 1)], dim=1), backend)
     hit = found.face >= 0
-    pixels = LAYOUT.pixels()[hit]
+    pixels = LAYOUT.pixel_xy()[hit]
     assert int(hit.sum()) > 40
     torch.testing.assert_close(values[hit, 2], found.depth[hit], rtol=1e-6, atol=0)
     torch.testing.assert_close(values[hit, :2], pixels * found.depth[hit, None], rtol=1e-5, atol=1e-5)
@@ -37,7 +37,7 @@ def test_value_by_hand(backend):
     # Halfway down the image from w = 1 to w = 3 it is not 1/2 but (1/2)/3 / ((1/2)/1 + (1/2)/3) = 1/4.
     clip = torch.tensor([[0.0, 0.0, 1.0], [8.0, 0.0, 1.0], [0.0, 24.0, 3.0]])
     faces, ranges = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1]])
-    layout = verbs.Layout.of(torch.tensor([[1, 4, 2, 5]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[1, 4, 2, 5]]))
     found = verbs.rasterize(clip, faces, ranges, layout, backend)
     value = verbs.interpolate(found, clip, faces, torch.tensor([[0.0], [0.0], [1.0]]), backend)
     assert float(value) == pytest.approx(0.25, abs=1e-7)
@@ -59,7 +59,7 @@ def test_reference_gradients_agree_with_central_differences():
 def test_near_plane_crossing_triangle_has_right_gradients():
     clip = torch.tensor([[-20.0, 10, -1], [40, 10, -1], [190, 55, 9]], dtype=torch.float64, requires_grad=True)
     faces, ranges = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1]])
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 41, 40]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 41, 40]]))
     found = verbs.rasterize(clip, faces, ranges, layout, "reference")
     assert int((found.face >= 0).sum()) > 50
     attributes = torch.tensor([[1.0], [2.0], [-1.0]], dtype=torch.float64)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from scene_ir.raster import verbs
 
-LAYOUT = verbs.Layout.of(torch.tensor([[0, 0, 40, 26], [10, 5, 10, 9], [3, 4, 33, 24]]))
+LAYOUT = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 40, 26], [10, 5, 10, 9], [3, 4, 33, 24]]))
 
 
 def soup(seed, count, behind, on_pixels):

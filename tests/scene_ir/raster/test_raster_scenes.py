@@ -20,7 +20,7 @@ from scene_ir.raster import kernels, launch, plan, verbs
 RECTS = torch.tensor(
     [[0, 0, 60, 44], [20, 10, 41, 33], [7, 7, 7, 20], [0, 0, 60, 44], [30, 20, 31, 21], [5, 0, 75, 9]]
 )
-LAYOUT = verbs.Layout.of(RECTS)
+LAYOUT = verbs.PixelLayout.from_rects(RECTS)
 FOCAL = 45.0
 
 
@@ -61,7 +61,7 @@ def solids(seed: int, nearest_m: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def everything(clip: Tensor, faces: Tensor, ranges: Tensor, backend: verbs.Backend, cull: bool | Tensor = False,
-               layout: verbs.Layout = LAYOUT) -> tuple[verbs.Fragments, list[Tensor]]:  # fmt: skip
+               layout: verbs.PixelLayout = LAYOUT) -> tuple[verbs.Fragments, list[Tensor]]:  # fmt: skip
     """What all verbs say, and the gradients of random sums of it."""
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(clip.shape[0], 4, generator=generator)
@@ -113,7 +113,11 @@ def test_one_draw_of_many_layers_is_the_reference_too(seed: int, nearest_m: floa
     shells = torch.cat([points * torch.tensor([1.0, 1.0, 1.0 + 0.01 * i]) for i in range(4)])
     layers = torch.cat([faces + i * len(points) for i in range(4)])
     layers = layers[torch.randperm(len(layers), generator=torch.Generator().manual_seed(seed))]
-    clip, ranges, layout = to_clip(shells), torch.tensor([[5, len(layers)]]), verbs.Layout.of(RECTS[:1])
+    clip, ranges, layout = (
+        to_clip(shells),
+        torch.tensor([[5, len(layers)]]),
+        verbs.PixelLayout.from_rects(RECTS[:1]),
+    )
     with sharing(threads):
         fast = everything(clip, layers, ranges, "warp", layout=layout)
     assert_same(fast, everything(clip, layers, ranges, "reference", layout=layout))
@@ -124,7 +128,7 @@ def test_one_draw_of_many_layers_is_the_reference_too(seed: int, nearest_m: floa
 def test_closed_solids_look_the_same_without_their_backs(seed: int, inside_out: bool) -> None:
     points, faces, ranges = solids(seed, 3.0)
     clip = to_clip(points)
-    layout = verbs.Layout.of(RECTS[:1].expand(6, 4))
+    layout = verbs.PixelLayout.from_rects(RECTS[:1].expand(6, 4))
     both = verbs.rasterize(clip, faces, ranges, layout)
     found = verbs.rasterize(clip, faces.flip(1) if inside_out else faces, ranges, layout, cull=True)
     assert int((both.face >= 0).sum()) > 0
@@ -147,9 +151,11 @@ def test_culling_is_right_across_the_near_plane(seed: int) -> None:
     a, b, c = points.to(torch.float64)[faces].unbind(1)
     facing = (torch.linalg.cross(b - a, c - a) * -a).sum(-1) > 0
     clip = to_clip(points)
-    kept = verbs.rasterize(clip, faces[facing], torch.tensor([[0, int(facing.sum())]]), verbs.Layout.of(RECTS[:1]))
+    kept = verbs.rasterize(
+        clip, faces[facing], torch.tensor([[0, int(facing.sum())]]), verbs.PixelLayout.from_rects(RECTS[:1])
+    )
     whole = torch.tensor([[0, len(faces)]])
-    culled = verbs.rasterize(clip, faces, whole, verbs.Layout.of(RECTS[:1]), cull=True)
+    culled = verbs.rasterize(clip, faces, whole, verbs.PixelLayout.from_rects(RECTS[:1]), cull=True)
     assert torch.equal(kept.depth, culled.depth)
 
 
@@ -171,7 +177,7 @@ def test_degenerate_and_extreme_triangles(seed: int) -> None:
     clip[count : count + len(extreme)] = extreme
     all_faces = torch.cat([faces, picks, flat, line])
     ranges = torch.tensor([[0, len(all_faces)], [len(faces), len(all_faces)]])
-    layout = verbs.Layout.of(RECTS[[0, 3]])
+    layout = verbs.PixelLayout.from_rects(RECTS[[0, 3]])
     found = [verbs.rasterize(clip, all_faces, ranges, layout, b) for b in ("warp", "reference")]
     assert torch.equal(found[0].face, found[1].face)
     assert torch.equal(found[0].depth, found[1].depth)
@@ -189,7 +195,7 @@ def test_triangles_far_wider_than_a_machine_word(seed: int) -> None:
     v = 30 * torch.rand(9, generator=generator) - 3
     w = 1 + 4 * torch.rand(9, generator=generator)
     clip, faces = torch.stack([u * w, v * w, w], dim=1), torch.arange(9).view(3, 3)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 270, 24], [3, 1, 200, 20]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 270, 24], [3, 1, 200, 20]]))
     ranges = torch.tensor([[0, 3], [1, 3]])
     assert_same(
         everything(clip, faces, ranges, "warp", layout=layout),
@@ -207,7 +213,7 @@ def test_however_many_threads_the_result_is_the_same_to_the_bit(threads: int) ->
     points, faces, ranges = solids(11, 0.5)
     clip = to_clip(points)
     for pixels, which in ((RECTS[:1], ranges[[0, -1], [0, 1]][None]), (RECTS, ranges)):
-        layout = verbs.Layout.of(pixels)
+        layout = verbs.PixelLayout.from_rects(pixels)
         with sharing(1):
             alone = everything(clip, faces, which, "warp", layout=layout)
         with sharing(threads):
@@ -221,10 +227,10 @@ def test_threads_share_all_pixels_once_and_evenly(seed: int, threads: int) -> No
     generator = torch.Generator().manual_seed(seed)
     low = torch.randint(0, 40, (7, 2), generator=generator)
     rects = torch.cat([low, low + torch.randint(-2, 90, (7, 2), generator=generator)], dim=1)
-    layout = verbs.Layout.of(rects)
+    layout = verbs.PixelLayout.from_rects(rects)
     ends = torch.randint(0, 900, (7, 2), generator=generator)
     with sharing(1):
-        parts, cuts = plan.share_on_cpu(layout, ends, None, threads)
+        parts, cuts = plan.split_for_threads(layout, ends, None, threads)
     owned = [
         first + i for _, _, _, _, row, end, *_, first in parts for i in range((end - row) * (_width(parts, first)))
     ]
@@ -266,7 +272,9 @@ def test_surfaces_close_together_do_not_flicker_while_the_camera_moves(
             points[:, :2] += 0.01 * step / focal * distance_m  # a hundredth of a pixel each time
             camera = torch.tensor([[focal, 0, 620], [0, focal, 180], [0, 0, 1]], dtype=torch.float64)
             clip = (points @ camera.T).to(torch.float32)
-            found = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), verbs.Layout.of(rect), backend)
+            found = verbs.rasterize(
+                clip, faces, torch.tensor([[0, len(faces)]]), verbs.PixelLayout.from_rects(rect), backend
+            )
             hit = found.face >= 0
             seen += int(hit.sum())
             assert (found.face[hit] < len(fine)).all()
@@ -284,9 +292,11 @@ def test_what_lies_outside_the_image_costs_nothing() -> None:
     corners = [faces[start:end] for start, end in ranges.tolist()]
     vertex_ranges = torch.tensor([[int(f.min()), int(f.max()) + 1] for f in corners])
     every = torch.cat([vertex_ranges + i * len(points) for i in range(3)])
-    alone = verbs.Layout.of(verbs.bounding_rects(clip[: len(points)], vertex_ranges, 44, 60))
+    alone = verbs.PixelLayout.from_rects(verbs.bounding_rects(clip[: len(points)], vertex_ranges, 44, 60))
     few = verbs.rasterize(clip[: len(points)], faces, ranges, alone)
-    many = verbs.rasterize(clip, more, more_ranges, verbs.Layout.of(verbs.bounding_rects(clip, every, 44, 60)))
+    many = verbs.rasterize(
+        clip, more, more_ranges, verbs.PixelLayout.from_rects(verbs.bounding_rects(clip, every, 44, 60))
+    )
     assert few.face.shape[0] > 500
     assert torch.equal(many.face, few.face)
     assert few.plan is not None
@@ -297,7 +307,7 @@ def test_what_lies_outside_the_image_costs_nothing() -> None:
 def test_faces_are_looked_through_once_and_again_when_they_change(monkeypatch: pytest.MonkeyPatch) -> None:
     clip = to_clip(torch.tensor([[-1.0, -1.0, 4.0], [1.0, -1.0, 4.0], [0.0, 1.0, 4.0]]))
     faces, ranges = torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1]])
-    layout = verbs.Layout.of(RECTS[:1])
+    layout = verbs.PixelLayout.from_rects(RECTS[:1])
     looks: list[int] = []
     search = torch.Tensor.aminmax
 
@@ -322,7 +332,7 @@ def test_outlines_follow_vertices_that_changed_since_they_were_rasterized() -> N
     points, faces, _ = solids(7, 4.0)
     clip = to_clip(points)
     whole = torch.tensor([[0, len(faces)]])
-    layout = verbs.Layout.of(RECTS[:1])
+    layout = verbs.PixelLayout.from_rects(RECTS[:1])
     found = verbs.rasterize(clip, faces, whole, layout)
     moved = clip + torch.tensor([0.1, 0.05, 0.0])
     expected = verbs.antialias(found, moved, faces, "reference")

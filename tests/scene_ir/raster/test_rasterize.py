@@ -19,7 +19,7 @@ def to_clip(uvw: torch.Tensor) -> torch.Tensor:
 
 def draw(uvw, faces, backend, size=(12, 14), near=verbs.NEAR_M):
     height, width = size
-    layout = verbs.Layout.of(torch.tensor([[0, 0, width, height]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, width, height]]))
     ranges = torch.tensor([[0, len(faces)]])
     found = verbs.rasterize(to_clip(uvw), torch.as_tensor(faces), ranges, layout, backend, near)
     return found.face.view(size), found.depth.view(size)
@@ -84,7 +84,7 @@ def test_near_plane_cuts_as_the_analytically_clipped_polygon(backend):
     def clip_of(x, z):
         return torch.stack([10.3 * x + 20.2 * z, torch.full_like(z, 10.0) + 5 * z, z], dim=1)
 
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 41, 40]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 41, 40]]))
     faces, ranges = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0, 2]])
     whole = verbs.rasterize(clip_of(x, z), faces, ranges, layout, backend, near)
     cut = clip_of(x, z.clamp(min=near))
@@ -119,7 +119,7 @@ def test_degenerate_triangles_are_skipped(backend):
     ],
 )
 def test_empty_draws_faces_and_rectangles(backend, rects, ranges):
-    layout = verbs.Layout.of(rects.to(torch.int64))
+    layout = verbs.PixelLayout.from_rects(rects.to(torch.int64))
     clip, faces = to_clip(TRIANGLE).requires_grad_(), torch.tensor([[0, 1, 2]])
     found = verbs.rasterize(clip, faces, ranges.to(torch.int64), layout, backend)
     assert found.face.tolist() == [-1] * layout.size
@@ -132,7 +132,7 @@ def test_empty_draws_faces_and_rectangles(backend, rects, ranges):
 
 @BOTH
 def test_no_vertices(backend):
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 2, 2]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 2, 2]]))
     clip, faces = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64)
     found = verbs.rasterize(clip, faces, torch.tensor([[0, 0]]), layout, backend)
     assert found.face.tolist() == [-1] * 4
@@ -143,7 +143,7 @@ def test_no_vertices(backend):
 def test_draws_are_independent_and_may_share_faces(backend):
     uvw = torch.cat([TRIANGLE, TRIANGLE + torch.tensor([1.0, 1.0, 1.0])])
     faces = torch.tensor([[0, 1, 2], [3, 4, 5]], dtype=torch.int32)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 14, 12], [3, 2, 9, 8], [0, 0, 14, 12]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 14, 12], [3, 2, 9, 8], [0, 0, 14, 12]]))
     ranges = torch.tensor([[0, 2], [1, 2], [1, 2]])
     found = verbs.rasterize(to_clip(uvw), faces, ranges, layout, backend)
     first, second, third = (found.face[span].view(shape) for span, shape in layout.spans())
@@ -178,7 +178,7 @@ def test_a_triangulated_rectangle_has_neither_holes_nor_doubly_hit_pixels(backen
     faces = torch.cat([upper.reshape(-1, 3), lower.reshape(-1, 3)])
     # One draw a triangle, so that each pixel tells how many triangles hit it.
     count = faces.shape[0]
-    layout = verbs.Layout.of(torch.tensor([[-2, -2, 36, 36]]).expand(count, 4))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[-2, -2, 36, 36]]).expand(count, 4))
     ranges = torch.arange(count)[:, None] + torch.tensor([0, 1])
     found = verbs.rasterize(to_clip(uvw), faces, ranges, layout, backend)
     hits = (found.face.view(count, 38, 38) >= 0).sum(dim=0)
@@ -188,7 +188,7 @@ def test_a_triangulated_rectangle_has_neither_holes_nor_doubly_hit_pixels(backen
 
 def test_errors():
     clip, faces = to_clip(TRIANGLE), torch.tensor([[0, 1, 2]])
-    layout, ranges = verbs.Layout.of(torch.tensor([[0, 0, 4, 4]])), torch.tensor([[0, 1]])
+    layout, ranges = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 4, 4]])), torch.tensor([[0, 1]])
     with pytest.raises(ShapeError, match="float32 with backend warp"):
         verbs.rasterize(clip.double(), faces, ranges, layout)
     with pytest.raises(RangeError, match=r"raster\.faces"):

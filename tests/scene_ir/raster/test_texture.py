@@ -83,7 +83,7 @@ def test_reference_gradients_agree_with_central_differences(border):
 
 
 def crops_of(rects, channels=4, seed=0):
-    layout = verbs.Layout.of(rects)
+    layout = verbs.PixelLayout.from_rects(rects)
     generator = torch.Generator().manual_seed(seed)
     return layout, torch.rand(layout.size, channels, generator=generator)
 
@@ -92,8 +92,8 @@ def crops_of(rects, channels=4, seed=0):
 @BORDERS
 def test_packed_crops_are_the_single_textures(backend, border):
     crops, values = crops_of(torch.tensor([[3, 2, 9, 6], [0, 0, 1, 1], [10, 4, 13, 12]]))
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 8, 5], [0, 0, 3, 3], [8, 0, 14, 12]]))
-    uv = layout.pixels() + torch.rand(layout.size, 2, generator=torch.Generator().manual_seed(1)) - 0.5
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 8, 5], [0, 0, 3, 3], [8, 0, 14, 12]]))
+    uv = layout.pixel_xy() + torch.rand(layout.size, 2, generator=torch.Generator().manual_seed(1)) - 0.5
     sampled = verbs.texture_packed(values, crops.rects, crops.offsets, layout, uv, backend, border)
     for i, ((crop, shape), (span, _)) in enumerate(zip(crops.spans(), layout.spans(), strict=True)):
         image = values[crop].T.reshape(4, *shape)
@@ -105,9 +105,9 @@ def test_packed_crops_are_the_single_textures(backend, border):
 def test_packed_identity_is_exact_and_empty_crops_are_zero(backend):
     rects = torch.tensor([[3, 2, 9, 6], [5, 5, 5, 5], [10, 4, 13, 12]])
     crops, values = crops_of(rects)
-    layout = verbs.Layout.of(torch.tensor([[3, 2, 9, 6], [0, 0, 2, 2], [10, 4, 13, 12]]))
-    sampled = verbs.texture_packed(values, rects, crops.offsets, layout, layout.pixels().float(), backend)
-    kept = layout.draw() != 1
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[3, 2, 9, 6], [0, 0, 2, 2], [10, 4, 13, 12]]))
+    sampled = verbs.texture_packed(values, rects, crops.offsets, layout, layout.pixel_xy().float(), backend)
+    kept = layout.draw_index() != 1
     assert torch.equal(sampled[kept], values)
     assert not sampled[~kept].any()
 
@@ -115,9 +115,9 @@ def test_packed_identity_is_exact_and_empty_crops_are_zero(backend):
 def test_packed_gradients_agree():
     rects = torch.tensor([[3, 2, 9, 6], [5, 5, 5, 5], [10, 4, 13, 12]])
     crops, values = crops_of(rects)
-    layout = verbs.Layout.of(torch.tensor([[2, 2, 9, 7], [0, 0, 2, 2], [10, 4, 13, 12]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[2, 2, 9, 7], [0, 0, 2, 2], [10, 4, 13, 12]]))
     generator = torch.Generator().manual_seed(2)
-    uv = layout.pixels() + torch.rand(layout.size, 2, generator=generator)
+    uv = layout.pixel_xy() + torch.rand(layout.size, 2, generator=generator)
     weights = torch.randn(layout.size, 4, generator=generator)
     grads = []
     for backend in BACKENDS:
@@ -132,7 +132,7 @@ def test_packed_gradients_agree():
 @BOTH
 def test_nothing_to_sample(backend):
     assert verbs.texture(image_of(2, 2), torch.zeros(0, 2), backend).shape == (0, 3)
-    none = verbs.Layout.of(torch.zeros(0, 4, dtype=torch.int64))
+    none = verbs.PixelLayout.from_rects(torch.zeros(0, 4, dtype=torch.int64))
     sampled = verbs.texture_packed(torch.zeros(0, 4), none.rects, none.offsets, none, torch.zeros(0, 2), backend)
     assert sampled.shape == (0, 4)
 
@@ -147,7 +147,7 @@ def test_errors():
         verbs.texture(image.double(), uv)
     with pytest.raises(ShapeError, match="at least one pixel"):
         verbs.texture(torch.zeros(3, 0, 4), uv)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 2, 1]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 2, 1]]))
     with pytest.raises(ShapeError, match=r"raster\.crop_rects"):
         verbs.texture_packed(
             torch.zeros(0, 3), torch.zeros(0, 4, dtype=torch.int64), torch.zeros(1).long(), layout, uv

@@ -19,12 +19,12 @@ from torch import Tensor
 
 from scene_ir.errors import ShapeError
 from scene_ir.raster import verbs
-from scene_ir.raster.layout import Layout
+from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor, render
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.render.sources import SolveSettings, analytic_shadows, from_own_picture, solve_sources
-from scene_ir.types import Crop, Mesh, Objects, Part, Render, SceneIR, scene_to
+from scene_ir.types import Crop, Mesh, Objects, Part, Render, SceneIR, convert_scene
 
 REFERENCE = RenderSettings(backend="reference")
 IDENTITY = 1e-5
@@ -56,7 +56,7 @@ def _only(objects: Objects, index: list[int]) -> Objects:
 
 @pytest.mark.parametrize(("backend", "dtype"), [("reference", torch.float64), ("warp", torch.float32)])
 def test_nothing_perturbed_gives_the_photograph(photographed: SceneIR, backend, dtype: torch.dtype) -> None:
-    scene = scene_to(photographed, dtype)
+    scene = convert_scene(photographed, dtype)
     image = Compositor(scene, RenderSettings(backend=backend)).render(scene).image
     assert float((image - scene.photograph).abs().max()) < IDENTITY
     assert torch.equal((image * 255).round(), (scene.photograph * 255).round())
@@ -217,7 +217,7 @@ def test_order_of_objects_does_not_matter(photographed: SceneIR) -> None:
 
 
 def test_backends_agree_in_values_and_gradients(photographed: SceneIR) -> None:
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     weights = torch.randn(scene.photograph.shape, generator=torch.Generator().manual_seed(1))
     weights = torch.nn.functional.avg_pool2d(weights[None], 7, 1, 3)[0]
     results = []
@@ -347,7 +347,7 @@ def test_blend_is_the_plain_formula_and_has_its_gradients() -> None:
     layers = torch.tensor([[0, 0, 4, 3], [2, 1, 6, 5]])
     shadows = torch.tensor([[1, 1, 5, 4]])
 
-    plan = blend.Plan.of(Layout.of(layers), Layout.of(shadows), (1, 0))
+    plan = blend.Plan.of(PixelLayout.from_rects(layers), PixelLayout.from_rects(shadows), (1, 0))
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
@@ -417,8 +417,8 @@ def test_paint_order_never_lays_a_hidden_car_over_its_hider(seed: int) -> None:
 
 def test_welded_normals_are_one_a_place(street: Street) -> None:
     """Vertices at one place face one way, though the mesh does not share them between faces."""
-    fleet = surfaces.Fleet.of(
-        [surfaces.Surface.of(street(torch.float64).meshes[0], torch.float64)], torch.zeros(1)
+    fleet = surfaces.ObjectSurfaces.from_surfaces(
+        [surfaces.TemplateSurface.from_mesh(street(torch.float64).meshes[0], torch.float64)], torch.zeros(1)
     )
     local = fleet.surfaces[0].unit
     _, smooth = fleet.normals(local)
@@ -429,25 +429,25 @@ def test_welded_normals_are_one_a_place(street: Street) -> None:
 
 
 def test_each_face_knows_what_is_across_its_edges(street: Street) -> None:
-    surface = surfaces.Surface.of(street(torch.float64).meshes[0], torch.float64)
+    surface = surfaces.TemplateSurface.from_mesh(street(torch.float64).meshes[0], torch.float64)
     points = surface.weld[surface.faces]
-    assert bool((surface.beside >= 0).all())
+    assert bool((surface.neighbours >= 0).all())
     for face, corners in enumerate(points.tolist()):
-        for corner, across in enumerate(surface.beside[face].tolist()):
+        for corner, across in enumerate(surface.neighbours[face].tolist()):
             assert set(corners) & set(points[across].tolist()) == set(corners) - {corners[corner]}
-            assert face in surface.beside[across].tolist()
+            assert face in surface.neighbours[across].tolist()
 
 
 def test_nothing_is_across_the_border_of_a_mesh_or_an_edge_of_three_faces() -> None:
     vertices = torch.tensor([[0.0, 0, 0], [0, -0.5, 0], [0.5, 0, 0], [-0.5, 0, 0], [0, 0, 0.5], [-0.5, -0.5, 0]])
     faces = torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4], [1, 3, 5]])
     mesh = Mesh(vertices, faces, torch.zeros(4, dtype=torch.int64))
-    beside = surfaces.Surface.of(mesh, torch.float64).beside
+    beside = surfaces.TemplateSurface.from_mesh(mesh, torch.float64).neighbours
     assert beside.tolist() == [[-1, -1, -1], [-1, 3, -1], [-1, -1, -1], [-1, -1, 1]]
 
 
 def test_scene_to_changes_every_floating_tensor(photographed: SceneIR) -> None:
-    single = scene_to(photographed, torch.float32)
+    single = convert_scene(photographed, torch.float32)
     assert single.objects.source[0].foreground.values.dtype == torch.float32
     assert single.camera.projection is not None
     assert single.camera.projection.dtype == torch.float32
@@ -456,7 +456,7 @@ def test_scene_to_changes_every_floating_tensor(photographed: SceneIR) -> None:
 
 
 def test_nearest_hits_stay_within_their_draw_and_reach() -> None:
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 5, 1], [2, 3, 5, 5], [0, 0, 2, 1]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 5, 1], [2, 3, 5, 5], [0, 0, 2, 1]]))
     face = torch.full((13,), -1, dtype=torch.int32)
     face[1], face[5] = 7, 2
     fragments = verbs.Fragments(layout, face, torch.ones(13), torch.zeros(3, 2, dtype=torch.int64), 0.05)
@@ -494,7 +494,7 @@ def test_an_outline_that_turned_away_leaves_no_rim(street: Street, dyaw: float) 
     """Beside the mesh, no pixel is more opaque than one beside it that is nearer to the mesh."""
     taken = _widely_cut(street(torch.float64), 2)
     compositor, turned = Compositor(taken, REFERENCE), _moved(taken, dyaw=dyaw)
-    drawn, opacity = compositor.draw(turned.objects), compositor.render(turned).opacity[0].values[0]
+    drawn, opacity = compositor.find_visible(turned.objects), compositor.render(turned).opacity[0].values[0]
     hit = (drawn.mesh.face >= 0).reshape(opacity.shape)
     distance = torch.from_numpy(cv2.distanceTransform((~hit).numpy().astype("uint8"), cv2.DIST_L2, 5))
     around = [torch.nn.functional.unfold(v[None, None].double(), 3, padding=1) for v in (opacity, distance)]
@@ -538,24 +538,24 @@ def test_a_stripe_thinner_than_a_pixel_is_as_dark_wherever_it_lies(street: Stree
 
 def test_outside_of_what_is_drawn_no_vehicle_changes_anything(photographed: SceneIR) -> None:
     """Neither the picture nor, for any of them, a gradient of it; weather may change every pixel."""
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     compositor = Compositor(scene)
     moved = scene.objects.translation.clone().requires_grad_(True)
     rendered = compositor.render(scene.with_objects(translation=moved + moved.new_tensor([0.3, 0.0, 0.2])))
-    assert rendered.drawn is not None
+    assert rendered.vehicle_regions is not None
     outside = torch.ones_like(scene.depth, dtype=torch.bool)
-    for x0, y0, x1, y1 in rendered.drawn.tolist():
+    for x0, y0, x1, y1 in rendered.vehicle_regions.tolist():
         outside[y0:y1, x0:x1] = False
     assert 0 < int(outside.sum()) < outside.numel()
     assert torch.equal(rendered.image.detach()[:, outside], scene.background[:, outside])
     (gradient,) = torch.autograd.grad(rendered.image[:, outside].sum(), moved)
     assert not bool(gradient.any())
     foggy = scene.with_environment(weather=torch.tensor([0.5, 0.0, 0.0, 0.0]))
-    assert compositor.render(foggy).drawn is None
+    assert compositor.render(foggy).vehicle_regions is None
 
 
 def test_what_shows_of_each_draw_has_a_rectangle_around_it() -> None:
-    layout = Layout.of(torch.tensor([[2, 3, 8, 9], [0, 0, 2, 2], [4, 4, 4, 7]]))
+    layout = PixelLayout.from_rects(torch.tensor([[2, 3, 8, 9], [0, 0, 2, 2], [4, 4, 4, 7]]))
     shown = torch.zeros(layout.size, dtype=torch.bool)
     shown[:36].view(6, 6)[2:4, 0:3] = True
     assert blend.shown_rects(layout, shown[:, None]).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]

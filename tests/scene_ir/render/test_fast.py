@@ -13,7 +13,7 @@ from torch import Tensor
 from scene_ir.ffd import from_symmetric
 from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Crop, SceneIR, scene_to
+from scene_ir.types import Crop, SceneIR, convert_scene
 
 PARAMETERS = ("translation", "yaw", "ffd", "size", "texture_code", "weather", "foliage", "light")
 VALUE, GRADIENT = 2e-4, 1e-4
@@ -94,14 +94,14 @@ def check(scene: SceneIR, values: dict[str, Tensor], active: tuple[str, ...]) ->
     active=st.sets(st.sampled_from(PARAMETERS), min_size=1, max_size=4),
 )
 def test_fused_is_the_reference(photographed: SceneIR, seed: int, spread: float, active: set[str]) -> None:
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     chosen = tuple(n for n in PARAMETERS if n in active)
     check(scene, draws(scene, seed, spread, chosen), chosen)
 
 
 @pytest.mark.parametrize("place", [[0.3, 0.0, -8.9], [3.2, 0.0, -7.5], [40.0, 0.0, 0.0], [0.0, 0.0, -30.0]])
 def test_fused_is_the_reference_at_and_behind_the_camera(photographed: SceneIR, place: list[float]) -> None:
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     active = ("translation", "yaw", "ffd")
     values = draws(scene, 3, 0.5, active)
     values["translation"][0] += torch.tensor(place)
@@ -110,14 +110,14 @@ def test_fused_is_the_reference_at_and_behind_the_camera(photographed: SceneIR, 
 
 def test_a_sun_overhead_casts_shadows_that_reach_nowhere(photographed: SceneIR) -> None:
     """Their length has a kink at 0, where its gradient is 0 and not infinite times 0."""
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     scene = scene.with_environment(sun=torch.tensor([0.0, -1.0, 0.0]))
     active = ("translation", "yaw")
     check(scene, draws(scene, 4, 0.5, active), active)
 
 
 def test_a_vehicle_that_the_photograph_never_showed(photographed: SceneIR) -> None:
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     objects = scene.objects
     aside = torch.tensor([[40.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     source = replace(objects.source[0], translation=objects.source[0].translation + aside[0])
@@ -140,7 +140,7 @@ def with_regions(scene: SceneIR) -> SceneIR:
 
 @pytest.mark.parametrize("spread", [0.0, 1.0])
 def test_codes_recolour_regions_of_paint(photographed: SceneIR, spread: float) -> None:
-    scene = with_regions(scene_to(photographed, torch.float32))
+    scene = with_regions(convert_scene(photographed, torch.float32))
     active = ("translation", "yaw", "texture_code")
     values = draws(scene, 6, spread, active)
     values["texture_code"] = draws(scene, 6, 1.0, active)["texture_code"]
@@ -148,7 +148,7 @@ def test_codes_recolour_regions_of_paint(photographed: SceneIR, spread: float) -
 
 
 def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> None:
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     fewer = scene.with_objects(**{
         n: getattr(scene.objects, n)[:2]
         for n in ("mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d",
@@ -185,8 +185,8 @@ def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> N
 
 
 def test_level_of_detail_changes_triangles_not_the_photograph(photographed: SceneIR) -> None:
-    scene = scene_to(photographed, torch.float32)
+    scene = convert_scene(photographed, torch.float32)
     coarse, full = Compositor(scene), Compositor(scene, RenderSettings(lod=False))
-    assert coarse.fleet.faces.shape[0] <= full.fleet.faces.shape[0]
+    assert coarse.object_surfaces.faces.shape[0] <= full.object_surfaces.faces.shape[0]
     for compositor in (coarse, full):
         assert float((compositor.render(scene).image - scene.photograph).abs().max()) < 1e-6

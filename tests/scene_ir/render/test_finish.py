@@ -11,7 +11,7 @@ import torch
 from scene_ir.render import finish, model, texture
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.render.surfaces import Surface
+from scene_ir.render.surfaces import TemplateSurface
 from scene_ir.types import Part, SceneIR
 
 
@@ -21,7 +21,7 @@ def compositor(photographed: SceneIR) -> Compositor:
 
 
 def test_the_template_is_the_photograph_where_that_shows_it(compositor: Compositor) -> None:
-    for surface, samples in zip(compositor.fleet.surfaces, compositor.samples(), strict=True):
+    for surface, samples in zip(compositor.object_surfaces.surfaces, compositor.sample_photograph(), strict=True):
         own = finish.fitted(surface, samples)
         gain, lift = (
             (samples.share[..., None] * own[samples.vertex][..., k]).sum(axis=1) for k in (slice(3), [3])
@@ -33,7 +33,7 @@ def test_the_template_is_the_photograph_where_that_shows_it(compositor: Composit
 
 
 def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> None:
-    surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
+    surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
     own = finish.fitted(surface, samples)[:, :3]
     paint = surface.part.numpy() == Part.PAINT
     seen = np.zeros(len(paint), bool)
@@ -45,7 +45,7 @@ def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> No
 
 def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
     none = finish.Samples(np.zeros((0, 3), np.int64), *(np.zeros((0, n)) for n in (3, 3, 3)), *[np.zeros(0)] * 3)
-    surface = compositor.fleet.surfaces[0]
+    surface = compositor.object_surfaces.surfaces[0]
     own = finish.fitted(surface, none)
     assert np.allclose(own, [1.0, 1.0, 1.0, 0.0])
     assert finish.base_paint(surface, none) is None
@@ -56,7 +56,7 @@ def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
 def test_base_paint_is_the_photographs(compositor: Compositor, photographed: SceneIR) -> None:
     """The first car is painted red, the second blue."""
     kept = torch.stack([s.paint for s in photographed.objects.source])
-    assert torch.allclose(kept, compositor.base_paint(compositor.samples()), atol=0.02)
+    assert torch.allclose(kept, compositor.base_paint(compositor.sample_photograph()), atol=0.02)
     red, blue = kept[:2]
     assert float(red[0]) > 1.5 * float(red[1])
     assert float(blue[2]) > 1.3 * float(blue[0])
@@ -69,14 +69,14 @@ def _lit(samples: finish.Samples, strength: float) -> finish.Samples:
 
 @pytest.mark.parametrize("strength", [0.0, 0.6, 1.4])
 def test_sunlight_is_read_off_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
-    surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
+    surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, strength))]
     assert finish.sunlight(seen, [strength]) == pytest.approx(strength, abs=0.01)
     assert abs(finish.sunlight(seen, [strength + 0.4]) - strength) < 0.4
 
 
 def test_one_vehicle_in_the_shade_does_not_change_the_frames_sunlight(compositor: Compositor) -> None:
-    surface, samples = compositor.fleet.surfaces[0], compositor.samples()[0]
+    surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, s)) for s in (1.4, 1.4, 0.0)]
     assert finish.sunlight(seen, [1.4, 1.4, 0.0]) == pytest.approx(1.4, abs=0.01)
 
@@ -91,10 +91,10 @@ def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypat
     names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "mesh_index", "category")
     names = (*names, "box2d", "truncation", "occlusion")
     objects, clear = photographed.objects, torch.zeros_like(photographed.depth)
-    together = Compositor(photographed, hidden=[clear] * len(objects)).samples()[1]
+    together = Compositor(photographed, hidden=[clear] * len(objects)).sample_photograph()[1]
     single = {n: getattr(objects, n)[1:2] for n in names}
     one = replace(photographed, objects=replace(objects, source=objects.source[1:2], **single))
-    alone = Compositor(one, hidden=[clear]).samples()[0]
+    alone = Compositor(one, hidden=[clear]).sample_photograph()[0]
     assert 50 < len(alone.weight) <= 151
     assert np.array_equal(together.vertex, alone.vertex)
     assert np.array_equal(together.photograph, alone.photograph)
@@ -102,8 +102,8 @@ def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypat
 
 def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor) -> None:
     """Without samples on one side, its gains are pulled towards the other's."""
-    surface: Surface = compositor.fleet.surfaces[1]
-    samples = compositor.samples()[1]
+    surface: TemplateSurface = compositor.object_surfaces.surfaces[1]
+    samples = compositor.sample_photograph()[1]
     brighter = replace(samples, photograph=np.minimum(1.5 * samples.photograph, 0.9))
     plain, bright = (finish.fitted(surface, s)[:, 0] for s in (samples, brighter))
     assert (bright >= plain - 1e-9).all()
@@ -113,16 +113,16 @@ def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor)
 def test_a_car_that_turns_is_relit(photographed: SceneIR) -> None:
     compositor = Compositor(photographed, RenderSettings("reference"))
     objects = compositor.scene.objects
-    assert bool((compositor.brighter(objects) == 0).all())
+    assert bool((compositor.compute_brightening(objects) == 0).all())
     live = objects.yaw.clone().requires_grad_()
-    still = compositor.brighter(replace(objects, yaw=live))
+    still = compositor.compute_brightening(replace(objects, yaw=live))
     assert bool((still == 0).all())
-    turned = compositor.brighter(replace(objects, yaw=objects.yaw + 0.3))
+    turned = compositor.compute_brightening(replace(objects, yaw=objects.yaw + 0.3))
     assert 0.02 < float(turned.abs().max()) <= model.RELIT_MOST
     # A side that turned to the sun is brighter.
     sun = photographed.environment.sun
-    normal = compositor.smooth
-    yaw = compositor.fleet.spread(objects.yaw)
+    normal = compositor.smooth_normals
+    yaw = compositor.object_surfaces.per_vertex(objects.yaw)
     gained = (_turned(normal, yaw + 0.3) - _turned(normal, yaw)) @ sun
     lit = (_turned(normal, yaw) @ sun > 0.1) & (gained.abs() > 0.02)
     assert bool((turned[lit].sign() == gained[lit].sign()).all())

@@ -10,17 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.labels import hidden_share
+from drivesem.attack.labels import hidden_shares
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene
 from scene_ir.raster.verbs import Backend
-from scene_ir.removal import without_objects
+from scene_ir.removal import remove_objects
 from scene_ir.render import blend
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.render.sources import SolveSettings, analytic_shadows, solve_sources
-from scene_ir.types import Crop, Front, SceneIR, scene_to
+from scene_ir.types import Crop, Occluder, SceneIR, convert_scene
 
 POLE_M = 6.0
 """Nearer than all cars of the small street, the nearest of which stands at 9 m."""
@@ -48,8 +48,8 @@ def with_pole(scene: SceneIR, backend: Backend, depth_m: float = POLE_M) -> Scen
         window = (slice(crop.y0, crop.y0 + h), slice(crop.x0, crop.x0 + w))
         mattes[i] = Crop(crop.values * clear[window], crop.x0, crop.y0)
         clear[window] &= crop.values[0] <= 0.0
-    pole = Front(Crop(torch.cat([torch.zeros_like(photograph), alpha[None]]), 0, 0), depth_m)
-    taken = replace(scene, photograph=photograph, background=background, front=(pole,))
+    pole = Occluder(Crop(torch.cat([torch.zeros_like(photograph), alpha[None]]), 0, 0), depth_m)
+    taken = replace(scene, photograph=photograph, background=background, occluders=(pole,))
     return solve_sources(taken, mattes, analytic_shadows(scene, settings), SolveSettings(backend=backend))
 
 
@@ -69,7 +69,7 @@ def levels(image: Tensor) -> Tensor:
 
 def solid(scene: SceneIR) -> Tensor:
     """Pixels (H, W) that show nothing but the pole."""
-    crop = scene.front[0].foreground
+    crop = scene.occluders[0].foreground
     return on_frame(replace(crop, values=crop.values[3:]), scene.depth.shape) >= 1.0
 
 
@@ -123,15 +123,15 @@ def test_car_in_front_of_a_far_pole_hides_it(street: Callable[[torch.dtype], Sce
 
 
 def test_pole_counts_as_hiding(fast_pole: SceneIR, street: Callable[[torch.dtype], SceneIR]) -> None:
-    bare = replace(fast_pole, front=())
-    shares = [hidden_share(Compositor(s).render(s)) for s in (fast_pole, bare)]
+    bare = replace(fast_pole, occluders=())
+    shares = [hidden_shares(Compositor(s).render(s)) for s in (fast_pole, bare)]
     assert float(shares[0][0]) > float(shares[1][0])
 
 
 def test_gradients_agree_with_the_reference(fast_pole: SceneIR) -> None:
     gradients = []
     for backend in ("reference", "warp"):
-        scene = scene_to(fast_pole, torch.float64) if backend == "reference" else fast_pole
+        scene = convert_scene(fast_pole, torch.float64) if backend == "reference" else fast_pole
         moved = shifted(scene, 0, (0.21, 0.13))
         leaves = [
             moved.objects.translation.clone().requires_grad_(),
@@ -154,7 +154,7 @@ def test_season_changes_a_pole_of_leaves(fast_pole: SceneIR) -> None:
     mask = solid(fast_pole)
     assert float((found - fast_pole.photograph).abs()[:, mask].amax(dim=0).median()) > 0.05
     # Season alone: the pole looks as the same pixels of the background do.
-    bare = replace(without_objects(leafy, [0, 1, 2]), front=())
+    bare = replace(remove_objects(leafy, [0, 1, 2]), occluders=())
     alone = Compositor(bare).render(bare.with_environment(foliage=autumn.environment.foliage)).image
     assert float((found - alone).abs()[:, mask].max()) < 1e-5
 
@@ -171,12 +171,12 @@ def test_fog_veils_the_pole_by_its_own_distance(street: Callable[[torch.dtype], 
 
 def test_removed_car_leaves_the_pole(fast_pole: SceneIR) -> None:
     for rows in ([0], [0, 1, 2]):
-        scene = without_objects(fast_pole, rows)
+        scene = remove_objects(fast_pole, rows)
         image = Compositor(scene).render(scene).image
         mask = solid(fast_pole)
         assert torch.equal(levels(image)[:, mask], levels(fast_pole.photograph)[:, mask])
         # Nor does the car's colour stay in the pole's soft border: it lies between pole and background.
-        crop = fast_pole.front[0].foreground
+        crop = fast_pole.occluders[0].foreground
         alpha = on_frame(replace(crop, values=crop.values[3:]), mask.shape)
         soft = (alpha > 0) & (alpha < 1)
         colour = image.new_tensor(COLOUR)[:, None]
@@ -189,13 +189,13 @@ def test_removed_car_leaves_the_pole(fast_pole: SceneIR) -> None:
 def test_scene_folder_keeps_what_stands_in_front(fast_pole: SceneIR, tmp_path: Path) -> None:
     save_scene(fast_pole, tmp_path / "scene")
     found = load_scene(tmp_path / "scene")
-    assert len(found.front) == 1
-    assert found.front[0].depth_m == fast_pole.front[0].depth_m
-    assert (found.front[0].foreground.x0, found.front[0].foreground.y0) == (
-        fast_pole.front[0].foreground.x0,
-        fast_pole.front[0].foreground.y0,
+    assert len(found.occluders) == 1
+    assert found.occluders[0].depth_m == fast_pole.occluders[0].depth_m
+    assert (found.occluders[0].foreground.x0, found.occluders[0].foreground.y0) == (
+        fast_pole.occluders[0].foreground.x0,
+        fast_pole.occluders[0].foreground.y0,
     )
-    assert torch.equal(found.front[0].foreground.values, fast_pole.front[0].foreground.values)
+    assert torch.equal(found.occluders[0].foreground.values, fast_pole.occluders[0].foreground.values)
     record = read_json(tmp_path / "scene" / "scene.json")
     record["front"][0]["depth_m"] = -1.0
     write_json(tmp_path / "scene" / "scene.json", record)
@@ -205,14 +205,14 @@ def test_scene_folder_keeps_what_stands_in_front(fast_pole: SceneIR, tmp_path: P
 
 def test_front_is_validated() -> None:
     with pytest.raises(RangeError, match=r"front\.depth_m"):
-        Front(Crop(torch.zeros(4, 2, 2), 0, 0), 0.0)
+        Occluder(Crop(torch.zeros(4, 2, 2), 0, 0), 0.0)
 
 
 def test_standing_things_follow_the_last_object_they_can_hide() -> None:
     size = torch.tensor([[4.0, 1.5, 1.8]] * 2)
     place = torch.tensor([[0.0, 1.6, 20.0], [0.0, 1.6, 10.0]])
     matrix = torch.tensor([[700.0, 0.0, 100.0, 0.0], [0.0, 700.0, 50.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
-    things = [Front(Crop(torch.zeros(4, 4, 3), 99, 40), depth) for depth in (15.0, 5.0, 30.0)]
+    things = [Occluder(Crop(torch.zeros(4, 4, 3), 99, 40), depth) for depth in (15.0, 5.0, 30.0)]
     feet = blend.standing_footprints(things, matrix)
     order = blend.paint_order(size, torch.zeros(2), place, torch.zeros(3), feet)
     assert order == [4, 0, 2, 1, 3]

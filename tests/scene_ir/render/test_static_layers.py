@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Camera, Crop, Render, SceneIR, Source, scene_to
+from scene_ir.types import Camera, Crop, Render, SceneIR, Source, convert_scene
 
 NAMES = ("translation", "yaw", "ffd", "texture_code", "weather", "foliage")
 SPREAD = {"translation": 0.6, "yaw": 0.3, "ffd": 0.03, "texture_code": 0.5, "weather": 0.7, "foliage": 0.7}
@@ -70,7 +70,7 @@ def scenes(photographed: SceneIR) -> list[SceneIR]:
         x0 = min(max(u - 130, 0), demo.camera.width - 220)
         y0 = min(max(v - 80, 0), demo.camera.height - 130)
         windows.append(cut(demo, (x0, y0, x0 + 220, y0 + 130)))
-    return [*windows, scene_to(photographed, torch.float32)]
+    return [*windows, convert_scene(photographed, torch.float32)]
 
 
 def perturbed(scene: SceneIR, active: frozenset[str], seed: int) -> SceneIR:

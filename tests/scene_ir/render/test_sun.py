@@ -24,7 +24,7 @@ def _lit(scene: SceneIR, *code: float) -> SceneIR:
 def _darkness(scene: SceneIR, base: SceneIR) -> Tensor:
     """(H, W): how much the vehicles darken the ground of the picture."""
     compositor = Compositor(base, REFERENCE)
-    layers = compositor.layers(compositor.moved(scene), compositor.sun_of(scene.environment))
+    layers = compositor.layers(compositor.moved(scene), compositor.perturbed_sun(scene.environment))
     out = torch.zeros_like(base.depth)
     for (packed, size), (x0, y0, x1, y1) in zip(
         layers.shadow_layout.spans(), layers.shadow_layout.rects.tolist(), strict=True
@@ -90,14 +90,14 @@ def test_what_is_hardly_the_cars_own_shadow_stays(photographed: SceneIR) -> None
     sources[0] = replace(sources[0], shadow=Crop(dark, shadow.x0, shadow.y0))
     other = photographed.with_objects(source=tuple(sources))  # pyright: ignore[reportArgumentType]
     compositor = Compositor(other, REFERENCE)
-    assert compositor.casts[0] == 0
-    still, moved = (compositor.ground(other.objects, sun) for sun in (None, _sun(compositor, other)))
+    assert compositor.shadow_is_own[0] == 0
+    still, moved = (compositor.place_patches(other.objects, sun) for sun in (None, _sun(compositor, other)))
     assert torch.equal(still[:4], moved[:4])
     own = Compositor(photographed, REFERENCE)
-    assert bool((own.casts == 1).any())
-    still, moved = (own.ground(other.objects, sun) for sun in (None, _sun(own, photographed)))
+    assert bool((own.shadow_is_own == 1).any())
+    still, moved = (own.place_patches(other.objects, sun) for sun in (None, _sun(own, photographed)))
     assert not torch.equal(still, moved)
 
 
 def _sun(compositor: Compositor, scene: SceneIR) -> Sun | None:
-    return compositor.sun_of(_lit(scene, 1, 0, 0).environment)
+    return compositor.perturbed_sun(_lit(scene, 1, 0, 0).environment)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.render.sources import _continue_shadow
-from scene_ir.render.surfaces import _sigmoid, on_ground
+from scene_ir.render.surfaces import _thread_invariant_sigmoid, pixels_to_ground
 
 RANDOM = torch.Generator()
 
@@ -32,7 +32,7 @@ def by_threads(work: Callable[[], Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("shape", [(94451,), (3, 41001), (0, 5), (2, 3, 4)])
 def test_sigmoid(shape: tuple[int, ...]) -> None:
     values = 4 * torch.randn(shape, generator=RANDOM.manual_seed(0))
-    one, *others = by_threads(lambda: _sigmoid(values))
+    one, *others = by_threads(lambda: _thread_invariant_sigmoid(values))
     assert all(torch.equal(one, other) for other in others)
     torch.testing.assert_close(one, torch.sigmoid(values), rtol=1e-6, atol=0)
 
@@ -51,7 +51,7 @@ def test_points_on_the_ground() -> None:
     camera = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]])
     ground = torch.tensor([0.01, -0.9998, 0.02, 1.65])
     placed = (torch.zeros(3), torch.tensor([1.0, 1.65, 9.0]), torch.tensor(0.3), ground)
-    one, *others = by_threads(lambda: on_ground(pixels, camera.inverse(), *placed) + 0.0)  # type: ignore[operator]
+    one, *others = by_threads(lambda: pixels_to_ground(pixels, camera.inverse(), *placed) + 0.0)  # type: ignore[operator]
     assert all(torch.equal(one, other) for other in others)
 
 
