@@ -1,1 +1,1 @@
-"""Scenes taken apart, and the differentiable renderer that puts them together again. Knows no detector."""
+"""Editable 3D scenes made from photographs, and the differentiable renderer that draws them. Knows no detector."""

@@ -1,13 +1,12 @@
-"""Errors raised at the borders of the scene representation.
+"""Errors for rejected input. Each message is one line: the field, what was expected, what was found.
 
-Their message is one line: what was looked at, what was expected, what was found. All but `WriteError` are
-`ValueError`s.
+All but `WriteError` are `ValueError`s.
 """
 
 from __future__ import annotations
 
 _MAX_CHARS = 500
-"""Characters of each part of a message."""
+"""Length limit of each part of a message."""
 
 
 def make_printable(text: object, max_chars: int = _MAX_CHARS) -> str:
@@ -23,7 +22,7 @@ def make_printable(text: object, max_chars: int = _MAX_CHARS) -> str:
 
 
 class SceneError(ValueError):
-    """Base of the errors below; catch this one to catch every rejected input."""
+    """Base class of the errors about rejected input."""
 
     def __init__(self, field: str, expected: str, actual: object) -> None:
         self.field = field
@@ -34,14 +33,12 @@ class SceneError(ValueError):
         )
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
-        """As processes hand errors to one another: `actual` as text, which always can be."""
+        """Pickle with `actual` as text, because the value itself may not be picklable."""
         return type(self), (self.field, self.expected, str(self.actual))
 
 
 class WriteError(OSError):
-    """A file that cannot be written: a full disk, a folder that may only be read. No input is to blame, and with
-    the next it would be the same, so this is no SceneError.
-    """
+    """A file cannot be written, for example because the disk is full. Not a SceneError: no input is to blame."""
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path
@@ -49,7 +46,7 @@ class WriteError(OSError):
         super().__init__(f"{path}: expected a place that can be written, found {reason}")
 
     def __reduce__(self) -> tuple[type[WriteError], tuple[str, str]]:
-        """As processes hand errors to one another."""
+        """Pickle by the constructor's arguments."""
         return type(self), (self.path, self.reason)
 
 
@@ -58,8 +55,8 @@ class ShapeError(SceneError):
 
 
 class RangeError(SceneError):
-    """A value lies outside what it may be, or is not finite."""
+    """A value is out of range or not finite."""
 
 
 class FormatError(SceneError):
-    """A file does not follow its format. `field` names the file, and the line or key where there is one."""
+    """A file does not follow its format. `field` names the file, and the line or key if there is one."""

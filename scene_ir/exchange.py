@@ -125,9 +125,9 @@ def add_roof_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
     top, body = (_render_object(scene, bare, mesh) for mesh in (load, own))
     size = (scene.camera.height, scene.camera.width)
     frame = (0, 0, size[1], size[0])
-    nearer = texture.crop_of(top.nearness, frame, size) >= texture.crop_of(body.nearness, frame, size)
-    rgba = texture.crop_of(top.rgba, frame, size) * nearer
-    whole = rgba + (1.0 - rgba[3:]) * texture.crop_of(source.foreground, frame, size)
+    nearer = texture.extract_crop(top.nearness, frame, size) >= texture.extract_crop(body.nearness, frame, size)
+    rgba = texture.extract_crop(top.rgba, frame, size) * nearer
+    whole = rgba + (1.0 - rgba[3:]) * texture.extract_crop(source.foreground, frame, size)
     rows, columns = ((whole[3] > 0).any(dim=side).nonzero()[:, 0] for side in (1, 0))
     y0, x0 = int(rows[0]), int(columns[0])
     values = whole[:, y0 : int(rows[-1]) + 1, x0 : int(columns[-1]) + 1]
@@ -212,12 +212,12 @@ def _render_object(scene: SceneIR, row: Objects, mesh: Mesh) -> _ObjectLayer:
     """`row`, one object of `mesh` that no photograph shows, in the scene's light."""
     compositor = Compositor(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))
     compositor.sunlight.fill_(_sunlight(scene))
-    layers = compositor.layers(compositor.scene.objects)
+    layers = compositor.draw_layers(compositor.scene.objects)
     (packed, size), (x0, y0) = layers.layout.spans()[0], layers.layout.rects[0, :2].tolist()
     opacity = layers.opacity[packed, None].clamp(0.0, 1.0)
     light = layers.colour[packed, :3] / opacity.clamp(min=model.LEAST_ALPHA)
     gain, lift = _exposure(scene, row.translation[0], row.size_lhw[0])
-    colour = texture.finished(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
+    colour = texture.apply_finish(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
     values = torch.cat([colour, opacity, 1.0 / layers.depth[packed, None]], dim=1).T.reshape(5, *size)
     values = values.to(scene.background).contiguous()
     if values.numel():  # else it stands beside the picture
@@ -230,15 +230,17 @@ def _sunlight(scene: SceneIR) -> float:
 
 
 def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, float]:
-    """Gain and lift as of `finish.exposure`: the medians of the others, of the gain as large a multiple of what
+    """Gain and lift as of `finish.estimate_exposure`: the medians of the others, of the gain as large a multiple of what
     the road shows where each stands, which differs along a street, in the shade of a house.
     """
     if not len(scene.objects):
         return 1.0, 0.0
     objects, whole = scene.objects, Compositor(scene.unperturbed())
     gains, lifts = [], []
-    for i, (surface, samples) in enumerate(zip(whole.fleet.surfaces, whole.samples(), strict=True)):
-        found = finish.exposure(surface, samples)
+    for i, (surface, samples) in enumerate(
+        zip(whole.object_surfaces.surfaces, whole.sample_photograph(), strict=True)
+    ):
+        found = finish.estimate_exposure(surface, samples)
         if found is not None:
             gains.append(found[0] / _road_light(scene, objects.translation[i], objects.size_lhw[i]))
             lifts.append(found[1])
@@ -259,7 +261,7 @@ def _road_light(scene: SceneIR, translation: Tensor, size_lhw: Tensor) -> float:
     pixels = (clip[:, :2] / clip[:, 2:].clamp(min=1.0)).round().long()
     column, row = pixels[:, 0].clamp(0, scene.camera.width - 1), pixels[:, 1].clamp(0, scene.camera.height - 1)
     shown = scene.background[:, row, column].mean(dim=0).double().numpy()
-    return float(finish.light_of(shown).mean())
+    return float(finish.display_to_light(shown).mean())
 
 
 def _blank_source(vehicle: Vehicle, mesh: Mesh, sunlight: float) -> Source:

@@ -10,7 +10,7 @@ from torch import Tensor
 from scene_ir.types import LATTICE, LATTICE_POINTS
 
 SYMMETRIC_DIM = LATTICE_POINTS * 3 // 2
-"""Independent offsets once left and right mirror each other: 96."""
+"""Number of independent offsets of a left-right symmetric lattice: 96."""
 
 
 def _bernstein(t: Tensor, degree: int) -> Tensor:
@@ -21,9 +21,9 @@ def _bernstein(t: Tensor, degree: int) -> Tensor:
 
 
 def lattice_weights(unit: Tensor) -> Tensor:
-    """Weights (V, 64) with which the lattice offsets move unit-box vertices (V, 3).
+    """Weights (V, 64) of the lattice points at unit-box vertices (V, 3).
 
-    Lattice points are ordered length-major, then height (from the roof, y = -1, to the ground, y = 0), then width.
+    Lattice points are ordered by length, then height (roof, y = -1, to ground, y = 0), then width.
     """
     bx = _bernstein(unit[:, 0] + 0.5, LATTICE[0] - 1)
     by = _bernstein(unit[:, 1] + 1.0, LATTICE[1] - 1)
@@ -32,19 +32,28 @@ def lattice_weights(unit: Tensor) -> Tensor:
 
 
 def deform(unit: Tensor, weights: Tensor, offsets: Tensor) -> Tensor:
-    """Deformed vertices (..., V, 3): unit (V, 3), weights (V, 64) of `lattice_weights`, offsets (..., 64, 3)."""
+    """Move vertices by lattice offsets.
+
+    Args:
+        unit: Unit-box vertices (V, 3).
+        weights: Weights (V, 64) from `lattice_weights`.
+        offsets: Lattice offsets (..., 64, 3), fractions of the unit box.
+
+    Returns:
+        Deformed vertices (..., V, 3).
+    """
     return unit + weights @ offsets
 
 
 def symmetrise(offsets: Tensor) -> Tensor:
-    """The nearest offsets (..., 64, 3) that are symmetric left to right (z to -z)."""
+    """The nearest left-right symmetric (z to -z) offsets (..., 64, 3)."""
     grid = offsets.reshape(*offsets.shape[:-2], *LATTICE, 3)
     mirror = grid.flip(-2) * grid.new_tensor([1.0, 1.0, -1.0])
     return (0.5 * (grid + mirror)).reshape(offsets.shape)
 
 
 def from_symmetric(code: Tensor) -> Tensor:
-    """Offsets (..., 64, 3) from the 96 independent numbers (..., 96): those of the half with z < 0."""
+    """Symmetric offsets (..., 64, 3) from the 96 independent numbers (..., 96) of the half with z < 0."""
     half = code.reshape(*code.shape[:-1], LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)
     mirror = half.flip(-2) * half.new_tensor([1.0, 1.0, -1.0])
     return torch.cat([half, mirror], dim=-2).reshape(*code.shape[:-1], LATTICE_POINTS, 3)
@@ -57,13 +66,15 @@ def to_symmetric(offsets: Tensor) -> Tensor:
 
 
 def low_order_modes() -> Tensor:
-    """Symmetric offsets (15, 96), at most 1, that bend a vehicle in the large: along and up by x, y, x^2,
-    xy, y^2 of where a lattice point lies along and up; across by z times 1, x, y, x^2, y^2. None is a move.
+    """Symmetric offsets (15, 96), at most 1, that deform a vehicle smoothly.
+
+    Offsets along the length and height are x, y, x^2, xy, y^2 of the lattice point's position; offsets along the
+    width are z times 1, x, y, x^2, y^2. No mode is a translation.
     """
     x, y, z = (torch.linspace(-1, 1, n) for n in LATTICE)
     x, y, z = (axis.reshape(-1) for axis in torch.meshgrid(x, y, z, indexing="ij"))
     along_and_up = (x, y, x * x, x * y, y * y)
-    across = (z, z * x, z * y, z * x * x, z * y * y)  # odd, lest left and right part
+    across = (z, z * x, z * y, z * x * x, z * y * y)  # odd in z, so that left and right mirror each other
     modes = []
     for axis, terms in enumerate((along_and_up, along_and_up, across)):
         for term in terms:
@@ -74,9 +85,9 @@ def low_order_modes() -> Tensor:
 
 
 def jacobian(unit: Tensor, offsets: Tensor) -> Tensor:
-    """Jacobian (..., V, 3, 3) of the deformation at unit-box points (V, 3), offsets (..., 64, 3).
+    """Jacobian (..., V, 3, 3) of the deformation by offsets (..., 64, 3) at unit-box points (V, 3).
 
-    Its singular values are the local strain; a positive determinant everywhere means that nothing is inverted.
+    Its singular values are the local strain; where its determinant is positive, the mesh is not inverted.
     """
     t = unit + unit.new_tensor([0.5, 1.0, 0.5])
     values = [_bernstein(t[:, axis], LATTICE[axis] - 1) for axis in range(3)]
@@ -90,6 +101,6 @@ def jacobian(unit: Tensor, offsets: Tensor) -> Tensor:
 
 
 def _bernstein_slope(t: Tensor, degree: int) -> Tensor:
-    """Derivatives (..., degree + 1) of the Bernstein polynomials: degree * (b[k-1] - b[k]) of one degree less."""
+    """Derivatives (..., degree + 1) of the Bernstein polynomials: degree * (b[k-1] - b[k]) of the next lower degree."""
     lower = _bernstein(t, degree - 1)
     return degree * (torch.nn.functional.pad(lower, (1, 0)) - torch.nn.functional.pad(lower, (0, 1)))

@@ -1,4 +1,4 @@
-"""Placing objects in camera space and projecting them: KITTI's conventions, in plain differentiable torch."""
+"""Place objects in camera space and project them, by KITTI's conventions; differentiable."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def yaw_matrix(yaw: Tensor) -> Tensor:
-    """Rotation (..., 3, 3) about the camera's y axis by yaw (...,) rad. At yaw 0 a car's front looks along +x."""
+    """Rotation (..., 3, 3) about the camera's y axis by yaw (...,) rad. At yaw 0 a car faces +x."""
     cos, sin = torch.cos(yaw), torch.sin(yaw)
     zero, one = torch.zeros_like(cos), torch.ones_like(cos)
     rows = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
@@ -15,38 +15,50 @@ def yaw_matrix(yaw: Tensor) -> Tensor:
 
 
 def place_vertices(unit: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
-    """Unit-box vertices to camera space.
+    """Transform unit-box vertices to camera space.
 
-    unit: (..., V, 3); size_lhw: (..., 3) m; yaw: (...,) rad; translation: (..., 3) m, bottom-face centre
-    -> (..., V, 3) m.
+    Args:
+        unit: Vertices (..., V, 3) in the unit box.
+        size_lhw: Length, height, width (..., 3) m.
+        yaw: Yaw (...,) rad.
+        translation: Bottom-face centre (..., 3) m.
+
+    Returns:
+        Vertices (..., V, 3) m.
     """
     rotated = (unit * size_lhw[..., None, :]) @ yaw_matrix(yaw).transpose(-1, -2)
     return rotated + translation[..., None, :]
 
 
 def to_clip(points: Tensor, matrix: Tensor) -> Tensor:
-    """Homogeneous pixel coordinates `(u w, v w, w)` of camera-space points. points: (..., 3), matrix: (3, 4)."""
+    """Homogeneous pixel coordinates `(u w, v w, w)` (..., 3) of camera-space points (..., 3); matrix (3, 4)."""
     return points @ matrix[:, :3].T + matrix[:, 3]
 
 
 def project(points: Tensor, matrix: Tensor) -> Tensor:
-    """Pixels (..., 2) of camera-space points (..., 3) in front of the camera (w > 0; not checked)."""
+    """Pixels (..., 2) of camera-space points (..., 3) in front of the camera (w > 0 is not checked)."""
     clip = to_clip(points, matrix)
     return clip[..., :2] / clip[..., 2:]
 
 
 def height_above_ground(depth: Tensor, ground: Tensor, matrix: Tensor) -> Tensor:
-    """Height (H, W) m, float64, above the ground plane of what is seen at `depth` (H, W) m; inf where that is inf.
+    """Height of each pixel's point above the ground plane.
 
-    ground (4,): plane n.x + d = 0; matrix (3, 4).
+    Args:
+        depth: Depth (H, W) m; inf in the sky.
+        ground: Plane (4,) n.x + d = 0.
+        matrix: Projection (3, 4).
+
+    Returns:
+        Height (H, W) m, float64; inf where the depth is inf.
     """
     depth, ground, matrix = (t.double() for t in (depth, ground.to(depth.device), matrix.to(depth.device)))
     up = torch.linalg.inv(matrix[:, :3]).T @ ground[:3]
     rows, columns = (torch.arange(n, dtype=torch.float64, device=depth.device) for n in depth.shape)
     slope = up[0] * columns + up[1] * rows[:, None] + up[2]
-    seen = torch.isfinite(depth)
-    height = ground[3] - up @ matrix[:, 3] + torch.where(seen, depth, 0.0) * slope
-    return torch.where(seen, height, torch.inf)
+    finite = torch.isfinite(depth)
+    height = ground[3] - up @ matrix[:, 3] + torch.where(finite, depth, 0.0) * slope
+    return torch.where(finite, height, torch.inf)
 
 
 _BOX_CORNERS = (
@@ -58,21 +70,46 @@ _BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0
 
 
 def box_corners(size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
-    """Corners (..., 8, 3) m of 3D boxes: bottom face first, in the order of KITTI's development kit."""
+    """Corners of 3D boxes, bottom face first, in the order of KITTI's development kit.
+
+    Args:
+        size_lhw: Length, height, width (..., 3) m.
+        yaw: Yaw (...,) rad.
+        translation: Bottom-face centre (..., 3) m.
+
+    Returns:
+        Corners (..., 8, 3) m.
+    """
     corners = torch.tensor(_BOX_CORNERS, dtype=size_lhw.dtype, device=size_lhw.device).T
     return place_vertices(corners.expand(*yaw.shape, 8, 3), size_lhw, yaw, translation)
 
 
 def ground_footprint(size_lhw: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
-    """Corners (..., 4, 2) m, (x, z), of the boxes' bottom faces."""
+    """Corners of the bottom faces of 3D boxes.
+
+    Args:
+        size_lhw: Length, height, width (..., 3) m.
+        yaw: Yaw (...,) rad.
+        translation: Bottom-face centre (..., 3) m.
+
+    Returns:
+        Corners (..., 4, 2) m, as (x, z).
+    """
     return box_corners(size_lhw, yaw, translation)[..., :4, [0, 2]]
 
 
 def project_boxes(size_lhw: Tensor, yaw: Tensor, translation: Tensor, matrix: Tensor, near: float = 0.1) -> Tensor:
     """Tight image boxes of 3D boxes, cut at the near plane but not at the image border.
 
-    size_lhw (N, 3), yaw (N,), translation (N, 3), matrix (3, 4) -> (N, 4) px, xyxy, differentiable. A box wholly
-    behind the near plane (w < `near` m) gives NaN.
+    Args:
+        size_lhw: Length, height, width (N, 3) m.
+        yaw: Yaw (N,) rad.
+        translation: Bottom-face centre (N, 3) m.
+        matrix: Projection (3, 4).
+        near: Near plane, m.
+
+    Returns:
+        Boxes (N, 4) px, xyxy; NaN for a box wholly behind the near plane.
     """
     clip = to_clip(box_corners(size_lhw, yaw, translation), matrix)
     edges = torch.tensor(_BOX_EDGES, device=clip.device)
@@ -92,30 +129,46 @@ def project_boxes(size_lhw: Tensor, yaw: Tensor, translation: Tensor, matrix: Te
 
 
 def clip_boxes(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
-    """Boxes (N, 4) cut at the image border; in KITTI's convention that is [0, width - 1] x [0, height - 1]."""
+    """Clip boxes at the image border, in KITTI's convention [0, width - 1] x [0, height - 1].
+
+    Args:
+        boxes_xyxy: Boxes (N, 4) px.
+        height: Image height, px.
+        width: Image width, px.
+
+    Returns:
+        Boxes (N, 4) px, xyxy.
+    """
     limit = boxes_xyxy.new_tensor([width - 1, height - 1, width - 1, height - 1])
     return torch.minimum(boxes_xyxy.clamp(min=0), limit)
 
 
 def clamp_inclusive(values: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
-    """Values kept in [low, high]; their gradient is 1 there, at the bounds too, and 0 beyond. low, high: numbers,
-    or tensors of the values' shape.
+    """Clamp values to [low, high] with gradient 1 inside and at the bounds, 0 outside.
 
-    `torch.clamp` has 1, 0.5 or 0 at a bound, as torch's version has it; codes begin there, and a photograph's
-    saturated pixels lie there.
+    The gradient of `torch.clamp` at a bound is 1, 0.5 or 0 depending on torch's version. Codes start at a bound,
+    and saturated pixels of a photograph lie on one.
+
+    Args:
+        values: Values of any shape.
+        low: Lower bound, a number or a tensor of the values' shape.
+        high: Upper bound, likewise.
+
+    Returns:
+        Values of the same shape.
     """
-    kept = torch.clamp(values.detach(), low, high)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return torch.where((values >= low) & (values <= high), values, kept) if values.requires_grad else kept
+    clamped = torch.clamp(values.detach(), low, high)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return torch.where((values >= low) & (values <= high), values, clamped) if values.requires_grad else clamped
 
 
 def weld_vertices(vertices: Tensor, tolerance: float = 1e-6) -> Tensor:
-    """Which place (V,) int64, counted from 0, each of the vertices (V, 3) is at: those at one place share it."""
+    """Position index (V,) int64 of vertices (V, 3); vertices at the same position share an index."""
     keys = (vertices.detach() / tolerance).round().to(torch.int64)
     return torch.unique(keys, dim=0, return_inverse=True)[1]
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Area-weighted unit normals (V, 3), pointing outwards for outward-wound faces."""
+    """Area-weighted unit normals (V, 3), outward for outward-wound faces."""
     corners = vertices[faces]
     face_normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     summed = torch.zeros_like(vertices).index_add(0, faces.reshape(-1), face_normal.repeat_interleave(3, dim=0))

@@ -12,7 +12,7 @@ from torch import Tensor
 from scene_ir.errors import RangeError
 from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import Layers, RenderSettings
+from scene_ir.render.prepare import ObjectLayers, RenderSettings
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _ROW = re.compile(r"objects\[(\d+)\](.*)", re.DOTALL)
@@ -79,7 +79,7 @@ def complete_uncovered_sources(
     if not hidden:
         return sources
     compositor = Compositor(photographed, settings)
-    layers = compositor.layers(compositor.moved(photographed))
+    layers = compositor.draw_layers(compositor.perturbed_objects(photographed))
     return tuple(
         _complete_source(source, layers, row, hidden[row]) if row in hidden else source
         for row, source in enumerate(sources)
@@ -94,7 +94,7 @@ def _opaque_mask(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tens
     return mask
 
 
-def _complete_source(source: Source, layers: Layers, row: int, hidden: Tensor) -> Source:
+def _complete_source(source: Source, layers: ObjectLayers, row: int, hidden: Tensor) -> Source:
     """The source with its foreground as `layers` draw it where `hidden` (H, W), as it was elsewhere."""
     old = source.foreground
     packed, size = layers.layout.spans()[row]

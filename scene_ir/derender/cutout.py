@@ -26,13 +26,13 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from scene_ir.derender.pose import Block, crops_of
+from scene_ir.derender.pose import PoseBlock, crop_boxes
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
 from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.types import Camera
-from scene_ir.weights import load_into, read_weights
+from scene_ir.weights import load_weights, read_weights
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -44,7 +44,7 @@ _TARGET_HW = (60.0, 116.0)
 """Size of the template in the crop: the rest is room for labels that are off, and for what stands around."""
 _MOST_ZOOM, _MOST_STRETCH = 4.0, 1.6
 """Of crops: how much larger than in the photograph, and how much wider than high."""
-GUIDES = 7
+GUIDE_CHANNELS = 7
 """Channels that the placed template gives, see `guides`."""
 CLASSES = ("visible", "front", "shadow", "behind")
 _DETAIL_PX = 90.0
@@ -88,7 +88,7 @@ class Cutout:
         h, w = self.visible.shape
         return slice(self.y0, self.y0 + h), slice(self.x0, self.x0 + w)
 
-    def whole(self, name: str, shape: tuple[int, ...]) -> Array:
+    def full_map(self, name: str, shape: tuple[int, ...]) -> Array:
         """One of the maps, "visible", "front" or "shadow", over the whole photograph (H, W)."""
         out = np.zeros(shape[:2], np.float32)
         out[self.window] = getattr(self, name)
@@ -101,16 +101,16 @@ class _First(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = (32, 64, 96, 128)
-        down, across, up, channels = [], [], [], 3 + GUIDES
+        down, across, up, channels = [], [], [], 3 + GUIDE_CHANNELS
         for out in widths:
-            down.append(nn.Sequential(Block(channels, out, 2), Block(out, out)))
+            down.append(nn.Sequential(PoseBlock(channels, out, 2), PoseBlock(out, out)))
             channels = out
         for out in widths[-2::-1]:
             across.append(nn.Conv2d(channels, out, 1))
-            up.append(Block(out, out))
+            up.append(PoseBlock(out, out))
             channels = out
         self.down, self.across, self.up = nn.ModuleList(down), nn.ModuleList(across), nn.ModuleList(up)
-        self.bottom = Block(widths[-1], widths[-1])
+        self.bottom = PoseBlock(widths[-1], widths[-1])
         self.out = nn.Conv2d(channels, 4 * len(CLASSES), 1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ class CutoutNet(nn.Module):
         x = torch.cat([(crops - _MEAN) / _SPREAD, guides], 1)
         return self.first(x.contiguous(memory_format=torch.channels_last))
 
-    def look_again(self, tiles: Tensor, shares: Tensor) -> Tensor:
+    def refine(self, tiles: Tensor, shares: Tensor) -> Tensor:
         """Log shares (N, 3, h, w) of visible, front, rest. tiles (N, 3, h, w) RGB in [0, 1] in the photograph's
         own pixels; shares (N, 3, h, w): visible, front and shadow, as first seen."""
         x = torch.cat([(tiles - _MEAN) / _SPREAD, shares], 1)
@@ -154,15 +154,15 @@ class CutoutNet(nn.Module):
 
 
 @lru_cache(maxsize=1)
-def shipped() -> CutoutNet:
+def load_network() -> CutoutNet:
     """The network with the package's weights, in eval mode. FormatError where they are missing or damaged."""
     network = CutoutNet()
-    load_into(network, read_weights(WEIGHTS)[1], WEIGHTS)
+    load_weights(network, read_weights(WEIGHTS)[1], WEIGHTS)
     network.requires_grad_(False)
     return network.eval()
 
 
-def crop_rect(placement: Placement, camera: Camera) -> tuple[int, int, int, int] | None:
+def crop_rectangle(placement: Placement, camera: Camera) -> tuple[int, int, int, int] | None:
     """The part of the photograph, px, half-open, that the first look sees: about the template, beyond the
     photograph's border where that is near. None where no part of the template shows."""
     clip = to_clip(_light(placement).vertices(), camera.matrix)
@@ -183,7 +183,7 @@ def crop_rect(placement: Placement, camera: Camera) -> tuple[int, int, int, int]
     return x0, y0, x0 + wide, y0 + high_px
 
 
-def zoomed(camera: Camera, rect: tuple[int, int, int, int]) -> Camera:
+def crop_camera(camera: Camera, rect: tuple[int, int, int, int]) -> Camera:
     """The camera whose picture is the crop of a rectangle."""
     x0, y0, x1, y1 = rect
     (height, width), sx, sy = CROP_HW, CROP_HW[1] / (x1 - x0), CROP_HW[0] / (y1 - y0)
@@ -191,7 +191,7 @@ def zoomed(camera: Camera, rect: tuple[int, int, int, int]) -> Camera:
     return Camera(zoom @ camera.intrinsics, height, width, zoom @ camera.matrix)
 
 
-def inside_of(rect: tuple[int, int, int, int], limit: tuple[int, int, int, int]) -> Array:
+def inside_mask(rect: tuple[int, int, int, int], limit: tuple[int, int, int, int]) -> Array:
     """Which pixels (96, 160) of a rectangle's crop show what lies inside `limit`, also a rectangle, px: 0 or 1."""
     (height, width), (x0, y0, x1, y1) = CROP_HW, rect
     columns = x0 + (np.arange(width) + 0.5) * (x1 - x0) / width
@@ -200,7 +200,7 @@ def inside_of(rect: tuple[int, int, int, int], limit: tuple[int, int, int, int])
     return ((rows >= limit[1]) & (rows <= limit[3]))[:, None] * across[None].astype(np.float32)
 
 
-def guides(
+def render_guides(
     placements: Sequence[Placement],
     cameras: Sequence[Camera],
     ground: Sequence[Tensor],
@@ -220,7 +220,7 @@ def guides(
     faces = torch.cat([p.mesh.faces + start for p, start in zip(coarse, first[:-1], strict=True)])
     ends = torch.tensor([len(p.mesh.faces) for p in coarse]).cumsum(0)
     face_ranges = torch.stack([ends - torch.tensor([len(p.mesh.faces) for p in coarse]), ends], 1)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, width, height]] * len(coarse)))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, width, height]] * len(coarse)))
     fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
     cover = verbs.antialias(fragments, clip, faces, backend)
     spots = verbs.interpolate(fragments, clip, faces, torch.cat([p.mesh.vertices for p in coarse]), backend)
@@ -264,40 +264,40 @@ def cut_out(
     camera: Camera,
     network: CutoutNet | None = None,
     backend: verbs.Backend = "warp",
-    again: bool = True,
+    refine_borders: bool = True,
 ) -> list[Cutout]:
     """Each placed vehicle's pixels. image (H, W, 3) RGB; nearer: for each vehicle the pixels (H, W) of nearer
     ones, as far as they are known; ground (4,): plane n.x + d = 0; network: another than the shipped
     one; again: whether to look again at the borders, which then are right to parts of a pixel."""
-    network = network or shipped()
-    shown = [(i, rect) for i, p in enumerate(placements) if (rect := crop_rect(p, camera)) is not None]
+    network = network or load_network()
+    shown = [(i, rect) for i, p in enumerate(placements) if (rect := crop_rectangle(p, camera)) is not None]
     found = [Cutout(0, 0, *(np.zeros((0, 0), np.float32),) * 3) for _ in placements]
     if not shown:
         return found
     rects = np.array([rect for _, rect in shown], np.float32) - 0.5
-    cameras = [zoomed(camera, rect) for _, rect in shown]
+    cameras = [crop_camera(camera, rect) for _, rect in shown]
     given = np.zeros((len(shown), 2, *CROP_HW), np.float32)
     for row, (i, rect) in enumerate(shown):
         others = np.repeat(nearer[i][..., None].astype(np.uint8) * 255, 3, axis=2)
-        given[row, 1] = inside_of(rect, (0, 0, camera.width, camera.height))
-        given[row, 0] = crops_of(others, rects[row : row + 1], CROP_HW, 1.0)[0, ..., 0] / 255 * given[row, 1]
-    crops = torch.from_numpy(crops_of(image, rects, CROP_HW, 1.0).transpose(0, 3, 1, 2).astype(np.float32) / 255)
-    said = guides([placements[i] for i, _ in shown], cameras, [ground] * len(shown), given, backend)
+        given[row, 1] = inside_mask(rect, (0, 0, camera.width, camera.height))
+        given[row, 0] = crop_boxes(others, rects[row : row + 1], CROP_HW, 1.0)[0, ..., 0] / 255 * given[row, 1]
+    crops = torch.from_numpy(crop_boxes(image, rects, CROP_HW, 1.0).transpose(0, 3, 1, 2).astype(np.float32) / 255)
+    said = render_guides([placements[i] for i, _ in shown], cameras, [ground] * len(shown), given, backend)
     shares = network(crops, said).softmax(1)[:, :3].numpy()
     for (i, rect), share in zip(shown, shares, strict=True):
         found[i] = _in_photograph(share, rect, image.shape)
-    return refined(image, found, network) if again else found
+    return refine_cutouts(image, found, network) if refine_borders else found
 
 
 def _in_photograph(shares: Array, rect: tuple[int, int, int, int], shape: tuple[int, ...]) -> Cutout:
     """Shares (3, 96, 160) of a crop in the photograph's pixels, as far as they lie inside."""
     x0, y0, x1, y1 = rect
     left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, shape[1]), min(y1, shape[0])
-    parts = enlarged(shares, (x1 - x0, y1 - y0))[:, top - y0 : bottom - y0, left - x0 : right - x0]
+    parts = resize_shares(shares, (x1 - x0, y1 - y0))[:, top - y0 : bottom - y0, left - x0 : right - x0]
     return Cutout(left, top, *(np.ascontiguousarray(part) for part in parts))
 
 
-def enlarged(shares: Array, size_wh: tuple[int, int]) -> Array:
+def resize_shares(shares: Array, size_wh: tuple[int, int]) -> Array:
     """Shares (3, 96, 160) of a crop with as many pixels as the photograph has there, (3, h, w)."""
     smaller = size_wh[0] < CROP_HW[1] and size_wh[1] < CROP_HW[0]
     how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
@@ -305,12 +305,14 @@ def enlarged(shares: Array, size_wh: tuple[int, int]) -> Array:
 
 
 @torch.no_grad()
-def refined(image: NDArray[np.uint8], cutouts: Sequence[Cutout], network: CutoutNet | None = None) -> list[Cutout]:
+def refine_cutouts(
+    image: NDArray[np.uint8], cutouts: Sequence[Cutout], network: CutoutNet | None = None
+) -> list[Cutout]:
     """The cut-outs after a look at the photograph's own pixels along their borders; elsewhere pixels are wholly
     one or the other. image (H, W, 3) RGB."""
-    network = network or shipped()
+    network = network or load_network()
     padded, places = [], []
-    looked = [unsure(c) if c.visible.size else np.zeros((0, 0), bool) for c in cutouts]
+    looked = [find_uncertain_pixels(c) if c.visible.size else np.zeros((0, 0), bool) for c in cutouts]
     for i, cutout in enumerate(cutouts):
         if not cutout.visible.size:
             padded.append(np.zeros((0, 0, 6), np.float32))
@@ -332,7 +334,7 @@ def refined(image: NDArray[np.uint8], cutouts: Sequence[Cutout], network: Cutout
         some = places[start : start + _BATCH]
         tiles = np.stack([padded[i][y : y + side, x : x + side] for i, y, x in some]).transpose(0, 3, 1, 2)
         both = torch.from_numpy(np.ascontiguousarray(tiles)).contiguous(memory_format=torch.channels_last)
-        shares = network.look_again(both[:, :3], both[:, 3:]).exp()[:, :2, HALO:-HALO, HALO:-HALO].numpy()
+        shares = network.refine(both[:, :3], both[:, 3:]).exp()[:, :2, HALO:-HALO, HALO:-HALO].numpy()
         for (i, y, x), share in zip(some, shares, strict=True):
             for values, part in zip(maps[i], share, strict=True):
                 chosen = looked[i][y : y + TILE, x : x + TILE]
@@ -344,7 +346,7 @@ def refined(image: NDArray[np.uint8], cutouts: Sequence[Cutout], network: Cutout
     ]
 
 
-def unsure(cutout: Cutout) -> Mask:
+def find_uncertain_pixels(cutout: Cutout) -> Mask:
     """Pixels (h, w) that may be of several things: along borders, and where the first look could not tell."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     out = np.zeros(cutout.visible.shape, bool)
@@ -362,17 +364,19 @@ def _tiles(wanted: NDArray[Any]) -> Mask:
     return np.asarray(parts.any((1, 3)))
 
 
-def of_mask(image: NDArray[np.uint8], mask: Mask, nearer: Mask, network: CutoutNet | None = None) -> Cutout:
+def cutout_from_mask(
+    image: NDArray[np.uint8], mask: Mask, nearer: Mask, network: CutoutNet | None = None
+) -> Cutout:
     """The cut-out of a vehicle whose pixels are known: borders to parts of a pixel. image (H, W, 3) RGB; mask
     (H, W), not empty; nearer (H, W): nearer vehicles' pixels."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     y0, y1 = max(int(rows[0]) - HALO, 0), min(int(rows[-1]) + 1 + HALO, mask.shape[0])
     x0, x1 = max(int(columns[0]) - HALO, 0), min(int(columns[-1]) + 1 + HALO, mask.shape[1])
     visible, front = (m[y0:y1, x0:x1].astype(np.float32) for m in (mask, nearer & ~mask))
-    return refined(image, [Cutout(x0, y0, visible, front, np.zeros_like(visible))], network)[0]
+    return refine_cutouts(image, [Cutout(x0, y0, visible, front, np.zeros_like(visible))], network)[0]
 
 
-def tidy(cutout: Cutout) -> Cutout:
+def clean_cutout(cutout: Cutout) -> Cutout:
     """Without specks, and without holes: windows and reflections are car, and what stands in front of one does not
     float in its middle."""
     solid = (cutout.visible >= 0.5).astype(np.uint8)
@@ -391,7 +395,7 @@ def tidy(cutout: Cutout) -> Cutout:
     return replace(cutout, visible=visible, front=front, shadow=shadow)
 
 
-def believed(cutout: Cutout, outline: Mask, known: Mask) -> Cutout:
+def remove_unlikely_occluders(cutout: Cutout, outline: Mask, known: Mask) -> Cutout:
     """The cut-out without what is unlikely in front of a placed vehicle, and with its notches filled.
 
     outline (H, W): of the placed mesh; known (H, W): pixels of nearer things that are known to be there.

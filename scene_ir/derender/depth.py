@@ -22,10 +22,11 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scene_ir.derender import maps, unet
+from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import unet
 from scene_ir.derender.unet import UNet
 from scene_ir.types import Camera
-from scene_ir.weights import load_into, read_weights
+from scene_ir.weights import load_weights, read_weights
 
 Array = NDArray[np.float32]
 
@@ -60,7 +61,7 @@ class DepthNet(UNet):
         super().__init__(1)
 
 
-def excess(numbers: Tensor) -> Tensor:
+def nearness_excess(numbers: Tensor) -> Tensor:
     """By how much each pixel is nearer than the ground (...), at least 0, of the network's numbers (...)."""
     return F.softplus(numbers + _AT_ZERO)
 
@@ -69,25 +70,25 @@ def excess(numbers: Tensor) -> Tensor:
 def load_network(path: Path = WEIGHTS) -> DepthNet:
     """The network of a weights file, in eval mode. FormatError naming file and key."""
     network = DepthNet()
-    load_into(network, read_weights(path)[1], path)
+    load_weights(network, read_weights(path)[1], path)
     network.requires_grad_(False)
     return network.eval().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 @dataclass(frozen=True, slots=True)
-class Ties:
+class DepthConstraints:
     """What is known of the surroundings, each (H, W). sky, flat in [0, 1]: where sky is seen, and where ground;
     stood, 0 or 1: where something labelled stands, and so ground is; behind_m: what is seen there once the
     labelled vehicles are gone is no nearer, 0 where nothing tells."""
 
     sky: Array
     flat: Array
-    stood: Array
+    footprint: Array
     behind_m: Array
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class GroundFrame:
     """A picture (H, W, 3) RGB float32 in [0, 1] without vehicles, its camera, and the ground: plane (4,) n.x + d =
     0, n up, and its depth plane_m (H, W), inf above the horizon."""
 
@@ -97,9 +98,9 @@ class Outlook:
     plane_m: Array
 
     @staticmethod
-    def of(image: Array, ground: Tensor, camera: Camera) -> Outlook:
+    def from_image(image: Array, ground: Tensor, camera: Camera) -> GroundFrame:
         """The outlook of a picture over a plane."""
-        return Outlook(image, ground, camera, maps.plane_depth(ground, camera))
+        return GroundFrame(image, ground, camera, maps.compute_plane_depth(ground, camera))
 
     def nearness(self, depth_m: Array) -> Array:
         """Of depth (H, W) m."""
@@ -110,7 +111,7 @@ class Outlook:
         endless = nearness < _ENDLESS
         return np.where(endless, np.inf, float(self.ground[3]) / np.where(endless, 1, nearness)).astype(np.float32)
 
-    def smoothed(self, values: Array, how: tuple[float, float]) -> Array:
+    def smooth(self, values: Array, how: tuple[float, float]) -> Array:
         """Values (H, W) smoothed where the picture has no edge (Min et al., Fast Global Image Smoothing, 2014).
         how: how much at KITTI's focal length, and the difference of 8-bit colours that is an edge."""
         guide = np.clip(np.rint(self.image * 255), 0, 255).astype(np.uint8)
@@ -121,39 +122,41 @@ class Outlook:
         return np.asarray(smooth, np.float32)
 
 
-def from_network(outlook: Outlook, network: DepthNet | None = None) -> Array:
+def predict_excess(outlook: GroundFrame, network: DepthNet | None = None) -> Array:
     """By how much each pixel (h, w) of a picture, coarser than it, is nearer than the ground."""
     camera = outlook.camera
-    view = unet.view(outlook.image, outlook.ground, camera)
+    view = unet.prepare_input(outlook.image, outlook.ground, camera)
     # In a picture of another focal length all is as near as it seems.
     zoom = float(camera.intrinsics[1, 1]) * view.image.shape[0] / (camera.height * unet.INPUT_FOCAL_PX)
     view = replace(view, elevation=view.elevation * np.float32(zoom))
-    return np.asarray(excess((network or load_network()).look(view))[0, 0].numpy() / zoom, np.float32)
+    return np.asarray(nearness_excess((network or load_network()).predict(view))[0, 0].numpy() / zoom, np.float32)
 
 
-def by_network(outlook: Outlook, flat: Array, network: DepthNet | None = None) -> Array:
+def nearness_by_network(outlook: GroundFrame, flat: Array, network: DepthNet | None = None) -> Array:
     """Nearness (H, W) as the network has it. flat (H, W) in [0, 1]: where ground is seen; borders of what stands
     there are laid along the picture's edges."""
     size = outlook.image.shape[1::-1]
     level = outlook.nearness(outlook.plane_m)
-    large = cv2.resize(np.log(from_network(outlook, network) + _LEAST), size, interpolation=cv2.INTER_LINEAR)
+    large = cv2.resize(np.log(predict_excess(outlook, network) + _LEAST), size, interpolation=cv2.INTER_LINEAR)
     told = level + _SCALE * np.exp(np.asarray(large, np.float32))
-    standing = np.exp(outlook.smoothed(np.log(told + _FAR_OFF), _TO_EDGES)) - _FAR_OFF
+    standing = np.exp(outlook.smooth(np.log(told + _FAR_OFF), _TO_EDGES)) - _FAR_OFF
     return np.maximum(flat * told + (1 - flat) * standing, level)
 
 
-def by_rule(outlook: Outlook, ties: Ties) -> Array:
+def nearness_by_rule(outlook: GroundFrame, ties: DepthConstraints) -> Array:
     """Nearness (H, W) of ground and of walls on its end, smoothed where the picture has no edge."""
     horizon = maps.horizon_row(outlook.ground, outlook.camera)
-    walls = outlook.nearness(maps.walls(outlook.plane_m, ties.flat, ties.stood, ties.sky, horizon))
+    walls = outlook.nearness(
+        maps.compute_wall_depth(outlook.plane_m, ties.flat, ties.footprint, ties.sky, horizon)
+    )
     known = (walls > 0).astype(np.float32)
-    total, weight = (outlook.smoothed(m, _RELAXED) for m in (walls, known))
+    total, weight = (outlook.smooth(m, _RELAXED) for m in (walls, known))
     standing = total / np.maximum(weight, _LEAST)
     return np.maximum(ties.flat * walls + (1 - ties.flat) * standing, outlook.nearness(outlook.plane_m))
 
 
-def surroundings(
-    image: Array, ground: Tensor, camera: Camera, ties: Ties, network: DepthNet | None = None
+def estimate_depth(
+    image: Array, ground: Tensor, camera: Camera, ties: DepthConstraints, network: DepthNet | None = None
 ) -> Array:
     """Depth (H, W) m along the optical axis of what a picture without vehicles shows, inf in the sky.
 
@@ -161,11 +164,11 @@ def surroundings(
     one. The network sees what stands where, the end of the ground tells how far that is: nearness by both is
     averaged, in logarithms. Nothing is farther than the ground that its ray meets.
     """
-    outlook = Outlook.of(image, ground, camera)
-    told, ruled = by_network(outlook, ties.flat, network), by_rule(outlook, ties)
+    outlook = GroundFrame.from_image(image, ground, camera)
+    told, ruled = nearness_by_network(outlook, ties.flat, network), nearness_by_rule(outlook, ties)
     both = np.sqrt((told + _FAR_OFF) * (ruled + _FAR_OFF)) - _FAR_OFF
     level = outlook.nearness(outlook.plane_m)
-    stood = cv2.GaussianBlur(ties.stood, (0, 0), max(_BLURRED * float(camera.intrinsics[0, 0]), 0.5))
+    stood = cv2.GaussianBlur(ties.footprint, (0, 0), max(_BLURRED * float(camera.intrinsics[0, 0]), 0.5))
     nearness = level + np.maximum(both - level, 0) * (1 - ties.sky) * (1 - stood)
     behind = outlook.nearness(np.where(ties.behind_m > 0, ties.behind_m, np.float32(1e-3)))
     return outlook.depth_m(np.maximum(_no_nearer(nearness, behind), level))

@@ -48,7 +48,9 @@ class IcpSettings:
     bound: float = 2.0
 
 
-def inside(placement: Placement, points: Tensor, settings: IcpSettings | None = None) -> NDArray[np.float64]:
+def points_near_box(
+    placement: Placement, points: Tensor, settings: IcpSettings | None = None
+) -> NDArray[np.float64]:
     """Of points (P, 3) m those in the placement's box, grown, and above the ground it stands on, (K, 3)."""
     settings = settings or IcpSettings()
     cloud = points.double().cpu().numpy() - placement.translation.double().numpy()
@@ -60,13 +62,13 @@ def inside(placement: Placement, points: Tensor, settings: IcpSettings | None = 
     return points.double().cpu().numpy()[kept]
 
 
-def to_points(
+def align_to_points(
     placement: Placement, points: Tensor, camera: Camera, settings: IcpSettings | None = None
 ) -> Placement | None:
     """The placement moved, turned and stretched so that its surface meets the laser's points (P, 3) m inside its
     box; None where there are too few."""
     settings = settings or IcpSettings()
-    cloud = inside(placement, points, settings)
+    cloud = points_near_box(placement, points, settings)
     if len(cloud) < _FEW:
         return None
     unit, normal = _surface(placement.mesh)

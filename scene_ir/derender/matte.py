@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene_ir.derender.cutout import Cutout
-from scene_ir.derender.silhouette import extent
+from scene_ir.derender.silhouette import mask_bounds
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -49,7 +49,9 @@ class ShareSettings:
     under_px: float = 2.0
 
 
-def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None) -> Array:
+def compute_matte(
+    image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: MatteSettings | None = None
+) -> Array:
     """Opacity (H, W) in [0, 1] of the car in `mask`.
 
     image (H, W, 3) RGB in [0, 1]. unknown (H, W): pixels of nearer things. The car runs on behind their border, so
@@ -59,7 +61,7 @@ def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: Matte
     opacity = np.zeros(mask.shape, np.float32)
     if not mask.any():
         return opacity
-    x0, y0, x1, y1 = extent(mask)
+    x0, y0, x1, y1 = mask_bounds(mask)
     margin = int(4 * settings.band_px) + 4
     window = (
         slice(max(y0 - margin, 0), min(y1 + margin, mask.shape[0])),
@@ -96,7 +98,7 @@ def matte(image: Array, mask: Mask, unknown: Mask, ground: Mask, settings: Matte
     return opacity
 
 
-def opacity_of(cutout: Cutout, mask: Mask, hidden: Mask, settings: ShareSettings | None = None) -> Array:
+def cutout_opacity(cutout: Cutout, mask: Mask, hidden: Mask, settings: ShareSettings | None = None) -> Array:
     """Opacity (H, W) in [0, 1] of the car of a cut-out. mask (H, W): its pixels; hidden (H, W): of nearer things.
 
     A little more than what is seen of it: some road that travels with a car shows less than an edge of car that is

@@ -27,12 +27,12 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from scene_ir.derender.maps import CAMERA_HEIGHT
+from scene_ir.derender.ground_geometry import CAMERA_HEIGHT_M
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.outlines import KINDS
 from scene_ir.types import Camera, check_shape
-from scene_ir.weights import load_into, read_weights
+from scene_ir.weights import load_weights, read_weights
 
 Array = NDArray[np.float32]
 
@@ -43,7 +43,7 @@ CONTEXT = 1.5
 """Side of the crop, in sides of the box."""
 BINS = 12
 """Of the viewing angle, 30 degrees each, centred at multiples of that."""
-NUMBERS = 9
+BOX_FEATURES = 9
 """What the network is told of a box, see `box_numbers`."""
 MEAN_LHW = {"Car": (4.07, 1.62, 1.68), "Truck": (9.97, 3.30, 2.55)}
 """m, of cars and vans together and of trucks and buses, in generated streets; KITTI's are within 6%."""
@@ -67,7 +67,7 @@ _HUBER = 1.5
 """Standard deviations from which on a vehicle pulls at the plane, or the plane at a vehicle, no stronger."""
 
 
-class Block(nn.Module):
+class PoseBlock(nn.Module):
     """Convolution, normalisation, ReLU; added to its input where that has the same shape."""
 
     def __init__(self, channels: int, out: int, stride: int = 1) -> None:
@@ -82,7 +82,7 @@ class Block(nn.Module):
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class PosePrediction:
     """What the network says of N boxes. bins (N, 12) logits; turn (N, 12, 2): cosine and sine, not normalised, of
     the angle from each bin's centre; offset (N, 2): of the projected 3D centre from the box's centre, in box
     sides; size (N, 3): log length, height, width over the class's means; depth (N,): log of the centre's depth
@@ -107,24 +107,24 @@ class PoseNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         layers = ((3, 16, 2), (16, 32, 2), (32, 32, 1), (32, 64, 2), (64, 64, 1), (64, 128, 2), (128, 128, 1))
-        self.blocks = nn.Sequential(*(Block(*layer) for layer in layers))
+        self.blocks = nn.Sequential(*(PoseBlock(*layer) for layer in layers))
         self.squeeze = nn.Conv2d(128, 40, 1)
         cells = 40 * (CROP_HW[0] // 16) * (CROP_HW[1] // 16)
-        self.hidden = nn.Linear(cells + NUMBERS, 160)
-        self.out = nn.Linear(160 + NUMBERS, sum(_OUT))
+        self.hidden = nn.Linear(cells + BOX_FEATURES, 160)
+        self.out = nn.Linear(160 + BOX_FEATURES, sum(_OUT))
 
-    def forward(self, crops: Tensor, numbers: Tensor) -> Said:
+    def forward(self, crops: Tensor, numbers: Tensor) -> PosePrediction:
         x = ((crops - _MEAN) / _SPREAD).contiguous(memory_format=torch.channels_last)
         x = F.relu(self.squeeze(self.blocks(x))).flatten(1)
         x = F.relu(self.hidden(torch.cat([x, numbers], 1)))
         bins, turn, offset, size, depth, log_sigma, kind = self.out(torch.cat([x, numbers], 1)).split(_OUT, 1)
-        return Said(
+        return PosePrediction(
             bins, turn.reshape(-1, BINS, 2), offset, size, depth[:, 0], log_sigma[:, 0].clamp(-4.5, 0.5), kind
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Poses:
+class VehiclePoses:
     """Vehicles in camera axes, one a box. translation (N, 3) m, bottom-face centre; yaw (N,) rad in [-pi, pi);
     size_lhw (N, 3) m; kind: one of `KINDS` each; log_depth_sigma (N,): standard deviation of the depth's
     logarithm; facing (N,) in [0.5, 1]: how sure it is which end is the front; ground (4,): the plane
@@ -149,12 +149,12 @@ def shipped() -> PoseNet:
 def load(path: Path) -> PoseNet:
     """The network with the weights of a file, in eval mode. FormatError naming file and key."""
     network = PoseNet()
-    load_into(network, read_weights(path)[1], path)
+    load_weights(network, read_weights(path)[1], path)
     network.requires_grad_(False)
     return network.eval()
 
 
-def box_numbers(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
+def box_features(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
     """What the network is told of boxes (N, 4) px, (N, 9): centre from the principal point over focal length (2),
     log width and height over focal length about their means (2), whether the image's border cuts it left, above,
     right, below (4), and whether it is a truck. trucks (N,) bool; cameras (N or 1, 6): see `camera_numbers`.
@@ -166,7 +166,7 @@ def box_numbers(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
     return torch.cat([centre, size, cut.to(centre), trucks.to(centre)[:, None]], 1)
 
 
-def camera_numbers(camera: Camera) -> Tensor:
+def camera_features(camera: Camera) -> Tensor:
     """Focal lengths, principal point, width, height of a camera, (1, 6) px."""
     k = camera.intrinsics.float()
     size = k.new_tensor([camera.width, camera.height])
@@ -178,7 +178,7 @@ def is_truck(kinds: Sequence[str]) -> Tensor:
     return torch.tensor([_IS[kind] == "Truck" for kind in kinds], dtype=torch.bool)
 
 
-def crops_of(
+def crop_boxes(
     image: NDArray[Any], boxes_xyxy: Array, size_hw: tuple[int, int] = CROP_HW, context: float = CONTEXT
 ) -> NDArray[Any]:
     """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3);
@@ -226,17 +226,17 @@ def mean_depth(boxes_xyxy: Tensor, kinds: Sequence[str], camera: Camera) -> Tens
     return camera.intrinsics[1, 1] * mean_sizes(kinds)[:, 1] / (boxes_xyxy[:, 3] - boxes_xyxy[:, 1])
 
 
-def mirrored(numbers: Tensor) -> Tensor:
+def mirror_features(numbers: Tensor) -> Tensor:
     """The numbers of a box in the mirrored image."""
     turned = numbers[:, [0, 1, 2, 3, 6, 5, 4, 7, 8]].clone()
     turned[:, 0] = -turned[:, 0]
     return turned
 
 
-def unmirrored(said: Said) -> Said:
+def unmirror_prediction(said: PosePrediction) -> PosePrediction:
     """What was said of mirrored images, as of the images themselves: angle a becomes pi - a."""
     bins = (BINS // 2 - torch.arange(BINS)) % BINS
-    return Said(
+    return PosePrediction(
         said.bins[:, bins],
         said.turn[:, bins] * said.turn.new_tensor([1.0, -1.0]),
         said.offset * said.offset.new_tensor([-1.0, 1.0]),
@@ -247,7 +247,7 @@ def unmirrored(said: Said) -> Said:
     )
 
 
-def viewing_angle(said: Said) -> tuple[Tensor, Tensor]:
+def decode_viewing_angle(said: PosePrediction) -> tuple[Tensor, Tensor]:
     """The viewing angle alpha (N,) rad and how sure its direction is (N,) in [0.5, 1]: the likeliest bin and its
     neighbours, each with its say; against the same, half a turn away.
     """
@@ -266,11 +266,11 @@ def viewing_angle(said: Said) -> tuple[Tensor, Tensor]:
     return alpha, ahead / (ahead + behind).clamp(min=1e-9)
 
 
-def _both(network: PoseNet, crops: Tensor, numbers: Tensor) -> Said:
+def _both(network: PoseNet, crops: Tensor, numbers: Tensor) -> PosePrediction:
     """What the network says of boxes, and of the same in the mirror, in the mean."""
     one = network(crops, numbers)
-    other = unmirrored(network(crops.flip(3), mirrored(numbers)))
-    return Said(
+    other = unmirror_prediction(network(crops.flip(3), mirror_features(numbers)))
+    return PosePrediction(
         torch.log(0.5 * (one.bins.softmax(1) + other.bins.softmax(1)) + 1e-9),
         F.normalize(one.turn, dim=-1) + F.normalize(other.turn, dim=-1),
         0.5 * (one.offset + other.offset),
@@ -282,15 +282,15 @@ def _both(network: PoseNet, crops: Tensor, numbers: Tensor) -> Said:
 
 
 @torch.no_grad()
-def estimate(
+def estimate_poses(
     photograph: Tensor,
     boxes_xyxy: Tensor,
     kinds: Sequence[str],
     camera: Camera,
     ground: Tensor | None = None,
     network: PoseNet | None = None,
-    looks: int = 1,
-) -> Poses:
+    rounds: int = 1,
+) -> VehiclePoses:
     """Poses and sizes of the vehicles in 2D boxes.
 
     photograph (3, H, W) RGB in [0, 1]; boxes_xyxy (N, 4) px; kinds: "Car", "Van" or "Truck", one a box; ground
@@ -307,8 +307,8 @@ def estimate(
         if kind not in _IS:
             raise RangeError(f"kinds[{i}]", " or ".join(_IS), repr(kind))
     boxes = boxes_xyxy.detach().cpu().float()
-    if looks < 1:
-        raise RangeError("looks", "at least 1", looks)
+    if rounds < 1:
+        raise RangeError("looks", "at least 1", rounds)
     for i, box in enumerate(boxes):
         if not bool(torch.isfinite(box).all() and (box[2:] > box[:2]).all()):
             raise RangeError(f"boxes_xyxy[{i}]", "finite, with an area", box.tolist())
@@ -319,11 +319,13 @@ def estimate(
     if not len(boxes):
         plane, _ = fit_plane(np.zeros((0, 3)), np.zeros(0), *_known(ground))
         nothing = torch.zeros(0)
-        return Poses(torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane))
+        return VehiclePoses(
+            torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane)
+        )
     image = np.ascontiguousarray(photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     network = network or shipped()
     poses = _look(network, image, boxes, kinds, camera, ground)
-    for _ in range(looks - 1):
+    for _ in range(rounds - 1):
         found = project_boxes(poses.size_lhw, poses.yaw, poses.translation, camera.matrix.float())
         found = clip_boxes(found, camera.height, camera.width)
         tight = (found[:, 2:] - found[:, :2] >= 0.5 * (boxes[:, 2:] - boxes[:, :2])).all(1)
@@ -334,11 +336,11 @@ def estimate(
 
 def _look(
     network: PoseNet, image: Array, boxes: Tensor, kinds: Sequence[str], camera: Camera, ground: Tensor | None
-) -> Poses:
+) -> VehiclePoses:
     """Poses from boxes (N, 4) px as they are; image (H, W, 3)."""
-    crops = torch.from_numpy(crops_of(image, boxes.numpy())).permute(0, 3, 1, 2)
-    said = _both(network, crops, box_numbers(boxes, is_truck(kinds), camera_numbers(camera)))
-    alpha, facing = viewing_angle(said)
+    crops = torch.from_numpy(crop_boxes(image, boxes.numpy())).permute(0, 3, 1, 2)
+    said = _both(network, crops, box_features(boxes, is_truck(kinds), camera_features(camera)))
+    alpha, facing = decode_viewing_angle(said)
     size = mean_sizes(kinds) * said.size.exp()
     depth = mean_depth(boxes, kinds, camera) * said.depth.exp()
     sigma = said.log_sigma.exp().clamp(min=_LEAST_SIGMA)
@@ -348,7 +350,7 @@ def _look(
     scale, sigma, plane = _onto_ground(foot, size, sigma, camera, ground)
     translation = foot * scale[:, None]
     yaw = alpha + torch.atan2(translation[:, 0], translation[:, 2])
-    return Poses(
+    return VehiclePoses(
         translation,
         (yaw + math.pi) % (2 * math.pi) - math.pi,
         size * scale[:, None],
@@ -371,7 +373,7 @@ def back_project(pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:
 def _known(ground: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
     """Slopes and height (3,) of the plane before any vehicle is seen, and their standard deviations (3,)."""
     if ground is None:
-        return np.array([0.0, 0.0, CAMERA_HEIGHT]), np.array(_PRIOR)
+        return np.array([0.0, 0.0, CAMERA_HEIGHT_M]), np.array(_PRIOR)
     n = ground.double().cpu().numpy()
     return -n[[0, 2, 3]] / n[1], np.array(_GIVEN)
 

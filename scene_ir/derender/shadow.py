@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_ir.derender.silhouette import Placement, extent, grow
-from scene_ir.push_pull import push_pull
-from scene_ir.render.surfaces import shadow_corners, shadow_density, sun_offset
+from scene_ir.derender.silhouette import Placement, grow_mask, mask_bounds
+from scene_ir.image_filters import push_pull
+from scene_ir.render.surfaces import shadow_corners, shadow_density, shadow_offset
 from scene_ir.types import Camera
 
 Array = NDArray[np.float32]
@@ -31,7 +31,7 @@ _LOW = 0.04
 long ones meet more that is dark for other reasons."""
 STRETCHES = (1.0, 1.25, 1.5)
 """Of a sun's shadows, tried in turn where theirs go on beyond what was expected."""
-LESS = 0.5
+MAX_SPILL_RATIO = 0.5
 """Share of the dark pixels beyond reach that may be left for longer shadows to be believed."""
 _CAST = 0.12
 """Darkness of the box shadow from which on a pixel counts as shaded by it."""
@@ -81,7 +81,7 @@ class GroundView:
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class GroundLight:
     """grey (H, W): the photograph's brightness; lit (H, W): how bright the ground would be without cars'
     shadows."""
 
@@ -89,7 +89,7 @@ class Light:
     lit: Array
 
 
-def ground_view(placement: Placement, ground: torch.Tensor, camera: Camera) -> GroundView:
+def view_ground(placement: Placement, ground: torch.Tensor, camera: Camera) -> GroundView:
     """The ground around one car as the camera sees it. ground (4,): plane n.x + d = 0."""
     matrix = camera.matrix.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
@@ -142,14 +142,14 @@ def _pictured(corners: NDArray[np.float64], camera: Camera) -> tuple[slice, slic
     return slice(y0, y1), slice(x0, x1)
 
 
-def light(
+def estimate_ground_light(
     image: Array,
     road: Array,
     vehicles: Mask,
     views: Sequence[GroundView],
     settings: ShadowSettings | None = None,
     behind: Callable[[Mask], Array] | None = None,
-) -> Light:
+) -> GroundLight:
     """Brightness as it is, and of the ground as it would be lit: continued from the road around the cars' places.
 
     image (H, W, 3); road (H, W) in [0, 1]; vehicles (H, W): all cars' pixels; behind: gives the image (H, W, 3)
@@ -157,14 +157,14 @@ def light(
     """
     settings = settings or ShadowSettings()
     grey = _brightness(image)
-    zone = np.logical_or.reduce([view.distance < settings.reach_m for view in views]) | grow(vehicles, 3)
+    zone = np.logical_or.reduce([view.distance < settings.reach_m for view in views]) | grow_mask(vehicles, 3)
     if behind is not None:
-        return Light(grey, _brightness(behind(zone)))
+        return GroundLight(grey, _brightness(behind(zone)))
     known = (road > 0.5) & ~zone
     if not known.any():
         known = ~zone
     lit = push_pull(np.ascontiguousarray(grey[..., None]), known.astype(np.float32))[..., 0]
-    return Light(grey, lit)
+    return GroundLight(grey, lit)
 
 
 def _brightness(image: Array) -> Array:
@@ -175,19 +175,19 @@ def _brightness(image: Array) -> Array:
     return np.asarray(cv2.GaussianBlur(brightest, (0, 0), 1.0), np.float32)
 
 
-def cast(placement: Placement, view: GroundView, sun: torch.Tensor) -> Array:
+def cast_box_shadow(placement: Placement, view: GroundView, sun: torch.Tensor) -> Array:
     """How dark (H, W), in [0, 1], the car's box makes the ground in this sun; 0 where it cannot reach."""
     dark = np.zeros(view.distance.shape, np.float32)
-    near = reachable(placement, view, sun)
+    near = reachable_ground(placement, view, sun)
     local = torch.from_numpy(view.local[near])
     size = placement.size_lhw.detach()[None]
-    offset = sun_offset(sun, placement.yaw.detach()[None], size[:, 1])
+    offset = shadow_offset(sun, placement.yaw.detach()[None], size[:, 1])
     dark[near] = shadow_density(local, size.expand(len(local), 3), offset.expand(len(local), 2)).numpy()
     return dark
 
 
-def find(
-    lighting: Light,
+def find_shadows(
+    lighting: GroundLight,
     vehicles: Mask,
     views: Sequence[GroundView],
     allowed: Sequence[Mask],
@@ -206,7 +206,7 @@ def find(
         return [], 0
     frame = vehicles.shape
     part = _all_windows(views)
-    lighting = Light(lighting.grey[part], lighting.lit[part])
+    lighting = GroundLight(lighting.grey[part], lighting.lit[part])
     vehicles, allowed, casts = vehicles[part], [a[part] for a in allowed], [c[part] for c in casts]
     near = np.stack([view.distance[part] for view in views])
     owner, nearest = near.argmin(0), near.min(0)
@@ -256,7 +256,7 @@ def _joined(candidates: Mask, seeds: Mask) -> Mask:
 
 
 def estimate_sun(
-    lighting: Light,
+    lighting: GroundLight,
     vehicles: Mask,
     placements: Sequence[Placement],
     views: Sequence[GroundView],
@@ -271,7 +271,7 @@ def estimate_sun(
     points, sizes, yaws, darkness = [], [], [], []
     owner = np.stack([view.distance for view in views]).argmin(0)
     for index, (placement, view) in enumerate(zip(placements, views, strict=True)):
-        ground = (view.distance < settings.reach_m) & ~grow(vehicles, 2) & (owner == index)
+        ground = (view.distance < settings.reach_m) & ~grow_mask(vehicles, 2) & (owner == index)
         flat = np.nonzero(ground.reshape(-1))[0]
         flat = flat[:: max(1, len(flat) // _SAMPLES)]
         if not len(flat):
@@ -289,7 +289,7 @@ def estimate_sun(
     sized = size[car]
 
     def explained(suns: Sequence[torch.Tensor], every: int = 1) -> list[float]:
-        offset = torch.stack([sun_offset(sun, yaw, size[:, 1]) for sun in suns])[:, car[::every]]
+        offset = torch.stack([shadow_offset(sun, yaw, size[:, 1]) for sun in suns])[:, car[::every]]
         model, dark = shadow_density(local[::every], sized[::every], offset), observed[::every]
         strength = (model * dark).sum(-1) / model.square().sum(-1).clamp(min=1e-6)
         rest = (dark - strength.clamp(0.0, 1.2)[:, None] * model).square().sum(-1)
@@ -324,7 +324,7 @@ def estimate_sun(
     return _sun(*best)
 
 
-def stretched(sun: torch.Tensor, factor: float) -> torch.Tensor:
+def lengthen_shadows(sun: torch.Tensor, factor: float) -> torch.Tensor:
     """Towards the sun (3,) whose shadows are `factor` times as long as those of `sun` (3,)."""
     lower = sun * sun.new_tensor([factor, 1.0, factor])
     return lower / lower.norm()
@@ -336,10 +336,10 @@ def _sun(length: float, angle: float) -> torch.Tensor:
     return sun / sun.norm()
 
 
-def reachable(placement: Placement, view: GroundView, sun: torch.Tensor) -> Mask:
+def reachable_ground(placement: Placement, view: GroundView, sun: torch.Tensor) -> Mask:
     """Ground (H, W) that the renderer's patch for this car's shadow covers."""
     size = placement.size_lhw.detach()[None]
-    offset = sun_offset(sun, placement.yaw.detach()[None], size[:, 1])
+    offset = shadow_offset(sun, placement.yaw.detach()[None], size[:, 1])
     corners = shadow_corners(size, offset)[0].numpy()
     low, high = corners.min(0), corners.max(0)
     low, high = low + 0.05, high - 0.05
@@ -349,12 +349,12 @@ def reachable(placement: Placement, view: GroundView, sun: torch.Tensor) -> Mask
     return reach
 
 
-def factors(image: Array, background: Array, region: Mask) -> Array:
+def shadow_factors(image: Array, background: Array, region: Mask) -> Array:
     """The factor (H, W, 3) in [0, 1] by which one car darkens the ground: photograph / background in its
     `region`."""
     factor = np.ones(image.shape, np.float32)
     if region.any():
-        x0, y0, x1, y1 = extent(region)
+        x0, y0, x1, y1 = mask_bounds(region)
         part = slice(y0, y1), slice(x0, x1)
         seen = np.clip(image[part] / np.maximum(background[part], 1 / 255), 0, 1)
         factor[part] = np.where(region[part][..., None], seen, 1)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir import ffd as lattice
-from scene_ir.derender import borders
-from scene_ir.geometry import place, to_clip
+from scene_ir.derender import edge_matching as borders
+from scene_ir.geometry import place_vertices, to_clip
 from scene_ir.meshes.lod import detail
 from scene_ir.meshes.templates import template
 from scene_ir.raster import verbs
@@ -34,25 +34,25 @@ _DETAIL_PX = 90.0
 _BAND = 0.12
 """Width of the band in which mask and outline pull at each other, as a fraction of the window."""
 
-_FREE = 0.5
+_FREE_MODE_SCALE = 0.5
 """How far single points of the lattice move where the shaped modes move by 1."""
-_HELD = 0.25
+_ANCHORED_SHARE = 0.25
 """How far pose and size of what is held move, as a share of how far others' do."""
-_LOOK_AGAIN = 10
+_RETRACE_STEPS = 10
 """Steps after which the edges that are seen are found anew."""
-_COVER = 2.0
+_MISSED_WEIGHT = 2.0
 """How much more a pixel of the mask that the mesh leaves out weighs than one that it covers in vain."""
 _ADAM = (0.9, 0.999)
 """Decay of the means of gradients and of their squares, as its authors recommend."""
-_BODIES = {
+_BODIES_BY_LABEL = {
     "Car": ("sedan", "hatchback", "estate", "suv", "pickup"),
     "Van": ("van", "suv"),
     "Truck": ("truck", "bus"),
 }
 """Kinds of templates that a label's type may mean."""
-_STAND_IN = {"van": ("suv",)}
+_FALLBACK_KINDS = {"van": ("suv",)}
 """What is left to choose where a kind that is alone is withheld."""
-_MOST_OWN = 6
+_MAX_USER_MESHES = 6
 """Of the user's meshes, tried for one label: each costs a draw."""
 _LOW_PART = 0.3
 """Lower part of a car, as a fraction of its height, beside which its shadow lies."""
@@ -73,7 +73,7 @@ class Placement:
         deformed = unit = self.mesh.vertices
         if self.ffd.requires_grad or bool(self.ffd.any()):
             deformed = lattice.deform(unit, lattice.lattice_weights(unit), self.ffd)
-        return place(deformed, self.size_lhw, self.yaw, self.translation)
+        return place_vertices(deformed, self.size_lhw, self.yaw, self.translation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,29 +94,29 @@ class FitSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class FitEvidence:
     """What a fit may know beside masks and boxes. picture (H, W, 3) RGB; held: one a placement, whether
     it is to stay nearly where it stands: a laser measured it, or hardly anything of it shows; empty: none."""
 
     picture: NDArray[np.uint8] | None = None
-    held: Sequence[bool] = ()
+    anchored: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Boxes:
+class LabelBoxes:
     """Labels' boxes xyxy (N, 4) px, and how much to trust each side, (N, 4) in [0, 1]: 0 where something cuts
     it."""
 
     xyxy: Tensor
     trust: Tensor
 
-    def row(self, index: int) -> Boxes:
+    def select(self, index: int) -> LabelBoxes:
         """One of them, as one row."""
-        return Boxes(self.xyxy[index : index + 1], self.trust[index : index + 1])
+        return LabelBoxes(self.xyxy[index : index + 1], self.trust[index : index + 1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OwnMesh:
+class UserMesh:
     """A user's mesh to choose from. kind: of the templates' kinds, its body's; size_lhw: its usual size, m."""
 
     mesh: Mesh
@@ -124,7 +124,7 @@ class OwnMesh:
     size_lhw: tuple[float, float, float]
 
 
-def candidates(kind: str, size_lhw: Sequence[float], withheld: str = "") -> tuple[str, ...]:
+def rank_template_kinds(kind: str, size_lhw: Sequence[float], withheld: str = "") -> tuple[str, ...]:
     """Template kinds that may stand for a label of type `kind`, the likeliest by its proportions first; without
     `withheld`, where that leaves any."""
     length, height, _width = size_lhw
@@ -140,27 +140,29 @@ def candidates(kind: str, size_lhw: Sequence[float], withheld: str = "") -> tupl
         found = ("hatchback", "sedan", "suv", "estate")
     else:
         found = ("sedan", "estate", "hatchback", "suv", "pickup")
-    return tuple(k for k in found if k != withheld) or _STAND_IN.get(withheld, found)
+    return tuple(k for k in found if k != withheld) or _FALLBACK_KINDS.get(withheld, found)
 
 
-def own_candidates(kind: str, size_lhw: Sequence[float], own: Sequence[OwnMesh]) -> tuple[Mesh, ...]:
+def select_user_meshes(kind: str, size_lhw: Sequence[float], own: Sequence[UserMesh]) -> tuple[Mesh, ...]:
     """The user's meshes that may stand for a label of type `kind`: of a body that is called so, and those whose
     usual size is nearest to the label's first, not more than a few."""
 
-    def apart(choice: OwnMesh) -> float:
+    def apart(choice: UserMesh) -> float:
         return float(np.square(np.log(np.divide(choice.size_lhw, size_lhw))).sum())
 
-    fitting = [choice for choice in own if choice.kind in _BODIES[kind]]
-    return tuple(choice.mesh for choice in sorted(fitting, key=apart)[:_MOST_OWN])
+    fitting = [choice for choice in own if choice.kind in _BODIES_BY_LABEL[kind]]
+    return tuple(choice.mesh for choice in sorted(fitting, key=apart)[:_MAX_USER_MESHES])
 
 
-def silhouettes(placements: Sequence[Placement], camera: Camera, backend: verbs.Backend = "warp") -> list[Mask]:
+def render_silhouettes(
+    placements: Sequence[Placement], camera: Camera, backend: verbs.Backend = "warp"
+) -> list[Mask]:
     """Pixels (H, W) whose centre each placed mesh covers, one mask a placement."""
     if not placements:
         return []
-    clip, faces, vertex_ranges, face_ranges = _pack(placements, camera.matrix)
+    clip, faces, vertex_ranges, face_ranges = _pack_meshes(placements, camera.matrix)
     rects = verbs.bounding_rects(clip, vertex_ranges, camera.height, camera.width)
-    layout = verbs.Layout.of(rects)
+    layout = verbs.PixelLayout.from_rects(rects)
     hit = (verbs.rasterize(clip, faces, face_ranges, layout, backend).face >= 0).cpu().numpy()
     masks = []
     for (span, shape), (x0, y0, x1, y1) in zip(layout.spans(), rects.tolist(), strict=True):
@@ -170,7 +172,7 @@ def silhouettes(placements: Sequence[Placement], camera: Camera, backend: verbs.
     return masks
 
 
-def iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
+def mask_iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
     """Intersection over union of two masks, counted outside `unknown`; 0 where both are empty."""
     if unknown is not None:
         first, second = first & ~unknown, second & ~unknown
@@ -178,19 +180,19 @@ def iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
     return np.count_nonzero(first & second) / union if union else 0.0
 
 
-def extent(mask: Mask) -> tuple[int, int, int, int]:
+def mask_bounds(mask: Mask) -> tuple[int, int, int, int]:
     """Bounding rectangle of a mask that is not empty: x0, y0, x1, y1, half-open."""
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def grow(mask: Mask, radius: float) -> Mask:
+def grow_mask(mask: Mask, radius: float) -> Mask:
     """The mask with everything within `radius` px (negative: without what is that near to its border)."""
     if not mask.any():
         return mask.copy()
     # Only where something can change: a frame has many more pixels than a car.
     margin = int(max(radius, 0)) + 2
-    x0, y0, x1, y1 = extent(mask)
+    x0, y0, x1, y1 = mask_bounds(mask)
     window = (slice(max(y0 - margin, 0), y1 + margin), slice(max(x0 - margin, 0), x1 + margin))
     part, grown = mask[window], mask.copy()
     if radius >= 0:
@@ -202,7 +204,7 @@ def grow(mask: Mask, radius: float) -> Mask:
     return grown
 
 
-def instance_mask(
+def grabcut_mask(
     image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float, float], rounds: int = 3
 ) -> Mask:
     """The car's pixels by GrabCut (Rother 2004) in a band around the template's outline.
@@ -215,14 +217,14 @@ def instance_mask(
     if not visible.any():
         return visible
     inside, outside_low, outside_high = band_px
-    x0, y0, x1, y1 = extent(outline)
+    x0, y0, x1, y1 = mask_bounds(outline)
     height, width = outline.shape
     low = np.arange(height)[:, None] > y1 - _LOW_PART * (y1 - y0)
-    reach = np.where(low, grow(outline, outside_low), grow(outline, outside_high))
+    reach = np.where(low, grow_mask(outline, outside_low), grow_mask(outline, outside_high))
     margin = int(2 * outside_high + 12)
     x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
     window = (slice(y0, y1), slice(x0, x1))
-    scale = float(np.clip(120 / max(extent(outline)[3] - extent(outline)[1], 1), 1, 4))
+    scale = float(np.clip(120 / max(mask_bounds(outline)[3] - mask_bounds(outline)[1], 1), 1, 4))
     size = (max(round((x1 - x0) * scale), 8), max(round((y1 - y0) * scale), 8))
 
     def enlarge(mask: Mask) -> Mask:
@@ -232,7 +234,7 @@ def instance_mask(
     labels = np.full(size[::-1], cv2.GC_BGD, np.uint8)
     labels[enlarge(reach)] = cv2.GC_PR_BGD
     labels[enlarge(outline)] = cv2.GC_PR_FGD
-    core = enlarge(grow(outline, -inside))
+    core = enlarge(grow_mask(outline, -inside))
     labels[core] = cv2.GC_FGD
     hidden = enlarge(unknown)
     labels[hidden] = cv2.GC_BGD
@@ -243,14 +245,14 @@ def instance_mask(
     cv2.setRNGSeed(0)
     cv2.grabCut(crop, labels, (0, 0, 1, 1), *models, rounds, cv2.GC_INIT_WITH_MASK)
     found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)) & ~hidden
-    found = _tidy(found, enlarge(outline), scale)
+    found = _clean_grabcut(found, enlarge(outline), scale)
     result = np.zeros_like(outline)
     back = cv2.resize(found.astype(np.float32), (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
     result[window] = back >= 0.5
     return result & ~unknown
 
 
-def _tidy(found: Mask, outline: Mask, scale: float) -> Mask:
+def _clean_grabcut(found: Mask, outline: Mask, scale: float) -> Mask:
     """Without specks and hairs, holes closed, only parts that reach well into the template."""
     radius = max(1, round(1.2 * scale))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
@@ -270,15 +272,15 @@ def _tidy(found: Mask, outline: Mask, scale: float) -> Mask:
     return kept | (enclosed & outline)
 
 
-def fit(
+def fit_silhouettes(
     placements: Sequence[Placement],
     masks: Sequence[Mask],
     unknown: Sequence[Mask],
-    boxes: Boxes,
+    boxes: LabelBoxes,
     camera: Camera,
     settings: FitSettings,
     backend: verbs.Backend = "warp",
-    beside: Evidence | None = None,
+    evidence: FitEvidence | None = None,
 ) -> list[Placement]:
     """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at
     nothing.
@@ -291,46 +293,48 @@ def fit(
     """
     if not placements or settings.steps == 0:
         return list(placements)
-    beside = beside or Evidence()
-    windows = [_window(mask, hidden, outline, beside.picture) for mask, hidden, outline in
-               zip(masks, unknown, silhouettes(placements, camera, backend), strict=True)]  # fmt: skip
+    evidence = evidence or FitEvidence()
+    windows = [_make_window(mask, hidden, outline, evidence.picture) for mask, hidden, outline in
+               zip(masks, unknown, render_silhouettes(placements, camera, backend), strict=True)]  # fmt: skip
     rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
-    layout = verbs.Layout.of(rects)
-    whole, placements = placements, _lighter(placements)
+    layout = verbs.PixelLayout.from_rects(rects)
+    whole, placements = placements, _with_coarse_meshes(placements)
     pull = torch.from_numpy(np.concatenate([w.pull.reshape(-1) / w.length for w in windows]))
-    faces, _, face_ranges = _pack(placements, camera.matrix)[1:]
+    faces, _, face_ranges = _pack_meshes(placements, camera.matrix)[1:]
     matrices = [w.zoom @ camera.matrix for w in windows]
     weights = [lattice.lattice_weights(p.mesh.vertices) for p in placements]
-    modes = _modes()
-    spread, bound = _units(settings, len(modes))
+    modes = _deformation_modes()
+    spread, bound = _code_scales(settings, len(modes))
     spread, bound = spread.repeat(len(placements), 1), bound.repeat(len(placements), 1)
-    for row, held in enumerate(beside.held):
+    for row, held in enumerate(evidence.anchored):
         if held:
-            spread[row, :7], bound[row, :7] = _HELD * spread[row, :7], _HELD * bound[row, :7]
+            spread[row, :7], bound[row, :7] = _ANCHORED_SHARE * spread[row, :7], _ANCHORED_SHARE * bound[row, :7]
     code = torch.zeros_like(spread, requires_grad=True)
     mean, square = torch.zeros_like(code), torch.zeros_like(code)
     best = torch.full((len(placements),), torch.inf)
     best_code = code.detach().clone()
-    followed: list[borders.Followed] = []
+    followed: list[borders.VisibleContour] = []
     for step in range(settings.steps + 1):
         clips = []
         for i, (placement, weight, matrix) in enumerate(zip(placements, weights, matrices, strict=True)):
-            moved = _apply(placement, code[i] * spread[i], modes)
+            moved = _apply_change(placement, code[i] * spread[i], modes)
             unit = lattice.deform(placement.mesh.vertices, weight, moved.ffd)
-            clips.append(to_clip(place(unit, moved.size_lhw, moved.yaw, moved.translation), matrix))
+            clips.append(to_clip(place_vertices(unit, moved.size_lhw, moved.yaw, moved.translation), matrix))
         clip = torch.cat(clips)
         fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
         covered = verbs.antialias(fragments, clip, faces, backend) * pull
         energy = torch.stack([covered[span].sum() for span, _ in layout.spans()])
-        apart = [_apart(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
+        apart = [_box_distances(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
         filling = (torch.stack(apart) * boxes.trust).sum(1)
         loss = energy + settings.prior * code.square().sum(1) + settings.box * filling
-        if beside.picture is not None and settings.edges > 0:
-            if step % _LOOK_AGAIN == 0:
-                followed = _followed(placements, windows, clips, fragments)
+        if evidence.picture is not None and settings.edges > 0:
+            if step % _RETRACE_STEPS == 0:
+                followed = _trace_contours(placements, windows, clips, fragments)
                 # Other edges make another sum: what was found with the last ones does not compare.
                 best = torch.full_like(best, torch.inf)
-            inner = [borders.apart(w.edges, f, c) for w, f, c in zip(windows, followed, clips, strict=True)]
+            inner = [
+                borders.contour_distance(w.edges, f, c) for w, f, c in zip(windows, followed, clips, strict=True)
+            ]
             loss = loss + settings.edges * torch.stack(inner)
         better = loss.detach() < best
         best = torch.where(better, loss.detach(), best)
@@ -347,15 +351,15 @@ def fit(
             scale = (square / (1 - _ADAM[1] ** (step + 1))).sqrt() + 1e-8
             code -= settings.rate * mean / (1 - _ADAM[0] ** (step + 1)) / scale
             code.clamp_(-bound / spread, bound / spread)
-    return [_apply(p, c, modes) for p, c in zip(whole, best_code * spread, strict=True)]
+    return [_apply_change(p, c, modes) for p, c in zip(whole, best_code * spread, strict=True)]
 
 
-def _lighter(placements: Sequence[Placement]) -> list[Placement]:
+def _with_coarse_meshes(placements: Sequence[Placement]) -> list[Placement]:
     """With no more triangles than windows show."""
     return [replace(p, mesh=detail(p.mesh, _DETAIL_PX)) for p in placements]
 
 
-def edge_distances(
+def measure_edge_distances(
     placements: Sequence[Placement],
     unknown: Mask,
     picture: NDArray[np.uint8],
@@ -364,28 +368,30 @@ def edge_distances(
 ) -> list[float]:
     """How far the edges of each placed mesh are from those of the picture (H, W, 3), in [0, 1]: which of several
     meshes at one place is the likeliest. 1 where nothing of it is seen."""
-    outlines = silhouettes(placements, camera, backend)
+    outlines = render_silhouettes(placements, camera, backend)
     seen = np.logical_or.reduce(outlines)
     if not seen.any():
         return [1.0] * len(placements)
-    windows = [_window(seen, unknown, seen, picture)] * len(placements)
-    placements = _lighter(placements)
+    windows = [_make_window(seen, unknown, seen, picture)] * len(placements)
+    placements = _with_coarse_meshes(placements)
     height, width = windows[0].known.shape
-    layout = verbs.Layout.of(torch.tensor([[0, 0, width, height]] * len(placements)))
-    clip, faces, vertex_ranges, face_ranges = _pack(placements, windows[0].zoom @ camera.matrix)
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, width, height]] * len(placements)))
+    clip, faces, vertex_ranges, face_ranges = _pack_meshes(placements, windows[0].zoom @ camera.matrix)
     fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
     clips = [clip[start:end] for start, end in vertex_ranges.tolist()]
-    followed = _followed(placements, windows, clips, fragments)
-    found = [float(borders.apart(w.edges, f, c)) for w, f, c in zip(windows, followed, clips, strict=True)]
+    followed = _trace_contours(placements, windows, clips, fragments)
+    found = [
+        float(borders.contour_distance(w.edges, f, c)) for w, f, c in zip(windows, followed, clips, strict=True)
+    ]
     return [d if len(f.channel) else 1.0 for d, f in zip(found, followed, strict=True)]
 
 
-def _followed(
+def _trace_contours(
     placements: Sequence[Placement],
-    windows: Sequence[_Window],
+    windows: Sequence[_FitWindow],
     clips: Sequence[Tensor],
     fragments: verbs.Fragments,
-) -> list[borders.Followed]:
+) -> list[borders.VisibleContour]:
     """The edges of each placed mesh that are seen in its window as it stands."""
     found = []
     spans = fragments.layout.spans()
@@ -395,12 +401,12 @@ def _followed(
         face = fragments.face[span].reshape(shape).long()
         face = torch.where(face >= 0, face - start, face)
         depth = fragments.depth[span].reshape(shape)
-        found.append(borders.follow(face, depth, clip, mesh.faces, mesh.part, window.known))
+        found.append(borders.trace_contour(face, depth, clip, mesh.faces, mesh.part, window.known))
         start += len(mesh.faces)
     return found
 
 
-def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
+def _box_distances(clip: Tensor, box_xyxy: Tensor, window: _FitWindow) -> Tensor:
     """How far (4,) the extent of a mesh is from a label's box on each side, squared, in units of the band."""
     # What lies beyond the image's border shows in no box; what is nearer than half a metre projects anywhere.
     pixels = clip[:, :2] / clip[:, 2:].clamp(min=0.5)
@@ -415,7 +421,7 @@ def _apart(clip: Tensor, box_xyxy: Tensor, window: _Window) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class _Window:
+class _FitWindow:
     """pull (h, w): signed distance to the mask over the band, in [-1, 1], 0 where unknown; length: px of outline;
     zoom (3, 3): image pixels to window pixels; frame (4,): the image's border xyxy in window pixels; edges
     (C, h, w): distance to the picture's edges; known (h, w): that nothing hides.
@@ -429,10 +435,10 @@ class _Window:
     known: Mask
 
 
-def _window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8] | None) -> _Window:
+def _make_window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8] | None) -> _FitWindow:
     height, width = mask.shape
     both = mask | outline
-    x0, y0, x1, y1 = extent(both) if both.any() else (0, 0, 1, 1)
+    x0, y0, x1, y1 = mask_bounds(both) if both.any() else (0, 0, 1, 1)
     margin = int(0.15 * max(x1 - x0, y1 - y0)) + 3
     x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
     scale = min(_WORK_PX / max(x1 - x0, y1 - y0), 4.0)
@@ -448,7 +454,7 @@ def _window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8]
     band = _BAND * max(size)
     pull = np.clip(signed / band, -1, 1) * shown
     # A piece of car outside the mesh tears off when the car turns; a piece of road inside it only travels along.
-    pull = np.where(pull < 0, _COVER * pull, pull)
+    pull = np.where(pull < 0, _MISSED_WEIGHT * pull, pull)
     zoom = torch.tensor(
         [
             [size[0] / (x1 - x0), 0.0, (0.5 - x0) * size[0] / (x1 - x0) - 0.5],
@@ -465,8 +471,10 @@ def _window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8]
     if picture is not None:
         method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
         crop = cv2.resize(picture[y0:y1, x0:x1], size, interpolation=method)
-        edges = borders.edge_field(np.asarray(crop, np.uint8).reshape(*size[::-1], 3), grow(~known, 1))
-    return _Window(
+        edges = borders.compute_edge_field(
+            np.asarray(crop, np.uint8).reshape(*size[::-1], 3), grow_mask(~known, 1)
+        )
+    return _FitWindow(
         np.asarray(resized, np.float32).reshape(size[::-1]),
         2.0 * (size[0] + size[1]),
         zoom,
@@ -476,7 +484,7 @@ def _window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8]
     )
 
 
-def _pack(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _pack_meshes(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Clip coordinates, faces, vertex ranges (N, 2) and face ranges (N, 2) of all placements in one draw."""
     clips, faces, vertex_ranges, face_ranges = [], [], [], []
     vertex = face = 0
@@ -490,7 +498,7 @@ def _pack(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tens
     return torch.cat(clips), torch.cat(faces), torch.tensor(vertex_ranges), torch.tensor(face_ranges)
 
 
-def _modes() -> Tensor:
+def _deformation_modes() -> Tensor:
     """Symmetric deformations (K, 64, 3) that turn one car's outline into another's; the lowest layer stays
     down."""
     modes = []
@@ -512,10 +520,10 @@ def _modes() -> Tensor:
     shaped = torch.stack(modes).reshape(-1, LATTICE_POINTS, 3)
     free = lattice.from_symmetric(torch.eye(lattice.SYMMETRIC_DIM)).reshape(-1, *LATTICE, 3)
     lifts = free[:, :, -1, :, 1].abs().sum((1, 2)) > 0
-    return torch.cat([shaped, _FREE * free[~lifts].reshape(-1, LATTICE_POINTS, 3)])
+    return torch.cat([shaped, _FREE_MODE_SCALE * free[~lifts].reshape(-1, LATTICE_POINTS, 3)])
 
 
-def _units(settings: FitSettings, modes: int) -> tuple[Tensor, Tensor]:
+def _code_scales(settings: FitSettings, modes: int) -> tuple[Tensor, Tensor]:
     """Standard deviations and bounds of x, z, y (m), yaw (rad), log length, height, width, and the modes."""
     shift, turn, stretch = settings.max_shift_m, settings.max_turn_rad, settings.max_stretch
     bound = [shift, shift, shift / 3, turn, stretch, stretch, stretch, *[settings.max_offset] * modes]
@@ -524,7 +532,7 @@ def _units(settings: FitSettings, modes: int) -> tuple[Tensor, Tensor]:
     return spread, torch.tensor(bound)
 
 
-def _apply(placement: Placement, change: Tensor, modes: Tensor) -> Placement:
+def _apply_change(placement: Placement, change: Tensor, modes: Tensor) -> Placement:
     """The placement after a change of pose, size and shape, in the order of `_units`."""
     return replace(
         placement,
@@ -535,7 +543,7 @@ def _apply(placement: Placement, change: Tensor, modes: Tensor) -> Placement:
     )
 
 
-def placed(mesh: str | Mesh, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
+def place_mesh(mesh: str | Mesh, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
     """A mesh, or the canonical template of a kind, at a label's place and size."""
     shape = template(mesh) if isinstance(mesh, str) else mesh
     return Placement(shape, translation, yaw, size_lhw, torch.zeros(LATTICE_POINTS, 3))

@@ -18,8 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from scene_ir.derender.colours import grey, largest
-from scene_ir.push_pull import push_pull
+from scene_ir.image_filters import channel_max, channel_mean, push_pull
 from scene_ir.types import Camera
 
 Image = NDArray[np.float32]
@@ -79,7 +78,7 @@ class StreetSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Shares:
+class StreetShares:
     """ground, sky (H, W) in [0, 1]: how much each known pixel looks like it; stood (H, W): where vehicles stood,
     which is ground though it is hidden; flat (H, W): ground again, given that known pixels show no vehicle, to
     tell what lies on the ground below its end; left out, it is the same."""
@@ -91,7 +90,7 @@ class Shares:
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class GroundCoordinates:
     """Where each pixel's ray meets the ground. across, along (H, W) m, to the right and ahead; along is inf above
     the horizon."""
 
@@ -100,7 +99,7 @@ class Plane:
 
 
 @dataclass(frozen=True, slots=True)
-class Continued:
+class StreetContinuation:
     """image (H, W, 3): known pixels and their smooth continuation; ground (H, W): pixels that see ground, the
     hidden ones by interpolation; heading, bend: of the road, slope and 1/m; foot (W,): row of the ground's end."""
 
@@ -111,7 +110,7 @@ class Continued:
     foot: NDArray[np.float64]
 
 
-def plane_view(ground: torch.Tensor, camera: Camera) -> Plane:
+def ground_coordinates(ground: torch.Tensor, camera: Camera) -> GroundCoordinates:
     """The ground as the camera sees it. ground (4,): plane n.x + d = 0."""
     matrix = camera.matrix.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
@@ -125,17 +124,17 @@ def plane_view(ground: torch.Tensor, camera: Camera) -> Plane:
     step = np.where(seen, step, 0)
     across = np.where(seen, centre[0] + step * ray[..., 0], 0)
     along = np.where(seen, centre[2] + step * ray[..., 2], np.inf)
-    return Plane(across.astype(np.float32), np.where(along > 0, along, np.inf).astype(np.float32))
+    return GroundCoordinates(across.astype(np.float32), np.where(along > 0, along, np.inf).astype(np.float32))
 
 
-def continued(
+def continue_street(
     image: Image,
     unknown: Mask,
-    share: Shares,
-    plane: Plane,
+    share: StreetShares,
+    plane: GroundCoordinates,
     horizon: float,
     settings: StreetSettings | None = None,
-) -> Continued:
+) -> StreetContinuation:
     """What the known pixels say of the unknown ones.
 
     image (H, W, 3) in [0, 1]; unknown (H, W): must not be used; share: what known pixels look like; horizon: its
@@ -145,12 +144,14 @@ def continued(
     rows = np.arange(image.shape[0])[:, None]
     seen = ~unknown & (share.ground > 0.5)
     coarse = settings.coarse
-    heading, bend = course(image, seen & (plane.along < settings.vote_m), plane, _VOTERS // coarse**2)
+    heading, bend = estimate_road_course(
+        image, seen & (plane.along < settings.vote_m), plane, _VOTERS // coarse**2
+    )
     level = np.where(share.stood, 1, share.ground).astype(np.float32)
-    foot = foot_rows(level, unknown & ~share.stood, plane, horizon, _column_ahead(plane, heading))
+    foot = find_foot_rows(level, unknown & ~share.stood, plane, horizon, _column_ahead(plane, heading))
     below = rows >= foot[None]
     ground = below & (plane.along < settings.far_m)
-    sky = (rows < top_rows(share.sky, unknown, horizon)[None]) & ~below
+    sky = (rows < find_skyline_rows(share.sky, unknown, horizon)[None]) & ~below
     upright = ~ground & ~sky
     # What is known is what it looks like: trees before the sky, signs on the verge.
     flat = np.where(unknown, ground, ground & ((share.ground if share.flat is None else share.flat) > 0.5))
@@ -167,7 +168,7 @@ def continued(
     profile = np.where(laid_out[..., None], profile.reshape(-1, 3)[cell], 0)
     rest = (image - profile).astype(np.float32)
     # What differs from the ground around it is a line, a dash or a crossing's bar: continued, it would be a smear.
-    odd = largest(np.abs(image - local)) / settings.marking
+    odd = channel_max(np.abs(image - local)) / settings.marking
     weight = np.where(unknown | ~flat, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
     guess = _sideways(rest, weight) + profile
     # Paint at the borders of removed cars must not tint what stands behind them.
@@ -177,10 +178,12 @@ def continued(
     guess = np.where(upright[..., None], walls, guess)
     guess = np.where(sky[..., None], _sideways(image, (~unknown & clear).astype(np.float32)), guess)
     guess = np.clip(guess, 0, 1)
-    return Continued(np.where(unknown[..., None], guess, image).astype(np.float32), ground, heading, bend, foot)
+    return StreetContinuation(
+        np.where(unknown[..., None], guess, image).astype(np.float32), ground, heading, bend, foot
+    )
 
 
-def _column_ahead(plane: Plane, heading: float) -> float:
+def _column_ahead(plane: GroundCoordinates, heading: float) -> float:
     """Column of the road's vanishing point: where the farthest row of the ground lies straight ahead."""
     rows = np.flatnonzero((plane.along < 399).all(1))
     if rows.size == 0:
@@ -188,8 +191,8 @@ def _column_ahead(plane: Plane, heading: float) -> float:
     return float(np.abs(plane.across[rows[0]] - heading * plane.along[rows[0]]).argmin())
 
 
-def foot_rows(
-    ground: NDArray[np.float32], unknown: Mask, plane: Plane, horizon: float, ahead: float
+def find_foot_rows(
+    ground: NDArray[np.float32], unknown: Mask, plane: GroundCoordinates, horizon: float, ahead: float
 ) -> NDArray[np.float64]:
     """Row (W,) at which each column's ground ends, by how much (H, W) known pixels look like ground.
 
@@ -245,7 +248,7 @@ def _onward(
     return foot[end] + share * drop / apart * (to - end)
 
 
-def top_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
+def find_skyline_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
     """Row (W,) below which each column shows no sky any more.
 
     Where that is hidden, it is the lower of both sides: what is higher than the rest of the skyline, a tree or a
@@ -280,10 +283,12 @@ def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float
     return good.argmax(0).astype(float), (height - good[::-1].argmax(0)).astype(float)
 
 
-def course(image: Image, known: Mask, plane: Plane, voters: int = _VOTERS) -> tuple[float, float]:
+def estimate_road_course(
+    image: Image, known: Mask, plane: GroundCoordinates, voters: int = _VOTERS
+) -> tuple[float, float]:
     """Heading (slope) and bend (1/m) of the road: the course that most edges on the known ground follow, of
     some `voters`; 0, 0 where there are too few."""
-    smooth: Any = cv2.GaussianBlur(grey(image), (0, 0), 1.0)
+    smooth: Any = cv2.GaussianBlur(channel_mean(image), (0, 0), 1.0)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
     strength = np.hypot(gx, gy)
     kernel = np.ones((5, 5), np.uint8)
@@ -333,13 +338,15 @@ def _profile(image: Image, cell: NDArray[np.int64], known: Mask, settings: Stree
     street, _ = mean(colour, filled, (1.5, 40.0))
     difference = colour - street
     # Paint has colours that no ground has: a car that nobody labelled must not run on along the road.
-    tint = largest(np.abs(difference - grey(difference)[..., None]))
+    tint = channel_max(np.abs(difference - channel_mean(difference)[..., None]))
     filled = np.asarray(filled / (1 + (tint / _TINT) ** 4), np.float32)
     weight = filled
     line, total = mean(difference, weight, (10.0, 0.5))
     for _ in range(3):
         # Reweighted, the mean comes near to a median: dashes do not become lines, lines stay.
-        weight = np.asarray(filled / (1 + (largest(np.abs(difference - line)) / settings.robust) ** 2), np.float32)
+        weight = np.asarray(
+            filled / (1 + (channel_max(np.abs(difference - line)) / settings.robust) ** 2), np.float32
+        )
         line, total = mean(difference, weight, (10.0, 0.5))
     local, _ = mean(colour, known_cells, (1.5, _AROUND))
     return local, line * np.clip(total * 10, 0, 1)[..., None]

@@ -32,14 +32,14 @@ _MEAN, _SPREAD = 0.42, 0.27
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class NetworkInput:
     """A photograph as a network sees it. image (h, w, 3) RGB in [0, 1]; elevation (h, w): see `elevation`."""
 
     image: Array
     elevation: Array
 
 
-def elevation(ground: Tensor, camera: Camera, size_hw: tuple[int, int]) -> Array:
+def compute_elevation(ground: Tensor, camera: Camera, size_hw: tuple[int, int]) -> Array:
     """The sine (h, w) of the angle by which each pixel of the resized photograph looks above the ground's horizon.
 
     ground: (4,) plane n.x + d = 0, n up.
@@ -53,14 +53,14 @@ def elevation(ground: Tensor, camera: Camera, size_hw: tuple[int, int]) -> Array
     return (np.einsum("i,ihw->hw", up, ray) / np.linalg.norm(ray, axis=0)).astype(np.float32)
 
 
-def view(image: Array, ground: Tensor, camera: Camera) -> View:
+def prepare_input(image: Array, ground: Tensor, camera: Camera) -> NetworkInput:
     """A photograph (H, W, 3) RGB in [0, 1] at the size that networks are made for."""
     height, width = image.shape[:2]
     scale = INPUT_FOCAL_PX / float(camera.intrinsics[0, 0])
     scale *= min(1.0, (_MOST_PX / (height * width * scale**2)) ** 0.5)
     h, w = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     small = np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-    return View(small, elevation(ground, camera, (h, w)))
+    return NetworkInput(small, compute_elevation(ground, camera, (h, w)))
 
 
 class _Norm(nn.Module):
@@ -143,7 +143,7 @@ class UNet(nn.Module):
         x = self.joined(self.to_middle(self.to_coarse(self.whole(coarse), coarse), middle))
         return self.out(self.to_fine(x, fine))
 
-    def look(self, view: View) -> Tensor:
+    def predict(self, view: NetworkInput) -> Tensor:
         """What it makes of one view (1, channels, h/2, w/2)."""
         with torch.no_grad():
             return self(

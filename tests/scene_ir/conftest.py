@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from scene_ir.render.sources import from_own_picture
+from scene_ir.render.sources import photograph_scene
 from scene_ir.types import Camera, Environment, Mesh, Objects, Part, SceneIR
 
 HEIGHT, WIDTH, FOCAL, EYE_M = 80, 144, 110.0, 1.65
@@ -84,4 +84,4 @@ def street() -> Callable[[torch.dtype], SceneIR]:
 @pytest.fixture(scope="session")
 def photographed() -> SceneIR:
     """The small street photographed, float64, for the reference backend."""
-    return from_own_picture(bare_scene(), "reference")
+    return photograph_scene(bare_scene(), "reference")

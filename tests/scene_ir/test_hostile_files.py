@@ -279,7 +279,7 @@ def test_weights_are_held_to_their_card(tmp_path: Path, monkeypatch: pytest.Monk
     data = next(weights.SHIPPED_WEIGHTS.glob("depth.safetensors")).read_bytes()
     path, card = tmp_path / "a.safetensors", tmp_path / "a.md"
     path.write_bytes(data)
-    monkeypatch.setattr(weights, "SHIPPED", tmp_path)
+    monkeypatch.setattr(weights, "SHIPPED_WEIGHTS", tmp_path)
     card.write_text("# nothing\n")
     with pytest.raises(FormatError, match=r"a\.safetensors: expected the SHA-256 of a\.md, which has none, found"):
         weights.read_weights(path)

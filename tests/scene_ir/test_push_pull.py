@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_ir.push_pull import push_pull
+from scene_ir.image_filters import push_pull
 
 SHAPE = (72, 120)
 

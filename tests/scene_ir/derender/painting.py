@@ -24,7 +24,7 @@ COLOURS = {
 def drawn(placement: Placement) -> tuple[verbs.Fragments, torch.Tensor]:
     """What of the mesh each pixel of `CAMERA` shows, and the vertices' clip coordinates."""
     clip = to_clip(placement.vertices(), CAMERA.matrix)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, 480, 200]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 480, 200]]))
     faces = placement.mesh.faces
     return verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout), clip
 

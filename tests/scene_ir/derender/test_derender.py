@@ -190,9 +190,9 @@ def test_what_is_labelled_and_no_vehicle_is_a_region_beside_those_of_the_labels(
     scene = derender(replace(street.frame, labels=both), DerenderSettings(fit=False))
     assert len(scene.objects) == 1
     assert torch.equal(scene.ignore, torch.cat([region, walker]))
-    assert scene.others is not None
-    assert (scene.others.kind, scene.others.ignore_xyxy.tolist()) == (("Pedestrian",), region.tolist())
-    assert torch.equal(scene.others.translation, one.translation)
+    assert scene.other_labels is not None
+    assert (scene.other_labels.kind, scene.other_labels.ignore_xyxy.tolist()) == (("Pedestrian",), region.tolist())
+    assert torch.equal(scene.other_labels.translation, one.translation)
 
 
 def test_vans_are_cars_and_trucks_are_trucks(street):
@@ -251,12 +251,12 @@ def test_all_real_frames_come_back(identifier):
 
 
 def test_a_2d_box_counts_only_where_it_is_not_the_3d_boxs_own_picture(street):
-    from scene_ir.derender.derender import _boxes
+    from scene_ir.derender.derender import _trusted_boxes
     from scene_ir.geometry import project_boxes
 
     labels, camera = street.frame.labels, street.frame.camera
-    assert _boxes(labels, [0], camera).trust.tolist() == [[1.0, 1.0, 1.0, 1.0]]
+    assert _trusted_boxes(labels, [0], camera).trust.tolist() == [[1.0, 1.0, 1.0, 1.0]]
     drawn = project_boxes(labels.size_lhw, labels.yaw, labels.translation, camera.matrix)
-    assert _boxes(replace(labels, boxes_xyxy=drawn), [0], camera).trust.tolist() == [[0.0, 1.0, 0.0, 0.0]]
+    assert _trusted_boxes(replace(labels, boxes_xyxy=drawn), [0], camera).trust.tolist() == [[0.0, 1.0, 0.0, 0.0]]
     hidden = replace(labels, occlusion=torch.tensor([2]))
-    assert _boxes(hidden, [0], camera).trust.tolist() == [[0.0, 0.0, 0.0, 0.0]]
+    assert _trusted_boxes(hidden, [0], camera).trust.tolist() == [[0.0, 0.0, 0.0, 0.0]]

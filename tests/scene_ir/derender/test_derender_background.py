@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_ir.derender.background import FillSettings, Ground, fill, mirrored
+from scene_ir.derender.patch_fill import GroundMaps, PatchFillSettings, fill_patches, mirror_sources
 
 SHAPE = (72, 120)
 
@@ -22,12 +22,16 @@ def hole() -> np.ndarray:
     return mask
 
 
-def no_ground() -> Ground:
-    return Ground(np.zeros(SHAPE, bool), np.zeros(SHAPE, np.float32))
+def no_ground() -> GroundMaps:
+    return GroundMaps(np.zeros(SHAPE, bool), np.zeros(SHAPE, np.float32))
 
 
-def filled(image: np.ndarray, forbidden: np.ndarray | None = None, ground: Ground | None = None, seed: int = 0):
-    return fill(image, hole(), hole() if forbidden is None else forbidden, 10.0, ground or no_ground(), seed)
+def filled(
+    image: np.ndarray, forbidden: np.ndarray | None = None, ground: GroundMaps | None = None, seed: int = 0
+):
+    return fill_patches(
+        image, hole(), hole() if forbidden is None else forbidden, 10.0, ground or no_ground(), seed
+    )
 
 
 def test_outside_the_hole_nothing_changes_and_inside_everything_is_in_range():
@@ -73,14 +77,14 @@ def test_ground_is_copied_where_ground_must_be():
     like = np.zeros(SHAPE, np.float32)
     like[:, 80:] = 1
     wanted = hole()
-    plain, guided = filled(image), filled(image, ground=Ground(wanted, like))
+    plain, guided = filled(image), filled(image, ground=GroundMaps(wanted, like))
     assert guided[37, 58].mean() > 0.7 > plain[37, 58].mean()
 
 
 def test_an_empty_hole_returns_a_copy():
     image = textured()
     nothing = np.zeros(SHAPE, bool)
-    result = fill(image, nothing, nothing, 10.0, no_ground())
+    result = fill_patches(image, nothing, nothing, 10.0, no_ground())
     assert np.array_equal(result, image)
     assert result is not image
 
@@ -89,13 +93,13 @@ def test_a_hole_that_is_the_whole_height_is_filled_from_the_side():
     image = textured()
     mask = np.zeros(SHAPE, bool)
     mask[:, 40:] = True
-    result = fill(image, mask, mask, 10.0, no_ground(), 0, FillSettings(iterations=(2, 1)))
+    result = fill_patches(image, mask, mask, 10.0, no_ground(), 0, PatchFillSettings(iterations=(2, 1)))
     assert np.isfinite(result).all()
     assert result[:, 100].mean() == pytest.approx(0.5, abs=0.1)
 
 
 def test_mirrored_points_to_known_pixels_and_known_pixels_to_themselves():
-    rows, columns = mirrored(hole())
+    rows, columns = mirror_sources(hole())
     assert not hole()[rows, columns].any()
     own = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
     assert np.array_equal(np.stack([rows, columns])[:, ~hole()], own[:, ~hole()])

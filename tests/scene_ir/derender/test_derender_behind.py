@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import segment
-from scene_ir.derender.behind import Behind, Surroundings
+from scene_ir.derender import segmentation as segment
+from scene_ir.derender.background_fill import BackgroundFill, BackgroundInputs
 from scene_ir.derender.derender import DerenderSettings, derender
-from scene_ir.derender.silhouette import grow
+from scene_ir.derender.silhouette import grow_mask
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Camera
 
 
-def surroundings(street) -> Surroundings:
+def surroundings(street) -> BackgroundInputs:
     height, width = street.mask.shape
     rows = np.arange(height)[:, None]
     ground = np.broadcast_to(rows > 100, (height, width)).astype(np.float32)
@@ -24,7 +24,7 @@ def surroundings(street) -> Surroundings:
     maps = dict.fromkeys(("sky", "foliage", "vehicle", "person"), nothing)
     seen = segment.Segmentation(**maps, road=ground, ground=ground)
     plane = torch.tensor([0.0, -1.0, 0.0, 1.65])
-    return Surroundings(88.0, plane, street.frame.camera, np.zeros_like(street.mask), nothing, seen)
+    return BackgroundInputs(88.0, plane, street.frame.camera, np.zeros_like(street.mask), nothing, seen)
 
 
 def photograph(street) -> np.ndarray:
@@ -34,7 +34,7 @@ def photograph(street) -> np.ndarray:
 @pytest.mark.parametrize("shrink", [2, 3, 4])
 def test_a_smaller_camera_sees_the_same(street, shrink: int) -> None:
     around = surroundings(street)
-    smaller = around.smaller(shrink)
+    smaller = around.scaled_down(shrink)
     points = torch.tensor([[1.0, 1.6, 8.0, 1.0], [-3.0, 0.5, 20.0, 1.0]])
     pixels = []
     for camera in (around.camera, smaller.camera):
@@ -42,28 +42,32 @@ def test_a_smaller_camera_sees_the_same(street, shrink: int) -> None:
         # where pixels' edges are whole numbers, sizes are shares of the image's
         pixels.append((clip[:, :2] / clip[:, 2:] + 0.5) / torch.tensor([camera.width, camera.height]))
     torch.testing.assert_close(pixels[0], pixels[1])
-    assert smaller.others.shape == smaller.seen.ground.shape == (smaller.camera.height, smaller.camera.width)
+    assert (
+        smaller.excluded.shape
+        == smaller.segmentation.ground.shape
+        == (smaller.camera.height, smaller.camera.width)
+    )
     assert smaller.horizon == pytest.approx((88.0 + 0.5) * smaller.camera.height / around.camera.height - 0.5)
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_only_the_hole_is_filled_and_from_the_street(street, shrink: int) -> None:
-    image, hole = photograph(street), grow(street.mask, 3)
-    behind = Behind(image, np.full(hole.shape, 9.0, np.float32), surroundings(street), shrink)
-    for found in (behind.filled(hole, 0), behind.continued(hole)):
+    image, hole = photograph(street), grow_mask(street.mask, 3)
+    behind = BackgroundFill(image, np.full(hole.shape, 9.0, np.float32), surroundings(street), shrink)
+    for found in (behind.fill_hole(hole, 0), behind.continue_street(hole)):
         assert np.array_equal(found[~hole], image[~hole])
         assert found.dtype == np.float32
         assert 0 <= found.min() <= found.max() <= 1
-    apart = np.abs(behind.filled(hole, 0) - street.background)[hole].mean()
+    apart = np.abs(behind.fill_hole(hole, 0) - street.background)[hole].mean()
     assert apart < 0.5 * np.abs(image - street.background)[hole].mean()
-    assert np.array_equal(behind.filled(hole, 0), behind.filled(hole, 0))
+    assert np.array_equal(behind.fill_hole(hole, 0), behind.fill_hole(hole, 0))
 
 
 def test_one_is_the_photographs_own_size(street) -> None:
-    around = surroundings(street).smaller(1)
+    around = surroundings(street).scaled_down(1)
     assert isinstance(around.camera, Camera)
     torch.testing.assert_close(around.camera.matrix, street.frame.camera.matrix)
-    assert np.array_equal(around.seen.ground, surroundings(street).seen.ground)
+    assert np.array_equal(around.segmentation.ground, surroundings(street).segmentation.ground)
 
 
 def test_fast_scenes_render_the_photograph(street) -> None:

@@ -8,28 +8,31 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import borders, silhouette
-from scene_ir.derender.silhouette import Boxes, Evidence, FitSettings, Placement
+from scene_ir.derender import edge_matching as borders
+from scene_ir.derender import silhouette
+from scene_ir.derender.silhouette import FitEvidence, FitSettings, LabelBoxes, Placement
 from scene_ir.geometry import to_clip
 from tests.scene_ir.derender.painting import CAMERA, NOTHING, drawn, painted
 
-NO_BOXES = Boxes(torch.zeros(1, 4), torch.zeros(1, 4))
+NO_BOXES = LabelBoxes(torch.zeros(1, 4), torch.zeros(1, 4))
 
 
 def car(yaw: float = 0.6, kind: str = "hatchback", x: float = 0.5) -> Placement:
-    return silhouette.placed(kind, torch.tensor([x, 1.65, 9.0]), torch.tensor(yaw), torch.tensor([4.0, 1.5, 1.7]))
+    return silhouette.place_mesh(
+        kind, torch.tensor([x, 1.65, 9.0]), torch.tensor(yaw), torch.tensor([4.0, 1.5, 1.7])
+    )
 
 
-def followed(placement: Placement, known: np.ndarray) -> tuple[borders.Followed, torch.Tensor]:
+def followed(placement: Placement, known: np.ndarray) -> tuple[borders.VisibleContour, torch.Tensor]:
     hits, clip = drawn(placement)
     face, depth = (values.reshape(200, 480) for values in (hits.face.long(), hits.depth))
-    return borders.follow(face, depth, clip, placement.mesh.faces, placement.mesh.part, known), clip
+    return borders.trace_contour(face, depth, clip, placement.mesh.faces, placement.mesh.part, known), clip
 
 
 def test_edges_of_a_square_pull_by_direction():
     picture = np.full((60, 80, 3), 40, np.uint8)
     picture[20:40, 30:50] = 200
-    field = borders.edge_field(picture, np.zeros((60, 80), bool))
+    field = borders.compute_edge_field(picture, np.zeros((60, 80), bool))
     assert field.shape == (4, 60, 80)
     assert float(field.min()) == 0
     assert float(field.max()) == 1
@@ -43,7 +46,7 @@ def test_edges_of_a_square_pull_by_direction():
 def test_edges_of_what_is_unknown_do_not_pull():
     picture = np.full((60, 80, 3), 40, np.uint8)
     picture[20:40, 30:50] = 200
-    assert float(borders.edge_field(picture, np.ones((60, 80), bool)).min()) == 1
+    assert float(borders.compute_edge_field(picture, np.ones((60, 80), bool)).min()) == 1
 
 
 def test_followed_points_lie_where_parts_meet():
@@ -71,22 +74,22 @@ def test_what_is_hidden_is_not_followed():
     assert float((point[:, 0] / point[:, 2]).max()) < 240.5
     nothing, clip = followed(car(), NOTHING)
     assert len(nothing.channel) == 0
-    assert float(borders.apart(torch.ones(4, 200, 480), nothing, clip)) == 0
+    assert float(borders.contour_distance(torch.ones(4, 200, 480), nothing, clip)) == 0
 
 
 def test_the_right_pose_is_nearest_and_the_slope_leads_to_it():
-    field = borders.edge_field(painted(car()), NOTHING)
+    field = borders.compute_edge_field(painted(car()), NOTHING)
     distance = {}
     for turn in (-0.1, -0.05, 0.0, 0.05, 0.1):
         found, clip = followed(car(0.6 + turn), ~NOTHING)
-        distance[turn] = float(borders.apart(field, found, clip))
+        distance[turn] = float(borders.contour_distance(field, found, clip))
     assert min(distance, key=lambda turn: distance[turn]) == 0.0
     assert distance[0.0] < 0.25
     placement = car()
     shift = torch.tensor(0.03, requires_grad=True)
     found, _ = followed(car(x=0.53), ~NOTHING)
     moved = placement.vertices() + shift * torch.tensor([1.0, 0.0, 0.0])
-    borders.apart(field, found, to_clip(moved, CAMERA.matrix)).backward()
+    borders.contour_distance(field, found, to_clip(moved, CAMERA.matrix)).backward()
     assert shift.grad is not None
     assert float(shift.grad) > 0
 
@@ -94,14 +97,16 @@ def test_the_right_pose_is_nearest_and_the_slope_leads_to_it():
 def test_edges_find_the_yaw_that_the_outline_leaves_open():
     truth, start = car(0.6), car(0.67)
     picture = painted(truth)
-    mask = silhouette.silhouettes([truth], CAMERA)[0]
+    mask = silhouette.render_silhouettes([truth], CAMERA)[0]
     # a mask whose border says nothing within 2 px of the outline, as those of photographs
-    ragged = silhouette.grow(mask, 2) & ~(
-        silhouette.grow(mask, 2) & (np.indices(mask.shape).sum(0) % 7 < 3) & ~mask
+    ragged = silhouette.grow_mask(mask, 2) & ~(
+        silhouette.grow_mask(mask, 2) & (np.indices(mask.shape).sum(0) % 7 < 3) & ~mask
     )
     turn = {}
-    for name, beside in (("outline", None), ("edges", Evidence(picture))):
-        fitted = silhouette.fit([start], [ragged], [NOTHING], NO_BOXES, CAMERA, FitSettings(), beside=beside)[0]
+    for name, beside in (("outline", None), ("edges", FitEvidence(picture))):
+        fitted = silhouette.fit_silhouettes(
+            [start], [ragged], [NOTHING], NO_BOXES, CAMERA, FitSettings(), evidence=beside
+        )[0]
         turn[name] = abs(math.degrees(float(fitted.yaw) - 0.6))
     assert turn["edges"] < 1.5
     assert turn["edges"] < turn["outline"]
@@ -110,17 +115,19 @@ def test_edges_find_the_yaw_that_the_outline_leaves_open():
 def test_a_picture_tells_one_template_from_another():
     for kind in ("sedan", "hatchback", "suv"):
         options = [car(kind=k) for k in ("sedan", "hatchback", "suv")]
-        distances = silhouette.edge_distances(options, NOTHING, painted(car(kind=kind)), CAMERA)
+        distances = silhouette.measure_edge_distances(options, NOTHING, painted(car(kind=kind)), CAMERA)
         assert options[int(np.argmin(distances))].mesh.name == f"{kind}-0"
 
 
 def test_a_car_out_of_sight_is_nowhere_near():
-    assert silhouette.edge_distances([car(x=80.0)], NOTHING, painted(car()), CAMERA) == [1.0]
+    assert silhouette.measure_edge_distances([car(x=80.0)], NOTHING, painted(car()), CAMERA) == [1.0]
 
 
 def test_what_a_laser_measured_hardly_moves():
     truth, start = car(0.6), car(0.67)
-    mask = silhouette.silhouettes([truth], CAMERA)[0]
-    beside = Evidence(painted(truth), [True])
-    fitted = silhouette.fit([start], [mask], [NOTHING], NO_BOXES, CAMERA, FitSettings(), beside=beside)[0]
+    mask = silhouette.render_silhouettes([truth], CAMERA)[0]
+    beside = FitEvidence(painted(truth), [True])
+    fitted = silhouette.fit_silhouettes(
+        [start], [mask], [NOTHING], NO_BOXES, CAMERA, FitSettings(), evidence=beside
+    )[0]
     assert abs(float(fitted.yaw - start.yaw)) <= 0.25 * FitSettings().max_turn_rad + 1e-5

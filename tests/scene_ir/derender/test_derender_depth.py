@@ -11,8 +11,9 @@ import torch
 
 from drivesem.synth.frames import SynthFrame, SynthSettings, generate_frame
 from drivesem.synth.soup import Material
-from scene_ir.derender import depth, maps
-from scene_ir.derender.depth import Ties
+from scene_ir.derender import depth
+from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender.depth import DepthConstraints
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera
 from tests.scene_ir.derender.conftest import HEIGHT, HORIZON, WIDTH, camera
@@ -25,8 +26,8 @@ WITHIN = 0.886
 """Share of that street's pixels whose depth is within a quarter of the truth."""
 
 
-def nothing_known(shape: tuple[int, ...]) -> Ties:
-    return Ties(*(np.zeros(shape, np.float32) for _ in range(4)))
+def nothing_known(shape: tuple[int, ...]) -> DepthConstraints:
+    return DepthConstraints(*(np.zeros(shape, np.float32) for _ in range(4)))
 
 
 def asphalt() -> np.ndarray:
@@ -52,22 +53,22 @@ def flat_of(street: SynthFrame) -> np.ndarray:
     return np.isin(street.ground_material, LEVEL_MATERIALS).astype(np.float32)
 
 
-def ties_of(street: SynthFrame) -> Ties:
+def ties_of(street: SynthFrame) -> DepthConstraints:
     known = nothing_known(street.image.shape[:2])
-    return Ties(street.environment.sky.numpy(), flat_of(street), known.stood, known.behind_m)
+    return DepthConstraints(street.environment.sky.numpy(), flat_of(street), known.footprint, known.behind_m)
 
 
 @pytest.fixture(scope="module")
 def found(street: SynthFrame) -> np.ndarray:
-    return depth.surroundings(picture(street), street.environment.ground, street.camera, ties_of(street))
+    return depth.estimate_depth(picture(street), street.environment.ground, street.camera, ties_of(street))
 
 
 def test_a_bare_plain_is_as_far_as_its_ground():
     known = nothing_known((HEIGHT, WIDTH))
     known.sky[: int(HORIZON)] = 1
     known.flat[int(HORIZON) :] = 1
-    found = depth.surroundings(asphalt(), LEVEL, camera(), known)
-    plane = maps.plane_depth(LEVEL, camera())
+    found = depth.estimate_depth(asphalt(), LEVEL, camera(), known)
+    plane = maps.compute_plane_depth(LEVEL, camera())
     near = plane < 30
     assert np.median(found[near] / plane[near]) > 0.97
     assert np.percentile(found[near] / plane[near], 5) > 0.85
@@ -83,7 +84,7 @@ def test_a_street_that_no_training_frame_has(street, found):
 
 
 def test_nothing_is_farther_than_the_ground(street, found):
-    plane = maps.plane_depth(street.environment.ground, street.camera)
+    plane = maps.compute_plane_depth(street.environment.ground, street.camera)
     assert (found <= plane * (1 + 1e-5)).all()
     assert found.dtype == np.float32
     assert found.min() > 0
@@ -91,22 +92,22 @@ def test_nothing_is_farther_than_the_ground(street, found):
 
 def test_the_sky_is_endlessly_far(street, found):
     sky = street.environment.sky.numpy() == 1
-    above = np.isinf(maps.plane_depth(street.environment.ground, street.camera))
+    above = np.isinf(maps.compute_plane_depth(street.environment.ground, street.camera))
     assert np.isinf(found[sky & above]).all()
 
 
-def tied_nothing(street: SynthFrame, ties: Ties) -> np.ndarray:
+def tied_nothing(street: SynthFrame, ties: DepthConstraints) -> np.ndarray:
     """The depth where the vehicles are nearer than all else."""
     close = replace(ties, behind_m=np.full_like(ties.behind_m, 0.5))
-    return depth.surroundings(picture(street), street.environment.ground, street.camera, close)
+    return depth.estimate_depth(picture(street), street.environment.ground, street.camera, close)
 
 
 def test_what_stands_behind_vehicles_is_no_nearer_than_they_are(street, found):
-    near = (found < 20) & np.isinf(maps.plane_depth(street.environment.ground, street.camera))
+    near = (found < 20) & np.isinf(maps.compute_plane_depth(street.environment.ground, street.camera))
     assert near.any()
     ties = ties_of(street)
     tied = replace(ties, behind_m=np.where(near, np.float32(25), 0).astype(np.float32))
-    again = depth.surroundings(picture(street), street.environment.ground, street.camera, tied)
+    again = depth.estimate_depth(picture(street), street.environment.ground, street.camera, tied)
     assert again[near].min() >= 25 * (1 - 1e-5)
     # what is seen around them gives way too, and nothing comes nearer
     assert (again >= found * (1 - 1e-5)).all()
@@ -115,11 +116,11 @@ def test_what_stands_behind_vehicles_is_no_nearer_than_they_are(street, found):
 
 def test_where_something_stands_there_is_ground(street):
     ground, view = street.environment.ground, street.camera
-    plane = maps.plane_depth(ground, view)
+    plane = maps.compute_plane_depth(ground, view)
     ties = ties_of(street)
-    stood = np.zeros_like(ties.stood)
+    stood = np.zeros_like(ties.footprint)
     stood[230:, 300:600] = 1
-    tied = depth.surroundings(picture(street), ground, view, replace(ties, stood=stood))
+    tied = depth.estimate_depth(picture(street), ground, view, replace(ties, stood=stood))
     inside = tied[260:350, 340:560] / plane[260:350, 340:560]
     assert inside.min() > 0.999
 
@@ -131,14 +132,16 @@ def test_a_picture_twice_as_large_shows_the_same_street(street, found):
     matrix[:2, 2] += 0.5
     twice = Camera(matrix[:, :3], 2 * view.height, 2 * view.width)
     large = cv2.resize(picture(street), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).clip(0, 1)
-    ties = Ties(*(cv2.resize(getattr(ties_of(street), f.name), None, fx=2, fy=2) for f in fields(Ties)))
-    again = depth.surroundings(large, street.environment.ground, twice, ties)[::2, ::2]
+    ties = DepthConstraints(
+        *(cv2.resize(getattr(ties_of(street), f.name), None, fx=2, fy=2) for f in fields(DepthConstraints))
+    )
+    again = depth.estimate_depth(large, street.environment.ground, twice, ties)[::2, ::2]
     both = (found < 80) & (again < 80)
     assert np.median(np.abs(np.log(again[both] / found[both]))) < 0.03
 
 
 def test_same_picture_same_depth(street, found):
-    again = depth.surroundings(picture(street), street.environment.ground, street.camera, ties_of(street))
+    again = depth.estimate_depth(picture(street), street.environment.ground, street.camera, ties_of(street))
     assert np.array_equal(again, found)
 
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import front, maps, silhouette
+from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import occluders as front
+from scene_ir.derender import silhouette
 from scene_ir.derender.derender import DerenderSettings, derender
-from scene_ir.geometry import height_above, project_boxes
+from scene_ir.geometry import height_above_ground, project_boxes
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Camera, Frame, Labels
 
@@ -42,7 +44,9 @@ def picture() -> np.ndarray:
     rng = np.random.default_rng(0)
     image = np.full((150, 240, 3), 120.0)
     image[:58] = (150, 180, 210)
-    car = silhouette.silhouettes([silhouette.placed("hatchback", PLACES[0], YAWS[0], SIZES[0])], CAMERA)[0]
+    car = silhouette.render_silhouettes(
+        [silhouette.place_mesh("hatchback", PLACES[0], YAWS[0], SIZES[0])], CAMERA
+    )[0]
     image[car] = (40, 60, 140)
     image[person()] = (190, 50, 40)
     return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
@@ -54,38 +58,38 @@ def frame(masks: torch.Tensor | None = None, depth: torch.Tensor | None = None) 
 
 
 def test_a_labelled_person_is_cut_out_of_its_box():
-    things = front.labelled(picture(), frame(), [0], [1])
+    things = front.find_labelled_occluders(picture(), frame(), [0], [1])
     assert len(things) == 1
     assert things[0].depth_m == pytest.approx(8.0)
-    assert silhouette.iou(things[0].mask, person()) > 0.8
+    assert silhouette.mask_iou(things[0].mask, person()) > 0.8
 
 
 def test_masks_of_the_data_set_are_used_and_far_things_left_out():
     masks = torch.zeros(2, 150, 240)
     masks[1, 60:90, 100:104] = 1.0
-    things = front.labelled(picture(), frame(masks), [0], [1])
+    things = front.find_labelled_occluders(picture(), frame(masks), [0], [1])
     assert np.array_equal(things[0].mask, (masks[1] > 0.5).numpy())
-    assert front.labelled(picture(), frame(masks), [1], [0]) == []
+    assert front.find_labelled_occluders(picture(), frame(masks), [1], [0]) == []
 
 
 def test_depth_tells_a_pole_from_the_ground_and_from_what_is_behind():
-    depth = np.minimum(maps.plane_depth(LEVEL, CAMERA), 60.0)
+    depth = np.minimum(maps.compute_plane_depth(LEVEL, CAMERA), 60.0)
     pole = np.zeros((150, 240), bool)
     pole[40:100, 118:122] = True
     depth[pole] = 9.0
-    car = silhouette.placed("hatchback", PLACES[0], YAWS[0], SIZES[0])
-    outline = silhouette.silhouettes([car], CAMERA)[0]
+    car = silhouette.place_mesh("hatchback", PLACES[0], YAWS[0], SIZES[0])
+    outline = silhouette.render_silhouettes([car], CAMERA)[0]
     shown = outline & ~pole
     depth[shown] = 11.5
-    height = height_above(torch.from_numpy(depth), LEVEL, CAMERA.matrix).float().numpy()
-    ground = np.isfinite(maps.plane_depth(LEVEL, CAMERA)) & ~pole & ~outline & (depth < 60)
+    height = height_above_ground(torch.from_numpy(depth), LEVEL, CAMERA.matrix).float().numpy()
+    ground = np.isfinite(maps.compute_plane_depth(LEVEL, CAMERA)) & ~pole & ~outline & (depth < 60)
     assert np.abs(height[ground]).max() < 0.01
-    things = front.measured(
-        depth.astype(np.float32), height, shown, [(outline, front.nearest_corner(car, CAMERA))]
+    things = front.find_measured_occluders(
+        depth.astype(np.float32), height, shown, [(outline, front.nearest_corner_depth(car, CAMERA))]
     )
     assert len(things) == 1
     assert things[0].depth_m == pytest.approx(9.0)
-    rows = slice(*silhouette.extent(outline)[1::2])
+    rows = slice(*silhouette.mask_bounds(outline)[1::2])
     assert np.array_equal(things[0].mask[rows], (pole & (height > 0.2))[rows])
 
 
@@ -93,15 +97,15 @@ def test_opacities_of_overlapping_things_add_up_to_at_most_one():
     image = picture().astype(np.float32) / 255
     body = person()
     shifted = np.roll(body, 3, axis=1) & ~body
-    found = front.opacities(image, [front.Thing(body, 8.0), front.Thing(shifted, 9.0)])
+    found = front.compute_opacities(image, [front.OccluderMask(body, 8.0), front.OccluderMask(shifted, 9.0)])
     assert (found[0] + found[1]).max() <= 1 + 1e-6
-    assert found[0][silhouette.grow(body, -1.5)].min() > 0.9
-    assert found[0][~silhouette.grow(body, 4)].max() == 0
+    assert found[0][silhouette.grow_mask(body, -1.5)].min() > 0.9
+    assert found[0][~silhouette.grow_mask(body, 4)].max() == 0
 
 
 def test_a_car_moves_behind_the_person_and_the_photograph_comes_back():
     scene = derender(frame(), DerenderSettings(fit=False))
-    assert len(scene.front) == 1
+    assert len(scene.occluders) == 1
     compositor = Compositor(scene)
 
     def levels(image: torch.Tensor) -> torch.Tensor:
@@ -110,7 +114,7 @@ def test_a_car_moves_behind_the_person_and_the_photograph_comes_back():
     assert torch.equal(levels(compositor.render(scene).image), levels(scene.photograph))
     shift = scene.objects.translation + torch.tensor([[-0.4, 0.0, 0.0]])
     moved = compositor.render(scene.with_objects(translation=shift))
-    core = torch.from_numpy(silhouette.grow(person(), -1.5))
+    core = torch.from_numpy(silhouette.grow_mask(person(), -1.5))
     same = (levels(moved.image) == levels(scene.photograph)).all(dim=0)
     assert float(same[core].double().mean()) > 0.95
     # The background keeps the person, without the car around it.

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from scene_ir.derender import silhouette
-from scene_ir.derender.icp import IcpSettings, inside, to_points
+from scene_ir.derender.icp import IcpSettings, align_to_points, points_near_box
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
@@ -18,13 +18,13 @@ TRUE_SIZE = (4.0, 1.5, 1.7)
 
 
 def car(x: float, z: float, yaw: float, size: tuple[float, float, float] = TRUE_SIZE) -> Placement:
-    return silhouette.placed("hatchback", torch.tensor([x, 1.65, z]), torch.tensor(yaw), torch.tensor(size))
+    return silhouette.place_mesh("hatchback", torch.tensor([x, 1.65, z]), torch.tensor(yaw), torch.tensor(size))
 
 
 def swept(placement: Placement, noise_m: float = 0.01) -> torch.Tensor:
     """Points (P, 3) m where rays through every third pixel meet the car, and the road below and a wall behind."""
     clip = to_clip(placement.vertices(), CAMERA.matrix)
-    layout = verbs.Layout.of(torch.tensor([[0, 0, CAMERA.width, CAMERA.height]]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, CAMERA.width, CAMERA.height]]))
     faces = placement.mesh.faces
     hits = verbs.rasterize(clip, faces, torch.tensor([[0, len(faces)]]), layout)
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
@@ -48,7 +48,7 @@ def errors(placement: Placement, truth: Placement) -> tuple[float, float, float]
 def test_points_correct_place_yaw_and_size(x: float, z: float, yaw: float):
     truth = car(x, z, yaw)
     start = car(x + 0.14, z - 0.14, yaw + 0.087, (4.2, 1.43, 1.78))
-    found = to_points(start, swept(truth), CAMERA)
+    found = align_to_points(start, swept(truth), CAMERA)
     assert found is not None
     before, after = errors(start, truth), errors(found, truth)
     assert after[0] < 0.5 * before[0]
@@ -60,12 +60,12 @@ def test_points_correct_place_yaw_and_size(x: float, z: float, yaw: float):
 def test_road_wall_and_what_is_beside_are_not_the_cars():
     truth = car(0.5, 9.0, 0.6)
     points = swept(truth)
-    kept = inside(truth, points)
+    kept = points_near_box(truth, points)
     assert len(kept) > 100
     assert kept[:, 1].max() < 1.65 - 0.15
     assert np.linalg.norm(kept[:, [0, 2]] - [0.5, 9.0], axis=1).max() < 2.9
     neighbour = torch.tensor([[0.5, 1.0, 12.5]]).repeat(300, 1)
-    alone, beside = (to_points(truth, p, CAMERA) for p in (points, torch.cat([points, neighbour])))
+    alone, beside = (align_to_points(truth, p, CAMERA) for p in (points, torch.cat([points, neighbour])))
     assert alone is not None
     assert beside is not None
     assert torch.equal(alone.translation, beside.translation)
@@ -74,10 +74,10 @@ def test_road_wall_and_what_is_beside_are_not_the_cars():
 def test_some_wrong_points_inside_the_box_do_not_spoil_it():
     truth, start = car(0.5, 9.0, 0.6), car(0.64, 8.86, 0.68)
     points = swept(truth)
-    count = len(inside(truth, points)) // 6
+    count = len(points_near_box(truth, points)) // 6
     rng = np.random.default_rng(1)
     stray = torch.from_numpy(rng.uniform([-0.8, 0.3, 8.0], [1.8, 1.3, 10.0], (count, 3)).astype(np.float32))
-    found = to_points(start, torch.cat([points, stray]), CAMERA)
+    found = align_to_points(start, torch.cat([points, stray]), CAMERA)
     assert found is not None
     assert errors(found, truth)[0] < 0.6 * errors(start, truth)[0]
     assert errors(found, truth)[1] < 0.4 * errors(start, truth)[1]
@@ -85,15 +85,15 @@ def test_some_wrong_points_inside_the_box_do_not_spoil_it():
 
 def test_too_few_points_say_nothing():
     truth = car(0.5, 9.0, 0.6)
-    on_it = torch.from_numpy(inside(truth, swept(truth))).float()
-    assert to_points(truth, on_it[:20], CAMERA) is None
-    assert to_points(truth, torch.zeros(0, 3), CAMERA) is None
+    on_it = torch.from_numpy(points_near_box(truth, swept(truth))).float()
+    assert align_to_points(truth, on_it[:20], CAMERA) is None
+    assert align_to_points(truth, torch.zeros(0, 3), CAMERA) is None
 
 
 def test_no_points_move_a_car_beyond_its_label():
     truth, start = car(0.5, 9.0, 0.6), car(1.6, 9.6, 1.3)
     settings = IcpSettings()
-    found = to_points(start, swept(truth), CAMERA, settings)
+    found = align_to_points(start, swept(truth), CAMERA, settings)
     assert found is not None
     limit = settings.bound * settings.shift_m + 1e-5
     assert float((found.translation - start.translation).abs().max()) <= limit

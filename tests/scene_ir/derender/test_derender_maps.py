@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import maps
+from scene_ir.derender import ground_geometry as maps
 from scene_ir.types import Camera, Labels
 
 CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
@@ -38,34 +38,34 @@ def test_ground_follows_the_labels_and_not_the_one_that_is_wrong():
 
 def test_horizon_and_plane_depth_of_a_level_camera():
     assert maps.horizon_row(LEVEL, CAMERA) == pytest.approx(88.0, abs=1e-4)
-    depth = maps.plane_depth(LEVEL, CAMERA)
+    depth = maps.compute_plane_depth(LEVEL, CAMERA)
     assert np.isinf(depth[:88]).all()
     assert depth[188, 100] == pytest.approx(380 * 1.65 / 100, rel=1e-4)
 
 
 def test_walls_stand_on_the_end_of_the_ground_and_the_sky_is_endlessly_far():
-    ground = maps.plane_depth(LEVEL, CAMERA)
+    ground = maps.compute_plane_depth(LEVEL, CAMERA)
     road = np.zeros((200, 480), np.float32)
     road[120:] = 1
     sky = np.zeros_like(road)
     sky[:40] = 1
-    depth = maps.walls(ground, road, np.zeros_like(road), sky, 88.0)
+    depth = maps.compute_wall_depth(ground, road, np.zeros_like(road), sky, 88.0)
     assert depth[150] == pytest.approx(ground[150])
     assert depth[60, 200] == pytest.approx(ground[120, 200], rel=0.05)
     assert np.isinf(depth[:40]).all()
-    assert depth[np.isfinite(depth)].max() <= maps.FAR
+    assert depth[np.isfinite(depth)].max() <= maps.FAR_M
 
 
 def test_where_a_car_stands_there_is_ground_and_no_wall_before_it():
-    ground = maps.plane_depth(LEVEL, CAMERA)
+    ground = maps.compute_plane_depth(LEVEL, CAMERA)
     road = np.zeros((200, 480), np.float32)
     road[150:] = 1  # rails or a verge that nobody took for ground
     labels = replace(
         labels_at([[0.0, 1.65, 20.0], [0.0, 1.65, 0.2]]), size_lhw=torch.tensor([[4.0, 1.5, 1.8]] * 2)
     )
-    stood = maps.footprints(labels, [0, 1], LEVEL, CAMERA)
+    stood = maps.draw_footprints(labels, [0, 1], LEVEL, CAMERA)
     nothing = np.zeros_like(road)
-    before, after = (maps.walls(ground, road, where, nothing, 88.0) for where in (nothing, stood))
+    before, after = (maps.compute_wall_depth(ground, road, where, nothing, 88.0) for where in (nothing, stood))
     car = slice(240 - 17, 240 + 17)
     assert before[100, car].max() < 11
     assert after[100, car].min() > 20
@@ -75,6 +75,6 @@ def test_where_a_car_stands_there_is_ground_and_no_wall_before_it():
 
 
 def test_sun_is_a_unit_vector_that_points_up():
-    sun = maps.sun_direction()
+    sun = maps.default_sun()
     assert float(sun.norm()) == pytest.approx(1)
     assert sun[1] < -0.5

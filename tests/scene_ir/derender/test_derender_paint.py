@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import paint
+from scene_ir.derender import paint_mask as paint
 from scene_ir.types import Crop
 
 H, W = 60, 90
@@ -43,7 +43,7 @@ def mesh_part(shift: int) -> Crop:
 @pytest.mark.parametrize("base", [(0.35, 0.4, 0.62), (0.62, 0.62, 0.6), (0.2, 0.42, 0.25)])
 def test_plates_lamps_and_windows_are_no_paint(base):
     foreground, truth = picture(base)
-    found = paint.region(foreground, mesh_part(2))
+    found = paint.estimate_paint_region(foreground, mesh_part(2))
     assert (found.x0, found.y0) == (5, 3)
     share = found.values[0].numpy()
     assert share.dtype == np.float32
@@ -58,7 +58,7 @@ def test_plates_lamps_and_windows_are_no_paint(base):
 
 def test_paint_as_dark_as_glass_is_where_the_mesh_says():
     foreground, truth = picture((0.1, 0.11, 0.12))
-    share = paint.region(foreground, mesh_part(0)).values[0].numpy()
+    share = paint.estimate_paint_region(foreground, mesh_part(0)).values[0].numpy()
     assert ((share > 0.5) == truth).mean() > 0.9
 
 
@@ -66,11 +66,11 @@ def test_nothing_outside_the_foreground():
     foreground, _ = picture((0.5, 0.2, 0.2))
     values = foreground.values.clone()
     values[:, :, :20] = 0
-    share = paint.region(replace(foreground, values=values), mesh_part(0)).values[0]
+    share = paint.estimate_paint_region(replace(foreground, values=values), mesh_part(0)).values[0]
     assert bool((share[:, :20] == 0).all())
     assert float(share[50:, 30:].min()) > 0.9
 
 
 def test_an_empty_foreground_has_an_empty_region():
     empty = Crop(torch.zeros(4, 0, 0), 0, 0)
-    assert paint.region(empty, Crop(torch.zeros(1, 0, 0), 0, 0)).values.shape == (1, 0, 0)
+    assert paint.estimate_paint_region(empty, Crop(torch.zeros(1, 0, 0), 0, 0)).values.shape == (1, 0, 0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from scene_ir import files
 from scene_ir.derender import pose
-from scene_ir.derender.pose import BINS, KINDS, PoseNet, Said
+from scene_ir.derender.pose import BINS, KINDS, PoseNet, PosePrediction
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.types import Camera
@@ -43,10 +43,10 @@ class Oracle(PoseNet):
         self.depth = torch.log(middle[:, 2] / pose.mean_depth(boxes, kinds, camera))
         self.log_sigma = torch.full_like(self.depth, math.log(0.05))
 
-    def forward(self, crops: Tensor, numbers: Tensor) -> Said:
+    def forward(self, crops: Tensor, numbers: Tensor) -> PosePrediction:
         centre = torch.arange(BINS) * (2 * math.pi / BINS)
         apart = self.alpha[:, None] - centre
-        said = Said(
+        said = PosePrediction(
             8 * apart.cos(),
             torch.stack([apart.cos(), apart.sin()], -1),
             self.offset,
@@ -57,7 +57,7 @@ class Oracle(PoseNet):
         )
         self.calls = getattr(self, "calls", 0) + 1
         # the second pass sees the mirror's image
-        return said if self.calls % 2 else pose.unmirrored(said)
+        return said if self.calls % 2 else pose.unmirror_prediction(said)
 
 
 def row_of_cars(
@@ -77,7 +77,9 @@ def grey() -> Tensor:
 
 def test_what_is_true_comes_out_as_it_is() -> None:
     camera, place, yaw, size, boxes = row_of_cars()
-    found = pose.estimate(grey(), boxes, ["Car"] * 3, camera, network=Oracle(camera, place, yaw, size, boxes))
+    found = pose.estimate_poses(
+        grey(), boxes, ["Car"] * 3, camera, network=Oracle(camera, place, yaw, size, boxes)
+    )
     torch.testing.assert_close(found.translation, place, atol=0.02, rtol=0)
     torch.testing.assert_close(found.yaw, yaw, atol=1e-3, rtol=0)
     torch.testing.assert_close(found.size_lhw, size, atol=5e-3, rtol=0)
@@ -91,8 +93,8 @@ def test_a_known_ground_corrects_the_depth_along_the_ray() -> None:
     network.size = network.size + torch.tensor([0.08, -0.08, 0.08])[:, None]
     ground = torch.tensor([0.0, -1.0, 0.0, 1.65])
     one = Oracle(camera, place[:1], yaw[:1], size[:1], boxes[:1])
-    alone = pose.estimate(grey(), boxes[:1], ["Car"], camera, torch.tensor([0.0, -1.0, 0.0, 5.0]), one)
-    found = pose.estimate(grey(), boxes, ["Car"] * 3, camera, ground, network)
+    alone = pose.estimate_poses(grey(), boxes[:1], ["Car"], camera, torch.tensor([0.0, -1.0, 0.0, 5.0]), one)
+    found = pose.estimate_poses(grey(), boxes, ["Car"] * 3, camera, ground, network)
     wrong = torch.tensor([0.08, 0.08, 0.08]).expm1()
     error = (found.translation[:, 2] / place[:, 2] - 1).abs()
     assert bool((error < 0.7 * wrong).all()), error
@@ -126,11 +128,13 @@ def test_the_ground_is_what_most_vehicles_stand_on() -> None:
 @pytest.mark.parametrize("alpha", [-3.1, -1.6, -0.3, 0.0, 0.8, 1.57, 3.0])
 def test_mirrored_twice_is_the_same_and_once_is_the_other_angle(alpha: float) -> None:
     camera, place, _, size, boxes = row_of_cars(places=((0.0, 15.0),))
-    said = Oracle(camera, place, torch.tensor([alpha]), size, boxes)(grey()[None], torch.zeros(1, pose.NUMBERS))
-    turned = pose.unmirrored(said)
-    assert torch.equal(pose.unmirrored(turned).bins, said.bins)
-    assert torch.equal(pose.unmirrored(turned).turn, said.turn)
-    angle, sure = pose.viewing_angle(turned)
+    said = Oracle(camera, place, torch.tensor([alpha]), size, boxes)(
+        grey()[None], torch.zeros(1, pose.BOX_FEATURES)
+    )
+    turned = pose.unmirror_prediction(said)
+    assert torch.equal(pose.unmirror_prediction(turned).bins, said.bins)
+    assert torch.equal(pose.unmirror_prediction(turned).turn, said.turn)
+    angle, sure = pose.decode_viewing_angle(turned)
     assert math.remainder(float(angle) - (math.pi - alpha), 2 * math.pi) == pytest.approx(0, abs=1e-5)
     assert float(sure) > 0.99
 
@@ -141,8 +145,10 @@ def test_front_and_back_equally_likely_is_said_to_be_so() -> None:
     apart = torch.where((centre - 1.0).cos() > 0, 1.0 - centre, 1.0 + math.pi - centre)
     turn = torch.stack([apart.cos(), apart.sin()], -1)[None]
     nothing = torch.zeros(1)
-    said = Said(bins, turn, torch.zeros(1, 2), torch.zeros(1, 3), nothing, nothing, torch.zeros(1, len(KINDS)))
-    alpha, sure = pose.viewing_angle(said)
+    said = PosePrediction(
+        bins, turn, torch.zeros(1, 2), torch.zeros(1, 3), nothing, nothing, torch.zeros(1, len(KINDS))
+    )
+    alpha, sure = pose.decode_viewing_angle(said)
     assert math.remainder(float(alpha) - 1.0, math.pi) == pytest.approx(0, abs=1e-4)
     assert float(sure) == pytest.approx(0.5, abs=0.01)
 
@@ -150,15 +156,15 @@ def test_front_and_back_equally_likely_is_said_to_be_so() -> None:
 def test_crops_show_the_box_in_their_middle() -> None:
     image = np.zeros((200, 300, 3), np.float32)
     image[40:80, 100:160] = 1  # pixels' centres 40 to 79, 100 to 159
-    crop = pose.crops_of(image, np.array([[99.5, 39.5, 159.5, 79.5]], np.float32), (64, 96), 1.0)[0]
+    crop = pose.crop_boxes(image, np.array([[99.5, 39.5, 159.5, 79.5]], np.float32), (64, 96), 1.0)[0]
     assert crop.min() > 0.49  # half a pixel beyond the edge is half light
     assert crop[1:-1, 1:-1].min() > 0.99
-    wide = pose.crops_of(image, np.array([[99.5, 39.5, 159.5, 79.5]], np.float32), (64, 96), 2.0)[0]
+    wide = pose.crop_boxes(image, np.array([[99.5, 39.5, 159.5, 79.5]], np.float32), (64, 96), 2.0)[0]
     assert wide[17:47, 25:71].min() > 0.99
     assert wide[:15].max() < 0.01
     assert wide[:, :23].max() < 0.01
     # from a halved picture too, and grey beyond the border
-    large = pose.crops_of(image, np.array([[-100, -60, 360, 260.0]], np.float32), (64, 96), 1.0)[0]
+    large = pose.crop_boxes(image, np.array([[-100, -60, 360, 260.0]], np.float32), (64, 96), 1.0)[0]
     assert large[0, 0].tolist() == [0.5, 0.5, 0.5]
     assert large[24, 48] == pytest.approx([1, 1, 1], abs=1e-5)
     assert large[50, 48] == pytest.approx([0, 0, 0], abs=1e-5)
@@ -168,19 +174,19 @@ def test_numbers_tell_where_the_border_cuts() -> None:
     camera = kitti_camera()
     boxes = torch.tensor([[0.0, 50, 100, 374], [609.6 - 50, 172.9 - 30, 609.6 + 50, 172.9 + 30]])
     boxes = torch.cat([boxes, torch.tensor([[1100.0, 0, 1241, 200]])])
-    numbers = pose.box_numbers(boxes, pose.is_truck(["Car", "Van", "Truck"]), pose.camera_numbers(camera))
-    assert numbers.shape == (3, pose.NUMBERS)
+    numbers = pose.box_features(boxes, pose.is_truck(["Car", "Van", "Truck"]), pose.camera_features(camera))
+    assert numbers.shape == (3, pose.BOX_FEATURES)
     assert numbers[:, 4:8].tolist() == [[1, 0, 0, 1], [0, 0, 0, 0], [0, 1, 1, 0]]
     assert numbers[:, 8].tolist() == [0, 0, 1]
     assert numbers[1, :2].tolist() == pytest.approx([0, 0], abs=1e-6)
-    turned = pose.mirrored(numbers)
+    turned = pose.mirror_features(numbers)
     assert turned[:, 4:8].tolist() == [[0, 0, 1, 1], [0, 0, 0, 0], [1, 1, 0, 0]]
     assert torch.equal(turned[:, 0], -numbers[:, 0])
 
 
 def test_no_boxes_give_no_poses() -> None:
     camera = kitti_camera()
-    found = pose.estimate(grey(), torch.zeros(0, 4), [], camera)
+    found = pose.estimate_poses(grey(), torch.zeros(0, 4), [], camera)
     assert found.translation.shape == (0, 3)
     assert found.kind == ()
     torch.testing.assert_close(found.ground, torch.tensor([0.0, -1.0, 0.0, 1.65]))
@@ -190,19 +196,19 @@ def test_what_is_not_right_is_refused() -> None:
     camera = kitti_camera()
     box = torch.tensor([[100.0, 100, 200, 160]])
     with pytest.raises(ShapeError, match="photograph"):
-        pose.estimate(grey()[:, :100], box, ["Car"], camera)
+        pose.estimate_poses(grey()[:, :100], box, ["Car"], camera)
     with pytest.raises(ShapeError, match="boxes_xyxy"):
-        pose.estimate(grey(), box[:, :3], ["Car"], camera)
+        pose.estimate_poses(grey(), box[:, :3], ["Car"], camera)
     with pytest.raises(ShapeError, match="kinds: expected 1"):
-        pose.estimate(grey(), box, [], camera)
+        pose.estimate_poses(grey(), box, [], camera)
     with pytest.raises(RangeError, match=r"kinds\[0\]: expected Car or Van or Truck, found 'Tram'"):
-        pose.estimate(grey(), box, ["Tram"], camera)
+        pose.estimate_poses(grey(), box, ["Tram"], camera)
     with pytest.raises(RangeError, match=r"boxes_xyxy\[0\]"):
-        pose.estimate(grey(), box[:, [2, 1, 0, 3]], ["Car"], camera)
+        pose.estimate_poses(grey(), box[:, [2, 1, 0, 3]], ["Car"], camera)
     with pytest.raises(RangeError, match=r"boxes_xyxy\[0\]"):
-        pose.estimate(grey(), box * math.nan, ["Car"], camera)
+        pose.estimate_poses(grey(), box * math.nan, ["Car"], camera)
     with pytest.raises(RangeError, match="ground"):
-        pose.estimate(grey(), box, ["Car"], camera, torch.tensor([0.0, 1.0, 0.0, 1.65]))
+        pose.estimate_poses(grey(), box, ["Car"], camera, torch.tensor([0.0, 1.0, 0.0, 1.65]))
 
 
 def test_damaged_weights_are_named(tmp_path: Path) -> None:
@@ -231,14 +237,14 @@ def test_boxes_at_the_border_and_of_few_pixels_give_finite_poses() -> None:
     generator = torch.Generator().manual_seed(0)
     photograph = torch.rand(3, HEIGHT, WIDTH, generator=generator)
     kinds = ["Truck", "Car", "Van", "Car", "Car"]
-    found = pose.estimate(photograph, boxes, kinds, camera)
+    found = pose.estimate_poses(photograph, boxes, kinds, camera)
     for values in (found.translation, found.yaw, found.size_lhw, found.log_depth_sigma, found.ground):
         assert bool(torch.isfinite(values).all())
     assert bool((found.translation[:, 2] > 0).all())
     assert bool((found.size_lhw > 0).all())
     assert bool((found.facing >= 0.5 - 1e-6).all())
     assert all(kind in KINDS for kind in found.kind)
-    again = pose.estimate(photograph, boxes, kinds, camera)
+    again = pose.estimate_poses(photograph, boxes, kinds, camera)
     assert torch.equal(found.translation, again.translation)
     assert torch.equal(found.yaw, again.yaw)
 
@@ -248,9 +254,9 @@ def test_the_mirrored_photograph_gives_the_mirrored_poses() -> None:
     camera = Camera(k, HEIGHT, WIDTH)
     photograph = torch.rand(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
     boxes = torch.tensor([[0.0, 180, 160, 330], [500, 170, 640, 240]])
-    one = pose.estimate(photograph, boxes, ["Car", "Car"], camera)
+    one = pose.estimate_poses(photograph, boxes, ["Car", "Car"], camera)
     turned = boxes[:, [2, 1, 0, 3]] * torch.tensor([-1.0, 1, -1, 1]) + torch.tensor([WIDTH - 1.0, 0, WIDTH - 1, 0])
-    other = pose.estimate(photograph.flip(2), turned, ["Car", "Car"], camera)
+    other = pose.estimate_poses(photograph.flip(2), turned, ["Car", "Car"], camera)
     flip = torch.tensor([-1.0, 1, 1])
     torch.testing.assert_close(other.translation * flip, one.translation, atol=2e-3, rtol=1e-4)
     apart = other.yaw - (math.pi - one.yaw)
@@ -260,5 +266,5 @@ def test_the_mirrored_photograph_gives_the_mirrored_poses() -> None:
 def test_clipped_boxes_are_what_the_flags_expect() -> None:
     camera, place, yaw, size, _ = row_of_cars(places=((-4.5, 6.0),))
     box = clip_boxes(project_boxes(size, yaw, place, camera.matrix), HEIGHT, WIDTH)
-    numbers = pose.box_numbers(box, pose.is_truck(["Car"]), pose.camera_numbers(camera))
+    numbers = pose.box_features(box, pose.is_truck(["Car"]), pose.camera_features(camera))
     assert numbers[0, 4] == 1

@@ -10,8 +10,9 @@ import torch
 
 from drivesem.synth.exposure import expose
 from drivesem.synth.frames import SynthFrame, SynthSettings, generate_frame
-from scene_ir.derender import segment, unet
-from scene_ir.derender.segment import Class, Segmentation
+from scene_ir.derender import segmentation as segment
+from scene_ir.derender import unet
+from scene_ir.derender.segmentation import Segmentation, StreetClass
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.types import Camera, Frame
 
@@ -32,7 +33,7 @@ def image(street: SynthFrame) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def seen(street: SynthFrame, image: np.ndarray) -> Segmentation:
-    return segment.segment(image, street.environment.ground, street.camera)
+    return segment.segment_photograph(image, street.environment.ground, street.camera)
 
 
 def iou(found: np.ndarray, truth: np.ndarray) -> float:
@@ -42,7 +43,7 @@ def iou(found: np.ndarray, truth: np.ndarray) -> float:
 def test_streets_that_no_training_frame_has(street, seen):
     other = generate_frame(42, 6, "heldout", SynthSettings(bent=True))
     picture = other.image.astype(np.float32) / 255
-    both = ((street, seen), (other, segment.segment(picture, other.environment.ground, other.camera)))
+    both = ((street, seen), (other, segment.segment_photograph(picture, other.environment.ground, other.camera)))
     for name, truth, least in (("sky", "sky", 0.93), ("foliage", "foliage_map", 0.6), ("road", "road", 0.75)):
         found = np.concatenate([getattr(maps, name).ravel() for _, maps in both]) > 0.5
         share = np.concatenate([getattr(frame.environment, truth).numpy().ravel() for frame, _ in both]) > 0.5
@@ -75,9 +76,9 @@ def test_no_sky_below_the_horizon_and_no_ground_above(street, image):
         return lambda _: (shares, ("sky", "road", "tree"))
 
     ground, camera = street.environment.ground, street.camera
-    height = unet.elevation(ground, camera, image.shape[:2])
-    sky = segment.segment(image, ground, camera, all_of("sky")).sky
-    road = segment.segment(image, ground, camera, all_of("road")).road
+    height = unet.compute_elevation(ground, camera, image.shape[:2])
+    sky = segment.segment_photograph(image, ground, camera, all_of("sky")).sky
+    road = segment.segment_photograph(image, ground, camera, all_of("road")).road
     assert sky[height < -0.02].max() == 0
     assert sky[height > 0].min() > 0.99
     assert road[height > 0.03].max() == 0
@@ -88,14 +89,14 @@ def test_pictures_of_other_sizes_and_focal_lengths_come_out_at_their_own(image):
     for shape, focal in (((61, 90), 70.0), ((1100, 900), 500.0)):
         part = np.ascontiguousarray(np.resize(image, (*shape, 3)))
         matrix = torch.tensor([[focal, 0, shape[1] / 2], [0, focal, shape[0] / 2], [0, 0, 1.0]])
-        shares = segment.from_network(part, LEVEL, Camera(matrix, *shape))
-        assert shares.shape[0] == len(Class)
+        shares = segment.predict_shares(part, LEVEL, Camera(matrix, *shape))
+        assert shares.shape[0] == len(StreetClass)
         assert shares.sum(0) == pytest.approx(1, abs=1e-5)
-        assert segment.segment(part, LEVEL, Camera(matrix, *shape)).sky.shape == shape
+        assert segment.segment_photograph(part, LEVEL, Camera(matrix, *shape)).sky.shape == shape
 
 
 def test_same_picture_same_maps(street, image, seen):
-    again = segment.segment(image, street.environment.ground, street.camera)
+    again = segment.segment_photograph(image, street.environment.ground, street.camera)
     assert all(np.array_equal(getattr(again, f.name), getattr(seen, f.name)) for f in fields(Segmentation))
 
 
@@ -106,7 +107,9 @@ def test_a_users_segmenter_is_asked_and_its_names_are_understood(image):
     camera = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
     blank = np.full((200, 480, 3), 0.5, np.float32)
     asked = []
-    found = segment.segment(blank, LEVEL, camera, lambda picture: (asked.append(picture), (shares, names))[1])
+    found = segment.segment_photograph(
+        blank, LEVEL, camera, lambda picture: (asked.append(picture), (shares, names))[1]
+    )
     assert asked[0] is blank
     assert found.sky[20].min() > 0.95
     assert found.foliage[125, :180].min() > 0.9
@@ -126,7 +129,7 @@ def test_a_users_segmenter_is_asked_and_its_names_are_understood(image):
 def test_a_segmenter_that_cannot_be_used_is_an_error(names, count, error, message):
     blank = np.zeros((200, 480, 3), np.float32)
     with pytest.raises(error, match=message):
-        segment.segment(blank, LEVEL, CAMERA, lambda _: (np.zeros((count, 5, 6), np.float32), names))
+        segment.segment_photograph(blank, LEVEL, CAMERA, lambda _: (np.zeros((count, 5, 6), np.float32), names))
 
 
 def framed(street: SynthFrame) -> Frame:
@@ -139,7 +142,7 @@ def framed(street: SynthFrame) -> Frame:
 
 def test_a_data_sets_classes_are_the_maps(street, seen):
     frame = framed(street)
-    given = segment.of_frame(frame, seen)
+    given = segment.apply_frame_classes(frame, seen)
     names = np.array(frame.class_names)[frame.classes.numpy()]
     terrain = names == "Terrain"
     assert np.array_equal(given.sky, names == "Sky")
@@ -148,7 +151,7 @@ def test_a_data_sets_classes_are_the_maps(street, seen):
     assert np.array_equal(given.foliage[terrain], seen.foliage[terrain])
     assert np.array_equal(given.ground, np.isin(names, ("Road", "Terrain")))
     assert np.array_equal(given.vehicle, np.isin(names, ("Car", "Van", "Truck")))
-    assert segment.of_frame(replace(frame, classes=None, class_names=()), seen) is seen
+    assert segment.apply_frame_classes(replace(frame, classes=None, class_names=()), seen) is seen
 
 
 def test_maps_of_one_within_a_mask_of_another(seen):

@@ -8,23 +8,23 @@ import torch
 
 from scene_ir.derender import shadow, silhouette
 from scene_ir.geometry import project
-from scene_ir.render.surfaces import shadow_density, sun_offset
+from scene_ir.render.surfaces import shadow_density, shadow_offset
 from scene_ir.types import Camera
 
 CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
 LEVEL = torch.tensor([0.0, -1.0, 0.0, 1.65])
-CAR = silhouette.placed(
+CAR = silhouette.place_mesh(
     "hatchback", torch.tensor([0.5, 1.65, 9.0]), torch.tensor(0.4), torch.tensor([4.0, 1.5, 1.7])
 )
 ROAD = np.concatenate([np.zeros((92, 480)), np.ones((108, 480))]).astype(np.float32)
 
 
 def view() -> shadow.GroundView:
-    return shadow.ground_view(CAR, LEVEL, CAMERA)
+    return shadow.view_ground(CAR, LEVEL, CAMERA)
 
 
 def vehicle() -> np.ndarray:
-    return silhouette.silhouettes([CAR], CAMERA)[0]
+    return silhouette.render_silhouettes([CAR], CAMERA)[0]
 
 
 def toward(x: float, z: float) -> torch.Tensor:
@@ -36,7 +36,7 @@ def shaded(sun: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     ground = view()
     flat = torch.from_numpy(np.where(np.isfinite(ground.local), ground.local, 99.0)).reshape(-1, 2)
     size = CAR.size_lhw.expand(len(flat), 3)
-    offset = sun_offset(sun, CAR.yaw.expand(len(flat)), size[:, 1])
+    offset = shadow_offset(sun, CAR.yaw.expand(len(flat)), size[:, 1])
     factor = 1 - 0.8 * shadow_density(flat, size, offset).reshape(200, 480).numpy()
     image = np.full((200, 480, 3), 0.6, np.float32) * factor[..., None]
     image[vehicle()] = (0.5, 0.1, 0.1)
@@ -56,8 +56,8 @@ def test_ground_view_knows_the_footprints_corners_and_middle():
 
 @pytest.mark.parametrize("place", [(0.5, 1.65, 9.0), (-2.5, 1.65, 2.0), (4.0, 1.65, 40.0)])
 def test_ground_view_holds_all_ground_within_metres_of_the_footprint(place: tuple[float, float, float]):
-    car = silhouette.placed("hatchback", torch.tensor(place), torch.tensor(0.4), CAR.size_lhw)
-    ground = shadow.ground_view(car, LEVEL, CAMERA)
+    car = silhouette.place_mesh("hatchback", torch.tensor(place), torch.tensor(0.4), CAR.size_lhw)
+    ground = shadow.view_ground(car, LEVEL, CAMERA)
     v, u = np.mgrid[0:200, 0:480]
     intrinsics = CAMERA.matrix.numpy()
     with np.errstate(divide="ignore"):
@@ -72,16 +72,19 @@ def test_ground_view_holds_all_ground_within_metres_of_the_footprint(place: tupl
 
 
 def found_in(
-    light: shadow.Light, sun: torch.Tensor, allowed: np.ndarray = ROAD > 0.5, pixels: np.ndarray | None = None
+    light: shadow.GroundLight,
+    sun: torch.Tensor,
+    allowed: np.ndarray = ROAD > 0.5,
+    pixels: np.ndarray | None = None,
 ) -> np.ndarray:
     """The car's shadow when the sun is known."""
-    cast = shadow.cast(CAR, view(), sun)
-    return shadow.find(light, vehicle() if pixels is None else pixels, [view()], [allowed], [cast])[0][0]
+    cast = shadow.cast_box_shadow(CAR, view(), sun)
+    return shadow.find_shadows(light, vehicle() if pixels is None else pixels, [view()], [allowed], [cast])[0][0]
 
 
 def test_a_shadow_is_found_and_the_lit_road_is_not():
     image, factor = shaded(toward(0.6, 0.0))
-    light = shadow.light(image, ROAD, vehicle(), [view()])
+    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
     found = found_in(light, toward(0.6, 0.0))
     visible = ~vehicle() & (view().distance < 2.4)
     assert found[visible & (factor < 0.5)].mean() > 0.95
@@ -93,7 +96,7 @@ def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
     image, _ = shaded(toward(0.0, 0.0))
     image[:, :260] *= 0.4
     image[92:110] *= 2.5
-    light = shadow.light(np.clip(image, 0, 1), ROAD, vehicle(), [view()])
+    light = shadow.estimate_ground_light(np.clip(image, 0, 1), ROAD, vehicle(), [view()])
     found = found_in(light, toward(0.0, 0.0))
     shade = (view().distance > 1.2) & (view().distance < 2.0) & ~vehicle()
     shade[:, 250:] = False
@@ -103,7 +106,7 @@ def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
 @pytest.mark.parametrize("direction", [(0.8, 0.0), (-0.8, 0.1)])
 def test_the_sun_is_on_the_other_side_of_the_shadow(direction):
     image, _ = shaded(toward(*direction))
-    light = shadow.light(image, ROAD, vehicle(), [view()])
+    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
     sun = shadow.estimate_sun(light, vehicle(), [CAR], [view()], toward(0.0, 0.0))
     assert float(sun[0]) * direction[0] > 0.2
     assert float(sun.norm()) == pytest.approx(1.0, abs=1e-5)
@@ -112,13 +115,13 @@ def test_the_sun_is_on_the_other_side_of_the_shadow(direction):
 def test_without_shadows_the_assumed_sun_stays():
     image = np.full((200, 480, 3), 0.6, np.float32)
     assumed = toward(0.1, -0.3)
-    light = shadow.light(image, ROAD, vehicle(), [view()])
+    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
     assert torch.equal(shadow.estimate_sun(light, vehicle(), [CAR], [view()], assumed), assumed)
 
 
 def test_reach_of_the_renderers_patch():
     ground = view()
-    reach = shadow.reachable(CAR, ground, toward(0.0, 0.0))
+    reach = shadow.reachable_ground(CAR, ground, toward(0.0, 0.0))
     assert reach[ground.distance < 0.5].all()
     assert not reach[ground.distance > 3.5].any()
 
@@ -126,7 +129,7 @@ def test_reach_of_the_renderers_patch():
 def test_a_low_suns_shadow_is_found_to_its_end():
     sun = toward(-1.7, 0.3)
     image, factor = shaded(sun)
-    light = shadow.light(image, ROAD, vehicle(), [view()])
+    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
     estimate = shadow.estimate_sun(light, vehicle(), [CAR], [view()], toward(0.0, 0.0))
     azimuths = [float(torch.atan2(s[2], s[0])) for s in (estimate, sun)]
     assert abs(np.remainder(azimuths[0] - azimuths[1] + np.pi, 2 * np.pi) - np.pi) < 0.2
@@ -139,22 +142,22 @@ def test_a_low_suns_shadow_is_found_to_its_end():
 def test_dark_ground_beyond_reach_counts_and_vanishes_with_longer_shadows():
     sun = toward(-1.8, 0.0)
     image, _ = shaded(sun)
-    light = shadow.light(image, ROAD, vehicle(), [view()])
+    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
     beyond = []
     for factor in (0.15, 1.0):
-        lower = shadow.stretched(sun, factor)
+        lower = shadow.lengthen_shadows(sun, factor)
         assert float(lower[0] / lower[1]) == pytest.approx(factor * float(sun[0] / sun[1]), rel=1e-5)
-        allowed = shadow.reachable(CAR, view(), lower)
-        casts = [shadow.cast(CAR, view(), lower)]
-        beyond.append(shadow.find(light, vehicle(), [view()], [allowed], casts)[1])
+        allowed = shadow.reachable_ground(CAR, view(), lower)
+        casts = [shadow.cast_box_shadow(CAR, view(), lower)]
+        beyond.append(shadow.find_shadows(light, vehicle(), [view()], [allowed], casts)[1])
     assert beyond[0] > 50
     assert beyond[1] == 0
 
 
 def test_the_cast_is_the_renderers_and_ends_where_its_patch_does():
     sun = toward(0.6, 0.2)
-    cast, (_, factor) = shadow.cast(CAR, view(), sun), shaded(sun)
-    inside = shadow.reachable(CAR, view(), sun)
+    cast, (_, factor) = shadow.cast_box_shadow(CAR, view(), sun), shaded(sun)
+    inside = shadow.reachable_ground(CAR, view(), sun)
     assert not cast[~inside].any()
     assert cast[inside] == pytest.approx((1 - factor[inside]) / 0.8, abs=1e-4)
 
@@ -165,7 +168,7 @@ def test_factors_darken_only_in_their_region():
     background[0, 0] = 0.1
     region = np.zeros((4, 5), bool)
     region[:2] = True
-    factor = shadow.factors(image, background, region)
+    factor = shadow.shadow_factors(image, background, region)
     assert factor[1, 1] == pytest.approx([0.4] * 3)
     assert factor[0, 0] == pytest.approx([1.0] * 3)
     assert (factor[2:] == 1).all()
@@ -177,7 +180,8 @@ def test_what_is_known_to_be_behind_a_car_tells_a_dark_strip_from_its_shadow():
     empty = np.full_like(image, 0.6) * strip[..., None]
     photograph = np.where(vehicle()[..., None], image, image * strip[..., None])
     plain, told = (
-        shadow.light(photograph, ROAD, vehicle(), [view()], behind=behind) for behind in (None, lambda _: empty)
+        shadow.estimate_ground_light(photograph, ROAD, vehicle(), [view()], behind=behind)
+        for behind in (None, lambda _: empty)
     )
     dark = (strip < 1) & (factor > 0.98) & ~vehicle() & (view().distance < 2.4)
     assert np.count_nonzero(dark) > 50

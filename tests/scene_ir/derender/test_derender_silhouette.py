@@ -10,21 +10,23 @@ import pytest
 import torch
 
 from scene_ir.derender import silhouette
-from scene_ir.derender.silhouette import Boxes, FitSettings
+from scene_ir.derender.silhouette import FitSettings, LabelBoxes
 from scene_ir.geometry import project_boxes
 from scene_ir.types import Camera
 
 CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
 NOTHING = np.zeros((200, 480), bool)
-NO_BOXES = Boxes(torch.zeros(1, 4), torch.zeros(1, 4))
+NO_BOXES = LabelBoxes(torch.zeros(1, 4), torch.zeros(1, 4))
 
 
 def car(x: float = 0.5, z: float = 11.0, yaw: float = 0.6, kind: str = "hatchback") -> silhouette.Placement:
-    return silhouette.placed(kind, torch.tensor([x, 1.65, z]), torch.tensor(yaw), torch.tensor([4.0, 1.5, 1.7]))
+    return silhouette.place_mesh(
+        kind, torch.tensor([x, 1.65, z]), torch.tensor(yaw), torch.tensor([4.0, 1.5, 1.7])
+    )
 
 
 def outline(placement: silhouette.Placement) -> np.ndarray:
-    return silhouette.silhouettes([placement], CAMERA)[0]
+    return silhouette.render_silhouettes([placement], CAMERA)[0]
 
 
 def test_silhouette_lies_in_the_projected_box_and_nearly_fills_its_height():
@@ -32,7 +34,7 @@ def test_silhouette_lies_in_the_projected_box_and_nearly_fills_its_height():
     box = project_boxes(placement.size_lhw[None], placement.yaw[None], placement.translation[None], CAMERA.matrix)[
         0
     ]
-    x0, y0, x1, y1 = silhouette.extent(outline(placement))
+    x0, y0, x1, y1 = silhouette.mask_bounds(outline(placement))
     assert x0 >= box[0] - 1
     assert y0 >= box[1] - 1
     assert x1 <= box[2] + 2
@@ -41,7 +43,7 @@ def test_silhouette_lies_in_the_projected_box_and_nearly_fills_its_height():
 
 
 def test_silhouettes_of_no_cars_and_of_a_car_beside_the_image():
-    assert silhouette.silhouettes([], CAMERA) == []
+    assert silhouette.render_silhouettes([], CAMERA) == []
     assert not outline(car(x=60.0)).any()
 
 
@@ -49,7 +51,7 @@ def test_silhouettes_of_no_cars_and_of_a_car_beside_the_image():
 def test_grow_and_shrink(radius, kept):
     mask = np.zeros((30, 30), bool)
     mask[13:18, 13:18] = True
-    grown = silhouette.grow(mask, radius)
+    grown = silhouette.grow_mask(mask, radius)
     assert grown.sum() == pytest.approx(kept, abs=25 if radius > 0 else 8)
     assert (grown >= mask).all() if radius > 0 else (grown <= mask).all()
 
@@ -59,9 +61,9 @@ def test_iou_leaves_the_unknown_out():
     first[10:20, 10:30], second[10:20, 20:40] = True, True
     unknown = NOTHING.copy()
     unknown[:, 30:] = True
-    assert silhouette.iou(first, second) == pytest.approx(1 / 3)
-    assert silhouette.iou(first, second, unknown) == pytest.approx(1 / 2)
-    assert silhouette.iou(NOTHING, NOTHING) == 0
+    assert silhouette.mask_iou(first, second) == pytest.approx(1 / 3)
+    assert silhouette.mask_iou(first, second, unknown) == pytest.approx(1 / 2)
+    assert silhouette.mask_iou(NOTHING, NOTHING) == 0
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,7 @@ def test_iou_leaves_the_unknown_out():
      ("Truck", (8.0, 3.2, 2.5), "truck"), ("Truck", (12.3, 2.9, 2.6), "bus")],
 )  # fmt: skip
 def test_templates_by_type_and_proportion(kind, size, first):
-    assert silhouette.candidates(kind, size)[0] == first
+    assert silhouette.rank_template_kinds(kind, size)[0] == first
 
 
 @pytest.mark.parametrize(
@@ -78,29 +80,29 @@ def test_templates_by_type_and_proportion(kind, size, first):
     [("Car", (4.5, 1.45, 1.8), "sedan"), ("Van", (5.5, 2.6, 2.0), "van"), ("Truck", (8.0, 3.2, 2.5), "truck")],
 )
 def test_a_kind_that_is_withheld_is_no_candidate(kind, size, withheld):
-    assert withheld in silhouette.candidates(kind, size)
-    left = silhouette.candidates(kind, size, withheld)
+    assert withheld in silhouette.rank_template_kinds(kind, size)
+    left = silhouette.rank_template_kinds(kind, size, withheld)
     assert left
     assert withheld not in left
 
 
 def test_a_users_meshes_are_tried_by_body_and_size():
-    mesh = silhouette.placed("van", torch.zeros(3), torch.tensor(0.0), torch.ones(3)).mesh
+    mesh = silhouette.place_mesh("van", torch.zeros(3), torch.tensor(0.0), torch.ones(3)).mesh
     lengths = (4.0, 4.4, 3.6, 4.8, 5.2, 3.2, 4.2, 4.1)
-    own = [silhouette.OwnMesh(replace(mesh, name=f"own {x}"), "sedan", (x, 1.5, 1.7)) for x in lengths]
-    lorry = silhouette.OwnMesh(replace(mesh, name="lorry"), "truck", (4.0, 1.5, 1.7))
-    chosen = silhouette.own_candidates("Car", (4.05, 1.5, 1.7), [lorry, *own])
+    own = [silhouette.UserMesh(replace(mesh, name=f"own {x}"), "sedan", (x, 1.5, 1.7)) for x in lengths]
+    lorry = silhouette.UserMesh(replace(mesh, name="lorry"), "truck", (4.0, 1.5, 1.7))
+    chosen = silhouette.select_user_meshes("Car", (4.05, 1.5, 1.7), [lorry, *own])
     assert [m.name for m in chosen[:3]] == ["own 4.1", "own 4.0", "own 4.2"]
     assert len(chosen) == 6
-    assert [m.name for m in silhouette.own_candidates("Truck", (8.0, 3.0, 2.5), [lorry, *own])] == ["lorry"]
-    assert silhouette.own_candidates("Van", (4.05, 1.5, 1.7), [lorry, *own]) == ()
+    assert [m.name for m in silhouette.select_user_meshes("Truck", (8.0, 3.0, 2.5), [lorry, *own])] == ["lorry"]
+    assert silhouette.select_user_meshes("Van", (4.05, 1.5, 1.7), [lorry, *own]) == ()
 
 
 def test_fit_finds_a_pose_that_is_off():
     truth, start = car(), car(x=0.65, yaw=0.57)
     target = outline(truth)
-    fitted = silhouette.fit([start], [target], [NOTHING], NO_BOXES, CAMERA, FitSettings())[0]
-    before, after = silhouette.iou(outline(start), target), silhouette.iou(outline(fitted), target)
+    fitted = silhouette.fit_silhouettes([start], [target], [NOTHING], NO_BOXES, CAMERA, FitSettings())[0]
+    before, after = silhouette.mask_iou(outline(start), target), silhouette.mask_iou(outline(fitted), target)
     assert before < 0.95
     assert after > 0.965
 
@@ -108,7 +110,7 @@ def test_fit_finds_a_pose_that_is_off():
 def test_fit_stays_near_the_label():
     start = car()
     target = outline(car(x=2.0, yaw=1.2))
-    fitted = silhouette.fit([start], [target], [NOTHING], NO_BOXES, CAMERA, FitSettings())[0]
+    fitted = silhouette.fit_silhouettes([start], [target], [NOTHING], NO_BOXES, CAMERA, FitSettings())[0]
     assert float((fitted.translation - start.translation).abs().max()) <= 0.3 + 1e-5
     assert abs(float(fitted.yaw - start.yaw)) <= 0.087 + 1e-5
     assert float((fitted.size_lhw / start.size_lhw).log().abs().max()) <= 0.08 + 1e-5
@@ -121,19 +123,21 @@ def test_what_is_unknown_pulls_at_nothing():
     target = outline(start)
     hidden = NOTHING.copy()
     hidden[:, 262:] = True
-    fitted = silhouette.fit([start], [target & ~hidden], [hidden], NO_BOXES, CAMERA, FitSettings())[0]
-    assert silhouette.iou(outline(fitted), target) > 0.95
+    fitted = silhouette.fit_silhouettes([start], [target & ~hidden], [hidden], NO_BOXES, CAMERA, FitSettings())[0]
+    assert silhouette.mask_iou(outline(fitted), target) > 0.95
 
 
 def test_the_labels_box_raises_a_roof_that_the_mask_lacks():
     truth = car()
     target = outline(truth)
-    x0, y0, x1, y1 = silhouette.extent(target)
+    x0, y0, x1, y1 = silhouette.mask_bounds(target)
     short = target.copy()
     short[: y0 + 8] = False
-    boxes = Boxes(torch.tensor([[x0, y0, x1 - 1, y1 - 1]]).float(), torch.tensor([[0.0, 1.0, 0.0, 1.0]]))
+    boxes = LabelBoxes(torch.tensor([[x0, y0, x1 - 1, y1 - 1]]).float(), torch.tensor([[0.0, 1.0, 0.0, 1.0]]))
     tops = [
-        silhouette.extent(outline(silhouette.fit([truth], [short], [NOTHING], b, CAMERA, FitSettings())[0]))[1]
+        silhouette.mask_bounds(
+            outline(silhouette.fit_silhouettes([truth], [short], [NOTHING], b, CAMERA, FitSettings())[0])
+        )[1]
         for b in (NO_BOXES, boxes)
     ]
     assert tops[1] < tops[0]
@@ -142,10 +146,10 @@ def test_the_labels_box_raises_a_roof_that_the_mask_lacks():
 
 def test_fit_of_no_steps_and_of_no_cars_changes_nothing():
     start = car()
-    same = silhouette.fit([start], [outline(start)], [NOTHING], NO_BOXES, CAMERA, FitSettings(steps=0))
+    same = silhouette.fit_silhouettes([start], [outline(start)], [NOTHING], NO_BOXES, CAMERA, FitSettings(steps=0))
     assert same == [start]
-    empty = Boxes(torch.zeros(0, 4), torch.zeros(0, 4))
-    assert silhouette.fit([], [], [], empty, CAMERA, FitSettings()) == []
+    empty = LabelBoxes(torch.zeros(0, 4), torch.zeros(0, 4))
+    assert silhouette.fit_silhouettes([], [], [], empty, CAMERA, FitSettings()) == []
 
 
 def painted(mask: np.ndarray) -> np.ndarray:
@@ -158,9 +162,9 @@ def painted(mask: np.ndarray) -> np.ndarray:
 def test_grabcut_finds_the_car_that_the_template_only_nearly_covers():
     truth = outline(car())
     template = outline(car(x=0.58, yaw=0.62))
-    found = silhouette.instance_mask(painted(truth), template, NOTHING, (8.0, 5.0, 8.0))
-    assert silhouette.iou(template, truth) < 0.95
-    assert silhouette.iou(found, truth) > 0.96
+    found = silhouette.grabcut_mask(painted(truth), template, NOTHING, (8.0, 5.0, 8.0))
+    assert silhouette.mask_iou(template, truth) < 0.95
+    assert silhouette.mask_iou(found, truth) > 0.96
 
 
 def test_grabcut_takes_nothing_of_nearer_cars_and_is_repeatable():
@@ -168,33 +172,33 @@ def test_grabcut_takes_nothing_of_nearer_cars_and_is_repeatable():
     hidden = NOTHING.copy()
     hidden[:, 262:] = True
     first, second = (
-        silhouette.instance_mask(painted(truth), outline(car(x=0.55)), hidden, (8.0, 5.0, 8.0)) for _ in range(2)
+        silhouette.grabcut_mask(painted(truth), outline(car(x=0.55)), hidden, (8.0, 5.0, 8.0)) for _ in range(2)
     )
     assert np.array_equal(first, second)
     assert not (first & hidden).any()
-    assert silhouette.iou(first, truth, hidden) > 0.9
+    assert silhouette.mask_iou(first, truth, hidden) > 0.9
 
 
 def test_a_car_wholly_hidden_has_no_mask():
-    assert not silhouette.instance_mask(painted(NOTHING), outline(car()), ~NOTHING, (5.0, 5.0, 5.0)).any()
+    assert not silhouette.grabcut_mask(painted(NOTHING), outline(car()), ~NOTHING, (5.0, 5.0, 5.0)).any()
 
 
 def test_a_tiny_car_is_found():
     placement = replace(car(z=60.0), translation=torch.tensor([2.0, 1.65, 60.0]))
     truth = outline(placement)
     image = cv2.GaussianBlur(painted(truth), (3, 3), 0.5)
-    found = silhouette.instance_mask(image, truth, NOTHING, (2.0, 2.0, 2.0))
-    assert silhouette.iou(found, truth) > 0.6
+    found = silhouette.grabcut_mask(image, truth, NOTHING, (2.0, 2.0, 2.0))
+    assert silhouette.mask_iou(found, truth) > 0.6
 
 
 def test_a_box_holds_a_car_that_the_image_cuts_by_what_is_inside():
     truth = car(x=-3.2, z=5.2, yaw=0.3)
     target = outline(truth)
-    x0, y0, x1, y1 = silhouette.extent(target)
+    x0, y0, x1, y1 = silhouette.mask_bounds(target)
     assert x0 == 0
-    boxes = Boxes(torch.tensor([[x0, y0, x1 - 1, y1 - 1]]).float(), torch.tensor([[0.0, 1.0, 1.0, 1.0]]))
-    fitted = silhouette.fit([truth], [target], [NOTHING], boxes, CAMERA, FitSettings())[0]
-    assert silhouette.iou(outline(fitted), target) > 0.97
+    boxes = LabelBoxes(torch.tensor([[x0, y0, x1 - 1, y1 - 1]]).float(), torch.tensor([[0.0, 1.0, 1.0, 1.0]]))
+    fitted = silhouette.fit_silhouettes([truth], [target], [NOTHING], boxes, CAMERA, FitSettings())[0]
+    assert silhouette.mask_iou(outline(fitted), target) > 0.97
 
 
 @pytest.mark.parametrize("radius", [0.0, 1.5, 4.0, -1.0, -2.5])
@@ -207,5 +211,5 @@ def test_growing_looks_at_no_more_than_it_needs_and_misses_nothing(radius: float
         wanted = away > -radius
     else:
         wanted = mask | (cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) <= radius)
-    assert np.array_equal(silhouette.grow(mask, radius), wanted)
-    assert not silhouette.grow(np.zeros_like(mask), radius).any()
+    assert np.array_equal(silhouette.grow_mask(mask, radius), wanted)
+    assert not silhouette.grow_mask(np.zeros_like(mask), radius).any()

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender.background import Ground, fill
-from scene_ir.derender.street import Plane, Shares, continued, course, foot_rows, plane_view, top_rows
+from scene_ir.derender.patch_fill import GroundMaps, fill_patches
+from scene_ir.derender.street import (
+    GroundCoordinates,
+    StreetShares,
+    continue_street,
+    estimate_road_course,
+    find_foot_rows,
+    find_skyline_rows,
+    ground_coordinates,
+)
 from scene_ir.types import Camera
 
 CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
@@ -18,8 +26,8 @@ BELOW = ROWS > 93
 ROAD = BELOW.astype(np.float32)
 
 
-def view() -> Plane:
-    return plane_view(LEVEL, CAMERA)
+def view() -> GroundCoordinates:
+    return ground_coordinates(LEVEL, CAMERA)
 
 
 def lateral(heading: float, bend: float = 0.0) -> np.ndarray:
@@ -41,10 +49,10 @@ def photograph(heading: float = 0.15, grain: float = 0.02, bend: float = 0.0) ->
     return np.clip(image + noise, 0, 1).astype(np.float32)
 
 
-def shares(ground: np.ndarray | None = None, stood: np.ndarray | None = None) -> Shares:
+def shares(ground: np.ndarray | None = None, stood: np.ndarray | None = None) -> StreetShares:
     """Ground below row 93, or as told; sky above row 60."""
     nowhere = np.zeros(ROWS.shape, bool)
-    return Shares(
+    return StreetShares(
         ROAD if ground is None else ground, (ROWS < 60).astype(np.float32), nowhere if stood is None else stood
     )
 
@@ -65,7 +73,7 @@ def test_plane_view_knows_a_point_of_the_road():
 @pytest.mark.parametrize(("heading", "bend"), [(0.15, 0.0), (-0.1, 0.0), (0.0, 0.006)])
 def test_edges_on_the_ground_tell_the_roads_course(heading, bend):
     known = BELOW & (view().along < 45) & ~hole()
-    found = course(photograph(heading, 0.005, bend), known, view())
+    found = estimate_road_course(photograph(heading, 0.005, bend), known, view())
     assert found == pytest.approx((heading, bend), abs=0.04)
 
 
@@ -74,7 +82,7 @@ def test_a_planted_line_and_a_verge_continue_through_the_hole():
     mask = hole()
     spoilt = image.copy()
     spoilt[mask] = (1, 0, 1)
-    guess = continued(spoilt, mask, shares(), view(), HORIZON)
+    guess = continue_street(spoilt, mask, shares(), view(), HORIZON)
     across = lateral(0.15)
     inside = mask & (ROWS > 100)
     line, asphalt = inside & (np.abs(across - 1.0) < 0.06), inside & (np.abs(across - 2.0) < 0.5)
@@ -91,14 +99,14 @@ def test_what_is_unknown_does_not_matter_and_the_result_is_the_same_twice():
     mask = hole()
     one, other = photograph(), photograph()
     other[mask] = (1, 0, 0)
-    first, second = (continued(image, mask, shares(), view(), HORIZON).image for image in (one, other))
+    first, second = (continue_street(image, mask, shares(), view(), HORIZON).image for image in (one, other))
     assert np.array_equal(first, second)
 
 
 def test_a_dash_beside_the_hole_is_not_smeared_into_it():
     image = photograph(0.0, 0.0)
     image[110:116, 205:222] = 0.9
-    guess = continued(image, hole(), shares(), view(), HORIZON).image
+    guess = continue_street(image, hole(), shares(), view(), HORIZON).image
     assert guess[113, 226:236].mean() < 0.55
 
 
@@ -106,20 +114,20 @@ def test_paint_on_the_ground_does_not_run_on_along_the_road():
     image = photograph(0.0, 0.0)
     near = (lateral(0.0) > 0.0) & (lateral(0.0) < 0.8) & (ROWS > 132)
     image[near] = (0.9, 0.05, 0.05)
-    guess = continued(image, hole(), shares(), view(), HORIZON).image
+    guess = continue_street(image, hole(), shares(), view(), HORIZON).image
     column = hole() & (ROWS > 105) & (ROWS < 125) & (np.abs(lateral(0.0) - 0.4) < 0.2)
     assert (guess[column][:, 0] - guess[column][:, 1]).mean() < 0.15
 
 
 def test_colours_of_walls_and_ground_and_sky_do_not_run_into_each_other():
     image = photograph(0.0, 0.0)
-    guess = continued(image, hole(), shares(), view(), HORIZON)
+    guess = continue_street(image, hole(), shares(), view(), HORIZON)
     assert guess.ground[100, 280]
     assert not guess.ground[88, 280]
     assert guess.image[72:92, 230:325] == pytest.approx(np.broadcast_to([0.6, 0.5, 0.4], (20, 95, 3)), abs=0.04)
     tall = hole()
     tall[30:130, 225:330] = True
-    guess = continued(image, tall, shares(), view(), HORIZON).image
+    guess = continue_street(image, tall, shares(), view(), HORIZON).image
     assert guess[35:57, 230:325] == pytest.approx(np.broadcast_to([0.7, 0.8, 0.95], (22, 95, 3)), abs=0.04)
 
 
@@ -128,10 +136,10 @@ def test_the_grounds_end_goes_on_straight_behind_the_hole():
     ground = (rows <= ROWS).astype(np.float32)
     mask = np.zeros(ROWS.shape, bool)
     mask[92:170, 320:400] = True
-    between = foot_rows(np.where(mask, 0, ground).astype(np.float32), mask, view(), HORIZON, 239.5)
+    between = find_foot_rows(np.where(mask, 0, ground).astype(np.float32), mask, view(), HORIZON, 239.5)
     assert between[330:390] == pytest.approx(rows[330:390], abs=1.5)
     mask[92:170, 320:] = True
-    beyond = foot_rows(np.where(mask, 0, ground).astype(np.float32), mask, view(), HORIZON, 239.5)
+    beyond = find_foot_rows(np.where(mask, 0, ground).astype(np.float32), mask, view(), HORIZON, 239.5)
     assert beyond[470] == pytest.approx(rows[470], abs=4)
 
 
@@ -141,7 +149,7 @@ def test_where_a_vehicle_stood_is_ground():
     stood = mask & (ROWS > 120)
     known = np.where(mask, 0, ROAD).astype(np.float32)
     without, told = (
-        continued(photograph(), mask, shares(known, place), view(), HORIZON) for place in (None, stood)
+        continue_street(photograph(), mask, shares(known, place), view(), HORIZON) for place in (None, stood)
     )
     assert told.ground[121:189, 245:].all()
     assert told.foot[300:].mean() < without.foot[300:].mean()
@@ -151,20 +159,22 @@ def test_the_skyline_is_interpolated_behind_the_hole():
     mask = np.zeros(ROWS.shape, bool)
     mask[30:80, 225:330] = True
     sky = np.where(mask, 0, ROWS < 60).astype(np.float32)
-    assert top_rows(sky, mask, HORIZON) == pytest.approx(np.full(480, 60), abs=1)
+    assert find_skyline_rows(sky, mask, HORIZON) == pytest.approx(np.full(480, 60), abs=1)
 
 
 def test_the_fill_has_the_guides_colours_and_the_photographs_grain():
     image = photograph(0.0, 0.03)
     mask = hole()
     like = np.where(mask, 0, ROAD).astype(np.float32)
-    guide = continued(image, mask, shares(), view(), HORIZON)
-    result = fill(image, mask, mask, HORIZON, Ground(guide.ground, like), guide=guide.image)
+    guide = continue_street(image, mask, shares(), view(), HORIZON)
+    result = fill_patches(image, mask, mask, HORIZON, GroundMaps(guide.ground, like), guide=guide.image)
     assert np.array_equal(result[~mask], image[~mask])
     part = (slice(106, 126), slice(228, 244))
     assert result[part].mean() == pytest.approx(guide.image[part].mean(), abs=0.04)
     assert result[part].std() > 1.3 * guide.image[part].std()
-    dark = fill(image, mask, mask, HORIZON, Ground(guide.ground, like), guide=guide.image * np.float32(0.6))
+    dark = fill_patches(
+        image, mask, mask, HORIZON, GroundMaps(guide.ground, like), guide=guide.image * np.float32(0.6)
+    )
     assert dark[part].mean() < result[part].mean() - 0.1
 
 
@@ -174,7 +184,7 @@ def test_behind_a_hole_a_tree_at_its_edge_ends_and_the_low_skyline_goes_on():
     sky[20:60, 200:260] = 0
     unknown = np.zeros(sky.shape, bool)
     unknown[10:95, 120:200] = True
-    found = top_rows(sky, unknown, 70.0)
+    found = find_skyline_rows(sky, unknown, 70.0)
     assert np.abs(found[120:178] - 60).max() < 3
     assert found[199] < 30
 
@@ -184,8 +194,10 @@ def test_what_the_maps_took_for_a_vehicle_lies_on_the_ground_where_none_is():
     known = shares()
     taken = known.ground.copy()
     taken[100:, :] = 0.1
-    plain = continued(image, hole(), Shares(known.ground, known.sky, known.stood), view(), HORIZON)
-    found = continued(image, hole(), Shares(known.ground, known.sky, known.stood, taken), view(), HORIZON)
+    plain = continue_street(image, hole(), StreetShares(known.ground, known.sky, known.stood), view(), HORIZON)
+    found = continue_street(
+        image, hole(), StreetShares(known.ground, known.sky, known.stood, taken), view(), HORIZON
+    )
     low = hole() & plain.ground
     assert low.any()
     assert np.abs(found.image - plain.image)[low].max() > 0.01

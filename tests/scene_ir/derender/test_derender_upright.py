@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_ir.derender.street import Continued
-from scene_ir.derender.upright import UprightSettings, copied
+from scene_ir.derender.standing_surfaces import ColumnCopySettings, copy_columns
+from scene_ir.derender.street import StreetContinuation
 
 SHAPE = (120, 320)
 HORIZON = 40.0
@@ -29,12 +29,12 @@ def hole() -> np.ndarray:
     return mask
 
 
-def guide(image: np.ndarray, foot: np.ndarray | None = None) -> Continued:
+def guide(image: np.ndarray, foot: np.ndarray | None = None) -> StreetContinuation:
     """A grey guess above the ground."""
     feet = np.full(SHAPE[1], float(FOOT)) if foot is None else foot
     ground = np.arange(SHAPE[0])[:, None] >= feet
     guess = np.where(hole()[..., None], np.float32(0.52), image).astype(np.float32)
-    return Continued(guess, ground, 0.0, 0.0, feet)
+    return StreetContinuation(guess, ground, 0.0, 0.0, feet)
 
 
 def spoilt(image: np.ndarray) -> np.ndarray:
@@ -44,19 +44,19 @@ def spoilt(image: np.ndarray) -> np.ndarray:
 def test_posts_go_on_at_their_own_distance_and_stay_sharp():
     image = fence()
     ground = np.arange(SHAPE[0])[:, None] >= np.full(SHAPE[1], FOOT)
-    found = copied(spoilt(image), hole(), hole() | ground, guide(image), HORIZON)
+    found = copy_columns(spoilt(image), hole(), hole() | ground, guide(image), HORIZON)
     wall = hole() & ~ground
-    assert found.done[wall].mean() > 0.95
-    assert not found.done[~wall].any()
-    assert np.array_equal(found.image[~found.done], spoilt(image)[~found.done])
-    assert np.abs(found.image - image)[found.done].mean() < 0.1
-    assert found.image[found.done].std() > 0.7 * image[found.done].std()
+    assert found.copied[wall].mean() > 0.95
+    assert not found.copied[~wall].any()
+    assert np.array_equal(found.image[~found.copied], spoilt(image)[~found.copied])
+    assert np.abs(found.image - image)[found.copied].mean() < 0.1
+    assert found.image[found.copied].std() > 0.7 * image[found.copied].std()
 
 
 def test_what_is_in_the_hole_does_not_matter_and_the_result_is_the_same_twice():
     image = fence()
-    first, second = (copied(i, hole(), hole(), guide(image), HORIZON) for i in (image, spoilt(image)))
-    assert np.array_equal(first.image[first.done], second.image[second.done])
+    first, second = (copy_columns(i, hole(), hole(), guide(image), HORIZON) for i in (image, spoilt(image)))
+    assert np.array_equal(first.image[first.copied], second.image[second.copied])
 
 
 def test_forbidden_pixels_are_not_copied():
@@ -64,9 +64,9 @@ def test_forbidden_pixels_are_not_copied():
     forbidden = hole()
     forbidden[:, 205:] = True
     image[:, 205:] = (1, 0, 0)
-    found = copied(spoilt(image), hole(), forbidden, guide(image), HORIZON)
-    assert found.done.any()
-    red = found.image[found.done][:, 0] - found.image[found.done][:, 1]
+    found = copy_columns(spoilt(image), hole(), forbidden, guide(image), HORIZON)
+    assert found.copied.any()
+    red = found.image[found.copied][:, 0] - found.image[found.copied][:, 1]
     assert red.max() < 0.3
 
 
@@ -76,9 +76,11 @@ def test_a_wall_along_the_road_keeps_its_line_to_the_vanishing_point():
     image = np.where(rows < HORIZON + (feet - HORIZON) / 2, 0.7, 0.3)[..., None].repeat(3, 2).astype(np.float32)
     image[rows >= feet] = 0.5
     forbidden = hole() | (rows >= feet)
-    found = copied(spoilt(image), hole(), forbidden, guide(image, feet), HORIZON, UprightSettings(settle=0))
-    assert found.done.any()
-    assert np.abs(found.image - image)[found.done].mean() < 0.03
+    found = copy_columns(
+        spoilt(image), hole(), forbidden, guide(image, feet), HORIZON, ColumnCopySettings(settle=0)
+    )
+    assert found.copied.any()
+    assert np.abs(found.image - image)[found.copied].mean() < 0.03
 
 
 @pytest.mark.parametrize("rows", [slice(0, 0), slice(90, 110)])
@@ -86,9 +88,9 @@ def test_without_an_upright_hole_nothing_changes(rows):
     image = fence()
     mask = np.zeros(SHAPE, bool)
     mask[rows, 100:120] = True
-    found = copied(image, mask, mask, guide(image), HORIZON)
+    found = copy_columns(image, mask, mask, guide(image), HORIZON)
     assert np.array_equal(found.image, image)
-    assert not found.done.any()
+    assert not found.copied.any()
 
 
 def test_a_narrow_source_is_not_shown_again_and_again():
@@ -96,12 +98,14 @@ def test_a_narrow_source_is_not_shown_again_and_again():
     # 20 columns have the guide's colour: repeated, they would fill the 60 of the hole.
     image[:, 202:222] = 0.52
     image[:, 210:214] = 0.35
-    found = copied(spoilt(image), hole(), hole(), guide(image), HORIZON, UprightSettings(settle=0, ring_weight=0))
-    assert found.done[60, 140:200].any()
+    found = copy_columns(
+        spoilt(image), hole(), hole(), guide(image), HORIZON, ColumnCopySettings(settle=0, ring_weight=0)
+    )
+    assert found.copied[60, 140:200].any()
     assert np.count_nonzero(found.image[60, 140:200, 0] < 0.7) <= 30
 
 
 def test_what_nothing_beside_fits_is_left_to_others():
     image = fence()
     image[:, :140], image[:, 200:] = (1, 0, 0), (0, 0, 1)
-    assert not copied(spoilt(image), hole(), hole(), guide(image), HORIZON).done.any()
+    assert not copy_columns(spoilt(image), hole(), hole(), guide(image), HORIZON).copied.any()

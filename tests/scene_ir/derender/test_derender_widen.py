@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scene_ir.derender import cutout, widen
+from scene_ir.derender import cutout
+from scene_ir.derender import mask_extension as widen
 from scene_ir.derender.cutout import Cutout
-from scene_ir.derender.derender import DerenderSettings, placements
+from scene_ir.derender.derender import DerenderSettings, place_vehicles
 
 SHAPE = (200, 320)
 PAINT, WALL, DARK = (190, 40, 35), (90, 100, 80), (12, 12, 14)
@@ -34,7 +35,7 @@ def found(image: np.ndarray, seen: Cutout, other: Cutout | None = None, allowed:
     other = other or seen
     drawn = ((seen.visible >= 0.5).astype(np.float32) + (other.visible >= 0.5)) / 2
     allowed = np.ones(SHAPE, bool) if allowed is None else allowed
-    return widen.widened(image, seen, other, drawn, allowed).visible >= 0.5
+    return widen.extend_mask(image, seen, other, drawn, allowed).visible >= 0.5
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -80,14 +81,14 @@ def test_shadows_and_nearer_things_of_the_same_colour_stay_out():
 def test_shares_add_up_to_at_most_one():
     low = block(80, 166, 240, 178).astype(np.float32) * 0.4
     seen = looked(MASK * 0.6, shadow=low)
-    wide = widen.widened(picture(ROOF), seen, seen, MASK.astype(np.float32), np.ones(SHAPE, bool))
+    wide = widen.extend_mask(picture(ROOF), seen, seen, MASK.astype(np.float32), np.ones(SHAPE, bool))
     assert (wide.visible + wide.front + wide.shadow <= 1 + 1e-6).all()
     assert (wide.visible >= seen.visible).all()
 
 
 def test_small_vehicles_stay_as_they_are():
     seen = looked(block(80, 60, 240, 120))
-    assert widen.widened(picture(ROOF), seen, seen, seen.visible, np.ones(SHAPE, bool)) is seen
+    assert widen.extend_mask(picture(ROOF), seen, seen, seen.visible, np.ones(SHAPE, bool)) is seen
 
 
 def test_the_same_input_gives_the_same_bytes():
@@ -101,7 +102,7 @@ def test_paint_counts_wherever_on_the_vehicle_it_is():
     image = picture(ROOF | (~MASK & (np.arange(SHAPE[1]) // 8 % 4 == 0)), paint)
     image[60:100, 84:236] = (200, 205, 210)
     seen = looked(MASK)
-    wide = widen.widened(image, seen, seen, ROOF.astype(np.float32), np.ones(SHAPE, bool)).visible >= 0.5
+    wide = widen.extend_mask(image, seen, seen, ROOF.astype(np.float32), np.ones(SHAPE, bool)).visible >= 0.5
     assert np.count_nonzero(wide & ROOF & ~MASK) > 0.9 * np.count_nonzero(ROOF & ~MASK)
 
 
@@ -115,5 +116,5 @@ def test_without_a_fit_each_vehicle_is_looked_at_once(street, monkeypatch, fit):
         return look(image, places, *rest, **options)
 
     monkeypatch.setattr(cutout, "cut_out", counted)
-    assert len(placements(street.frame, DerenderSettings(fit=fit))) == 1
+    assert len(place_vehicles(street.frame, DerenderSettings(fit=fit))) == 1
     assert sum(looks) == (2 if fit else 1)

@@ -12,9 +12,9 @@ from scene_ir.types import Camera, Labels
 
 Array = NDArray[np.float32]
 
-CAMERA_HEIGHT = 1.65
+CAMERA_HEIGHT_M = 1.65
 """m, of KITTI's cameras above the road (Geiger et al., IJRR 2013)."""
-FAR = 80.0
+FAR_M = 80.0
 """m, where upright surfaces without a visible foot are put."""
 _SEAMLESS = 0.02
 """Of the image's width: over how much walls of other depths pass into each other."""
@@ -37,12 +37,12 @@ def fit_ground(labels: Labels | None, rows: list[int]) -> torch.Tensor:
     """
     points = labels.translation[rows].double().numpy() if labels is not None and rows else np.zeros((0, 3))
     prior = np.diag([1 / 0.03, 1 / 0.015, 1 / 0.15])
-    target = np.array([0.0, 0.0, CAMERA_HEIGHT / 0.15])
+    target = np.array([0.0, 0.0, CAMERA_HEIGHT_M / 0.15])
     sigma = 0.1 + 0.01 * points[:, 2]
     design = np.stack([points[:, 0], points[:, 2], np.ones(len(points))], 1) / sigma[:, None]
     goal = points[:, 1] / sigma
     weight = np.ones(len(points))
-    plane = np.array([0.0, 0.0, CAMERA_HEIGHT])
+    plane = np.array([0.0, 0.0, CAMERA_HEIGHT_M])
     for _ in range(10):
         root = np.sqrt(weight)
         rows_all = np.concatenate([design * root[:, None], prior])
@@ -53,7 +53,7 @@ def fit_ground(labels: Labels | None, rows: list[int]) -> torch.Tensor:
     return torch.from_numpy((normal / np.linalg.norm(normal[:3])).astype(np.float32))
 
 
-def plane_depth(ground: torch.Tensor, camera: Camera) -> Array:
+def compute_plane_depth(ground: torch.Tensor, camera: Camera) -> Array:
     """Depth z (H, W) m at which each pixel's ray meets the ground plane; inf where it does not."""
     matrix = camera.matrix.double().numpy()
     normal = ground.double().numpy()
@@ -76,7 +76,7 @@ def horizon_row(ground: torch.Tensor, camera: Camera) -> float:
     return float(-(across[0] * (camera.width - 1) / 2 + across[2]) / across[1])
 
 
-def footprints(labels: Labels, rows: list[int], ground: torch.Tensor, camera: Camera) -> Array:
+def draw_footprints(labels: Labels, rows: list[int], ground: torch.Tensor, camera: Camera) -> Array:
     """1 where something labelled stands on the ground, else 0 (H, W): whatever the pixels look like, there is
     ground."""
     corners = box_corners(labels.size_lhw[rows], labels.yaw[rows], labels.translation[rows])[:, :4].double()
@@ -90,7 +90,7 @@ def footprints(labels: Labels, rows: list[int], ground: torch.Tensor, camera: Ca
     return stands
 
 
-def walls(ground_depth: Array, flat: Array, stood: Array, sky: Array, horizon: float) -> Array:
+def compute_wall_depth(ground_depth: Array, flat: Array, stood: Array, sky: Array, horizon: float) -> Array:
     """Depth (H, W) m by rule: the plane's (H, W) where there is ground, upright walls on its upper end, inf in the
     sky. flat, sky (H, W) in [0, 1]: where ground is seen, and where sky; stood (H, W): see `footprints`: there is
     ground too, and a little to its sides, and what is seen around it stands no nearer.
@@ -113,15 +113,15 @@ def walls(ground_depth: Array, flat: Array, stood: Array, sky: Array, horizon: f
     window = max(3, width // 40) | 1
     top = cv2.blur(top.astype(np.float32)[None], (window, 1))[0]
     foot = np.clip(np.rint(top).astype(int), 0, height - 1)
-    wall = np.minimum(ground_depth[foot, np.arange(width)], FAR)
+    wall = np.minimum(ground_depth[foot, np.arange(width)], FAR_M)
     # Fog shows the inverse of depth, and a step between columns as a seam.
     wall = 1 / cv2.GaussianBlur(1 / wall[None], (0, 0), _SEAMLESS * width)[0]
     depth = np.minimum(ground_depth, wall[None])
-    depth = np.where(rows >= foot[None], np.minimum(ground_depth, FAR), depth)
+    depth = np.where(rows >= foot[None], np.minimum(ground_depth, FAR_M), depth)
     return np.where(sky > 0.5, np.inf, depth).astype(np.float32)
 
 
-def sun_direction() -> torch.Tensor:
+def default_sun() -> torch.Tensor:
     """(3,) unit vector towards the sun: the documented constant (a photograph alone rarely tells)."""
     sun = torch.tensor(DEFAULT_SUN)
     return sun / sun.norm()

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir.derender import unet
-from scene_ir.derender.unet import UNet, elevation
+from scene_ir.derender.unet import UNet, compute_elevation
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Camera, Frame
-from scene_ir.weights import load_into, read_weights
+from scene_ir.weights import load_weights, read_weights
 
 Array = NDArray[np.float32]
 
@@ -35,7 +35,7 @@ _RARER_VEHICLES = 1.0
 nothing the network took walls and hedges for some."""
 
 
-class Class(IntEnum):
+class StreetClass(IntEnum):
     """What the network tells apart. GROUND is neither road nor grass: paving, kerbs, gravel."""
 
     SKY = 0
@@ -61,7 +61,7 @@ class Segmentation:
     vehicle: Array
     person: Array
 
-    def within(self, mask: NDArray[np.bool_], other: Segmentation) -> Segmentation:
+    def merge_inside(self, mask: NDArray[np.bool_], other: Segmentation) -> Segmentation:
         """These maps, and in a mask (H, W) the `other` ones."""
         return Segmentation(
             *(np.where(mask, getattr(other, f.name), getattr(self, f.name)) for f in fields(Segmentation))
@@ -92,7 +92,7 @@ _MEANING = {
 where it is not listed."""
 _MIXED = "terrain"
 """Virtual KITTI's name of all ground that is no road: whether it is grass, the network has to tell."""
-NEEDED = ("sky", "foliage", "road")
+REQUIRED_MAPS = ("sky", "foliage", "road")
 """Maps that a segmenter's classes must fill."""
 _GROUND_ENDS, _SKY_ENDS = 0.02, -0.012
 """Sines of the elevation above which no ground is, and below which no sky: between, there are hills and the
@@ -114,26 +114,26 @@ class SegmentNet(UNet):
     of `Class`."""
 
     def __init__(self) -> None:
-        super().__init__(len(Class))
+        super().__init__(len(StreetClass))
 
 
 @lru_cache(maxsize=2)
 def load_network(path: Path = WEIGHTS) -> SegmentNet:
     """The network of a weights file, in eval mode. FormatError naming file and key."""
     network = SegmentNet()
-    load_into(network, read_weights(path)[1], path)
+    load_weights(network, read_weights(path)[1], path)
     network.requires_grad_(False)
     return network.eval().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
-def from_network(image: Array, ground: Tensor, camera: Camera, network: SegmentNet | None = None) -> Array:
+def predict_shares(image: Array, ground: Tensor, camera: Camera, network: SegmentNet | None = None) -> Array:
     """Shares (8, h, w) of each `Class` in a photograph (H, W, 3) RGB in [0, 1], coarser than it."""
-    logits = (network or load_network()).look(unet.view(image, ground, camera))
-    logits[:, Class.VEHICLE] -= _RARER_VEHICLES
+    logits = (network or load_network()).predict(unet.prepare_input(image, ground, camera))
+    logits[:, StreetClass.VEHICLE] -= _RARER_VEHICLES
     return logits.softmax(1)[0].numpy()
 
 
-def segment(
+def segment_photograph(
     image: Array,
     ground: Tensor,
     camera: Camera,
@@ -149,12 +149,12 @@ def segment(
     classes for sky, foliage or road, ShapeError for shares of another number.
     """
     if segmenter is None:
-        shares, names = from_network(image, ground, camera, network), tuple(kind.name for kind in Class)
+        shares, names = predict_shares(image, ground, camera, network), tuple(kind.name for kind in StreetClass)
     else:
         shares, names = segmenter(image)
         if shares.ndim != 3 or len(shares) != len(names):
             raise ShapeError("segmenter", f"shares ({len(names)}, h, w)", shares.shape)
-        missing = [name for name in NEEDED if not _members(names, name)]
+        missing = [name for name in REQUIRED_MAPS if not _members(names, name)]
         if missing:
             raise RangeError("segmenter", f"a class for {missing[0]}", ", ".join(names)[:200])
     height, width = image.shape[:2]
@@ -166,7 +166,7 @@ def segment(
     )
     soft = np.clip((soft - _LEAST) / (_MOST - _LEAST), 0, 1)
     found = Segmentation(*(np.ascontiguousarray(m) for m in np.moveaxis(soft, -1, 0)))
-    looks = elevation(ground, camera, coarse.shape[:2])
+    looks = compute_elevation(ground, camera, coarse.shape[:2])
     looks = cv2.resize(looks, (width, height), interpolation=cv2.INTER_LINEAR)
     below = np.clip((_GROUND_ENDS - looks) / _ENDS_WITHIN, 0, 1)
     above = np.clip((looks - _SKY_ENDS) / _ENDS_WITHIN, 0, 1)
@@ -180,7 +180,7 @@ def segment(
     )
 
 
-def of_frame(frame: Frame, estimated: Segmentation) -> Segmentation:
+def apply_frame_classes(frame: Frame, estimated: Segmentation) -> Segmentation:
     """The maps as the frame's classes have them, all 0 or 1; as `estimated` where it has none.
 
     Terrain, which is grass or paving, is foliage as far as the estimate says so.

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from scene_ir.derender import silhouette
-from scene_ir.derender.matte import MatteSettings, matte
+from scene_ir.derender.matte import MatteSettings, compute_matte
 from scene_ir.geometry import to_clip
-from scene_ir.types import Camera, Crop, Frame, Front, Labels
+from scene_ir.types import Camera, Crop, Frame, Labels, Occluder
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -42,16 +42,16 @@ _TIGHT = MatteSettings(generous_px=0.2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Thing:
+class OccluderMask:
     """One thing in front. mask (H, W): its pixels; depth_m: along the optical axis, to where it stands."""
 
     mask: Mask
     depth_m: float
 
 
-def labelled(
+def find_labelled_occluders(
     image: NDArray[np.uint8], frame: Frame, vehicles: Sequence[int], others: Sequence[int]
-) -> list[Thing]:
+) -> list[OccluderMask]:
     """Labelled things that are no vehicles and nearer than the farthest of those, nearest first.
 
     image (H, W, 3) RGB; vehicles: the labels' rows that become objects; others: rows with a 3D box that may be
@@ -62,18 +62,22 @@ def labelled(
         return []
     depth = to_clip(labels.translation, camera.matrix.to(labels.translation))[:, 2].tolist()
     farthest = max(depth[row] for row in vehicles)
-    found: list[Thing] = []
+    found: list[OccluderMask] = []
     nearer = np.zeros(image.shape[:2], bool)
     for row in sorted((i for i in others if 0 < depth[i] < farthest), key=lambda i: depth[i]):
-        mask = _in_box(image, labels, row, nearer) if frame.masks is None else (frame.masks[row] > 0.5).numpy()
+        mask = (
+            _segment_in_box(image, labels, row, nearer)
+            if frame.masks is None
+            else (frame.masks[row] > 0.5).numpy()
+        )
         mask = mask & ~nearer
         if np.count_nonzero(mask) >= _LEAST_PX:
-            found.append(Thing(mask, depth[row]))
+            found.append(OccluderMask(mask, depth[row]))
             nearer = nearer | mask
     return found
 
 
-def _in_box(image: NDArray[np.uint8], labels: Labels, row: int, nearer: Mask) -> Mask:
+def _segment_in_box(image: NDArray[np.uint8], labels: Labels, row: int, nearer: Mask) -> Mask:
     """The pixels (H, W) of a labelled thing: those in its box that look unlike what surrounds it."""
     x0, y0, x1, y1 = labels.boxes_xyxy[row].tolist()
     v, u = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
@@ -83,20 +87,22 @@ def _in_box(image: NDArray[np.uint8], labels: Labels, row: int, nearer: Mask) ->
         return ellipse
     width = x1 - x0
     band = (_SURE * width + 1, _NEAR * width + 1, _FAR * width + 1)
-    mask = silhouette.instance_mask(image, ellipse, nearer, band)
+    mask = silhouette.grabcut_mask(image, ellipse, nearer, band)
     mask &= (np.abs(across) <= 1) & (np.abs(down) <= 1)
     filled = np.count_nonzero(mask) / max(np.count_nonzero((np.abs(across) <= 1) & (np.abs(down) <= 1)), 1)
     return mask if _FILLED[0] <= filled <= _FILLED[1] else ellipse & ~nearer
 
 
-def measured(depth_m: Array, height_m: Array, vehicles: Mask, boxes: Sequence[tuple[Mask, float]]) -> list[Thing]:
+def find_measured_occluders(
+    depth_m: Array, height_m: Array, vehicles: Mask, boxes: Sequence[tuple[Mask, float]]
+) -> list[OccluderMask]:
     """Things in front by a depth map. depth_m (H, W); height_m (H, W): of each pixel's point above the ground;
     vehicles (H, W): pixels of all vehicles, or of things known already; boxes: for each vehicle its outline (H, W)
     and the depth of its nearest corner."""
     near = np.zeros(depth_m.shape, bool)
     for outline, nearest in boxes:
         if outline.any():
-            x0, y0, x1, y1 = silhouette.extent(outline)
+            x0, y0, x1, y1 = silhouette.mask_bounds(outline)
             side = round(_AROUND * (x1 - x0))
             window = (slice(y0, y1), slice(max(x0 - side, 0), x1 + side))
             near[window] |= depth_m[window] < nearest - _GAP_M
@@ -106,24 +112,24 @@ def measured(depth_m: Array, height_m: Array, vehicles: Mask, boxes: Sequence[tu
         start = float(depth_m[near].min())
         layer = near & (depth_m <= _SLICE * start)
         near = near & ~layer
-        found += [Thing(part, float(np.median(depth_m[part]))) for part in _parts(layer)]
+        found += [OccluderMask(part, float(np.median(depth_m[part]))) for part in _split_components(layer)]
     return found
 
 
-def _parts(mask: Mask) -> list[Mask]:
+def _split_components(mask: Mask) -> list[Mask]:
     """The pieces of a mask that hang together, without specks."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     return [parts == k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= _LEAST_PX]
 
 
-def nearest_corner(placement: silhouette.Placement, camera: Camera) -> float:
+def nearest_corner_depth(placement: silhouette.Placement, camera: Camera) -> float:
     """Depth, m, of the nearest corner of a vehicle's box along the optical axis; at least 0.3."""
     half = placement.size_lhw.detach()[[0, 2]].norm() / 2
     middle = to_clip(placement.translation.detach()[None], camera.matrix.to(placement.translation))[0, 2]
     return max(float(middle - half), 0.3)
 
 
-def before(things: Sequence[Thing], depth_m: float, shape: tuple[int, int]) -> Mask:
+def mask_nearer_occluders(things: Sequence[OccluderMask], depth_m: float, shape: tuple[int, int]) -> Mask:
     """Pixels (H, W) of the things that are nearer than `depth_m`: a vehicle there cannot own them."""
     mask = np.zeros(shape, bool)
     for thing in things:
@@ -132,20 +138,20 @@ def before(things: Sequence[Thing], depth_m: float, shape: tuple[int, int]) -> M
     return mask
 
 
-def opacities(image: Array, things: Sequence[Thing]) -> list[Array]:
+def compute_opacities(image: Array, things: Sequence[OccluderMask]) -> list[Array]:
     """How much (H, W) of each pixel shows each thing, in [0, 1]. image (H, W, 3)."""
     found = []
     nothing = np.zeros(image.shape[:2], bool)
     for thing in sorted(things, key=lambda t: t.depth_m):
-        opacity = matte(image, thing.mask, nothing, nothing, _TIGHT)
+        opacity = compute_matte(image, thing.mask, nothing, nothing, _TIGHT)
         for other in found:
             opacity = np.where(other > 0, np.minimum(opacity, 1 - other), opacity)
         found.append(opacity.astype(np.float32))
     return found
 
 
-def layer(opacity: Array, depth_m: float) -> Front:
+def make_occluder(opacity: Array, depth_m: float) -> Occluder:
     """A thing as the scene keeps it, its colours not yet solved. opacity (H, W)."""
-    x0, y0, x1, y1 = silhouette.extent(opacity > 0)
+    x0, y0, x1, y1 = silhouette.mask_bounds(opacity > 0)
     part = torch.from_numpy(np.ascontiguousarray(opacity[y0:y1, x0:x1]))
-    return Front(Crop(torch.cat([torch.zeros(3, *part.shape), part[None]]), x0, y0), depth_m)
+    return Occluder(Crop(torch.cat([torch.zeros(3, *part.shape), part[None]]), x0, y0), depth_m)

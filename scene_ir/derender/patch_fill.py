@@ -27,7 +27,7 @@ _SIDEWAYS = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class FillSettings:
+class PatchFillSettings:
     """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds
     at the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far
     away costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's
@@ -54,7 +54,7 @@ class FillSettings:
     grain_px: float = 1.5
     keep: float = 0.85
 
-    def smaller(self, shrink: int) -> FillSettings:
+    def scaled_down(self, shrink: int) -> PatchFillSettings:
         """For a photograph at one over `shrink` of its size: the same lengths of what is to be seen."""
         coarse, fine = self.search_px
         return replace(
@@ -67,29 +67,29 @@ class FillSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class GroundMaps:
     """wanted (H, W): pixels that see the ground once the cars are gone; like (H, W) in [0, 1]: how much each pixel
     of the photograph looks like ground.
     """
 
     wanted: Mask
-    like: NDArray[np.float32]
+    share: NDArray[np.float32]
 
-    def halved(self, size: tuple[int, int]) -> Ground:
+    def halved(self, size: tuple[int, int]) -> GroundMaps:
         """At the next coarser level, of `size` (width, height)."""
         wanted = cv2.resize(self.wanted.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
-        like = cv2.resize(self.like.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        return Ground(wanted, np.asarray(like, np.float32))
+        like = cv2.resize(self.share.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        return GroundMaps(wanted, np.asarray(like, np.float32))
 
 
-def fill(
+def fill_patches(
     image: Image,
     hole: Mask,
     forbidden: Mask,
     horizon: float,
-    ground: Ground,
+    ground: GroundMaps,
     seed: int = 0,
-    settings: FillSettings | None = None,
+    settings: PatchFillSettings | None = None,
     guide: Image | None = None,
 ) -> Image:
     """The image with `hole` filled from pixels that are not `forbidden`.
@@ -98,7 +98,7 @@ def fill(
     px; ground: where ground is to be seen, and where it can be copied from; guide (H, W, 3): roughly what is to be
     seen, smooth in the hole -> (H, W, 3) in [0, 1], equal to the image outside the hole.
     """
-    settings = settings or FillSettings()
+    settings = settings or PatchFillSettings()
     if not hole.any():
         return image.copy()
     forbidden = forbidden | hole
@@ -121,10 +121,10 @@ def fill(
         level_image, level_hole, level_forbidden = pyramid[index]
         level_guide = guides[index]
         if source is None:
-            start = level_image[first_guess(level_forbidden, grounds[index])]
+            start = level_image[initial_sources(level_forbidden, grounds[index])]
             if level_guide is not None:
                 sigma = max(settings.settle_px / 2**index, 1.0)
-                start = start + mean_inside(level_guide - start, level_hole, sigma)
+                start = start + masked_blur(level_guide - start, level_hole, sigma)
         else:
             size = (level_image.shape[1], level_image.shape[0])
             start = cv2.resize(current, size, interpolation=cv2.INTER_LINEAR)
@@ -138,7 +138,7 @@ def fill(
     assert source is not None
     current = _with_grain(current, image, hole, forbidden, source, settings.grain_px)
     if guide is not None:
-        current = current + mean_inside(guide - current, hole, settings.settle_px)
+        current = current + masked_blur(guide - current, hole, settings.settle_px)
     return np.where(hole[..., None], np.clip(current, 0, 1), image).astype(np.float32)
 
 
@@ -146,15 +146,15 @@ def _with_grain(
     current: Image, image: Image, hole: Mask, forbidden: Mask, source: NDArray[np.int64], sigma: float
 ) -> Image:
     """The fill with fine detail as it is at each pixel's own source: the mean of several sources has lost it."""
-    detail = image - mean_inside(image, ~forbidden, sigma)
-    smooth = mean_inside(current, np.ones_like(hole), sigma)
+    detail = image - masked_blur(image, ~forbidden, sigma)
+    smooth = masked_blur(current, np.ones_like(hole), sigma)
     rows, columns = source[hole].T
     result = current.copy()
     result[hole] = smooth[hole] + detail[rows, columns]
     return result
 
 
-def mean_inside(values: Image, mask: Mask, sigma: float) -> Image:
+def masked_blur(values: Image, mask: Mask, sigma: float) -> Image:
     """Gaussian mean (H, W, 3), sigma px, of the values (H, W, 3) in the mask (H, W)."""
     weight = mask.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
@@ -162,7 +162,7 @@ def mean_inside(values: Image, mask: Mask, sigma: float) -> Image:
     return np.asarray(mean, np.float32)
 
 
-def mirrored(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def mirror_sources(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns (H, W) of a first guess: each unknown pixel copies what lies mirrored at the hole's nearest
     end.
 
@@ -180,13 +180,13 @@ def mirrored(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.where(known, rows, nearest[0]), np.where(known, columns, nearest[1])
 
 
-def first_guess(unknown: Mask, ground: Ground) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def initial_sources(unknown: Mask, ground: GroundMaps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """`mirrored`, with ground from the nearest ground where ground must be."""
-    rows, columns = mirrored(unknown)
-    other = unknown | (ground.like < 0.5)
+    rows, columns = mirror_sources(unknown)
+    other = unknown | (ground.share < 0.5)
     if other.all():
         return rows, columns
-    ground_rows, ground_columns = mirrored(other)
+    ground_rows, ground_columns = mirror_sources(other)
     take = ground.wanted & unknown
     return np.where(take, ground_rows, rows), np.where(take, ground_columns, columns)
 
@@ -216,9 +216,9 @@ class _Level:
         image: Image,
         hole: Mask,
         forbidden: Mask,
-        ground: Ground,
+        ground: GroundMaps,
         horizon_and_scale: tuple[float, int],
-        settings: FillSettings,
+        settings: PatchFillSettings,
     ) -> None:
         self.settings = settings
         horizon, scale = horizon_and_scale[0] / horizon_and_scale[1], horizon_and_scale[1]
@@ -257,7 +257,7 @@ class _Level:
         """Prefer sources that look like the guide (H, W, 3) at the place that they are copied to."""
         self.guide = guide[self.rows, self.columns]
         image = self.padded[self.pad : -self.pad, self.pad : -self.pad]
-        self.blurred = mean_inside(image, self.allowed, max(self.settings.guide_px / self.scale, 0.7))
+        self.blurred = masked_blur(image, self.allowed, max(self.settings.guide_px / self.scale, 0.7))
 
     def _flat(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.int64]:
         return (rows + self.pad) * self.stride + columns + self.pad
@@ -277,7 +277,7 @@ class _Level:
         dy = (rows - self.rows[which]) / self.reach[which]
         dx = (columns - self.columns[which]) / self.column_unit
         cost = colour + self.settings.row_weight * dy * dy + self.settings.column_weight * dx * dx
-        cost = cost + self.wanted[which] * (1 - self.ground.like[rows, columns])
+        cost = cost + self.wanted[which] * (1 - self.ground.share[rows, columns])
         if self.guide is not None:
             apart = self.blurred[rows, columns] - self.guide[which]
             cost = cost + self.settings.guide_weight * np.einsum("pk,pk->p", apart, apart)
@@ -301,7 +301,7 @@ class _Level:
     def _start(self, coarse: NDArray[np.int64] | None) -> None:
         """First sources: mirrored ones, or the coarser level's where these are better."""
         everything = np.arange(self.rows.size)
-        rows, columns = first_guess(~self.allowed, self.ground)
+        rows, columns = initial_sources(~self.allowed, self.ground)
         self.source = np.stack([rows[self.rows, self.columns], columns[self.rows, self.columns]], 1)
         self.best = self._cost(everything, self.source[:, 0], self.source[:, 1])
         if coarse is not None:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from scene_ir.derender.background import mean_inside
-from scene_ir.derender.colours import square_length
-from scene_ir.derender.street import Continued
+from scene_ir.derender.patch_fill import masked_blur
+from scene_ir.derender.street import StreetContinuation
+from scene_ir.image_filters import channel_square_sum
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -27,7 +27,7 @@ _AREA = cv2.INTER_AREA
 
 
 @dataclass(frozen=True, slots=True)
-class UprightSettings:
+class ColumnCopySettings:
     """scale: of the photograph at which columns are compared. In px of that size: reach_px, step_px: shifts that
     are tried; ring_px: what is known so near to the hole must agree with what is known beside the copy; guess_px:
     blur at which a copy is held against the guide. Weights of squared differences of colour, one pixel's at most
@@ -56,7 +56,7 @@ class UprightSettings:
     settle: float = 0.75
     settle_px: float = 10.0
 
-    def smaller(self, shrink: int) -> UprightSettings:
+    def scaled_down(self, shrink: int) -> ColumnCopySettings:
         """For a photograph at one over `shrink` of its size: the same lengths of what is to be seen."""
         return replace(
             self,
@@ -79,67 +79,67 @@ _LEAST_RATIO, _MOST_RATIO = 0.7, 1.45
 """Of a source's size to its copy's: more would blur, or show another street."""
 _FOOT_PX = 12.0
 """Feet are smoothed so far along the street: their noise must not shake what stands on them."""
-_BAD = 4.0
+_FORBIDDEN_COST = 4.0
 """Cost, in units of `most`, of a pixel that must not be copied."""
 
 
 @dataclass(frozen=True, slots=True)
-class Copied:
+class ColumnCopy:
     """image (H, W, 3) with what was copied; done (H, W): those pixels."""
 
     image: Image
-    done: Mask
+    copied: Mask
 
 
-def copied(
+def copy_columns(
     image: Image,
     hole: Mask,
     forbidden: Mask,
-    guide: Continued,
+    guide: StreetContinuation,
     horizon: float,
-    settings: UprightSettings | None = None,
-) -> Copied:
+    settings: ColumnCopySettings | None = None,
+) -> ColumnCopy:
     """The image with the upright part of the hole copied from columns beside it.
 
     image (H, W, 3) in [0, 1]; hole, forbidden (H, W): what to fill, and what must not be copied: ground, other
     vehicles, the hole; guide: roughly what is to be seen, and where ground is; horizon: its row, px. Pixels that
     the best columns do not show are left to others.
     """
-    settings = settings or UprightSettings()
+    settings = settings or ColumnCopySettings()
     hole = hole & ~guide.ground
     height, width = hole.shape
     size = (max(round(width * settings.scale), 1), max(round(height * settings.scale), 1))
     small = cv2.resize(hole.astype(np.float32), size, interpolation=_AREA) > 0.3
     if not small.any():
-        return Copied(image.copy(), np.zeros_like(hole))
-    heights = _heights(guide.foot, horizon)
-    shifts = _Search(image, small, forbidden, guide.image, (heights, horizon), settings).best()
+        return ColumnCopy(image.copy(), np.zeros_like(hole))
+    heights = _wall_heights(guide.foot, horizon)
+    shifts = _ColumnSearch(image, small, forbidden, guide.image, (heights, horizon), settings).best_shifts()
     place = np.minimum((np.arange(width) * settings.scale).astype(np.int64), shifts.size - 1)
     moved = np.isfinite(shifts[place])
     where = np.arange(width) + np.where(moved, np.rint(shifts[place] / settings.scale), 0)
-    ratio = _ratio(heights, np.arange(width), where)
+    ratio = _size_ratio(heights, np.arange(width), where)
     u = np.ascontiguousarray(np.broadcast_to(where.astype(np.float32), (height, width)))
     v = (horizon + (np.arange(height)[:, None] - horizon) * ratio).astype(np.float32)
     copy = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     blocked = forbidden.astype(np.float32)
     bad = cv2.remap(blocked, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1.0,))
     done = hole & (bad < 0.01) & moved
-    copy = copy + settings.settle * mean_inside(guide.image - copy, done, settings.settle_px)
-    return Copied(np.where(done[..., None], np.clip(copy, 0, 1), image).astype(np.float32), done)
+    copy = copy + settings.settle * masked_blur(guide.image - copy, done, settings.settle_px)
+    return ColumnCopy(np.where(done[..., None], np.clip(copy, 0, 1), image).astype(np.float32), done)
 
 
-def _heights(foot: Rows, horizon: float) -> Rows:
+def _wall_heights(foot: Rows, horizon: float) -> Rows:
     """Heights (W,) px from the horizon down to the foot, smooth."""
     return np.maximum(gaussian_filter1d(foot, _FOOT_PX, mode="nearest") - horizon, _LEAST_HEIGHT_PX)
 
 
-def _ratio(heights: Rows, columns: NDArray[np.int64], where: Rows) -> Rows:
+def _size_ratio(heights: Rows, columns: NDArray[np.int64], where: Rows) -> Rows:
     """Size of the source against its copy's."""
     source = np.interp(where, np.arange(heights.size), heights)
     return np.clip(source / heights[columns], 1 / _MOST_RATIO, 1 / _LEAST_RATIO)
 
 
-class _Search:
+class _ColumnSearch:
     """The shift of each column at the size at which columns are compared."""
 
     def __init__(
@@ -149,7 +149,7 @@ class _Search:
         forbidden: Mask,
         guide: Image,
         street: tuple[Rows, float],
-        settings: UprightSettings,
+        settings: ColumnCopySettings,
     ) -> None:
         """hole (h, w): at the smaller size; all else of the photograph's; street: heights of the feet, horizon."""
         self.settings, self.hole = settings, hole
@@ -167,11 +167,11 @@ class _Search:
         reach = np.ones((2 * settings.ring_px + 1, 2 * settings.ring_px + 1), np.uint8)
         above_foot = np.arange(height)[:, None] < self.horizon + self.heights
         self.ring = (cv2.dilate(hole.astype(np.uint8), reach) > 0) & ~self.forbidden & above_foot
-        self.smooth = mean_inside(self.image, ~self.forbidden, settings.guess_px)
+        self.smooth = masked_blur(self.image, ~self.forbidden, settings.guess_px)
         shifts = np.arange(-settings.reach_px, settings.reach_px + 1, settings.step_px)
         self.shifts = shifts[np.abs(shifts) >= _LEAST_SHIFT_PX]
 
-    def best(self) -> Rows:
+    def best_shifts(self) -> Rows:
         """Shifts (w,) px of this size; nan in columns without a hole."""
         chosen = np.full(self.hole.shape[1], np.nan)
         columns = np.flatnonzero(self.hole.any(0))
@@ -202,17 +202,17 @@ class _Search:
         looks = np.empty((columns.size, self.shifts.size, _SAMPLES * 3), np.float32)
         for k, shift in enumerate(self.shifts.tolist()):
             where = columns + shift
-            ratio = _ratio(self.heights, columns, where.astype(np.float64))
+            ratio = _size_ratio(self.heights, columns, where.astype(np.float64))
             v = np.rint(self.horizon + (rows[:, None] - self.horizon) * ratio).astype(np.int64)
             u = np.broadcast_to(where, v.shape)
             outside = (v < 0) | (v >= height) | (u < 0) | (u >= width)
             at = v.clip(0, height - 1) * width + u.clip(0, width - 1)
             found, bad = colours.take(at, axis=0), forbidden.take(at) | outside
-            apart = np.minimum(square_length(found - image), settings.most_ring)
+            apart = np.minimum(channel_square_sum(found - image), settings.most_ring)
             cost = settings.ring_weight * np.where(bad, settings.most, apart) * ring
-            guess = np.minimum(square_length(smooth.take(at, axis=0) - guide), settings.most)
+            guess = np.minimum(channel_square_sum(smooth.take(at, axis=0) - guide), settings.most)
             far = settings.far * abs(shift) / 100 * settings.most
-            cost = cost + (settings.guess_weight * guess + _BAD * settings.most * bad + far) * hole
+            cost = cost + (settings.guess_weight * guess + _FORBIDDEN_COST * settings.most * bad + far) * hole
             costs[:, k] = cost.sum(0)
             looks[:, k] = found[sample, np.arange(columns.size)].transpose(1, 0, 2).reshape(columns.size, -1)
         return costs, looks

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from scene_ir.derender.silhouette import Boxes, Placement
+from scene_ir.derender.silhouette import LabelBoxes, Placement
 from scene_ir.meshes.lod import detail
 from scene_ir.types import Camera, Mesh
 
@@ -27,7 +27,7 @@ _NEAR_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class SettleSettings:
+class BoxAlignmentSettings:
     """Standard deviations of labels: shift_m along and across the view, lift_m, turn_rad, stretch of each size; of
     a box's side, side_px plus side_share of the box's height. robust: standard deviations from which on a side
     pulls no harder. reach: bounds of the change, in standard deviations.
@@ -43,15 +43,18 @@ class SettleSettings:
     reach: float = 2.0
 
 
-def settle(
-    placements: Sequence[Placement], boxes: Boxes, camera: Camera, settings: SettleSettings | None = None
+def align_to_boxes(
+    placements: Sequence[Placement],
+    boxes: LabelBoxes,
+    camera: Camera,
+    settings: BoxAlignmentSettings | None = None,
 ) -> tuple[list[Placement], NDArray[np.float64]]:
     """Each placement at the likeliest pose and size given its label and its box, and what that costs (N,), half a
     squared standard deviation as the unit.
 
     A robust Gauss-Newton of seven numbers with the four sides as data and the label as prior.
     """
-    settings = settings or SettleSettings()
+    settings = settings or BoxAlignmentSettings()
     settled, costs = [], np.zeros(len(placements))
     shapes: dict[int, _Shape] = {}
     for i, (placement, box, trust) in enumerate(zip(placements, boxes.xyxy, boxes.trust, strict=True)):
@@ -103,7 +106,7 @@ def _bounds(clip: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([pixels.min(1), pixels.max(1)])
 
 
-def _spread(s: SettleSettings) -> NDArray[np.float64]:
+def _spread(s: BoxAlignmentSettings) -> NDArray[np.float64]:
     return np.array([s.shift_m, s.lift_m, s.shift_m, s.turn_rad, s.stretch, s.stretch, s.stretch])
 
 
@@ -140,7 +143,7 @@ def _solve(
     shape: _Shape,
     sides: tuple[NDArray[np.float64], NDArray[np.float64]],
     camera: Camera,
-    settings: SettleSettings,
+    settings: BoxAlignmentSettings,
 ) -> tuple[NDArray[np.float64], float]:
     """sides: the box (4,) px, and the trust in each of its sides (4,)."""
     box, trust = sides

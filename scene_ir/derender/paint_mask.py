@@ -49,19 +49,19 @@ class _Look:
     spread: Array
 
 
-def with_regions(scene: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
+def add_paint_regions(scene: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
     """The scene with `Source.region` of each object: its paint, by the photograph. Needs `objects.source`."""
     if not scene.objects.source:
         return scene
-    parts = Compositor(scene, RenderSettings(backend)).photographed_paint()
+    parts = Compositor(scene, RenderSettings(backend)).project_paint()
     sources = tuple(
-        replace(source, region=region(source.foreground, part))
+        replace(source, region=estimate_paint_region(source.foreground, part))
         for source, part in zip(scene.objects.source, parts, strict=True)
     )
     return replace(scene, objects=replace(scene.objects, source=sources))
 
 
-def region(foreground: Crop, part: Crop) -> Crop:
+def estimate_paint_region(foreground: Crop, part: Crop) -> Crop:
     """How much of each pixel of a foreground (4, h, w) is paint: Crop (1, h, w) in [0, 1].
 
     part: Crop (1, h, w) of the same place, what the mesh says, continued beyond its outline.
@@ -73,7 +73,7 @@ def region(foreground: Crop, part: Crop) -> Crop:
     opacity = rgba[3]
     straight = (rgba[:3] / np.maximum(opacity, 0.05)).clip(0, 1)
     rows = torch.from_numpy(straight.reshape(3, -1).T.copy())
-    lab = texture.lab(rows).numpy().reshape(*opacity.shape, 3)
+    lab = texture.rgb_to_lab(rows).numpy().reshape(*opacity.shape, 3)
     solid = opacity > 0.95
     high = int(np.ptp(np.flatnonzero(solid.any(1)))) + 1 if solid.any() else 1
     sigma = max(_BLUR * high, 0.5)

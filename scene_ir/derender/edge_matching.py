@@ -28,7 +28,7 @@ _MOST_POINTS = 600
 
 
 @dataclass(frozen=True, slots=True)
-class Followed:
+class VisibleContour:
     """Points of a mesh on its visible edges. vertex (P, 3): of the face that each lies on; weight (P, 3): its
     barycentric coordinates; offset (P, 2) px: from it to the edge, half a pixel; channel (P,): the edge's
     direction.
@@ -40,7 +40,7 @@ class Followed:
     channel: Tensor
 
 
-def edge_field(picture: NDArray[np.uint8], unknown: NDArray[np.bool_]) -> Tensor:
+def compute_edge_field(picture: NDArray[np.uint8], unknown: NDArray[np.bool_]) -> Tensor:
     """Distance to the nearest image edge of each direction, (4, h, w), in units of the reach and at most 1.
 
     picture (h, w, 3) RGB; edges at pixels that are unknown (h, w) do not count.
@@ -60,9 +60,9 @@ def edge_field(picture: NDArray[np.uint8], unknown: NDArray[np.bool_]) -> Tensor
     return torch.from_numpy(np.stack(field).astype(np.float32))
 
 
-def follow(
+def trace_contour(
     face: Tensor, depth: Tensor, clip: Tensor, faces: Tensor, part: Tensor, known: NDArray[np.bool_]
-) -> Followed:
+) -> VisibleContour:
     """The visible edges of a mesh as drawn into a window.
 
     face (h, w): the triangle seen, -1 for none; depth (h, w) m; clip (V, 3); faces (F, 3); part (F,) of the mesh;
@@ -101,7 +101,7 @@ def follow(
     share = torch.stack([(pixel * torch.linalg.cross(*two)).sum(1) for two in ((b, c), (c, a), (a, b))], 1)
     share = share / share.sum(1, keepdim=True)
     usable = torch.isfinite(share).all(1) & (share.abs() < 2).all(1)
-    return Followed(
+    return VisibleContour(
         vertex[usable],
         share[usable].float(),
         torch.from_numpy(offset).float()[usable],
@@ -109,7 +109,7 @@ def follow(
     )
 
 
-def apart(field: Tensor, followed: Followed, clip: Tensor) -> Tensor:
+def contour_distance(field: Tensor, followed: VisibleContour, clip: Tensor) -> Tensor:
     """How far () the followed edges are from image edges, the mean over them in [0, 1]; 0 where there are none.
     Differentiable to clip (V, 3)."""
     if not len(followed.channel):

@@ -21,7 +21,7 @@ from scene_ir.derender.cutout import Cutout
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-LEAST_PX = 80.0
+MIN_HEIGHT_PX = 80.0
 """Height of vehicles whose colours tell enough."""
 _SAMPLE = 7
 """One of so many pixels is enough to find the kinds of colours; a prime, so that samples lie in all columns."""
@@ -31,7 +31,7 @@ _FIRM = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class WidenSettings:
+class MaskExtensionSettings:
     """How far a vehicle may go on, and what tells it. Lengths are in its heights.
 
     working_px: height to which larger vehicles are scaled down: colours tell as much there. band, inner: how far
@@ -58,13 +58,13 @@ class WidenSettings:
     thin: float = 0.02
 
 
-def widened(
+def extend_mask(
     image: NDArray[np.uint8],
     seen: Cutout,
     other: Cutout,
     drawn: Array,
     allowed: Mask,
-    settings: WidenSettings | None = None,
+    settings: MaskExtensionSettings | None = None,
 ) -> Cutout:
     """The cut-out with what beside it looks like the vehicle.
 
@@ -72,14 +72,14 @@ def widened(
     takes for the vehicle is decided by colours. drawn (H, W): share of the two places whose outline a pixel is in.
     allowed (H, W): where the vehicle may be: not what is nearer. Vehicles lower than `LEAST_PX` stay as they are.
     """
-    settings = settings or WidenSettings()
+    settings = settings or MaskExtensionSettings()
     solid = seen.visible >= 0.5
     rows = np.flatnonzero(solid.any(1))
-    if not len(rows) or rows[-1] + 1 - rows[0] < LEAST_PX:
+    if not len(rows) or rows[-1] + 1 - rows[0] < MIN_HEIGHT_PX:
         return seen
     high = rows[-1] + 1 - rows[0]
     scale = min(settings.working_px / high, 1.0)
-    second = other.whole("visible", image.shape)[seen.window]
+    second = other.full_map("visible", image.shape)[seen.window]
     parts = (seen.visible, second, seen.front, seen.shadow, np.asarray(drawn[seen.window], np.float32))
     size = (max(round(solid.shape[1] * scale), 1), max(round(solid.shape[0] * scale), 1))
     small = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts]).astype(np.float32)
@@ -92,7 +92,9 @@ def widened(
     return replace(seen, visible=visible, shadow=np.minimum(seen.shadow, 1 - visible - seen.front).clip(0))
 
 
-def _more(photo: NDArray[np.uint8], shares: Array, free: Mask, high: float, settings: WidenSettings) -> Array:
+def _more(
+    photo: NDArray[np.uint8], shares: Array, free: Mask, high: float, settings: MaskExtensionSettings
+) -> Array:
     """How much (h, w) of each pixel is vehicle. shares (5, h, w): visible at either look, front, shadow, drawn."""
     first, second, front, shade, drawn = shares
     solid = first >= 0.5
@@ -133,7 +135,7 @@ def _depth(mask: Mask) -> Array:
 
 
 def _likelier(
-    photo: NDArray[np.uint8], inside: Mask, outside: Mask, high: float, settings: WidenSettings
+    photo: NDArray[np.uint8], inside: Mask, outside: Mask, high: float, settings: MaskExtensionSettings
 ) -> Array:
     """Log of how much likelier (h, w) a pixel's colour is on the vehicle near by than beside it near by."""
     kinds = _kinds(photo, settings.colours)
@@ -167,7 +169,9 @@ def _kinds(photo: NDArray[np.uint8], count: int) -> NDArray[np.int64]:
     return np.asarray(apart.argmin(1), np.int64).reshape(photo.shape[:2])
 
 
-def _walked(photo: NDArray[np.uint8], inside: Mask, open_: Mask, prior: Array, settings: WidenSettings) -> Array:
+def _walked(
+    photo: NDArray[np.uint8], inside: Mask, open_: Mask, prior: Array, settings: MaskExtensionSettings
+) -> Array:
     """Shares (h, w) that are smooth but across edges, 1 inside, near the prior where open, 0 elsewhere."""
     values = photo.astype(np.float32) / 255
     known = inside.astype(np.float32)
