@@ -20,7 +20,7 @@ from drivesem.classify.objects.types import ObjectModel
 from drivesem.classify.space import Change
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.render.lit import Lights, LitMesh, Materials, over
+from scene_ir.render.lit_mesh import Lights, LitMesh, Materials, composite_over
 from scene_ir.types import Camera
 
 DRAWN_PX, SEEN_PX = 512, 224
@@ -92,7 +92,7 @@ class ObjectScene:
             return self._behind.to(drawn)
         rows, columns = _Cut.around(y, drawn.shape[1]), _Cut.around(x, drawn.shape[2])
         around = (*columns.beside(x, drawn.shape[2]), *rows.beside(y, drawn.shape[1]))
-        whole = over(F.pad(drawn, around), self.background[:, rows.drawn, columns.drawn].to(drawn))
+        whole = composite_over(F.pad(drawn, around), self.background[:, rows.drawn, columns.drawn].to(drawn))
         size = (rows.small, columns.small)
         small = _smaller(whole, size)
         picture = self._behind.to(drawn, copy=True)

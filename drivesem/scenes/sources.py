@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from drivesem.config.blocks import DEMO, PHOTOGRAPHS, SCENES, Scenes
-from drivesem.config.commands import Derender
+from drivesem.config.commands import DerenderConfig
 from drivesem.config.errors import UsageError
+from drivesem.config.options import DEMO, PHOTOGRAPHS, SCENES, SceneOptions
 from drivesem.store import place
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.types import Frame, SceneIR
@@ -72,11 +72,11 @@ class PhotographSource:
     shipped network places the vehicles of the 2D boxes.
     """
 
-    def __init__(self, config: Scenes) -> None:
+    def __init__(self, config: SceneOptions) -> None:
         from drivesem.data.registry import open_dataset
         from drivesem.data.splits import chosen
 
-        points = isinstance(config, Derender) and config.velodyne
+        points = isinstance(config, DerenderConfig) and config.velodyne
         dataset = open_dataset(config.dataset, config.root or "", with_points=points, focal_px=config.focal)
         self._dataset = dataset if config.split is None else chosen(dataset, config.split)
         self._settings = _settings(config)
@@ -100,7 +100,7 @@ class Photographs:
     shipped network. Raises FormatError for a folder without images, UsageError for a detector that is none.
     """
 
-    def __init__(self, path: Path, config: Scenes) -> None:
+    def __init__(self, path: Path, config: SceneOptions) -> None:
         from drivesem.data.frames import images_of
         from drivesem.scenes.label_free import settings_for
 
@@ -204,7 +204,7 @@ def _taken_apart(frame: Frame, settings: DerenderSettings, kept: KeptScenes | No
     return make() if kept is None else kept.scene((frame, settings), make)
 
 
-def _finder(config: Scenes) -> Predictor:
+def _finder(config: SceneOptions) -> Predictor:
     """What finds vehicles in photographs without labels."""
     from detectors.base import DetectorError
     from detectors.registry import load_predictor
@@ -212,7 +212,7 @@ def _finder(config: Scenes) -> Predictor:
     try:
         return load_predictor(config.finder)
     except DetectorError as error:
-        raise UsageError.of("--finder", "a detector", error) from error
+        raise UsageError.from_detector_error("--finder", "a detector", error) from error
 
 
 def derender_settings(
@@ -222,7 +222,7 @@ def derender_settings(
     cannot be read.
     """
     from scene_ir.derender.derender import DerenderSettings
-    from scene_ir.derender.silhouette import OwnMesh
+    from scene_ir.derender.silhouette import UserMesh
 
     settings = DerenderSettings() if fit else DerenderSettings.fast()
     if segmenter is not None:
@@ -233,18 +233,18 @@ def derender_settings(
         from drivesem.synth.assets import meshes_in
         from scene_ir.meshes.lod import simplify
 
-        own = (OwnMesh(simplify(v.mesh, _MOST_FACES), v.kind, v.size_lhw) for v in meshes_in(str(meshes)))
+        own = (UserMesh(simplify(v.mesh, _MOST_FACES), v.kind, v.size_lhw) for v in meshes_in(str(meshes)))
         settings = replace(settings, meshes=tuple(own))
     return settings
 
 
-def _settings(config: Scenes) -> DerenderSettings:
-    if isinstance(config, Derender):
+def _settings(config: SceneOptions) -> DerenderSettings:
+    if isinstance(config, DerenderConfig):
         return derender_settings(config.fit, config.meshes, config.segmenter)
     return derender_settings(config.fit)
 
 
-def _kept_scenes(config: Scenes) -> KeptScenes | None:
+def _kept_scenes(config: SceneOptions) -> KeptScenes | None:
     if config.cache is None:
         return None
     from drivesem.scenes.kept import KeptScenes
@@ -254,9 +254,9 @@ def _kept_scenes(config: Scenes) -> KeptScenes | None:
     return kept
 
 
-def open_source(config: Scenes) -> SceneSource:
+def open_source(config: SceneOptions) -> SceneSource:
     """The source that the configuration names. Raises SceneError for an unknown or unreadable data set."""
-    if isinstance(config, Derender) and config.photo is not None:
+    if isinstance(config, DerenderConfig) and config.photo is not None:
         return Photographs(Path(config.photo), config)
     if config.dataset == DEMO:
         return DemoSource(config.seed, config.limit or DEMO_SCENES)
@@ -267,9 +267,9 @@ def open_source(config: Scenes) -> SceneSource:
     return PhotographSource(config)
 
 
-def make_ready(config: Scenes) -> None:
+def make_ready(config: SceneOptions) -> None:
     """Compile or load, together, the kernels that draw the source's frames, before a frame asks for them."""
     from drivesem.synth import kernels, mesh_kernels
-    from scene_ir.render.kernels import ready
+    from scene_ir.render import fast
 
-    ready.make_ready((kernels, mesh_kernels) if config.dataset == DEMO else ())
+    fast.compile_kernels((kernels, mesh_kernels) if config.dataset == DEMO else ())

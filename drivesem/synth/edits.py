@@ -28,9 +28,8 @@ from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
-from scene_ir.render.environment import time_gain
+from scene_ir.render.environment import move_sun, time_gain
 from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH
-from scene_ir.render.sun import moved_sun
 from scene_ir.render.texture import apply_texture_code
 
 __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
@@ -75,9 +74,9 @@ def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
 def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
     if edit.remove:
         return None
-    if edit.mesh_share:
+    if edit.mesh_fraction:
         expected = "lattice offsets; a generated vehicle has no other shape to take a share of"
-        raise RangeError(f"object {actor.track}: mesh", expected, f"{edit.mesh_share:.0%}")
+        raise RangeError(f"object {actor.track}: mesh", expected, f"{edit.mesh_fraction:.0%}")
     length = actor.size_lhw[0]
     along, across = (a * length + b for a, b in zip(edit.translate, edit.translate_m, strict=True))
     cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)
@@ -118,7 +117,7 @@ def _under_sun(light: Light, code: tuple[float, ...]) -> Light:
         torch.tensor(np.asarray(value), dtype=torch.float64) for value in (light.sun, light.up, code)
     )
     strength = 1 + SUN_STRENGTH * code[2]
-    return replace(light, sun=moved_sun(sun, up, change).numpy(), sun_colour=light.sun_colour * strength)
+    return replace(light, sun=move_sun(sun, up, change).numpy(), sun_colour=light.sun_colour * strength)
 
 
 def _weathered(light: Light, code: tuple[float, ...]) -> Light:

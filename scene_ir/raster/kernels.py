@@ -39,30 +39,30 @@ FAR = wp.constant(wp.float64(1e300))
 ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
 ONE = wp.constant(wp.float64(1.0))
-ALL = wp.constant(wp.uint64((1 << 64) - 1))
-BEYOND = wp.constant(wp.float64(1.0 + 1e-6))
+ALL_BITS = wp.constant(wp.uint64((1 << 64) - 1))
+FARTHER = wp.constant(wp.float64(1.0 + 1e-6))
 """A depth so many times another one is farther, as float32 too."""
 ROUNDING = wp.constant(wp.float64(1e-12))
 """Of a sum of edge functions, in shares of what it adds up; some thousand times what float64 rounds."""
 LIMIT_PX = wp.constant(wp.float64(1e9))
 """Places beyond this are as good as there: it keeps them within int32."""
-BEHIND = wp.constant(-(1 << 31))
+BEHIND_NEAR = wp.constant(-(1 << 31))
 """Marks a vertex in front of the near plane's cut, whose place in the image says nothing."""
-WIDE = wp.constant(12)
+WIDE_ROW_PX = wp.constant(12)
 """Rows of more pixels than this are worth the divisions that find where a triangle begins and ends on them."""
-STEEP = wp.constant(wp.float64(1e-6))
+MIN_SLOPE = wp.constant(wp.float64(1e-6))
 """An edge function that changes less than this share of itself over a pixel does not tell where it ends."""
 
-TILE = wp.constant(16)
+TILE_PX = wp.constant(16)
 """Pixels along each side of the squares of which it is known what they show farthest away."""
-NOTHING = wp.constant(wp.int64((0x7F800000 << 32) | 0xFFFFFFFF))
+EMPTY_KEY = wp.constant(wp.int64((0x7F800000 << 32) | 0xFFFFFFFF))
 """Key of a pixel that no triangle has reached, (depth bits << 32 | face): infinitely far, face -1."""
 X0, Y0, X1, Y1, ROW, ROW_END, OFFSET, FACE, FACE_END, CULL, FIRST = (wp.constant(i) for i in range(11))
 """Columns of Plan.parts."""
 
 
 @wp.struct
-class Edges:
+class TriangleEdges:
     """Signed edge normals and |det| of a triangle; det is 0 where it is not seen."""
 
     n0: wp.vec3d
@@ -72,7 +72,7 @@ class Edges:
 
 
 @wp.func
-def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
+def _find_range(offsets: wp.array(dtype=wp.int64), count: int, i: int):
     """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are passed over."""
     if i < count:  # of draws of one pixel each there may be as many as pixels
         if offsets[i] == wp.int64(i) and offsets[i + 1] == wp.int64(i + 1):
@@ -89,7 +89,7 @@ def find(offsets: wp.array(dtype=wp.int64), count: int, i: int):
 
 
 @wp.func
-def find_part(parts: wp.array2d(dtype=wp.int32), i: int):
+def _find_part(parts: wp.array2d(dtype=wp.int32), i: int):
     """The part that packed pixel i belongs to."""
     low = int(0)
     high = parts.shape[0]
@@ -103,89 +103,91 @@ def find_part(parts: wp.array2d(dtype=wp.int32), i: int):
 
 
 @wp.func
-def whole(value: wp.float64):
+def _to_int(value: wp.float64):
     """A whole number as an int."""
     return wp.int32(wp.clamp(value, -LIMIT_PX, LIMIT_PX))
 
 
 @wp.func
-def around(u: wp.float64, v: wp.float64):
+def _pixels_near(u: wp.float64, v: wp.float64):
     """The first and the last pixel (x, y, x, y) that a point at u, v may touch: none, where the first is later."""
     return wp.vec4i(
-        whole(wp.ceil(u - SLACK_PX)),
-        whole(wp.ceil(v - SLACK_PX)),
-        whole(wp.floor(u + SLACK_PX)),
-        whole(wp.floor(v + SLACK_PX)),
+        _to_int(wp.ceil(u - SLACK_PX)),
+        _to_int(wp.ceil(v - SLACK_PX)),
+        _to_int(wp.floor(u + SLACK_PX)),
+        _to_int(wp.floor(v + SLACK_PX)),
     )
 
 
 @wp.func
-def both(a: wp.vec4i, b: wp.vec4i):
+def _merge_boxes(a: wp.vec4i, b: wp.vec4i):
     return wp.vec4i(wp.min(a[0], b[0]), wp.min(a[1], b[1]), wp.max(a[2], b[2]), wp.max(a[3], b[3]))
 
 
 @wp.kernel
-def corner_kernel(start: int, clip: wp.array(dtype=wp.vec3f), near: wp.float64, boxes: wp.array(dtype=wp.vec4i)):
+def _corner_kernel(start: int, clip: wp.array(dtype=wp.vec3f), near: wp.float64, boxes: wp.array(dtype=wp.vec4i)):
     i = start + wp.tid()
     c = wp.vec3d(clip[i])
     if c[2] >= near:
         scale = ONE / c[2]
-        boxes[i] = around(c[0] * scale, c[1] * scale)
+        boxes[i] = _pixels_near(c[0] * scale, c[1] * scale)
     else:
-        boxes[i] = wp.vec4i(BEHIND, 0, 0, 0)
+        boxes[i] = wp.vec4i(BEHIND_NEAR, 0, 0, 0)
 
 
 @wp.func
-def with_side(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
+def _extend_by_edge(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
     """`box` widened by corner a and by where the side from a to b passes the near plane."""
     grown = box
     if a[2] >= near:
         scale = ONE / a[2]
-        grown = both(grown, around(a[0] * scale, a[1] * scale))
+        grown = _merge_boxes(grown, _pixels_near(a[0] * scale, a[1] * scale))
     if (a[2] >= near) != (b[2] >= near):
         share = (near - a[2]) / (b[2] - a[2])
         scale = ONE / near
         u = (a[0] + share * (b[0] - a[0])) * scale
         v = (a[1] + share * (b[1] - a[1])) * scale
-        grown = both(grown, around(u, v))
+        grown = _merge_boxes(grown, _pixels_near(u, v))
     return grown
 
 
 @wp.func
-def bounds_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(dtype=wp.vec4i), near: wp.float64):
+def _triangle_bounds(
+    corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(dtype=wp.vec4i), near: wp.float64
+):
     """First and last pixel (x, y, x, y) of the part of a triangle that lies beyond the near plane."""
     a = boxes[corner[0]]
     b = boxes[corner[1]]
     c = boxes[corner[2]]
-    box = both(a, both(b, c))
-    if box[0] == BEHIND:
+    box = _merge_boxes(a, _merge_boxes(b, c))
+    if box[0] == BEHIND_NEAR:
         c0 = wp.vec3d(clip[corner[0]])
         c1 = wp.vec3d(clip[corner[1]])
         c2 = wp.vec3d(clip[corner[2]])
         box = wp.vec4i(2000000000, 2000000000, -2000000000, -2000000000)
-        box = with_side(box, c0, c1, near)
-        box = with_side(box, c1, c2, near)
-        box = with_side(box, c2, c0, near)
+        box = _extend_by_edge(box, c0, c1, near)
+        box = _extend_by_edge(box, c1, c2, near)
+        box = _extend_by_edge(box, c2, c0, near)
     return box
 
 
 @wp.func
-def edge_at(n: wp.vec3d, x: wp.float64, y: wp.float64):
+def _edge_value(n: wp.vec3d, x: wp.float64, y: wp.float64):
     return (n[0] * x + n[1] * y) + n[2]
 
 
 @wp.func
-def edge(n: wp.vec3d, x: int, y: int):
-    return edge_at(n, wp.float64(x), wp.float64(y))
+def _edge_value_px(n: wp.vec3d, x: int, y: int):
+    return _edge_value(n, wp.float64(x), wp.float64(y))
 
 
 @wp.func
-def extent(c: wp.vec3d):
+def _l1_norm(c: wp.vec3d):
     return (wp.abs(c[0]) + wp.abs(c[1])) + wp.abs(c[2])
 
 
 @wp.func
-def owns(e: wp.float64, n: wp.vec3d):
+def _owns_pixel(e: wp.float64, n: wp.vec3d):
     """Whether a pixel with edge function e >= 0 is inside; on the edge, one of the two sides' triangles owns it."""
     first = n[0]
     if first == ZERO:
@@ -196,16 +198,16 @@ def owns(e: wp.float64, n: wp.vec3d):
 
 
 @wp.func
-def edges_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
+def _triangle_edges(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
     """Edge functions of a triangle; of one seen from behind none, where that is culled."""
     c0 = wp.vec3d(clip[corner[0]])
     c1 = wp.vec3d(clip[corner[1]])
     c2 = wp.vec3d(clip[corner[2]])
-    found = Edges()
+    found = TriangleEdges()
     n0 = wp.cross(c1, c2)
     det = (c0[0] * n0[0] + c0[1] * n0[1]) + c0[2] * n0[2]
     if cull == 0 or det < ZERO:
-        if wp.abs(det) > DEGENERATE * (extent(c0) * extent(c1) * extent(c2)):
+        if wp.abs(det) > DEGENERATE * (_l1_norm(c0) * _l1_norm(c1) * _l1_norm(c2)):
             sign = ONE
             if det < ZERO:
                 sign = -ONE
@@ -217,14 +219,14 @@ def edges_of(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
 
 
 @wp.func
-def narrow(span: wp.vec2i, n: wp.vec3d, run: wp.float64, y: int):
+def _narrow_span(span: wp.vec2i, n: wp.vec3d, run: wp.float64, y: int):
     """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it. run: 1 /
     n[0], once for all rows.
     """
     base = n[1] * wp.float64(y) + n[2]
     first = span[0]
     end = span[1]
-    if wp.abs(n[0]) > STEEP * (wp.abs(n[1] * wp.float64(y)) + wp.abs(n[2])):
+    if wp.abs(n[0]) > MIN_SLOPE * (wp.abs(n[1] * wp.float64(y)) + wp.abs(n[2])):
         x = wp.clamp(-base * run, -LIMIT_PX, LIMIT_PX)
         if n[0] > ZERO:
             first = wp.max(first, wp.int32(wp.floor(x)) - 1)
@@ -234,8 +236,8 @@ def narrow(span: wp.vec2i, n: wp.vec3d, run: wp.float64, y: int):
 
 
 @wp.func
-def fill(
-    e: Edges,
+def _fill_triangle(
+    e: TriangleEdges,
     face: int,
     box: wp.vec4i,
     origin: int,
@@ -251,39 +253,39 @@ def fill(
     n = (e.n0 + e.n1) + e.n2
     # The depth's denominator, n . (x, y, 1), is no more than what the pixel will sum up, and this.
     reach = wp.max(wp.max(wp.abs(box[0]), wp.abs(box[1])), wp.max(wp.abs(box[2]), wp.abs(box[3])))
-    slack = ROUNDING * (extent(e.n0) + extent(e.n1) + extent(e.n2)) * wp.float64(reach + 1)
+    slack = ROUNDING * (_l1_norm(e.n0) + _l1_norm(e.n1) + _l1_norm(e.n2)) * wp.float64(reach + 1)
     runs = wp.vec3d(ONE / e.n0[0], ONE / e.n1[0], ONE / e.n2[0])
     for y in range(box[1], box[3]):
         row = origin + y * width
         span = wp.vec2i(box[0], box[2])
-        if span[1] - span[0] > WIDE:
-            span = narrow(span, e.n0, runs[0], y)
-            span = narrow(span, e.n1, runs[1], y)
-            span = narrow(span, e.n2, runs[2], y)
+        if span[1] - span[0] > WIDE_ROW_PX:
+            span = _narrow_span(span, e.n0, runs[0], y)
+            span = _narrow_span(span, e.n1, runs[1], y)
+            span = _narrow_span(span, e.n2, runs[2], y)
         for x in range(span[0], span[1]):
             if layered:
                 behind = wp.float64(wp.cast(wp.int32(keys[row + x] >> wp.int64(32)), wp.float32))
-                if e.det > (edge(n, x, y) + slack) * (behind * BEYOND):
+                if e.det > (_edge_value_px(n, x, y) + slack) * (behind * FARTHER):
                     continue
-            e0 = edge(e.n0, x, y)
-            e1 = edge(e.n1, x, y)
-            e2 = edge(e.n2, x, y)
+            e0 = _edge_value_px(e.n0, x, y)
+            e1 = _edge_value_px(e.n1, x, y)
+            e2 = _edge_value_px(e.n2, x, y)
             least = wp.min(e0, wp.min(e1, e2))
             if least == ZERO:
-                if not (owns(e0, e.n0) and owns(e1, e.n1) and owns(e2, e.n2)):
+                if not (_owns_pixel(e0, e.n0) and _owns_pixel(e1, e.n1) and _owns_pixel(e2, e.n2)):
                     least = -ONE
             w = e.det / ((e0 + e1) + e2)
             bits = wp.int64(wp.cast(wp.float32(w), wp.int32))
             key = (bits << wp.int64(32)) | wp.int64(face)
-            key = wp.where(least >= ZERO, key, NOTHING)
-            key = wp.where(w >= near, key, NOTHING)
-            key = wp.where(w < FAR, key, NOTHING)
-            if alone or key < NOTHING:
+            key = wp.where(least >= ZERO, key, EMPTY_KEY)
+            key = wp.where(w >= near, key, EMPTY_KEY)
+            key = wp.where(w < FAR, key, EMPTY_KEY)
+            if alone or key < EMPTY_KEY:
                 wp.atomic_min(keys, row + x, key)
 
 
 @wp.func
-def note_farthest(
+def _update_tiles(
     part: int,
     x0: int,
     x1: int,
@@ -295,17 +297,17 @@ def note_farthest(
     tiles: wp.array3d(dtype=wp.float32),
 ):
     """What the tiles of a part show farthest away."""
-    for ty in range((row_end - row + TILE - 1) // TILE):
-        for tx in range((x1 - x0 + TILE - 1) // TILE):
+    for ty in range((row_end - row + TILE_PX - 1) // TILE_PX):
+        for tx in range((x1 - x0 + TILE_PX - 1) // TILE_PX):
             farthest = wp.int64(0)
-            for y in range(row + ty * TILE, wp.min(row + ty * TILE + TILE, row_end)):
-                for x in range(x0 + tx * TILE, wp.min(x0 + tx * TILE + TILE, x1)):
+            for y in range(row + ty * TILE_PX, wp.min(row + ty * TILE_PX + TILE_PX, row_end)):
+                for x in range(x0 + tx * TILE_PX, wp.min(x0 + tx * TILE_PX + TILE_PX, x1)):
                     farthest = wp.max(farthest, keys[origin + y * width + x])
             tiles[part, ty, tx] = wp.cast(wp.int32(farthest >> wp.int64(32)), wp.float32)
 
 
 @wp.func
-def is_hidden(
+def _is_hidden(
     corner: wp.vec3i,
     clip: wp.array(dtype=wp.vec3f),
     part: int,
@@ -316,15 +318,15 @@ def is_hidden(
 ):
     """Whether all tiles that a triangle in `box` may touch showed nearer things when they were last looked at."""
     nearest = wp.float64(wp.min(clip[corner[0]][2], wp.min(clip[corner[1]][2], clip[corner[2]][2])))
-    for ty in range((box[1] - row) // TILE, (box[3] - 1 - row) // TILE + 1):
-        for tx in range((box[0] - x0) // TILE, (box[2] - 1 - x0) // TILE + 1):
-            if nearest <= wp.float64(tiles[part, ty, tx]) * BEYOND:
+    for ty in range((box[1] - row) // TILE_PX, (box[3] - 1 - row) // TILE_PX + 1):
+        for tx in range((box[0] - x0) // TILE_PX, (box[2] - 1 - x0) // TILE_PX + 1):
+            if nearest <= wp.float64(tiles[part, ty, tx]) * FARTHER:
                 return False
     return True
 
 
 @wp.kernel
-def rasterize_kernel(
+def _rasterize_kernel(
     start: int,
     lanes: int,
     parts: wp.array2d(dtype=wp.int32),
@@ -356,18 +358,18 @@ def rasterize_kernel(
         if sorted:
             f = order[face]
             if quarter > 0 and (face == begin + quarter or face == begin + 2 * quarter):
-                note_farthest(part, x0, x1, row, row_end, origin, width, keys, tiles)
-        box = bounds_of(faces[f], clip, boxes, near)
+                _update_tiles(part, x0, x1, row, row_end, origin, width, keys, tiles)
+        box = _triangle_bounds(faces[f], clip, boxes, near)
         box = wp.vec4i(
             wp.max(box[0], x0), wp.max(box[1], row), wp.min(box[2] + 1, x1), wp.min(box[3] + 1, row_end)
         )
         some = box[0] < box[2] and box[1] < box[3]
         if sorted and some and quarter > 0 and face >= begin + quarter:
-            some = not is_hidden(faces[f], clip, part, x0, row, box, tiles)
+            some = not _is_hidden(faces[f], clip, part, x0, row, box, tiles)
         if some:
-            e = edges_of(faces[f], clip, parts[part, CULL])
+            e = _triangle_edges(faces[f], clip, parts[part, CULL])
             if e.det > ZERO:
-                fill(e, f, box, origin, width, near, lanes == 1, sorted, keys)
+                _fill_triangle(e, f, box, origin, width, near, lanes == 1, sorted, keys)
         face += lanes
 
 
@@ -385,9 +387,9 @@ def unpack_kernel(
 
 
 @wp.func
-def pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype=wp.int64)):
+def _pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype=wp.int64)):
     """Image coordinates of packed pixel i, and the width of its draw."""
-    draw = find(offsets, rects.shape[0], i)
+    draw = _find_range(offsets, rects.shape[0], i)
     within = i - wp.int32(offsets[draw])
     x0 = wp.int32(rects[draw, 0])
     y0 = wp.int32(rects[draw, 1])
@@ -397,7 +399,7 @@ def pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype=
 
 
 @wp.struct
-class Hit:
+class TriangleHit:
     """A triangle at a pixel: its corners, edge functions, 1 over their sum, and perspective-correct weights."""
 
     i0: int
@@ -412,10 +414,10 @@ class Hit:
 
 
 @wp.func
-def find_hit(
+def triangle_hit(
     f: int, x: wp.float64, y: wp.float64, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)
 ):
-    hit = Hit()
+    hit = TriangleHit()
     corners = faces[f]
     hit.i0 = corners[0]
     hit.i1 = corners[1]
@@ -423,9 +425,9 @@ def find_hit(
     hit.c0 = wp.vec3d(clip[hit.i0])
     hit.c1 = wp.vec3d(clip[hit.i1])
     hit.c2 = wp.vec3d(clip[hit.i2])
-    e0 = edge_at(wp.cross(hit.c1, hit.c2), x, y)
-    e1 = edge_at(wp.cross(hit.c2, hit.c0), x, y)
-    e2 = edge_at(wp.cross(hit.c0, hit.c1), x, y)
+    e0 = _edge_value(wp.cross(hit.c1, hit.c2), x, y)
+    e1 = _edge_value(wp.cross(hit.c2, hit.c0), x, y)
+    e2 = _edge_value(wp.cross(hit.c0, hit.c1), x, y)
     hit.e = wp.vec3d(e0, e1, e2)
     hit.scale = ONE / ((e0 + e1) + e2)
     hit.b = hit.e * hit.scale
@@ -433,7 +435,9 @@ def find_hit(
 
 
 @wp.func
-def add_to_corners(hit: Hit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip: wp.array(dtype=wp.vec3d)):
+def add_corner_gradients(
+    hit: TriangleHit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip: wp.array(dtype=wp.vec3d)
+):
     """Add what gradients to the edge functions, each times the pixel (x, y, 1), mean for the corners."""
     # q . (a x b) has the gradients b x q to a and q x a to b; here gathered by corner.
     wp.atomic_add(grad_clip, hit.i0, wp.cross(q1, hit.c2) + wp.cross(hit.c1, q2))
@@ -442,7 +446,7 @@ def add_to_corners(hit: Hit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip
 
 
 @wp.kernel
-def interpolate_kernel(
+def _interpolate_kernel(
     start: int,
     face: wp.array(dtype=wp.int32),
     rects: wp.array2d(dtype=wp.int64),
@@ -455,15 +459,15 @@ def interpolate_kernel(
     i = start + wp.tid()
     f = face[i]
     if f >= 0:
-        at = pixel_xy(i, rects, offsets)
-        hit = find_hit(f, wp.float64(at[0]), wp.float64(at[1]), clip, faces)
+        at = _pixel_xy(i, rects, offsets)
+        hit = triangle_hit(f, wp.float64(at[0]), wp.float64(at[1]), clip, faces)
         for k in range(attributes.shape[1]):
             value = hit.e[0] * wp.float64(attributes[hit.i0, k]) + hit.e[1] * wp.float64(attributes[hit.i1, k])
             out[i, k] = wp.float32((value + hit.e[2] * wp.float64(attributes[hit.i2, k])) * hit.scale)
 
 
 @wp.kernel
-def interpolate_backward_kernel(
+def _interpolate_backward_kernel(
     start: int,
     face: wp.array(dtype=wp.int32),
     rects: wp.array2d(dtype=wp.int64),
@@ -480,8 +484,8 @@ def interpolate_backward_kernel(
     i = start + wp.tid()
     f = face[i]
     if f >= 0:
-        at = pixel_xy(i, rects, offsets)
-        hit = find_hit(f, wp.float64(at[0]), wp.float64(at[1]), clip, faces)
+        at = _pixel_xy(i, rects, offsets)
+        hit = triangle_hit(f, wp.float64(at[0]), wp.float64(at[1]), clip, faces)
         # d out_k / d e_i = (a_ik - out_k) / sum e
         g0 = ZERO
         g1 = ZERO
@@ -502,11 +506,11 @@ def interpolate_backward_kernel(
                 wp.atomic_add(grad_attributes, hit.i2, k, wp.float32(g * hit.b[2]))
         if with_clip:
             p = wp.vec3d(wp.float64(at[0]), wp.float64(at[1]), ONE)
-            add_to_corners(hit, p * (g0 * hit.scale), p * (g1 * hit.scale), p * (g2 * hit.scale), grad_clip)
+            add_corner_gradients(hit, p * (g0 * hit.scale), p * (g1 * hit.scale), p * (g2 * hit.scale), grad_clip)
 
 
 @wp.func
-def weights(t: float):
+def _bicubic_weights(t: float):
     """Catmull-Rom weights of the pixels at -1, 0, 1, 2 for a sample at t in [0, 1)."""
     return wp.vec4f(
         ((-0.5 * t + 1.0) * t - 0.5) * t,
@@ -517,8 +521,8 @@ def weights(t: float):
 
 
 @wp.func
-def slopes(t: float):
-    """Derivatives of `weights`."""
+def _bicubic_slopes(t: float):
+    """Derivatives of `_bicubic_weights`."""
     return wp.vec4f(
         (-1.5 * t + 2.0) * t - 0.5,
         (4.5 * t - 5.0) * t,
@@ -528,7 +532,7 @@ def slopes(t: float):
 
 
 @wp.func
-def local(value: float, origin: int, size: int):
+def _clamp_to_crop(value: float, origin: int, size: int):
     """Place in a crop; beyond 3 px outside all taps lie outside as well. A NaN stays one."""
     place = value - float(origin)
     if place < -4.0:
@@ -539,13 +543,13 @@ def local(value: float, origin: int, size: int):
 
 
 @wp.func
-def tap(first: int, k: int, size: int):
+def _tap_index(first: int, k: int, size: int):
     """Index of tap k, of those at first - 1 ... first + 2, kept inside the crop."""
     return wp.clamp(first + k - 1, 0, size - 1)
 
 
 @wp.func
-def trim(weight: wp.vec4f, first: int, size: int):
+def _zero_outside(weight: wp.vec4f, first: int, size: int):
     """Weights with those of taps outside the crop set to 0."""
     keep = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     if first - 1 >= 0 and first - 1 < size:
@@ -560,7 +564,7 @@ def trim(weight: wp.vec4f, first: int, size: int):
 
 
 @wp.struct
-class Taps:
+class BicubicTaps:
     """The 4 x 4 texels of a sample: flat places of its columns and rows, weights, and the weights' derivatives."""
 
     columns: wp.vec4i
@@ -572,7 +576,7 @@ class Taps:
 
 
 @wp.func
-def find_taps(
+def bicubic_taps(
     uv: wp.vec2f,
     x0: int,
     y0: int,
@@ -582,39 +586,46 @@ def find_taps(
     texel_stride: int,
     clamp: bool,
 ):
-    taps = Taps()
-    u = local(uv[0], x0, width)
-    v = local(uv[1], y0, height)
+    taps = BicubicTaps()
+    u = _clamp_to_crop(uv[0], x0, width)
+    v = _clamp_to_crop(uv[1], y0, height)
     x = wp.clamp(wp.int32(wp.floor(u)), -4, width + 3)
     y = wp.clamp(wp.int32(wp.floor(v)), -4, height + 3)
-    taps.wx = weights(u - wp.floor(u))
-    taps.wy = weights(v - wp.floor(v))
-    taps.sx = slopes(u - wp.floor(u))
-    taps.sy = slopes(v - wp.floor(v))
+    taps.wx = _bicubic_weights(u - wp.floor(u))
+    taps.wy = _bicubic_weights(v - wp.floor(v))
+    taps.sx = _bicubic_slopes(u - wp.floor(u))
+    taps.sy = _bicubic_slopes(v - wp.floor(v))
     if x >= 1 and x + 2 < width and y >= 1 and y + 2 < height:  # nearly always
         at = start + (y - 1) * width
         taps.columns = wp.vec4i(x - 1, x, x + 1, x + 2) * texel_stride
         taps.rows = wp.vec4i(at, at + width, at + 2 * width, at + 3 * width) * texel_stride
         return taps
-    taps.columns = wp.vec4i(tap(x, 0, width), tap(x, 1, width), tap(x, 2, width), tap(x, 3, width)) * texel_stride
-    taps.rows = wp.vec4i(tap(y, 0, height), tap(y, 1, height), tap(y, 2, height), tap(y, 3, height))
+    taps.columns = (
+        wp.vec4i(
+            _tap_index(x, 0, width), _tap_index(x, 1, width), _tap_index(x, 2, width), _tap_index(x, 3, width)
+        )
+        * texel_stride
+    )
+    taps.rows = wp.vec4i(
+        _tap_index(y, 0, height), _tap_index(y, 1, height), _tap_index(y, 2, height), _tap_index(y, 3, height)
+    )
     taps.rows = (taps.rows * width + wp.vec4i(start, start, start, start)) * texel_stride
     if not clamp:
-        taps.wx = trim(taps.wx, x, width)
-        taps.wy = trim(taps.wy, y, height)
-        taps.sx = trim(taps.sx, x, width)
-        taps.sy = trim(taps.sy, y, height)
+        taps.wx = _zero_outside(taps.wx, x, width)
+        taps.wy = _zero_outside(taps.wy, y, height)
+        taps.sx = _zero_outside(taps.sx, x, width)
+        taps.sy = _zero_outside(taps.sy, y, height)
     return taps
 
 
 @wp.func
-def row_sum(texels: wp.array(dtype=wp.float32), base: int, columns: wp.vec4i, weight: wp.vec4f):
+def _weighted_row(texels: wp.array(dtype=wp.float32), base: int, columns: wp.vec4i, weight: wp.vec4f):
     low = weight[0] * texels[base + columns[0]] + weight[1] * texels[base + columns[1]]
     return low + (weight[2] * texels[base + columns[2]] + weight[3] * texels[base + columns[3]])
 
 
 @wp.kernel
-def texture_kernel(
+def _texture_kernel(
     start: int,
     texels: wp.array(dtype=wp.float32),
     channels: int,
@@ -628,24 +639,24 @@ def texture_kernel(
     out: wp.array2d(dtype=wp.float32),
 ):
     i = start + wp.tid()
-    draw = find(offsets, crops.shape[0], i)
+    draw = _find_range(offsets, crops.shape[0], i)
     x0 = wp.int32(crops[draw, 0])
     y0 = wp.int32(crops[draw, 1])
     width = wp.int32(crops[draw, 2]) - x0
     height = wp.int32(crops[draw, 3]) - y0
     if width > 0 and height > 0:
-        t = find_taps(uv[i], x0, y0, width, height, wp.int32(crop_offsets[draw]), texel_stride, clamp)
+        t = bicubic_taps(uv[i], x0, y0, width, height, wp.int32(crop_offsets[draw]), texel_stride, clamp)
         for c in range(channels):
             base = c * channel_stride
-            low = t.wy[0] * row_sum(texels, base + t.rows[0], t.columns, t.wx)
-            low += t.wy[1] * row_sum(texels, base + t.rows[1], t.columns, t.wx)
-            high = t.wy[2] * row_sum(texels, base + t.rows[2], t.columns, t.wx)
-            high += t.wy[3] * row_sum(texels, base + t.rows[3], t.columns, t.wx)
+            low = t.wy[0] * _weighted_row(texels, base + t.rows[0], t.columns, t.wx)
+            low += t.wy[1] * _weighted_row(texels, base + t.rows[1], t.columns, t.wx)
+            high = t.wy[2] * _weighted_row(texels, base + t.rows[2], t.columns, t.wx)
+            high += t.wy[3] * _weighted_row(texels, base + t.rows[3], t.columns, t.wx)
             out[i, c] = low + high
 
 
 @wp.kernel
-def texture_backward_kernel(
+def _texture_backward_kernel(
     start: int,
     texels: wp.array(dtype=wp.float32),
     channels: int,
@@ -663,13 +674,13 @@ def texture_backward_kernel(
     grad_texels: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
-    draw = find(offsets, crops.shape[0], i)
+    draw = _find_range(offsets, crops.shape[0], i)
     x0 = wp.int32(crops[draw, 0])
     y0 = wp.int32(crops[draw, 1])
     width = wp.int32(crops[draw, 2]) - x0
     height = wp.int32(crops[draw, 3]) - y0
     if width > 0 and height > 0:
-        t = find_taps(uv[i], x0, y0, width, height, wp.int32(crop_offsets[draw]), texel_stride, clamp)
+        t = bicubic_taps(uv[i], x0, y0, width, height, wp.int32(crop_offsets[draw]), texel_stride, clamp)
         gu = float(0.0)
         gv = float(0.0)
         for c in range(channels):
@@ -678,8 +689,8 @@ def texture_backward_kernel(
             for row in range(4):
                 at = base + t.rows[row]
                 if with_uv:
-                    gu += g * t.wy[row] * row_sum(texels, at, t.columns, t.sx)
-                    gv += g * t.sy[row] * row_sum(texels, at, t.columns, t.wx)
+                    gu += g * t.wy[row] * _weighted_row(texels, at, t.columns, t.sx)
+                    gv += g * t.sy[row] * _weighted_row(texels, at, t.columns, t.wx)
                 if with_texels:
                     for column in range(4):
                         wp.atomic_add(grad_texels, at + t.columns[column], g * t.wy[row] * t.wx[column])
@@ -688,7 +699,7 @@ def texture_backward_kernel(
 
 
 @wp.func
-def offer(
+def _record_outline(
     keys: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     axis: int,
@@ -716,7 +727,7 @@ def offer(
 
 
 @wp.func
-def offer_end(
+def _record_interval_end(
     keys: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     axis: int,
@@ -728,22 +739,26 @@ def offer_end(
     is_end: bool,
     key: int,
 ):
-    """`offer` to the pair around `value`, and to both its neighbours where it meets a pixel centre. origin: packed
+    """`_record_outline` to the pair around `value`, and to both its neighbours where it meets a pixel centre. origin: packed
     index that pixel 0 of the line would have."""
     if value > wp.float64(low - 1) and value < wp.float64(high):
         below = wp.int32(wp.floor(value))
-        offer(keys, face, axis, value, below, low, high, origin + below * step, step, is_end, key)
+        _record_outline(keys, face, axis, value, below, low, high, origin + below * step, step, is_end, key)
         nearest = wp.int32(wp.round(value))
         if wp.abs(value - wp.float64(nearest)) <= SNAP_PX:
             if nearest != below:
-                offer(keys, face, axis, value, nearest, low, high, origin + nearest * step, step, is_end, key)
+                _record_outline(
+                    keys, face, axis, value, nearest, low, high, origin + nearest * step, step, is_end, key
+                )
             other = nearest - 1
             if other != below:
-                offer(keys, face, axis, value, other, low, high, origin + other * step, step, is_end, key)
+                _record_outline(
+                    keys, face, axis, value, other, low, high, origin + other * step, step, is_end, key
+                )
 
 
 @wp.func
-def cut(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: wp.float64):
+def _clip_interval(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: wp.float64):
     """`span` (low, high, low edge, high edge) of a line cut by slope * s + base >= 0; empty where high < low."""
     low = span[0]
     high = span[1]
@@ -766,22 +781,22 @@ def cut(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: wp.float64):
 
 
 @wp.func
-def bits_at(words: wp.array(dtype=wp.uint64), first: int, count: int):
+def _read_bits(words: wp.array(dtype=wp.uint64), first: int, count: int):
     """`count` bits, 1 to 64, from bit `first` on; the lowest is bit `first`. Reads one word beyond them."""
     word = first >> 6
     bit = wp.uint64(first & 63)
     high = (words[word + 1] << wp.uint64(1)) << (wp.uint64(63) - bit)
-    return ((words[word] >> bit) | high) & (ALL >> wp.uint64(64 - count))
+    return ((words[word] >> bit) | high) & (ALL_BITS >> wp.uint64(64 - count))
 
 
 @wp.func
-def any_bit(words: wp.array(dtype=wp.uint64), x: int, x_end: int, y: int, y_end: int, origin: int, width: int):
+def _any_bit(words: wp.array(dtype=wp.uint64), x: int, x_end: int, y: int, y_end: int, origin: int, width: int):
     """Whether a bit is set in columns [x, x_end) of rows [y, y_end)."""
     seen = wp.uint64(0)
     if x_end - x <= 64:
         at = origin + y * width + x
         last = origin + y_end * width + x
-        keep = ALL >> wp.uint64(64 - (x_end - x))
+        keep = ALL_BITS >> wp.uint64(64 - (x_end - x))
         while at < last and seen == wp.uint64(0):
             word = at >> 6
             bit = wp.uint64(at & 63)
@@ -791,19 +806,19 @@ def any_bit(words: wp.array(dtype=wp.uint64), x: int, x_end: int, y: int, y_end:
         for row in range(y, y_end):
             first = int(x)
             while first < x_end:
-                seen = seen | bits_at(words, origin + row * width + first, wp.min(x_end - first, 64))
+                seen = seen | _read_bits(words, origin + row * width + first, wp.min(x_end - first, 64))
                 first += 64
     return seen != wp.uint64(0)
 
 
 @wp.func
-def low_place(bits: wp.uint64):
+def _lowest_bit(bits: wp.uint64):
     """The place, 0 to 63, of the lowest bit that is set."""
     return wp.int32(wp.bit_count((bits & (~bits + wp.uint64(1))) - wp.uint64(1)))
 
 
 @wp.kernel
-def hit_kernel(
+def _hit_kernel(
     start: int,
     face: wp.array(dtype=wp.int32),
     hits: wp.array(dtype=wp.uint64),
@@ -820,67 +835,67 @@ def hit_kernel(
 
 
 @wp.kernel
-def mark_kernel(
+def _mark_boundaries_kernel(
     start: int,
     parts: wp.array2d(dtype=wp.int32),
     hits: wp.array(dtype=wp.uint64),
-    beside: wp.array(dtype=wp.uint64),
+    boundary: wp.array(dtype=wp.uint64),
     right: wp.array(dtype=wp.uint64),
     below: wp.array(dtype=wp.uint64),
-    either: wp.array(dtype=wp.uint64),
+    right_or_below: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
     """64 packed pixels: in `right` and `below` a bit where the next pixel in the row or column is hit and this one is
-    not, or the other way, with an empty key; in `either` both; in `beside` where any of the four neighbours differs
+    not, or the other way, with an empty key; in `right_or_below` both; in `boundary` where any of the four neighbours differs
     so."""
     word = start + wp.tid()
     i = int(64 * word)
     end = wp.min(i + 64, keys.shape[1])
-    beside_bits = wp.uint64(0)
+    boundary_bits = wp.uint64(0)
     right_bits = wp.uint64(0)
     below_bits = wp.uint64(0)
     while i < end:  # a run of pixels in one row
-        part = find_part(parts, i)
+        part = _find_part(parts, i)
         width = parts[part, X1] - parts[part, X0]
         within = i - parts[part, OFFSET]
         y = within // width
         x = within - y * width
         count = wp.min(end - i, width - x)
-        run = ALL >> wp.uint64(64 - count)
-        here = bits_at(hits, i, count)
-        to_right = here ^ bits_at(hits, i + 1, count)
+        run = ALL_BITS >> wp.uint64(64 - count)
+        here = _read_bits(hits, i, count)
+        to_right = here ^ _read_bits(hits, i + 1, count)
         if x + count == width:
             to_right = to_right & (run >> wp.uint64(1))
         to_below = wp.uint64(0)
         if parts[part, Y0] + y + 1 < parts[part, Y1]:
-            to_below = here ^ bits_at(hits, i + width, count)
+            to_below = here ^ _read_bits(hits, i + width, count)
         differs = to_right | to_below
         if x > 0:
-            differs = differs | (here ^ bits_at(hits, i - 1, count))
+            differs = differs | (here ^ _read_bits(hits, i - 1, count))
         else:
             differs = differs | ((here ^ (here << wp.uint64(1))) & run & ~wp.uint64(1))
         if y > 0:
-            differs = differs | (here ^ bits_at(hits, i - width, count))
+            differs = differs | (here ^ _read_bits(hits, i - width, count))
         place = wp.uint64(i & 63)
         right_bits = right_bits | (to_right << place)
         below_bits = below_bits | (to_below << place)
-        beside_bits = beside_bits | (differs << place)
+        boundary_bits = boundary_bits | (differs << place)
         i += count
-    beside[word] = beside_bits
+    boundary[word] = boundary_bits
     right[word] = right_bits
     below[word] = below_bits
-    either[word] = right_bits | below_bits
+    right_or_below[word] = right_bits | below_bits
     while right_bits != wp.uint64(0):
-        keys[0, 64 * word + low_place(right_bits)] = wp.int64(-1)
+        keys[0, 64 * word + _lowest_bit(right_bits)] = wp.int64(-1)
         right_bits = right_bits & (right_bits - wp.uint64(1))
     while below_bits != wp.uint64(0):
-        keys[1, 64 * word + low_place(below_bits)] = wp.int64(-1)
+        keys[1, 64 * word + _lowest_bit(below_bits)] = wp.int64(-1)
         below_bits = below_bits & (below_bits - wp.uint64(1))
 
 
 @wp.func
-def scan(
-    e: Edges,
+def _scan_line(
+    e: TriangleEdges,
     code: int,
     axis: int,
     line: int,
@@ -902,23 +917,23 @@ def scan(
     b1 = e.n1[other] * at + e.n1[2]
     b2 = e.n2[other] * at + e.n2[2]
     span = wp.vec4d(-FAR, FAR, ZERO, ZERO)
-    span = cut(span, e.n0[axis], b0, ZERO)
-    span = cut(span, e.n1[axis], b1, ONE)
-    span = cut(span, e.n2[axis], b2, ONE + ONE)
+    span = _clip_interval(span, e.n0[axis], b0, ZERO)
+    span = _clip_interval(span, e.n1[axis], b1, ONE)
+    span = _clip_interval(span, e.n2[axis], b2, ONE + ONE)
     slope = (e.n0[axis] + e.n1[axis]) + e.n2[axis]
     # w >= near is sum e <= |det| / near: a fourth side, which is never an outline.
-    span = cut(span, -slope, e.det / near - ((b0 + b1) + b2), wp.float64(3.0))
+    span = _clip_interval(span, -slope, e.det / near - ((b0 + b1) + b2), wp.float64(3.0))
     if span[0] <= span[1]:
         low_edge = wp.int32(span[2])
         high_edge = wp.int32(span[3])
         if low_edge < 3:
-            offer_end(keys, face, axis, span[0], low, high, origin, step, False, code + low_edge)
+            _record_interval_end(keys, face, axis, span[0], low, high, origin, step, False, code + low_edge)
         if high_edge < 3:
-            offer_end(keys, face, axis, span[1], low, high, origin, step, True, code + high_edge)
+            _record_interval_end(keys, face, axis, span[1], low, high, origin, step, True, code + high_edge)
 
 
 @wp.kernel
-def outline_kernel(
+def _outline_kernel(
     start: int,
     lanes: int,
     parts: wp.array2d(dtype=wp.int32),
@@ -929,7 +944,7 @@ def outline_kernel(
     face: wp.array(dtype=wp.int32),
     right: wp.array(dtype=wp.uint64),
     below: wp.array(dtype=wp.uint64),
-    either: wp.array(dtype=wp.uint64),
+    right_or_below: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
     """Finds for each marked pair of pixels the triangle's edge that reaches farthest from the hit to the empty one."""
@@ -947,34 +962,36 @@ def outline_kernel(
     if x1 <= x0 or row_end <= row:
         end = f
     while f < end:
-        box = bounds_of(faces[f], clip, boxes, near)
+        box = _triangle_bounds(faces[f], clip, boxes, near)
         # A pair may begin one pixel before the first that the triangle touches.
         xa = wp.max(box[0] - 1, x0)
         ya = wp.max(box[1] - 1, row)
         xb = wp.min(box[2] + 1, x1)
         yb = wp.min(box[3] + 1, row_end)
         if xa < xb and ya < yb:
-            if any_bit(either, xa, xb, ya, yb, origin, width):
-                e = edges_of(faces[f], clip, parts[part, CULL])
+            if _any_bit(right_or_below, xa, xb, ya, yb, origin, width):
+                e = _triangle_edges(faces[f], clip, parts[part, CULL])
                 if e.det > ZERO:
                     for y in range(wp.max(box[1], row), yb):
-                        if any_bit(right, xa, xb, y, y + 1, origin, width):
-                            scan(e, 3 * f, 0, y, x0, x1, origin + y * width, 1, near, face, keys)
+                        if _any_bit(right, xa, xb, y, y + 1, origin, width):
+                            _scan_line(e, 3 * f, 0, y, x0, x1, origin + y * width, 1, near, face, keys)
                     x = wp.max(box[0], x0)
                     while x < xb:
                         columns = wp.uint64(0)
                         for y in range(ya, yb):
-                            columns = columns | bits_at(below, origin + y * width + x, wp.min(xb - x, 64))
+                            columns = columns | _read_bits(below, origin + y * width + x, wp.min(xb - x, 64))
                         while columns != wp.uint64(0):
-                            column = x + low_place(columns)
-                            scan(e, 3 * f, 1, column, row, column_end, origin + column, width, near, face, keys)
+                            column = x + _lowest_bit(columns)
+                            _scan_line(
+                                e, 3 * f, 1, column, row, column_end, origin + column, width, near, face, keys
+                            )
                             columns = columns & (columns - wp.uint64(1))
                         x += 64
         f += lanes
 
 
 @wp.struct
-class Crossing:
+class OutlineCrossing:
     """An outline between a hit pixel and an empty neighbour: both pixels, the edge's corners, its edge function at
     both, which is 0 at the outline, how far from the hit it lies, and which of the pair (0, 1) it changes."""
 
@@ -989,7 +1006,7 @@ class Crossing:
 
 
 @wp.func
-def crossing(
+def _outline_crossing(
     axis: int,
     x: int,
     y: int,
@@ -999,7 +1016,7 @@ def crossing(
     faces: wp.array(dtype=wp.vec3i),
 ):
     """The outline on edge `code` = face * 3 + edge between pixel (x, y) and the next one along `axis`."""
-    found = Crossing()
+    found = OutlineCrossing()
     p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
     q = p + wp.vec3d(wp.float64(1 - axis), wp.float64(axis), ZERO)
     if first_is_hit:
@@ -1022,13 +1039,13 @@ def crossing(
 
 
 @wp.kernel
-def coverage_kernel(
+def _coverage_kernel(
     start: int,
     parts: wp.array2d(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
     faces: wp.array(dtype=wp.vec3i),
     face: wp.array(dtype=wp.int32),
-    beside: wp.array(dtype=wp.uint64),
+    boundary: wp.array(dtype=wp.uint64),
     right: wp.array(dtype=wp.uint64),
     below: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
@@ -1038,11 +1055,11 @@ def coverage_kernel(
     """64 packed pixels: coverage of those that a hit and an empty pixel meet at, and `choice`: the edge that
     decided it * 4 + the neighbour's side, -1 where none did."""
     word = start + wp.tid()
-    bits = beside[word]
+    bits = boundary[word]
     while bits != wp.uint64(0):
-        i = 64 * word + low_place(bits)
+        i = 64 * word + _lowest_bit(bits)
         bits = bits & (bits - wp.uint64(1))
-        part = find_part(parts, i)
+        part = _find_part(parts, i)
         width = parts[part, X1] - parts[part, X0]
         row = (i - parts[part, OFFSET]) // width
         column = i - parts[part, OFFSET] - row * width
@@ -1061,15 +1078,15 @@ def coverage_kernel(
             y = row - back * axis
             if x >= 0 and y >= 0:
                 pair = i - back * step
-                marked = bits_at(below, pair, 1)
+                marked = _read_bits(below, pair, 1)
                 if axis == 0:
-                    marked = bits_at(right, pair, 1)
+                    marked = _read_bits(right, pair, 1)
                 if marked != wp.uint64(0):
                     key = keys[axis, pair]
                     if key >= wp.int64(0):
                         code = wp.int32(key & wp.int64(0xFFFFFFFF))
                         first_is_hit = hit != (back == 1)
-                        c = crossing(
+                        c = _outline_crossing(
                             axis, parts[part, X0] + x, parts[part, Y0] + y, first_is_hit, code, clip, faces
                         )
                         amount = wp.abs(HALF - c.t)
@@ -1086,25 +1103,25 @@ def coverage_kernel(
 
 
 @wp.kernel
-def coverage_backward_kernel(
+def _coverage_backward_kernel(
     start: int,
     parts: wp.array2d(dtype=wp.int32),
     clip: wp.array(dtype=wp.vec3f),
     faces: wp.array(dtype=wp.vec3i),
     face: wp.array(dtype=wp.int32),
-    beside: wp.array(dtype=wp.uint64),
+    boundary: wp.array(dtype=wp.uint64),
     choice: wp.array(dtype=wp.int64),
     grad_out: wp.array(dtype=wp.float32),
     grad_clip: wp.array(dtype=wp.vec3d),
 ):
     word = start + wp.tid()
-    bits = beside[word]
+    bits = boundary[word]
     while bits != wp.uint64(0):
-        i = 64 * word + low_place(bits)
+        i = 64 * word + _lowest_bit(bits)
         bits = bits & (bits - wp.uint64(1))
         chosen = choice[i]
         if chosen >= wp.int64(0):
-            part = find_part(parts, i)
+            part = _find_part(parts, i)
             width = parts[part, X1] - parts[part, X0]
             row = (i - parts[part, OFFSET]) // width
             column = i - parts[part, OFFSET] - row * width
@@ -1115,7 +1132,7 @@ def coverage_backward_kernel(
             x = parts[part, X0] + column - back * (1 - axis)
             y = parts[part, Y0] + row - back * axis
             hit = face[i] >= 0
-            c = crossing(axis, x, y, hit != (back == 1), code, clip, faces)
+            c = _outline_crossing(axis, x, y, hit != (back == 1), code, clip, faces)
             # An empty pixel gets t - 1/2, a hit one keeps 1/2 + t: both grow with t = e_hit / (e_hit - e_empty), and
             # e = p . (a x b).
             length = c.e_hit - c.e_empty
@@ -1129,28 +1146,28 @@ def rasterize(
     clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterPlan]:
     """See `verbs.rasterize`. Returns face (T,) int32, depth (T,) and what `antialias` can use again."""
-    plan = _plan(clip, faces, face_ranges, layout, near, cull)
+    plan = _make_plan(clip, faces, face_ranges, layout, near, cull)
     size = layout.size
-    keys = torch.full((size,), int(NOTHING), dtype=torch.int64, device=clip.device)
+    keys = torch.full((size,), int(EMPTY_KEY), dtype=torch.int64, device=clip.device)
     face = torch.empty(size, dtype=torch.int32, device=clip.device)
     depth = torch.empty(size, dtype=torch.float32, device=clip.device)
     if size:
-        order = _front_first(clip, faces, face_ranges, cull)
+        order = _front_to_back_order(clip, faces, face_ranges, cull)
         high, wide = (
             (layout.rects[:, 2:] - layout.rects[:, :2]).amax(dim=0).flip(0).tolist() if len(order) else (0, 0)
         )
-        tiles = clip.new_empty(len(plan.parts), -(-high // TILE), -(-wide // TILE), dtype=torch.float32)
+        tiles = clip.new_empty(len(plan.parts), -(-high // TILE_PX), -(-wide // TILE_PX), dtype=torch.float32)
         inputs = [
             plan.lanes,
             array(plan.parts),
-            *_corners(clip, faces),
-            _boxes(plan),
+            *_mesh_arrays(clip, faces),
+            _box_array(plan),
             near,
             array(order),
             array(tiles),
             array(keys),
         ]
-        launch(rasterize_kernel, plan.cuts, inputs, (), clip.device)
+        launch(_rasterize_kernel, plan.cuts, inputs, (), clip.device)
         launch(unpack_kernel, split_range(size), [array(keys), array(face), array(depth)], (), clip.device)
     return face, depth, plan
 
@@ -1186,9 +1203,9 @@ class _Interpolate(torch.autograd.Function):
         ctx.save_for_backward(fragments.face, clip, faces, attributes)
         ctx.layout = fragments.layout
         out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
-        hits = [array(fragments.face), *_layout(fragments.layout)]
-        inputs = [*hits, *_corners(clip, faces), _floats(attributes), array(out)]
-        launch(interpolate_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
+        hits = [array(fragments.face), *_layout_arrays(fragments.layout)]
+        inputs = [*hits, *_mesh_arrays(clip, faces), _contiguous_array(attributes), array(out)]
+        launch(_interpolate_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
         return out
 
     @staticmethod
@@ -1199,12 +1216,12 @@ class _Interpolate(torch.autograd.Function):
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
         grad_attributes = torch.zeros_like(attributes, memory_format=torch.contiguous_format)
         inputs = [
-            *(array(face), *_layout(ctx.layout), *_corners(clip, faces)),
-            *(_floats(attributes), _floats(grad_out), with_clip, with_attributes),
+            *(array(face), *_layout_arrays(ctx.layout), *_mesh_arrays(clip, faces)),
+            *(_contiguous_array(attributes), _contiguous_array(grad_out), with_clip, with_attributes),
             *(array(grad_clip, wp.vec3d), array(grad_attributes)),
         ]
         count = face.shape[0] if grad_out.numel() else 0
-        launch(interpolate_backward_kernel, _one(count), inputs, (), clip.device)
+        launch(_interpolate_backward_kernel, _single_thread(count), inputs, (), clip.device)
         to_clip = grad_clip.to(clip.dtype) if with_clip else None
         return None, to_clip, None, grad_attributes if with_attributes else None
 
@@ -1215,8 +1232,8 @@ class _Texture(torch.autograd.Function):
         ctx.save_for_backward(texels, *crops, offsets, uv)
         ctx.strides, ctx.clamp = strides, clamp
         out = uv.new_zeros(uv.shape[0], strides[0])
-        inputs = [*_sampling(texels, strides, crops, offsets, uv), clamp, array(out)]
-        launch(texture_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
+        inputs = [*_sampling_inputs(texels, strides, crops, offsets, uv), clamp, array(out)]
+        launch(_texture_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
         return out
 
     @staticmethod
@@ -1227,13 +1244,13 @@ class _Texture(torch.autograd.Function):
         grad_uv = torch.zeros_like(uv, memory_format=torch.contiguous_format)
         grad_texels = torch.zeros_like(texels, memory_format=torch.contiguous_format)
         inputs = [
-            *_sampling(texels, ctx.strides, (crop_rects, crop_offsets), offsets, uv),
-            *(ctx.clamp, _floats(grad_out), with_uv, with_texels),
+            *_sampling_inputs(texels, ctx.strides, (crop_rects, crop_offsets), offsets, uv),
+            *(ctx.clamp, _contiguous_array(grad_out), with_uv, with_texels),
             *(array(grad_uv, wp.vec2f), array(grad_texels.view(-1))),
         ]
         count = uv.shape[0] if grad_out.numel() else 0
-        edges = _one(count) if with_texels else split_range(count)
-        launch(texture_backward_kernel, edges, inputs, (), uv.device)
+        edges = _single_thread(count) if with_texels else split_range(count)
+        launch(_texture_backward_kernel, edges, inputs, (), uv.device)
         return grad_texels if with_texels else None, None, None, None, grad_uv if with_uv else None, None
 
 
@@ -1242,22 +1259,39 @@ class _Antialias(torch.autograd.Function):
     def forward(ctx, fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
         plan = fragments.plan
         if plan is None or not plan.matches(clip):
-            plan = _plan(clip, faces, fragments.face_ranges, fragments.layout, fragments.near, fragments.cull)
+            plan = _make_plan(clip, faces, fragments.face_ranges, fragments.layout, fragments.near, fragments.cull)
         size, like = fragments.face.shape[0], fragments.face
         coverage = torch.empty(size, dtype=clip.dtype, device=clip.device)
         count = (size + 63) // 64
         marks = torch.empty((5, count + 1), dtype=torch.int64, device=clip.device)  # the last is only looked at
         keys, choice = like.new_empty((2, size), dtype=torch.int64), like.new_empty(size, dtype=torch.int64)
         if size:
-            parts, mesh, face = array(plan.parts), _corners(clip, faces), array(like)
-            hits, beside, right, below, either = (array(m, wp.uint64) for m in marks)
-            found, seen, edges = array(keys), array(coverage), _words(size)
-            launch(hit_kernel, edges, [face, hits, seen], (), like.device)
-            launch(mark_kernel, edges, [parts, hits, beside, right, below, either, found], (), like.device)
-            inputs = [plan.lanes, parts, *mesh, _boxes(plan), fragments.near, face, right, below, either, found]
-            launch(outline_kernel, plan.outline_cuts, inputs, (), like.device)
-            inputs = [parts, *mesh, face, beside, right, below, found, array(choice), seen]
-            launch(coverage_kernel, edges, inputs, (), like.device)
+            parts, mesh, face = array(plan.parts), _mesh_arrays(clip, faces), array(like)
+            hits, boundary, right, below, right_or_below = (array(m, wp.uint64) for m in marks)
+            found, seen, edges = array(keys), array(coverage), _split_words(size)
+            launch(_hit_kernel, edges, [face, hits, seen], (), like.device)
+            launch(
+                _mark_boundaries_kernel,
+                edges,
+                [parts, hits, boundary, right, below, right_or_below, found],
+                (),
+                like.device,
+            )
+            inputs = [
+                plan.lanes,
+                parts,
+                *mesh,
+                _box_array(plan),
+                fragments.near,
+                face,
+                right,
+                below,
+                right_or_below,
+                found,
+            ]
+            launch(_outline_kernel, plan.outline_cuts, inputs, (), like.device)
+            inputs = [parts, *mesh, face, boundary, right, below, found, array(choice), seen]
+            launch(_coverage_kernel, edges, inputs, (), like.device)
         ctx.save_for_backward(like, clip, faces, marks[1], choice)
         ctx.plan = plan
         return coverage
@@ -1265,29 +1299,29 @@ class _Antialias(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_out: Tensor):
-        face, clip, faces, beside, choice = ctx.saved_tensors
+        face, clip, faces, boundary, choice = ctx.saved_tensors
         grad_clip = torch.zeros_like(clip, dtype=torch.float64)
         if face.shape[0]:
             inputs = [
-                *(array(ctx.plan.parts), *_corners(clip, faces), array(face)),
-                *(array(beside, wp.uint64), array(choice)),
-                *(_floats(grad_out), array(grad_clip, wp.vec3d)),
+                *(array(ctx.plan.parts), *_mesh_arrays(clip, faces), array(face)),
+                *(array(boundary, wp.uint64), array(choice)),
+                *(_contiguous_array(grad_out), array(grad_clip, wp.vec3d)),
             ]
-            launch(coverage_backward_kernel, _one(beside.shape[0] - 1), inputs, (), face.device)
+            launch(_coverage_backward_kernel, _single_thread(boundary.shape[0] - 1), inputs, (), face.device)
         return None, grad_clip.to(clip.dtype), None
 
 
-def _one(count: int) -> list[int]:
+def _single_thread(count: int) -> list[int]:
     """[0, count) for one thread: its pixels add to vertices or texels that they may share."""
     return [0, count]
 
 
-def _words(size: int) -> list[int]:
+def _split_words(size: int) -> list[int]:
     """Shares of the words of 64 bits that hold `size` bits."""
     return [*(edge // 64 for edge in split_range(size)[:-1]), (size + 63) // 64]
 
 
-def _plan(
+def _make_plan(
     clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
 ) -> RasterPlan:
     """How the threads share the draws, and where the vertices fall."""
@@ -1300,11 +1334,11 @@ def _plan(
         cuts = outlines = [0, parts.shape[0] * lanes]
     boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
     inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
-    launch(corner_kernel, split_range(clip.shape[0]), inputs, (), clip.device)
+    launch(_corner_kernel, split_range(clip.shape[0]), inputs, (), clip.device)
     return RasterPlan(parts, lanes, cuts, outlines, boxes, clip.detach(), tensor_version(clip))
 
 
-def _front_first(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
+def _front_to_back_order(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
     """Faces (F,) int32 from the nearest to the farthest, where that is worth it: of one draw on a CPU whose backs
     are seen too, so that most of its faces lie behind others. Else none, (0,).
     """
@@ -1317,24 +1351,24 @@ def _front_first(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor 
     return order
 
 
-def _corners(clip: Tensor, faces: Tensor) -> list[Any]:
+def _mesh_arrays(clip: Tensor, faces: Tensor) -> list[Any]:
     """Vertices, and the three of each face."""
     return [array(clip.contiguous(), wp.vec3f), array(int32_faces(faces), wp.vec3i)]
 
 
-def _boxes(plan: RasterPlan) -> Any:
+def _box_array(plan: RasterPlan) -> Any:
     return array(plan.boxes, wp.vec4i)
 
 
-def _layout(layout: PixelLayout) -> list[Any]:
+def _layout_arrays(layout: PixelLayout) -> list[Any]:
     return [array(layout.rects.contiguous()), array(layout.offsets.contiguous())]
 
 
-def _floats(values: Tensor) -> Any:
+def _contiguous_array(values: Tensor) -> Any:
     return array(values.contiguous())
 
 
-def _sampling(texels: Tensor, strides, crops, offsets: Tensor, uv: Tensor) -> list:
+def _sampling_inputs(texels: Tensor, strides, crops, offsets: Tensor, uv: Tensor) -> list:
     flat = array(texels.contiguous().view(-1))
     places = [array(t.contiguous()) for t in (*crops, offsets)]
     return [flat, *strides, *places, array(uv.contiguous(), wp.vec2f)]

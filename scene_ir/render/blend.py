@@ -16,15 +16,15 @@ from scene_ir.raster.verbs import Backend
 from scene_ir.render.model import SATURATED
 from scene_ir.types import Occluder
 
-_STANDING_M = 0.4
+_OCCLUDER_WIDTH_M = 0.4
 """Width of what stands in front of vehicles, on the ground: about a person's."""
 
-Span = tuple[slice, tuple[slice, slice], tuple[int, int]]
+LayerSpan = tuple[slice, tuple[slice, slice], tuple[int, int]]
 """Packed pixels of a layer, its rows and columns in the picture, and its (height, width) px."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BlendPlan:
     """What is blended where. order: the layers back to front; spans, shadow_spans: of each draw; empty rectangles
     are left out of `order` and `shadows`, the draws that have a shadow."""
 
@@ -32,11 +32,11 @@ class Plan:
     shadow_layout: PixelLayout
     order: tuple[int, ...]
     shadows: tuple[int, ...]
-    spans: tuple[Span, ...]
-    shadow_spans: tuple[Span, ...]
+    spans: tuple[LayerSpan, ...]
+    shadow_spans: tuple[LayerSpan, ...]
 
     @classmethod
-    def of(cls, layout: PixelLayout, shadow_layout: PixelLayout, order: Sequence[int]) -> Plan:
+    def from_layouts(cls, layout: PixelLayout, shadow_layout: PixelLayout, order: Sequence[int]) -> BlendPlan:
         """order: all layers, back to front."""
         spans, shadow_spans = _spans(layout), _spans(shadow_layout)
         drawn = tuple(i for i in order if min(spans[i][2]) > 0)
@@ -49,9 +49,9 @@ class Plan:
         return [size[0] * size[1] for _, _, size in self.spans]
 
 
-def _spans(layout: PixelLayout) -> tuple[Span, ...]:
+def _spans(layout: PixelLayout) -> tuple[LayerSpan, ...]:
     """Where the packed pixels of each draw go."""
-    out: list[Span] = []
+    out: list[LayerSpan] = []
     for (packed, size), (x0, y0, _, _) in zip(layout.spans(), layout.rects.tolist(), strict=True):
         out.append((packed, (slice(y0, y0 + size[0]), slice(x0, x0 + size[1])), size))
     return tuple(out)
@@ -80,7 +80,7 @@ def clamp_colour(image: Tensor) -> Tensor:
     return _Clamp.apply(image)
 
 
-def uncovered(opacity: Tensor, plan: Plan, frame_hw: tuple[int, int]) -> Tensor:
+def visible_background(opacity: Tensor, plan: BlendPlan, frame_hw: tuple[int, int]) -> Tensor:
     """How much of what lies behind all layers shows, (H, W). opacity: (T,). Differentiable to opacity."""
     shows = opacity.new_ones(frame_hw)
     for i in plan.order:
@@ -94,7 +94,7 @@ def composite(
     canvas: Tensor,
     depth: Tensor,
     what: tuple[Tensor, Tensor, Tensor, Tensor],
-    plan: Plan,
+    plan: BlendPlan,
     clamped: bool,
     backend: Backend = "reference",
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -111,10 +111,12 @@ def composite(
         from scene_ir.render.kernels import blending
 
         rects = [(plan.layout, plan.order), (plan.shadow_layout, plan.shadows)]
-        layers, shadows = (_stack(layout, order) for layout, order in rects)
+        layers, shadows = (_stack_inputs(layout, order) for layout, order in rects)
         edges = blending.row_edges(canvas.shape[1], torch.cat([layers[1], shadows[1]]).cpu().numpy())
-        return blending.Blend.apply(canvas, factor, colour, opacity, z, depth, (shadows, layers, edges), clamped)
-    image = _Blend.apply(canvas, factor, colour[:, : canvas.shape[0]], opacity, plan)
+        return blending.BlendLayers.apply(
+            canvas, factor, colour, opacity, z, depth, (shadows, layers, edges), clamped
+        )
+    image = _ReferenceBlend.apply(canvas, factor, colour[:, : canvas.shape[0]], opacity, plan)
     if clamped:
         image = torch.cat([clamp_colour(image[:3]), image[3:]])
     with torch.no_grad():
@@ -128,7 +130,7 @@ def composite(
     return image, nearest, number
 
 
-def shown_rects(layout: PixelLayout, shown: Tensor) -> Tensor:
+def visible_rects(layout: PixelLayout, shown: Tensor) -> Tensor:
     """Of each draw the rectangle (N, 4) int64 px, half-open, of its pixels where any of `shown` (T, C) is true,
     and of one more around them, which the smallest change may show. Empty where nothing is.
     """
@@ -146,16 +148,18 @@ def shown_rects(layout: PixelLayout, shown: Tensor) -> Tensor:
     return torch.tensor(rects, dtype=torch.int64).reshape(-1, 4)
 
 
-def _stack(layout: PixelLayout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+def _stack_inputs(layout: PixelLayout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
     return torch.tensor(order, dtype=torch.int32, device=layout.rects.device), layout.rects, layout.offsets
 
 
-class _Blend(torch.autograd.Function):
+class _ReferenceBlend(torch.autograd.Function):
     """Works in place on one copy of the picture in both directions, where autograd would copy it for each
     layer."""
 
     @staticmethod
-    def forward(ctx: Any, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: Plan) -> Tensor:
+    def forward(
+        ctx: Any, canvas: Tensor, shadow: Tensor, colour: Tensor, opacity: Tensor, plan: BlendPlan
+    ) -> Tensor:
         out = canvas.clone(memory_format=torch.contiguous_format)
         under: list[Tensor] = []
         for packed, (rows, columns), size in (plan.shadow_spans[i] for i in plan.shadows):
@@ -178,7 +182,7 @@ class _Blend(torch.autograd.Function):
         to_shadow = torch.zeros_like(shadow)
         to_colour = opacity.new_zeros(opacity.shape[0], ctx.channels)
         to_opacity = torch.zeros_like(opacity)
-        plan: Plan = ctx.plan
+        plan: BlendPlan = ctx.plan
         steps = len(plan.shadows)
         for k in range(len(plan.order) - 1, -1, -1):
             packed, (rows, columns), size = plan.spans[plan.order[k]]
@@ -202,7 +206,7 @@ def paint_order(
     size_lhw (N, 3) m, yaw (N,) rad, translation (N, 3) m; centre (3,) m, where the camera stands. Of two
     footprints apart, the one on the camera's side of the line between them is in front (a car beside a long truck
     may be farther by its middle and yet hide it); where that says nothing, or in a cycle, the nearest point
-    decides. standing: (K, 4, 2) m, footprints of things that are no objects, see `standing_footprints`: they are
+    decides. standing: (K, 4, 2) m, footprints of things that are no objects, see `occluder_footprints`: they are
     N, N + 1, ..., and come right after the last object that they can hide, so that the objects keep their order.
     """
     count = int(translation.shape[0])
@@ -222,10 +226,10 @@ def paint_order(
         ]  # the first that hides none of the others; in a cycle, the first
         order.append(chosen)
         remaining.remove(chosen)
-    return order if standing is None or not len(standing) else _with_standing(order, corners, standing, eye)
+    return order if standing is None or not len(standing) else _insert_occluders(order, corners, standing, eye)
 
 
-def _with_standing(order: list[int], corners: np.ndarray, standing: np.ndarray, eye: np.ndarray) -> list[int]:
+def _insert_occluders(order: list[int], corners: np.ndarray, standing: np.ndarray, eye: np.ndarray) -> list[int]:
     """The order of N objects with K standing things among them. corners (N, 4, 2), standing (K, 4, 2), eye (2,),
     m."""
     count, things = len(corners), len(standing)
@@ -243,7 +247,7 @@ def _with_standing(order: list[int], corners: np.ndarray, standing: np.ndarray, 
     return found
 
 
-def standing_footprints(front: Sequence[Occluder], matrix: Tensor) -> np.ndarray:
+def occluder_footprints(front: Sequence[Occluder], matrix: Tensor) -> np.ndarray:
     """Corners (K, 4, 2) m, (x, z), of small squares where things stand. matrix: (3, 4) of the camera."""
     inverse = np.linalg.inv(matrix[:, :3].detach().cpu().double().numpy())
     centre = -inverse @ matrix[:, 3].detach().cpu().double().numpy()
@@ -252,7 +256,7 @@ def standing_footprints(front: Sequence[Occluder], matrix: Tensor) -> np.ndarray
         height, width = thing.foreground.values.shape[1:]
         foot = np.array([thing.foreground.x0 + (width - 1) / 2, thing.foreground.y0 + height - 1.0, 1.0])
         places.append((centre + inverse @ foot * thing.depth_m)[[0, 2]])
-    square = _STANDING_M / 2 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    square = _OCCLUDER_WIDTH_M / 2 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return np.array(places).reshape(-1, 1, 2) + square
 
 

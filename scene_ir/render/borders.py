@@ -16,12 +16,12 @@ from torch import Tensor
 from scene_ir.geometry import weld_vertices
 from scene_ir.raster.verbs import Backend
 
-WALK = 4
+MAX_WALK_FACES = 4
 """How many faces further a surface is followed between two looks."""
 
 
 @dataclass(frozen=True, slots=True)
-class Edges:
+class MeshEdges:
     """Of a mesh's faces (F, 3). across (3F,) int64: beyond edge 3 * face + i, opposite to the face's corner i, the
     edge of who shares it, -1 where nobody does or more than one. creased (3F,): whether looks change there.
     onwards (F, 3) int64: the faces beyond edges at which they do not, -1 where they do.
@@ -32,7 +32,7 @@ class Edges:
     onwards: Tensor
 
     @classmethod
-    def of(cls, vertices: Tensor, faces: Tensor, looks: Tensor, crease_cos: float) -> Edges:
+    def from_mesh(cls, vertices: Tensor, faces: Tensor, looks: Tensor, crease_cos: float) -> MeshEdges:
         """vertices (V, 3): at one place they are one. looks (F, C): of faces' materials. An
         edge is creased between two that differ, or whose normals' product is less than `crease_cos`.
         """
@@ -53,25 +53,25 @@ class Edges:
         creased |= across < 0
         return cls(across, creased, torch.where(creased, -1, there).reshape(-1, 3))
 
-    def smooth(self, one: Tensor, other: Tensor) -> Tensor:
+    def join_smoothly(self, one: Tensor, other: Tensor) -> Tensor:
         """Whether faces (P,) share an edge with others (P,) at which looks do not change."""
         return (self.onwards.index_select(0, one) == other[:, None]).any(dim=1)
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class VisibleFace:
     """face (B,) int64, and where (B,) on its way it is seen, as a share."""
 
     face: Tensor
     share: Tensor
 
-    def mirrored(self) -> Sight:
+    def reversed(self) -> VisibleFace:
         """The same on ways from their ends."""
-        return Sight(self.face, 1 - self.share)
+        return VisibleFace(self.face, 1 - self.share)
 
 
 @dataclass(frozen=True, slots=True)
-class Borders:
+class SurfaceBorders:
     """Borders (B,) on ways. way (B,) int64: which; share (B,) in [0, 1]: where on it, differentiable; across (B,):
     whether it runs across the way rather than along it; before, after: what is seen on both sides.
     """
@@ -79,25 +79,25 @@ class Borders:
     way: Tensor
     share: Tensor
     across: Tensor
-    before: Sight
-    after: Sight
+    before: VisibleFace
+    after: VisibleFace
 
 
-def borders(
+def find_borders(
     clip: Tensor,
     faces: Tensor,
-    edges: Edges,
+    edges: MeshEdges,
     seen: tuple[Tensor, Tensor],
     start: Tensor,
     step: Tensor,
     backend: Backend,
-) -> Borders:
+) -> SurfaceBorders:
     """The borders on ways from looks (P, 3), (x, y, 1), to those a step (P, 3) further, of which the ones see the
     first faces of `seen` (P,), (P,) int64, and the others the second. clip (V, 3), faces (F, 3).
     """
     points, end = clip.detach().to(torch.float64), start + step
-    leave = Walk.over(points, faces, edges.across, seen, start, end, backend)
-    enter = Walk.over(points, faces, edges.across, (seen[1], seen[0]), end, start, backend)
+    leave = MeshWalk.trace(points, faces, edges.across, seen, start, end, backend)
+    enter = MeshWalk.trace(points, faces, edges.across, (seen[1], seen[0]), end, start, backend)
     # How much nearer the first surface is, as inverse depth, where it ends and where the second one begins.
     nearer = leave.plane - enter.plane
     at_leave, at_enter = (
@@ -112,49 +112,51 @@ def borders(
     way, edge, near, far = leave.creases(edges.creased, until)
     way_back, edge_back, near_back, far_back = enter.creases(edges.creased, 1 - until)
     apart = (~leave.met & ~enter.met).nonzero()[:, 0]
-    one, other = leave.last(apart, until), enter.last(apart, 1 - until).mirrored()
+    one, other = leave.last_face(apart, until), enter.last_face(apart, 1 - until).reversed()
     ends = torch.where(first_ends, leave.edge[:, -1], enter.edge[:, -1])
     ways = torch.cat([way, way_back, apart])
-    share, slope = _cut(clip, faces, torch.cat([edge, edge_back, ends[apart]]), start[ways], end[ways])
+    share, slope = _cross_edges(clip, faces, torch.cat([edge, edge_back, ends[apart]]), start[ways], end[ways])
     at = through[apart].nonzero()[:, 0]
     if len(at):
-        plane = _plane(clip, faces, leave.face[apart[at], -1]) - _plane(clip, faces, enter.face[apart[at], -1])
+        plane = _face_planes(clip, faces, leave.face[apart[at], -1]) - _face_planes(
+            clip, faces, enter.face[apart[at], -1]
+        )
         where = at + len(ways) - len(apart)
         met = -(plane * start[ways[where]]).sum(dim=1) / (plane * step[ways[where]]).sum(dim=1)
         share, slope = share.index_put((where,), met), slope.index_put((where,), plane.detach()[:, :2])
-    return Borders(
+    return SurfaceBorders(
         ways,
         share.clamp(0, 1),
         _runs_across(slope, step[ways]),
-        _joined(near, far_back.mirrored(), one),
-        _joined(far, near_back.mirrored(), other),
+        _concat_faces(near, far_back.reversed(), one),
+        _concat_faces(far, near_back.reversed(), other),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Rims:
+class SurfaceRims:
     """Where surfaces end on ways (P,) to looks that meet nothing. inner: the borders (B,) before that; end (B,):
     where on the borders' ways the surface ends, as a share, differentiable; across (P,): whether that end runs
     across the way rather than along it.
     """
 
-    inner: Borders
+    inner: SurfaceBorders
     end: Tensor
     across: Tensor
 
 
-def rims(
-    clip: Tensor, faces: Tensor, edges: Edges, seen: Tensor, start: Tensor, step: Tensor, backend: Backend
-) -> Rims:
-    """Of ways as those of `borders`, whose looks see the faces `seen` (P,) and, a step further, nothing."""
+def find_rims(
+    clip: Tensor, faces: Tensor, edges: MeshEdges, seen: Tensor, start: Tensor, step: Tensor, backend: Backend
+) -> SurfaceRims:
+    """Of ways as those of `find_borders`, whose looks see the faces `seen` (P,) and, a step further, nothing."""
     points, end = clip.detach().to(torch.float64), start + step
-    walk = Walk.over(points, faces, edges.across, (seen, torch.full_like(seen, -1)), start, end, backend)
+    walk = MeshWalk.trace(points, faces, edges.across, (seen, torch.full_like(seen, -1)), start, end, backend)
     way, edge, near, far = walk.creases(edges.creased, walk.end)
-    share, slope = _cut(clip, faces, edge, start[way], end[way])
-    ends, _ = _cut(clip, faces, walk.edge[way, -1], start[way], end[way])
-    _, slope_of_end = _cut(clip.detach(), faces, walk.edge[:, -1], start, end)
-    return Rims(
-        Borders(way, share.clamp(0, 1), _runs_across(slope, step[way]), near, far),
+    share, slope = _cross_edges(clip, faces, edge, start[way], end[way])
+    ends, _ = _cross_edges(clip, faces, walk.edge[way, -1], start[way], end[way])
+    _, slope_of_end = _cross_edges(clip.detach(), faces, walk.edge[:, -1], start, end)
+    return SurfaceRims(
+        SurfaceBorders(way, share.clamp(0, 1), _runs_across(slope, step[way]), near, far),
         torch.where(walk.end[way] < 1, ends.clamp(0, 1), 1.0),
         _runs_across(slope_of_end, step),
     )
@@ -167,14 +169,14 @@ def _runs_across(slope: Tensor, step: Tensor) -> Tensor:
     return (along > aside) | ((along == aside) & (heading[:, 0] > 0))
 
 
-def _joined(*sights: Sight) -> Sight:
-    return Sight(torch.cat([sight.face for sight in sights]), torch.cat([sight.share for sight in sights]))
+def _concat_faces(*sights: VisibleFace) -> VisibleFace:
+    return VisibleFace(torch.cat([sight.face for sight in sights]), torch.cat([sight.share for sight in sights]))
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
-    """From the faces that are seen at the start of ways towards their ends, over faces (P, WALK + 1). share, edge
-    (P, WALK + 1): where each is left, in [0, 1], and by which edge, 3 * face + edge; goes_on (P, WALK + 1):
+class MeshWalk:
+    """From the faces that are seen at the start of ways towards their ends, over faces (P, MAX_WALK_FACES + 1). share, edge
+    (P, MAX_WALK_FACES + 1): where each is left, in [0, 1], and by which edge, 3 * face + edge; goes_on (P, WALK + 1):
     whether to the next one. end (P,): where the last is left; plane (P, 3): its inverse depth at pixel (x, y, 1)
     is its product with it. met (P,): whether it is what is seen at the way's end.
     """
@@ -188,7 +190,7 @@ class Walk:
     met: Tensor
 
     @classmethod
-    def over(
+    def trace(
         cls,
         points: Tensor,
         faces: Tensor,
@@ -197,24 +199,26 @@ class Walk:
         start: Tensor,
         end: Tensor,
         backend: Backend,
-    ) -> Walk:
-        """Of points (V, 3) float64, faces and `Edges.across`: from the first of `seen` towards the second."""
+    ) -> MeshWalk:
+        """Of points (V, 3) float64, faces and `MeshEdges.across`: from the first of `seen` towards the second."""
         if backend == "warp":
-            from scene_ir.render.kernels.walks import walked
+            from scene_ir.render.kernels.mesh_walk import trace_walks
 
-            face, share, edge, goes_on, plane, met = walked(points, faces, across, seen, start, end, WALK)
+            face, share, edge, goes_on, plane, met = trace_walks(
+                points, faces, across, seen, start, end, MAX_WALK_FACES
+            )
             return cls(face, share, edge, goes_on, share[:, -1], plane, met)
         here, goal = seen
-        share, edge, plane, beyond = _left(points, faces, here, start, end)
+        share, edge, plane, beyond = _exit_face(points, faces, here, start, end)
         met, going = torch.zeros_like(here, dtype=torch.bool), torch.ones_like(here, dtype=torch.bool)
         chain, goes_on = [(here, share, edge)], []
-        for _ in range(WALK):
+        for _ in range(MAX_WALK_FACES):
             onto = across[edge]
             apex = points[faces.reshape(-1)[onto]]
             going = going & ~met & (share < 1) & (onto >= 0) & ((beyond * apex).sum(dim=1) > 0)
             met = met | (going & (onto // 3 == goal))
             at = going.nonzero()[:, 0]
-            left, *rest = _left(points, faces, onto[at] // 3, start[at], end[at])
+            left, *rest = _exit_face(points, faces, onto[at] // 3, start[at], end[at])
             further = (left.maximum(share[at]), *rest)
             share, edge, plane, beyond = (
                 old.index_put((at,), new) for old, new in zip((share, edge, plane, beyond), further, strict=True)
@@ -225,31 +229,31 @@ class Walk:
         goes_on.append(torch.zeros_like(going))
         return cls(face, shares, edges, torch.stack(goes_on, dim=1), share, plane, met)
 
-    def creases(self, creased: Tensor, room: Tensor) -> tuple[Tensor, Tensor, Sight, Sight]:
+    def creases(self, creased: Tensor, room: Tensor) -> tuple[Tensor, Tensor, VisibleFace, VisibleFace]:
         """Where looks change on the surface before `room` (P,), a share of the way: which ways (B,), by which
-        edges (B,), and what is seen nearer and farther. creased: as in `Edges`.
+        edges (B,), and what is seen nearer and farther. creased: as in `MeshEdges`.
         """
         way, place = (self.goes_on & (self.share < room[:, None]) & creased[self.edge]).nonzero(as_tuple=True)
-        near, far = self._sight(way, place, room), self._sight(way, place + 1, room)
+        near, far = self._visible_face(way, place, room), self._visible_face(way, place + 1, room)
         return way, self.edge[way, place], near, far
 
-    def last(self, way: Tensor, room: Tensor) -> Sight:
+    def last_face(self, way: Tensor, room: Tensor) -> VisibleFace:
         """The last that is seen on ways (B,) before `room` (P,)."""
         passed = (self.goes_on & (self.share < room[:, None])).sum(dim=1)
-        return self._sight(way, passed[way], room)
+        return self._visible_face(way, passed[way], room)
 
-    def _sight(self, way: Tensor, place: Tensor, room: Tensor) -> Sight:
+    def _visible_face(self, way: Tensor, place: Tensor, room: Tensor) -> VisibleFace:
         """The faces at places (B,) of walks (B,), midway between where they begin and where they are left."""
         begins = torch.where(place > 0, self.share[way, (place - 1).clamp_min(0)], 0.0)
         ends = self.share[way, place].minimum(room[way]).maximum(begins)
-        return Sight(self.face[way, place], (begins + ends) / 2)
+        return VisibleFace(self.face[way, place], (begins + ends) / 2)
 
 
-def _left(
+def _exit_face(
     points: Tensor, faces: Tensor, face: Tensor, start: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Where (P,) on ways from start to end (P, 3) faces (P,) are left, 1 where they are not; by which edge (P,),
-    3 * face + edge; their planes (P, 3), as in `Walk`; and the edge's normal (P, 3), whose product with what lies
+    3 * face + edge; their planes (P, 3), as in `MeshWalk`; and the edge's normal (P, 3), whose product with what lies
     beyond it is positive.
     """
     corners = points[faces[face].reshape(-1)].reshape(-1, 3, 3)
@@ -263,7 +267,7 @@ def _left(
     return share, 3 * face + edge, normals.sum(dim=1) / det, beyond
 
 
-def _cut(clip: Tensor, faces: Tensor, edge: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+def _cross_edges(clip: Tensor, faces: Tensor, edge: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     """Where (B,) edges (B,), 3 * face + edge, cross ways from start to end (B, 3), as a share, differentiable, 1/2
     where they do not; and the slopes (B, 2) of their edge functions.
     """
@@ -276,8 +280,8 @@ def _cut(clip: Tensor, faces: Tensor, edge: Tensor, start: Tensor, end: Tensor) 
     return share, normal.detach()[:, :2]
 
 
-def _plane(clip: Tensor, faces: Tensor, face: Tensor) -> Tensor:
-    """(B, 3) of faces (B,), as in `Walk`; differentiable."""
+def _face_planes(clip: Tensor, faces: Tensor, face: Tensor) -> Tensor:
+    """(B, 3) of faces (B,), as in `MeshWalk`; differentiable."""
     corners = clip.index_select(0, faces[face].reshape(-1)).reshape(-1, 3, 3).to(torch.float64)
     normals = torch.linalg.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
     return normals.sum(dim=1) / (corners[:, 0] * normals[:, 0]).sum(-1, keepdim=True)

@@ -15,10 +15,9 @@ import torch
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
-from scene_ir.render.environment import apply_foliage, apply_weather, shadow_softening
+from scene_ir.render.environment import PerturbedSun, apply_foliage, apply_weather, shadow_softening
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
-from scene_ir.render.sun import Sun
-from scene_ir.render.texture import Regions
+from scene_ir.render.texture import PaintRegions
 from scene_ir.types import Crop, Objects, Render, SceneIR
 
 
@@ -30,23 +29,23 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
 class Compositor(PreparedScene):
     """Draws perturbations of one scene; keeps what no parameter touches."""
 
-    _fixed: fast.Fixed | None = None
-    _before: Compositor | None = None
+    _fixed_geometry: fast.FixedGeometry | None = None
+    _compositor_before: Compositor | None = None
 
     @property
-    def fixed(self) -> fast.Fixed | None:
+    def fixed_geometry(self) -> fast.FixedGeometry | None:
         """What the fast kernels read, gathered on first use; None where they are not used."""
-        if self._fixed is None and self.texels is not None and self.settings.backend == "warp":
+        if self._fixed_geometry is None and self.texels is not None and self.settings.backend == "warp":
             with torch.no_grad():
-                self._fixed = fast.Fixed.of(self)
-        return self._fixed
+                self._fixed_geometry = fast.FixedGeometry.from_scene(self)
+        return self._fixed_geometry
 
-    def layers(self, objects: Objects, sun: Sun | None = None) -> ObjectLayers:
+    def draw_layers(self, objects: Objects, sun: PerturbedSun | None = None) -> ObjectLayers:
         """The objects drawn one by one, not yet blended. sun: as of `sun_of`."""
-        fixed = self.fixed
+        fixed = self.fixed_geometry
         if fixed is None:
-            return reference.layers(self, objects, self.find_visible(objects, sun), sun)
-        return _layers([self], self.batch, fixed, [objects], [sun])[0]
+            return reference.draw_layers(self, objects, self.find_visible(objects, sun), sun)
+        return _draw_layers([self], self.batch, fixed, [objects], [sun])[0]
 
     def render(self, perturbed: SceneIR) -> Render:
         """The picture of a perturbed scene; with nothing perturbed, the photograph. Where vehicles were exchanged,
@@ -54,16 +53,16 @@ class Compositor(PreparedScene):
         for a state of which this scene is the one before.
         """
         if perturbed.before is None and self.scene.before is not None:
-            if self._before is None:
-                self._before = Compositor(self.scene.before, self.settings)
-            return self._before.render(perturbed)
+            if self._compositor_before is None:
+                self._compositor_before = Compositor(self.scene.before, self.settings)
+            return self._compositor_before.render(perturbed)
         if perturbed.before is not None and self.scene.before is None:
             raise RangeError("scene", "a state of the compositor's own", "one with vehicles exchanged")
-        objects = self.moved(perturbed)
+        objects = self.perturbed_objects(perturbed)
         sun = self.perturbed_sun(perturbed.environment)
-        return self.compose(perturbed, objects, self.layers(objects, sun) if len(objects) else None)
+        return self.compose(perturbed, objects, self.draw_layers(objects, sun) if len(objects) else None)
 
-    def moved(self, perturbed: SceneIR) -> Objects:
+    def perturbed_objects(self, perturbed: SceneIR) -> Objects:
         """The objects of a perturbed scene in this one's dtype. Raises ShapeError where it has other objects."""
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
@@ -102,15 +101,15 @@ class Compositor(PreparedScene):
             )
             if drawn is not None:
                 with torch.no_grad():
-                    shown = blend.shown_rects(layers.layout, layers.opacity[:, None] != 0)[: len(objects)]
-                    shaded = blend.shown_rects(layers.shadow_layout, layers.shadow != 1)
+                    shown = blend.visible_rects(layers.layout, layers.opacity[:, None] != 0)[: len(objects)]
+                    shaded = blend.visible_rects(layers.shadow_layout, layers.shadow != 1)
                 drawn = torch.cat([shown, shaded])
-            plan = blend.Plan.of(layers.layout, layers.shadow_layout, order)
+            plan = blend.BlendPlan.from_layouts(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
             number = number if self.occluders is None else number.masked_fill(number > len(objects), 0)
             if weather:  # what stands before the sky is not covered with it, nor what stands on a wet road wet
-                shows = blend.uncovered(layers.opacity, plan, self.frame_hw)
+                shows = blend.visible_background(layers.opacity, plan, self.frame_hw)
                 behind = replace(
                     behind, sky=behind.sky.to(self.like) * shows, road=behind.road.to(self.like) * shows
                 )
@@ -130,25 +129,25 @@ class Compositor(PreparedScene):
         return Render(image, depth, number, opacity, drawn)
 
 
-def _layers(
+def _draw_layers(
     members: Sequence[Compositor],
     pack: SceneBatch,
-    fixed: fast.Fixed,
+    fixed: fast.FixedGeometry,
     objects: Sequence[Objects],
-    suns: Sequence[Sun | None],
+    suns: Sequence[PerturbedSun | None],
 ) -> list[ObjectLayers]:
     """The layers of each member by the fast kernels, all of them in one go."""
     drawn = pack.find_visible(objects, suns, with_ground=False)
     code = None
     if any(is_active(o.texture_code) for o in objects):
         regions = [m.regions for m in members]
-        code = fast.Code(
+        code = fast.PaintCodes(
             concat([o.texture_code for o in objects]),
             concat([m.paint_lightness for m in members]),
-            Regions.joined([r for r in regions if r is not None]),
+            PaintRegions.concat([r for r in regions if r is not None]),
         )
     yaw = concat([o.yaw for o in objects])
-    colour, opacity, depth, shadow = fast.photographed(fixed, drawn, drawn.reach_px, yaw, code)
+    colour, opacity, depth, shadow = fast.draw_photographed(fixed, drawn, drawn.reach_px, yaw, code)
     if len(members) == 1:
         return [ObjectLayers(drawn.mesh.layout, colour, opacity, depth, drawn.patch_layout, shadow)]
     layouts, grounds = (
@@ -164,9 +163,11 @@ def _layers(
 
 
 @lru_cache(maxsize=2)
-def _together(members: tuple[Compositor, ...]) -> tuple[SceneBatch, fast.Fixed]:
+def _batch_compositors(members: tuple[Compositor, ...]) -> tuple[SceneBatch, fast.FixedGeometry]:
     """Compositors, all of them with fast kernels, as one."""
-    return SceneBatch(members), fast.Fixed.pack([m.fixed for m in members if m.fixed is not None])
+    return SceneBatch(members), fast.FixedGeometry.concat(
+        [m.fixed_geometry for m in members if m.fixed_geometry is not None]
+    )
 
 
 def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
@@ -176,11 +177,11 @@ def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
     """
     members = tuple(c for c, _ in pairs)
     together = len(pairs) > 1 and all(
-        c.fixed is not None and (scene.before is None) == (c.scene.before is None) for c, scene in pairs
+        c.fixed_geometry is not None and (scene.before is None) == (c.scene.before is None) for c, scene in pairs
     )
     if not together:
         return [c.render(scene) for c, scene in pairs]
-    objects = [c.moved(scene) for c, scene in pairs]
+    objects = [c.perturbed_objects(scene) for c, scene in pairs]
     suns = [c.perturbed_sun(scene.environment) for c, scene in pairs]
-    layers = _layers(members, *_together(members), objects, suns)
+    layers = _draw_layers(members, *_batch_compositors(members), objects, suns)
     return [c.compose(p, o, part) for (c, p), o, part in zip(pairs, objects, layers, strict=True)]

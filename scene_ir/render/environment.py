@@ -6,6 +6,7 @@ differentiable there from both sides, though the weather code is bounded to [0, 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import kornia
@@ -17,7 +18,7 @@ from scene_ir.geometry import clamp_inclusive, height_above_ground
 from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
-from scene_ir.render.texture import lab, rgb_of, smoothstep
+from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab, smoothstep
 from scene_ir.types import Environment, SceneIR
 
 
@@ -47,7 +48,7 @@ def time_gain(time: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def crowns_of(scene: SceneIR) -> Tensor:
+def compute_crown_maps(scene: SceneIR) -> Tensor:
     """What density does to foliage, (5, H, W) in [0, 1]: how far a pixel opens in a thin crown; how far it darkens
     in a thick one, neither on level ground, as grass is no crown; RGB of what shows through. Behind leaves is what
     surrounds them: the sky where they stand before it, a wall where they climb it.
@@ -69,12 +70,12 @@ def apply_foliage(
 
     Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is
     a curve in CIE L*; density darkens the crowns (1) or lets what is behind show through them (-1).
-    crowns: of `crowns_of`. Differentiable to all, with backend `warp` (float32, fused) to picture and code.
+    crowns: of `compute_crown_maps`. Differentiable to all, with backend `warp` (float32, fused) to picture and code.
     """
     if backend == "warp":
         from scene_ir.render.kernels import effects
 
-        return effects.foliage(image, environment, crowns)
+        return effects.apply_foliage(image, environment, crowns)
     amount = environment.foliage_map.to(image)
     index = (amount.flatten() > model.FEWEST_LEAVES).nonzero()[:, 0]
     if index.numel() == 0:
@@ -88,9 +89,9 @@ def apply_foliage(
 
 
 def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
-    """The leaf model on rows (R, 3); maps (R, 5): of `crowns_of`."""
+    """The leaf model on rows (R, 3); maps (R, 5): of `compute_crown_maps`."""
     hue, shift, density = code.unbind(-1)
-    lightness, a, b = lab(clamp_inclusive(rgb, 0.0, 1.0)).unbind(-1)
+    lightness, a, b = rgb_to_lab(clamp_inclusive(rgb, 0.0, 1.0)).unbind(-1)
     level = clamp_inclusive(lightness / 100.0, *model.LEVEL)
     lifted = torch.sigmoid(torch.logit(level) + model.LEAF_LIGHTNESS * shift)
     chroma = (1.0 + model.LEAF_CHROMA * hue) * (lifted / level).sqrt()
@@ -100,7 +101,7 @@ def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
     room = 4.0 * level * (1.0 - level)
     red = chroma * (cos * a - sin * b) + model.LEAF_RED * hue * room
     yellow = chroma * (sin * a + cos * b) + model.LEAF_YELLOW * hue * room
-    out = rgb_of(torch.stack([100.0 * level, red, yellow], dim=-1))
+    out = lab_to_soft_rgb(torch.stack([100.0 * level, red, yellow], dim=-1))
     thick = density * torch.sigmoid(model.CROWN_BEND * density)
     thin = -density * torch.sigmoid(-model.CROWN_BEND * density)
     out = out + (thick * model.THICK_SHARE * maps[:, 1])[:, None] * (model.THICK_DARKNESS * out - out)
@@ -117,10 +118,10 @@ def apply_weather(
     and to the road only where there is some.
     """
     if backend == "warp":
-        streaks = _streaks(*environment.sky.shape).to(image)
+        streaks = _rain_streaks(*environment.sky.shape).to(image)
         from scene_ir.render.kernels import effects
 
-        return effects.weather(image, inverse_depth, environment, air, streaks)
+        return effects.apply_weather(image, inverse_depth, environment, air, streaks)
     fog, rain, time, overcast = environment.weather.to(image).unbind(-1)
     sky, road = environment.sky.to(image), environment.road.to(image)
     depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
@@ -146,20 +147,20 @@ def apply_weather(
     grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
     damp = model.DAMP_LIGHT * (model.DAMP_COLOUR * image + (1.0 - model.DAMP_COLOUR) * grey)
     image = image + model.DAMP * rain * (damp - image)
-    mirrored = _mirror(image)
+    mirrored = _mirror_road(image)
     grazing = model.SHEEN_NEAR + model.SHEEN_FAR * smoothstep(depth, *model.SHEEN_M)
     sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air[:, None, None]
     image = image + rain * (road * grazing) * (sheen - image)
     veil = -torch.expm1(-model.RAIN_EXTINCTION_PER_M * rain * depth)
-    image = veiled(image, veil, model.RAIN_AIR * air[:, None, None])
-    streaks = _streaks(*sky.shape).to(image)
+    image = apply_veil(image, veil, model.RAIN_AIR * air[:, None, None])
+    streaks = _rain_streaks(*sky.shape).to(image)
     image = image + model.STREAKS * rain * streaks * (air[:, None, None] - image)
 
     # Fog (Koschmieder 1924).
-    return veiled(image, -torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth), air[:, None, None])
+    return apply_veil(image, -torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth), air[:, None, None])
 
 
-def veiled(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
+def apply_veil(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
     """A picture (3, H, W) behind a veil, of which a share (H, W) in [0, 1] is air (3, 1, 1); 0 leaves every bit.
 
     Light adds up, display values do not: they are squared first, which is a display's exponent of 2.2 nearly, and
@@ -169,7 +170,7 @@ def veiled(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
     return image + (torch.sqrt(light + veil * (air * air - image * image)) - torch.sqrt(light))
 
 
-def _mirror(image: Tensor) -> Tensor:
+def _mirror_road(image: Tensor) -> Tensor:
     """What a wet road reflects, coarsely: the picture smeared downwards."""
     height, reach = image.shape[1], model.mirror_reach(image.shape[1])
     smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate", separable=True)[0]
@@ -178,7 +179,7 @@ def _mirror(image: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _streaks(height: int, width: int) -> Tensor:
+def _rain_streaks(height: int, width: int) -> Tensor:
     """Rain streaks (H, W) in [0, 1]: sparse drops drawn out along a slight slant; the same for each frame size."""
     generator = torch.Generator().manual_seed(20190416)
     drops = (torch.rand(height, width, generator=generator) > 0.9965).float()
@@ -201,3 +202,46 @@ def _leaf_gaps(height: int, width: int) -> Tensor:
     coarse = kornia.filters.gaussian_blur2d(noise, (21, 21), (4.0, 4.0), border_type="replicate")
     mixed = (fine - 0.5) / fine.std().clamp(min=1e-6) + 0.5 * (coarse - 0.5) / coarse.std().clamp(min=1e-6)
     return torch.sigmoid(2.0 * mixed - 1.0)[0, 0]
+
+
+@dataclass(frozen=True, slots=True)
+class PerturbedSun:
+    """direction (3,): unit, towards it, in camera axes; strength (): of its light, as a factor on the
+    photograph's; shade (): of the shadows that it casts, likewise. Differentiable to `Environment.light`.
+    """
+
+    direction: Tensor
+    strength: Tensor
+    shade: Tensor
+
+    @classmethod
+    def from_environment(cls, environment: Environment, like: Tensor, sunlight: Tensor) -> PerturbedSun:
+        """Under `environment.light`, in the dtype of `like`; sunlight (): how strong the photograph's is, as
+        `Source.sunlight`. At code 0 the photograph's to the last bit, with both factors 1.
+        """
+        sun, up = environment.sun.to(like), environment.ground[:3].to(like)
+        code = environment.light.to(like)
+        still = torch.zeros_like(code)
+        # What the code adds, so that nothing is rounded where it is 0.
+        direction = sun + (move_sun(sun, up, code) - move_sun(sun, up, still))
+        strength = 1.0 + model.SUN_STRENGTH * code[2]
+        shade = _shadow_strength(direction, up, sunlight * strength) / _shadow_strength(sun, up, sunlight).clamp(
+            min=1e-6
+        )
+        return cls(direction, strength, torch.where(sunlight > 0, shade, torch.ones_like(shade)))
+
+
+def move_sun(sun: Tensor, up: Tensor, code: Tensor) -> Tensor:
+    """The direction (3,) towards a sun (3,) under a light code (3,): turned about `up` (3,), to the right for who
+    looks at it, and risen."""
+    sine = (sun * up).sum()
+    flat = torch.nn.functional.normalize(sun - sine * up, dim=0)
+    azimuth, height = model.SUN_TURN_RAD * code[0], torch.asin(sine) + model.SUN_RISE_RAD * code[1]
+    along = torch.cos(azimuth) * flat + torch.sin(azimuth) * torch.linalg.cross(flat, up)
+    return torch.cos(height) * along + torch.sin(height) * up
+
+
+def _shadow_strength(sun: Tensor, up: Tensor, sunlight: Tensor) -> Tensor:
+    """The share of the light on the ground that a shadow takes away."""
+    direct = sunlight * (sun * up).sum().clamp(min=0.0)
+    return direct / (sum(model.AMBIENT) + direct)

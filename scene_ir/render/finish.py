@@ -27,39 +27,39 @@ from scene_ir.types import Part
 
 Array = NDArray[np.float64]
 
-_LEAST_GAIN = 0.03
+_MIN_GAIN = 0.03
 """Of any part, by night."""
-_MOST_GAIN = (3.0, 1.4)
+_MAX_GAIN = (3.0, 1.4)
 """Of paint, whose colour is the vehicle's own, and of all else, whose colour the template knows but for the
 light."""
 _DARK_SHARE = 0.05
 """Share of a vehicle that is as dark as its darkest parts: tyres, grilles and gaps are on all sides."""
-_MOST_LIFT = 0.25
+_MAX_LIFT = 0.25
 _STRENGTHS = np.linspace(0.0, 2.4, 13)
 """Of the sun; with the largest, a side that faces it gets six times the light of one that does not."""
-_SIDES, _UNEVEN, _UNSURE = 10.0, 0.25, 0.3
+_PAINT_SAMPLES, _PAINT_SCATTER, _STRENGTH_SCATTER = 10.0, 0.25, 0.3
 """Independent samples that a car's paint is worth, their scatter about one colour (logarithm), and that of the
 expected strength."""
-_SHADED, _NO_SHADOW = 0.3, 0.02
+_EXPECTED_STRENGTH, _PRIOR_WEIGHT = 0.3, 0.02
 """Sunlight to expect where nothing tells, between an overcast sky's and a clear one's; weight of that."""
-_PLENTY = 50
+_MIN_EXPOSURE_PX = 50
 """Pixels that tell how a frame is exposed."""
-_SURE_PX, _DISAGREES = 200.0, 20.0
+_HALF_EVIDENCE_PX, _MAX_COST = 200.0, 20.0
 """Samples of paint at which a vehicle counts half; how much one vehicle's disagreement may cost."""
 _DARKEST, _BRIGHTEST = 0.02, 0.97
 """Display values beyond which a template's or a photograph's colour says nothing of their ratio."""
-_PRIOR = 0.02
+_PRIOR_PULL = 0.02
 """Pull of a part's mean, beside a bond of 1 between neighbours: it is felt from about seven vertices on."""
-_MOST_SAMPLES = 4.0
+_MAX_VERTEX_SAMPLES = 4.0
 """Samples of a vertex beyond which more add no weight: large panels would not bend at all."""
-_TWIN = 0.3
+_TWIN_BOND = 0.3
 """Bond of a vertex to its twin on the other side: cars are symmetric, their light is not."""
-_FEWEST = 4.0
+_MIN_SAMPLES = 4.0
 """Samples below which a part's mean is taken from all that is no paint, and the paint's from all of the car."""
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class FinishSamples:
     """What the photograph shows of one object. vertex (K, 3) int64, the corners of the triangle at each pixel, and
     share (K, 3), how near it is to them; template, photograph (K, 3) RGB; sky, direct (K,): light on it by
     `texture.daylight` without a sun, and what a sun of strength 1 adds; weight (K,) in [0, 1]."""
@@ -74,7 +74,7 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
-class _Web:
+class _VertexGraph:
     """A surface's vertices as nodes, one for each place and part. node (V,); part (M,); bonds: their Laplacian."""
 
     node: NDArray[np.int64]
@@ -82,74 +82,78 @@ class _Web:
     bonds: scipy.sparse.csc_array
 
 
-def base_paint(surface: TemplateSurface, samples: Samples) -> Tensor | None:
+def estimate_paint(surface: TemplateSurface, samples: FinishSamples) -> Tensor | None:
     """The paint (3,) RGB as the photograph shows it most: the median in CIE L*a*b*; None where it shows none."""
     part = surface.part.cpu().numpy()
     clear = (part[samples.vertex] == Part.PAINT).all(axis=1) & (samples.weight > 0.5)
-    if np.count_nonzero(clear) < _FEWEST:
+    if np.count_nonzero(clear) < _MIN_SAMPLES:
         return None
-    lab = texture.lab(torch.from_numpy(samples.photograph[clear]))
-    return texture.rgb_exact(lab.median(dim=0).values[None])[0].clamp(0.0, 1.0)
+    rgb_to_lab = texture.rgb_to_lab(torch.from_numpy(samples.photograph[clear]))
+    return texture.lab_to_rgb(rgb_to_lab.median(dim=0).values[None])[0].clamp(0.0, 1.0)
 
 
-def sunlight(seen: Sequence[tuple[TemplateSurface, Samples]], expected: Sequence[float | None]) -> float:
-    """How strongly the sun lights a frame's vehicles, as `texture.shade` counts it: the strength for which sides
+def estimate_sunlight(
+    seen: Sequence[tuple[TemplateSurface, FinishSamples]], expected: Sequence[float | None]
+) -> float:
+    """How strongly the sun lights a frame's vehicles, as `texture.shade_template` counts it: the strength for which sides
     of a vehicle that face it and others are of one colour, for most vehicles, not far from what is expected.
 
     seen: the vehicles; expected: of each, by its shadow, None where it has none. A vehicle counts by how much of
-    its paint is seen, and one that disagrees with the rest, in the shade of a tree, by no more than `_DISAGREES`.
+    its paint is seen, and one that disagrees with the rest, in the shade of a tree, by no more than `_MAX_COST`.
     """
-    cost = _NO_SHADOW * np.square((_STRENGTHS - _SHADED) / _UNSURE)
+    cost = _PRIOR_WEIGHT * np.square((_STRENGTHS - _EXPECTED_STRENGTH) / _STRENGTH_SCATTER)
     for (surface, samples), strength in zip(seen, expected, strict=True):
         clear = (surface.part.cpu().numpy()[samples.vertex] == Part.PAINT).all(axis=1)
         weight = samples.weight * clear
         own = np.zeros_like(cost)
-        if weight.sum() >= _FEWEST:
-            level = np.log(light_of(samples.photograph.mean(axis=1)))
+        if weight.sum() >= _MIN_SAMPLES:
+            level = np.log(display_to_light(samples.photograph.mean(axis=1)))
             rest = level - np.log(samples.sky + _STRENGTHS[:, None] * samples.direct)
             mean = (rest * weight).sum(axis=1, keepdims=True) / weight.sum()
             apart = (np.square(rest - mean) * weight).sum(axis=1) / weight.sum()
-            own += _SIDES * apart / _UNEVEN**2
+            own += _PAINT_SAMPLES * apart / _PAINT_SCATTER**2
         if strength is not None:
-            own += np.square((_STRENGTHS - np.clip(strength, 0.0, _STRENGTHS[-1])) / _UNSURE)
-        evidence = (weight.sum() + _FEWEST) / (weight.sum() + _SURE_PX)
-        cost = cost + evidence * np.minimum(own - own.min(), _DISAGREES)
+            own += np.square((_STRENGTHS - np.clip(strength, 0.0, _STRENGTHS[-1])) / _STRENGTH_SCATTER)
+        evidence = (weight.sum() + _MIN_SAMPLES) / (weight.sum() + _HALF_EVIDENCE_PX)
+        cost = cost + evidence * np.minimum(own - own.min(), _MAX_COST)
     return float(_STRENGTHS[int(cost.argmin())])
 
 
-def exposure(surface: TemplateSurface, samples: Samples) -> tuple[float, float] | None:
-    """Gain and lift of `texture.finished` for another vehicle in the same light: the median over what is not
+def estimate_exposure(surface: TemplateSurface, samples: FinishSamples) -> tuple[float, float] | None:
+    """Gain and lift of `texture.apply_finish` for another vehicle in the same light: the median over what is not
     paint, whose colour templates know; None where too little of it is seen.
     """
     known = (surface.part.cpu().numpy()[samples.vertex[:, 0]] != Part.PAINT) & (samples.weight > 0.5)
-    if np.count_nonzero(known) < _PLENTY:
+    if np.count_nonzero(known) < _MIN_EXPOSURE_PX:
         return None
-    lift = _lift(surface, samples)
-    bright = light_of((samples.photograph[known].mean(axis=1) - lift).clip(0.0) / (1.0 - lift))
+    lift = _estimate_lift(surface, samples)
+    bright = display_to_light((samples.photograph[known].mean(axis=1) - lift).clip(0.0) / (1.0 - lift))
     gain = np.median(bright / np.maximum(samples.template[known].mean(axis=1), _DARKEST))
-    return float(np.clip(gain, _LEAST_GAIN, _MOST_GAIN[1])), lift
+    return float(np.clip(gain, _MIN_GAIN, _MAX_GAIN[1])), lift
 
 
-def fitted(surface: TemplateSurface, samples: Samples) -> Array:
-    """For each vertex (V, 4) the gains (3) and the lift of `texture.finished`.
+def fit_finish(surface: TemplateSurface, samples: FinishSamples) -> Array:
+    """For each vertex (V, 4) the gains (3) and the lift of `texture.apply_finish`.
 
     The lift is how bright the vehicle's darkest parts are, by haze and by what they mirror; paint has none.
     """
-    web = _web(surface.weld, surface.faces, surface.part, surface.unit)
+    web = _build_graph(surface.weld, surface.faces, surface.part, surface.unit)
     count = len(web.part)
-    lift = np.where(web.part == Part.PAINT, 0.0, _lift(surface, samples))
+    lift = np.where(web.part == Part.PAINT, 0.0, _estimate_lift(surface, samples))
     less = 1.0 - lift[web.node[samples.vertex[:, :1]]]
-    ratio = np.log(light_of(1.0 - (1.0 - samples.photograph) / less) / np.maximum(samples.template, _DARKEST))
+    ratio = np.log(
+        display_to_light(1.0 - (1.0 - samples.photograph) / less) / np.maximum(samples.template, _DARKEST)
+    )
     node = web.node[samples.vertex].reshape(-1)
     share = (samples.weight[:, None] * samples.share).reshape(-1)
-    total = _summed(node, share, count)
-    mean = np.stack([_summed(node, share * ratio[:, c].repeat(3), count) for c in range(3)], axis=1)
+    total = _sum_at_nodes(node, share, count)
+    mean = np.stack([_sum_at_nodes(node, share * ratio[:, c].repeat(3), count) for c in range(3)], axis=1)
     mean /= np.maximum(total, 1e-9)[:, None]
-    most = np.log(np.where(web.part == Part.PAINT, *_MOST_GAIN))[:, None]
-    mean = np.clip(mean, np.log(_LEAST_GAIN), most)
-    data = np.minimum(total, _MOST_SAMPLES)
-    matrix = web.bonds + scipy.sparse.diags_array(data + _PRIOR)
-    known = data[:, None] * mean + _PRIOR * _priors(web.part, total, mean)
+    most = np.log(np.where(web.part == Part.PAINT, *_MAX_GAIN))[:, None]
+    mean = np.clip(mean, np.log(_MIN_GAIN), most)
+    data = np.minimum(total, _MAX_VERTEX_SAMPLES)
+    matrix = web.bonds + scipy.sparse.diags_array(data + _PRIOR_PULL)
+    known = data[:, None] * mean + _PRIOR_PULL * _prior_gains(web.part, total, mean)
     # Symmetric and dominated by its diagonal: no pivots, and an order that fills in little.
     solver = scipy.sparse.linalg.splu(
         matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
@@ -158,47 +162,47 @@ def fitted(surface: TemplateSurface, samples: Samples) -> Array:
     return np.concatenate([found, lift[web.node, None]], axis=1)
 
 
-def _summed(node: NDArray[np.int64], values: Array, count: int) -> Array:
+def _sum_at_nodes(node: NDArray[np.int64], values: Array, count: int) -> Array:
     """The sum of values (L,) at each of `count` nodes (L,)."""
     return np.bincount(node, values, count).astype(np.float64)
 
 
-def light_of(display: Array) -> Array:
-    """The light that `texture.finished` shows as these display values."""
+def display_to_light(display: Array) -> Array:
+    """The light that `texture.apply_finish` shows as these display values."""
     return -np.log(1.0 - np.clip(display, _DARKEST / 2, _BRIGHTEST))
 
 
-def _lift(surface: TemplateSurface, samples: Samples) -> float:
+def _estimate_lift(surface: TemplateSurface, samples: FinishSamples) -> float:
     """How much brighter the darkest of the vehicle, paint apart, is than its template's darkest."""
     part = surface.part.cpu().numpy()[samples.vertex[:, 0]]
     clear = (samples.weight > 0.5) & (part != Part.PAINT)
-    if np.count_nonzero(clear) < _FEWEST:
+    if np.count_nonzero(clear) < _MIN_SAMPLES:
         return 0.0
     dark, own = (np.quantile(v[clear].mean(axis=1), _DARK_SHARE) for v in (samples.photograph, samples.template))
-    return float(np.clip((dark - own) / (1.0 - own), 0.0, _MOST_LIFT))
+    return float(np.clip((dark - own) / (1.0 - own), 0.0, _MAX_LIFT))
 
 
-def _priors(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
+def _prior_gains(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
     """The logarithm (M, 3) of the gain that nodes of a part have by the median; of other parts' where it is
     unseen."""
     out = np.zeros((len(part), 3))
-    rest = _median(mean, total * (part != Part.PAINT))
+    rest = _weighted_median(mean, total * (part != Part.PAINT))
     for kind in np.unique(part):
         mine = part == kind
         own = total * mine
-        if own.sum() >= _FEWEST:
-            out[mine] = _median(mean, own)
+        if own.sum() >= _MIN_SAMPLES:
+            out[mine] = _weighted_median(mean, own)
         elif kind == Part.PAINT:
-            out[mine] = _median(mean, total)
+            out[mine] = _weighted_median(mean, total)
         else:
             # No colour of its own: as dark or bright as the rest.
             out[mine] = rest.mean()
     return out
 
 
-def _median(values: Array, weight: Array) -> Array:
+def _weighted_median(values: Array, weight: Array) -> Array:
     """The weighted median (3,) of values (M, 3); 0 where there is no weight."""
-    if weight.sum() < _FEWEST:
+    if weight.sum() < _MIN_SAMPLES:
         return np.zeros(3)
     order = np.argsort(values, axis=0, kind="stable")
     running = np.cumsum(weight[order], axis=0)
@@ -207,7 +211,7 @@ def _median(values: Array, weight: Array) -> Array:
 
 
 @lru_cache(maxsize=128)
-def _web(weld: Tensor, faces: Tensor, part: Tensor, unit: Tensor) -> _Web:
+def _build_graph(weld: Tensor, faces: Tensor, part: Tensor, unit: Tensor) -> _VertexGraph:
     welded, kinds = weld.cpu().numpy(), part.cpu().numpy()
     key, first, node = np.unique(welded * len(Part) + kinds, return_index=True, return_inverse=True)
     count = len(key)
@@ -222,10 +226,10 @@ def _web(weld: Tensor, faces: Tensor, part: Tensor, unit: Tensor) -> _Web:
         tree = scipy.spatial.KDTree(points[mine])
         twins.append(np.stack([mine, mine[tree.query(points[mine] * [1.0, 1.0, -1.0])[1]]], axis=1))
     pairs = np.concatenate([edges, *twins])
-    bond = np.concatenate([np.ones(len(edges)), np.full(len(pairs) - len(edges), 0.5 * _TWIN)])
+    bond = np.concatenate([np.ones(len(edges)), np.full(len(pairs) - len(edges), 0.5 * _TWIN_BOND)])
     proper = pairs[:, 0] != pairs[:, 1]
     pairs, bond = pairs[proper], bond[proper]
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
     columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
     joined = scipy.sparse.coo_array((np.tile(bond, 2), (rows, columns)), shape=(count, count)).tocsc()
-    return _Web(node, kinds[first], (scipy.sparse.diags_array(joined.sum(axis=1)) - joined).tocsc())
+    return _VertexGraph(node, kinds[first], (scipy.sparse.diags_array(joined.sum(axis=1)) - joined).tocsc())

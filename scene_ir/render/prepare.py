@@ -23,10 +23,9 @@ from torch import Tensor
 from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
-from scene_ir.render.environment import crowns_of, sky_colour
-from scene_ir.render.sun import Sun
+from scene_ir.render.environment import PerturbedSun, compute_crown_maps, sky_colour
 from scene_ir.render.surfaces import ObjectSurfaces, TemplateSurface, VertexPlacement
-from scene_ir.render.texture import Regions, Texels, smoothstep
+from scene_ir.render.texture import PaintRegions, PhotographTexels, smoothstep
 from scene_ir.types import Crop, Environment, Objects, SceneIR, convert_scene
 
 MAX_HALO_PX = 64.0
@@ -85,13 +84,13 @@ class OccluderLayers:
     @classmethod
     def from_scene(cls, scene: SceneIR, like: Tensor) -> OccluderLayers:
         """Of a scene's `front`. `like`: a tensor of the dtype and device to work in."""
-        texels = Texels.pack([f.foreground for f in scene.occluders], like)
+        texels = PhotographTexels.from_crops([f.foreground for f in scene.occluders], like)
         layout = verbs.PixelLayout.from_rects(texels.rects)
         rgba, draw = texels.values, layout.draw_index()
         depth = like.new_tensor([f.depth_m for f in scene.occluders])[draw]
         colour = torch.cat([rgba[:, :3], rgba[:, 3:] / depth[:, None]], dim=1)
         x, y = layout.pixel_xy().unbind(1)
-        footprints = blend.standing_footprints(scene.occluders, scene.camera.matrix)
+        footprints = blend.occluder_footprints(scene.occluders, scene.camera.matrix)
         return cls(footprints, layout, colour, rgba[:, 3], depth, y * scene.camera.width + x)
 
     def append_to(self, layers: ObjectLayers | None, change: Tensor | None) -> ObjectLayers:
@@ -117,7 +116,7 @@ class OccluderLayers:
 @dataclass(frozen=True, slots=True)
 class PlacedGeometry:
     """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the
-    camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.brightened`, by what the
+    camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.limit_brightening`, by what the
     objects turned since the photograph. lights (N, 4) and inside (N, 3, 3) float64, of the fast kernels alone: the
     sun on each object, and from a pixel (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways."""
 
@@ -280,18 +279,20 @@ class PreparedScene:
         rects = drawn.mesh.layout.rects.tolist()
         for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
             before = [mattes[j] for j in order[order.index(i) + 1 :]]
-            unseen = hidden[i] if hidden else texture.hidden_behind(before, self.frame_hw, self.like)
+            unseen = hidden[i] if hidden else texture.occlusion_map(before, self.frame_hw, self.like)
             x0, y0, x1, y1 = rects[i]
             if x1 <= x0:
                 crops.append(Crop(self.like.new_zeros(channels.TEXEL, 0, 0), 0, 0))
                 continue
             depth = Crop(drawn.mesh.depth[packed].reshape(1, *size), x0, y0)
-            crops.append(texture.source_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self.frame_hw))
-        self.texels = Texels.pack(crops + crops, self.like)
-        self.shadows = Texels.pack([_shadow_darkness(s.shadow, self.frame_hw) for s in objects.source], self.like)
+            crops.append(texture.build_texels(objects.source[i], depth, unseen, (x0, y0, x1, y1), self.frame_hw))
+        self.texels = PhotographTexels.from_crops(crops + crops, self.like)
+        self.shadows = PhotographTexels.from_crops(
+            [_shadow_darkness(s.shadow, self.frame_hw) for s in objects.source], self.like
+        )
         blank = Crop(self.like.new_zeros(1, 0, 0), 0, 0)
-        self.regions = Regions(
-            Texels.pack([s.region or blank for s in objects.source], self.like),
+        self.regions = PaintRegions(
+            PhotographTexels.from_crops([s.region or blank for s in objects.source], self.like),
             torch.tensor([s.region is not None for s in objects.source], device=self.like.device),
         )
 
@@ -300,7 +301,7 @@ class PreparedScene:
         """(V, 4): gains (3) and lift that make the templates' colours the vehicles'; found on first use."""
         if self._finish is None:
             parts = zip(self.object_surfaces.surfaces, self.sample_photograph(), strict=True)
-            found = [torch.from_numpy(finish.fitted(surface, samples)) for surface, samples in parts]
+            found = [torch.from_numpy(finish.fit_finish(surface, samples)) for surface, samples in parts]
             self._finish = torch.cat(found).to(self.like)
             self._base_visible = None
         return self._finish
@@ -311,22 +312,22 @@ class PreparedScene:
             paint = torch.stack([s.paint for s in objects.source]).to(self.like)
         else:
             paint = self._template_paint()
-        return texture.lab(paint.clamp(0.0, 1.0))[:, 0]
+        return texture.rgb_to_lab(paint.clamp(0.0, 1.0))[:, 0]
 
     def _template_paint(self) -> Tensor:
         """The mean colour (N, 3) of the templates' paint."""
-        fleet = self.object_surfaces
+        object_surfaces = self.object_surfaces
         total = self.base_size_lhw.new_zeros(len(self.base_size_lhw), 3)
-        total = total.index_add(0, fleet.owner, fleet.colours * fleet.paint[:, None])
-        count = total.new_zeros(len(total)).index_add(0, fleet.owner, fleet.paint)
+        total = total.index_add(0, object_surfaces.owner, object_surfaces.colours * object_surfaces.paint[:, None])
+        count = total.new_zeros(len(total)).index_add(0, object_surfaces.owner, object_surfaces.paint)
         return total / count.clamp(min=1e-3)[:, None]
 
-    def base_paint(self, samples: Sequence[finish.Samples]) -> Tensor:
+    def estimate_paint(self, samples: Sequence[finish.FinishSamples]) -> Tensor:
         """The paint (N, 3) of the objects as the photograph shows it, by their `samples`; the templates' where it
         shows none."""
         paint = self._template_paint()
         for i, (surface, own) in enumerate(zip(self.object_surfaces.surfaces, samples, strict=True)):
-            found = finish.base_paint(surface, own)
+            found = finish.estimate_paint(surface, own)
             if found is not None:
                 paint[i] = found.to(paint)
         return paint
@@ -334,15 +335,17 @@ class PreparedScene:
     def _place(self, objects: Objects) -> PlacedGeometry:
         return self.batch.place([objects], [None], with_ground=True)
 
-    def find_visible(self, objects: Objects, sun: Sun | None = None) -> VisibleSurfaces:
+    def find_visible(self, objects: Objects, sun: PerturbedSun | None = None) -> VisibleSurfaces:
         """Find which surfaces the pixels see. sun: as of `sun_of`."""
         return self.batch.find_visible([objects], [sun])
 
-    def perturbed_sun(self, environment: Environment) -> Sun | None:
+    def perturbed_sun(self, environment: Environment) -> PerturbedSun | None:
         """The sun of a perturbed scene; None where it is the photograph's."""
         if not len(self.sunlight) or not is_active(environment.light):
             return None
-        return Sun.of(replace(self.scene.environment, light=environment.light), self.like, self.sunlight.mean())
+        return PerturbedSun.from_environment(
+            replace(self.scene.environment, light=environment.light), self.like, self.sunlight.mean()
+        )
 
     def local_vertices(self, objects: Objects) -> Tensor:
         """Vertices (V, 3) m in their objects' frames."""
@@ -350,9 +353,9 @@ class PreparedScene:
         changed = any(now.requires_grad or not torch.equal(now, then) for now, then in shapes)
         return self.object_surfaces.local_vertices(objects.ffd, objects.size_lhw) if changed else self._base_local
 
-    def compute_brightening(self, objects: Objects, sun: Sun | None = None) -> Tensor:
+    def compute_brightening(self, objects: Objects, sun: PerturbedSun | None = None) -> Tensor:
         """By how much (V,) the surfaces are brighter than in the photograph, since they or the sun turned, or its
-        light changed: see `texture.brightened`."""
+        light changed: see `texture.limit_brightening`."""
         turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
         if not objects.source or not (turned or sun is not None):
             return self.like.new_zeros(self.object_surfaces.owner.shape[0])
@@ -370,18 +373,18 @@ class PreparedScene:
             if sun is None
             else now - self._base_sun_exposure + (sun.strength - 1.0) * now
         )
-        return texture.brightened(sunlight * more / then, self.object_surfaces.paint)
+        return texture.limit_brightening(sunlight * more / then, self.object_surfaces.paint)
 
-    def _sun_exposure(self, yaw: Tensor, moved: Sun | None = None) -> Tensor:
+    def _sun_exposure(self, yaw: Tensor, moved: PerturbedSun | None = None) -> Tensor:
         """How squarely (V,) the sun meets the surfaces of objects that stand at yaw (N,)."""
         direction = self.scene.environment.sun.to(self.like) if moved is None else moved.direction
         sun = direction.expand(len(yaw), 3)
         x, y, z = self.object_surfaces.per_vertex(surfaces.rotate_y(sun, -yaw)).unbind(-1)
         # Written out: sums along an axis may differ in their last bit with the number of rows.
         soft = self.smooth_normals[:, 0] * x + self.smooth_normals[:, 1] * y + self.smooth_normals[:, 2] * z
-        return texture.sunward(soft)
+        return texture.sun_exposure(soft)
 
-    def place_patches(self, objects: Objects, sun: Sun | None = None) -> Tensor:
+    def place_patches(self, objects: Objects, sun: PerturbedSun | None = None) -> Tensor:
         """Clip coordinates (4N, 3) of the corners of the shadows' patches.
 
         A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
@@ -405,8 +408,8 @@ class PreparedScene:
         corners = surfaces.place_on_ground(corners, objects.yaw, objects.translation, ground)
         return surfaces.project_vertices(corners, self.scene.camera)
 
-    def patch_inputs(self, sun: Sun | None) -> tuple[Tensor, ...]:
-        """What the kernels take of the patches besides poses: the tensors of `kernels.patches.Photographed`."""
+    def patch_inputs(self, sun: PerturbedSun | None) -> tuple[Tensor, ...]:
+        """What the kernels take of the patches besides poses: the tensors of `kernels.shadow_patches.Photographed`."""
         count, environment = len(self.base_size_lhw), self.scene.environment
         direction, ground = (t.to(self.like) for t in (environment.sun, environment.ground))
         casts = self.like.new_zeros(count) if sun is None else self.shadow_is_own[:, 0].contiguous()
@@ -423,9 +426,9 @@ class PreparedScene:
 
     @property
     def crown_maps(self) -> Tensor:
-        """Of `environment.crowns_of`; found on first use."""
+        """Of `environment.compute_crown_maps`; found on first use."""
         if self._crown_maps is None:
-            self._crown_maps = crowns_of(self.scene)
+            self._crown_maps = compute_crown_maps(self.scene)
         return self._crown_maps
 
     @property
@@ -450,7 +453,7 @@ class PreparedScene:
             (x0, y0), (h, w) = (shadow.x0, shadow.y0), shadow.values.shape[1:]
             cut = min(x0, y0) <= 0 or x0 + w >= self.frame_hw[1] or y0 + h >= self.frame_hw[0]
             inverted = replace(shadow, values=1.0 - shadow.values.to(self.like))
-            dark = texture.crop_of(inverted, tuple(rects[i]), self.frame_hw).mean(dim=0).flatten()
+            dark = texture.extract_crop(inverted, tuple(rects[i]), self.frame_hw).mean(dim=0).flatten()
             alike = torch.nn.functional.cosine_similarity(dark, density[packed], dim=0)
             casts[i] = float(alike >= model.OWN_SHADOW and not cut)
         return casts
@@ -485,13 +488,13 @@ class PreparedScene:
         """Unit normals (V, 3) of objects where they stand, with sharp edges."""
         return surfaces.rotate_y(self.sharp_normals, self.object_surfaces.per_vertex(objects.yaw))
 
-    def object_lights(self, sun: Sun | None = None) -> Tensor:
+    def object_lights(self, sun: PerturbedSun | None = None) -> Tensor:
         """(N, 4): direction and strength of the sun on each object."""
         direction = self.scene.environment.sun.to(self.like) if sun is None else sun.direction
         strength = self.sunlight if sun is None else self.sunlight * sun.strength
         return torch.cat([direction.expand(len(strength), 3), strength[:, None]], dim=1)
 
-    def shade_template(self, xy: Tensor, owner: Tensor, own: Tensor, sun: Sun | None = None) -> Tensor:
+    def shade_template(self, xy: Tensor, owner: Tensor, own: Tensor, sun: PerturbedSun | None = None) -> Tensor:
         """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
         `own_attributes` (K, ...)."""
         light = self.object_lights(sun).index_select(0, owner)
@@ -500,7 +503,7 @@ class PreparedScene:
         ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1) @ self.unproject.T
         normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-6)
         to_eye = -torch.nn.functional.normalize(ray, dim=-1)
-        return texture.shade(normal, to_eye, albedo, sheen, height, light[:, :3], light[:, 3])
+        return texture.shade_template(normal, to_eye, albedo, sheen, height, light[:, :3], light[:, 3])
 
     @torch.no_grad()
     def project_paint(self) -> list[Crop]:
@@ -524,14 +527,14 @@ class PreparedScene:
             if not h or not w or not bool(known.any()):
                 out.append(Crop(self.like.new_zeros(1, h, w), place.x0, place.y0))
                 continue
-            values = texture.continued(dense[packed].T.reshape(1, *size), known)
+            values = texture.extend_nearest(dense[packed].T.reshape(1, *size), known)
             rows = (torch.arange(h) + place.y0 - y0).clamp(0, size[0] - 1)
             columns = (torch.arange(w) + place.x0 - x0).clamp(0, size[1] - 1)
             out.append(Crop(values[:, rows][:, :, columns], place.x0, place.y0))
         return out
 
     @torch.no_grad()
-    def sample_photograph(self) -> list[finish.Samples]:
+    def sample_photograph(self) -> list[finish.FinishSamples]:
         """What the photograph shows of each object, beside its template in daylight: a row a pixel, of large
         objects about `_MOST_SAMPLES` pixels, spread evenly."""
         objects, drawn = at_photographed_pose(self.scene.objects), self._base_visible
@@ -567,7 +570,7 @@ class PreparedScene:
         for i, (start, _) in enumerate(self.object_surfaces.vertex_ranges.tolist()):
             mine = (owner == i) & (weight > 0.0)
             vertex, *values = (c[mine].cpu().numpy() for c in columns)
-            out.append(finish.Samples(vertex - start, *(v.astype(np.float64) for v in values)))
+            out.append(finish.FinishSamples(vertex - start, *(v.astype(np.float64) for v in values)))
         return out
 
     def patch_density(self, drawn: VisibleSurfaces) -> Tensor:
@@ -592,8 +595,8 @@ class SceneBatch:
     def __init__(self, members: Sequence[PreparedScene]) -> None:
         self._members = tuple(members)
         self._backend: verbs.Backend = members[0].settings.backend
-        rigs = [m.placement for m in members if m.placement is not None]
-        self._placement = VertexPlacement.concat(rigs) if rigs else None
+        placements = [m.placement for m in members if m.placement is not None]
+        self._placement = VertexPlacement.concat(placements) if placements else None
         self._faces, self._vertex_ranges, self._face_ranges = ObjectSurfaces.concat_faces(
             [m.object_surfaces for m in members]
         )
@@ -613,7 +616,9 @@ class SceneBatch:
         self._shadowless = torch.tensor([s for m in members for s in m.objects_without_shadow()], dtype=torch.bool)
         self._still_patch_inputs: tuple[Tensor, ...] | None = None
 
-    def place(self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool) -> PlacedGeometry:
+    def place(
+        self, objects: Sequence[Objects], suns: Sequence[PerturbedSun | None], with_ground: bool
+    ) -> PlacedGeometry:
         """Where the vertices of perturbed objects, of each member, come to lie, and the light on them.
         with_ground: the patches by plain torch."""
         if self._placement is None:
@@ -646,7 +651,7 @@ class SceneBatch:
         yaw, place, size = (concat([getattr(o, n) for o in objects]) for n in ("yaw", "translation", "size_lhw"))
         return surfaces.place_patches(yaw, place, size, lights, fixed)[1]
 
-    def _patch_inputs(self, suns: Sequence[Sun | None]) -> tuple[Tensor, ...]:
+    def _patch_inputs(self, suns: Sequence[PerturbedSun | None]) -> tuple[Tensor, ...]:
         """What of the shadows' patches poses do not touch; kept where no sun moves."""
         if self._still_patch_inputs is None or any(sun is not None for sun in suns):
             parts = [m.patch_inputs(sun) for m, sun in zip(self._members, suns, strict=True)]
@@ -661,7 +666,7 @@ class SceneBatch:
         return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
 
     def find_visible(
-        self, objects: Sequence[Objects], suns: Sequence[Sun | None], with_ground: bool = True
+        self, objects: Sequence[Objects], suns: Sequence[PerturbedSun | None], with_ground: bool = True
     ) -> VisibleSurfaces:
         """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
         backend, reach = self._backend, self.reach_px(objects)
@@ -710,7 +715,7 @@ def _shadow_darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
     h, w = shadow.values.shape[1:]
     dark = replace(shadow, values=1.0 - shadow.values)
     rect = (shadow.x0 - 4, shadow.y0 - 4, shadow.x0 + w + 4, shadow.y0 + h + 4)
-    return Crop(texture.crop_of(dark, rect, frame_hw), rect[0], rect[1])
+    return Crop(texture.extract_crop(dark, rect, frame_hw), rect[0], rect[1])
 
 
 def patch_faces(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:

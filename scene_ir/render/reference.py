@@ -13,18 +13,18 @@ from torch import Tensor
 from scene_ir.geometry import clamp_inclusive
 from scene_ir.raster import verbs
 from scene_ir.render import channels, model, surfaces, texture
+from scene_ir.render.environment import PerturbedSun
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, VisibleSurfaces, is_active, patch_faces
-from scene_ir.render.sun import Sun
 from scene_ir.render.texture import smoothstep
 from scene_ir.types import Objects
 
 
 @dataclass(frozen=True, slots=True)
-class _Rows:
+class _PixelRows:
     """Pixels to be coloured, mesh rows first, each part grouped by object.
 
     pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this
-    row fills; counts (2N,) int64 rows of each mesh, then of each halo; fringe: see `_Fringe`; anchor (R - Rm,)
+    row fills; counts (2N,) int64 rows of each mesh, then of each halo; fringe: see `_OutlineRows`; anchor (R - Rm,)
     int64: the mesh row that each row of a halo moves with.
     """
 
@@ -34,12 +34,12 @@ class _Rows:
     share: Tensor
     counts: Tensor
     mesh_rows: int
-    fringe: _Fringe
+    fringe: _OutlineRows
     anchor: Tensor
 
 
 @dataclass(frozen=True, slots=True)
-class _Shaded:
+class _ShadedRows:
     """Rows with their looks: premultiplied colour (R, 3), opacity (R,), depth (R,) m, paint and height (R,)."""
 
     colour: Tensor
@@ -50,7 +50,7 @@ class _Shaded:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fringe:
+class _OutlineRows:
     """Pixels at a mesh's outline continue what their neighbours inside show: those whose centres the mesh misses
     have nothing of their own, the others lean on their neighbours the more, the less they are covered. So nothing
     jumps when the outline passes over a pixel's centre.
@@ -66,9 +66,9 @@ class _Fringe:
     weight: Tensor
 
     @classmethod
-    def of(
+    def from_coverage(
         cls, layout: verbs.PixelLayout, hit: Tensor, coverage: Tensor, mesh_pixel: Tensor, owner: Tensor
-    ) -> _Fringe:
+    ) -> _OutlineRows:
         """hit, coverage, owner (T,): of all packed pixels; mesh_pixel (Rm,) int64: those that have a row."""
         row = (coverage.detach()[mesh_pixel] < 1).nonzero()[:, 0]
         pixel = mesh_pixel[row]
@@ -97,20 +97,22 @@ class _Fringe:
         return known.index_add(0, self.row, (1.0 - self.own)[:, None] * (mean - known[self.row]))
 
 
-def layers(
-    prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, sun: Sun | None = None
+def draw_layers(
+    prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, sun: PerturbedSun | None = None
 ) -> ObjectLayers:
     """`layers` in plain torch."""
-    rows = _rows(prepared, drawn, bool(objects.source))
+    rows = _collect_rows(prepared, drawn, bool(objects.source))
     size = drawn.mesh.layout.size
     if objects.source:
-        shaded = _photographed_rows(prepared, objects, drawn, rows, sun)
+        shaded = _shade_photographed(prepared, objects, drawn, rows, sun)
     else:
         plain = prepared.template_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
-        own = _mesh_attributes(prepared, drawn, rows, plain)
+        own = _interpolate_attributes(prepared, drawn, rows, plain)
         colour = clamp_inclusive(prepared.shade_template(rows.xy, rows.owner, own, sun), 0.0, 1.0)
         z = own[:, channels.OWN_DEPTH]
-        shaded = _Shaded(colour, torch.ones_like(z), z, own[:, channels.OWN_PAINT], own[:, channels.OWN_HEIGHT])
+        shaded = _ShadedRows(
+            colour, torch.ones_like(z), z, own[:, channels.OWN_PAINT], own[:, channels.OWN_HEIGHT]
+        )
     colour, depth = shaded.colour, shaded.depth
     if is_active(objects.texture_code):
         code, base = objects.texture_code.index_select(0, rows.owner), prepared.paint_lightness[rows.owner]
@@ -127,11 +129,11 @@ def layers(
         opacity.new_zeros(size).index_add(0, rows.pixel, opacity),
         z,
         drawn.patch_layout,
-        _shadow_factors(prepared, objects, drawn),
+        _sample_shadows(prepared, objects, drawn),
     )
 
 
-def _rows(prepared: PreparedScene, drawn: VisibleSurfaces, with_halo: bool) -> _Rows:
+def _collect_rows(prepared: PreparedScene, drawn: VisibleSurfaces, with_halo: bool) -> _PixelRows:
     layout = drawn.mesh.layout
     count = layout.rects.shape[0]
     covered = drawn.coverage.detach()
@@ -154,11 +156,13 @@ def _rows(prepared: PreparedScene, drawn: VisibleSurfaces, with_halo: bool) -> _
     x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
     within, width = pixel - layout.offsets[rows_owner], x1 - x0
     xy = torch.stack([x0 + within % width, y0 + within // width], dim=-1)
-    fringe = _Fringe.of(layout, hit, drawn.coverage, mesh_pixel, owner)
-    return _Rows(pixel, rows_owner, xy.to(prepared.like), share, counts, mesh_pixel.shape[0], fringe, anchor)
+    fringe = _OutlineRows.from_coverage(layout, hit, drawn.coverage, mesh_pixel, owner)
+    return _PixelRows(pixel, rows_owner, xy.to(prepared.like), share, counts, mesh_pixel.shape[0], fringe, anchor)
 
 
-def _mesh_attributes(prepared: PreparedScene, drawn: VisibleSurfaces, rows: _Rows, attributes: Tensor) -> Tensor:
+def _interpolate_attributes(
+    prepared: PreparedScene, drawn: VisibleSurfaces, rows: _PixelRows, attributes: Tensor
+) -> Tensor:
     """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
     dense = verbs.interpolate(
         drawn.mesh, drawn.geometry.clip, prepared.object_surfaces.faces, attributes, prepared.settings.backend
@@ -166,28 +170,28 @@ def _mesh_attributes(prepared: PreparedScene, drawn: VisibleSurfaces, rows: _Row
     return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
 
-def _averaged_attributes(
-    prepared: PreparedScene, drawn: VisibleSurfaces, rows: _Rows, attributes: Tensor
+def _average_attributes(
+    prepared: PreparedScene, drawn: VisibleSurfaces, rows: _PixelRows, attributes: Tensor
 ) -> Tensor:
     """`_mesh_attributes`, but the mean over the pixels, at `model.SUBPIXELS`: what is thinner than a pixel would
     else be a row of dots. A place that is not reached counts as the pixel's centre."""
-    fleet, clip = prepared.object_surfaces, drawn.geometry.clip.double()
+    object_surfaces, clip = prepared.object_surfaces, drawn.geometry.clip.double()
     face = drawn.mesh.face[rows.pixel[: rows.mesh_rows]].long()
     hit = (face >= 0).nonzero()[:, 0]
     centre, start = rows.xy[hit].double(), face[hit]
     total = clip.new_zeros(len(hit), attributes.shape[1])
     for place in model.SUBPIXELS:
         xy = centre + clip.new_tensor(place) / 16.0
-        found = _walked(start, xy, clip.detach(), fleet.faces, fleet.neighbours)
+        found = _walk_mesh(start, xy, clip.detach(), object_surfaces.faces, object_surfaces.neighbours)
         xy = torch.where(found[:, None] < 0, centre, xy)
-        corner = fleet.faces[torch.where(found < 0, start, found)]
+        corner = object_surfaces.faces[torch.where(found < 0, start, found)]
         share = surfaces.perspective_weights(clip[corner], xy)
         total = total + (share[..., None] * attributes.double()[corner]).sum(dim=1)
     mean = clip.new_zeros(len(face), attributes.shape[1]).index_copy(0, hit, total / len(model.SUBPIXELS))
     return rows.fringe.fill(mean.to(attributes))
 
 
-def _walked(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tensor) -> Tensor:
+def _walk_mesh(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tensor) -> Tensor:
     """Faces (K,) that places xy (K, 2) px lie in, reached from `face` (K,) over the mesh's edges; -1 where it ends
     or turns away before, or that takes more than `model.WALK` faces."""
     found, here = torch.full_like(face, -1), face
@@ -206,16 +210,21 @@ def _walked(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tenso
     return found
 
 
-def _photographed_rows(
-    prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, rows: _Rows, sun: Sun | None
-) -> _Shaded:
+def _shade_photographed(
+    prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, rows: _PixelRows, sun: PerturbedSun | None
+) -> _ShadedRows:
     """All rows, coloured by the photograph, and completed where it did not see the mesh."""
-    geometry, base, fleet, m = drawn.geometry, prepared.base_geometry, prepared.object_surfaces, rows.mesh_rows
+    geometry, base, object_surfaces, m = (
+        drawn.geometry,
+        prepared.base_geometry,
+        prepared.object_surfaces,
+        rows.mesh_rows,
+    )
     turn = torch.stack(
         [
             geometry.facing_cos - base.facing_cos,
             base.facing_cos,
-            fleet.paint,
+            object_surfaces.paint,
             prepared.vertex_height,
             geometry.brightening,
         ],
@@ -223,8 +232,10 @@ def _photographed_rows(
     )
 
     attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
-    dense = verbs.interpolate(drawn.mesh, geometry.clip, fleet.faces, attributes, prepared.settings.backend)
-    mesh = rows.fringe.fill(_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
+    dense = verbs.interpolate(
+        drawn.mesh, geometry.clip, object_surfaces.faces, attributes, prepared.settings.backend
+    )
+    mesh = rows.fringe.fill(_photograph_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
     look = torch.cat([mesh, mesh.index_select(0, rows.anchor)])
     move, rest = look.split([channels.W_THEN, channels.LOOK - channels.W_THEN], dim=1)
     z_then, z_now, turned, cos_then, paint, up, brighter = rest.unbind(1)
@@ -234,7 +245,7 @@ def _photographed_rows(
     seen = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
     rgb, rest = seen.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
     alpha, hidden, inset, z_seen, support = rest.unbind(1)
-    rgb = texture.relit(rgb, brighter)
+    rgb = texture.relight(rgb, brighter)
     clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
     inside = texture.inside_weight(uv, *prepared.frame_hw)
     visible = inside * clear
@@ -260,25 +271,25 @@ def _photographed_rows(
     need = (fill != 0.0).nonzero()[:, 0]
     if need.numel():
         filled = fill.index_select(0, need)
-        completed = _completion(prepared, objects, drawn, rows, need, cos_then[:m] + turned[:m], sun)
+        completed = _complete_unseen(prepared, objects, drawn, rows, need, cos_then[:m] + turned[:m], sun)
         colour = colour.index_add(0, need, filled[:, None] * completed)
         opacity = opacity.index_add(0, need, filled)
     assert prepared.regions is not None
     if is_active(objects.texture_code) and bool(prepared.regions.known.any()):
         unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
-        found = prepared.regions.texels.sample_parts(uv, rows.counts, prepared.settings.backend)[:, 0]
+        found = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.settings.backend)[:, 0]
         paint = texture.paint_share(paint, found, unseen, prepared.regions.known[rows.owner])
-    return _Shaded(colour, opacity, z_now, paint, up)
+    return _ShadedRows(colour, opacity, z_now, paint, up)
 
 
-def _completion(
+def _complete_unseen(
     prepared: PreparedScene,
     objects: Objects,
     drawn: VisibleSurfaces,
-    rows: _Rows,
+    rows: _PixelRows,
     need: Tensor,
     cos_now: Tensor,
-    sun: Sun | None,
+    sun: PerturbedSun | None,
 ) -> Tensor:
     """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the
     template in the car's own finish.
@@ -286,9 +297,9 @@ def _completion(
     cos_now: (Rm,) towards the camera.
     """
     attributes = prepared.completion_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
-    own = _averaged_attributes(prepared, drawn, rows, attributes)[need]
+    own = _average_attributes(prepared, drawn, rows, attributes)[need]
     gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
-    colour = texture.finished(prepared.shade_template(rows.xy[need], rows.owner[need], own, sun), gain, lift)
+    colour = texture.apply_finish(prepared.shade_template(rows.xy[need], rows.owner[need], own, sun), gain, lift)
     clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
     z = clip[:, 2]
     safe = z.clamp(min=model.NEAREST_MIRRORED_M)
@@ -311,7 +322,7 @@ def _completion(
     return colour + weight[:, None] * (clamp_inclusive(straight, 0.0, 1.0) - colour)
 
 
-def _shadow_factors(prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces) -> Tensor:
+def _sample_shadows(prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces) -> Tensor:
     """Factors (Ts, 3) on the ground, of all patches."""
     clip, layout = drawn.geometry.patch_clip, drawn.patch_layout
     assert drawn.patch_fragments is not None
@@ -325,7 +336,7 @@ def _shadow_factors(prepared: PreparedScene, objects: Objects, drawn: VisibleSur
     dense = verbs.interpolate(drawn.patch_fragments, clip, faces, fixed, prepared.settings.backend)
     hit = (drawn.patch_fragments.face >= 0).nonzero()[:, 0]
     xy = layout.pixel_xy()[hit].to(prepared.like)
-    wanted = xy + _lookup(dense.index_select(0, hit), xy)[:, :2]
+    wanted = xy + _photograph_lookup(dense.index_select(0, hit), xy)[:, :2]
     height, width = prepared.frame_hw
     # Constant from the border on, where `_darkness` repeats it: clamping two pixels beyond leaves no kink.
     uv = wanted.clamp(min=-2.0).minimum(wanted.new_tensor([width + 1.0, height + 1.0]))
@@ -340,7 +351,7 @@ def _shadow_factors(prepared: PreparedScene, objects: Objects, drawn: VisibleSur
     return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
 
 
-def _lookup(attributes: Tensor, xy: Tensor) -> Tensor:
+def _photograph_lookup(attributes: Tensor, xy: Tensor) -> Tensor:
     """From interpolated clip differences to where the photograph shows this point.
 
     attributes (R, 4 + K): clip then minus now (3), w then, and K more; xy (R, 2) px

@@ -75,10 +75,10 @@ def solve_sources(
         raise ShapeError("mattes and shadows", f"one an object, {count}", f"{len(alphas)} and {len(shadows)}")
     with torch.no_grad():
         margins = list(margins_px) if margins_px is not None else [settings.margin_px] * count
-        return _solve(scene, list(alphas), list(shadows), margins, settings)
+        return _solve_scene(scene, list(alphas), list(shadows), margins, settings)
 
 
-def from_own_picture(bare: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
+def photograph_scene(bare: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
     """`bare` after a photograph of it, of 8 bit and drawn by the compositor itself, was taken apart. bare: its
     objects stand before its background, and have no sources. backend: see `RenderSettings`.
     """
@@ -91,7 +91,7 @@ def from_own_picture(bare: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
     clear, mattes = torch.ones_like(bare.depth), list(shot.opacity)
     for i in reversed(order):  # the nearest hides the others
         opacity = shot.opacity[i]
-        window = _window(clear[None], opacity)
+        window = _crop_view(clear[None], opacity)
         mattes[i] = replace(opacity, values=opacity.values * window)
         window *= 1 - opacity.values
     taken = replace(bare, photograph=(shot.image * _LEVELS).round() / _LEVELS)
@@ -103,7 +103,7 @@ def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> 
     bare = replace(scene, objects=replace(scene.objects, source=()))
     with torch.no_grad():
         compositor = Compositor(bare, settings)
-        layers = compositor.layers(compositor.scene.objects)
+        layers = compositor.draw_layers(compositor.scene.objects)
     rects = layers.shadow_layout.rects.tolist()
     return tuple(
         Crop(layers.shadow[packed].T.reshape(3, *size), rects[i][0], rects[i][1])
@@ -111,7 +111,7 @@ def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> 
     )
 
 
-def _solve(
+def _solve_scene(
     scene: SceneIR,
     alphas: list[Crop],
     shadows: list[Crop | None],
@@ -120,66 +120,70 @@ def _solve(
 ) -> SceneIR:
     objects, image = scene.objects, scene.photograph
     frame_hw = (scene.camera.height, scene.camera.width)
-    blank = [_source(scene, i, alphas[i], shadows[i], margins_px[i], settings) for i in range(len(objects))]
+    blank = [
+        _unsolved_source(scene, i, alphas[i], shadows[i], margins_px[i], settings) for i in range(len(objects))
+    ]
     staged = scene.with_objects(source=tuple(blank))  # type: ignore[arg-type]
     compositor = Compositor(staged, RenderSettings(settings.backend), whole_patches=True)
     drawn = compositor.find_visible(compositor.scene.objects)
     nearest = drawn.nearest_hits()
     count = len(objects)
-    mattes = [_cut(alphas[i], drawn, nearest, i, image) for i in range(count)]
+    mattes = [_cut_matte(alphas[i], drawn, nearest, i, image) for i in range(count)]
     mattes += [replace(f.foreground, values=f.foreground.values[3:].to(image)) for f in scene.occluders]
     covered = torch.zeros(frame_hw, dtype=torch.bool)
     for matte in mattes:
-        _window(covered[None], matte)[0] |= matte.values[0] > 0
-    factors = _shadow_crops(compositor, drawn, shadows, covered, settings)
-    background = _balance(image, scene.background, factors, covered)
+        _crop_view(covered[None], matte)[0] |= matte.values[0] > 0
+    factors = _complete_shadows(compositor, drawn, shadows, covered, settings)
+    background = _balance_background(image, scene.background, factors, covered)
 
     canvas = background.clone()
     for factor in factors:
-        _window(canvas, factor).mul_(factor.values)
+        _crop_view(canvas, factor).mul_(factor.values)
     order = blend.paint_order(
         objects.size_lhw,
         objects.yaw,
         objects.translation,
         surfaces.camera_centre(scene.camera.matrix),
-        blend.standing_footprints(scene.occluders, scene.camera.matrix),
+        blend.occluder_footprints(scene.occluders, scene.camera.matrix),
     )
     behind_nearer = {
-        i: texture.hidden_behind([mattes[j] for j in order[place + 1 :]], frame_hw, image)
+        i: texture.occlusion_map([mattes[j] for j in order[place + 1 :]], frame_hw, image)
         for place, i in enumerate(order)
     }
     lit = [factors[i] if shadows[i] is not None else None for i in range(count)]
-    blank = _lit_sources(scene, blank, mattes, lit, [behind_nearer[i] for i in range(count)], settings)
+    blank = _estimate_lighting(scene, blank, mattes, lit, [behind_nearer[i] for i in range(count)], settings)
     solved: dict[int, Source] = {}
     front = list(scene.occluders)
     for place, i in enumerate(order):
         nearer = torch.zeros(frame_hw, dtype=torch.bool)
         for j in order[place + 1 :]:
-            _window(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
+            _crop_view(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
         if i >= count:
             bare = replace(mattes[i], values=torch.zeros_like(mattes[i].values))
-            standing = _foreground(mattes[i], image, canvas, nearer, bare)
-            behind = _window(canvas, standing)
+            standing = _solve_foreground(mattes[i], image, canvas, nearer, bare)
+            behind = _crop_view(canvas, standing)
             behind.copy_(standing.values[:3] + (1.0 - standing.values[3:]) * behind)
             front[i - count] = replace(front[i - count], foreground=standing)
             continue
         packed, size = drawn.mesh.layout.spans()[i]
         x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
         coverage = Crop(drawn.coverage[packed].reshape(1, *size), x0, y0)
-        foreground = _foreground(mattes[i], image, canvas, nearer, coverage)
+        foreground = _solve_foreground(mattes[i], image, canvas, nearer, coverage)
         source = replace(blank[i], foreground=foreground, shadow=lit[i])
         solved[i] = source
         rect = drawn.mesh.layout.rects[i].tolist()
-        if not any(_meet(rect, mattes[j]) for j in order[place + 1 :]):
+        if not any(_touches(rect, mattes[j]) for j in order[place + 1 :]):
             continue  # nothing is solved against what it shows
-        one = replace(scene, background=canvas, objects=replace(_only(objects, i), source=(source,)), occluders=())
+        one = replace(
+            scene, background=canvas, objects=replace(_select_object(objects, i), source=(source,)), occluders=()
+        )
         alone = Compositor(one, RenderSettings(settings.backend), hidden=[behind_nearer[i]])
-        canvas = _with_layer(alone)
+        canvas = _composite_object(alone)
     sources = tuple(solved[i] for i in range(count))
     return replace(scene, background=background, objects=replace(objects, source=sources), occluders=tuple(front))
 
 
-def _source(
+def _unsolved_source(
     scene: SceneIR, index: int, alpha: Crop, shadow: Crop | None, margin_px: float, settings: SolveSettings
 ) -> Source:
     """A source with its geometry, not yet solved."""
@@ -194,7 +198,7 @@ def _source(
     )  # fmt: skip
 
 
-def _lit_sources(
+def _estimate_lighting(
     scene: SceneIR,
     blank: list[Source],
     mattes: list[Crop],
@@ -207,18 +211,18 @@ def _lit_sources(
         return blank
     plain = []
     for source, matte in zip(blank, mattes, strict=False):  # those of what stands in front come after
-        colour = _window(scene.photograph, matte) * matte.values
+        colour = _crop_view(scene.photograph, matte) * matte.values
         plain.append(replace(source, foreground=replace(matte, values=torch.cat([colour, matte.values]))))
     whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), occluders=())
     compositor = Compositor(whole, RenderSettings(settings.backend), hidden=hidden)
     samples = compositor.sample_photograph()
     seen = list(zip(compositor.object_surfaces.surfaces, samples, strict=True))
-    strength = finish.sunlight(seen, [_by_shadow(s, scene.environment.sun) for s in shadows])
-    paint = compositor.base_paint(samples)
+    strength = finish.estimate_sunlight(seen, [_sunlight_from_shadow(s, scene.environment.sun) for s in shadows])
+    paint = compositor.estimate_paint(samples)
     return [replace(s, paint=paint[i], sunlight=strength) for i, s in enumerate(blank)]
 
 
-def _only(objects: Objects, index: int) -> Objects:
+def _select_object(objects: Objects, index: int) -> Objects:
     """Object `index` alone, without source."""
     names = (
         "mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d", "truncation",
@@ -227,30 +231,30 @@ def _only(objects: Objects, index: int) -> Objects:
     return replace(objects, source=(), **{n: getattr(objects, n)[index : index + 1] for n in names})
 
 
-def _window(frame: Tensor, crop: Crop) -> Tensor:
+def _crop_view(frame: Tensor, crop: Crop) -> Tensor:
     """The view of a frame (C, H, W) that a crop lies on."""
     h, w = crop.values.shape[1:]
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
 
 
-def _meet(rect: Sequence[int], matte: Crop) -> bool:
+def _touches(rect: Sequence[int], matte: Crop) -> bool:
     """Whether a matte has pixels in a rectangle x0, y0, x1, y1, half-open, or right beside it."""
     h, w = matte.values.shape[1:]
     across = matte.x0 <= rect[2] and rect[0] <= matte.x0 + w
     return bool(h and w) and across and matte.y0 <= rect[3] and rect[1] <= matte.y0 + h
 
 
-def _cut(alpha: Crop, drawn: VisibleSurfaces, nearest: Tensor, index: int, like: Tensor) -> Crop:
+def _cut_matte(alpha: Crop, drawn: VisibleSurfaces, nearest: Tensor, index: int, like: Tensor) -> Crop:
     """The matte where mesh and halo carry it, trimmed to where it is above 0 and what it may be continued to."""
     packed, size = drawn.mesh.layout.spans()[index]
     x0, y0, x1, y1 = drawn.mesh.layout.rects[index].tolist()
     height, width = like.shape[1:]
     carried = (nearest[packed] >= 0).reshape(1, *size).to(like)
-    values = texture.crop_of(alpha, (x0, y0, x1, y1), (height, width)).to(like).clamp(0.0, 1.0) * carried
-    return _trimmed(Crop(values, x0, y0), values[0] > 0, grow=int(np.ceil(_EXTENSION_PX)))
+    values = texture.extract_crop(alpha, (x0, y0, x1, y1), (height, width)).to(like).clamp(0.0, 1.0) * carried
+    return _trim_crop(Crop(values, x0, y0), values[0] > 0, grow=int(np.ceil(_EXTENSION_PX)))
 
 
-def _trimmed(crop: Crop, keep: Tensor, grow: int = 0) -> Crop:
+def _trim_crop(crop: Crop, keep: Tensor, grow: int = 0) -> Crop:
     """The smallest part of a crop that holds `keep` (h, w), and `grow` px around it."""
     rows, columns = keep.any(dim=1).nonzero()[:, 0], keep.any(dim=0).nonzero()[:, 0]
     if rows.numel() == 0:
@@ -261,7 +265,7 @@ def _trimmed(crop: Crop, keep: Tensor, grow: int = 0) -> Crop:
     return Crop(crop.values[:, top:bottom, left:right].contiguous(), crop.x0 + left, crop.y0 + top)
 
 
-def _shadow_crops(
+def _complete_shadows(
     compositor: Compositor,
     drawn: VisibleSurfaces,
     shadows: list[Crop | None],
@@ -281,17 +285,17 @@ def _shadow_crops(
         rect = (x0, y0, x0 + size[1], y0 + size[0])
         height, width = covered.shape
         inverted = replace(shadow, values=1.0 - shadow.values.to(density))
-        dark = texture.crop_of(inverted, rect, (height, width)).clamp(0.0, 1.0)
+        dark = texture.extract_crop(inverted, rect, (height, width)).clamp(0.0, 1.0)
         expected = density[packed].reshape(size)
         if settings.complete_shadows:
-            dark = _continue_shadow(dark, expected, covered[y0 : rect[3], x0 : rect[2]])
+            dark = _extend_shadow(dark, expected, covered[y0 : rect[3], x0 : rect[2]])
         hit = (drawn.patch_fragments.face[packed] >= 0).reshape(1, *size)
         dark = dark * (hit & (dark.amax(dim=0, keepdim=True) > 0.5 / _LEVELS))
-        out.append(_trimmed(Crop(1.0 - dark, x0, y0), dark.amax(dim=0) > 0))
+        out.append(_trim_crop(Crop(1.0 - dark, x0, y0), dark.amax(dim=0) > 0))
     return out
 
 
-def _continue_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
+def _extend_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
     """Darkness (3, h, w) with its unseen pixels, `covered` (h, w), taken from the expected one (h, w), fitted to
     the seen ones in strength and, near them, in value."""
     seen = (~covered).to(dark)
@@ -310,14 +314,14 @@ def _continue_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
     return torch.where(covered, (model + rest).clamp(0.0, 0.95), dark)
 
 
-def _balance(image: Tensor, background: Tensor, factors: list[Crop], covered: Tensor) -> Tensor:
+def _balance_background(image: Tensor, background: Tensor, factors: list[Crop], covered: Tensor) -> Tensor:
     """The background for which background times shadows is the photograph where no vehicle covers it.
 
     Changes `factors` in place where the quantised background asks for it.
     """
     product = torch.ones_like(image)
     for factor in factors:
-        _window(product, factor).mul_(factor.values)
+        _crop_view(product, factor).mul_(factor.values)
     free = ~covered
     plain = free & (product == 1.0).all(dim=0)
     near = ((image - background * product).abs().amax(dim=0) <= _KEEP) & free
@@ -329,26 +333,26 @@ def _balance(image: Tensor, background: Tensor, factors: list[Crop], covered: Te
     chosen = torch.full(covered.shape, -1)
     for i, factor in enumerate(factors):
         mean = factor.values.mean(dim=0) if factor.values.numel() else factor.values.new_zeros(0, 0)
-        lowest, choice = _window(darkest[None], factor)[0], _window(chosen[None], factor)[0]
+        lowest, choice = _crop_view(darkest[None], factor)[0], _crop_view(chosen[None], factor)[0]
         better = (mean < lowest) & (mean < 1.0)
         choice[better] = i
         lowest[better] = mean[better]
     failed = torch.zeros_like(covered)
     for i, factor in enumerate(factors):
-        mine = ((_window(chosen[None], factor)[0] == i) & _window(free[None], factor)[0])[None]
-        below, goal = _window(out, factor), _window(image, factor)
-        others = _window(product, factor) / factor.values.clamp(min=1e-6)
+        mine = ((_crop_view(chosen[None], factor)[0] == i) & _crop_view(free[None], factor)[0])[None]
+        below, goal = _crop_view(out, factor), _crop_view(image, factor)
+        others = _crop_view(product, factor) / factor.values.clamp(min=1e-6)
         wanted = goal / (below * others).clamp(min=1e-6)
         below.copy_(torch.where(mine & (wanted > 1.0), goal / others, below))
         factor.values.copy_(torch.where(mine, wanted.clamp(max=1.0), factor.values))
         exact = (below * others * factor.values - goal).abs().amax(dim=0) < 1e-6
-        _window(failed[None], factor)[0] |= mine[0] & ((below > 1.0).any(dim=0) | ~exact)
+        _crop_view(failed[None], factor)[0] |= mine[0] & ((below > 1.0).any(dim=0) | ~exact)
     for factor in factors:
-        factor.values.masked_fill_(_window(failed[None], factor), 1.0)
+        factor.values.masked_fill_(_crop_view(failed[None], factor), 1.0)
     return torch.where(failed, image, out)
 
 
-def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, coverage: Crop) -> Crop:
+def _solve_foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, coverage: Crop) -> Crop:
     """Premultiplied foreground and matte (4, h, w) over the canvas, continued a little under nearer objects.
 
     nearer: (H, W) bool, where they are; coverage: Crop (1, h, w) by the mesh, the opacity under them.
@@ -356,10 +360,10 @@ def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, cove
     h, w = matte.values.shape[1:]
     if h == 0 or w == 0:
         return Crop(image.new_zeros(4, 0, 0), matte.x0, matte.y0)
-    goal, behind = _window(image, matte), _window(canvas, matte)
+    goal, behind = _crop_view(image, matte), _crop_view(canvas, matte)
     opacity = matte.values[0]
-    seen = (opacity > 0) & ~_window(nearer[None], matte)[0]
-    low, high = _plausible(goal, seen & (opacity > _SOLID))
+    seen = (opacity > 0) & ~_crop_view(nearer[None], matte)[0]
+    low, high = _plausible_range(goal, seen & (opacity > _SOLID))
     need = torch.where(
         goal < behind,
         (behind - goal) / (behind - low).clamp(min=1e-6),
@@ -374,13 +378,13 @@ def _foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, cove
     distance, index = (torch.from_numpy(part) for part in nearest_true_pixel(solid))
     straight = (colour / raised.clamp(min=0.5)).flatten(1)[:, index]
     rect = (matte.x0, matte.y0, matte.x0 + w, matte.y0 + h)
-    filled = texture.crop_of(coverage, rect, (image.shape[1], image.shape[2])).to(values)
+    filled = texture.extract_crop(coverage, rect, (image.shape[1], image.shape[2])).to(values)
     continued = torch.cat([straight * filled, filled])
-    use = (distance <= _EXTENSION_PX) & _window(nearer[None], matte)[0] & ~seen
+    use = (distance <= _EXTENSION_PX) & _crop_view(nearer[None], matte)[0] & ~seen
     return replace(matte, values=torch.where(use, continued, values))
 
 
-def _plausible(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
+def _plausible_range(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
     """Lowest and highest foreground (3, h, w) to believe in: between the photograph's colour and that of the
     nearest pixel that is all vehicle, `solid` (h, w), and a little beyond."""
     if not bool(solid.any()):
@@ -391,7 +395,7 @@ def _plausible(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
     return low, (torch.maximum(goal, inside) + _COLOUR_SLACK).clamp(max=1.0)
 
 
-def _by_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
+def _sunlight_from_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
     """How strong the sun (3,) is that casts this shadow, by what it takes away; None without one."""
     if shadow is None or not shadow.values.numel():
         return None
@@ -403,11 +407,11 @@ def _by_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
     return (_OPEN * level / max(left, 0.05) - level) / max(-float(sun[1]), 0.3)
 
 
-def _with_layer(alone: Compositor) -> Tensor:
+def _composite_object(alone: Compositor) -> Tensor:
     """The background of a scene of one object with that object laid over it, without its shadow."""
     objects, background = alone.scene.objects, alone.scene.background
-    layers = alone.layers(objects)
+    layers = alone.draw_layers(objects)
     no_shadow = PixelLayout.from_rects(layers.shadow_layout.rects * 0)
-    plan = blend.Plan.of(layers.layout, no_shadow, range(len(objects)))
+    plan = blend.BlendPlan.from_layouts(layers.layout, no_shadow, range(len(objects)))
     what = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
     return blend.composite(background, alone.scene.depth, what, plan, False, alone.settings.backend)[0]

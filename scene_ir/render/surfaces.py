@@ -209,17 +209,17 @@ class ObjectSurfaces:
         )
 
     @staticmethod
-    def concat_faces(fleets: Sequence[ObjectSurfaces]) -> tuple[Tensor, list[list[int]], list[list[int]]]:
+    def concat_faces(surface_sets: Sequence[ObjectSurfaces]) -> tuple[Tensor, list[list[int]], list[list[int]]]:
         """Faces (F, 3) of several fleets' vertices, one after the other; vertex and face ranges of all objects."""
         vertex_ranges: list[list[int]] = []
         face_ranges: list[list[int]] = []
         faces, vertices, triangles = [], 0, 0
-        for fleet in fleets:
-            faces.append(fleet.faces + vertices)
-            vertex_ranges += [[vertices + a, vertices + b] for a, b in fleet.vertex_ranges.tolist()]
-            face_ranges += [[triangles + a, triangles + b] for a, b in fleet.face_ranges.tolist()]
-            vertices += fleet.owner.shape[0]
-            triangles += fleet.faces.shape[0]
+        for object_surfaces in surface_sets:
+            faces.append(object_surfaces.faces + vertices)
+            vertex_ranges += [[vertices + a, vertices + b] for a, b in object_surfaces.vertex_ranges.tolist()]
+            face_ranges += [[triangles + a, triangles + b] for a, b in object_surfaces.face_ranges.tolist()]
+            vertices += object_surfaces.owner.shape[0]
+            triangles += object_surfaces.faces.shape[0]
         return torch.cat(faces), vertex_ranges, face_ranges
 
     def local_vertices(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
@@ -280,49 +280,59 @@ class VertexPlacement:
     vertex_edges: list[int]
 
     @classmethod
-    def concat(cls, rigs: Sequence[VertexPlacement]) -> VertexPlacement:
+    def concat(cls, placements: Sequence[VertexPlacement]) -> VertexPlacement:
         """Several scenes' objects, one after the other."""
-        if len(rigs) == 1:
-            return rigs[0]
-        counts = [r.matrix.shape[0] for r in rigs]
+        if len(placements) == 1:
+            return placements[0]
+        counts = [r.matrix.shape[0] for r in placements]
         shifts = [sum(counts[:i]) for i in range(len(counts))]
         edges = [0]
-        for rig in rigs:
-            edges += [edges[-1] + e for e in rig.vertex_edges[1:]]
-        plain = ("unit", "normal", "paint", "ffd", "lit", "sunlight", "matrix", "centre")
+        for placement in placements:
+            edges += [edges[-1] + e for e in placement.vertex_edges[1:]]
+        plain = ("unit", "normal", "paint", "base_ffd", "base_exposure", "sunlight", "matrix", "centre")
         return cls(
-            bent=torch.cat([r.base_bend for r in rigs], 1),
-            weights=tuple(w for r in rigs for w in r.weights),
-            owner=torch.cat([r.owner + s for r, s in zip(rigs, shifts, strict=True)]),
-            edges=edges,
-            **{name: torch.cat([getattr(r, name) for r in rigs]) for name in plain},
+            base_bend=torch.cat([r.base_bend for r in placements], 1),
+            weights=tuple(w for r in placements for w in r.weights),
+            owner=torch.cat([r.owner + s for r, s in zip(placements, shifts, strict=True)]),
+            vertex_edges=edges,
+            **{name: torch.cat([getattr(r, name) for r in placements]) for name in plain},
         )
 
     @classmethod
     def from_objects(
-        cls, fleet: ObjectSurfaces, base: Objects, normal: Tensor, camera: Camera, sun: Tensor, sunlight: Tensor
+        cls,
+        object_surfaces: ObjectSurfaces,
+        base: Objects,
+        normal: Tensor,
+        camera: Camera,
+        sun: Tensor,
+        sunlight: Tensor,
     ) -> VertexPlacement:
         """Of one scene's objects, as photographed. normal (V, 3), welded; sun (3,) and sunlight (N,): the
         photograph's."""
         count, like = len(base), normal
-        rig = cls(
-            unit=torch.cat([s.unit for s in fleet.surfaces]) if count else like,
-            weights=tuple(s.weights for s in fleet.surfaces),
+        placement = cls(
+            unit=torch.cat([s.unit for s in object_surfaces.surfaces]) if count else like,
+            weights=tuple(s.weights for s in object_surfaces.surfaces),
             normal=normal.contiguous(),
-            owner=fleet.owner.to(torch.int32),
-            paint=fleet.paint,
-            ffd=base.ffd.new_full((), torch.nan),
-            bent=torch.zeros_like(like.T),
-            lit=like.new_zeros(len(like)),
+            owner=object_surfaces.owner.to(torch.int32),
+            paint=object_surfaces.paint,
+            base_ffd=base.ffd.new_full((), torch.nan),
+            base_bend=torch.zeros_like(like.T),
+            base_exposure=like.new_zeros(len(like)),
             sunlight=sunlight,
             matrix=camera.matrix.to(like).expand(count, 3, 4).contiguous(),
             centre=camera_centre(camera.matrix).to(like).expand(count, 3).contiguous(),
-            edges=[0, *fleet.vertex_ranges[:, 1].tolist()],
+            vertex_edges=[0, *object_surfaces.vertex_ranges[:, 1].tolist()],
         )
-        rig = replace(rig, bent=rig.bend_vertices(base.ffd), ffd=base.ffd)
+        placement = replace(placement, base_bend=placement.bend_vertices(base.ffd), base_ffd=base.ffd)
         lights = torch.cat([sun.to(like).expand(count, 3), sunlight[:, None]], dim=1)
         poses = base.ffd, base.size_lhw, base.yaw, base.translation
-        return replace(rig, lit=place_with_kernels(rig, *poses, lights)[3]) if count else rig
+        return (
+            replace(placement, base_exposure=place_with_kernels(placement, *poses, lights)[3])
+            if count
+            else placement
+        )
 
     def bend_vertices(self, ffd: Tensor) -> Tensor:
         """What offsets (N, P, 3) are at the vertices, as fractions of the unit box: rows x, y, z (3, V), which a
@@ -344,15 +354,15 @@ class VertexPlacement:
 
 
 def place_with_kernels(
-    rig: VertexPlacement, ffd: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor, lights: Tensor
+    placement: VertexPlacement, ffd: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor, lights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """By the kernels, in float32: clip coordinates (V, 3) of objects' vertices, the cosines (V,) of their normals
-    to the camera, how much brighter they are (V,), see `texture.brightened`, and how squarely the sun meets them
+    to the camera, how much brighter they are (V,), see `texture.limit_brightening`, and how squarely the sun meets them
     (V,). lights (N, 4): direction and strength of the sun on each object.
     """
-    from scene_ir.render.kernels.placement import Place
+    from scene_ir.render.kernels.placement import PlaceVertices
 
-    found = Place.apply(ffd, size_lhw, yaw, translation, lights, rig)
+    found = PlaceVertices.apply(ffd, size_lhw, yaw, translation, lights, placement)
     assert isinstance(found, tuple)
     return found
 
@@ -364,9 +374,9 @@ def place_patches(
     float64, 0 to 1 both ways; and without gradient the same back, and clip coordinates (4N, 3) of the corners.
     lights as of `placed`; fixed: as of `Prepared.patched`.
     """
-    from scene_ir.render.kernels.patches import Patch
+    from scene_ir.render.kernels.shadow_patches import PlacePatches
 
-    found = Patch.apply(yaw, translation, size_lhw, lights, fixed)
+    found = PlacePatches.apply(yaw, translation, size_lhw, lights, fixed)
     assert isinstance(found, tuple)
     return found
 

@@ -50,7 +50,7 @@ class _Smoothstep(torch.autograd.Function):
 
 
 @dataclass(frozen=True, slots=True)
-class Texels:
+class PhotographTexels:
     """What the photograph knows of each object. values: (S, C); rects (N, 4) int64 px; offsets (N + 1,) int64."""
 
     values: Tensor
@@ -58,7 +58,7 @@ class Texels:
     offsets: Tensor
 
     @classmethod
-    def pack(cls, crops: Sequence[Crop], like: Tensor) -> Texels:
+    def from_crops(cls, crops: Sequence[Crop], like: Tensor) -> PhotographTexels:
         """Crops of one channel count, packed. `like`: a tensor of the dtype and device wanted."""
         rows = [crop.values.flatten(1).T.to(like) for crop in crops]
         rects = [
@@ -79,9 +79,9 @@ class Texels:
         layout = verbs.PixelLayout.from_rects(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
         return verbs.texture_packed(self.values, self.rects, self.offsets, layout, uv, backend, border)
 
-    def sample_parts(self, uv: Tensor, counts: Tensor, backend: verbs.Backend) -> Tensor:
+    def sample_mesh_and_halo(self, uv: Tensor, counts: Tensor, backend: verbs.Backend) -> Tensor:
         """As `sample`, 0 beyond the crops, with counts (2N,): rows of the objects' meshes, then of their halos."""
-        twice = Texels(
+        twice = PhotographTexels(
             torch.cat([self.values, self.values]),
             torch.cat([self.rects, self.rects]),
             torch.cat([self.offsets, self.offsets[1:] + self.values.shape[0]]),
@@ -90,21 +90,21 @@ class Texels:
 
 
 @dataclass(frozen=True, slots=True)
-class Regions:
+class PaintRegions:
     """Where N objects are paint, by the photograph. texels: of one channel, empty where known (N,) is false."""
 
-    texels: Texels
+    texels: PhotographTexels
     known: Tensor
 
     @classmethod
-    def joined(cls, parts: Sequence[Regions]) -> Regions:
+    def concat(cls, parts: Sequence[PaintRegions]) -> PaintRegions:
         """Those of several scenes' objects, one after the other."""
         if len(parts) == 1:
             return parts[0]
         starts = np.cumsum([0] + [p.texels.values.shape[0] for p in parts])
         offsets = [p.texels.offsets[:-1] + int(start) for p, start in zip(parts, starts[:-1], strict=True)]
         end = parts[0].texels.offsets.new_tensor([int(starts[-1])])
-        texels = Texels(
+        texels = PhotographTexels(
             torch.cat([p.texels.values for p in parts]),
             torch.cat([p.texels.rects for p in parts]),
             torch.cat([*offsets, end]),
@@ -118,7 +118,7 @@ def paint_share(mesh: Tensor, region: Tensor, unseen: Tensor, known: Tensor) -> 
     return torch.where(known, region + unseen * (mesh - region), mesh)
 
 
-def crop_of(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tensor:
+def extract_crop(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tensor:
     """The values (C, h, w) of `crop` seen through `rect` (x0, y0, x1, y1), which may reach beyond the frame.
 
     Zero where the crop says nothing; beyond the frame its edge pixels repeat, since a vehicle goes on there.
@@ -135,7 +135,7 @@ def crop_of(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tenso
     return picked * known
 
 
-def source_texels(
+def build_texels(
     source: Source, mesh_depth: Crop, hidden: Tensor, rect: Sequence[int], frame_hw: tuple[int, int]
 ) -> Crop:
     """The `channels.TEXEL` numbers of the texels of one object inside `rect`, padded.
@@ -145,23 +145,23 @@ def source_texels(
     """
     x0, y0, x1, y1 = rect[0] - _PAD, rect[1] - _PAD, rect[2] + _PAD, rect[3] + _PAD
     window = (x0, y0, x1, y1)
-    rgba = crop_of(source.foreground, window, frame_hw)
+    rgba = extract_crop(source.foreground, window, frame_hw)
     frame = Crop(hidden[None], 0, 0)
     covered = torch.isfinite(mesh_depth.values)
-    padded = crop_of(Crop(covered.to(rgba), mesh_depth.x0, mesh_depth.y0), window, frame_hw)[0] > 0.5
+    padded = extract_crop(Crop(covered.to(rgba), mesh_depth.x0, mesh_depth.y0), window, frame_hw)[0] > 0.5
     finite = torch.where(covered, mesh_depth.values, torch.zeros_like(mesh_depth.values)).to(rgba)
-    depth = continued(crop_of(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw), padded)
+    depth = extend_nearest(extract_crop(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw), padded)
     depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
     inset = torch.from_numpy(np.ascontiguousarray(distance)).to(rgba).clamp(max=_DEEP_PX)
     pool = 2 * model.SUPPORT_PX + 1
     support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=model.SUPPORT_PX)[0]
-    values = torch.cat([rgba, crop_of(frame, window, frame_hw).to(rgba), inset[None], depth, support])
+    values = torch.cat([rgba, extract_crop(frame, window, frame_hw).to(rgba), inset[None], depth, support])
     return Crop(values, x0, y0)
 
 
-def continued(values: Tensor, known: Tensor) -> Tensor:
+def extend_nearest(values: Tensor, known: Tensor) -> Tensor:
     """Values (C, h, w) where `known` (h, w), elsewhere those of the nearest known pixel; unchanged if none is."""
     mask = known.cpu().numpy()
     if not mask.any():
@@ -170,7 +170,7 @@ def continued(values: Tensor, known: Tensor) -> Tensor:
     return values.flatten(1)[:, index]
 
 
-def hidden_behind(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:
+def occlusion_map(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:
     """(H, W) in [0, 1]: 1 well inside the mattes Crop (1, h, w) of nearer objects, 0 wherever they are
     transparent.
 
@@ -243,9 +243,9 @@ def apply_texture_code(
     slope is not.
     """
     if backend == "warp":
-        from scene_ir.render.kernels import colour as kernels
+        from scene_ir.render.kernels.colour import repaint
 
-        return kernels.paint(colour, opacity, code, paint, height, base_lightness)
+        return repaint(colour, opacity, code, paint, height, base_lightness)
     index = ((paint > 0.0) & (opacity > 0.0)).nonzero()[:, 0]
     if index.numel() == 0:
         return colour
@@ -260,7 +260,7 @@ def apply_texture_code(
 
 def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) -> Tensor:
     """The paint model: a curve in CIE L*, shifts of a* and b*, and a veil of dust. rgb (R, 3), code (R, 5)."""
-    lightness, a, b = lab(rgb).unbind(-1)
+    lightness, a, b = rgb_to_lab(rgb).unbind(-1)
     shift, red, yellow, gloss, dirt = code.unbind(-1)
     level = clamp_inclusive(lightness / 100.0, *model.LEVEL)
     glossy = gloss * model.GLOSS_GAIN * (lightness - base_lightness) / model.GLOSSY_L
@@ -268,29 +268,29 @@ def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) ->
     room = 4.0 * level * (1.0 - level)
     red, yellow = a + model.CHROMA_GAIN * red * room, b + model.CHROMA_GAIN * yellow * room
     changed = torch.stack([100.0 * level, red, yellow], dim=-1)
-    out = rgb_of(changed)
+    out = lab_to_soft_rgb(changed)
     veil = (dirt * model.DIRT_GAIN * (1.0 - model.CLEAN_ROOF * clamp_inclusive(height, 0.0, 1.0)))[:, None]
     return out + veil * (out.new_tensor(model.DUST_RGB) - out)
 
 
-def lab(rgb: Tensor) -> Tensor:
+def rgb_to_lab(rgb: Tensor) -> Tensor:
     """CIE L*a*b* (R, 3) of sRGB rows (R, 3)."""
     return kornia.color.rgb_to_lab(rgb.T[None, :, :, None])[0, :, :, 0].T
 
 
-def rgb_of(lab_rows: Tensor) -> Tensor:
+def lab_to_soft_rgb(lab_rows: Tensor) -> Tensor:
     """sRGB rows (R, 3) in (0, 1) of CIE L*a*b* rows (R, 3).
 
-    Colours out of gamut bend back softly; so near black and white the result is not the inverse of `lab`: take
+    Colours out of gamut bend back softly; so near black and white the result is not the inverse of `rgb_to_lab`: take
     differences of two results.
     """
-    rgb = rgb_exact(lab_rows)
+    rgb = lab_to_rgb(lab_rows)
     softplus = torch.nn.functional.softplus
     return softplus(rgb, beta=model.GAMUT_SHARPNESS) - softplus(rgb - 1.0, beta=model.GAMUT_SHARPNESS)
 
 
-def rgb_exact(lab_rows: Tensor) -> Tensor:
-    """sRGB rows (R, 3) of CIE L*a*b* rows (R, 3): the inverse of `lab`, out of [0, 1] where no display shows
+def lab_to_rgb(lab_rows: Tensor) -> Tensor:
+    """sRGB rows (R, 3) of CIE L*a*b* rows (R, 3): the inverse of `rgb_to_lab`, out of [0, 1] where no display shows
     it."""
     return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
 
@@ -299,15 +299,15 @@ def daylight(normal: Tensor, sun: Tensor, sunlight: Tensor | float) -> Tensor:
     """Light (R,) on surfaces in the open: sky dome and ground bounce, and a sun of a strength (R,). normal (R, 3),
     sun (3,) unit; sun (R, 3) too."""
     around, above = model.AMBIENT
-    return (around + above * (0.5 - 0.5 * normal[:, 1])) + sunlight * sunward((normal * sun).sum(-1))
+    return (around + above * (0.5 - 0.5 * normal[:, 1])) + sunlight * sun_exposure((normal * sun).sum(-1))
 
 
-def sunward(cos: Tensor) -> Tensor:
+def sun_exposure(cos: Tensor) -> Tensor:
     """How squarely the sun meets a surface whose normal has this cosine to it: 0 from behind, smooth."""
     return 0.5 * (cos + (cos.square() + model.TERMINATOR).sqrt())
 
 
-def shade(
+def shade_template(
     normal: Tensor,
     to_eye: Tensor,
     albedo: Tensor,
@@ -345,7 +345,7 @@ def shade(
     return lit + strength[:, None] * (surround - lit) + glint[:, None] * (1.0 - lit)
 
 
-def brightened(ratio: Tensor, paint: Tensor) -> Tensor:
+def limit_brightening(ratio: Tensor, paint: Tensor) -> Tensor:
     """How much brighter a surface is after it turned: a share of what it was, within `model.RELIT_MOST`.
 
     ratio: by how much the light on it grew, relative, above -1; paint: share of it. 0 for 0.
@@ -354,15 +354,15 @@ def brightened(ratio: Tensor, paint: Tensor) -> Tensor:
     return share * ratio / (1.0 + (ratio / model.RELIT_MOST).square()).sqrt()
 
 
-def relit(rgb: Tensor, brighter: Tensor) -> Tensor:
-    """Photographed colours (R, 3) in other light: brighter (R,) as by `brightened`. The same bits where it is 0.
+def relight(rgb: Tensor, brighter: Tensor) -> Tensor:
+    """Photographed colours (R, 3) in other light: brighter (R,) as by `limit_brightening`. The same bits where it is 0.
 
     What is white in the photograph hardly changes: film saturates.
     """
     return rgb * (1.0 + brighter[:, None] * (1.0 - rgb * rgb))
 
 
-def finished(light: Tensor, gain: Tensor, lift: Tensor) -> Tensor:
+def apply_finish(light: Tensor, gain: Tensor, lift: Tensor) -> Tensor:
     """Light (R, 3) of a template as a photograph shows the vehicle: gain (R, 3), and lift (R, 1) that the darkest
     has. Bright light saturates as on film: 1 is never reached."""
     return 1.0 - (1.0 - lift) * torch.exp(-(light * gain))

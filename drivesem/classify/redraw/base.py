@@ -15,7 +15,7 @@ from torch import Tensor
 from drivesem.classify.results import Likeness
 from drivesem.classify.scenes import SEEN_PX, ObjectScene, camera
 from drivesem.classify.space import Change
-from scene_ir.render.lit import Lights
+from scene_ir.render.lit_mesh import Lights
 from scene_ir.types import Camera
 
 Array = NDArray[np.float32]

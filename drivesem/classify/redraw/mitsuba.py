@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivesem.classify.redraw.base import Solid
 from drivesem.failures.second_renderer.base import NoSecondRendererError
-from scene_ir.render.lit import GAMMA, UP
+from scene_ir.render.lit_mesh import GAMMA, UPWARD_SHARE
 
 NAME = "mitsuba"
 _RAYS = 16
@@ -81,10 +81,10 @@ class MitsubaRenderer:
         return torch.cat([linear.clamp(0, 1) ** GAMMA, coverage[None]])
 
     def _sky(self, strength: float) -> dict[str, Any]:
-        """Radiance whose cosine-weighed mean over the half-space of a normal is 1 + UP up . normal."""
+        """Radiance whose cosine-weighed mean over the half-space of a normal is 1 + UPWARD_SHARE up . normal."""
         height, width = _SKY
         polar = (np.arange(height) + 0.5) / height * math.pi  # 0 is up
-        rows = strength * (1 + 1.5 * UP * np.cos(polar))
+        rows = strength * (1 + 1.5 * UPWARD_SHARE * np.cos(polar))
         pixels = np.broadcast_to(rows[:, None, None], (height, width, 3)).astype(np.float32)
         # The scene's y points down: the sky is turned upside down.
         turn = self._library.ScalarTransform4f(np.diag([1.0, -1.0, -1.0, 1.0]))
@@ -139,5 +139,5 @@ def _mitsuba() -> Any:
         library.set_variant(_VARIANT)
         importlib.import_module("drjit").set_thread_count(torch.get_num_threads())
     except Exception as error:  # also what a library raises whose own libraries are missing
-        raise NoSecondRendererError.of(NAME, _EXPECTED, error) from error
+        raise NoSecondRendererError.from_exception(NAME, _EXPECTED, error) from error
     return library

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from drivesem.classify.redraw.base import Array, Solid
-from drivesem.failures.second_renderer.screen import Coat, Window, shared_screen
-from scene_ir.render.lit import AROUND, GAMMA, UP
+from drivesem.failures.second_renderer.opengl import ImageWindow, PaintLayer, shared_context
+from scene_ir.render.lit_mesh import GAMMA, MIRRORED_SHARE, UPWARD_SHARE
 
 _MATT = 0.96**2
 """Of a colour glTF's shading lets so much show of what is neither metal nor glossy, in pyrender's version."""
@@ -27,27 +27,27 @@ class PyrenderRenderer:
     name = "pyrender"
 
     def __init__(self) -> None:
-        self._screen = shared_screen()
+        self._screen = shared_context()
 
     def draw(self, solid: Solid) -> torch.Tensor:
         """See `Redraw`."""
         lights, size = solid.lights, (solid.camera.height, solid.camera.width)
-        window = Window(0, 0, size[1], size[0])
+        window = ImageWindow(0, 0, size[1], size[0])
         intrinsics = solid.camera.matrix.numpy()[:3, :3]
         intensity = math.pi * float(lights.strength) * lights.reach**2
         diffuse, specular, shininess = (
             np.repeat(values, 3, axis=0) for values in (solid.diffuse, solid.specular, solid.shininess)
         )
-        around = float(lights.environment) * (1 - UP * solid.normals[:, 1:2])
-        sky = np.clip((diffuse + AROUND * specular[:, None]) * around, 0, 1)
-        matt = [Coat(solid.points, solid.normals, diffuse / np.float32(_MATT), 1.0, 0.0)]
-        bare = [Coat(solid.points, solid.normals, (sky**GAMMA).astype(np.float32), 1.0, 0.0)]
+        around = float(lights.environment) * (1 - UPWARD_SHARE * solid.normals[:, 1:2])
+        sky = np.clip((diffuse + MIRRORED_SHARE * specular[:, None]) * around, 0, 1)
+        matt = [PaintLayer(solid.points, solid.normals, diffuse / np.float32(_MATT), 1.0, 0.0)]
+        bare = [PaintLayer(solid.points, solid.normals, (sky**GAMMA).astype(np.float32), 1.0, 0.0)]
         glossy = []
         for exponent in np.unique(shininess):
             own = shininess == exponent
             height = np.repeat(specular[own, None] * 8 / (exponent + 2), 3, axis=1)
             rough = float((2 / (exponent + 2)) ** 0.25)
-            glossy.append(Coat(solid.points[own], solid.normals[own], height.astype(np.float32), rough, 1.0))
+            glossy.append(PaintLayer(solid.points[own], solid.normals[own], height.astype(np.float32), rough, 1.0))
         lamp = lights.point.numpy(), intensity
         drawn = [
             self._screen.shade(coats, light, intrinsics, window)

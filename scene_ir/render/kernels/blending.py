@@ -23,7 +23,7 @@ wp.set_module_options({"fuse_fp": True, "fast_math": False, "enable_backward": F
 
 
 @wp.struct
-class Stack:
+class LayerStack:
     """What is laid where. order: the draws, back to front; rects (N, 4) px; offsets (N + 1,) into packed pixels."""
 
     order: wp.array(dtype=wp.int32)
@@ -32,7 +32,7 @@ class Stack:
 
 
 @wp.struct
-class Span:
+class RowSpan:
     """A draw's part of a row: columns [x0, x1), the packed pixel that column 0 would have; empty where it has none."""
 
     draw: int
@@ -42,8 +42,8 @@ class Span:
 
 
 @wp.func
-def span_of(stack: Stack, k: int, y: int):
-    out = Span()
+def _row_span(stack: LayerStack, k: int, y: int):
+    out = RowSpan()
     draw = stack.order[k]
     y0 = wp.int32(stack.rects[draw, 1])
     if y >= y0 and y < wp.int32(stack.rects[draw, 3]):
@@ -57,22 +57,22 @@ def span_of(stack: Stack, k: int, y: int):
 # What follows is written in C, a row of a draw at a time: of Warp's own indices and vectors a CPU makes one number after
 # the other. The pragma lets its compiler take several pixels at once, which lie in arrays of their own.
 
-_ROW = """
+_ROW_POINTERS = """
     float* const red = (float*)((char*)PLANES.data + y * PLANES.strides[1]);
     float* const green = (float*)((char*)red + PLANES.strides[0]);
     float* const blue = (float*)((char*)green + PLANES.strides[0]);
 """
-_EACH = """
+_PIXEL_LOOP = """
     #pragma clang loop vectorize(assume_safety)
     for (int x = x0; x < x1; ++x) {
 """
-_SHADE = (
-    _ROW.replace("PLANES", "image")
+_SHADE_CODE = (
+    _ROW_POINTERS.replace("PLANES", "image")
     + """
     const float* const f = (const float*)factor.data + 3 * origin;
     float* const under = (float*)under_shadow.data + 3 * origin;
 """
-    + _EACH
+    + _PIXEL_LOOP
     + """
         under[3 * x] = red[x];
         under[3 * x + 1] = green[x];
@@ -83,8 +83,8 @@ _SHADE = (
     }
 """
 )
-_LAY = (
-    _ROW.replace("PLANES", "image")
+_LAY_CODE = (
+    _ROW_POINTERS.replace("PLANES", "image")
     + """
     const float* const c = (const float*)colour.data + 4 * origin;
     const float* const alpha = (const float*)opacity.data + origin;
@@ -93,7 +93,7 @@ _LAY = (
     float* const closest = (float*)((char*)nearest.data + y * nearest.strides[0]);
     wp::int64* const who = (wp::int64*)((char*)number.data + y * number.strides[0]);
 """
-    + _EACH
+    + _PIXEL_LOOP
     + """
         const float clear = 1.0f - alpha[x];
         under[4 * x] = red[x];
@@ -109,7 +109,7 @@ _LAY = (
     if (image.shape[0] > 3) {
         float* const inverse = (float*)((char*)blue + image.strides[0]);
     """
-    + _EACH
+    + _PIXEL_LOOP
     + """
             under[4 * x + 3] = inverse[x];
             inverse[x] = c[4 * x + 3] + (1.0f - alpha[x]) * inverse[x];
@@ -117,51 +117,51 @@ _LAY = (
     }
 """
 )
-_CLAMP = (
+_CLAMP_CODE = (
     """
-    wp::uint8* const told = (wp::uint8*)((char*)over.data + y * over.strides[0]);
+    wp::uint8* const flags = (wp::uint8*)((char*)clamp_flags.data + y * clamp_flags.strides[0]);
     for (int channel = 0; channel < 3; ++channel) {
         float* const plane = (float*)((char*)image.data + y * image.strides[1] + channel * image.strides[0]);
     """
-    + _EACH
+    + _PIXEL_LOOP
     + """
             const float v = plane[x];
             const float away = v > 0.5f ? v - 0.5f : 0.5f - v;
             const int bits = away > 0.5f + SATURATEDf ? 1 : (away >= 0.5f - SATURATEDf ? 8 : 0);
-            const float kept = v < 0.0f ? 0.0f : (v > 1.0f ? 1.0f : v);
-            plane[x] = told[x] >= 64 ? v : kept;
-            told[x] |= (wp::uint8)(told[x] >= 64 ? 0 : bits << channel);
+            const float clamped = v < 0.0f ? 0.0f : (v > 1.0f ? 1.0f : v);
+            plane[x] = flags[x] >= 64 ? v : clamped;
+            flags[x] |= (wp::uint8)(flags[x] >= 64 ? 0 : bits << channel);
         }
     }
-    for (int x = x0; x < x1; ++x) told[x] |= 64;
+    for (int x = x0; x < x1; ++x) flags[x] |= 64;
 """
 )
-_START = (
+_START_CODE = (
     """
     for (int channel = 0; channel < grad.shape[0]; ++channel) {
         const char* const given = (const char*)grad_image.data + y * grad_image.strides[1] + channel * grad_image.strides[0];
         float* const plane = (float*)((char*)grad.data + y * grad.strides[1] + channel * grad.strides[0]);
-        const wp::uint8* const told = (const wp::uint8*)((const char*)over.data + y * over.strides[0]);
+        const wp::uint8* const flags = (const wp::uint8*)((const char*)clamp_flags.data + y * clamp_flags.strides[0]);
         const int gone = channel < 3 ? 1 << channel : 0, half = channel < 3 ? 8 << channel : 0;
         const int step = grad_image.strides[2];
     """
-    + _EACH
+    + _PIXEL_LOOP
     + """
             const float g = *(const float*)(given + x * step);
-            plane[x] = told[x] & gone ? 0.0f : (told[x] & half ? 0.5f * g : g);
+            plane[x] = flags[x] & gone ? 0.0f : (flags[x] & half ? 0.5f * g : g);
         }
     }
 """
 )
-_LIFT = (
-    _ROW.replace("PLANES", "grad")
+_LIFT_CODE = (
+    _ROW_POINTERS.replace("PLANES", "grad")
     + """
     const float* const alpha = (const float*)opacity.data + origin;
     const float* const under = (const float*)under_layer.data + 4 * origin;
     float* const to_c = (float*)grad_colour.data + 4 * origin;
     float* const to_alpha = (float*)grad_opacity.data + origin;
 """
-    + _EACH
+    + _PIXEL_LOOP
     + """
         const float clear = 1.0f - alpha[x];
         to_c[4 * x] = red[x];
@@ -176,7 +176,7 @@ _LIFT = (
     if (grad.shape[0] > 3) {
         float* const inverse = (float*)((char*)blue + grad.strides[0]);
     """
-    + _EACH
+    + _PIXEL_LOOP
     + """
             to_c[4 * x + 3] = inverse[x];
             to_alpha[x] -= inverse[x] * under[4 * x + 3];
@@ -185,14 +185,14 @@ _LIFT = (
     }
 """
 )
-_UNSHADE = (
-    _ROW.replace("PLANES", "grad")
+_UNSHADE_CODE = (
+    _ROW_POINTERS.replace("PLANES", "grad")
     + """
     const float* const f = (const float*)factor.data + 3 * origin;
     const float* const under = (const float*)under_shadow.data + 3 * origin;
     float* const to_f = (float*)grad_factor.data + 3 * origin;
 """
-    + _EACH
+    + _PIXEL_LOOP
     + """
         to_f[3 * x] = red[x] * under[3 * x];
         to_f[3 * x + 1] = green[x] * under[3 * x + 1];
@@ -205,8 +205,8 @@ _UNSHADE = (
 )
 
 
-@wp.func_native(_SHADE)
-def shade_row(
+@wp.func_native(_SHADE_CODE)
+def _shade_row(
     image: wp.array3d(dtype=wp.float32),
     y: int,
     x0: int,
@@ -218,8 +218,8 @@ def shade_row(
     """Columns [x0, x1) of a row darkened; origin: the packed pixel that column 0 would have."""
 
 
-@wp.func_native(_LAY)
-def lay_row(
+@wp.func_native(_LAY_CODE)
+def _lay_row(
     image: wp.array3d(dtype=wp.float32),
     y: int,
     x0: int,
@@ -236,27 +236,29 @@ def lay_row(
     """A layer over them."""
 
 
-@wp.func_native(_CLAMP.replace("SATURATED", str(model.SATURATED)))
-def clamp_row(image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, over: wp.array2d(dtype=wp.uint8)):
+@wp.func_native(_CLAMP_CODE.replace("SATURATED", str(model.SATURATED)))
+def _clamp_row(
+    image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, clamp_flags: wp.array2d(dtype=wp.uint8)
+):
     """Kept in [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5), and that it was
     done (6): rectangles overlap, and a pixel that was clamped before stays as it is.
     """
 
 
-@wp.func_native(_START)
-def start_row(
+@wp.func_native(_START_CODE)
+def _start_row(
     grad_image: wp.array3d(dtype=wp.float32),
     y: int,
     x0: int,
     x1: int,
-    over: wp.array2d(dtype=wp.uint8),
+    clamp_flags: wp.array2d(dtype=wp.uint8),
     grad: wp.array3d(dtype=wp.float32),
 ):
     """The gradient to pixels before they were clamped: see `blend.clamp_colour`."""
 
 
-@wp.func_native(_LIFT)
-def lift_row(
+@wp.func_native(_LIFT_CODE)
+def _lift_row(
     grad: wp.array3d(dtype=wp.float32),
     y: int,
     x0: int,
@@ -267,11 +269,11 @@ def lift_row(
     grad_colour: wp.array(dtype=wp.vec4f),
     grad_opacity: wp.array(dtype=wp.float32),
 ):
-    """Back through `lay_row`."""
+    """Back through `_lay_row`."""
 
 
-@wp.func_native(_UNSHADE)
-def unshade_row(
+@wp.func_native(_UNSHADE_CODE)
+def _unshade_row(
     grad: wp.array3d(dtype=wp.float32),
     y: int,
     x0: int,
@@ -281,14 +283,14 @@ def unshade_row(
     under_shadow: wp.array(dtype=wp.vec3f),
     grad_factor: wp.array(dtype=wp.vec3f),
 ):
-    """Back through `shade_row`."""
+    """Back through `_shade_row`."""
 
 
 @wp.kernel
-def blend_kernel(
+def _blend_kernel(
     start: int,
-    shadows: Stack,
-    layers: Stack,
+    shadows: LayerStack,
+    layers: LayerStack,
     factor: wp.array(dtype=wp.vec3f),
     colour: wp.array(dtype=wp.vec4f),
     opacity: wp.array(dtype=wp.float32),
@@ -299,36 +301,36 @@ def blend_kernel(
     number: wp.array2d(dtype=wp.int64),
     under_shadow: wp.array(dtype=wp.vec3f),
     under_layer: wp.array(dtype=wp.vec4f),
-    over: wp.array2d(dtype=wp.uint8),
+    clamp_flags: wp.array2d(dtype=wp.uint8),
 ):
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
-        s = span_of(shadows, k, y)
-        shade_row(image, y, s.x0, s.x1, s.origin, factor, under_shadow)
+        s = _row_span(shadows, k, y)
+        _shade_row(image, y, s.x0, s.x1, s.origin, factor, under_shadow)
     for k in range(layers.order.shape[0]):
-        s = span_of(layers, k, y)
-        lay_row(
+        s = _row_span(layers, k, y)
+        _lay_row(
             image, y, s.x0, s.x1, s.origin, s.draw, colour, opacity, depth, under_layer, nearest, number
         )  # fmt: skip
     if clamped:
         for k in range(shadows.order.shape[0]):
-            s = span_of(shadows, k, y)
-            clamp_row(image, y, s.x0, s.x1, over)
+            s = _row_span(shadows, k, y)
+            _clamp_row(image, y, s.x0, s.x1, clamp_flags)
         for k in range(layers.order.shape[0]):
-            s = span_of(layers, k, y)
-            clamp_row(image, y, s.x0, s.x1, over)
+            s = _row_span(layers, k, y)
+            _clamp_row(image, y, s.x0, s.x1, clamp_flags)
 
 
 @wp.kernel
-def blend_backward_kernel(
+def _blend_backward_kernel(
     start: int,
-    shadows: Stack,
-    layers: Stack,
+    shadows: LayerStack,
+    layers: LayerStack,
     factor: wp.array(dtype=wp.vec3f),
     opacity: wp.array(dtype=wp.float32),
     under_shadow: wp.array(dtype=wp.vec3f),
     under_layer: wp.array(dtype=wp.vec4f),
-    over: wp.array2d(dtype=wp.uint8),
+    clamp_flags: wp.array2d(dtype=wp.uint8),
     grad_image: wp.array3d(dtype=wp.float32),
     grad: wp.array3d(dtype=wp.float32),
     grad_factor: wp.array(dtype=wp.vec3f),
@@ -337,20 +339,20 @@ def blend_backward_kernel(
 ):
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
-        s = span_of(shadows, k, y)
-        start_row(grad_image, y, s.x0, s.x1, over, grad)
+        s = _row_span(shadows, k, y)
+        _start_row(grad_image, y, s.x0, s.x1, clamp_flags, grad)
     for k in range(layers.order.shape[0]):
-        s = span_of(layers, k, y)
-        start_row(grad_image, y, s.x0, s.x1, over, grad)
+        s = _row_span(layers, k, y)
+        _start_row(grad_image, y, s.x0, s.x1, clamp_flags, grad)
     for i in range(layers.order.shape[0]):
-        s = span_of(layers, layers.order.shape[0] - 1 - i, y)
-        lift_row(grad, y, s.x0, s.x1, s.origin, opacity, under_layer, grad_colour, grad_opacity)
+        s = _row_span(layers, layers.order.shape[0] - 1 - i, y)
+        _lift_row(grad, y, s.x0, s.x1, s.origin, opacity, under_layer, grad_colour, grad_opacity)
     for i in range(shadows.order.shape[0]):
-        s = span_of(shadows, shadows.order.shape[0] - 1 - i, y)
-        unshade_row(grad, y, s.x0, s.x1, s.origin, factor, under_shadow, grad_factor)
+        s = _row_span(shadows, shadows.order.shape[0] - 1 - i, y)
+        _unshade_row(grad, y, s.x0, s.x1, s.origin, factor, under_shadow, grad_factor)
 
 
-class Blend(torch.autograd.Function):
+class BlendLayers(torch.autograd.Function):
     """See `blend.composite`. plan: (order, rects, offsets) of the shadows and of the layers, and the edges of the
     rows that threads share."""
 
@@ -362,20 +364,20 @@ class Blend(torch.autograd.Function):
         nearest = background_depth.clone()
         height, width = nearest.shape
         number = torch.zeros(height, width, dtype=torch.int64, device=canvas.device)
-        over = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
+        clamp_flags = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
         under_shadow, under_layer = torch.empty_like(factor), torch.empty_like(colour)
         inputs = [
             *(
-                make_struct(Stack, *shadows),
-                make_struct(Stack, *layers),
+                make_struct(LayerStack, *shadows),
+                make_struct(LayerStack, *layers),
                 array(factor, wp.vec3f),
                 array(colour, wp.vec4f),
             ),
             *(array(opacity), array(depth), clamped, array(image), array(nearest), array(number)),
-            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over)),
+            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(clamp_flags)),
         ]
-        launch(blend_kernel, edges, inputs, device=canvas.device)
-        ctx.save_for_backward(factor, opacity, under_shadow, under_layer, over)
+        launch(_blend_kernel, edges, inputs, device=canvas.device)
+        ctx.save_for_backward(factor, opacity, under_shadow, under_layer, clamp_flags)
         ctx.plan, ctx.channels = plan, canvas.shape[0]
         ctx.mark_non_differentiable(nearest, number)
         ctx.set_materialize_grads(False)
@@ -386,7 +388,7 @@ class Blend(torch.autograd.Function):
     def backward(ctx: Any, grad_image: Tensor | None, *_: Tensor | None):
         if grad_image is None:
             return (None,) * 8
-        factor, opacity, under_shadow, under_layer, over = ctx.saved_tensors
+        factor, opacity, under_shadow, under_layer, clamp_flags = ctx.saved_tensors
         shadows, layers, edges = ctx.plan
         with_canvas = ctx.needs_input_grad[0]
         contiguous = torch.contiguous_format
@@ -399,11 +401,16 @@ class Blend(torch.autograd.Function):
         grad_factor, grad_colour = torch.empty_like(factor), torch.empty_like(under_layer)
         grad_opacity = torch.empty_like(opacity)
         inputs = [
-            *(make_struct(Stack, *shadows), make_struct(Stack, *layers), array(factor, wp.vec3f), array(opacity)),
-            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(over), array(grad_image)),
+            *(
+                make_struct(LayerStack, *shadows),
+                make_struct(LayerStack, *layers),
+                array(factor, wp.vec3f),
+                array(opacity),
+            ),
+            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(clamp_flags), array(grad_image)),
             *(array(grad), array(grad_factor, wp.vec3f), array(grad_colour, wp.vec4f), array(grad_opacity)),
         ]
-        launch(blend_backward_kernel, edges, inputs, device=factor.device)
+        launch(_blend_backward_kernel, edges, inputs, device=factor.device)
         return (grad if with_canvas else None), grad_factor, grad_colour, grad_opacity, None, None, None, None
 
 

@@ -1,7 +1,7 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
 """CIE L*a*b* and back, and the paint of vehicles, as NVIDIA Warp functions with gradients by hand; float32.
 
-What they compute is in `texture` (`lab`, `rgb_of`, `apply_texture_code`); a test holds both together.
+What they compute is in `texture` (`lab`, `lab_to_rgb`, `apply_texture_code`); a test holds both together.
 A function's gradient is the function that ends in `_adjoint`: arguments, then the gradient to the result.
 """
 
@@ -15,14 +15,14 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.lanes import SIMD_OPTIONS, exp_, load, load3, log_, store, store3
 from scene_ir.raster.launch import launch, split_range, start_warp
+from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, log_, store, store3
 from scene_ir.render import model
 
 start_warp()
 wp.set_module_options(SIMD_OPTIONS)
 
-SHARPNESS, BEYOND = model.GAMUT_SHARPNESS, math.exp(-model.GAMUT_SHARPNESS)
+SHARPNESS, GAMUT_TAIL = model.GAMUT_SHARPNESS, math.exp(-model.GAMUT_SHARPNESS)
 GLOSS_PER_L = model.GLOSS_GAIN / model.GLOSSY_L
 LEVEL_LOW, LEVEL_HIGH = model.LEVEL
 DUST = wp.constant(wp.vec3f(*model.DUST_RGB))
@@ -37,160 +37,162 @@ TO_B = wp.constant(wp.vec3f(0.0556466391351772 * 0.95047, -0.2040413383665112, 1
 
 
 @wp.func
-def linear(x: wp.float32):
+def _to_linear(x: wp.float32):
     """sRGB to linear light."""
     power = exp_(2.4 * log_(wp.max((x + 0.055) * (1.0 / 1.055), 1e-3)))
     return wp.where(x > 0.04045, power, x * (1.0 / 12.92))
 
 
 @wp.func
-def linear_slope(x: wp.float32, value: wp.float32):
+def _to_linear_slope(x: wp.float32, value: wp.float32):
     return wp.where(x > 0.04045, 2.4 * value / wp.max(x + 0.055, 1e-3), 1.0 / 12.92)
 
 
 @wp.func
-def root(x: wp.float32):
+def _lab_root(x: wp.float32):
     """The cube root of CIE L*a*b*, straight near 0."""
     return wp.where(x > 0.008856, exp_(log_(wp.max(x, 0.008856)) * (1.0 / 3.0)), 7.787 * x + 4.0 / 29.0)
 
 
 @wp.func
-def root_slope(x: wp.float32, value: wp.float32):
+def _lab_root_slope(x: wp.float32, value: wp.float32):
     return wp.where(x > 0.008856, value / (3.0 * wp.max(x, 0.008856)), 7.787)
 
 
 @wp.func
-def cube(f: wp.float32):
+def _lab_cube(f: wp.float32):
     return wp.where(f > 0.2068966, f * f * f, (f - 4.0 / 29.0) * (1.0 / 7.787))
 
 
 @wp.func
-def cube_slope(f: wp.float32):
+def _lab_cube_slope(f: wp.float32):
     return wp.where(f > 0.2068966, 3.0 * f * f, 1.0 / 7.787)
 
 
 @wp.func
-def gamma(x: wp.float32):
+def _to_srgb(x: wp.float32):
     """Linear light to sRGB."""
     power = 1.055 * exp_(log_(wp.max(x, 0.0031308)) * (1.0 / 2.4)) - 0.055
     return wp.where(x > 0.0031308, power, 12.92 * x)
 
 
 @wp.func
-def gamma_slope(x: wp.float32, value: wp.float32):
+def _to_srgb_slope(x: wp.float32, value: wp.float32):
     return wp.where(x > 0.0031308, (value + 0.055) / (2.4 * wp.max(x, 0.0031308)), 12.92)
 
 
 @wp.func
-def into_gamut(x: wp.float32):
+def _into_gamut(x: wp.float32):
     """softplus(x) - softplus(x - 1), softplus(x) = log(1 + exp(SHARPNESS x)) / SHARPNESS."""
     power = exp_(SHARPNESS * x)
-    return log_((1.0 + power) / (1.0 + BEYOND * power)) * (1.0 / SHARPNESS)
+    return log_((1.0 + power) / (1.0 + GAMUT_TAIL * power)) * (1.0 / SHARPNESS)
 
 
 @wp.func
-def into_gamut_slope(x: wp.float32):
+def _into_gamut_slope(x: wp.float32):
     power = exp_(SHARPNESS * x)
-    return (power / (1.0 + power)) * ((1.0 - BEYOND) / (1.0 + BEYOND * power))
+    return (power / (1.0 + power)) * ((1.0 - GAMUT_TAIL) / (1.0 + GAMUT_TAIL * power))
 
 
 @wp.func
-def light_of(rgb: wp.vec3f):
-    return wp.vec3f(linear(rgb[0]), linear(rgb[1]), linear(rgb[2]))
+def _linear_rgb(rgb: wp.vec3f):
+    return wp.vec3f(_to_linear(rgb[0]), _to_linear(rgb[1]), _to_linear(rgb[2]))
 
 
 @wp.func
-def lab_of(rgb: wp.vec3f):
-    light = light_of(rgb)
-    x = root(wp.dot(TO_X, light))
-    y = root(wp.dot(TO_Y, light))
-    z = root(wp.dot(TO_Z, light))
+def rgb_to_lab(rgb: wp.vec3f):
+    light = _linear_rgb(rgb)
+    x = _lab_root(wp.dot(TO_X, light))
+    y = _lab_root(wp.dot(TO_Y, light))
+    z = _lab_root(wp.dot(TO_Z, light))
     return wp.vec3f(116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z))
 
 
 @wp.func
-def lab_adjoint(rgb: wp.vec3f, g: wp.vec3f):
-    light = light_of(rgb)
+def rgb_to_lab_adjoint(rgb: wp.vec3f, g: wp.vec3f):
+    light = _linear_rgb(rgb)
     x = wp.dot(TO_X, light)
     y = wp.dot(TO_Y, light)
     z = wp.dot(TO_Z, light)
-    g_x = root_slope(x, root(x)) * (500.0 * g[1])
-    g_y = root_slope(y, root(y)) * (116.0 * g[0] - 500.0 * g[1] + 200.0 * g[2])
-    g_z = root_slope(z, root(z)) * (-200.0 * g[2])
+    g_x = _lab_root_slope(x, _lab_root(x)) * (500.0 * g[1])
+    g_y = _lab_root_slope(y, _lab_root(y)) * (116.0 * g[0] - 500.0 * g[1] + 200.0 * g[2])
+    g_z = _lab_root_slope(z, _lab_root(z)) * (-200.0 * g[2])
     g_light = g_x * TO_X + g_y * TO_Y + g_z * TO_Z
     return wp.vec3f(
-        linear_slope(rgb[0], light[0]) * g_light[0],
-        linear_slope(rgb[1], light[1]) * g_light[1],
-        linear_slope(rgb[2], light[2]) * g_light[2],
+        _to_linear_slope(rgb[0], light[0]) * g_light[0],
+        _to_linear_slope(rgb[1], light[1]) * g_light[1],
+        _to_linear_slope(rgb[2], light[2]) * g_light[2],
     )
 
 
 @wp.func
-def roots_of(lab: wp.vec3f):
+def _xyz_roots(lab: wp.vec3f):
     y = (lab[0] + 16.0) * (1.0 / 116.0)
     return wp.vec3f(lab[1] * (1.0 / 500.0) + y, y, y - lab[2] * (1.0 / 200.0))
 
 
 @wp.func
-def rgb_of(lab: wp.vec3f):
+def lab_to_rgb(lab: wp.vec3f):
     """sRGB in (0, 1): what is out of gamut bends back softly."""
-    f = roots_of(lab)
-    xyz = wp.vec3f(cube(f[0]), cube(f[1]), cube(wp.max(f[2], 0.0)))
+    f = _xyz_roots(lab)
+    xyz = wp.vec3f(_lab_cube(f[0]), _lab_cube(f[1]), _lab_cube(wp.max(f[2], 0.0)))
     return wp.vec3f(
-        into_gamut(gamma(wp.dot(TO_R, xyz))),
-        into_gamut(gamma(wp.dot(TO_G, xyz))),
-        into_gamut(gamma(wp.dot(TO_B, xyz))),
+        _into_gamut(_to_srgb(wp.dot(TO_R, xyz))),
+        _into_gamut(_to_srgb(wp.dot(TO_G, xyz))),
+        _into_gamut(_to_srgb(wp.dot(TO_B, xyz))),
     )
 
 
 @wp.func
-def channel_slope(x: wp.float32):
-    value = gamma(x)
-    return into_gamut_slope(value) * gamma_slope(x, value)
+def _channel_slope(x: wp.float32):
+    value = _to_srgb(x)
+    return _into_gamut_slope(value) * _to_srgb_slope(x, value)
 
 
 @wp.func
-def rgb_adjoint(lab: wp.vec3f, g: wp.vec3f):
-    f = roots_of(lab)
-    xyz = wp.vec3f(cube(f[0]), cube(f[1]), cube(wp.max(f[2], 0.0)))
-    g_xyz = (channel_slope(wp.dot(TO_R, xyz)) * g[0]) * TO_R
-    g_xyz += (channel_slope(wp.dot(TO_G, xyz)) * g[1]) * TO_G
-    g_xyz += (channel_slope(wp.dot(TO_B, xyz)) * g[2]) * TO_B
-    g_x = cube_slope(f[0]) * g_xyz[0]
-    g_y = cube_slope(f[1]) * g_xyz[1]
-    g_z = wp.where(f[2] >= 0.0, cube_slope(f[2]) * g_xyz[2], 0.0)
+def lab_to_rgb_adjoint(lab: wp.vec3f, g: wp.vec3f):
+    f = _xyz_roots(lab)
+    xyz = wp.vec3f(_lab_cube(f[0]), _lab_cube(f[1]), _lab_cube(wp.max(f[2], 0.0)))
+    g_xyz = (_channel_slope(wp.dot(TO_R, xyz)) * g[0]) * TO_R
+    g_xyz += (_channel_slope(wp.dot(TO_G, xyz)) * g[1]) * TO_G
+    g_xyz += (_channel_slope(wp.dot(TO_B, xyz)) * g[2]) * TO_B
+    g_x = _lab_cube_slope(f[0]) * g_xyz[0]
+    g_y = _lab_cube_slope(f[1]) * g_xyz[1]
+    g_z = wp.where(f[2] >= 0.0, _lab_cube_slope(f[2]) * g_xyz[2], 0.0)
     return wp.vec3f((g_x + g_y + g_z) * (1.0 / 116.0), g_x * (1.0 / 500.0), g_z * (-1.0 / 200.0))
 
 
 @wp.func
-def within(x: wp.float32, low: wp.float32, high: wp.float32):
+def clamp_slope(x: wp.float32, low: wp.float32, high: wp.float32):
     """The slope of clamping: 1 from low to high."""
     return wp.where(x >= low, 1.0, 0.0) * wp.where(x <= high, 1.0, 0.0)
 
 
 @wp.func
-def clamped(x: wp.vec3f):
+def clamp01(x: wp.vec3f):
     return wp.vec3f(wp.min(wp.max(x[0], 0.0), 1.0), wp.min(wp.max(x[1], 0.0), 1.0), wp.min(wp.max(x[2], 0.0), 1.0))
 
 
 @wp.func
-def clamped_adjoint(x: wp.vec3f, g: wp.vec3f):
-    return wp.vec3f(within(x[0], 0.0, 1.0) * g[0], within(x[1], 0.0, 1.0) * g[1], within(x[2], 0.0, 1.0) * g[2])
+def clamp01_adjoint(x: wp.vec3f, g: wp.vec3f):
+    return wp.vec3f(
+        clamp_slope(x[0], 0.0, 1.0) * g[0], clamp_slope(x[1], 0.0, 1.0) * g[1], clamp_slope(x[2], 0.0, 1.0) * g[2]
+    )
 
 
 @wp.func
-def level_of(lightness: wp.float32):
+def lightness_level(lightness: wp.float32):
     return wp.min(wp.max(lightness * 0.01, LEVEL_LOW), LEVEL_HIGH)
 
 
 @wp.func
-def lifted(level: wp.float32, odds: wp.float32):
+def scale_odds(level: wp.float32, odds: wp.float32):
     """sigmoid(logit(level) + log(odds))."""
     return level * odds / (level * odds + (1.0 - level))
 
 
 @wp.struct
-class Coat:
+class PaintChange:
     """What changes a paint: shifts of lightness, a*, b*; gloss; dirt; and how much of it sticks at this height."""
 
     shift: wp.float32
@@ -202,94 +204,102 @@ class Coat:
 
 
 @wp.func
-def painted(lab: wp.vec3f, coat: Coat, base: wp.float32):
+def _repaint(lab: wp.vec3f, change: PaintChange, base: wp.float32):
     """The paint model before dust: L*a*b*. base: L* about which gloss turns contrast."""
-    odds = exp_(model.LIGHTNESS_GAIN * coat.shift + coat.gloss * GLOSS_PER_L * (lab[0] - base))
-    level = lifted(level_of(lab[0]), odds)
+    odds = exp_(model.LIGHTNESS_GAIN * change.shift + change.gloss * GLOSS_PER_L * (lab[0] - base))
+    level = scale_odds(lightness_level(lab[0]), odds)
     room = 4.0 * model.CHROMA_GAIN * level * (1.0 - level)
-    return wp.vec3f(100.0 * level, lab[1] + coat.red * room, lab[2] + coat.yellow * room)
+    return wp.vec3f(100.0 * level, lab[1] + change.red * room, lab[2] + change.yellow * room)
 
 
 @wp.func
-def dusted(rgb: wp.vec3f, coat: Coat):
-    return rgb + (model.DIRT_GAIN * coat.dirt * coat.grip) * (DUST - rgb)
+def _add_dust(rgb: wp.vec3f, change: PaintChange):
+    return rgb + (model.DIRT_GAIN * change.dirt * change.grip) * (DUST - rgb)
 
 
 @wp.func
-def painted_adjoint(lab: wp.vec3f, coat: Coat, base: wp.float32, g: wp.vec3f):
+def _repaint_adjoint(lab: wp.vec3f, change: PaintChange, base: wp.float32, g: wp.vec3f):
     """-> the colour, dusted; gradients to lab, (shift, red, yellow), (gloss, dirt, grip), base."""
-    odds = exp_(model.LIGHTNESS_GAIN * coat.shift + coat.gloss * GLOSS_PER_L * (lab[0] - base))
-    before = level_of(lab[0])
-    level = lifted(before, odds)
+    odds = exp_(model.LIGHTNESS_GAIN * change.shift + change.gloss * GLOSS_PER_L * (lab[0] - base))
+    before = lightness_level(lab[0])
+    level = scale_odds(before, odds)
     room = 4.0 * model.CHROMA_GAIN * level * (1.0 - level)
-    changed = wp.vec3f(100.0 * level, lab[1] + coat.red * room, lab[2] + coat.yellow * room)
-    out = rgb_of(changed)
-    veil = model.DIRT_GAIN * coat.dirt * coat.grip
+    changed = wp.vec3f(100.0 * level, lab[1] + change.red * room, lab[2] + change.yellow * room)
+    out = lab_to_rgb(changed)
+    veil = model.DIRT_GAIN * change.dirt * change.grip
     g_veil = model.DIRT_GAIN * wp.dot(g, DUST - out)
-    g_lab = rgb_adjoint(changed, (1.0 - veil) * g)
-    g_room = coat.red * g_lab[1] + coat.yellow * g_lab[2]
+    g_lab = lab_to_rgb_adjoint(changed, (1.0 - veil) * g)
+    g_room = change.red * g_lab[1] + change.yellow * g_lab[2]
     g_level = 100.0 * g_lab[0] + 4.0 * model.CHROMA_GAIN * (1.0 - 2.0 * level) * g_room
     g_odds = g_level * level * (1.0 - level)
     bottom = before * odds + (1.0 - before)
     g_before = g_level * odds / (bottom * bottom)
     g_tint = wp.vec3f(model.LIGHTNESS_GAIN * g_odds, room * g_lab[1], room * g_lab[2])
-    g_finish = wp.vec3f(GLOSS_PER_L * (lab[0] - base) * g_odds, coat.grip * g_veil, coat.dirt * g_veil)
-    g_base = -GLOSS_PER_L * coat.gloss * g_odds
-    g_light = 0.01 * within(lab[0] * 0.01, LEVEL_LOW, LEVEL_HIGH) * g_before - g_base
+    g_finish = wp.vec3f(GLOSS_PER_L * (lab[0] - base) * g_odds, change.grip * g_veil, change.dirt * g_veil)
+    g_base = -GLOSS_PER_L * change.gloss * g_odds
+    g_light = 0.01 * clamp_slope(lab[0] * 0.01, LEVEL_LOW, LEVEL_HIGH) * g_before - g_base
     return out + veil * (DUST - out), wp.vec3f(g_light, g_lab[1], g_lab[2]), g_tint, g_finish, g_base
 
 
 @wp.func
-def grip_at(height: wp.float32):
+def _dust_share(height: wp.float32):
     return 1.0 - model.CLEAN_ROOF * wp.min(wp.max(height, 0.0), 1.0)
 
 
 @wp.func
-def coat_at(code: wp.array(dtype=wp.float32), i: int, height: wp.float32):
-    coat = Coat()
-    coat.shift = load(code, 5 * i)
-    coat.red = load(code, 5 * i + 1)
-    coat.yellow = load(code, 5 * i + 2)
-    coat.gloss = load(code, 5 * i + 3)
-    coat.dirt = load(code, 5 * i + 4)
-    coat.grip = grip_at(height)
-    return coat
+def _read_change(code: wp.array(dtype=wp.float32), i: int, height: wp.float32):
+    change = PaintChange()
+    change.shift = load(code, 5 * i)
+    change.red = load(code, 5 * i + 1)
+    change.yellow = load(code, 5 * i + 2)
+    change.gloss = load(code, 5 * i + 3)
+    change.dirt = load(code, 5 * i + 4)
+    change.grip = _dust_share(height)
+    return change
 
 
 @wp.func
-def bare():
-    return Coat()
+def _no_change():
+    return PaintChange()
 
 
 @wp.func
-def size_of(coat: Coat):
-    return wp.abs(coat.shift) + wp.abs(coat.red) + wp.abs(coat.yellow) + wp.abs(coat.gloss) + wp.abs(coat.dirt)
+def _change_size(change: PaintChange):
+    return (
+        wp.abs(change.shift)
+        + wp.abs(change.red)
+        + wp.abs(change.yellow)
+        + wp.abs(change.gloss)
+        + wp.abs(change.dirt)
+    )
 
 
 @wp.func
-def paint_change(rgb: wp.vec3f, coat: Coat, base: wp.float32):
+def _paint_difference(rgb: wp.vec3f, change: PaintChange, base: wp.float32):
     """What a coat adds to an opaque colour in [0, 1]; exactly 0 where it is bare, whatever the rounding."""
-    lab = lab_of(rgb)
-    change = dusted(rgb_of(painted(lab, coat, base)), coat) - rgb_of(painted(lab, bare(), base))
-    return wp.where(size_of(coat) > 0.0, 1.0, 0.0) * change
+    lab = rgb_to_lab(rgb)
+    difference = _add_dust(lab_to_rgb(_repaint(lab, change, base)), change) - lab_to_rgb(
+        _repaint(lab, _no_change(), base)
+    )
+    return wp.where(_change_size(change) > 0.0, 1.0, 0.0) * difference
 
 
 @wp.func
-def paint_change_adjoint(rgb: wp.vec3f, coat: Coat, base: wp.float32, g: wp.vec3f):
+def _paint_difference_adjoint(rgb: wp.vec3f, change: PaintChange, base: wp.float32, g: wp.vec3f):
     """-> the change itself; gradients to rgb, (shift, red, yellow), (gloss, dirt, grip), base."""
-    lab = lab_of(rgb)
-    now, g_lab, g_tint, g_finish, g_base = painted_adjoint(lab, coat, base, g)
-    then, g_bare, _tint, _finish, _base = painted_adjoint(lab, bare(), base, g)
-    return now - then, lab_adjoint(rgb, g_lab - g_bare), g_tint, g_finish, g_base
+    lab = rgb_to_lab(rgb)
+    now, g_lab, g_tint, g_finish, g_base = _repaint_adjoint(lab, change, base, g)
+    then, g_bare, _tint, _finish, _base = _repaint_adjoint(lab, _no_change(), base, g)
+    return now - then, rgb_to_lab_adjoint(rgb, g_lab - g_bare), g_tint, g_finish, g_base
 
 
 @wp.func
-def painted_share(opacity: wp.float32, paint: wp.float32):
+def _paint_opacity(opacity: wp.float32, paint: wp.float32):
     return wp.where(wp.min(opacity, paint) > 0.0, opacity * paint, 0.0)
 
 
 @wp.kernel
-def paint_kernel(
+def _paint_kernel(
     start: int,
     colour: wp.array(dtype=wp.float32),
     opacity: wp.array(dtype=wp.float32),
@@ -302,13 +312,13 @@ def paint_kernel(
     i = start + wp.tid()
     alpha = load(opacity, i)
     own = load3(colour, 3 * i, 1)
-    straight = clamped((1.0 / wp.max(alpha, model.LEAST_ALPHA)) * own)
-    change = paint_change(straight, coat_at(code, i, load(height, i)), load(base, i))
-    store3(out, 3 * i, 1, own + painted_share(alpha, load(paint, i)) * change)
+    straight = clamp01((1.0 / wp.max(alpha, model.LEAST_ALPHA)) * own)
+    difference = _paint_difference(straight, _read_change(code, i, load(height, i)), load(base, i))
+    store3(out, 3 * i, 1, own + _paint_opacity(alpha, load(paint, i)) * difference)
 
 
 @wp.kernel
-def paint_adjoint_kernel(
+def _paint_adjoint_kernel(
     start: int,
     colour: wp.array(dtype=wp.float32),
     opacity: wp.array(dtype=wp.float32),
@@ -327,20 +337,20 @@ def paint_adjoint_kernel(
     g = load3(grad, 3 * i, 1)
     scale = 1.0 / wp.max(alpha, model.LEAST_ALPHA)
     straight = scale * own
-    rgb = clamped(straight)
+    rgb = clamp01(straight)
     up = load(height, i)
     share = load(paint, i)
     touched = wp.where(wp.min(alpha, share) > 0.0, 1.0, 0.0)
-    coat = coat_at(code, i, up)
-    change, g_rgb, g_tint, g_finish, g_base = paint_change_adjoint(
-        rgb, coat, load(base, i), painted_share(alpha, share) * g
+    change = _read_change(code, i, up)
+    difference, g_rgb, g_tint, g_finish, g_base = _paint_difference_adjoint(
+        rgb, change, load(base, i), _paint_opacity(alpha, share) * g
     )
-    along = touched * wp.dot(g, change)
-    g_straight = scale * clamped_adjoint(straight, g_rgb)
+    along = touched * wp.dot(g, difference)
+    g_straight = scale * clamp01_adjoint(straight, g_rgb)
     thin = wp.where(alpha >= model.LEAST_ALPHA, wp.dot(g_straight, straight), 0.0)
     store(grads, i, share * along - thin)
     store(grads, i + rows, alpha * along)
-    store(grads, i + 2 * rows, -model.CLEAN_ROOF * within(up, 0.0, 1.0) * g_finish[2])
+    store(grads, i + 2 * rows, -model.CLEAN_ROOF * clamp_slope(up, 0.0, 1.0) * g_finish[2])
     store(grads, i + 3 * rows, g_base)
     store3(grads, i + 4 * rows, rows, g_tint)
     store(grads, i + 7 * rows, g_finish[0])
@@ -355,7 +365,7 @@ class _Paint(torch.autograd.Function):
     def forward(ctx: Any, *rows: Tensor) -> Tensor:
         given = [row.detach().contiguous() for row in rows]
         out = torch.empty_like(given[0])
-        launch(paint_kernel, split_range(out.shape[0]), [array(t) for t in (*given, out)])
+        launch(_paint_kernel, split_range(out.shape[0]), [flat_array(t) for t in (*given, out)])
         ctx.save_for_backward(*given)
         return out
 
@@ -365,17 +375,17 @@ class _Paint(torch.autograd.Function):
         given = ctx.saved_tensors
         rows = given[0].shape[0]
         grads = given[0].new_empty(12, rows)
-        inputs = [*(array(t) for t in (*given, grad)), rows]
-        launch(paint_adjoint_kernel, split_range(rows), inputs, [array(grads)])
+        inputs = [*(flat_array(t) for t in (*given, grad)), rows]
+        launch(_paint_adjoint_kernel, split_range(rows), inputs, [flat_array(grads)])
         return grads[9:].T, grads[0], grads[4:9].T, grads[1], grads[2], grads[3]
 
 
-def array(values: Tensor) -> Any:
+def flat_array(values: Tensor) -> Any:
     """A float tensor as Warp's array of its numbers, one after the other."""
     return wp.from_torch(values.detach().contiguous().view(-1), dtype=wp.float32)
 
 
-def paint(
+def repaint(
     colour: Tensor, opacity: Tensor, code: Tensor, share: Tensor, height: Tensor, base_lightness: Tensor
 ) -> Tensor:
     """See `texture.apply_texture_code`. All float32; differentiable to all."""

@@ -17,20 +17,20 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.lanes import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
 from scene_ir.raster.launch import launch, split_range, start_warp, threads
+from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
 from scene_ir.render import model
 from scene_ir.render.kernels.colour import (
-    array,
-    clamped,
-    clamped_adjoint,
-    lab_adjoint,
-    lab_of,
-    level_of,
-    lifted,
-    rgb_adjoint,
-    rgb_of,
-    within,
+    clamp01,
+    clamp01_adjoint,
+    clamp_slope,
+    flat_array,
+    lab_to_rgb,
+    lab_to_rgb_adjoint,
+    lightness_level,
+    rgb_to_lab,
+    rgb_to_lab_adjoint,
+    scale_odds,
 )
 from scene_ir.types import Environment
 
@@ -55,8 +55,20 @@ DARKENING = wp.constant(wp.vec3d(*model.DARKENING))
 WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 
 _STRIP = 64
-"""Columns that a thread of the CPU smears at a time; `mirror` and `unmirror` have room for this many."""
-OVERCAST, WET, MIST, COVER, GAIN, GAIN_SLOPE, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_HAZE, SETTINGS = (
+"""Columns that a thread of the CPU smears at a time; `_mirror_columns` and `_mirror_columns_adjoint` have room for this many."""
+(
+    SETTING_OVERCAST,
+    SETTING_RAIN,
+    SETTING_FOG,
+    SETTING_COVER,
+    SETTING_GAIN,
+    SETTING_GAIN_SLOPE,
+    SETTING_AIR,
+    SETTING_AIR_BY_OVERCAST,
+    SETTING_AIR_BY_TIME,
+    SETTING_AIR_BY_HAZE,
+    SETTING_COUNT,
+) = (
     *(0, 1, 2, 3, 4),
     *(7, 10, 13, 16, 19, 22),
 )
@@ -66,12 +78,12 @@ overcast (3), time (3), and what either of fog and rain, fully on alone, does to
 
 
 @wp.func
-def grey_air_of(air: wp.array(dtype=wp.float32)):
+def _grey_air(air: wp.array(dtype=wp.float32)):
     return wp.float64(LUMA[0] * air[0] + LUMA[1] * air[1] + LUMA[2] * air[2])
 
 
 @wp.kernel
-def settings_kernel(
+def _settings_kernel(
     start: int,
     code: wp.array(dtype=wp.float32),
     air: wp.array(dtype=wp.float32),
@@ -95,124 +107,124 @@ def settings_kernel(
         + WARMTH[c] * (one - two * wp.float64(model.DUSK_ENDS) * square) * dusk
         - dimming * (one - two * wp.float64(model.DIMMING_ENDS) * square) * dim
     )
-    grey = grey_air_of(air)
-    away = wp.float64(model.OVERCAST_AIR) * grey - wp.float64(air[c])
+    _luma = _grey_air(air)
+    away = wp.float64(model.OVERCAST_AIR) * _luma - wp.float64(air[c])
     plain = wp.float64(air[c]) + overcast * away
-    darker = (wp.float64(model.OVERCAST_AIR) - one) * grey
+    darker = (wp.float64(model.OVERCAST_AIR) - one) * _luma
     fog = wp.float64(code[0])
     rain = wp.float64(code[1])
     greyed = wp.float64(model.HAZE_GREY) * (fog + rain - fog * rain)
-    paler = grey + overcast * darker - plain
+    paler = _luma + overcast * darker - plain
     misty = plain + greyed * paler
     if c == 0:
-        settings[OVERCAST] = wp.float32(overcast)
-        settings[WET] = code[1]
-        settings[MIST] = code[0]
-        settings[COVER] = wp.float32(wp.float64(COVER_AIR) * grey + wp.float64(model.COVER_LIGHT))
-    settings[GAIN + c] = wp.float32(gain)
-    settings[GAIN_SLOPE + c] = wp.float32(slope)
-    settings[AIR + c] = wp.float32(misty + gain * misty)
+        settings[SETTING_OVERCAST] = wp.float32(overcast)
+        settings[SETTING_RAIN] = code[1]
+        settings[SETTING_FOG] = code[0]
+        settings[SETTING_COVER] = wp.float32(wp.float64(COVER_AIR) * _luma + wp.float64(model.COVER_LIGHT))
+    settings[SETTING_GAIN + c] = wp.float32(gain)
+    settings[SETTING_GAIN_SLOPE + c] = wp.float32(slope)
+    settings[SETTING_AIR + c] = wp.float32(misty + gain * misty)
     along = away + greyed * (darker - away)
-    settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
-    settings[AIR_BY_TIME + c] = wp.float32(slope * misty)
-    settings[AIR_BY_HAZE + c] = wp.float32(wp.float64(model.HAZE_GREY) * paler * (one + gain))
+    settings[SETTING_AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
+    settings[SETTING_AIR_BY_TIME + c] = wp.float32(slope * misty)
+    settings[SETTING_AIR_BY_HAZE + c] = wp.float32(wp.float64(model.HAZE_GREY) * paler * (one + gain))
 
 
 @wp.func
-def grey(x: wp.vec3f):
+def _luma(x: wp.vec3f):
     return wp.dot(LUMA, x)
 
 
 @wp.func
-def same(x: wp.float32):
+def _splat(x: wp.float32):
     return wp.vec3f(x, x, x)
 
 
 @wp.func
-def grown(x: wp.vec3f, gain: wp.vec3f):
+def _apply_gain(x: wp.vec3f, gain: wp.vec3f):
     return wp.vec3f(x[0] + gain[0] * x[0], x[1] + gain[1] * x[1], x[2] + gain[2] * x[2])
 
 
 @wp.func
-def cover_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _overcast_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
     """What overcast, fully on, would add."""
-    y = grey(x)
-    flat = FLAT * x + same(FLAT_GREY * y + FLAT_LIGHT)
-    return (flat + sky * (same(load(settings, COVER) + model.COVER_STRUCTURE * y) - flat)) - x
+    y = _luma(x)
+    flat = FLAT * x + _splat(FLAT_GREY * y + FLAT_LIGHT)
+    return (flat + sky * (_splat(load(settings, SETTING_COVER) + model.COVER_STRUCTURE * y) - flat)) - x
 
 
 @wp.func
-def damp_change(x: wp.vec3f):
+def _damp_change(x: wp.vec3f):
     """What rain, at 1 / `model.DAMP`, would add by wetting."""
-    return (DAMP * x + same(DAMP_GREY * grey(x))) - x
+    return (DAMP * x + _splat(DAMP_GREY * _luma(x))) - x
 
 
 @wp.func
-def before(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _before_mirror(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after overcast, time of day and damp."""
-    covered = x + load(settings, OVERCAST) * cover_change(x, sky, settings)
-    timed = grown(covered, load3(settings, GAIN, 1))
-    return timed + (model.DAMP * load(settings, WET)) * damp_change(timed)
+    covered = x + load(settings, SETTING_OVERCAST) * _overcast_change(x, sky, settings)
+    timed = _apply_gain(covered, load3(settings, SETTING_GAIN, 1))
+    return timed + (model.DAMP * load(settings, SETTING_RAIN)) * _damp_change(timed)
 
 
 @wp.func
-def depth_of(inverse: wp.float32):
+def _haze_depth(inverse: wp.float32):
     return 1.0 / wp.max(inverse, NEAREST)
 
 
 @wp.func
-def far_share(depth: wp.float32):
+def _sheen_share(depth: wp.float32):
     return wp.min(wp.max((depth - SHEEN_FROM) * (1.0 / SHEEN_OVER), 0.0), 1.0)
 
 
 @wp.func
-def grazing_at(depth: wp.float32):
-    t = far_share(depth)
+def _grazing_sheen(depth: wp.float32):
+    t = _sheen_share(depth)
     return model.SHEEN_NEAR + model.SHEEN_FAR * (t * t * (3.0 - 2.0 * t))
 
 
 @wp.func
-def root_of(x: wp.vec3f):
+def _sqrt3(x: wp.vec3f):
     return wp.vec3f(wp.sqrt(x[0]), wp.sqrt(x[1]), wp.sqrt(x[2]))
 
 
 @wp.func
-def veiled(x: wp.vec3f, veil: wp.float32, air: wp.vec3f):
-    """See `environment.veiled`."""
+def _apply_veil(x: wp.vec3f, veil: wp.float32, air: wp.vec3f):
+    """See `environment.apply_veil`."""
     square = wp.cw_mul(x, x)
-    light = square + same(VEIL_BEND)
-    return x + (root_of(light + veil * (wp.cw_mul(air, air) - square)) - root_of(light))
+    light = square + _splat(VEIL_BEND)
+    return x + (_sqrt3(light + veil * (wp.cw_mul(air, air) - square)) - _sqrt3(light))
 
 
 @wp.func
-def veiled_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3f):
+def _apply_veil_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3f):
     """-> gradients to x, to the veil and to the air."""
     square = wp.cw_mul(x, x)
-    light = square + same(VEIL_BEND)
+    light = square + _splat(VEIL_BEND)
     more = wp.cw_mul(air, air) - square
-    by_root = wp.cw_div(g, root_of(light + veil * more))
-    to_x = g + wp.cw_mul(x, (1.0 - veil) * by_root - wp.cw_div(g, root_of(light)))
+    by_root = wp.cw_div(g, _sqrt3(light + veil * more))
+    to_x = g + wp.cw_mul(x, (1.0 - veil) * by_root - wp.cw_div(g, _sqrt3(light)))
     return to_x, 0.5 * wp.dot(by_root, more), veil * wp.cw_mul(by_root, air)
 
 
 @wp.func
-def hazed(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after haze, streaks and fog."""
-    rain = load(settings, WET)
-    air = load3(settings, AIR, 1)
-    far = veiled(x, 1.0 - exp_(-RAIN * rain * depth), model.RAIN_AIR * air)
+    rain = load(settings, SETTING_RAIN)
+    air = load3(settings, SETTING_AIR, 1)
+    far = _apply_veil(x, 1.0 - exp_(-RAIN * rain * depth), model.RAIN_AIR * air)
     streaked = far + (model.STREAKS * rain * streak) * (air - far)
-    return veiled(streaked, 1.0 - exp_(-FOG * load(settings, MIST) * depth), air)
+    return _apply_veil(streaked, 1.0 - exp_(-FOG * load(settings, SETTING_FOG) * depth), air)
 
 
 @wp.func
-def shiny(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel with the road's sheen, of which `wet` in [0, 1] is seen."""
-    return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, AIR, 1) - x)
+    return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, SETTING_AIR, 1) - x)
 
 
 @wp.kernel
-def dry_kernel(
+def _dry_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
@@ -223,34 +235,34 @@ def dry_kernel(
     out: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
-    x = before(load3(image, i, plane), load(sky, i), settings)
-    store3(out, i, plane, hazed(x, depth_of(load(inverse, i)), load(streaks, i), settings))
+    x = _before_mirror(load3(image, i, plane), load(sky, i), settings)
+    store3(out, i, plane, _apply_haze(x, _haze_depth(load(inverse, i)), load(streaks, i), settings))
 
 
 @wp.kernel
-def damp_kernel(
+def _damp_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
     sky: wp.array(dtype=wp.float32),
     plane: int,
     first: int,
-    kept: int,
+    wet_pixels: int,
     out: wp.array(dtype=wp.float32),
 ):
-    """Pixels before the mirror; out: planes of `kept` numbers, from pixel `first` on."""
+    """Pixels before the mirror; out: planes of `wet_pixels` numbers, from pixel `first` on."""
     i = start + wp.tid()
-    store3(out, i - first, kept, before(load3(image, i, plane), load(sky, i), settings))
+    store3(out, i - first, wet_pixels, _before_mirror(load3(image, i, plane), load(sky, i), settings))
 
 
 @wp.kernel
-def wet_kernel(
+def _wet_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     damp: wp.array(dtype=wp.float32),
     mirrored: wp.array(dtype=wp.float32),
     first: int,
-    kept: int,
+    wet_pixels: int,
     inverse: wp.array(dtype=wp.float32),
     road: wp.array(dtype=wp.float32),
     streaks: wp.array(dtype=wp.float32),
@@ -258,33 +270,33 @@ def wet_kernel(
     out: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
-    depth = depth_of(load(inverse, i))
-    share = load(settings, WET) * (load(road, i) * grazing_at(depth))
-    x = shiny(load3(damp, i - first, kept), load3(mirrored, i - first, kept), share, settings)
-    store3(out, i, plane, hazed(x, depth, load(streaks, i), settings))
+    depth = _haze_depth(load(inverse, i))
+    share = load(settings, SETTING_RAIN) * (load(road, i) * _grazing_sheen(depth))
+    x = _apply_sheen(load3(damp, i - first, wet_pixels), load3(mirrored, i - first, wet_pixels), share, settings)
+    store3(out, i, plane, _apply_haze(x, depth, load(streaks, i), settings))
 
 
 @wp.func
-def before_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
-    """Of `before`: the gradient to x, to rain, time and overcast (3), and to sky."""
-    overcast = load(settings, OVERCAST)
-    damping = model.DAMP * load(settings, WET)
-    gain = load3(settings, GAIN, 1)
-    change = cover_change(x, sky, settings)
+def _before_mirror_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
+    """Of `_before_mirror`: the gradient to x, to rain, time and overcast (3), and to sky."""
+    overcast = load(settings, SETTING_OVERCAST)
+    damping = model.DAMP * load(settings, SETTING_RAIN)
+    gain = load3(settings, SETTING_GAIN, 1)
+    change = _overcast_change(x, sky, settings)
     covered = x + overcast * change
-    rain = model.DAMP * wp.dot(g, damp_change(grown(covered, gain)))
+    rain = model.DAMP * wp.dot(g, _damp_change(_apply_gain(covered, gain)))
     wetted = g + damping * ((DAMP * g + DAMP_GREY * sum3(g) * LUMA) - g)
-    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, GAIN_SLOPE, 1))
-    timed = grown(wetted, gain)
+    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, SETTING_GAIN_SLOPE, 1))
+    timed = _apply_gain(wetted, gain)
     flat = (1.0 - sky) * timed
     grey_slope = FLAT_GREY * sum3(flat) + model.COVER_STRUCTURE * sky * sum3(timed)
     out = timed + overcast * ((FLAT * flat + grey_slope * LUMA) - timed)
-    g_sky = overcast * wp.dot(timed, cover_change(x, 1.0, settings) - cover_change(x, 0.0, settings))
+    g_sky = overcast * wp.dot(timed, _overcast_change(x, 1.0, settings) - _overcast_change(x, 0.0, settings))
     return out, wp.vec3f(rain, time, model.OVERCAST * wp.dot(timed, change)), g_sky
 
 
 @wp.func
-def after_adjoint(
+def _after_mirror_adjoint(
     x: wp.vec3f,
     mirrored: wp.vec3f,
     road: wp.float32,
@@ -293,27 +305,27 @@ def after_adjoint(
     g: wp.vec3f,
     settings: wp.array(dtype=wp.float32),
 ):
-    """Of `shiny` and `hazed`: gradients to x, to mirrored, to (fog, rain, time, overcast), to inverse, to road."""
-    rain = load(settings, WET)
-    fog = load(settings, MIST)
-    air = load3(settings, AIR, 1)
-    depth = depth_of(inverse)
-    t = far_share(depth)
-    seen = road * grazing_at(depth)
+    """Of `_apply_sheen` and `_apply_haze`: gradients to x, to mirrored, to (fog, rain, time, overcast), to inverse, to road."""
+    rain = load(settings, SETTING_RAIN)
+    fog = load(settings, SETTING_FOG)
+    air = load3(settings, SETTING_AIR, 1)
+    depth = _haze_depth(inverse)
+    t = _sheen_share(depth)
+    seen = road * _grazing_sheen(depth)
     wet = rain * seen
     sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air - x
     wetted = x + wet * sheen
     clear = exp_(-RAIN * rain * depth)
     haze = model.RAIN_AIR * air
-    far = veiled(wetted, 1.0 - clear, haze)
+    far = _apply_veil(wetted, 1.0 - clear, haze)
     streaked = far + (model.STREAKS * rain * streak) * (air - far)
     visible = exp_(-FOG * fog * depth)
 
-    g_far, g_fog, g_fog_air = veiled_adjoint(streaked, 1.0 - visible, air, g)
+    g_far, g_fog, g_fog_air = _apply_veil_adjoint(streaked, 1.0 - visible, air, g)
     g_fogged = FOG * visible * g_fog
     g_streak = wp.dot(g_far, air - far)
     g_haze = (1.0 - model.STREAKS * rain * streak) * g_far
-    g_wet, g_veil, g_haze_air = veiled_adjoint(wetted, 1.0 - clear, haze, g_haze)
+    g_wet, g_veil, g_haze_air = _apply_veil_adjoint(wetted, 1.0 - clear, haze, g_haze)
     g_hazed = RAIN * clear * g_veil
     g_sheen = wp.dot(g_wet, sheen)
     g_air = (
@@ -322,22 +334,22 @@ def after_adjoint(
         + model.RAIN_AIR * g_haze_air
         + (model.SHEEN_AIR * wet) * g_wet
     )
-    g_grey = wp.dot(g_air, load3(settings, AIR_BY_HAZE, 1))
+    g_grey = wp.dot(g_air, load3(settings, SETTING_AIR_BY_HAZE, 1))
     code = wp.vec4f(
         g_fogged * depth + (1.0 - rain) * g_grey,
         g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen + (1.0 - fog) * g_grey,
-        wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
-        wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
+        wp.dot(g_air, load3(settings, SETTING_AIR_BY_TIME, 1)),
+        wp.dot(g_air, load3(settings, SETTING_AIR_BY_OVERCAST, 1)),
     )
     bend = (model.SHEEN_FAR * 6.0 / SHEEN_OVER) * (t - t * t)
     g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
     g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
-    g_road = g_sheen * rain * grazing_at(depth)
+    g_road = g_sheen * rain * _grazing_sheen(depth)
     return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, code, g_inverse, g_road
 
 
 @wp.kernel
-def dry_adjoint_kernel(
+def _dry_adjoint_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
@@ -348,7 +360,7 @@ def dry_adjoint_kernel(
     grad: wp.array(dtype=wp.float32),
     grad_image: wp.array(dtype=wp.float32),
     grad_inverse: wp.array(dtype=wp.float32),
-    shares: wp.array(dtype=wp.float32),
+    code_parts: wp.array(dtype=wp.float32),
     grad_maps: wp.array(dtype=wp.float32),
 ):
     """shares: each pixel's part of the gradients to fog, rain, time, overcast, a plane each; grad_maps: to sky and
@@ -356,21 +368,21 @@ def dry_adjoint_kernel(
     i = start + wp.tid()
     colour = load3(image, i, plane)
     cover = load(sky, i)
-    x = before(colour, cover, settings)
-    g, _mirrored, code, g_inverse, _road = after_adjoint(
+    x = _before_mirror(colour, cover, settings)
+    g, _mirrored, code, g_inverse, _road = _after_mirror_adjoint(
         x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
     )
-    g_colour, parts, g_sky = before_adjoint(colour, cover, g, settings)
+    g_colour, parts, g_sky = _before_mirror_adjoint(colour, cover, g, settings)
     store3(grad_image, i, plane, g_colour)
     store(grad_inverse, i, g_inverse)
-    store(shares, i, code[0])
-    store3(shares, i + plane, plane, wp.vec3f(code[1], code[2], code[3]) + parts)
+    store(code_parts, i, code[0])
+    store3(code_parts, i + plane, plane, wp.vec3f(code[1], code[2], code[3]) + parts)
     store(grad_maps, i, g_sky)
     store(grad_maps, i + plane, 0.0)
 
 
 @wp.kernel
-def wet_adjoint_kernel(
+def _wet_adjoint_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
@@ -382,35 +394,35 @@ def wet_adjoint_kernel(
     road: wp.array(dtype=wp.float32),
     mirrored: wp.array(dtype=wp.float32),
     first: int,
-    kept: int,
+    wet_pixels: int,
     grad_mirrored: wp.array(dtype=wp.float32),
     grad_image: wp.array(dtype=wp.float32),
     grad_inverse: wp.array(dtype=wp.float32),
-    shares: wp.array(dtype=wp.float32),
+    code_parts: wp.array(dtype=wp.float32),
     grad_maps: wp.array(dtype=wp.float32),
 ):
     """Back to the mirror: to grad_image goes the gradient to the picture before it."""
     i = start + wp.tid()
-    x = before(load3(image, i, plane), load(sky, i), settings)
-    g, g_mirrored, code, g_inverse, g_road = after_adjoint(
+    x = _before_mirror(load3(image, i, plane), load(sky, i), settings)
+    g, g_mirrored, code, g_inverse, g_road = _after_mirror_adjoint(
         x,
-        load3(mirrored, i - first, kept),
+        load3(mirrored, i - first, wet_pixels),
         load(road, i),
         load(inverse, i),
         load(streaks, i),
         load3(grad, i, plane),
         settings,
     )
-    store3(grad_mirrored, i - first, kept, g_mirrored)
+    store3(grad_mirrored, i - first, wet_pixels, g_mirrored)
     store3(grad_image, i, plane, g)
     store(grad_inverse, i, g_inverse)
-    store(shares, i, code[0])
-    store3(shares, i + plane, plane, wp.vec3f(code[1], code[2], code[3]))
+    store(code_parts, i, code[0])
+    store3(code_parts, i + plane, plane, wp.vec3f(code[1], code[2], code[3]))
     store(grad_maps, i + plane, g_road)
 
 
 @wp.kernel
-def damp_adjoint_kernel(
+def _damp_adjoint_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
@@ -418,24 +430,24 @@ def damp_adjoint_kernel(
     plane: int,
     grad_damp: wp.array(dtype=wp.float32),
     first: int,
-    kept: int,
+    wet_pixels: int,
     grad_image: wp.array(dtype=wp.float32),
-    shares: wp.array(dtype=wp.float32),
+    code_parts: wp.array(dtype=wp.float32),
     grad_maps: wp.array(dtype=wp.float32),
 ):
     """From before the mirror back to the picture; grad_damp: what comes through the mirror."""
     i = start + wp.tid()
-    g = load3(grad_image, i, plane) + load3(grad_damp, i - first, kept)
-    g_colour, parts, g_sky = before_adjoint(load3(image, i, plane), load(sky, i), g, settings)
+    g = load3(grad_image, i, plane) + load3(grad_damp, i - first, wet_pixels)
+    g_colour, parts, g_sky = _before_mirror_adjoint(load3(image, i, plane), load(sky, i), g, settings)
     store3(grad_image, i, plane, g_colour)
-    store3(shares, i + plane, plane, load3(shares, i + plane, plane) + parts)
+    store3(code_parts, i + plane, plane, load3(code_parts, i + plane, plane) + parts)
     store(grad_maps, i, g_sky)
 
 
 @wp.func_native("""
     // Sums run down the columns [left, right) in double, then over each three of them.
-    const float* from = (const float*)source.data + plane * kept;
-    float* to = (float*)target.data + plane * kept;
+    const float* from = (const float*)source.data + plane * wet_pixels;
+    float* to = (float*)target.data + plane * wet_pixels;
     const int end = x0 + columns < width ? x0 + columns : width;
     const int left = x0 > 0 ? x0 - 1 : 0, right = end < width ? end + 1 : width;
     const int begin = road_top > radius ? road_top : radius;
@@ -464,8 +476,8 @@ def damp_adjoint_kernel(
         }
     }
 """)
-def mirror(
-    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, kept: int, x0: int,
+def _mirror_columns(
+    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, wet_pixels: int, x0: int,
     columns: int, width: int, top: int, bottom: int, road_top: int, radius: int,
 ):  # fmt: skip
     """What a wet road mirrors, in columns [x0, x0 + columns), rows [road_top, bottom); 0 above, from `top` on."""
@@ -474,8 +486,8 @@ def mirror(
 @wp.func_native("""
     // Row y of the mirror sums the rows j in [Y - 2 radius, Y] of the picture, Y = max(y, radius); those above the
     // picture are its first row. So row j gathers the mirror's rows with Y in [j, j + 2 radius].
-    const float* from = (const float*)source.data + plane * kept;
-    float* to = (float*)target.data + plane * kept;
+    const float* from = (const float*)source.data + plane * wet_pixels;
+    float* to = (float*)target.data + plane * wet_pixels;
     const int end = x0 + columns < width ? x0 + columns : width;
     const int left = x0 > 0 ? x0 - 1 : 0, right = end < width ? end + 1 : width;
     const double scale = 1.0 / (3.0 * (2 * radius + 1));
@@ -497,15 +509,15 @@ def mirror(
         }
     }
 """)
-def unmirror(
-    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, kept: int, x0: int,
+def _mirror_columns_adjoint(
+    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, wet_pixels: int, x0: int,
     columns: int, width: int, top: int, bottom: int, radius: int,
 ):  # fmt: skip
-    """The transpose of `mirror`: from gradients to the mirror, 0 where it is, to those to the picture."""
+    """The transpose of `_mirror_columns`: from gradients to the mirror, 0 where it is, to those to the picture."""
 
 
 @wp.kernel
-def mirror_kernel(
+def _mirror_kernel(
     start: int,
     source: wp.array(dtype=wp.float32),
     target: wp.array(dtype=wp.float32),
@@ -520,16 +532,16 @@ def mirror_kernel(
     """A thread takes `columns` columns of a channel."""
     t = start + wp.tid()
     strips = (width + columns - 1) // columns
-    kept = (bottom - top) * width
+    wet_pixels = (bottom - top) * width
     x0 = (t % strips) * columns
     if forward:
-        mirror(source, target, t // strips, kept, x0, columns, width, top, bottom, road_top, radius)
+        _mirror_columns(source, target, t // strips, wet_pixels, x0, columns, width, top, bottom, road_top, radius)
     else:
-        unmirror(source, target, t // strips, kept, x0, columns, width, top, bottom, radius)
+        _mirror_columns_adjoint(source, target, t // strips, wet_pixels, x0, columns, width, top, bottom, radius)
 
 
 @dataclass(frozen=True, slots=True)
-class _Wet:
+class _WetRows:
     """Rows [top, bottom) that hold what a wet road mirrors, or the road, which begins at row road_top."""
 
     top: int
@@ -538,7 +550,7 @@ class _Wet:
     radius: int
 
     @classmethod
-    def of(cls, road: Tensor) -> _Wet:
+    def of(cls, road: Tensor) -> _WetRows:
         height = road.shape[0]
         radius = model.mirror_reach(height) // 2
         if road.is_cuda:  # to look where the road is would make the CPU wait
@@ -560,7 +572,7 @@ def _ranges(first: int, last: int) -> list[int]:
     return [first + edge for edge in split_range(last - first)]
 
 
-class _Scratch(threading.local):
+class _ScratchMemory(threading.local):
     """Room for numbers that are dropped when a call ends; new room each time would cost the CPU more to be given
     than to be written."""
 
@@ -576,7 +588,7 @@ class _Scratch(threading.local):
         return list(self._room[: sum(sizes)].split(sizes))
 
 
-_scratch = _Scratch()
+_scratch = _ScratchMemory()
 
 
 class _Weather(torch.autograd.Function):
@@ -594,74 +606,77 @@ class _Weather(torch.autograd.Function):
         streaks: Tensor,
     ) -> Tensor:
         height, width = image.shape[1:]
-        plane, wet = height * width, _Wet.of(road)
+        plane, wet = height * width, _WetRows.of(road)
         first, last = wet.top * width, wet.bottom * width
-        kept = last - first
-        settings, out = image.new_empty(SETTINGS), torch.empty_like(image, memory_format=torch.contiguous_format)
-        damp, mirrored = _scratch.planes(image, 3 * kept)[0], image.new_empty(3 * kept)
-        kept_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
-        picture, sight, cover, way, drops = (array(t) for t in kept_maps)
-        given, target, held, shown = array(settings), array(out), array(damp), array(mirrored)
-        launch(settings_kernel, [0, 3], [array(code), array(air)], [given])
+        wet_pixels = last - first
+        settings, out = (
+            image.new_empty(SETTING_COUNT),
+            torch.empty_like(image, memory_format=torch.contiguous_format),
+        )
+        damp, mirrored = _scratch.planes(image, 3 * wet_pixels)[0], image.new_empty(3 * wet_pixels)
+        saved_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
+        picture, sight, cover, way, drops = (flat_array(t) for t in saved_maps)
+        given, target, held, shown = flat_array(settings), flat_array(out), flat_array(damp), flat_array(mirrored)
+        launch(_settings_kernel, [0, 3], [flat_array(code), flat_array(air)], [given])
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
             inputs = [given, picture, sight, cover, drops, plane]
-            launch(dry_kernel, _ranges(top * width, bottom * width), inputs, [target])
-        launch(damp_kernel, _ranges(first, last), [given, picture, cover, plane, first, kept], [held])
-        _mirror(wet, width, held, shown, True)
-        inputs = [given, held, shown, first, kept, sight, way, drops, plane]
-        launch(wet_kernel, _ranges(first, last), inputs, [target])
-        ctx.save_for_backward(*kept_maps, settings, mirrored)
+            launch(_dry_kernel, _ranges(top * width, bottom * width), inputs, [target])
+        launch(_damp_kernel, _ranges(first, last), [given, picture, cover, plane, first, wet_pixels], [held])
+        _launch_mirror(wet, width, held, shown, True)
+        inputs = [given, held, shown, first, wet_pixels, sight, way, drops, plane]
+        launch(_wet_kernel, _ranges(first, last), inputs, [target])
+        ctx.save_for_backward(*saved_maps, settings, mirrored)
         ctx.wet = wet
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        wet: _Wet = ctx.wet
+        wet: _WetRows = ctx.wet
         image, inverse, *_ = ctx.saved_tensors
-        picture, sight, cover, way, drops, given, shown = (array(t) for t in ctx.saved_tensors)
+        picture, sight, cover, way, drops, given, shown = (flat_array(t) for t in ctx.saved_tensors)
         height, width = inverse.shape
         plane, first, last = height * width, wet.top * width, wet.bottom * width
         grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
         grad_maps = image.new_empty(2, height, width)
         scratch = _scratch.planes(image, 4 * plane, 3 * (last - first), 3 * (last - first))
-        parts, to_mirror, to_damp = (array(t) for t in scratch)
-        inputs = [given, picture, sight, cover, drops, plane, array(grad)]
-        outputs = [array(grad_image), array(grad_inverse), parts, array(grad_maps)]
+        parts, to_mirror, to_damp = (flat_array(t) for t in scratch)
+        inputs = [given, picture, sight, cover, drops, plane, flat_array(grad)]
+        outputs = [flat_array(grad_image), flat_array(grad_inverse), parts, flat_array(grad_maps)]
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
-            launch(dry_adjoint_kernel, _ranges(top * width, bottom * width), inputs, outputs)
+            launch(_dry_adjoint_kernel, _ranges(top * width, bottom * width), inputs, outputs)
         through = [way, shown, first, last - first, to_mirror]
-        launch(wet_adjoint_kernel, _ranges(first, last), [*inputs, *through], outputs)
-        _mirror(wet, width, to_mirror, to_damp, False)
+        launch(_wet_adjoint_kernel, _ranges(first, last), [*inputs, *through], outputs)
+        _launch_mirror(wet, width, to_mirror, to_damp, False)
         inputs = [given, picture, cover, plane, to_damp, first, last - first]
-        launch(damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], *outputs[2:]])
-        grad_code = _row_by_row(scratch[0].view(4, height, width))
+        launch(_damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], *outputs[2:]])
+        grad_code = _sum_rows_first(scratch[0].view(4, height, width))
         return grad_image, grad_inverse, grad_code, None, *grad_maps, None
 
 
-def _row_by_row(shares: Tensor) -> Tensor:
+def _sum_rows_first(code_parts: Tensor) -> Tensor:
     """Sums (K,) of planes (K, H, W), rows first: so they do not hang on the number of threads."""
-    return shares.sum(dim=2).sum(dim=1)
+    return code_parts.sum(dim=2).sum(dim=1)
 
 
-def _mirror(wet: _Wet, width: int, source: Any, target: Any, forward: bool) -> None:
+def _launch_mirror(wet: _WetRows, width: int, source: Any, target: Any, forward: bool) -> None:
     columns = 1 if source.device.is_cuda else _STRIP
     count = 3 * -(-width // columns) if wet.bottom > wet.top else 0
     parts = 1 if source.device.is_cuda else threads()
     edges = [count * i // parts for i in range(parts + 1)]
     inputs = [source, target, columns, width, wet.top, wet.bottom, wet.road_top, wet.radius, forward]
-    launch(mirror_kernel, edges, inputs)
+    launch(_mirror_kernel, edges, inputs)
 
 
 ODDS, CHROMA, COS, SIN, RED, YELLOW, THICKER, THINNER, TURN_SLOPE, THICKER_SLOPE, THINNER_SLOPE = range(11)
-LEAF_SETTINGS = 11
+LEAF_SETTING_COUNT = 11
 """Numbers that are the same for all leaves: where they stand, and their count. Factor of the odds of lightness; of
 chroma; cosine and sine of the turn of hue; shift of a* and b*; how much thicker and thinner; slopes of the turn
 along hue, of thicker and thinner along density."""
 
 
 @wp.kernel
-def leaf_settings_kernel(
+def _leaf_settings_kernel(
     start: int,
     code: wp.array(dtype=wp.float32),
     settings: wp.array(dtype=wp.float32),
@@ -677,7 +692,7 @@ def leaf_settings_kernel(
     rate_slope = wp.float64(LEAF_TURN_SLOPE) * (one - bend * bend)
     thick = one / (one + wp.exp(wp.float64(-model.CROWN_BEND) * density))
     steep = wp.float64(model.CROWN_BEND) * density * thick * (one - thick)
-    first = t * LEAF_SETTINGS
+    first = t * LEAF_SETTING_COUNT
     settings[first + ODDS] = wp.float32(wp.exp(on * wp.float64(model.LEAF_LIGHTNESS) * wp.float64(code[1])))
     settings[first + CHROMA] = wp.float32(one + wp.float64(model.LEAF_CHROMA) * hue)
     settings[first + COS] = wp.float32(wp.cos(-rate * hue))
@@ -692,12 +707,12 @@ def leaf_settings_kernel(
 
 
 @wp.func
-def leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+def _leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
     """The leaf model before its crown's density: L*a*b*."""
-    before = level_of(lab[0])
+    _before_mirror = lightness_level(lab[0])
     odds = load(settings, at + ODDS)
-    level = lifted(before, odds)
-    chroma = load(settings, at + CHROMA) * wp.sqrt(odds / (before * odds + (1.0 - before)))
+    level = scale_odds(_before_mirror, odds)
+    chroma = load(settings, at + CHROMA) * wp.sqrt(odds / (_before_mirror * odds + (1.0 - _before_mirror)))
     cos = load(settings, at + COS)
     sin = load(settings, at + SIN)
     room = 4.0 * level * (1.0 - level)
@@ -707,8 +722,8 @@ def leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
 
 
 @wp.struct
-class Crown:
-    """One pixel of `environment.crowns_of`."""
+class CrownPixel:
+    """One pixel of `environment.compute_crown_maps`."""
 
     thinned: wp.float32
     thickened: wp.float32
@@ -716,9 +731,9 @@ class Crown:
 
 
 @wp.func
-def crown_at(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
+def _read_crown(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
     """crowns: five planes: thinned, thickened, behind."""
-    at = Crown()
+    at = CrownPixel()
     at.thinned = load(crowns, i)
     at.thickened = load(crowns, plane + i)
     at.behind = load3(crowns, 2 * plane + i, plane)
@@ -726,28 +741,28 @@ def crown_at(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
 
 
 @wp.func
-def crowned(rgb: wp.vec3f, at: Crown, settings: wp.array(dtype=wp.float32), first: int):
+def _apply_crown(rgb: wp.vec3f, at: CrownPixel, settings: wp.array(dtype=wp.float32), first: int):
     """Leaves in a thicker or thinner crown."""
     dense = (1.0 - THICK * load(settings, first + THICKER) * at.thickened) * rgb
     return dense + (model.THIN_SHARE * load(settings, first + THINNER) * at.thinned) * (at.behind - dense)
 
 
 @wp.func
-def leaf_adjoint(lab: wp.vec3f, crown: Crown, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+def _leaf_adjoint(lab: wp.vec3f, crown: CrownPixel, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
     """-> gradients to lab and to hue, lightness and density (3)."""
-    changed = leaf_lab(lab, settings, at)
-    rgb = rgb_of(changed)
+    changed = _leaf_lab(lab, settings, at)
+    rgb = lab_to_rgb(changed)
     keep = 1.0 - THICK * load(settings, at + THICKER) * crown.thickened
     through = model.THIN_SHARE * load(settings, at + THINNER) * crown.thinned
     g_thin = model.THIN_SHARE * crown.thinned * wp.dot(g, crown.behind - keep * rgb)
     g_dense = (1.0 - through) * g
     g_thick = -THICK * crown.thickened * wp.dot(g_dense, rgb)
-    g_lab = rgb_adjoint(changed, keep * g_dense)
+    g_lab = lab_to_rgb_adjoint(changed, keep * g_dense)
 
-    before = level_of(lab[0])
+    _before_mirror = lightness_level(lab[0])
     odds = load(settings, at + ODDS)
-    bottom = before * odds + (1.0 - before)
-    level = before * odds / bottom
+    bottom = _before_mirror * odds + (1.0 - _before_mirror)
+    level = _before_mirror * odds / bottom
     root = wp.sqrt(odds / bottom)
     chroma = load(settings, at + CHROMA) * root
     cos = load(settings, at + COS)
@@ -766,7 +781,7 @@ def leaf_adjoint(lab: wp.vec3f, crown: Crown, g: wp.vec3f, settings: wp.array(dt
         load(settings, at + THICKER_SLOPE) * g_thick + load(settings, at + THINNER_SLOPE) * g_thin,
     )
     out = wp.vec3f(
-        0.01 * within(lab[0] * 0.01, LEVEL_LOW, LEVEL_HIGH) * g_before,
+        0.01 * clamp_slope(lab[0] * 0.01, LEVEL_LOW, LEVEL_HIGH) * g_before,
         chroma * (cos * g_lab[1] + sin * g_lab[2]),
         chroma * (cos * g_lab[2] - sin * g_lab[1]),
     )
@@ -774,12 +789,12 @@ def leaf_adjoint(lab: wp.vec3f, crown: Crown, g: wp.vec3f, settings: wp.array(dt
 
 
 @wp.func
-def leaf_share(amount: wp.float32):
+def _leaf_share(amount: wp.float32):
     return wp.where(amount > model.FEWEST_LEAVES, amount, 0.0)
 
 
 @wp.kernel
-def foliage_kernel(
+def _foliage_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     code: wp.array(dtype=wp.float32),
@@ -791,17 +806,19 @@ def foliage_kernel(
 ):
     i = start + wp.tid()
     own = load3(image, i, plane)
-    crown = crown_at(crowns, i, plane)
-    lab = lab_of(clamped(own))
-    now = crowned(rgb_of(leaf_lab(lab, settings, 0)), crown, settings, 0)
-    then = crowned(rgb_of(leaf_lab(lab, settings, LEAF_SETTINGS)), crown, settings, LEAF_SETTINGS)
+    crown = _read_crown(crowns, i, plane)
+    lab = rgb_to_lab(clamp01(own))
+    now = _apply_crown(lab_to_rgb(_leaf_lab(lab, settings, 0)), crown, settings, 0)
+    then = _apply_crown(
+        lab_to_rgb(_leaf_lab(lab, settings, LEAF_SETTING_COUNT)), crown, settings, LEAF_SETTING_COUNT
+    )
     size = wp.abs(load(code, 0)) + wp.abs(load(code, 1)) + wp.abs(load(code, 2))
-    share = wp.where(size > 0.0, leaf_share(load(amount, i)), 0.0)
+    share = wp.where(size > 0.0, _leaf_share(load(amount, i)), 0.0)
     store3(out, i, plane, own + share * (now - then))
 
 
 @wp.kernel
-def foliage_code_kernel(
+def _foliage_code_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
@@ -810,18 +827,20 @@ def foliage_code_kernel(
     plane: int,
     grad: wp.array(dtype=wp.float32),
     first: int,
-    kept: int,
-    shares: wp.array(dtype=wp.float32),
+    wet_pixels: int,
+    code_parts: wp.array(dtype=wp.float32),
 ):
-    """shares: each pixel's part of the gradient to the code, planes of `kept` numbers, from pixel `first` on."""
+    """shares: each pixel's part of the gradient to the code, planes of `wet_pixels` numbers, from pixel `first` on."""
     i = start + wp.tid()
-    g = leaf_share(load(amount, i)) * load3(grad, i, plane)
-    _lab, code = leaf_adjoint(lab_of(clamped(load3(image, i, plane))), crown_at(crowns, i, plane), g, settings, 0)
-    store3(shares, i - first, kept, code)
+    g = _leaf_share(load(amount, i)) * load3(grad, i, plane)
+    _lab, code = _leaf_adjoint(
+        rgb_to_lab(clamp01(load3(image, i, plane))), _read_crown(crowns, i, plane), g, settings, 0
+    )
+    store3(code_parts, i - first, wet_pixels, code)
 
 
 @wp.kernel
-def foliage_image_kernel(
+def _foliage_image_kernel(
     start: int,
     settings: wp.array(dtype=wp.float32),
     image: wp.array(dtype=wp.float32),
@@ -834,13 +853,13 @@ def foliage_image_kernel(
     i = start + wp.tid()
     own = load3(image, i, plane)
     g = load3(grad, i, plane)
-    rgb = clamped(own)
-    lab = lab_of(rgb)
-    part = leaf_share(load(amount, i)) * g
-    crown = crown_at(crowns, i, plane)
-    now, _code = leaf_adjoint(lab, crown, part, settings, 0)
-    then, _none = leaf_adjoint(lab, crown, part, settings, LEAF_SETTINGS)
-    store3(grad_image, i, plane, g + clamped_adjoint(own, lab_adjoint(rgb, now - then)))
+    rgb = clamp01(own)
+    lab = rgb_to_lab(rgb)
+    part = _leaf_share(load(amount, i)) * g
+    crown = _read_crown(crowns, i, plane)
+    now, _code = _leaf_adjoint(lab, crown, part, settings, 0)
+    then, _none = _leaf_adjoint(lab, crown, part, settings, LEAF_SETTING_COUNT)
+    store3(grad_image, i, plane, g + clamp01_adjoint(own, rgb_to_lab_adjoint(rgb, now - then)))
 
 
 class _Foliage(torch.autograd.Function):
@@ -851,14 +870,14 @@ class _Foliage(torch.autograd.Function):
         height, width = image.shape[1:]
         plane = height * width
         top, bottom = (0, height) if image.is_cuda else _rows(amount, model.FEWEST_LEAVES)
-        kept_maps = [t.detach().contiguous() for t in (image, amount, crowns)]
-        settings = image.new_empty(2 * LEAF_SETTINGS)
-        out = kept_maps[0].clone()
-        given, own_code, maps = array(settings), array(code), [array(t) for t in kept_maps]
-        launch(leaf_settings_kernel, [0, 2], [own_code], [given])
+        saved_maps = [t.detach().contiguous() for t in (image, amount, crowns)]
+        settings = image.new_empty(2 * LEAF_SETTING_COUNT)
+        out = saved_maps[0].clone()
+        given, own_code, maps = flat_array(settings), flat_array(code), [flat_array(t) for t in saved_maps]
+        launch(_leaf_settings_kernel, [0, 2], [own_code], [given])
         inputs = [given, own_code, *maps, plane]
-        launch(foliage_kernel, _ranges(top * width, bottom * width), inputs, [array(out)])
-        ctx.save_for_backward(*kept_maps, settings)
+        launch(_foliage_kernel, _ranges(top * width, bottom * width), inputs, [flat_array(out)])
+        ctx.save_for_backward(*saved_maps, settings)
         ctx.rows = (top, bottom)
         return out
 
@@ -870,25 +889,37 @@ class _Foliage(torch.autograd.Function):
         height, width = image.shape[1:]
         first, last = top * width, bottom * width
         grad = grad.contiguous()
-        inputs = [array(settings), *(array(t) for t in ctx.saved_tensors[:3]), height * width, array(grad)]
+        inputs = [
+            flat_array(settings),
+            *(flat_array(t) for t in ctx.saved_tensors[:3]),
+            height * width,
+            flat_array(grad),
+        ]
         grad_image = grad_code = None
         if ctx.needs_input_grad[0]:
             grad_image = grad.clone()
-            launch(foliage_image_kernel, _ranges(first, last), inputs, [array(grad_image)])
+            launch(_foliage_image_kernel, _ranges(first, last), inputs, [flat_array(grad_image)])
         if ctx.needs_input_grad[1]:
-            (shares,) = _scratch.planes(image, 3 * (last - first))
-            launch(foliage_code_kernel, _ranges(first, last), [*inputs, first, last - first], [array(shares)])
-            grad_code = _row_by_row(shares.view(3, bottom - top, width))
+            (code_parts,) = _scratch.planes(image, 3 * (last - first))
+            launch(
+                _foliage_code_kernel,
+                _ranges(first, last),
+                [*inputs, first, last - first],
+                [flat_array(code_parts)],
+            )
+            grad_code = _sum_rows_first(code_parts.view(3, bottom - top, width))
         return grad_image, grad_code, None, None
 
 
-def weather(image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, streaks: Tensor) -> Tensor:
-    """See `environment.apply_weather`; streaks: (H, W). All float32, the airlight constant."""
+def apply_weather(
+    image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, streaks: Tensor
+) -> Tensor:
+    """See `environment.weather`; streaks: (H, W). All float32, the airlight constant."""
     code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 
-def foliage(image: Tensor, environment: Environment, crowns: Tensor) -> Tensor:
-    """See `environment.apply_foliage`; crowns: (5, H, W). All float32."""
+def apply_foliage(image: Tensor, environment: Environment, crowns: Tensor) -> Tensor:
+    """See `environment.foliage`; crowns: (5, H, W). All float32."""
     code, amount = environment.foliage.to(image), environment.foliage_map.to(image)
     return _Foliage.apply(image, code, amount, crowns.to(image))

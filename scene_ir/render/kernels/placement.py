@@ -20,12 +20,12 @@ from scene_ir.render import model
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
 
-AROUND, ABOVE = model.AMBIENT
+AMBIENT, SKYLIGHT = model.AMBIENT
 RELIT, RELIT_MORE = model.RELIT[0], model.RELIT[1] - model.RELIT[0]
 
 
 @wp.struct
-class Templates:
+class TemplateVertices:
     """Of vertices: where they are in the unit box, by how much they are bent there (3, V), their unit normals,
     their objects, how much of them is paint, and how squarely the photograph's sun meets them.
     """
@@ -39,7 +39,7 @@ class Templates:
 
 
 @wp.struct
-class Poses:
+class PoseInputs:
     """Of objects: cosine and sine of the yaws; translation, size; cameras; how strong the photograph's sun is;
     direction and strength of theirs.
     """
@@ -54,7 +54,7 @@ class Poses:
 
 
 @wp.struct
-class Places:
+class PlacedVertices:
     """Of vertices: clip coordinates, cosines towards the camera, how squarely the sun meets them, and how much
     brighter they are; or gradients to these, of which the third is not asked for.
     """
@@ -66,7 +66,7 @@ class Places:
 
 
 @wp.struct
-class ToPoses:
+class PoseGradients:
     """Gradients: to bends (3, V); to translations and yaws, to sizes, and to lights."""
 
     bend: wp.array2d(dtype=wp.float32)
@@ -76,32 +76,32 @@ class ToPoses:
 
 
 @wp.func
-def turned(v: wp.vec3f, turn: wp.vec2f):
+def _rotate_y(v: wp.vec3f, turn: wp.vec2f):
     """A vector turned about the y axis."""
     return wp.vec3f(turn[0] * v[0] + turn[1] * v[2], v[1], turn[0] * v[2] - turn[1] * v[0])
 
 
 @wp.func
-def bent(templates: Templates, i: int):
+def _bent_vertex(templates: TemplateVertices, i: int):
     """A vertex in its unit box."""
     return templates.unit[i] + wp.vec3f(templates.bend[0, i], templates.bend[1, i], templates.bend[2, i])
 
 
 @wp.func
-def sun_of(poses: Poses, o: int):
+def _sun_direction(poses: PoseInputs, o: int):
     light = poses.lights[o]
     return wp.vec3f(light[0], light[1], light[2])
 
 
 @wp.func
-def light_then(templates: Templates, poses: Poses, i: int, o: int):
+def _photographed_light(templates: TemplateVertices, poses: PoseInputs, i: int, o: int):
     """The light on a vertex in the photograph."""
     dome = 0.5 - 0.5 * templates.normal[i][1]
-    return AROUND + ABOVE * dome + poses.sunlight[o] * templates.lit[i]
+    return AMBIENT + SKYLIGHT * dome + poses.sunlight[o] * templates.lit[i]
 
 
 @wp.func
-def strength_of(poses: Poses, o: int):
+def _relative_strength(poses: PoseInputs, o: int):
     """How strong the sun is, as a factor on the photograph's; 1 where there it is none."""
     strength = float(1.0)
     if poses.sunlight[o] != 0.0:
@@ -110,22 +110,22 @@ def strength_of(poses: Poses, o: int):
 
 
 @wp.kernel(enable_backward=False)
-def place_kernel(start: int, templates: Templates, poses: Poses, places: Places):
+def _place_kernel(start: int, templates: TemplateVertices, poses: PoseInputs, places: PlacedVertices):
     i = start + wp.tid()
     o = templates.owner[i]
     turn = poses.turn[o]
-    p = turned(wp.cw_mul(bent(templates, i), poses.size[o]), turn) + poses.translation[o]
-    n = turned(templates.normal[i], turn)
+    p = _rotate_y(wp.cw_mul(_bent_vertex(templates, i), poses.size[o]), turn) + poses.translation[o]
+    n = _rotate_y(templates.normal[i], turn)
     q = wp.vec4f(p[0], p[1], p[2], 1.0)
     places.clip[i] = wp.vec3f(
         wp.dot(poses.matrix[o, 0], q), wp.dot(poses.matrix[o, 1], q), wp.dot(poses.matrix[o, 2], q)
     )
     way = poses.centre[o] - p
     places.facing[i] = wp.dot(way, n) / wp.max(wp.length(way), 1e-6)
-    soft = wp.dot(n, sun_of(poses, o))
+    soft = wp.dot(n, _sun_direction(poses, o))
     lit = 0.5 * (soft + wp.sqrt(soft * soft + model.TERMINATOR))
-    more = strength_of(poses, o) * lit - templates.lit[i]
-    ratio = poses.sunlight[o] * more / light_then(templates, poses, i, o)
+    more = _relative_strength(poses, o) * lit - templates.lit[i]
+    ratio = poses.sunlight[o] * more / _photographed_light(templates, poses, i, o)
     share = RELIT + RELIT_MORE * templates.paint[i]
     bound = ratio * (1.0 / model.RELIT_MOST)
     places.lit[i] = lit
@@ -133,7 +133,9 @@ def place_kernel(start: int, templates: Templates, poses: Poses, places: Places)
 
 
 @wp.kernel(enable_backward=False)
-def place_backward_kernel(start: int, templates: Templates, poses: Poses, grads: Places, to: ToPoses):
+def _place_backward_kernel(
+    start: int, templates: TemplateVertices, poses: PoseInputs, grads: PlacedVertices, to: PoseGradients
+):
     i = start + wp.tid()
     g = grads.clip[i]
     gf = grads.facing[i]
@@ -143,9 +145,9 @@ def place_backward_kernel(start: int, templates: Templates, poses: Poses, grads:
         o = templates.owner[i]
         turn = poses.turn[o]
         size = poses.size[o]
-        v = bent(templates, i)
-        r = turned(wp.cw_mul(v, size), turn)
-        n = turned(templates.normal[i], turn)
+        v = _bent_vertex(templates, i)
+        r = _rotate_y(wp.cw_mul(v, size), turn)
+        n = _rotate_y(templates.normal[i], turn)
         way = poses.centre[o] - (r + poses.translation[o])
         length = wp.max(wp.length(way), 1e-6)
         m = poses.matrix[o, 0] * g[0] + poses.matrix[o, 1] * g[1] + poses.matrix[o, 2] * g[2]
@@ -153,12 +155,12 @@ def place_backward_kernel(start: int, templates: Templates, poses: Poses, grads:
         to_p = wp.vec3f(m[0], m[1], m[2]) - to_way
         to_n = way * (gf / length)
         if gb != 0.0:
-            sun = sun_of(poses, o)
+            sun = _sun_direction(poses, o)
             soft = wp.dot(n, sun)
             root = wp.sqrt(soft * soft + model.TERMINATOR)
             lit = 0.5 * (soft + root)
-            then = light_then(templates, poses, i, o)
-            strength = strength_of(poses, o)
+            then = _photographed_light(templates, poses, i, o)
+            strength = _relative_strength(poses, o)
             ratio = poses.sunlight[o] * (strength * lit - templates.lit[i]) / then
             bound = ratio * (1.0 / model.RELIT_MOST)
             squared = 1.0 + bound * bound
@@ -184,28 +186,28 @@ def place_backward_kernel(start: int, templates: Templates, poses: Poses, grads:
     to.bend[2, i] = to_bend[2]
 
 
-class Place(torch.autograd.Function):
+class PlaceVertices(torch.autograd.Function):
     """Offsets ffd (N, P, 3), size (N, 3) m, yaw (N,), translation (N, 3) m, lights (N, 4) -> clip (V, 3), cosine
     towards the camera (V,), how much brighter (V,); and how squarely the sun meets each vertex (V,), without
-    gradient. rig: `surfaces.Rig`.
+    gradient. placement: `surfaces.Rig`.
     """
 
     @staticmethod
-    def forward(ctx: Any, ffd, size, yaw, translation, lights, rig):
-        bend = rig.bend(ffd.detach())
+    def forward(ctx: Any, ffd, size, yaw, translation, lights, placement):
+        bend = placement.bend_vertices(ffd.detach())
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
-        count, like = rig.unit.shape[0], rig.unit
+        count, like = placement.unit.shape[0], placement.unit
         clip, facing, lit, brighter = like.new_empty(count, 3), *like.new_empty(3, count)
-        kept = [t.detach().contiguous() for t in (turn, translation, size, lights)]
-        templates, poses = _inputs(rig, bend, *kept)
+        saved = [t.detach().contiguous() for t in (turn, translation, size, lights)]
+        templates, poses = _inputs(placement, bend, *saved)
         launch(
-            place_kernel,
+            _place_kernel,
             split_range(count),
-            [templates, poses, make_struct(Places, clip, facing, lit, brighter)],
+            [templates, poses, make_struct(PlacedVertices, clip, facing, lit, brighter)],
             (),
             like.device,
         )
-        ctx.kept, ctx.rig, ctx.bend = kept, rig, bend
+        ctx.saved, ctx.placement, ctx.bend = saved, placement, bend
         ctx.mark_non_differentiable(lit)
         ctx.set_materialize_grads(False)
         return clip, facing, brighter, lit
@@ -213,8 +215,8 @@ class Place(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_clip: Tensor | None, grad_facing: Tensor | None, grad_brighter: Tensor | None, _):
-        rig, like = ctx.rig, ctx.rig.unit
-        count, objects = like.shape[0], len(rig.edges) - 1
+        placement, like = ctx.placement, ctx.placement.unit
+        count, objects = like.shape[0], len(placement.vertex_edges) - 1
         grads = [
             like.new_zeros(shape) if gradient is None else gradient.contiguous()
             for gradient, shape in ((grad_clip, (count, 3)), (grad_facing, count), (grad_brighter, count))
@@ -222,22 +224,32 @@ class Place(torch.autograd.Function):
         to_bend = like.new_empty(3, count)
         pose, to_size, to_lights = like.new_zeros(objects, 11, dtype=torch.float64).split([4, 3, 4], 1)
         pose, to_size, to_lights = pose.contiguous(), to_size.contiguous(), to_lights.contiguous()
-        to = make_struct(ToPoses, to_bend, pose, to_size, to_lights)
-        places = make_struct(Places, grads[0], grads[1], grads[1], grads[2])
+        to = make_struct(PoseGradients, to_bend, pose, to_size, to_lights)
+        places = make_struct(PlacedVertices, grads[0], grads[1], grads[1], grads[2])
         launch(
-            place_backward_kernel,
-            split_by_work(rig.edges),
-            [*_inputs(rig, ctx.bend, *ctx.kept), places, to],
+            _place_backward_kernel,
+            split_by_work(placement.vertex_edges),
+            [*_inputs(placement, ctx.bend, *ctx.saved), places, to],
             (),
             like.device,
         )
         small = [t.to(like.dtype) for t in (to_size, pose, to_lights)]
-        to_ffd = rig.unbend(to_bend) if ctx.needs_input_grad[0] else None
+        to_ffd = placement.bend_gradient(to_bend) if ctx.needs_input_grad[0] else None
         return to_ffd, small[0], small[1][:, 3], small[1][:, :3], small[2], None
 
 
 def _inputs(
-    rig: Any, bend: Tensor, turn: Tensor, translation: Tensor, size: Tensor, lights: Tensor
+    placement: Any, bend: Tensor, turn: Tensor, translation: Tensor, size: Tensor, lights: Tensor
 ) -> tuple[Any, Any]:
-    templates = make_struct(Templates, rig.unit, bend, rig.normal, rig.owner, rig.paint, rig.lit)
-    return templates, make_struct(Poses, turn, translation, size, rig.matrix, rig.centre, rig.sunlight, lights)
+    templates = make_struct(
+        TemplateVertices,
+        placement.unit,
+        bend,
+        placement.normal,
+        placement.owner,
+        placement.paint,
+        placement.base_exposure,
+    )
+    return templates, make_struct(
+        PoseInputs, turn, translation, size, placement.matrix, placement.centre, placement.sunlight, lights
+    )

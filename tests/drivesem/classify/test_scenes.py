@@ -20,7 +20,7 @@ from drivesem.classify.scenes import (
 from drivesem.classify.space import Amounts, Change, ObjectSpace, moved_of
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.render.lit import over
+from scene_ir.render.lit_mesh import composite_over
 from tests.drivesem.classify.standins import model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)
@@ -72,7 +72,7 @@ def test_only_what_is_around_an_object_is_drawn_smaller(drawn_px, along, monkeyp
     weight = torch.randn(3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(1))
     drawn = scene.mesh.render(vertices, view, scene.lights())
     whole = torch.nn.functional.interpolate(
-        over(drawn, behind)[None], (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True
+        composite_over(drawn, behind)[None], (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True
     )[0]
     part, x, y = scene.mesh.render_part(vertices, view, scene.lights())
     found = scene.shown(part, x, y)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scene_ir.geometry import to_clip
-from scene_ir.render.borders import WALK, Edges, Walk
-from scene_ir.render.lit import GAMMA, Lights, LitMesh, Materials
+from scene_ir.render.borders import WALK, MeshEdges, MeshWalk
+from scene_ir.render.lit_mesh import GAMMA, Lights, LitMesh, Materials
 from scene_ir.types import Camera
 
 SIZE, DEPTH = 32, 2.0
@@ -52,10 +52,10 @@ def shown(colour):
     return colour**GAMMA
 
 
-LOOKS = pytest.mark.parametrize("looks", [1, 2])
+SAMPLES_PER_SIDE = pytest.mark.parametrize("looks", [1, 2])
 
 
-@LOOKS
+@SAMPLES_PER_SIDE
 @settings(deadline=None, max_examples=15)
 @given(start=st.floats(9.0, 11.0), thin=st.floats(0.02, 0.7))
 def test_a_strip_thinner_than_a_pixel_is_seen_by_its_width(looks, start, thin):
@@ -66,7 +66,7 @@ def test_a_strip_thinner_than_a_pixel_is_seen_by_its_width(looks, start, thin):
     assert found == pytest.approx(wanted, abs=2e-3)
 
 
-@LOOKS
+@SAMPLES_PER_SIDE
 @settings(deadline=None, max_examples=15)
 @given(end=st.floats(19.0, 21.0), thin=st.floats(0.02, 0.7))
 def test_so_is_one_at_the_outline(looks, end, thin):
@@ -74,7 +74,7 @@ def test_so_is_one_at_the_outline(looks, end, thin):
     assert found == pytest.approx((end - 2.3) * shown(0.8) + thin * shown(0.02), abs=2e-3)
 
 
-@LOOKS
+@SAMPLES_PER_SIDE
 @settings(deadline=None, max_examples=15)
 @given(start=st.floats(9.0, 11.0), slices=st.integers(1, 40))
 def test_where_the_nearer_surface_ends_is_its_border_whatever_the_faces_behind(looks, start, slices):
@@ -86,7 +86,7 @@ def test_where_the_nearer_surface_ends_is_its_border_whatever_the_faces_behind(l
 def test_walks_by_the_kernel_are_those_by_torch():
     solid = trimesh.creation.icosphere(3, 0.5)
     vertices, faces = torch.tensor(solid.vertices, dtype=torch.float32), torch.tensor(solid.faces)
-    edges = Edges.of(vertices, faces, torch.zeros(len(faces), 1), math.cos(0.1))
+    edges = MeshEdges.from_mesh(vertices, faces, torch.zeros(len(faces), 1), math.cos(0.1))
     points = to_clip(vertices + torch.tensor([0.3, 0.3, 2.0]), CAMERA.matrix).double()
     generator = torch.Generator().manual_seed(0)
     seen = torch.randint(len(faces), (400,), generator=generator)
@@ -96,7 +96,7 @@ def test_walks_by_the_kernel_are_those_by_torch():
     end = start + 3 * torch.stack([angle.cos(), angle.sin(), 0 * angle], dim=1)
     goal = torch.randint(len(faces), (400,), generator=generator)
     fast, plain = (
-        Walk.over(points, faces, edges.across, (seen, goal), start, end, backend)
+        MeshWalk.trace(points, faces, edges.across, (seen, goal), start, end, backend)
         for backend in ("warp", "reference")
     )
     for name in ("face", "edge", "goes_on", "met"):
@@ -109,10 +109,10 @@ def test_walks_by_the_kernel_are_those_by_torch():
 def test_edges_know_their_neighbours_and_where_looks_change():
     box = trimesh.creation.box((1, 1, 1))
     vertices, faces = torch.tensor(box.vertices, dtype=torch.float32), torch.tensor(box.faces)
-    edges = Edges.of(vertices, faces, torch.zeros(len(faces), 1), 0.766)
+    edges = MeshEdges.from_mesh(vertices, faces, torch.zeros(len(faces), 1), 0.766)
     assert bool((edges.across >= 0).all())
     assert torch.equal(edges.across[edges.across], torch.arange(36))
     assert int((~edges.creased).sum()) == 12  # the diagonals of six sides, seen from both
-    coloured = Edges.of(vertices, faces, torch.arange(12.0)[:, None], 0.766)
+    coloured = MeshEdges.from_mesh(vertices, faces, torch.arange(12.0)[:, None], 0.766)
     assert bool(coloured.creased.all())
-    assert bool((Edges.of(vertices, faces[:1], torch.zeros(1, 1), 0.766).across == -1).all())
+    assert bool((MeshEdges.from_mesh(vertices, faces[:1], torch.zeros(1, 1), 0.766).across == -1).all())

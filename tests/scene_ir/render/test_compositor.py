@@ -23,7 +23,7 @@ from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor, render
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.render.sources import SolveSettings, analytic_shadows, from_own_picture, solve_sources
+from scene_ir.render.sources import SolveSettings, analytic_shadows, photograph_scene, solve_sources
 from scene_ir.types import Crop, Mesh, Objects, Part, Render, SceneIR, convert_scene
 
 REFERENCE = RenderSettings(backend="reference")
@@ -34,7 +34,7 @@ Street = Callable[[torch.dtype], SceneIR]
 def _regions(scene: SceneIR, margin: int = 0) -> Tensor:
     """(H, W) bool: the crops of vehicles and shadows."""
     compositor = Compositor(scene, REFERENCE)
-    layers = compositor.layers(compositor.scene.objects)
+    layers = compositor.draw_layers(compositor.scene.objects)
     inside = torch.zeros_like(scene.depth, dtype=torch.bool)
     for rects in (layers.layout.rects, layers.shadow_layout.rects):
         for x0, y0, x1, y1 in rects.tolist():
@@ -347,7 +347,7 @@ def test_blend_is_the_plain_formula_and_has_its_gradients() -> None:
     layers = torch.tensor([[0, 0, 4, 3], [2, 1, 6, 5]])
     shadows = torch.tensor([[1, 1, 5, 4]])
 
-    plan = blend.Plan.of(PixelLayout.from_rects(layers), PixelLayout.from_rects(shadows), (1, 0))
+    plan = blend.BlendPlan.from_layouts(PixelLayout.from_rects(layers), PixelLayout.from_rects(shadows), (1, 0))
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
@@ -527,7 +527,7 @@ def test_a_stripe_thinner_than_a_pixel_is_as_dark_wherever_it_lies(street: Stree
     behind = replace(objects, translation=place, yaw=objects.yaw.new_tensor([-math.pi / 2]))
     pictures = []
     for stripe in (0.8, 0.0):
-        taken = from_own_picture(replace(scene, meshes=(_ribbed(stripe),), objects=behind), "reference")
+        taken = photograph_scene(replace(scene, meshes=(_ribbed(stripe),), objects=behind), "reference")
         compositor = Compositor(taken, REFERENCE)
         turns = torch.linspace(0.30, 0.42, 7).tolist()
         pictures.append(torch.stack([compositor.render(_moved(taken, dyaw=turn)).image for turn in turns]))
@@ -558,8 +558,8 @@ def test_what_shows_of_each_draw_has_a_rectangle_around_it() -> None:
     layout = PixelLayout.from_rects(torch.tensor([[2, 3, 8, 9], [0, 0, 2, 2], [4, 4, 4, 7]]))
     shown = torch.zeros(layout.size, dtype=torch.bool)
     shown[:36].view(6, 6)[2:4, 0:3] = True
-    assert blend.shown_rects(layout, shown[:, None]).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]
+    assert blend.visible_rects(layout, shown[:, None]).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]
     for channel in range(3):
         several = torch.zeros(layout.size, 3, dtype=torch.bool)
         several[:, channel] = shown
-        assert blend.shown_rects(layout, several).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]
+        assert blend.visible_rects(layout, several).tolist() == [[2, 4, 6, 8], [0, 0, 0, 0], [0, 0, 0, 0]]

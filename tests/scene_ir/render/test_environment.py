@@ -161,7 +161,7 @@ def test_grass_is_no_crown_and_leaves_show_what_surrounds_them(
     low = (slice(60, 68), slice(100, 108))
     depth[low] *= 1 - 0.5 * model.GRASS_M / scene.environment.ground[3]
     environment = replace(scene.environment, foliage_map=leaves)
-    crowns = env.crowns_of(replace(scene, background=picture, depth=depth, environment=environment))
+    crowns = env.compute_crown_maps(replace(scene, background=picture, depth=depth, environment=environment))
     at = {name: crowns[:, top + 2 : top + 6, left + 2 : left + 6] for name, (top, left) in patches.items()}
     assert float(at["level"][:2].max()) < 1e-3
     torch.testing.assert_close(at["low"][:2].sum(0), torch.full((4, 4), 0.5).double(), atol=0.02, rtol=0)

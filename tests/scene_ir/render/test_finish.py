@@ -22,11 +22,11 @@ def compositor(photographed: SceneIR) -> Compositor:
 
 def test_the_template_is_the_photograph_where_that_shows_it(compositor: Compositor) -> None:
     for surface, samples in zip(compositor.object_surfaces.surfaces, compositor.sample_photograph(), strict=True):
-        own = finish.fitted(surface, samples)
+        own = finish.fit_finish(surface, samples)
         gain, lift = (
             (samples.share[..., None] * own[samples.vertex][..., k]).sum(axis=1) for k in (slice(3), [3])
         )
-        again = texture.finished(*(torch.from_numpy(v) for v in (samples.template, gain, lift))).numpy()
+        again = texture.apply_finish(*(torch.from_numpy(v) for v in (samples.template, gain, lift))).numpy()
         sure = samples.weight > 0.9
         before = np.abs(samples.template[sure] - samples.photograph[sure]).mean()
         assert np.abs(again[sure] - samples.photograph[sure]).mean() < min(0.05, 0.3 * before)
@@ -34,7 +34,7 @@ def test_the_template_is_the_photograph_where_that_shows_it(compositor: Composit
 
 def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> None:
     surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
-    own = finish.fitted(surface, samples)[:, :3]
+    own = finish.fit_finish(surface, samples)[:, :3]
     paint = surface.part.numpy() == Part.PAINT
     seen = np.zeros(len(paint), bool)
     seen[np.unique(samples.vertex[samples.weight > 0.5])] = True
@@ -44,25 +44,27 @@ def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> No
 
 
 def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
-    none = finish.Samples(np.zeros((0, 3), np.int64), *(np.zeros((0, n)) for n in (3, 3, 3)), *[np.zeros(0)] * 3)
+    none = finish.FinishSamples(
+        np.zeros((0, 3), np.int64), *(np.zeros((0, n)) for n in (3, 3, 3)), *[np.zeros(0)] * 3
+    )
     surface = compositor.object_surfaces.surfaces[0]
-    own = finish.fitted(surface, none)
+    own = finish.fit_finish(surface, none)
     assert np.allclose(own, [1.0, 1.0, 1.0, 0.0])
-    assert finish.base_paint(surface, none) is None
-    assert finish.sunlight([(surface, none)], [None]) == pytest.approx(0.4, abs=0.11)
-    assert finish.sunlight([(surface, none)] * 3, [1.2] * 3) == pytest.approx(1.2, abs=0.21)
+    assert finish.estimate_paint(surface, none) is None
+    assert finish.estimate_sunlight([(surface, none)], [None]) == pytest.approx(0.4, abs=0.11)
+    assert finish.estimate_sunlight([(surface, none)] * 3, [1.2] * 3) == pytest.approx(1.2, abs=0.21)
 
 
 def test_base_paint_is_the_photographs(compositor: Compositor, photographed: SceneIR) -> None:
     """The first car is painted red, the second blue."""
     kept = torch.stack([s.paint for s in photographed.objects.source])
-    assert torch.allclose(kept, compositor.base_paint(compositor.sample_photograph()), atol=0.02)
+    assert torch.allclose(kept, compositor.estimate_paint(compositor.sample_photograph()), atol=0.02)
     red, blue = kept[:2]
     assert float(red[0]) > 1.5 * float(red[1])
     assert float(blue[2]) > 1.3 * float(blue[0])
 
 
-def _lit(samples: finish.Samples, strength: float) -> finish.Samples:
+def _lit(samples: finish.FinishSamples, strength: float) -> finish.FinishSamples:
     level = 0.3 * (samples.sky + strength * samples.direct)
     return replace(samples, photograph=np.repeat(1.0 - np.exp(-level)[:, None], 3, axis=1))
 
@@ -71,14 +73,14 @@ def _lit(samples: finish.Samples, strength: float) -> finish.Samples:
 def test_sunlight_is_read_off_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
     surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, strength))]
-    assert finish.sunlight(seen, [strength]) == pytest.approx(strength, abs=0.01)
-    assert abs(finish.sunlight(seen, [strength + 0.4]) - strength) < 0.4
+    assert finish.estimate_sunlight(seen, [strength]) == pytest.approx(strength, abs=0.01)
+    assert abs(finish.estimate_sunlight(seen, [strength + 0.4]) - strength) < 0.4
 
 
 def test_one_vehicle_in_the_shade_does_not_change_the_frames_sunlight(compositor: Compositor) -> None:
     surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, s)) for s in (1.4, 1.4, 0.0)]
-    assert finish.sunlight(seen, [1.4, 1.4, 0.0]) == pytest.approx(1.4, abs=0.01)
+    assert finish.estimate_sunlight(seen, [1.4, 1.4, 0.0]) == pytest.approx(1.4, abs=0.01)
 
 
 def test_a_frames_vehicles_share_their_sunlight(photographed: SceneIR) -> None:
@@ -105,7 +107,7 @@ def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor)
     surface: TemplateSurface = compositor.object_surfaces.surfaces[1]
     samples = compositor.sample_photograph()[1]
     brighter = replace(samples, photograph=np.minimum(1.5 * samples.photograph, 0.9))
-    plain, bright = (finish.fitted(surface, s)[:, 0] for s in (samples, brighter))
+    plain, bright = (finish.fit_finish(surface, s)[:, 0] for s in (samples, brighter))
     assert (bright >= plain - 1e-9).all()
     assert (bright > 1.1 * plain)[surface.part.numpy() == Part.PAINT].mean() > 0.9
 

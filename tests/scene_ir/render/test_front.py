@@ -213,7 +213,7 @@ def test_standing_things_follow_the_last_object_they_can_hide() -> None:
     place = torch.tensor([[0.0, 1.6, 20.0], [0.0, 1.6, 10.0]])
     matrix = torch.tensor([[700.0, 0.0, 100.0, 0.0], [0.0, 700.0, 50.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
     things = [Occluder(Crop(torch.zeros(4, 4, 3), 99, 40), depth) for depth in (15.0, 5.0, 30.0)]
-    feet = blend.standing_footprints(things, matrix)
+    feet = blend.occluder_footprints(things, matrix)
     order = blend.paint_order(size, torch.zeros(2), place, torch.zeros(3), feet)
     assert order == [4, 0, 2, 1, 3]
     assert blend.paint_order(size, torch.zeros(2), place, torch.zeros(3)) == [0, 1]

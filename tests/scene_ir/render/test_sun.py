@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from scene_ir.render.compositor import Compositor
+from scene_ir.render.environment import PerturbedSun, move_sun
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.render.sun import Sun, moved_sun
 from scene_ir.types import Crop, SceneIR
 
 REFERENCE = RenderSettings(backend="reference")
@@ -24,7 +24,9 @@ def _lit(scene: SceneIR, *code: float) -> SceneIR:
 def _darkness(scene: SceneIR, base: SceneIR) -> Tensor:
     """(H, W): how much the vehicles darken the ground of the picture."""
     compositor = Compositor(base, REFERENCE)
-    layers = compositor.layers(compositor.moved(scene), compositor.perturbed_sun(scene.environment))
+    layers = compositor.draw_layers(
+        compositor.perturbed_objects(scene), compositor.perturbed_sun(scene.environment)
+    )
     out = torch.zeros_like(base.depth)
     for (packed, size), (x0, y0, x1, y1) in zip(
         layers.shadow_layout.spans(), layers.shadow_layout.rects.tolist(), strict=True
@@ -37,7 +39,9 @@ def test_code_0_is_the_photographs_to_the_bit(photographed: SceneIR) -> None:
     live = _lit(photographed, 0, 0, 0).environment.light.requires_grad_()
     picture = Compositor(photographed, REFERENCE).render(photographed.with_environment(light=live)).image
     assert torch.equal(picture.detach(), Compositor(photographed, REFERENCE).render(photographed).image)
-    sun = Sun.of(_lit(photographed, 0, 0, 0).environment, photographed.photograph, torch.tensor(0.6))
+    sun = PerturbedSun.from_environment(
+        _lit(photographed, 0, 0, 0).environment, photographed.photograph, torch.tensor(0.6)
+    )
     assert torch.equal(sun.direction, photographed.environment.sun)
     assert (float(sun.strength), float(sun.shade)) == (1.0, 1.0)
 
@@ -47,7 +51,7 @@ def test_it_turns_about_the_vertical_and_rises(code: tuple[float, float]) -> Non
     up, height, azimuth = torch.tensor([0.0, -1.0, 0.0]), math.radians(40), math.radians(30)
     flat = math.cos(height)
     sun = torch.tensor([flat * math.sin(azimuth), -math.sin(height), flat * math.cos(azimuth)])
-    x, y, z = moved_sun(sun, up, torch.tensor([*code, 0.0])).tolist()
+    x, y, z = move_sun(sun, up, torch.tensor([*code, 0.0])).tolist()
     assert math.hypot(x, y, z) == pytest.approx(1)
     assert math.degrees(math.asin(-y)) == pytest.approx(40 + 7.5 * code[1], abs=1e-3)
     assert math.degrees(math.atan2(x, z)) == pytest.approx(30 + 15 * code[0], abs=1e-3)
@@ -99,5 +103,5 @@ def test_what_is_hardly_the_cars_own_shadow_stays(photographed: SceneIR) -> None
     assert not torch.equal(still, moved)
 
 
-def _sun(compositor: Compositor, scene: SceneIR) -> Sun | None:
+def _sun(compositor: Compositor, scene: SceneIR) -> PerturbedSun | None:
     return compositor.perturbed_sun(_lit(scene, 1, 0, 0).environment)

@@ -49,7 +49,7 @@ def _mean_lab(code: list[float]) -> Tensor:
     after = texture.apply_texture_code(
         colour, opacity, colour.new_tensor(code).expand(ROWS, 5), torch.ones_like(opacity), height, base
     )
-    return texture.lab((after / opacity[:, None]).clamp(0, 1)).mean(dim=0)
+    return texture.rgb_to_lab((after / opacity[:, None]).clamp(0, 1)).mean(dim=0)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -71,7 +71,7 @@ def test_gloss_raises_contrast_and_dirt_gathers_low() -> None:
         return texture.apply_texture_code(colour, opacity, rows, full, full * height, base) / opacity[:, None]
 
     def spread(rgb: Tensor) -> Tensor:
-        return texture.lab(rgb.clamp(0, 1))[:, 0].std()
+        return texture.rgb_to_lab(rgb.clamp(0, 1))[:, 0].std()
 
     assert float(spread(after([0, 0, 0, 0.8, 0], 0.5))) > float(spread(after([0, 0, 0, -0.8, 0], 0.5)))
     clean = colour / opacity[:, None]
@@ -123,18 +123,18 @@ def test_inside_weight_fades_beyond_the_photograph() -> None:
 
 def test_crop_of_pads_with_zero_and_repeats_the_frames_edge() -> None:
     crop = Crop(torch.arange(1.0, 5.0).reshape(1, 2, 2), 0, 1)
-    seen = texture.crop_of(crop, (-1, 0, 3, 5), (4, 6))
+    seen = texture.extract_crop(crop, (-1, 0, 3, 5), (4, 6))
     assert seen[0].tolist() == [
         [0, 0, 0, 0], [1, 1, 2, 0], [3, 3, 4, 0], [0, 0, 0, 0], [0, 0, 0, 0],
     ]  # fmt: skip
-    below = texture.crop_of(crop, (0, 1, 2, 5), (3, 6))
+    below = texture.extract_crop(crop, (0, 1, 2, 5), (3, 6))
     assert below[0].tolist() == [[1, 2], [3, 4], [3, 4], [3, 4]]
 
 
 def test_hidden_is_zero_wherever_nearer_mattes_are_transparent() -> None:
     matte = torch.zeros(1, 12, 12)
     matte[0, 1:11, 1:11] = 0.001
-    hidden = texture.hidden_behind([Crop(matte, 3, 2)], (20, 20), torch.zeros(1))
+    hidden = texture.occlusion_map([Crop(matte, 3, 2)], (20, 20), torch.zeros(1))
     assert hidden.shape == (20, 20)
     assert bool((hidden[2:14, 3:15][matte[0] == 0] == 0).all())
     assert float(hidden[8, 9]) == 1.0
@@ -145,7 +145,9 @@ def test_shade_is_brighter_towards_the_sun_and_in_range() -> None:
     sun = torch.tensor([0.0, -0.6, -0.8])
     normal = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(3)), dim=1)
     eye = torch.tensor([0.0, 0.0, -1.0]).expand(200, 3)
-    lit = texture.shade(normal, eye, torch.full((200, 3), 0.5), torch.zeros(200, 2), torch.full((200,), 0.5), sun)
+    lit = texture.shade_template(
+        normal, eye, torch.full((200, 3), 0.5), torch.zeros(200, 2), torch.full((200,), 0.5), sun
+    )
     assert 0.0 <= float(lit.min()) <= float(lit.max()) <= 1.0
     towards = (normal * sun).sum(-1)
     assert float(lit[towards > 0.5].mean()) > 1.3 * float(lit[towards < -0.3].mean())
@@ -153,15 +155,15 @@ def test_shade_is_brighter_towards_the_sun_and_in_range() -> None:
 
 def test_relit_is_the_same_bits_where_nothing_turned() -> None:
     rgb = torch.rand(50, 3, generator=torch.Generator().manual_seed(4))
-    assert torch.equal(texture.relit(rgb, torch.zeros(50)), rgb)
-    bright = texture.relit(rgb, torch.full((50,), 0.2))
+    assert torch.equal(texture.relight(rgb, torch.zeros(50)), rgb)
+    bright = texture.relight(rgb, torch.full((50,), 0.2))
     assert bool((bright >= rgb).all())
     assert float((bright - rgb).max()) < 0.1
     ratio = torch.linspace(-0.9, 4.0, 60, dtype=torch.float64, requires_grad=True)
     paint = torch.linspace(0, 1, 60, dtype=torch.float64)
-    share = texture.brightened(ratio, paint)
+    share = texture.limit_brightening(ratio, paint)
     assert float(share.detach().abs().max()) <= model.RELIT_MOST
-    assert torch.autograd.gradcheck(lambda r: texture.brightened(r, paint), (ratio,))
+    assert torch.autograd.gradcheck(lambda r: texture.limit_brightening(r, paint), (ratio,))
 
 
 def test_paint_share_is_the_region_where_it_was_seen() -> None:
@@ -173,7 +175,7 @@ def test_paint_share_is_the_region_where_it_was_seen() -> None:
 
 def test_finished_stays_in_gamut_and_keeps_black_lifted() -> None:
     light = torch.linspace(0, 3, 20)[:, None].expand(20, 3)
-    shown = texture.finished(light, torch.full((20, 3), 1.5), torch.full((20, 1), 0.1))
+    shown = texture.apply_finish(light, torch.full((20, 3), 1.5), torch.full((20, 1), 0.1))
     assert float(shown[0].max()) == pytest.approx(0.1)
     assert bool((shown.diff(dim=0) > 0).all())
     assert float(shown.max()) < 1.0
@@ -197,6 +199,6 @@ def test_looks_at_the_border_fade_beyond_it() -> None:
 
 def test_relit_spares_what_is_white() -> None:
     colours = torch.tensor([[0.5, 1.0, 0.2], [0.5, 1.0, 0.2]])
-    found = texture.relit(colours, torch.tensor([0.2, -0.4]))
+    found = texture.relight(colours, torch.tensor([0.2, -0.4]))
     expected = torch.tensor([[0.575, 1.0, 0.2384], [0.35, 1.0, 0.1232]])
     assert torch.allclose(found, expected, atol=1e-6)

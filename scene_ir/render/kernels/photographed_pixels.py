@@ -28,17 +28,17 @@ from scene_ir.raster.launch import (
 )
 from scene_ir.raster.layout import Fragments, PixelLayout
 from scene_ir.render import channels, surfaces
-from scene_ir.render.kernels import ground, shading
+from scene_ir.render.kernels import shading, shadows
 
 Painter = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """From mesh, halo, look, fill, codes, table and nearest to mesh and halo."""
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """What `Photographed` reads and does not change. See `fast.Fixed` and `prepare.Drawn` for what is not said here.
+class ShadingInputs:
+    """What `PhotographedPixels` reads and does not change. See `fast.FixedGeometry` and `prepare.Drawn` for what is not said here.
 
-    ground: the shadows' patches, one an object; inside (N, 3, 3) float64: see `ground.Ground`. painter: None, or what
+    ground: the shadows' patches, one an object; inside (N, 3, 3) float64: see `shadows.ShadowArrays`. painter: None, or what
     repaints premultiplied RGBA of mesh and halo (T, 4) each, given them, what the pixels look at (T, 9), how much of
     them was filled (T,) and the codes, differentiable. reach_px: how far each halo reaches.
     """
@@ -48,7 +48,7 @@ class Setting:
     inside: Tensor
     reach_px: Sequence[float]
     faces: Tensor
-    beside: Tensor
+    neighbours: Tensor
     base_clip: Tensor
     base: Tensor
     own: Tensor
@@ -59,10 +59,10 @@ class Setting:
     painter: Painter | None
 
 
-class _Parts:
+class _ObjectRanges:
     """Objects [start, end) as ranges of packed pixels: what one thread draws from the first stage to the last."""
 
-    def __init__(self, s: Setting, code: Tensor | None) -> None:
+    def __init__(self, s: ShadingInputs, code: Tensor | None) -> None:
         self.pixels = s.fragments.layout.offsets.tolist()
         self.ground = s.ground.offsets.tolist()
         count = len(self.pixels) - 1
@@ -75,36 +75,36 @@ class _Parts:
 
 
 @dataclass(slots=True)
-class _Kept:
+class _ForwardState:
     """What the forward pass leaves to the backward one. turn (N, 2): cosine and sine of the yaws; painted: leaves and
     results of the painter; needs, leaning: of each part, the pixels that were completed, and those that
-    `shading.leans`."""
+    `shading.is_partly_covered`."""
 
-    parts: _Parts
+    parts: _ObjectRanges
     pixels: Any
     vertices: Any
     photograph: Any
     looks: Any
-    shadows: list[Any]
+    shadow_inputs: list[Any]
     turn: Tensor
     needs: dict[int, Tensor]
-    leaning: dict[int, Tensor]
+    partial: dict[int, Tensor]
     painted: tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]] | None = None
 
 
-class Photographed(torch.autograd.Function):
+class PhotographedPixels(torch.autograd.Function):
     """All pixels of photographed objects, and of their shadows.
 
-    clip (V, 3), facing (V,), brighter (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `ground.Ground`),
+    clip (V, 3), facing (V,), brighter (V,), coverage (T,), yaw (N,), then (N, 3, 3) float64 (see `shadows.ShadowArrays`),
     code (N, 5) or (0,), sun (N, 4): differentiable, the code through the painter. -> premultiplied RGB and opacity / depth
     (T, 4), opacity (T,), depth (T,) m (inf where nothing is), and the factors by which the ground is darkened (Ts, 3).
     """
 
     @staticmethod
-    def forward(ctx: Any, clip, facing, brighter, coverage, yaw, then, code, sun, s: Setting):
+    def forward(ctx: Any, clip, facing, brighter, coverage, yaw, then, code, sun, s: ShadingInputs):
         size, device = coverage.shape[0], clip.device
         clip, facing, brighter, coverage = (t.detach().contiguous() for t in (clip, facing, brighter, coverage))
-        parts = _Parts(s, code if s.painter is not None else None)
+        parts = _ObjectRanges(s, code if s.painter is not None else None)
         table, ground_table = (
             torch.empty(layout.size, 4, dtype=torch.int32, device=device)
             for layout in (s.fragments.layout, s.ground)
@@ -115,24 +115,26 @@ class Photographed(torch.autograd.Function):
         mesh, halo, fill = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
         colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
         shadow = clip.new_empty(s.ground.size, 3)
-        pixels = make_struct(shading.Pixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest)
+        pixels = make_struct(
+            shading.PackedPixels, table, s.fragments.layout.rects, s.fragments.face, coverage, nearest
+        )
         vertices = make_struct(
-            shading.Vertices, s.faces, s.beside, clip, facing, brighter, s.base_clip, s.base, s.own
+            shading.MeshVertices, s.faces, s.neighbours, clip, facing, brighter, s.base_clip, s.base, s.own
         )
         photograph = make_struct(
-            shading.Photograph, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
+            shading.PhotographArrays, *s.texels, s.frame_wh, turn, sun.detach().contiguous(), s.unproject
         )
-        looks = make_struct(shading.Looks, found, look, mesh, halo, fill)
-        layers = make_struct(shading.Layers, colour, opacity, depth)
-        patches = make_struct(ground.Ground, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
-        shadows = [array(ground_table, wp.vec4i), patches]
+        looks = make_struct(shading.LookupArrays, found, look, mesh, halo, fill)
+        layers = make_struct(shading.LayerArrays, colour, opacity, depth)
+        patches = make_struct(shadows.ShadowArrays, s.inside, then.detach().contiguous(), *s.dark, s.frame_wh)
+        shadow_inputs = [array(ground_table, wp.vec4i), patches]
         tables = [
             [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
             for layout, out in ((s.fragments.layout, table), (s.ground, ground_table))
         ]
         darkened = array(shadow, wp.vec3f)
         needs: dict[int, Tensor] = {}
-        leaning: dict[int, Tensor] = {}
+        partial: dict[int, Tensor] = {}
         final = s.painter is None
 
         def work(start: int, end: int) -> None:
@@ -140,44 +142,48 @@ class Photographed(torch.autograd.Function):
             for inputs in tables:
                 launch(shading.table_kernel, [start, end], inputs, (), device)
             launch(
-                ground.shadow_kernel, [parts.ground[start], parts.ground[end]], [*shadows, darkened], (), device
+                shadows.shadow_kernel,
+                [parts.ground[start], parts.ground[end]],
+                [*shadow_inputs, darkened],
+                (),
+                device,
             )
             if last == first:
                 return
             surfaces.nearest_hits(s.fragments, s.reach_px, range(start, end), nearest)
-            launch(shading.look_kernel, [first, last], [pixels, vertices, looks], (), device)
-            leaning[start] = lean = _leaning(coverage[first:last]).add_(first)
-            launch(shading.find_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
-            launch(shading.fill_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
+            launch(shading.lookup_kernel, [first, last], [pixels, vertices, looks], (), device)
+            partial[start] = lean = _partly_covered(coverage[first:last]).add_(first)
+            launch(shading.save_lookups_kernel, [0, lean.shape[0]], [array(lean), looks], (), device)
+            launch(shading.extend_lookups_kernel, [0, lean.shape[0]], [array(lean), pixels, looks], (), device)
             launch(shading.shade_kernel, [first, last], [pixels, photograph, looks, final, layers], (), device)
             needs[start] = need = fill[first:last].nonzero()[:, 0] + first
             if need.numel():
                 inputs = [array(need), pixels, vertices, photograph, looks, final, layers]
                 launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
 
-        for kernel in (shading.look_kernel, ground.shadow_kernel):
+        for kernel in (shading.lookup_kernel, shadows.shadow_kernel):
             load_kernel(kernel)
         run_in_threads(work, parts.edges)
-        kept = _Kept(parts, pixels, vertices, photograph, looks, shadows, turn, needs, leaning)
+        state = _ForwardState(parts, pixels, vertices, photograph, looks, shadow_inputs, turn, needs, partial)
         if s.painter is not None:
             with torch.enable_grad():
                 leaves = tuple(t.detach().requires_grad_() for t in (mesh, halo, look, fill, code))
-                kept.painted = leaves, s.painter(*leaves, table, nearest)
-            for name, painted in zip(("mesh", "halo"), kept.painted[1], strict=True):
+                state.painted = leaves, s.painter(*leaves, table, nearest)
+            for name, painted in zip(("mesh", "halo"), state.painted[1], strict=True):
                 looks.set_array(name, painted.detach().contiguous())
             launch(shading.combine_kernel, split_range(size), [pixels, looks, layers], (), device)
-        ctx.setting, ctx.kept = s, kept
+        ctx.setting, ctx.state = s, state
         ctx.mark_non_differentiable(depth)
         return colour, opacity, depth, shadow
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_colour: Tensor, grad_opacity: Tensor, _: Tensor, grad_shadow: Tensor):
-        s: Setting = ctx.setting
-        kept: _Kept = ctx.kept
+        s: ShadingInputs = ctx.setting
+        state: _ForwardState = ctx.state
         parts, pixels, vertices, photograph, looks = (
-            *(kept.parts, kept.pixels, kept.vertices),
-            *(kept.photograph, kept.looks),
+            *(state.parts, state.pixels, state.vertices),
+            *(state.photograph, state.looks),
         )
         grad_colour, grad_opacity = grad_colour.contiguous(), grad_opacity.contiguous()
         size, count, device = grad_opacity.shape[0], s.base_clip.shape[0], grad_colour.device
@@ -187,46 +193,52 @@ class Photographed(torch.autograd.Function):
         grad_facing, grad_brighter = zeros(count), zeros(count)
         grad_clip = zeros(count, 3, dtype=torch.float64)
         grad_then = torch.zeros_like(s.inside)
-        grad_turn = torch.zeros_like(kept.turn, dtype=torch.float64)
-        grad_sun = torch.zeros(len(kept.turn), 4, dtype=torch.float64, device=device)
-        to_layers = make_struct(shading.Layers, grad_colour, grad_opacity, grad_opacity)  # depth has no gradient
+        grad_turn = torch.zeros_like(state.turn, dtype=torch.float64)
+        grad_sun = torch.zeros(len(state.turn), 4, dtype=torch.float64, device=device)
+        to_layers = make_struct(
+            shading.LayerArrays, grad_colour, grad_opacity, grad_opacity
+        )  # depth has no gradient
         grads = make_struct(
-            *(shading.Gradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
+            *(shading.ShadingGradients, grad_look, grad_kept, grad_mesh, grad_halo, grad_fill, grad_coverage),
             *(grad_clip, grad_facing, grad_brighter, grad_turn, grad_sun),
         )
-        shadowed = [*kept.shadows, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
+        shadowed = [*state.shadow_inputs, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
 
-        final = kept.painted is None
+        final = state.painted is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
             ranges = [parts.ground[start], parts.ground[end]]
-            launch(ground.shadow_backward_kernel, ranges, shadowed, (), device)
+            launch(shadows.shadow_backward_kernel, ranges, shadowed, (), device)
             if last == first:
                 return
             grad_coverage[first:last].zero_()
             if final:
                 grad_look[first:last].zero_()
                 grad_fill[first:last].zero_()
-            need = kept.needs[start]
+            need = state.needs[start]
             if need.numel():
                 inputs = [array(need), pixels, vertices, photograph, looks, final, to_layers, grads]
                 launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
             inputs = [pixels, photograph, looks, final, to_layers, grads]
             launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
-            lean = kept.leaning[start]
-            launch(shading.keep_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
+            lean = state.partial[start]
+            launch(shading.move_gradients_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
             launch(
-                shading.fill_backward_kernel, [0, lean.shape[0]], [array(lean), pixels, looks, grads], (), device
+                shading.extend_lookups_backward_kernel,
+                [0, lean.shape[0]],
+                [array(lean), pixels, looks, grads],
+                (),
+                device,
             )
-            launch(shading.look_backward_kernel, [first, last], [pixels, vertices, looks, grads], (), device)
+            launch(shading.lookup_backward_kernel, [first, last], [pixels, vertices, looks, grads], (), device)
 
         grad_code = None
-        if kept.painted is not None:
+        if state.painted is not None:
             launch(
                 shading.combine_backward_kernel, split_range(size), [pixels, looks, to_layers, grads], (), device
             )
-            leaves, painted = kept.painted
+            leaves, painted = state.painted
             grad_mesh, grad_halo, more, to_fill, grad_code = torch.autograd.grad(
                 painted, leaves, (grad_mesh, grad_halo), allow_unused=True
             )
@@ -236,12 +248,12 @@ class Photographed(torch.autograd.Function):
             grads.set_array("halo", grad_halo)
             grad_look.copy_(more)
         run_in_threads(work, parts.edges)
-        turn = kept.turn
+        turn = state.turn
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
 
 
-def _leaning(coverage: Tensor) -> Tensor:
-    """Which pixels `shading.leans`: of what is hit, at least half is covered."""
+def _partly_covered(coverage: Tensor) -> Tensor:
+    """Which pixels `shading.is_partly_covered`: of what is hit, at least half is covered."""
     return coverage.frac().nonzero()[:, 0]

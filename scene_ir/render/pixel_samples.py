@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from scene_ir.raster.layout import Fragments
-from scene_ir.render.borders import Edges
+from scene_ir.render.borders import MeshEdges
 
-FINE = 256
+GRID_SCALE = 256
 """Sights lie on a grid so much finer than that of looks."""
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
+class PixelSamples:
     """What `rasterize` found in one draw, count x count looks a pixel. A sight is a face in a pixel: face, pixel
     (S,) int64, the pixel counted row by row; share (S,): of the pixel's looks that meet it; at (S, 2): its middle,
     (x, y) in looks. sight (T,) int64: of each look, where it meets a face.
@@ -31,7 +31,7 @@ class Looks:
     sight: Tensor
 
     @classmethod
-    def of(cls, fragments: Fragments, count: int) -> Looks:
+    def from_fragments(cls, fragments: Fragments, count: int) -> PixelSamples:
         """Of a draw whose rectangle begins and ends with pixels."""
         x0, y0, x1, y1 = fragments.layout.rects[0].tolist()
         wide, rows, columns = x1 - x0, (y1 - y0) // count, (x1 - x0) // count
@@ -84,7 +84,7 @@ class Looks:
         """(P,) int64, what looks (P,) see, -1 where that is nothing."""
         return self.fragments.face.index_select(0, look).to(torch.int64)
 
-    def ways(self, edges: Edges) -> tuple[Ways, Ways]:
+    def offsets_at_borders(self, edges: MeshEdges) -> tuple[SampleOffsets, SampleOffsets]:
         """Between looks that are neighbours: those that see two faces, but for those of one smooth surface, and
         those from a look that sees one to a look that sees nothing.
         """
@@ -98,14 +98,14 @@ class Looks:
         here, there = torch.cat(here), torch.cat(there)
         one, other = self.face_at(here), self.face_at(there)
         inner = ((one >= 0) & (other >= 0)).nonzero()[:, 0]
-        inner = inner[~edges.smooth(one.index_select(0, inner), other.index_select(0, inner))]
+        inner = inner[~edges.join_smoothly(one.index_select(0, inner), other.index_select(0, inner))]
         outwards, inwards = (one >= 0) & (other < 0), (one < 0) & (other >= 0)
         rim = torch.cat([here[outwards], there[inwards]]), torch.cat([there[outwards], here[inwards]])
-        return Ways.of(self, here[inner], there[inner]), Ways.of(self, *rim)
+        return SampleOffsets.between(self, here[inner], there[inner]), SampleOffsets.between(self, *rim)
 
 
 @dataclass(frozen=True, slots=True)
-class Ways:
+class SampleOffsets:
     """From looks here to there (P,). start, step (P, 3) float64: where (x, y, 1) the one is, and how far the other
     from it; down (P,): along a column, not along a row.
     """
@@ -117,9 +117,9 @@ class Ways:
     down: Tensor
 
     @classmethod
-    def of(cls, looks: Looks, here: Tensor, there: Tensor) -> Ways:
-        wide = looks.wide
-        x0, y0 = looks.fragments.layout.rects[0, :2].tolist()
+    def between(cls, samples: PixelSamples, here: Tensor, there: Tensor) -> SampleOffsets:
+        wide = samples.wide
+        x0, y0 = samples.fragments.layout.rects[0, :2].tolist()
         start = torch.stack([here % wide + x0, here // wide + y0, torch.ones_like(here)], dim=1)
         down = (there - here).abs() != 1
         sign = (there - here).sign()

@@ -19,7 +19,7 @@ ONE = wp.constant(wp.float64(1.0))
 
 
 @wp.struct
-class Left:
+class WalkExit:
     """Where a face is left on a way, by which of its edges, its plane, and the edge's normal, from it outwards."""
 
     share: wp.float64
@@ -29,7 +29,7 @@ class Left:
 
 
 @wp.func
-def offered(found: Left, n: wp.vec3d, sign: wp.float64, edge: int, start: wp.vec3d, end: wp.vec3d):
+def _earlier_exit(found: WalkExit, n: wp.vec3d, sign: wp.float64, edge: int, start: wp.vec3d, end: wp.vec3d):
     """`found`, or the edge with normal n, where the way leaves by it earlier."""
     outside = wp.dot(n, end) * sign
     share = ONE
@@ -46,7 +46,7 @@ def offered(found: Left, n: wp.vec3d, sign: wp.float64, edge: int, start: wp.vec
 
 
 @wp.func
-def left(
+def _face_exit(
     face: int, points: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), start: wp.vec3d, end: wp.vec3d
 ):
     corner = faces[face]
@@ -62,17 +62,17 @@ def left(
         sign = ONE
     elif det < ZERO:
         sign = -ONE
-    found = Left()
+    found = WalkExit()
     found.share = wp.float64(2.0)
-    found = offered(found, n0, sign, 3 * face, start, end)
-    found = offered(found, n1, sign, 3 * face + 1, start, end)
-    found = offered(found, n2, sign, 3 * face + 2, start, end)
+    found = _earlier_exit(found, n0, sign, 3 * face, start, end)
+    found = _earlier_exit(found, n1, sign, 3 * face + 1, start, end)
+    found = _earlier_exit(found, n2, sign, 3 * face + 2, start, end)
     found.plane = (n0 + n1 + n2) / det
     return found
 
 
 @wp.kernel
-def walk_kernel(
+def _walk_kernel(
     first: int,
     points: wp.array(dtype=wp.vec3d),
     faces: wp.array(dtype=wp.vec3i),
@@ -86,10 +86,10 @@ def walk_kernel(
     edge: wp.array2d(dtype=wp.int64),
     goes_on: wp.array2d(dtype=wp.uint8),
     plane: wp.array(dtype=wp.vec3d),
-    met: wp.array(dtype=wp.uint8),
+    meets: wp.array(dtype=wp.uint8),
 ):
     i = first + wp.tid()
-    now = left(wp.int32(here[i]), points, faces, start[i], end[i])
+    now = _face_exit(wp.int32(here[i]), points, faces, start[i], end[i])
     face[i, 0] = here[i]
     share[i, 0] = now.share
     edge[i, 0] = wp.int64(now.edge)
@@ -105,18 +105,18 @@ def walk_kernel(
         goes_on[i, turn - 1] = wp.uint8(going)
         if going == 1:
             before = now.share
-            now = left(onto // 3, points, faces, start[i], end[i])
+            now = _face_exit(onto // 3, points, faces, start[i], end[i])
             now.share = wp.max(now.share, before)
         face[i, turn] = wp.int64(now.edge // 3)
         share[i, turn] = now.share
         edge[i, turn] = wp.int64(now.edge)
         if going == 1 and now.edge // 3 == wp.int32(goal[i]):
-            met[i] = wp.uint8(1)
+            meets[i] = wp.uint8(1)
             going = 0
     plane[i] = now.plane
 
 
-def walked(
+def trace_walks(
     points: Tensor,
     faces: Tensor,
     across: Tensor,
@@ -125,17 +125,17 @@ def walked(
     end: Tensor,
     most: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """face, share, edge, goes_on, plane, met of `borders.Walk`, over at most `most` faces further."""
+    """face, share, edge, goes_on, plane, met of `borders.MeshWalk`, over at most `most` faces further."""
     here, goal = seen
     count = len(here)
     face, edge = (here.new_empty(count, most + 1) for _ in range(2))
     share, plane = start.new_empty(count, most + 1), start.new_empty(count, 3)
     goes_on = torch.zeros(count, most + 1, dtype=torch.uint8)
-    met = torch.zeros(count, dtype=torch.uint8)
+    meets = torch.zeros(count, dtype=torch.uint8)
     inputs = [
         *(array(points, wp.vec3d), array(int32_faces(faces), wp.vec3i), array(across)),
         *(array(here), array(goal), array(start, wp.vec3d), array(end, wp.vec3d)),
-        *(array(face), array(share), array(edge), array(goes_on), array(plane, wp.vec3d), array(met)),
+        *(array(face), array(share), array(edge), array(goes_on), array(plane, wp.vec3d), array(meets)),
     ]
-    launch(walk_kernel, split_range(count), inputs, (), points.device)
-    return face, share, edge, goes_on.bool(), plane, met.bool()
+    launch(_walk_kernel, split_range(count), inputs, (), points.device)
+    return face, share, edge, goes_on.bool(), plane, meets.bool()

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.render.lit import GAMMA, Lights, LitMesh, Materials, over, shade
+from scene_ir.render.lit_mesh import GAMMA, Lights, LitMesh, Materials, composite_over, shade_phong
 from scene_ir.types import Camera
 
 SIZE = 96
-FINE = 288
+FINE_PX = 288
 """As gradients are compared: small faces hop over a pixel of less."""
 DARK = torch.tensor(0.0)
 
@@ -54,11 +54,11 @@ def test_a_surface_that_faces_lamp_and_camera():
     point, normal = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
     lamp = Lights(torch.zeros(3), torch.tensor(0.5), torch.tensor(0.2), reach=2.0)
     one = torch.ones(1)
-    matt = shade(point, normal, torch.tensor([[1.0, 0.5, 0.0]]), 0 * one, 10 * one, lamp)
+    matt = shade_phong(point, normal, torch.tensor([[1.0, 0.5, 0.0]]), 0 * one, 10 * one, lamp)
     torch.testing.assert_close(matt, torch.tensor([[0.7, 0.35, 0.0]]))
-    glossy = shade(point, normal, torch.zeros(1, 3), one, 10 * one, lamp)
+    glossy = shade_phong(point, normal, torch.zeros(1, 3), one, 10 * one, lamp)
     torch.testing.assert_close(glossy, torch.full((1, 3), 0.5 + 0.2 * 0.2))
-    nearer = shade(point / 2, normal, torch.ones(1, 3), 0 * one, 10 * one, lamp)
+    nearer = shade_phong(point / 2, normal, torch.ones(1, 3), 0 * one, 10 * one, lamp)
     torch.testing.assert_close(nearer, torch.full((1, 3), 0.5 * 4 + 0.2))
 
 
@@ -66,7 +66,7 @@ def test_a_surface_that_is_turned_away_has_the_environment_alone_and_more_from_a
     point, lamp = torch.tensor([[0.0, 0.0, 2.0]]), Lights(torch.zeros(3), torch.tensor(0.5), torch.tensor(0.2))
     one = torch.ones(1)
     up, down, away = (
-        shade(point, torch.tensor([normal]), torch.ones(1, 3), one, one, lamp)[0, 0]
+        shade_phong(point, torch.tensor([normal]), torch.ones(1, 3), one, one, lamp)[0, 0]
         for normal in ([0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
     )
     assert float(up) == pytest.approx(1.2 * 0.2 * 1.4)
@@ -86,7 +86,7 @@ def test_a_square_before_the_camera(backend):
     torch.testing.assert_close(inside, torch.full_like(inside, 0.4**GAMMA), atol=1e-5, rtol=0)
     assert bool((drawn[:3, drawn[3] == 0] == 0).all())
     background = torch.rand(3, SIZE, SIZE)
-    picture = over(drawn, background)
+    picture = composite_over(drawn, background)
     assert torch.equal(picture[:, 0, 0], background[:, 0, 0])
     torch.testing.assert_close(picture[:, SIZE // 2, SIZE // 2], torch.full((3,), 0.4**GAMMA))
 
@@ -97,7 +97,7 @@ def test_what_lies_before_a_background_has_the_gradients_of_differences():
         torch.rand(channels, 3, 2, generator=generator, dtype=torch.float64).requires_grad_()
         for channels in (4, 3)
     )
-    assert torch.autograd.gradcheck(over, (drawn, background))
+    assert torch.autograd.gradcheck(composite_over, (drawn, background))
 
 
 @pytest.mark.parametrize("mesh", [trimesh.creation.box((0.5, 0.6, 1)), trimesh.creation.icosphere(2, 0.5)])
@@ -129,15 +129,17 @@ MESHES = {
 def test_gradients_are_those_of_central_differences(name, moved):
     lit = solid(MESHES[name])
     generator = torch.Generator().manual_seed(1)
-    weight = torch.nn.functional.avg_pool2d(torch.randn(1, 4, FINE, FINE, generator=generator), 9, 1, 4)[0, :3]
+    weight = torch.nn.functional.avg_pool2d(torch.randn(1, 4, FINE_PX, FINE_PX, generator=generator), 9, 1, 4)[
+        0, :3
+    ]
     rest, angles = lit.vertices, torch.tensor([0.35, 0.5, 0.1])
     size = {"pose": 3, "vertex": rest.numel(), "light": 5}[moved]
 
     def value(theta):
         offsets = theta.reshape(rest.shape) if moved == "vertex" else 0
         placed = turned(rest + offsets, angles + theta if moved == "pose" else angles)
-        drawn = lit.render(placed, camera(FINE), lights(theta if moved == "light" else None))
-        return (over(drawn, torch.full((3, FINE, FINE), 0.4)).double() * weight.double()).sum()
+        drawn = lit.render(placed, camera(FINE_PX), lights(theta if moved == "light" else None))
+        return (composite_over(drawn, torch.full((3, FINE_PX, FINE_PX), 0.4)).double() * weight.double()).sum()
 
     leaf = torch.zeros(size, requires_grad=True)
     (gradient,) = torch.autograd.grad(value(leaf), leaf)

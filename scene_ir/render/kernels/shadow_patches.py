@@ -23,13 +23,13 @@ wp.set_module_options({"fuse_fp": True, "fast_math": False})
 
 ZERO, ONE, HALF = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(0.5))
 TINY = wp.constant(wp.float64(1e-6))
-SINE, LONGEST, SHRUNK = (
+MIN_SINE, MAX_OFFSET_M, SHRUNK = (
     wp.constant(wp.float64(v)) for v in (model.LEAST_SINE, model.SUN_OFFSET_MAX_M, model.SHRUNK)
 )
 
 
 @wp.struct
-class Photographed:
+class PatchInputs:
     """Of objects: the patches' corners (N, 4), m, in their frames, and how far out along the shadow's offset each lies;
     that offset, m; sizes; direction of the sun; plane of the ground; cameras; where patches follow another sun, 1,
     else 0.
@@ -46,7 +46,7 @@ class Photographed:
 
 
 @wp.struct
-class Poses:
+class PatchPoses:
     """Of objects: yaws, translations, sizes, directions and strengths of the sun."""
 
     yaw: wp.array(dtype=wp.float32)
@@ -56,7 +56,7 @@ class Poses:
 
 
 @wp.struct
-class Found:
+class PatchOutputs:
     """Clip coordinates (N, 4) of the corners; from (s, t, 1) on a patch to its clip coordinates, and back."""
 
     clip: wp.array2d(dtype=wp.vec3f)
@@ -65,8 +65,8 @@ class Found:
 
 
 @wp.struct
-class ToPoses:
-    """Gradients to `Poses`."""
+class PatchPoseGradients:
+    """Gradients to `PatchPoses`."""
 
     yaw: wp.array(dtype=wp.float64)
     translation: wp.array(dtype=wp.vec3d)
@@ -75,26 +75,26 @@ class ToPoses:
 
 
 @wp.func
-def offset_of(sun: wp.vec3d, yaw: wp.float64, height: wp.float64):
+def _shadow_offset(sun: wp.vec3d, yaw: wp.float64, height: wp.float64):
     """`surfaces.sun_offset`."""
-    scale = -height / wp.max(-sun[1], SINE)
+    scale = -height / wp.max(-sun[1], MIN_SINE)
     c = wp.cos(yaw)
     s = wp.sin(yaw)
     x = (c * sun[0] - s * sun[2]) * scale
     z = (c * sun[2] + s * sun[0]) * scale
     length = wp.sqrt(wp.max(x * x + z * z, TINY * TINY))  # under the root: of 0, a root has no gradient
-    part = wp.min(length, LONGEST) / length
+    part = wp.min(length, MAX_OFFSET_M) / length
     return wp.vec2d(x * part, z * part)
 
 
 @wp.func
-def grown(share: wp.float64):
+def _soft_growth(share: wp.float64):
     """How much a patch grows with its object: softly no less than 0."""
     return HALF * (share + (wp.sqrt(share * share + SHRUNK * SHRUNK) - SHRUNK))
 
 
 @wp.func
-def corner_at(
+def _patch_corner(
     yaw: wp.float64,
     place: wp.vec3d,
     size: wp.vec3d,
@@ -108,12 +108,12 @@ def corner_at(
     ground: wp.vec4d,
 ):
     """A corner of a patch, m, in camera axes: see `Prepared.ground`."""
-    still = offset_of(sun_then, yaw, then[1])
-    falls = still + (offset_of(sun, yaw, then[1]) - still) * casts
+    still = _shadow_offset(sun_then, yaw, then[1])
+    falls = still + (_shadow_offset(sun, yaw, then[1]) - still) * casts
     x0 = corner[0] + outwards * (falls[0] - offset[0])
     z0 = corner[1] + outwards * (falls[1] - offset[1])
-    x0 = x0 + grown(size[0] / then[0] - ONE) * x0
-    z0 = z0 + grown(size[2] / then[2] - ONE) * z0
+    x0 = x0 + _soft_growth(size[0] / then[0] - ONE) * x0
+    z0 = z0 + _soft_growth(size[2] / then[2] - ONE) * z0
     c = wp.cos(yaw)
     s = wp.sin(yaw)
     x = c * x0 + s * z0
@@ -123,7 +123,7 @@ def corner_at(
 
 
 @wp.func
-def corner_loss(
+def _corner_loss(
     yaw: wp.float64,
     place: wp.vec3d,
     size: wp.vec3d,
@@ -137,16 +137,16 @@ def corner_loss(
     ground: wp.vec4d,
     g: wp.vec3d,
 ):
-    return wp.dot(corner_at(yaw, place, size, sun, corner, outwards, offset, then, sun_then, casts, ground), g)
+    return wp.dot(_patch_corner(yaw, place, size, sun, corner, outwards, offset, then, sun_then, casts, ground), g)
 
 
 @wp.func
-def direction(light: wp.vec4f):
+def _sun_direction(light: wp.vec4f):
     return wp.vec3d(wp.float64(light[0]), wp.float64(light[1]), wp.float64(light[2]))
 
 
 @wp.func
-def clip_of(matrix: wp.array2d(dtype=wp.vec4f), o: int, p: wp.vec3d):
+def _to_clip(matrix: wp.array2d(dtype=wp.vec4f), o: int, p: wp.vec3d):
     q = wp.vec4d(p[0], p[1], p[2], ONE)
     return wp.vec3d(
         wp.dot(wp.vec4d(matrix[o, 0]), q), wp.dot(wp.vec4d(matrix[o, 1]), q), wp.dot(wp.vec4d(matrix[o, 2]), q)
@@ -154,19 +154,19 @@ def clip_of(matrix: wp.array2d(dtype=wp.vec4f), o: int, p: wp.vec3d):
 
 
 @wp.kernel(enable_backward=False)
-def patch_kernel(start: int, fixed: Photographed, poses: Poses, found: Found):
+def _patch_kernel(start: int, fixed: PatchInputs, poses: PatchPoses, outputs: PatchOutputs):
     o = start + wp.tid()
     first = wp.vec3d()
     second = wp.vec3d()
     last = wp.vec3d()
     for k in range(4):
-        p = corner_at(
-            wp.float64(poses.yaw[o]), wp.vec3d(poses.translation[o]), wp.vec3d(poses.size[o]), direction(poses.lights[o]),
+        p = _patch_corner(
+            wp.float64(poses.yaw[o]), wp.vec3d(poses.translation[o]), wp.vec3d(poses.size[o]), _sun_direction(poses.lights[o]),
             wp.vec2d(fixed.corners[o, k]), wp.float64(fixed.outwards[o, k]), wp.vec2d(fixed.offset[o]),
             wp.vec3d(fixed.size[o]), wp.vec3d(fixed.sun[o]), wp.float64(fixed.casts[o]), wp.vec4d(fixed.ground[o]),
         )  # fmt: skip
-        c = clip_of(fixed.matrix, o, p)
-        found.clip[o, k] = wp.vec3f(c)
+        c = _to_clip(fixed.matrix, o, p)
+        outputs.clip[o, k] = wp.vec3f(c)
         if k == 0:
             first = c
         if k == 1:
@@ -176,17 +176,22 @@ def patch_kernel(start: int, fixed: Photographed, poses: Poses, found: Found):
     a = second - first
     b = last - first
     patch = wp.mat33d(a[0], b[0], first[0], a[1], b[1], first[1], a[2], b[2], first[2])
-    found.patch[o] = patch
-    found.inside[o] = wp.inverse(patch)
+    outputs.patch[o] = patch
+    outputs.inside[o] = wp.inverse(patch)
 
 
 @wp.kernel(enable_backward=False)
-def patch_backward_kernel(
-    start: int, fixed: Photographed, poses: Poses, found: Found, grads: wp.array(dtype=wp.mat33d), to: ToPoses
+def _patch_backward_kernel(
+    start: int,
+    fixed: PatchInputs,
+    poses: PatchPoses,
+    outputs: PatchOutputs,
+    grads: wp.array(dtype=wp.mat33d),
+    to: PatchPoseGradients,
 ):
     """grads: to `inside`."""
     o = start + wp.tid()
-    turned = wp.transpose(found.inside[o])
+    turned = wp.transpose(outputs.inside[o])
     g = turned * grads[o] * turned * -ONE
     to_second = wp.vec3d(g[0, 0], g[1, 0], g[2, 0])
     to_last = wp.vec3d(g[0, 1], g[1, 1], g[2, 1])
@@ -204,8 +209,8 @@ def patch_backward_kernel(
             + wp.vec4d(fixed.matrix[o, 1]) * g_clip[1]
             + wp.vec4d(fixed.matrix[o, 2]) * g_clip[2]
         )
-        to_yaw, to_place, to_size, to_sun, to_c, to_o, to_f, to_t, to_s, to_casts, to_ground, to_g = wp.grad(corner_loss)(
-            wp.float64(poses.yaw[o]), wp.vec3d(poses.translation[o]), wp.vec3d(poses.size[o]), direction(poses.lights[o]),
+        to_yaw, to_place, to_size, to_sun, to_c, to_o, to_f, to_t, to_s, to_casts, to_ground, to_g = wp.grad(_corner_loss)(
+            wp.float64(poses.yaw[o]), wp.vec3d(poses.translation[o]), wp.vec3d(poses.size[o]), _sun_direction(poses.lights[o]),
             wp.vec2d(fixed.corners[o, k]), wp.float64(fixed.outwards[o, k]), wp.vec2d(fixed.offset[o]),
             wp.vec3d(fixed.size[o]), wp.vec3d(fixed.sun[o]), wp.float64(fixed.casts[o]), wp.vec4d(fixed.ground[o]),
             wp.vec3d(m[0], m[1], m[2]),
@@ -217,17 +222,17 @@ def patch_backward_kernel(
 
 
 @wp.kernel(enable_backward=True)
-def adjoints_kernel(out: wp.array(dtype=wp.float64)):
-    """Never run: see `shading.adjoints_kernel`."""
+def _adjoints_kernel(out: wp.array(dtype=wp.float64)):
+    """Never run: see `shading._adjoints_kernel`."""
     a = wp.vec3d(ONE, ONE, ONE)
     b = wp.vec2d(ONE, ONE)
-    out[0] = corner_loss(ONE, a, a, a, b, ONE, b, a, a, ONE, wp.vec4d(ONE, ONE, ONE, ONE), a)
+    out[0] = _corner_loss(ONE, a, a, a, b, ONE, b, a, a, ONE, wp.vec4d(ONE, ONE, ONE, ONE), a)
 
 
-class Patch(torch.autograd.Function):
+class PlacePatches(torch.autograd.Function):
     """yaw (N,), translation (N, 3) m, size (N, 3) m, lights (N, 4) -> float64 (N, 3, 3) from clip coordinates to (s, t,
     1) on the patches, 0 to 1 both ways, differentiable; the same back, and clip coordinates (4N, 3) of the corners,
-    which are not. fixed: the tensors of `Photographed`.
+    which are not. fixed: the tensors of `PatchInputs`.
     """
 
     @staticmethod
@@ -237,11 +242,11 @@ class Patch(torch.autograd.Function):
         clip = like.new_empty(count, 4, 3)
         patch, inside = (like.new_empty(count, 3, 3, dtype=torch.float64) for _ in range(2))
         inputs = [
-            make_struct(Photographed, *fixed),
-            make_struct(Poses, *poses),
-            make_struct(Found, clip, patch, inside),
+            make_struct(PatchInputs, *fixed),
+            make_struct(PatchPoses, *poses),
+            make_struct(PatchOutputs, clip, patch, inside),
         ]
-        launch(patch_kernel, [0, count], inputs, (), like.device)
+        launch(_patch_kernel, [0, count], inputs, (), like.device)
         ctx.kept = fixed, poses, clip, patch, inside
         ctx.mark_non_differentiable(patch, clip)
         return inside, patch, clip.view(-1, 3)
@@ -252,10 +257,10 @@ class Patch(torch.autograd.Function):
         fixed, poses, clip, patch, inside = ctx.kept
         to = [torch.zeros_like(t, dtype=torch.float64) for t in poses]
         inputs = [
-            make_struct(Photographed, *fixed),
-            make_struct(Poses, *poses),
-            make_struct(Found, clip, patch, inside),
+            make_struct(PatchInputs, *fixed),
+            make_struct(PatchPoses, *poses),
+            make_struct(PatchOutputs, clip, patch, inside),
         ]
-        inputs = [*inputs, array(grad_inside.contiguous(), wp.mat33d), make_struct(ToPoses, *to)]
-        launch(patch_backward_kernel, [0, len(poses[0])], inputs, (), grad_inside.device)
+        inputs = [*inputs, array(grad_inside.contiguous(), wp.mat33d), make_struct(PatchPoseGradients, *to)]
+        launch(_patch_backward_kernel, [0, len(poses[0])], inputs, (), grad_inside.device)
         return *(t.to(poses[0].dtype) for t in to), None

@@ -13,8 +13,7 @@ import warp as wp
 from scene_ir.raster.launch import start_warp
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import model
-from scene_ir.render.kernels.lookups import sums_of_dark
-from scene_ir.render.kernels.shading import inside_weight, rect_of, taps_at
+from scene_ir.render.kernels.shading import crop_taps, inside_weight, read_rect, sample_darkness
 
 start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False})
@@ -25,7 +24,7 @@ EXTENDED = wp.constant(wp.vec2f(*model.SHADOW_EXTENDED_PX))
 
 
 @wp.struct
-class Ground:
+class ShadowArrays:
     """Photographed shadows: what they take away, three numbers a texel and a 0, and where the crops lie; from a pixel
     (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways, and to that point's clip coordinates then,
     over w now.
@@ -40,7 +39,7 @@ class Ground:
 
 
 @wp.func
-def ground_place(ground: Ground, o: int, x: int, y: int):
+def _photographed_ground(ground: ShadowArrays, o: int, x: int, y: int):
     """Where the photograph shows the ground point that a pixel shows, px, and 1 where the patch reaches, else 0."""
     p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
     q = ground.inside[o] @ p
@@ -54,37 +53,39 @@ def ground_place(ground: Ground, o: int, x: int, y: int):
 
 
 @wp.func
-def in_frame(uv: wp.vec2f, wh: wp.vec2f):
+def _clamp_to_frame(uv: wp.vec2f, wh: wp.vec2f):
     """Kept within two pixels of the frame, where crops repeat their border."""
     return wp.vec2f(wp.min(wp.max(uv[0], -2.0), wh[0] + 1.0), wp.min(wp.max(uv[1], -2.0), wh[1] + 1.0))
 
 
 @wp.func
-def reached(uv: wp.vec2f, rect: wp.vec4i):
+def _reaches_crop(uv: wp.vec2f, rect: wp.vec4i):
     """Whether a lookup can find anything in a crop."""
     found = uv[0] > wp.float32(rect[0] - 2) and uv[0] < wp.float32(rect[2] + 1)
     return found and uv[1] > wp.float32(rect[1] - 2) and uv[1] < wp.float32(rect[3] + 1)
 
 
 @wp.kernel(enable_backward=False)
-def shadow_kernel(start: int, table: wp.array(dtype=wp.vec4i), ground: Ground, out: wp.array(dtype=wp.vec3f)):
+def shadow_kernel(
+    start: int, table: wp.array(dtype=wp.vec4i), ground: ShadowArrays, out: wp.array(dtype=wp.vec3f)
+):
     i = start + wp.tid()
     at = table[i]
     factor = wp.vec3f(1.0, 1.0, 1.0)
-    place = ground_place(ground, at[0], at[1], at[2])
+    place = _photographed_ground(ground, at[0], at[1], at[2])
     if place[2] > 0.0:
-        rect = rect_of(ground.rects, at[0])
+        rect = read_rect(ground.rects, at[0])
         wh = ground.frame_wh[at[0]]
-        uv = in_frame(wp.vec2f(place[0], place[1]), wh)
-        if reached(uv, rect):
-            t = taps_at(uv, rect, ground.offsets[at[0]], False)
-            dark = sums_of_dark(ground.dark, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)[0]
+        uv = _clamp_to_frame(wp.vec2f(place[0], place[1]), wh)
+        if _reaches_crop(uv, rect):
+            t = crop_taps(uv, rect, ground.offsets[at[0]], False)
+            dark = sample_darkness(ground.dark, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)[0]
             factor = factor - wp.vec3f(dark[0], dark[1], dark[2]) * inside_weight(place[0], place[1], wh, EXTENDED)
     out[i] = factor
 
 
 @wp.func
-def border_loss(place: wp.vec2f, wh: wp.vec2f):
+def _border_loss(place: wp.vec2f, wh: wp.vec2f):
     return inside_weight(place[0], place[1], wh, EXTENDED)
 
 
@@ -92,7 +93,7 @@ def border_loss(place: wp.vec2f, wh: wp.vec2f):
 def shadow_backward_kernel(
     start: int,
     table: wp.array(dtype=wp.vec4i),
-    ground: Ground,
+    ground: ShadowArrays,
     grad_out: wp.array(dtype=wp.vec3f),
     grad_then: wp.array(dtype=wp.mat33d),
 ):
@@ -102,15 +103,15 @@ def shadow_backward_kernel(
         return  # under a vehicle
     at = table[i]
     o = at[0]
-    place = ground_place(ground, o, at[1], at[2])
+    place = _photographed_ground(ground, o, at[1], at[2])
     if place[2] > 0.0:
-        rect = rect_of(ground.rects, o)
+        rect = read_rect(ground.rects, o)
         wh = ground.frame_wh[o]
         flat = wp.vec2f(place[0], place[1])
-        uv = in_frame(flat, wh)
-        if reached(uv, rect):
-            t = taps_at(uv, rect, ground.offsets[o], False)
-            sums = sums_of_dark(ground.dark, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)
+        uv = _clamp_to_frame(flat, wh)
+        if _reaches_crop(uv, rect):
+            t = crop_taps(uv, rect, ground.offsets[o], False)
+            sums = sample_darkness(ground.dark, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)
             along = wp.vec4f(g[0], g[1], g[2], 0.0)
             dark = wp.dot(along, sums[0])
             to_u = wp.dot(along, sums[1])
@@ -120,8 +121,8 @@ def shadow_backward_kernel(
             if uv[1] != place[1]:
                 to_v = float(0.0)
             if uv[0] != place[0] or uv[1] != place[1]:
-                border = border_loss(flat, wh)
-                to_border, to_wh = wp.grad(border_loss)(flat, wh)
+                border = _border_loss(flat, wh)
+                to_border, to_wh = wp.grad(_border_loss)(flat, wh)
                 to_u = to_u * border + dark * to_border[0]
                 to_v = to_v * border + dark * to_border[1]
             if to_u != 0.0 or to_v != 0.0:
@@ -134,6 +135,6 @@ def shadow_backward_kernel(
 
 
 @wp.kernel(enable_backward=True)
-def adjoints_kernel(out: wp.array(dtype=wp.float32)):
-    """Never run: see `shading.adjoints_kernel`."""
-    out[0] = border_loss(wp.vec2f(0.0, 0.0), wp.vec2f(0.0, 0.0))
+def _adjoints_kernel(out: wp.array(dtype=wp.float32)):
+    """Never run: see `shading._adjoints_kernel`."""
+    out[0] = _border_loss(wp.vec2f(0.0, 0.0), wp.vec2f(0.0, 0.0))
