@@ -1,8 +1,8 @@
-"""Certificates: does a failure hold when the same scene is photographed again and again?
+"""Certificates: whether a failure persists when the same scene is photographed again and again.
 
-A fault is looked at in draws of `nuisances` that no search has seen. It is certain where all is right in at least
-15 of 16 draws of the scene before the change, and wrong in at least 12 of 16 after it: the Wilson interval (95 %)
-of 12 of 16 begins above one half.
+A fault is evaluated in nuisance samples that no search has seen. It is certain where the object is right in at
+least 15 of 16 samples before the change and wrong in at least 12 of 16 after it: the 95 % Wilson interval of 12 of
+16 begins above one half.
 """
 
 from __future__ import annotations
@@ -17,108 +17,175 @@ from torch import Tensor
 from detectors import boxes
 from detectors.base import Predictor, predict
 from detectors.types import Targets
-from drivesem.attack import goals
-from drivesem.attack.judging import JudgedClasses
-from drivesem.config.blocks import CERTIFYING_DRAWS
-from drivesem.failures import margin
-from drivesem.failures.grades import Count, Kind
-from drivesem.failures.kinds import OF_OBJECTS, SAME_PLACE, Fault, Judged, View, judge
-from drivesem.failures.nuisances import Draw, Nuisances
-from drivesem.failures.second_renderer.base import SecondRenderer
+from drivesem.attack import losses
+from drivesem.attack.labels import Labeller, visible_boxes
+from drivesem.attack.targets import EvaluatedClasses
+from drivesem.config.options import MIN_DRAWS
+from drivesem.failures import margins as margin
+from drivesem.failures.grades import Certificate, Kind
+from drivesem.failures.kinds import (
+    OBJECT_KINDS,
+    SAME_PLACE_IOU,
+    DetectionOutcome,
+    Fault,
+    LabelledDetections,
+    match_detections,
+)
+from drivesem.failures.nuisances import Nuisances, NuisanceSample
+from drivesem.failures.second_renderer.base import SecondRender, SecondRenderer
 from scene_ir.errors import RangeError
+from scene_ir.io import round_to_8bit
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
-    """Of `draws` draws before the change, and as many after it, how many must be right, and wrong. RangeError for
-    fewer draws than that needs.
-    """
+class CertificateRule:
+    """How many samples must be right before the change, and wrong after it. RangeError for too few samples."""
 
-    draws: int = CERTIFYING_DRAWS
+    draws: int = MIN_DRAWS
+    """Samples of either state."""
     right_before: float = 15 / 16
+    """Minimum share of samples that are right before the change."""
     wrong_after: float = 12 / 16
+    """Minimum share of samples that are wrong after it."""
 
     def __post_init__(self) -> None:
-        if self.draws < CERTIFYING_DRAWS:
-            raise RangeError("draws", f"at least {CERTIFYING_DRAWS}, which a certificate's rule needs", self.draws)
+        if self.draws < MIN_DRAWS:
+            raise RangeError("draws", f"at least {MIN_DRAWS}, which a certificate needs", self.draws)
 
     @property
     def before(self) -> int:
+        """Samples that must be right before the change."""
         return math.ceil(self.right_before * self.draws)
 
     @property
     def after(self) -> int:
+        """Samples that must be wrong after it."""
         return math.ceil(self.wrong_after * self.draws)
 
-    def holds(self, count: Count) -> bool:
-        """Whether a fault with these draws is certain."""
-        return count.before >= self.before and count.after >= self.after
+    def holds(self, certificate: Certificate) -> bool:
+        """Whether a fault with this certificate is certain."""
+        return certificate.before >= self.before and certificate.after >= self.after
 
 
 @dataclass(frozen=True, slots=True)
 class SampleOutcome:
-    """One draw of one state, as a detector sees it. judged: by `threshold`; classes: how many are judged."""
+    """Detections in one nuisance sample of one state."""
 
-    view: View
-    judged: Judged
+    labelled: LabelledDetections
+    """Labels and detections of the image."""
+    outcome: DetectionOutcome
+    """Both matched at `threshold`."""
     threshold: float
-    draw: Draw
-    classes: int
+    """The detector's t*."""
+    sample: NuisanceSample
+    """The sample."""
+    num_classes: int
+    """Number of evaluated classes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
-    """One draw of one state as a picture (3, H, W), before a detector sees it. targets: labels among CLASSES;
-    shown_xyxy: (N, 4) px, the boxes of what shows of the objects.
-    """
+class SampleImage:
+    """The image of one nuisance sample of one state."""
 
-    picture: Tensor
+    image: Tensor
+    """(3, H, W) RGB in [0, 1]."""
     targets: Targets
-    shown_xyxy: Tensor
-    draw: Draw
+    """Labels among `CLASSES`."""
+    visible_xyxy: Tensor
+    """(N, 4) px, boxes of the visible parts of the objects."""
+    sample: NuisanceSample
+    """The sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompositorRenderer:
+    """The first renderer behind the interface of the second ones: the compositor's images, labels that moved."""
+
+    compositor: Compositor
+    """Compositor of the scene."""
+    labeller: Labeller
+    """Its labeller."""
+
+    @property
+    def name(self) -> str:
+        return "compositor"
+
+    def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
+        """Nothing: the compositor renders every change."""
+        del changed
+        return ()
+
+    @torch.no_grad()
+    def render(self, changed: SceneIR) -> SecondRender:
+        """Render a state of the scene as an image file would hold it."""
+        render = self.compositor.render(changed)
+        targets = self.labeller.moved(changed, render).targets
+        return SecondRender(round_to_8bit(render.image), targets, visible_boxes(render))
 
 
 @dataclass(frozen=True)
-class Camera:
-    """Looks at states of one scene through a renderer and a detector. stream: name of the draws, which follow from
-    it and their number alone.
-    """
+class NuisanceCamera:
+    """Renders states of one scene in nuisance samples and runs a detector on them."""
 
     renderer: SecondRenderer
+    """What renders the scene."""
     detector: Predictor
+    """What is evaluated."""
     t_star: float
+    """Its score threshold."""
     nuisances: Nuisances
+    """Ranges of the samples."""
     stream: str
+    """Name of the sample stream; a sample follows from it and its number alone."""
 
-    def look(self, state: SceneIR, number: int, ignore: Tensor) -> SampleOutcome:
-        """The number-th draw of a state. ignore: (N,) bool, the objects that are not judged in it."""
-        return self.see(self.expose(state, number, ignore))
+    def evaluate(self, state: SceneIR, number: int, ignore: Tensor) -> SampleOutcome:
+        """Render a state in a nuisance sample and run the detector on it.
 
-    @torch.no_grad()
-    def expose(self, state: SceneIR, number: int, ignore: Tensor) -> Exposure:
-        """The same, before the detector sees it."""
-        draw = self.nuisances.draw(self.stream, number, state)
-        redrawn = self.renderer.redraw(draw.scene(state))
-        truth, known, count = redrawn.targets, redrawn.shown_xyxy, len(ignore)
-        skipped = torch.cat([truth.ignore[:count] | ignore.to(truth.ignore), truth.ignore[count:]])
-        shown = torch.where(boxes.area(known)[:, None] > 0, draw.boxes(known), torch.zeros_like(known))
-        targets = Targets(draw.boxes(truth.boxes_xyxy), truth.labels, skipped)
-        return Exposure(draw.picture(redrawn.image), targets, shown, draw)
+        Args:
+            state: State of the scene.
+            number: Number of the sample in the stream.
+            ignore: (N,) bool, objects that are ignored in addition.
+        """
+        return self.detect(self.render(state, number, ignore))
 
     @torch.no_grad()
-    def see(self, exposure: Exposure) -> SampleOutcome:
-        """What the detector makes of it."""
-        judged = JudgedClasses.of(self.detector)
-        targets = judged.targets(exposure.targets)
-        detections = judged.detections(predict(self.detector, exposure.picture[None])[0])
-        view = View(targets, with_regions(exposure.shown_xyxy, targets), detections)
-        return SampleOutcome(view, judge(view, self.t_star), self.t_star, exposure.draw, len(judged.names))
+    def render(self, state: SceneIR, number: int, ignore: Tensor) -> SampleImage:
+        """Render a state in a nuisance sample.
+
+        Args:
+            state: State of the scene.
+            number: Number of the sample in the stream.
+            ignore: (N,) bool, objects that are ignored in addition.
+        """
+        sample = self.nuisances.sample(self.stream, number, state)
+        render = self.renderer.render(sample.perturb_scene(state))
+        truth, visible, count = render.targets, render.visible_xyxy, len(ignore)
+        ignored = torch.cat([truth.ignore[:count] | ignore.to(truth.ignore), truth.ignore[count:]])
+        is_visible = boxes.area(visible)[:, None] > 0
+        visible = torch.where(is_visible, sample.transform_boxes(visible), torch.zeros_like(visible))
+        targets = Targets(sample.transform_boxes(truth.boxes_xyxy), truth.labels, ignored)
+        return SampleImage(sample.degrade_image(render.image), targets, visible, sample)
+
+    @torch.no_grad()
+    def detect(self, rendered: SampleImage) -> SampleOutcome:
+        """Run the detector on a rendered sample and match its detections."""
+        classes = EvaluatedClasses.from_detector(self.detector)
+        targets = classes.map_targets(rendered.targets)
+        detections = classes.map_detections(predict(self.detector, rendered.image[None])[0])
+        labelled = LabelledDetections(targets, pad_visible_boxes(rendered.visible_xyxy, targets), detections)
+        outcome = match_detections(labelled, self.t_star)
+        return SampleOutcome(labelled, outcome, self.t_star, rendered.sample, len(classes.names))
 
 
-def with_regions(shown_xyxy: Tensor, targets: Targets) -> Tensor:
-    """Boxes of what shows of the objects (N, 4), as many as there are targets (M, 4): zeros for regions."""
-    return torch.cat([shown_xyxy, shown_xyxy.new_zeros(len(targets) - len(shown_xyxy), 4)])
+def pad_visible_boxes(visible_xyxy: Tensor, targets: Targets) -> Tensor:
+    """Append zeros to the objects' visible boxes (N, 4), one row for each further target (M, 4)."""
+    return torch.cat([visible_xyxy, visible_xyxy.new_zeros(len(targets) - len(visible_xyxy), 4)])
+
+
+SampleVerdict = tuple[bool, float | None]
+"""Whether a fault occurs in a sample after the change, or is absent before it; and its margin."""
 
 
 def certify(
@@ -126,89 +193,119 @@ def certify(
     places_xyxy: Tensor,
     before: Callable[[int], SampleOutcome],
     after: Callable[[int], SampleOutcome],
-    rule: Rule,
-) -> tuple[Count, ...]:
-    """Count draws for each fault until no more can change whether it is certain: first after the change, then, of
-    what still may be, before it.
+    rule: CertificateRule,
+) -> tuple[Certificate, ...]:
+    """Certify faults on shared samples, at most `rule.draws` of either state.
 
-    places_xyxy: (F, 4) px of each fault, in the picture without a draw; it matters for background. before, after:
-    the number-th look at either state. Looks are shared by all faults: at most 2 * rule.draws of them.
+    Args:
+        faults: F faults.
+        places_xyxy: (F, 4) px, their places in the image without nuisances; used for background faults.
+        before: Number of a sample -> its outcome before the change.
+        after: The same after it.
+        rule: How many samples decide.
     """
 
-    def seen(changed: bool, number: int, asked: Sequence[int]) -> list[Drawn]:
-        look, says = (after(number), has) if changed else (before(number), is_right)
-        told = [(faults[f], places_xyxy[f], look) for f in asked]
-        return [(says(*one), margin_of(*one)) for one in told]
+    def judge_sample(changed: bool, number: int, rows: Sequence[int]) -> list[SampleVerdict]:
+        outcome, check = (after(number), shows_fault) if changed else (before(number), is_correct)
+        cases = [(faults[row], places_xyxy[row], outcome) for row in rows]
+        return [(check(*case), fault_margin(*case)) for case in cases]
 
-    return count_draws(len(faults), seen, rule)
-
-
-Drawn = tuple[bool, float | None]
-"""Of a fault in a draw: whether it is wrong after the change, or right before it; and its margin."""
+    return count_samples(len(faults), judge_sample, rule)
 
 
-def count_draws(
-    faults: int, seen: Callable[[bool, int, Sequence[int]], Sequence[Drawn]], rule: Rule
-) -> tuple[Count, ...]:
-    """The same for so many faults of whatever kind. seen: whether it is after the change, number of the draw, and
-    places of the faults that are asked -> each of these.
+def count_samples(
+    count: int,
+    judge_sample: Callable[[bool, int, Sequence[int]], Sequence[SampleVerdict]],
+    rule: CertificateRule,
+) -> tuple[Certificate, ...]:
+    """Judge samples until no more can change whether a fault is certain: first after the change, then before it
+    for the faults that still may be.
+
+    Args:
+        count: Number of faults.
+        judge_sample: Whether after the change, number of the sample, rows of the faults -> their verdicts.
+        rule: How many samples decide.
     """
-    wrong: list[list[Drawn]] = [[] for _ in range(faults)]
-    right: list[list[Drawn]] = [[] for _ in range(faults)]
-    for drawn, changed, needed in ((wrong, True, rule.after), (right, False, rule.before)):
-        # What has failed the first half is not asked again.
-        asked = [f for f in range(faults) if changed or _held(wrong[f]) >= rule.after]
+    wrong: list[list[SampleVerdict]] = [[] for _ in range(count)]
+    right: list[list[SampleVerdict]] = [[] for _ in range(count)]
+    for verdicts, changed, needed in ((wrong, True, rule.after), (right, False, rule.before)):
+        rows = [row for row in range(count) if changed or _count_true(wrong[row]) >= rule.after]
         for number in range(rule.draws):
-            if all(len(drawn[f]) - _held(drawn[f]) > rule.draws - needed for f in asked):
+            if all(len(verdicts[row]) - _count_true(verdicts[row]) > rule.draws - needed for row in rows):
                 break
-            for f, one in zip(asked, seen(changed, number, asked), strict=True):
-                drawn[f].append(one)
+            for row, verdict in zip(rows, judge_sample(changed, number, rows), strict=True):
+                verdicts[row].append(verdict)
     return tuple(
-        Count(_held(r), len(r), _held(w), len(w), _mean(r), _mean(w)) for r, w in zip(right, wrong, strict=True)
+        Certificate(_count_true(r), len(r), _count_true(w), len(w), _mean_margin(r), _mean_margin(w))
+        for r, w in zip(right, wrong, strict=True)
     )
 
 
-def _held(draws: Sequence[Drawn]) -> int:
-    return sum(holds for holds, _ in draws)
+def shows_fault(fault: Fault, place_xyxy: Tensor, outcome: SampleOutcome) -> bool:
+    """Whether a sample shows a fault. An object that the sample hides, or makes too small or faint, is not missed.
 
-
-def has(fault: Fault, place_xyxy: Tensor, look: SampleOutcome) -> bool:
-    """Whether a look shows this fault: an object that is judged and not found, or reported twice; something on
-    nothing there. Where a draw hides an object, or makes it too small or faint to be judged, nothing is missed.
+    Args:
+        fault: The fault.
+        place_xyxy: (4,) px, where a background fault is.
+        outcome: The sample.
     """
-    if fault.kind in OF_OBJECTS:
-        return not bool(look.judged.found[fault.target] | look.view.targets.ignore[fault.target])
+    if fault.kind in OBJECT_KINDS:
+        ignored = outcome.labelled.targets.ignore[fault.target]
+        return not bool(outcome.outcome.detected[fault.target] | ignored)
     if fault.kind is Kind.TWICE:
-        return fault.target in look.judged.twice
-    at = look.view.detections.boxes_xyxy[list(look.judged.background)]
-    return bool((_overlap(place_xyxy, look, at) >= SAME_PLACE).any())
+        return fault.target in outcome.outcome.duplicates
+    background = outcome.labelled.detections.boxes_xyxy[list(outcome.outcome.background)]
+    return _overlaps_place(place_xyxy, outcome, background)
 
 
-def is_right(fault: Fault, place_xyxy: Tensor, look: SampleOutcome) -> bool:
-    """Whether all is right in a look where the fault may be: the object found, once; nothing reported there."""
+def is_correct(fault: Fault, place_xyxy: Tensor, outcome: SampleOutcome) -> bool:
+    """Whether a sample is right where the fault may occur: the object detected once, or nothing at its place.
+
+    Args:
+        fault: The fault.
+        place_xyxy: (4,) px, where a background fault is.
+        outcome: The sample.
+    """
     if fault.kind is Kind.BACKGROUND:
-        at = look.view.detections.boxes_xyxy[look.view.detections.scores >= look.threshold]
-        return not bool((_overlap(place_xyxy, look, at) >= SAME_PLACE).any())
-    found = bool(look.judged.found[fault.target])
-    return found and (fault.kind is not Kind.TWICE or fault.target not in look.judged.twice)
+        detections = outcome.labelled.detections
+        confident = detections.boxes_xyxy[detections.scores >= outcome.threshold]
+        return not _overlaps_place(place_xyxy, outcome, confident)
+    detected = bool(outcome.outcome.detected[fault.target])
+    return detected and (fault.kind is not Kind.TWICE or fault.target not in outcome.outcome.duplicates)
 
 
-def margin_of(fault: Fault, place_xyxy: Tensor, look: SampleOutcome) -> float | None:
-    """The fault's margin in a look, in logits, of what suppression left; None of what is reported twice."""
+def fault_margin(fault: Fault, place_xyxy: Tensor, outcome: SampleOutcome) -> float | None:
+    """Compute a fault's margin in a sample from the detections after suppression.
+
+    Args:
+        fault: The fault.
+        place_xyxy: (4,) px, where a background fault is.
+        outcome: The sample.
+
+    Returns:
+        Logits; None for duplicates.
+    """
     if fault.kind is Kind.TWICE:
         return None
-    candidates = goals.of_detections(look.view.detections, look.classes)
+    labelled = outcome.labelled
+    candidates = losses.candidates_from_detections(labelled.detections, outcome.num_classes)
     if fault.kind is Kind.BACKGROUND:
-        return float(margin.of_places(candidates, look.draw.boxes(place_xyxy[None]), look.threshold)[0])
-    target, view = slice(fault.target, fault.target + 1), look.view
-    box, label = view.targets.boxes_xyxy[target], view.targets.labels[target]
-    return float(margin.of_objects(candidates, box, label, view.shown_xyxy[target], look.threshold)[0])
+        place = outcome.sample.transform_boxes(place_xyxy[None])
+        return float(margin.place_margins(candidates, place, outcome.threshold)[0])
+    row = slice(fault.target, fault.target + 1)
+    box, label = labelled.targets.boxes_xyxy[row], labelled.targets.labels[row]
+    return float(margin.object_margins(candidates, box, label, labelled.visible_xyxy[row], outcome.threshold)[0])
 
 
-def _overlap(place_xyxy: Tensor, look: SampleOutcome, at_xyxy: Tensor) -> Tensor:
-    return boxes.iou_matrix(look.draw.boxes(place_xyxy[None]).to(at_xyxy), at_xyxy)[0]
+def _overlaps_place(place_xyxy: Tensor, outcome: SampleOutcome, boxes_xyxy: Tensor) -> bool:
+    place = outcome.sample.transform_boxes(place_xyxy[None]).to(boxes_xyxy)
+    return bool((boxes.iou_matrix(place, boxes_xyxy)[0] >= SAME_PLACE_IOU).any())
 
 
-def _mean(draws: Sequence[Drawn]) -> float | None:
-    known = [margin for _, margin in draws if margin is not None]
-    return round(sum(known) / len(known), 4) if known else None
+def _count_true(verdicts: Sequence[SampleVerdict]) -> int:
+    return sum(holds for holds, _ in verdicts)
+
+
+def _mean_margin(verdicts: Sequence[SampleVerdict]) -> float | None:
+    margins = [margin for _, margin in verdicts if margin is not None]
+    return round(sum(margins) / len(margins), 4) if margins else None

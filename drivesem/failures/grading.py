@@ -1,8 +1,9 @@
-"""How sure a failure is: threshold, certain, confirmed, shared; each grade holds what the one before it asks.
+"""Grades: how certain a failure is. Each grade includes the requirements of the previous one.
 
-threshold: right in one picture and wrong in another (`evaluation.failures`). certain: of a kind that is a failure
-(`kinds`), with a certificate. confirmed: a second renderer's pictures of the same draws fail too. shared: so does
-a detector of another architecture, which is right under a placebo, a random edit as large.
+threshold: right in one image and wrong in another (`evaluation.failures`). certain: one of the kinds in `kinds`,
+    with
+a certificate. confirmed: it also occurs in a second renderer's images of the same samples. shared: it also occurs
+with a detector of another architecture, which is right under a placebo, a random edit of the same size.
 """
 
 from __future__ import annotations
@@ -14,190 +15,218 @@ import torch
 from torch import Tensor
 
 from detectors.base import Predictor, predict
-from drivesem.attack.judging import JudgedClasses, t_star_of
-from drivesem.evaluation.failures import Failures
-from drivesem.failures.certificate import Camera, Rule, SampleOutcome, certify, has, is_right
-from drivesem.failures.grades import SECOND, Agreement, Count, Grade, Kind
-from drivesem.failures.kinds import OF_OBJECTS, Fault, View, find
+from drivesem.attack.targets import EvaluatedClasses, resolve_t_star
+from drivesem.evaluation.failures import FrameFailures
+from drivesem.failures.certificate import (
+    CertificateRule,
+    NuisanceCamera,
+    SampleOutcome,
+    certify,
+    is_correct,
+    shows_fault,
+)
+from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, Kind, SecondOpinion
+from drivesem.failures.kinds import OBJECT_KINDS, Fault, LabelledDetections, find_faults
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.second_renderer.base import SecondRenderer
 from scene_ir.errors import SceneError
 from scene_ir.types import SceneIR
 
-_SECOND_DRAWS = range(SECOND[1])
-"""Draws that a second renderer and another detector see."""
+_OPINION_SAMPLES = range(AGREEMENT_RULE[1])
+"""Samples that a second renderer and a second detector see."""
 
 
 @dataclass(frozen=True, slots=True)
-class Graded:
-    """A fault and how sure it is. second, peer: None where they were not asked."""
+class GradedFault:
+    """A fault, its grade, and the evidence for it."""
 
     fault: Fault
+    """The failure."""
     grade: Grade
-    count: Count
-    second: Agreement | None = None
-    peer: Agreement | None = None
+    """Its grade."""
+    count: Certificate
+    """Its certificate."""
+    second: SecondOpinion | None = None
+    """Opinion of a second renderer; None where there was none."""
+    peer: SecondOpinion | None = None
+    """Opinion of a second detector; None where there was none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """A scene before and after a change. renderer: the compositor, as `CompositorDraw`; benign, now: what the
-    detector sees in the two pictures that were judged; placebo: the scene after a
-    random edit as large as the change, made when it is asked for.
-    """
+class GradingInput:
+    """A scene before and after a change, and what the detector reports in both images."""
 
     identifier: str
+    """Name of the frame."""
     base: SceneIR
+    """Scene before the change."""
     changed: SceneIR
+    """Scene after it."""
     renderer: SecondRenderer
-    benign: View
-    now: View
+    """The compositor, as a `CompositorRenderer`."""
+    benign: LabelledDetections
+    """Labels and detections before the change."""
+    now: LabelledDetections
+    """Labels and detections after it."""
     placebo: Callable[[], SceneIR] | None = None
+    """Makes the scene after a random edit of the same size as the change."""
 
 
 @dataclass(frozen=True, slots=True)
-class Grades:
-    """Of one case. lost, phantoms: by target and by detection, those of today's failures that are one of a kind;
-    what is missing here is none. notes: why a
-    grade could not be reached.
-    """
+class FrameGrades:
+    """Grades of one frame's failures; failures by threshold that are none of the kinds are missing."""
 
-    lost: Mapping[int, Graded]
-    phantoms: Mapping[int, Graded]
+    lost: Mapping[int, GradedFault]
+    """Faults of objects, by target."""
+    phantoms: Mapping[int, GradedFault]
+    """Other faults, by detection."""
     notes: tuple[str, ...] = ()
+    """Why a grade could not be reached."""
 
 
 @dataclass
 class Grader:
-    """Grades failures of one detector. seed: of the draws; second: makes the second renderer of a scene by its
-    frame's name, and raises SceneError where it cannot; peer: loads the other detector; witness: of other makes,
-    whose objects in the photograph are no phantoms'. None leaves the question out.
-    """
+    """Grades the failures of one detector."""
 
     detector: Predictor
+    """The detector."""
     t_star: float
+    """Its score threshold."""
     nuisances: Nuisances = field(default_factory=Nuisances)
-    rule: Rule = field(default_factory=Rule)
+    """Ranges of the samples."""
+    rule: CertificateRule = field(default_factory=CertificateRule)
+    """How many samples make a certificate."""
     seed: int = 0
-    second: Callable[[str, SceneIR], SecondRenderer] | None = None
-    peer: Callable[[], Predictor] | None = None
-    witness: Callable[[Tensor], Tensor] | None = None
-    _kept: tuple[Tensor, dict[tuple[str, int], SampleOutcome]] | None = None
+    """Seed of the samples."""
+    make_second_renderer: Callable[[str, SceneIR], SecondRenderer] | None = None
+    """Makes a scene's second renderer, or raises SceneError; None stops at *certain*."""
+    load_second_detector: Callable[[], Predictor] | None = None
+    """Loads the second detector; None stops at *confirmed*."""
+    reference_detector: Callable[[Tensor], Tensor] | None = None
+    """Boxes of the objects in the photograph, which are no phantoms; see `make_reference_detector`."""
+    _unchanged_outcomes: tuple[Tensor, dict[tuple[str, int], SampleOutcome]] | None = None
+    """Cache of outcomes before the change: the frame's labels, and outcomes by stream and number."""
 
-    def faults(self, case: Case, failures: Failures) -> tuple[Fault, ...]:
-        """Those failures by threshold that are of a kind, in the order of `kinds.find`."""
+    def faults(self, case: GradingInput, failures: FrameFailures) -> tuple[Fault, ...]:
+        """Those failures by threshold that are of a kind, in the order of `kinds.find_faults`."""
         if not failures.success:
             return ()
-        seen = self.witness(case.base.photograph) if self.witness is not None and failures.phantoms else None
+        reference_xyxy = None
+        if self.reference_detector is not None and failures.phantoms:
+            reference_xyxy = self.reference_detector(case.base.photograph)
         lost, phantoms = set(failures.lost), set(failures.phantoms)
         return tuple(
             fault
-            for fault in find(case.benign, case.now, self.t_star, seen)
-            if (fault.target in lost if fault.kind in OF_OBJECTS else fault.detection in phantoms)
+            for fault in find_faults(case.benign, case.now, self.t_star, reference_xyxy)
+            if (fault.target in lost if fault.kind in OBJECT_KINDS else fault.detection in phantoms)
         )
 
-    def grade(self, case: Case, failures: Failures) -> Grades:
-        """Grade what fails by threshold. The same case gives the same grades."""
-        faults = self.faults(case, failures)
-        graded, notes = self._graded(case, faults)
-        return Grades(
-            {one.fault.target: one for one in graded if one.fault.kind in OF_OBJECTS},
-            {one.fault.detection: one for one in graded if one.fault.kind not in OF_OBJECTS},
+    def grade(self, case: GradingInput, failures: FrameFailures) -> FrameGrades:
+        """Grade the failures by threshold of one frame; deterministic."""
+        graded, notes = self._grade_faults(case, self.faults(case, failures))
+        return FrameGrades(
+            {one.fault.target: one for one in graded if one.fault.kind in OBJECT_KINDS},
+            {one.fault.detection: one for one in graded if one.fault.kind not in OBJECT_KINDS},
             notes,
         )
 
-    def certificates(self, case: Case, faults: tuple[Fault, ...]) -> tuple[Count, ...]:
-        """Of faults, by draws of the case's own renderer."""
-        camera = self._camera(case, case.renderer, self.detector, self.t_star)
+    def certificates(self, case: GradingInput, faults: tuple[Fault, ...]) -> tuple[Certificate, ...]:
+        """Certify faults on samples by the frame's own renderer."""
+        camera = self._make_camera(case, case.renderer, self.detector, self.t_star)
+        return certify(
+            faults,
+            _fault_boxes(case, faults),
+            lambda number: self._evaluate_unchanged(case, camera, number),
+            lambda number: _evaluate_state(case.changed, case.now, camera, number),
+            self.rule,
+        )
 
-        def before(number: int) -> SampleOutcome:
-            return self._before(case, camera, number)
-
-        def after(number: int) -> SampleOutcome:
-            return _after(case, camera, number)
-
-        return certify(faults, _places(case, faults), before, after, self.rule)
-
-    def _before(self, case: Case, camera: Camera, number: int) -> SampleOutcome:
-        """The number-th look at the scene before the change. Kept as long as the frame stays: attacks on it differ
-        in what comes after.
+    def _evaluate_unchanged(self, case: GradingInput, camera: NuisanceCamera, number: int) -> SampleOutcome:
+        """Evaluate a sample of the scene before the change; cached while the frame stays the same, as attacks on
+        it differ only in what comes after.
         """
         labels = case.base.objects.box2d  # no change touches them
-        if self._kept is None or self._kept[0] is not labels:
-            self._kept = (labels, {})
-        kept, key = self._kept[1], (camera.stream, number)
-        if key not in kept:
-            kept[key] = _look(case.base, case.benign, camera, number)
-        return kept[key]
+        if self._unchanged_outcomes is None or self._unchanged_outcomes[0] is not labels:
+            self._unchanged_outcomes = (labels, {})
+        cache, key = self._unchanged_outcomes[1], (camera.stream, number)
+        if key not in cache:
+            cache[key] = _evaluate_state(case.base, case.benign, camera, number)
+        return cache[key]
 
-    def _graded(self, case: Case, faults: tuple[Fault, ...]) -> tuple[list[Graded], tuple[str, ...]]:
-        counts = self.certificates(case, faults)
+    def _grade_faults(
+        self, case: GradingInput, faults: tuple[Fault, ...]
+    ) -> tuple[list[GradedFault], tuple[str, ...]]:
+        certificates = self.certificates(case, faults)
         graded = [
-            Graded(fault, Grade.CERTAIN if self.rule.holds(count) else Grade.THRESHOLD, count)
-            for fault, count in zip(faults, counts, strict=True)
+            GradedFault(fault, Grade.CERTAIN if self.rule.holds(certificate) else Grade.THRESHOLD, certificate)
+            for fault, certificate in zip(faults, certificates, strict=True)
         ]
-        certain = [g for g in graded if g.grade is Grade.CERTAIN]
-        if not certain or self.second is None:
+        certain = [one.fault for one in graded if one.grade is Grade.CERTAIN]
+        if not certain or self.make_second_renderer is None:
             return graded, ()
         try:
-            renderer = self.second(case.identifier, case.changed)
-            camera = self._camera(case, renderer, self.detector, self.t_star, "second")
-            before = [self._before(case, camera, number) for number in _SECOND_DRAWS]
-            second = _agreements(case, camera, [g.fault for g in certain], before, renderer.name)
+            renderer = self.make_second_renderer(case.identifier, case.changed)
+            camera = self._make_camera(case, renderer, self.detector, self.t_star, "second")
+            before = [self._evaluate_unchanged(case, camera, number) for number in _OPINION_SAMPLES]
+            second = _second_opinions(case, camera, certain, before, renderer.name)
         except SceneError as error:
             return graded, (f"no second renderer: expected {error.expected}, found {error.actual}",)
-        confirmed = [fault for fault, agreement in second.items() if agreement.agrees]
-        peers: Mapping[Fault, Agreement] = {}
-        if confirmed and self.peer is not None and case.placebo is not None:
-            peer = self.peer()
-            camera = self._camera(case, case.renderer, peer, t_star_of(peer), "peer")
+        confirmed = [fault for fault, opinion in second.items() if opinion.agrees]
+        peers: Mapping[Fault, SecondOpinion] = {}
+        if confirmed and self.load_second_detector is not None and case.placebo is not None:
+            peer = self.load_second_detector()
+            camera = self._make_camera(case, case.renderer, peer, resolve_t_star(peer), "peer")
             placebo = case.placebo()
-            before = [_look(placebo, case.benign, camera, number) for number in _SECOND_DRAWS]
-            peers = _agreements(case, camera, confirmed, before, peer.name)
+            before = [_evaluate_state(placebo, case.benign, camera, number) for number in _OPINION_SAMPLES]
+            peers = _second_opinions(case, camera, confirmed, before, peer.name)
 
-        def told(g: Graded) -> Graded:
-            by_second, by_peer = second.get(g.fault), peers.get(g.fault)
-            grade = g.grade
-            if by_second is not None and by_second.agrees:
-                grade = Grade.SHARED if by_peer is not None and by_peer.agrees else Grade.CONFIRMED
-            return Graded(g.fault, grade, g.count, by_second, by_peer)
+        def add_opinions(one: GradedFault) -> GradedFault:
+            by_renderer, by_detector = second.get(one.fault), peers.get(one.fault)
+            grade = one.grade
+            if by_renderer is not None and by_renderer.agrees:
+                grade = Grade.SHARED if by_detector is not None and by_detector.agrees else Grade.CONFIRMED
+            return GradedFault(one.fault, grade, one.count, by_renderer, by_detector)
 
-        return [told(g) for g in graded], ()
+        return [add_opinions(one) for one in graded], ()
 
-    def _camera(
-        self, case: Case, renderer: SecondRenderer, detector: Predictor, t_star: float, which: str = "certificate"
-    ) -> Camera:
-        return Camera(renderer, detector, t_star, self.nuisances, f"{which}:{case.identifier}:{self.seed}")
-
-
-def _look(state: SceneIR, view: View, camera: Camera, number: int) -> SampleOutcome:
-    """view: says which of the scene's objects are not judged in that state."""
-    return camera.look(state, number, view.targets.ignore[: len(state.objects)])
-
-
-def _after(case: Case, camera: Camera, number: int) -> SampleOutcome:
-    return _look(case.changed, case.now, camera, number)
+    def _make_camera(
+        self,
+        case: GradingInput,
+        renderer: SecondRenderer,
+        detector: Predictor,
+        t_star: float,
+        purpose: str = "certificate",
+    ) -> NuisanceCamera:
+        stream = f"{purpose}:{case.identifier}:{self.seed}"
+        return NuisanceCamera(renderer, detector, t_star, self.nuisances, stream)
 
 
-def _agreements(
-    case: Case, camera: Camera, faults: list[Fault], before: list[SampleOutcome], name: str
-) -> dict[Fault, Agreement]:
-    """What a camera says of faults. before: its looks at the state in which all is to be right."""
-    places = _places(case, tuple(faults))
-    after = [_after(case, camera, number) for number in _SECOND_DRAWS]
+def _evaluate_state(
+    state: SceneIR, labelled: LabelledDetections, camera: NuisanceCamera, number: int
+) -> SampleOutcome:
+    """Evaluate a sample of a state; `labelled` names the objects that are ignored in it."""
+    return camera.evaluate(state, number, labelled.targets.ignore[: len(state.objects)])
+
+
+def _second_opinions(
+    case: GradingInput, camera: NuisanceCamera, faults: list[Fault], before: list[SampleOutcome], name: str
+) -> dict[Fault, SecondOpinion]:
+    """Count how often faults occur with a camera. before: samples of the state that should be right."""
+    places = _fault_boxes(case, tuple(faults))
+    after = [_evaluate_state(case.changed, case.now, camera, number) for number in _OPINION_SAMPLES]
     return {
-        fault: Agreement(
+        fault: SecondOpinion(
             name,
-            sum(is_right(fault, place, look) for look in before),
-            sum(has(fault, place, look) for look in after),
+            sum(is_correct(fault, place, outcome) for outcome in before),
+            sum(shows_fault(fault, place, outcome) for outcome in after),
             len(after),
         )
         for fault, place in zip(faults, places, strict=True)
     }
 
 
-def _places(case: Case, faults: tuple[Fault, ...]) -> Tensor:
-    """Where faults are, (F, 4) px of the changed picture: the object's label, or the detection."""
+def _fault_boxes(case: GradingInput, faults: tuple[Fault, ...]) -> Tensor:
+    """(F, 4) px in the changed image: the object's label, or the detection on background."""
     boxes_xyxy = [
         case.now.detections.boxes_xyxy[fault.detection]
         if fault.kind is Kind.BACKGROUND
@@ -207,16 +236,18 @@ def _places(case: Case, faults: tuple[Fault, ...]) -> Tensor:
     return torch.stack(boxes_xyxy) if boxes_xyxy else case.now.targets.boxes_xyxy[:0]
 
 
-def witness_of(detector: Predictor) -> Callable[[Tensor], Tensor]:
-    """Where a detector sees an object of any class in a photograph (3, H, W): boxes (K, 4) px, from its t* on.
+def make_reference_detector(detector: Predictor) -> Callable[[Tensor], Tensor]:
+    """Make a function from a photograph (3, H, W) to the boxes (K, 4) px of all objects that a detector sees in
+    it.
 
-    Raises DetectorError where it knows no cars.
+    Raises:
+        DetectorError: The detector knows no cars.
     """
-    JudgedClasses.of(detector)
-    t_star = t_star_of(detector)
+    EvaluatedClasses.from_detector(detector)
+    t_star = resolve_t_star(detector)
 
-    def seen(photograph: Tensor) -> Tensor:
+    def detect(photograph: Tensor) -> Tensor:
         detections = predict(detector, photograph[None])[0]
         return detections.boxes_xyxy[detections.scores >= t_star]
 
-    return seen
+    return detect

@@ -1,9 +1,7 @@
-"""JPEG as a map of pictures that has a gradient: what `kornia.enhance.jpeg_codec_differentiable` computes, in few
-passes. Nothing is written.
+"""Differentiable JPEG: what `kornia.enhance.jpeg_codec_differentiable` computes, in few passes.
 
-Everything but the rounding is linear: colours to luminance and colour differences, these at half the resolution,
-and the cosine transform of blocks of 8 x 8. Along rows and columns each is a matrix, and so is what they make
-together.
+Everything but the rounding is linear: RGB to luma and chroma, chroma at half the resolution, and the cosine
+transform of blocks of 8 x 8. Each is a matrix along rows and along columns, and so is their product.
 """
 
 from __future__ import annotations
@@ -18,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesem.failures.banded import Matrix, Separable
-from scene_ir.geometry import kept_within
+from drivesem.failures.separable import Matrix, SeparableMap
+from scene_ir.geometry import clamp_inclusive
 
 _LUMINANCE = np.array(
     [
@@ -36,119 +34,139 @@ _LUMINANCE = np.array(
 )
 _CHROMINANCE = np.full((8, 8), 99.0)
 _CHROMINANCE[:4, :4] = [[17, 18, 24, 47], [18, 21, 26, 66], [24, 26, 56, 99], [47, 66, 99, 99]]
-"""Steps of the coefficients at quality 50: ITU-T T.81, annex K.1."""
+"""Quantisation steps at quality 50: ITU-T T.81, annex K.1."""
 _TO_YCC = np.array([[0.299, 0.587, 0.114], [-0.299, -0.587, 0.886], [0.701, -0.587, -0.114]]) * [
     [1],
     [0.564],
     [0.713],
 ]
-"""From RGB to luminance and colour differences, as kornia has them."""
+"""From RGB to luma and chroma, as in kornia."""
 _BLUR = np.array([np.exp(-2.0), 1.0, np.exp(-2.0)]) / (1.0 + 2.0 * np.exp(-2.0))
-"""Over pixels, before colour differences are taken at half the resolution."""
+"""Blur of the chroma before it is sampled at half the resolution."""
 
 
 @dataclass(frozen=True, slots=True)
-class Codec:
-    """JPEG at one quality for pictures of one size. light, colour: to coefficients; light_back, colour_back: to
-    pixels; light_steps, colour_steps: of the coefficients.
-    """
+class DifferentiableJpeg:
+    """JPEG at one quality for images of one size."""
 
-    light: Separable
-    colour: Separable
-    light_back: Separable
-    colour_back: Separable
-    light_steps: Tensor
-    colour_steps: Tensor
+    luma: SeparableMap
+    """Luma to DCT coefficients."""
+    chroma: SeparableMap
+    """Chroma to DCT coefficients at half the resolution."""
+    luma_inverse: SeparableMap
+    """Coefficients back to luma."""
+    chroma_inverse: SeparableMap
+    """Coefficients back to chroma at full resolution."""
+    luma_steps: Tensor
+    """Quantisation step of each luma coefficient."""
+    chroma_steps: Tensor
+    """Quantisation step of each chroma coefficient."""
 
     @classmethod
-    def of(cls, hw: tuple[int, int], quality: int, like: Tensor) -> Codec:
-        """For pictures (3, H, W) of the dtype and on the device of a tensor. quality: 1 to 100."""
-        maps = _maps(hw, like.dtype, like.device)
+    def create(cls, hw: tuple[int, int], quality: int, like: Tensor) -> DifferentiableJpeg:
+        """Build the transforms.
+
+        Args:
+            hw: Height and width of the images, px.
+            quality: JPEG quality, 1 to 100.
+            like: Tensor of the images' dtype and device.
+        """
+        maps = _transforms(hw, like.dtype, like.device)
         height, width = (maps[0].rows.outputs, maps[0].columns.outputs)
         steps = []
         for table, parts in ((_LUMINANCE, 8), (_CHROMINANCE, 16)):
             scaled = np.clip(
-                (table * _step(5000 / quality if quality < 50 else 200 - 2 * quality) + 50) / 100, 1, 255
+                (table * _soft_floor(5000 / quality if quality < 50 else 200 - 2 * quality) + 50) / 100, 1, 255
             )
-            steps.append(torch.from_numpy(np.tile(_step(scaled), (height // parts, width // parts))).to(like))
+            steps.append(
+                torch.from_numpy(np.tile(_soft_floor(scaled), (height // parts, width // parts))).to(like)
+            )
         return cls(*maps, *steps)
 
     def __call__(self, image: Tensor) -> Tensor:
-        """What is left of a picture (3, H, W) in [0, 1]; differentiable."""
+        """Encode and decode an image (3, H, W) in [0, 1]; differentiable."""
         to_ycc = torch.from_numpy(_TO_YCC).to(image)
-        # Less the middle of the levels: the colour differences' own is in the rounding's favour, half a level.
+        # Centre the levels on 0; chroma's offset of half a level compensates the rounding.
         levels = torch.addmm(image.new_tensor([[-128.0], [-0.5], [-0.5]]), 255 * to_ycc, image.flatten(1))
         levels = levels.view_as(image)
-        light = self.light_back(_rounded(self.light(levels[:1]), self.light_steps))
-        colour = self.colour_back(_rounded(self.colour(levels[1:]), self.colour_steps))
+        light = self.luma_inverse(_quantise(self.luma(levels[:1]), self.luma_steps))
+        colour = self.chroma_inverse(_quantise(self.chroma(levels[1:]), self.chroma_steps))
         back = torch.linalg.inv(to_ycc.double()).to(image) / 255
         offset = back @ image.new_tensor([[128.0], [0.5], [0.5]])
         rgb = torch.addmm(offset, back, torch.cat([light, colour]).flatten(1))
-        return kept_within(rgb.view_as(image), 0, 1)
+        return clamp_inclusive(rgb.view_as(image), 0, 1)
 
 
-def _step(value: Any) -> Any:
-    """A whole number, nearly: the differentiable floor that kornia rounds steps with."""
+def _soft_floor(value: Any) -> Any:
+    """The differentiable floor by which kornia rounds quantisation steps."""
     whole = np.floor(value)
     return whole + (value - 0.5 - whole) ** 3
 
 
 @lru_cache(maxsize=4)
-def _maps(
+def _transforms(
     hw: tuple[int, int], dtype: torch.dtype, device: torch.device
-) -> tuple[Separable, Separable, Separable, Separable]:
-    """Light and colour to coefficients and back; pictures go on to a multiple of 16 as their last pixels."""
+) -> tuple[SeparableMap, SeparableMap, SeparableMap, SeparableMap]:
+    """Luma and chroma to coefficients and back; images are padded to a multiple of 16 by their last pixels."""
     like = torch.empty(0, dtype=dtype, device=device)
     first, second, third, fourth = (
-        Separable.of(rows, columns, like) for rows, columns in zip(*map(_side, hw), strict=True)
+        SeparableMap.from_dense(rows, columns, like)
+        for rows, columns in zip(*map(_axis_transforms, hw), strict=True)
     )
     return first, second, third, fourth
 
 
-def _side(size: int) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """The same along one side: coefficients of `size` pixels, and of them at half the resolution, and back."""
-    whole = size + -size % 16
-    half = whole // 2
-    continued = np.eye(size)[np.minimum(np.arange(whole), size - 1)]
-    thinned = np.zeros((half, size))
+def _axis_transforms(size: int) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """The same along one axis of `size` pixels: luma and chroma to coefficients, and back."""
+    padded_size = size + -size % 16
+    half_size = padded_size // 2
+    pad = np.eye(size)[np.minimum(np.arange(padded_size), size - 1)]
+    downsample = np.zeros((half_size, size))
     for tap in range(2):
         for reach, weight in zip((-1, 0, 1), _BLUR, strict=True):
-            at = 2 * np.arange(half) + tap + reach
-            at = np.where(at < 0, -at, np.where(at >= whole, 2 * whole - 2 - at, at))  # mirrored at the border
-            np.add.at(thinned, (np.arange(half), np.minimum(at, size - 1)), 0.5 * weight)
-    place = np.clip((np.arange(size) + 0.5) / 2 - 0.5, 0, half - 1)
-    first = np.floor(place).astype(np.int64)
-    doubled = np.zeros((half, size))
-    np.add.at(doubled, (first, np.arange(size)), 1 - (place - first))
-    np.add.at(doubled, (np.minimum(first + 1, half - 1), np.arange(size)), place - first)
-    return _cosines(continued), _cosines(thinned), _cosines(np.eye(whole))[:, :size].T, _cosines(doubled).T
+            source = 2 * np.arange(half_size) + tap + reach
+            source = np.where(
+                source < 0, -source, np.where(source >= padded_size, 2 * padded_size - 2 - source, source)
+            )  # mirrored at the border
+            np.add.at(downsample, (np.arange(half_size), np.minimum(source, size - 1)), 0.5 * weight)
+    position = np.clip((np.arange(size) + 0.5) / 2 - 0.5, 0, half_size - 1)
+    first = np.floor(position).astype(np.int64)
+    upsample = np.zeros((half_size, size))
+    np.add.at(upsample, (first, np.arange(size)), 1 - (position - first))
+    np.add.at(upsample, (np.minimum(first + 1, half_size - 1), np.arange(size)), position - first)
+    return (
+        _block_dct(pad),
+        _block_dct(downsample),
+        _block_dct(np.eye(padded_size))[:, :size].T,
+        _block_dct(upsample).T,
+    )
 
 
-def _cosines(matrix: Matrix) -> Matrix:
-    """The cosine transform of every eight rows."""
+def _block_dct(matrix: Matrix) -> Matrix:
+    """Apply the cosine transform to every eight rows."""
     blocks = matrix.reshape(-1, 8, matrix.shape[1])
     return np.asarray(scipy.fft.dct(blocks, axis=1, norm="ortho")).reshape(matrix.shape)
 
 
-def _rounded(coefficients: Tensor, steps: Tensor) -> Tensor:
-    """Coefficients (C, h, w) in whole steps (h, w), with a cube of what is left, so that there is a gradient."""
-    result: Tensor = _Rounded.apply(coefficients, steps)  # pyright: ignore[reportAssignmentType]
+def _quantise(coefficients: Tensor, steps: Tensor) -> Tensor:
+    """Round coefficients (C, h, w) to steps (h, w), plus the cube of the remainder, which gives a gradient."""
+    result: Tensor = _SoftRound.apply(coefficients, steps)  # pyright: ignore[reportAssignmentType]
     return result
 
 
-class _Rounded(torch.autograd.Function):
+class _SoftRound(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, coefficients: Tensor, steps: Tensor) -> Tensor:
-        counted = coefficients / steps
-        whole = counted.round()
-        left = counted.sub_(whole)
-        ctx.save_for_backward(left)
-        return whole.addcmul_(left.square(), left).mul_(steps)
+        in_steps = coefficients / steps
+        rounded = in_steps.round()
+        remainder = in_steps.sub_(rounded)
+        ctx.save_for_backward(remainder)
+        return rounded.addcmul_(remainder.square(), remainder).mul_(steps)
 
     @staticmethod
     @once_differentiable
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor, None]:
-        (left,) = ctx.saved_tensors
-        return (3 * left.square()).mul_(gradients[0]), None
+        (remainder,) = ctx.saved_tensors
+        return (3 * remainder.square()).mul_(gradients[0]), None

@@ -1,9 +1,9 @@
-"""Kinds of failure, as TIDE names them (Bolya et al. 2020, "TIDE: A General Toolbox for Identifying Object
-Detection Errors"), and what is none.
+"""Kinds of detection failure, after TIDE (Bolya et al. 2020, "TIDE: A General Toolbox for Identifying Object
+Detection Errors"), and what does not count as one.
 
-An object is found where a detection of its class meets its label or the box of what shows of it, at an IoU of 0.5:
-nobody can frame what stands behind a van. What is found before a change and not after it is one failure, whatever
-else is reported in its place. A phantom lies on nothing at all.
+An object is detected where a detection of its class overlaps its label, or the box of its visible part, with an
+IoU of at least 0.5: no detector can frame what stands behind a van. An object that is detected before a change and
+not after it is one failure, even if something else is reported in its place. A phantom lies on nothing at all.
 """
 
 from __future__ import annotations
@@ -18,173 +18,177 @@ from detectors import boxes
 from detectors.types import Detections, Targets
 from drivesem.failures.grades import Kind
 
-MEETS = 0.5
-"""IoU from which a detection meets an object, and share of it on an ignored region that excuses it."""
-TOUCHES = 0.1
-"""IoU up to which a detection lies on nothing (TIDE's background threshold)."""
-SAME_PLACE = 0.3
-"""IoU from which two detections are about the same place."""
-HALF = 0.5
-"""Share of t* from which a benign detection tells that a place was suspect before the change."""
+MATCH_IOU = 0.5
+"""Minimum IoU of a detection and its object; minimum share of a detection on an ignored region that excuses it."""
+BACKGROUND_IOU = 0.1
+"""Maximum IoU of a detection that lies on nothing (TIDE's background threshold)."""
+SAME_PLACE_IOU = 0.3
+"""Minimum IoU of two detections of about the same place."""
+SUSPECT_SCORE_SHARE = 0.5
+"""Share of t* from which a benign detection makes a place suspect before the change."""
 
-
-OF_OBJECTS = (Kind.MISSED, Kind.CLASS, Kind.PLACED)
-"""Kinds of failure in which an object is not found."""
+OBJECT_KINDS = (Kind.MISSED, Kind.CLASS, Kind.PLACED)
+"""Kinds of failure in which an object is not detected."""
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """One picture: what is there, and what a detector reports. targets, detections: labels among the same names;
-    shown_xyxy: (M, 4) px, the box of what shows of each target; zeros where it is not known.
-    """
+class LabelledDetections:
+    """Labels and detections of one image, with class indices into the same list."""
 
     targets: Targets
-    shown_xyxy: Tensor
+    """Labels of the M objects and ignored regions."""
+    visible_xyxy: Tensor
+    """(M, 4) px, box of the visible part of each target; zeros where unknown."""
     detections: Detections
+    """What the detector reports."""
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """A view by one threshold. found: (M,) bool; instead: for targets that are not found, the kind and the
-    detection that stands for it, if there is one; twice: by target that is found, the first detection that reports
-    it again; background: detections on nothing, best first, one a place.
-    """
+class DetectionOutcome:
+    """Labelled detections, matched at one score threshold."""
 
-    found: Tensor
-    instead: dict[int, tuple[Kind, int]]
-    twice: dict[int, int]
+    detected: Tensor
+    """(M,) bool, targets that are detected."""
+    misreports: dict[int, tuple[Kind, int]]
+    """By undetected target: the kind of failure and the detection that explains it, if there is one."""
+    duplicates: dict[int, int]
+    """By detected target: the first detection that reports it again."""
     background: tuple[int, ...]
-
-    def kind_of(self, target: int) -> Kind:
-        """Of a target that is not found."""
-        return self.instead.get(target, (Kind.MISSED, -1))[0]
+    """Detections on nothing, by descending score, one per place."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A failure of one kind. target: index of the object, -1 of background; detection: index in the changed view
-    of what is reported wrongly, -1 where nothing is.
-    """
+    """One failure of one kind."""
 
     kind: Kind
+    """What went wrong."""
     target: int
+    """Index of the object; -1 for background."""
     detection: int
+    """Index of the wrong detection in the changed image; -1 where there is none."""
 
 
-def meets(view: View) -> Tensor:
-    """How well each detection meets each target, (D, M): the better IoU of its label and of what shows."""
-    at = view.detections.boxes_xyxy
-    label = boxes.iou_matrix(at, view.targets.boxes_xyxy.to(at))
-    return torch.maximum(label, boxes.iou_matrix(at, view.shown_xyxy.to(at)))
+def match_ious(labelled: LabelledDetections) -> Tensor:
+    """(D, M) in [0, 1]: the larger IoU of each detection with each target's label and with its visible part."""
+    detected_xyxy = labelled.detections.boxes_xyxy
+    label_ious = boxes.iou_matrix(detected_xyxy, labelled.targets.boxes_xyxy.to(detected_xyxy))
+    return torch.maximum(label_ious, boxes.iou_matrix(detected_xyxy, labelled.visible_xyxy.to(detected_xyxy)))
 
 
-def judge(view: View, threshold: float) -> Judged:
-    """Match detections from that score on to the targets of their class, best score first, each to the free target
-    that it meets best; then say what the others are.
+def match_detections(labelled: LabelledDetections, threshold: float) -> DetectionOutcome:
+    """Match detections of at least that score to targets of their class, then classify the unmatched ones.
+
+    Detections match by descending score, each to the free target with the largest IoU.
     """
-    detections, targets = view.detections, view.targets
-    overlap = meets(view)
-    same = detections.labels[:, None] == targets.labels.to(detections.labels)[None]
+    detections, targets = labelled.detections, labelled.targets
+    ious = match_ious(labelled)
+    same_class = detections.labels[:, None] == targets.labels.to(detections.labels)[None]
     counts = ~targets.ignore.to(detections.labels.device)
     order = [
         d for d in torch.argsort(detections.scores, descending=True, stable=True).tolist()
         if float(detections.scores[d]) >= threshold
     ]  # fmt: skip
-    rows, own, counted = overlap.tolist(), same.tolist(), counts.tolist()
-    found = [False] * len(targets)
-    left = []
+    rows, own_class, counted = ious.tolist(), same_class.tolist(), counts.tolist()
+    detected = [False] * len(targets)
+    unmatched = []
     for d in order:
         free = [
             (rows[d][t], -t)
-            for t in range(len(found))
-            if counted[t] and own[d][t] and not found[t] and rows[d][t] >= MEETS
+            for t in range(len(detected))
+            if counted[t] and own_class[d][t] and not detected[t] and rows[d][t] >= MATCH_IOU
         ]
         if free:
-            found[-max(free)[1]] = True
+            detected[-max(free)[1]] = True
         else:
-            left.append(d)
-    excused = _excused(view, overlap, counts)
-    instead: dict[int, tuple[Kind, int]] = {}
-    twice: dict[int, int] = {}
-    nothing: list[int] = []
-    on_something = _share_on(view, counts)
-    for d in left:
+            unmatched.append(d)
+    excused = _lies_on_ignored(labelled, ious, counts)
+    on_object = _lies_on_object(labelled, counts)
+    misreports: dict[int, tuple[Kind, int]] = {}
+    duplicates: dict[int, int] = {}
+    background: list[int] = []
+    for d in unmatched:
         if excused[d]:
             continue
-        candidates = [(rows[d][t], -t) for t in range(len(found)) if counted[t]]
-        best, place = max(candidates, default=(0.0, 0))
-        target = -place
-        if best < TOUCHES:
-            if not on_something[d]:
-                nothing.append(d)
-        elif best >= MEETS and found[target]:
-            twice.setdefault(target, d)
-        elif best >= MEETS:
-            # Its own class would have found it.
-            instead[target] = (Kind.CLASS, d) if target not in instead else _better(instead[target], Kind.CLASS, d)
-        elif own[d][target] and not found[target]:
-            instead.setdefault(target, (Kind.PLACED, d))
-    return Judged(
-        torch.tensor(found, dtype=torch.bool), instead, twice, tuple(_one_a_place(detections.boxes_xyxy, nothing))
-    )
+        candidates = [(rows[d][t], -t) for t in range(len(detected)) if counted[t]]
+        best, negative_target = max(candidates, default=(0.0, 0))
+        target = -negative_target
+        if best < BACKGROUND_IOU:
+            if not on_object[d]:
+                background.append(d)
+        elif best >= MATCH_IOU and detected[target]:
+            duplicates.setdefault(target, d)
+        elif best >= MATCH_IOU:
+            # A detection of the target's own class would have matched. Another class explains more than a bad box;
+            # of two detections of a kind, the first has the higher score.
+            if target not in misreports or misreports[target][0] is not Kind.CLASS:
+                misreports[target] = Kind.CLASS, d
+        elif own_class[d][target] and not detected[target]:
+            misreports.setdefault(target, (Kind.PLACED, d))
+    places = tuple(_suppress_same_place(detections.boxes_xyxy, background))
+    return DetectionOutcome(torch.tensor(detected, dtype=torch.bool), misreports, duplicates, places)
 
 
-def find(benign: View, changed: View, threshold: float, seen_xyxy: Tensor | None = None) -> tuple[Fault, ...]:
-    """What was right in the benign view and is wrong in the changed one: objects first, then background.
+def find_faults(
+    benign: LabelledDetections, changed: LabelledDetections, threshold: float, reference_xyxy: Tensor | None = None
+) -> tuple[Fault, ...]:
+    """List what was right in the benign image and is wrong in the changed one: objects first, then background.
 
-    The i-th targets of both are the same object. Objects that are ignored now are no failures. No background is
-    where the benign view has a detection of any class at half the threshold, or where somebody else sees an object
-    in the photograph. seen_xyxy: (K, 4) px, what else is seen there. Raises ValueError where the targets do not
-    correspond.
+    Objects that are ignored after the change are no failures. A detection is no background fault where the benign
+    image has a detection of any class at half the threshold, or where a reference detector sees an object.
+
+    Args:
+        benign: Image before the change.
+        changed: Image after it; its i-th target is the same object as the i-th benign one.
+        threshold: Minimum score of a detection.
+        reference_xyxy: (K, 4) px, objects that a reference detector sees in the photograph.
+
+    Raises:
+        ValueError: The numbers of targets differ.
     """
     if len(benign.targets) != len(changed.targets):
         raise ValueError(
             f"targets: expected the {len(benign.targets)} benign objects, found {len(changed.targets)}"
         )
-    before, after = judge(benign, threshold), judge(changed, threshold)
+    before, after = match_detections(benign, threshold), match_detections(changed, threshold)
     faults: list[Fault] = []
     for target in range(len(changed.targets)):
-        if bool(changed.targets.ignore[target]) or not bool(before.found[target]):
+        if bool(changed.targets.ignore[target]) or not bool(before.detected[target]):
             continue
-        if not bool(after.found[target]):
-            kind, detection = after.instead.get(target, (Kind.MISSED, -1))
+        if not bool(after.detected[target]):
+            kind, detection = after.misreports.get(target, (Kind.MISSED, -1))
             faults.append(Fault(kind, target, detection))
-        elif target in after.twice and target not in before.twice:
-            faults.append(Fault(Kind.TWICE, target, after.twice[target]))
-    known = benign.detections.boxes_xyxy[benign.detections.scores >= HALF * threshold]
-    if seen_xyxy is not None:
-        known = torch.cat([known, seen_xyxy.to(known)])
-    at = changed.detections.boxes_xyxy
-    new = ~(boxes.iou_matrix(at, known) >= SAME_PLACE).any(dim=1)
-    faults += [Fault(Kind.BACKGROUND, -1, d) for d in after.background if bool(new[d])]
+        elif target in after.duplicates and target not in before.duplicates:
+            faults.append(Fault(Kind.TWICE, target, after.duplicates[target]))
+    known = benign.detections.boxes_xyxy[benign.detections.scores >= SUSPECT_SCORE_SHARE * threshold]
+    if reference_xyxy is not None:
+        known = torch.cat([known, reference_xyxy.to(known)])
+    is_new = ~(boxes.iou_matrix(changed.detections.boxes_xyxy, known) >= SAME_PLACE_IOU).any(dim=1)
+    faults += [Fault(Kind.BACKGROUND, -1, d) for d in after.background if bool(is_new[d])]
     return tuple(faults)
 
 
-def _better(known: tuple[Kind, int], kind: Kind, detection: int) -> tuple[Kind, int]:
-    """Another class says more than a bad frame; of two of a kind the first, which has the better score."""
-    return known if known[0] is kind else (kind, detection)
+def _lies_on_ignored(labelled: LabelledDetections, ious: Tensor, counts: Tensor) -> list[bool]:
+    """(D,): detections of any class on ignored targets, which may be right or wrong."""
+    detected_xyxy = labelled.detections.boxes_xyxy
+    inside = boxes.ioa_matrix(detected_xyxy, labelled.targets.boxes_xyxy.to(detected_xyxy)) >= MATCH_IOU
+    return ((inside | (ious >= BACKGROUND_IOU)) & ~counts[None]).any(dim=1).tolist()
 
 
-def _excused(view: View, overlap: Tensor, counts: Tensor) -> list[bool]:
-    """(D,): detections on what is ignored, of whatever class: nobody knows whether they are right."""
-    at, around = view.detections.boxes_xyxy, view.targets.boxes_xyxy.to(view.detections.boxes_xyxy)
-    on = boxes.ioa_matrix(at, around) >= MEETS
-    return ((on | (overlap >= TOUCHES)) & ~counts[None]).any(dim=1).tolist()
+def _lies_on_object(labelled: LabelledDetections, counts: Tensor) -> list[bool]:
+    """(D,): detections that lie mostly on an object, even if they frame only a small part of it."""
+    detected_xyxy = labelled.detections.boxes_xyxy
+    inside = boxes.ioa_matrix(detected_xyxy, labelled.targets.boxes_xyxy.to(detected_xyxy)) >= MATCH_IOU
+    return (inside & counts[None]).any(dim=1).tolist()
 
 
-def _share_on(view: View, counts: Tensor) -> list[bool]:
-    """(D,): detections that lie on an object for the most part, however little of it they frame."""
-    at, around = view.detections.boxes_xyxy, view.targets.boxes_xyxy.to(view.detections.boxes_xyxy)
-    return ((boxes.ioa_matrix(at, around) >= MEETS) & counts[None]).any(dim=1).tolist()
-
-
-def _one_a_place(boxes_xyxy: Tensor, order: list[int]) -> Iterator[int]:
-    """Of detections, best first, those that no better one lies on; boxes without an area lie nowhere."""
-    kept: list[int] = []
+def _suppress_same_place(boxes_xyxy: Tensor, order: list[int]) -> Iterator[int]:
+    """Yield those of the ordered detections that no earlier one overlaps; boxes without an area are skipped."""
+    chosen: list[int] = []
     for d in order:
-        here = boxes_xyxy[d : d + 1]
-        if float(boxes.area(here)) > 0 and not bool(
-            (boxes.iou_matrix(here, boxes_xyxy[kept]) >= SAME_PLACE).any()
+        box = boxes_xyxy[d : d + 1]
+        if float(boxes.area(box)) > 0 and not bool(
+            (boxes.iou_matrix(box, boxes_xyxy[chosen]) >= SAME_PLACE_IOU).any()
         ):
-            kept.append(d)
+            chosen.append(d)
             yield d

@@ -1,4 +1,4 @@
-"""The states around a counterexample in which one object may be, as samples that detectors are shown."""
+"""Samples of the states around a counterexample, or anywhere within the bounds, with the object's features."""
 
 from __future__ import annotations
 
@@ -13,46 +13,49 @@ import torch
 from torch import Tensor
 
 from detectors.base import Predictor
-from detectors.planted import features as features_of
+from detectors.planted import compute_features
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.unit_box import UnitBox
+from drivesem.attack.methods.margin_search import UnitBox
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import SPECS, Parameter
-from drivesem.failures.certificate import Camera, Exposure, SampleOutcome, margin_of
+from drivesem.failures.certificate import (
+    CompositorRenderer,
+    NuisanceCamera,
+    SampleImage,
+    SampleOutcome,
+    fault_margin,
+)
 from drivesem.failures.kinds import Fault, Kind
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.rules import Floats
-from drivesem.failures.second_renderer.compositor import CompositorDraw
-from drivesem.failures.views import DrawnViews
 from scene_ir.types import SceneIR
 
 if TYPE_CHECKING:
     from scipy.stats.qmc import QMCEngine
 
-SEEN: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast")
-"""Features of the object's label and of the picture in it, see `detectors.planted.FEATURES`."""
-NEAR = 0.3
-"""Part of the reach in which states lie that are near the counterexample."""
-_LEAST = 1e-6
-"""Margin, in logits, of what is just found."""
-PLACED = ("distance_m", "yaw_deg")
-"""distance_m: depth of the object's origin; yaw_deg: its heading about the vertical axis, as KITTI counts it."""
+IMAGE_FEATURES: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast")
+"""Features of the object's label and of the image inside it, see `detectors.planted.FEATURES`."""
+NEAR_REACH = 0.3
+"""Share of the reach within which states are near the counterexample."""
+_MIN_ABS_MARGIN = 1e-6
+"""Smallest absolute margin in logits, where object and best candidate disagree about the sign."""
+POSE_FEATURES = ("distance_m", "yaw_deg")
+"""Depth of the object's origin; its heading about the vertical axis in KITTI's convention."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
-    """One state in one draw of the nuisances. features: by name, of the object."""
+class ObjectSample:
+    """One state in one nuisance sample, described for one object."""
 
-    exposure: Exposure
+    image: SampleImage
+    """The rendered sample."""
     features: dict[str, float]
+    """The object's features by name."""
 
 
 class Neighbourhood:
-    """What object `index` and what all objects share may become, within reach of theta (D,), the others as found.
-
-    reach: how far, as a share of the bounds' width either way, within the bounds. name: of the samples and their
-    draws, which follow from it and their number alone.
-    """
+    """The states within reach of theta: one object and the scene's shared parameters vary, other objects stay."""
 
     def __init__(
         self,
@@ -64,129 +67,165 @@ class Neighbourhood:
         name: str,
         reach: float = 1.0,
     ) -> None:
+        """Prepare the samples.
+
+        Args:
+            objective: Scene, detector and labels.
+            feasible: Set that every state is projected to.
+            theta: (D,) the counterexample.
+            index: The object.
+            nuisances: Ranges of the nuisance samples.
+            name: Name of the samples, which follow from it and their number alone.
+            reach: Largest change either way, as a share of the bounds' width.
+        """
         self._objective, self._feasible, self._theta, self.index = objective, feasible, theta, index
         self._box = UnitBox(objective.problem(feasible), objective.space.theta0)
         self._own = ((self._box.owner == index) | (self._box.owner < 0)).nonzero()[:, 0]
         mine = (self._box.holder == index) | (self._box.holder < 0)
         self._mine = mine.to(theta.device)
         self._span = reach * (objective.space.upper - objective.space.lower)
-        renderer = CompositorDraw(objective.compositor, objective.labeller)
-        self._camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"hole:{name}")
-        self._sequence = _halton(len(self._own), name)
-        self._places: list[Floats] = []
+        renderer = CompositorRenderer(objective.compositor, objective.labeller)
+        self._camera = NuisanceCamera(renderer, objective.detector, objective.t_star, nuisances, f"hole:{name}")
+        self._sequence = _make_halton(len(self._own), name)
+        self._points: list[Floats] = []
 
-    def sample(self, number: int, part: float = 1.0) -> Sample | None:
-        """The number-th state, seen once; None where the object does not count there. part: of the reach."""
-        return self.sample_at(self.place(number), number, part)
+    def sample(self, number: int, part: float = 1.0) -> ObjectSample | None:
+        """Render the state of a number in a nuisance sample of that number; `part` is the share of the reach to
+        use. None where the object does not count.
+        """
+        return self.sample_at(self.unit_point(number), number, part)
 
-    def sample_at(self, place: Floats, draw: int, part: float = 1.0) -> Sample | None:
-        """The state at a place (d,) of the unit cube, in a draw by its number; see `sample`."""
-        scene = self._objective.space.apply(self._objective.space.scene, self.theta_at(place, part))
+    def sample_at(self, point: Floats, draw: int, part: float = 1.0) -> ObjectSample | None:
+        """Render the state at a point of the unit cube.
+
+        Args:
+            point: (d,) in [0, 1].
+            draw: Number of the nuisance sample.
+            part: Share of the reach to use.
+
+        Returns:
+            None where the object does not count.
+        """
+        scene = self._objective.space.apply(self._objective.space.scene, self.theta_at(point, part))
         ignore = torch.zeros(len(scene.objects), dtype=torch.bool)
-        exposure = self._camera.expose(scene, draw, ignore)
-        if bool(exposure.targets.ignore[self.index]):
+        image = self._camera.render(scene, draw, ignore)
+        if bool(image.targets.ignore[self.index]):
             return None
-        return Sample(exposure, described(self._objective, scene, exposure, self.index))
+        return ObjectSample(image, describe_object(self._objective, scene, image, self.index))
 
-    def place(self, number: int) -> Floats:
-        """Of the number-th state, (d,) in the unit cube: Halton's."""
-        return _nth(self._places, self._sequence, number)
+    def unit_point(self, number: int) -> Floats:
+        """Halton's point (d,) of that number in the unit cube."""
+        return _sequence_point(self._points, self._sequence, number)
 
     def theta(self, number: int, part: float = 1.0) -> Tensor:
-        """Of the number-th state (D,), feasible. part: of the reach, in which states lie closer together."""
-        return self.theta_at(self.place(number), part)
+        """The feasible state (D,) of that number; a smaller `part` of the reach keeps states closer together."""
+        return self.theta_at(self.unit_point(number), part)
 
-    def theta_at(self, place: Floats, part: float = 1.0) -> Tensor:
-        """At a place (d,) of the unit cube, see `theta`."""
-        at = self._box.start.clone()
-        at[self._own] = torch.from_numpy(place).to(at)
-        away = torch.where(self._mine, self._box.theta(at) - self._theta, 0)
+    def theta_at(self, point: Floats, part: float = 1.0) -> Tensor:
+        """The feasible state (D,) at a point (d,) of the unit cube; see `theta`."""
+        box_point = self._box.start.clone()
+        box_point[self._own] = torch.from_numpy(point).to(box_point)
+        change = torch.where(self._mine, self._box.theta(box_point) - self._theta, 0)
         if part < 1:
-            away = part * away
-        away = torch.minimum(torch.maximum(away, -part * self._span), part * self._span)
-        return self._feasible.project(self._theta + away).theta
+            change = part * change
+        change = torch.minimum(torch.maximum(change, -part * self._span), part * self._span)
+        return self._feasible.project(self._theta + change).theta
 
-    def camera_of(self, detector: Predictor, t_star: float) -> Camera:
-        """Another detector in the place of the objective's, which sees the same pictures."""
+    def camera_for(self, detector: Predictor, t_star: float) -> NuisanceCamera:
+        """A camera with another detector, which sees the same images."""
         return replace(self._camera, detector=detector, t_star=t_star)
 
-    def look(self, sample: Sample, camera: Camera | None = None) -> SampleOutcome:
-        """What the objective's detector, or another camera's, makes of a sample. Costs a pass."""
-        return (camera or self._camera).see(sample.exposure)
+    def evaluate(self, sample: ObjectSample, camera: NuisanceCamera | None = None) -> SampleOutcome:
+        """Run the objective's detector, or another camera's, on a sample. Costs a pass."""
+        return (camera or self._camera).detect(sample.image)
 
-    def fails(self, sample: Sample, camera: Camera | None = None) -> bool:
-        """Whether the object is not found, by either. Costs a pass."""
-        return not bool(self.look(sample, camera).judged.found[self.index])
+    def fails(self, sample: ObjectSample, camera: NuisanceCamera | None = None) -> bool:
+        """Whether the object is missed. Costs a pass."""
+        return not bool(self.evaluate(sample, camera).outcome.detected[self.index])
 
-    def margin(self, sample: Sample) -> float:
-        """How far the object is from being lost, in logits beyond t*: below 0 where it is. Costs a pass."""
-        return margin_in(self._camera.see(sample.exposure), self.index)
+    def margin(self, sample: ObjectSample) -> float:
+        """The object's margin in logits, negative where it is missed. Costs a pass."""
+        return object_margin(self._camera.detect(sample.image), self.index)
 
 
-class Everywhere:
-    """All objects of a scene, each anywhere within the bounds: one pass tells of all of them.
+class SceneSampler:
+    """Samples all objects of a scene at once, each anywhere within the bounds.
 
-    name: of the states and their draws, which follow from it and their number alone. judged: objects found as
-    photographed, whose losses count.
+    `counted_objects` lists the objects that are detected in the benign image.
     """
 
     def __init__(self, objective: Objective, feasible: FeasibleSet, nuisances: Nuisances, name: str) -> None:
         self._objective, self._feasible = objective, feasible
         self._box = UnitBox(objective.problem(feasible), objective.space.theta0)
-        renderer = CompositorDraw(objective.compositor, objective.labeller)
-        self.camera = Camera(renderer, objective.detector, objective.t_star, nuisances, f"everywhere:{name}")
-        self.judged = DrawnViews.of(objective, nuisances, name).judged.nonzero()[:, 0].tolist()
-        self._sequence = _halton(len(self._box.owner), name)
-        self._places: list[Floats] = []
+        renderer = CompositorRenderer(objective.compositor, objective.labeller)
+        self.camera = NuisanceCamera(
+            renderer, objective.detector, objective.t_star, nuisances, f"everywhere:{name}"
+        )
+        self.counted_objects = (
+            NuisanceMarginOracle.for_objective(objective, nuisances, name).counted_objects.nonzero()[:, 0].tolist()
+        )
+        self._sequence = _make_halton(len(self._box.owner), name)
+        self._points: list[Floats] = []
 
     def theta(self, number: int) -> Tensor:
-        """Of the number-th state (D,), feasible."""
-        place = torch.from_numpy(_nth(self._places, self._sequence, number))
-        return self._feasible.project(self._box.theta(place.to(self._box.start))).theta
+        """The feasible state (D,) of that number."""
+        point = torch.from_numpy(_sequence_point(self._points, self._sequence, number))
+        return self._feasible.project(self._box.theta(point.to(self._box.start))).theta
 
-    def exposed(self, number: int, camera: Camera | None = None) -> Exposure:
-        """The number-th state in a draw of that number, whoever draws it."""
+    def render(self, number: int, camera: NuisanceCamera | None = None) -> SampleImage:
+        """Render the state of a number in a nuisance sample of that number, by this or another camera."""
         scene = self._objective.space.apply(self._objective.space.scene, self.theta(number))
         nothing = torch.zeros(len(scene.objects), dtype=torch.bool)
-        return (camera or self.camera).expose(scene, number, nothing)
+        return (camera or self.camera).render(scene, number, nothing)
 
-    def sample(self, number: int) -> dict[int, Sample]:
-        """The number-th state, by those judged objects that count there. No detector is asked."""
-        return self.sample_of(self.theta(number), number)
+    def sample(self, number: int) -> dict[int, ObjectSample]:
+        """Describe the counted objects that count in the state of a number, without a detector pass."""
+        return self.sample_at(self.theta(number), number)
 
-    def sample_of(self, theta: Tensor, draw: int) -> dict[int, Sample]:
-        """The same of a feasible theta (D,), in a draw by its number."""
+    def sample_at(self, theta: Tensor, draw: int) -> dict[int, ObjectSample]:
+        """The same for a feasible state (D,) and the number of a nuisance sample."""
         scene = self._objective.space.apply(self._objective.space.scene, theta)
-        exposure = self.camera.expose(scene, draw, torch.zeros(len(scene.objects), dtype=torch.bool))
-        counts = [index for index in self.judged if not bool(exposure.targets.ignore[index])]
-        return {index: Sample(exposure, described(self._objective, scene, exposure, index)) for index in counts}
+        image = self.camera.render(scene, draw, torch.zeros(len(scene.objects), dtype=torch.bool))
+        counts = [index for index in self.counted_objects if not bool(image.targets.ignore[index])]
+        return {
+            index: ObjectSample(image, describe_object(self._objective, scene, image, index)) for index in counts
+        }
 
-    def margins(self, samples: Mapping[int, Sample]) -> dict[int, float]:
-        """How far each object of one state is from being lost, see `Neighbourhood.margin`. Costs a pass, if there
-        is an object.
-        """
+    def margins(self, samples: Mapping[int, ObjectSample]) -> dict[int, float]:
+        """Margins of the objects of one state, in logits. Costs a pass if there is an object."""
         if not samples:
             return {}
-        look = self.camera.see(next(iter(samples.values())).exposure)
-        return {index: margin_in(look, index) for index in samples}
+        outcome = self.camera.detect(next(iter(samples.values())).image)
+        return {index: object_margin(outcome, index) for index in samples}
 
 
-def margin_in(look: SampleOutcome, index: int) -> float:
-    """How far an object is from being lost in a look, in logits beyond t*: below 0 where it is not found."""
-    beyond = margin_of(Fault(Kind.MISSED, index, -1), torch.zeros(4), look)
-    assert beyond is not None
-    # A detection that meets two objects is one's alone: then what is best placed is not what is found.
-    return max(beyond, _LEAST) if bool(look.judged.found[index]) else min(beyond, -_LEAST)
+def object_margin(outcome: SampleOutcome, index: int) -> float:
+    """An object's margin in a sample, in logits: negative exactly where it is missed."""
+    margin = fault_margin(Fault(Kind.MISSED, index, -1), torch.zeros(4), outcome)
+    assert margin is not None
+    # A detection can overlap two objects but detects only one of them.
+    detected = bool(outcome.outcome.detected[index])
+    return max(margin, _MIN_ABS_MARGIN) if detected else min(margin, -_MIN_ABS_MARGIN)
 
 
-def described(objective: Objective, scene: SceneIR, exposure: Exposure, index: int) -> dict[str, float]:
-    """Features by name of an object of a scene, of which a picture was taken."""
+def describe_object(objective: Objective, scene: SceneIR, image: SampleImage, index: int) -> dict[str, float]:
+    """Compute an object's features.
+
+    Args:
+        objective: Scene and parameters.
+        scene: The state.
+        image: Its image and labels.
+        index: The object.
+
+    Returns:
+        Values by name: `IMAGE_FEATURES`, `POSE_FEATURES`, and the codes and changes of the parameters in use.
+    """
     objects, environment, space = scene.objects, scene.environment, objective.space
-    box = exposure.targets.boxes_xyxy[None, index : index + 1]
-    seen = features_of(exposure.picture[None], box.to(exposure.picture), SEEN)[:, 0, 0].tolist()
-    found: dict[str, float] = dict(zip(SEEN, seen, strict=True))
-    found["distance_m"] = float(objects.translation[index, 2])
-    found["yaw_deg"] = math.degrees(math.remainder(float(objects.yaw[index]), 2 * math.pi))
+    box = image.targets.boxes_xyxy[None, index : index + 1]
+    image_values = compute_features(image.image[None], box.to(image.image), IMAGE_FEATURES)[:, 0, 0].tolist()
+    features: dict[str, float] = dict(zip(IMAGE_FEATURES, image_values, strict=True))
+    features["distance_m"] = float(objects.translation[index, 2])
+    features["yaw_deg"] = math.degrees(math.remainder(float(objects.yaw[index]), 2 * math.pi))
     codes = {
         Parameter.COLOR: objects.texture_code[index],
         Parameter.WEATHER: environment.weather,
@@ -195,23 +234,23 @@ def described(objective: Objective, scene: SceneIR, exposure: Exposure, index: i
     }
     for parameter, values in codes.items():
         if parameter in space.params:
-            found |= dict(zip(SPECS[parameter].names, values.tolist(), strict=True))
+            features |= dict(zip(SPECS[parameter].names, values.tolist(), strict=True))
     if Parameter.TRANSLATE in space.params:
-        found["moved_m"] = float((objects.translation[index] - space.scene.objects.translation[index]).norm())
+        features["moved_m"] = float((objects.translation[index] - space.scene.objects.translation[index]).norm())
     if Parameter.SIZE in space.params:
         still = space.scene.objects.size_lhw[index]
-        found["grown_percent"] = 100 * float((objects.size_lhw[index] / still).mean() - 1)
-    return found
+        features["grown_percent"] = 100 * float((objects.size_lhw[index] / still).mean() - 1)
+    return features
 
 
-def _halton(dimensions: int, name: str) -> QMCEngine:
-    from scipy.stats import qmc  # on use: it takes a third of a second to load
+def _make_halton(dimensions: int, name: str) -> QMCEngine:
+    from scipy.stats import qmc  # imported on use: it takes a third of a second
 
     return qmc.Halton(dimensions, scramble=True, rng=np.random.default_rng(zlib.crc32(name.encode())))
 
 
-def _nth(known: list[Floats], sequence: QMCEngine, number: int) -> Floats:
-    """The number-th place of a sequence, of which some are known."""
-    while len(known) <= number:
-        known.append(sequence.random(1)[0])
-    return known[number]
+def _sequence_point(points: list[Floats], sequence: QMCEngine, number: int) -> Floats:
+    """The point of that number; `points` caches those drawn so far."""
+    while len(points) <= number:
+        points.append(sequence.random(1)[0])
+    return points[number]

@@ -1,8 +1,8 @@
-"""What a camera does between two frames, and what nobody could set up more exactly: draws of it.
+"""Nuisances: what a camera changes between two frames, and what nobody could set up more exactly.
 
-A draw is a set of numbers, made from a name and a number alone, so that it can be made again: `Nuisances.draw`. It
-is applied to a picture (`Draw.picture`, differentiable), to boxes in it (`Draw.boxes`) and to the scene
-before it is rendered (`Draw.scene`).
+A sample is a set of numbers that follows from a stream's name and a number alone, so it can be drawn again
+(`Nuisances.sample`). It applies to an image (`NuisanceSample.degrade_image`, differentiable), to boxes in it
+(`NuisanceSample.transform_boxes`), and to the scene before it is rendered (`NuisanceSample.perturb_scene`).
 """
 
 from __future__ import annotations
@@ -21,41 +21,49 @@ from torch.autograd.function import once_differentiable
 
 from drivesem.attack.space import ground_axes
 from drivesem.config.errors import UsageError
-from drivesem.failures.banded import Matrix, Separable
-from drivesem.failures.jpeg import Codec
+from drivesem.failures.jpeg import DifferentiableJpeg
+from drivesem.failures.separable import Matrix, SeparableMap
 from scene_ir.types import LATTICE, SceneIR
 
-_GENTLEST_JPEG = 95
-_DARKEST = 1e-6
-"""Of a picture's values before gamma: it has a slope there."""
-_PART = 1 << 17
-"""Numbers that a processor's second cache holds: one operation after the other on so many, not on all."""
-_TAPS, _REACH = 2, 2.5
-"""Pixels either way that a blur takes at least, and standard deviations of a wide one."""
-_NOTHING = 1e-9
-"""Weight beside the largest that a picture does not show; products with subnormal ones take ten times as long."""
+_MAX_JPEG_QUALITY = 95
+_MIN_VALUE = 1e-6
+"""Smallest pixel value before gamma, where it still has a slope."""
+_CHUNK = 1 << 17
+"""Values that fit into a CPU's second-level cache: all operations run on one chunk before the next."""
+_MIN_TAPS, _BLUR_DEVIATIONS = 2, 2.5
+"""Pixels either way that a blur covers at least; standard deviations that a wide one covers."""
+_MIN_WEIGHT = 1e-9
+"""Blur weights below this are zero: they change no pixel, and products with subnormal ones take ten times as
+long."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nuisances:
-    """Ranges; each is switched off by 0. Of the camera: shift_px, of the frame either way, along both axes; scale,
-    about the picture's centre, +-; gain, +- of brightness; gamma, +- of the exponent's logarithm; noise, standard
-    deviation in levels of 255; blur_px, the largest standard deviation; jpeg, the lowest quality (the highest is
-    95). Of what a person could set up again: position_m along and across, angle_deg, size (share), code, either
-    way.
+    """Ranges of the nuisances; 0 switches one off. The first seven belong to the camera, the others to the scene.
     """
 
     shift_px: float = 15.0
+    """Largest shift of the frame either way along both axes."""
     scale: float = 0.03
+    """Largest zoom about the image's centre, either way."""
     gain: float = 0.05
+    """Largest relative change of brightness, either way."""
     gamma: float = 0.05
+    """Largest change of the logarithm of the tone exponent, either way."""
     noise: float = 2.0
+    """Standard deviation of the noise, in levels of 255."""
     blur_px: float = 0.7
+    """Largest standard deviation of the blur."""
     jpeg: float = 75.0
+    """Lowest JPEG quality; the highest is 95."""
     position_m: float = 0.05
+    """Largest move of a vehicle along and across its heading, either way."""
     angle_deg: float = 1.0
+    """Largest turn of a vehicle, either way."""
     size: float = 0.01
+    """Largest relative change of a vehicle's size, either way."""
     code: float = 0.02
+    """Largest change of a paint, weather or foliage code, either way."""
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -66,14 +74,14 @@ class Nuisances:
                 raise UsageError(f"--nuisances: {entry.name}", expected, value)
 
     @classmethod
-    def of(cls, text: str) -> Nuisances:
-        """Of `NAME=VALUE` with commas; what is not named keeps its default, `off` is none of all.
+    def parse(cls, text: str) -> Nuisances:
+        """Parse comma-separated `NAME=VALUE`; unnamed ranges keep their defaults, `off` switches all off.
 
-        Raises UsageError naming the setting.
+        Raises:
+            UsageError: A name or value is wrong.
         """
-        none = cls(**{entry.name: 0.0 for entry in fields(cls)})
         if text in ("default", "off"):
-            return cls() if text == "default" else none
+            return cls() if text == "default" else cls(**{entry.name: 0.0 for entry in fields(cls)})
         known = [entry.name for entry in fields(cls)]
         ranges: dict[str, float] = {}
         for part in text.split(","):
@@ -88,12 +96,25 @@ class Nuisances:
             ranges[name] = number
         return replace(cls(), **ranges)
 
-    def draw(self, stream: str, number: int, scene: SceneIR) -> Draw:
-        """The number-th draw of a stream, which its name alone decides, for this scene's picture and objects."""
-        return self.of_picture(stream, number, (scene.camera.height, scene.camera.width), len(scene.objects))
+    def sample(self, stream: str, number: int, scene: SceneIR) -> NuisanceSample:
+        """Draw a sample for a scene's image and objects.
 
-    def of_picture(self, stream: str, number: int, hw: tuple[int, int], count: int = 0) -> Draw:
-        """The same of any picture, in which so many objects may be moved."""
+        Args:
+            stream: Name of the stream.
+            number: Number of the sample in it.
+            scene: Scene of N objects.
+        """
+        return self.sample_for_image(stream, number, (scene.camera.height, scene.camera.width), len(scene.objects))
+
+    def sample_for_image(self, stream: str, number: int, hw: tuple[int, int], count: int = 0) -> NuisanceSample:
+        """Draw a sample for any image.
+
+        Args:
+            stream: Name of the stream.
+            number: Number of the sample in it.
+            hw: Height and width of the image, px.
+            count: Number of objects that may move.
+        """
         seed = int.from_bytes(hashlib.sha256(f"{stream}:{number}".encode()).digest()[:8], "big") >> 1
         generator = torch.Generator().manual_seed(seed)
 
@@ -103,8 +124,8 @@ class Nuisances:
         camera = uniform(7).tolist()
         position, angle, size = uniform(count, 2), uniform(count), uniform(count)
         paint, weather, foliage = uniform(count, 5), uniform(4), uniform(3)
-        quality = self.jpeg + (_GENTLEST_JPEG - self.jpeg) * (camera[6] + 1) / 2
-        return Draw(
+        quality = self.jpeg + (_MAX_JPEG_QUALITY - self.jpeg) * (camera[6] + 1) / 2
+        return NuisanceSample(
             hw=hw,
             shift_px=(self.shift_px * camera[0], self.shift_px * camera[1]),
             zoom=1 + self.scale * camera[2],
@@ -124,112 +145,121 @@ class Nuisances:
 
 
 class NoiseField:
-    """Standard normal numbers of a seed, made when they are first asked for and kept: a search goes round in a few
-    draws, and random numbers take longer than all else that is done to a picture.
+    """Standard normal noise from a seed, drawn once and cached: a search cycles through a few samples, and random
+    numbers take longer than everything else that is done to an image.
     """
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
-        self._kept: Tensor | None = None
+        self._values: Tensor | None = None
 
-    def of(self, image: Tensor) -> Tensor:
-        """As many as an image has, of its dtype."""
-        if self._kept is None or self._kept.shape != image.shape:
-            self._kept = torch.randn(image.shape, generator=torch.Generator().manual_seed(self._seed))
-        return self._kept.to(image)
+    def like(self, image: Tensor) -> Tensor:
+        """Noise of an image's shape, dtype and device."""
+        if self._values is None or self._values.shape != image.shape:
+            self._values = torch.randn(image.shape, generator=torch.Generator().manual_seed(self._seed))
+        return self._values.to(image)
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
-    """One draw. hw: of the picture; jpeg: quality, None for none; noise: standard deviation of RGB in [0, 1].
-    position_m (N, 2), along and across each car; angle (N,) rad; size (N,), a share; paint (N, 5), weather (4,),
-    foliage (3,): changes of codes.
-    """
+class NuisanceSample:
+    """One sample of the nuisances, for an image and N objects."""
 
     hw: tuple[int, int]
+    """Height and width of the image, px."""
     shift_px: tuple[float, float]
+    """Shift to the right and downwards."""
     zoom: float
+    """Magnification about the centre."""
     gain: float
+    """Factor on brightness."""
     gamma: float
+    """Tone exponent."""
     blur_px: float
+    """Standard deviation of the blur."""
     jpeg: int | None
+    """JPEG quality, 1 to 100; None for none."""
     noise: float
+    """Standard deviation of the noise, RGB in [0, 1]."""
     noise_field: NoiseField
+    """Standard normal numbers."""
     position_m: Tensor
+    """(N, 2) moves along and across each vehicle's heading."""
     angle: Tensor
+    """(N,) rad, turns."""
     size: Tensor
+    """(N,) relative changes of size."""
     paint: Tensor
+    """(N, 5) changes of texture codes."""
     weather: Tensor
+    """(4,) changes of the weather code."""
     foliage: Tensor
+    """(3,) changes of the foliage code."""
 
-    def scene(self, scene: SceneIR) -> SceneIR:
-        """A scene set up again: each car a little off on the ground, the codes too, but for codes at 0, which are
-        as photographed and stay so.
+    def perturb_scene(self, scene: SceneIR) -> SceneIR:
+        """Set the scene up again: move each vehicle a little on the ground and change the codes. Codes of 0, which
+        mean as photographed, stay 0.
         """
         objects, environment = scene.objects, scene.environment
         axes = ground_axes(objects.yaw, torch.ones_like(objects.yaw), environment.ground)
         moved = objects.translation + (self.position_m.to(axes)[:, :, None] * axes).sum(dim=1)
         yaw = objects.yaw + self.angle.to(axes)
-        grown = objects.ffd + self.size.to(axes)[:, None, None] * _AT_REST.to(axes)
+        grown = objects.ffd + self.size.to(axes)[:, None, None] * _LATTICE_POINTS.to(axes)
         return scene.with_objects(
-            translation=moved, yaw=yaw, ffd=grown, texture_code=_nudged(objects.texture_code, self.paint, -1)
+            translation=moved, yaw=yaw, ffd=grown, texture_code=_perturb_code(objects.texture_code, self.paint, -1)
         ).with_environment(
-            weather=_nudged(environment.weather, self.weather, 0),
-            foliage=_nudged(environment.foliage, self.foliage, -1),
+            weather=_perturb_code(environment.weather, self.weather, 0),
+            foliage=_perturb_code(environment.foliage, self.foliage, -1),
         )
 
-    def picture(self, image: Tensor) -> Tensor:
-        """What the camera makes of a picture (3, H, W) in [0, 1], on the 8-bit grid but where it carries a
-        gradient.
+    def degrade_image(self, image: Tensor) -> Tensor:
+        """Apply the camera's nuisances to an image (3, H, W) in [0, 1]; border pixels are replicated.
 
-        Differentiable: JPEG is `jpeg.Codec`'s then, libjpeg's otherwise. Beyond the border, the last pixels go on.
+        An image that requires a gradient gets it, with JPEG by `jpeg.DifferentiableJpeg`. Others are rounded to
+        8 bits, with JPEG by libjpeg.
         """
-        here = image
+        result = image
         if self.shift_px != (0, 0) or self.zoom != 1 or self.blur_px > 0:
-            here = _lens(self.hw, self.shift_px, self.zoom, self.blur_px, image.dtype, image.device)(here)
-        noise = self.noise_field.of(image) if self.noise else None
-        here = _Developed.apply(here, self.gain, self.gamma, self.noise, noise)
-        assert isinstance(here, Tensor)
+            warp = _warp_and_blur(self.hw, self.shift_px, self.zoom, self.blur_px, image.dtype, image.device)
+            result = warp(result)
+        noise = self.noise_field.like(image) if self.noise else None
+        result = _ToneAndNoise.apply(result, self.gain, self.gamma, self.noise, noise)
+        assert isinstance(result, Tensor)
         if image.requires_grad:
-            return here if self.jpeg is None else Codec.of(self.hw, self.jpeg, image)(here)
-        levels = (255 * here).round_()
-        return (levels if self.jpeg is None else _jpeg(levels, self.jpeg)).div_(255)
+            return result if self.jpeg is None else DifferentiableJpeg.create(self.hw, self.jpeg, image)(result)
+        levels = (255 * result).round_()
+        return (levels if self.jpeg is None else _encode_and_decode_jpeg(levels, self.jpeg)).div_(255)
 
-    def boxes(self, boxes_xyxy: Tensor) -> Tensor:
-        """Where boxes (M, 4) px of the picture are in what the camera makes of it, cut at its border."""
-        matrix = self._matrix(boxes_xyxy[None, :0])[0]
-        corners = boxes_xyxy.reshape(-1, 2) @ matrix[:, :2].T + matrix[:, 2]
+    def transform_boxes(self, boxes_xyxy: Tensor) -> Tensor:
+        """Where boxes (M, 4) px of the original image lie in the degraded one, clipped to its border."""
+        centre = [(self.hw[1] - 1) / 2, (self.hw[0] - 1) / 2]
+        offset = [c - self.zoom * c + s for c, s in zip(centre, self.shift_px, strict=True)]
+        matrix = boxes_xyxy.new_tensor([[self.zoom, 0.0], [0.0, self.zoom]])
+        corners = boxes_xyxy.reshape(-1, 2) @ matrix.T + boxes_xyxy.new_tensor(offset)
         limit = boxes_xyxy.new_tensor([self.hw[1] - 1.0, self.hw[0] - 1.0])
         return torch.minimum(corners.clamp_min(0), limit).reshape(-1, 4)
 
-    def _matrix(self, like: Tensor) -> Tensor:
-        """(1, 2, 3): pixels of the picture to those of the draw."""
-        centre = [(self.hw[1] - 1) / 2, (self.hw[0] - 1) / 2]
-        move = [c - self.zoom * c + s for c, s in zip(centre, self.shift_px, strict=True)]
-        return like.new_tensor([[[self.zoom, 0.0, move[0]], [0.0, self.zoom, move[1]]]])
 
-
-def _nudged(code: Tensor, change: Tensor, low: float) -> Tensor:
+def _perturb_code(code: Tensor, change: Tensor, low: float) -> Tensor:
     return torch.where(code == 0, code, (code + change.to(code)).clamp(low, 1))
 
 
-class _Developed(torch.autograd.Function):
-    """Gain and gamma of an image, noise of that standard deviation from a field, and what is left in [0, 1]."""
+class _ToneAndNoise(torch.autograd.Function):
+    """Apply gain and gamma to an image, add scaled noise, and clip to [0, 1]."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, gain: float, gamma: float, noise: float, field: Tensor | None) -> Tensor:
         result, toned = image.clone(memory_format=torch.contiguous_format), gain != 1 or gamma != 1
-        noises = [None] if field is None else field.flatten().split(_PART)
-        parts = result.flatten().split(result.numel() if field is None else _PART)
+        noises = [None] if field is None else field.flatten().split(_CHUNK)
+        parts = result.flatten().split(result.numel() if field is None else _CHUNK)
         for part, random in zip(parts, noises, strict=True):
             if toned:
-                part.clamp_(_DARKEST, 1).log_().mul_(gamma).exp_().mul_(gain)
+                part.clamp_(_MIN_VALUE, 1).log_().mul_(gamma).exp_().mul_(gain)
             if random is not None:
                 part.add_(random, alpha=noise)
         if ctx.needs_input_grad[0]:
             slope = ((result >= 0) & (result <= 1)).to(image)
             if toned:
-                known = image.clamp(_DARKEST, 1)
+                known = image.clamp(_MIN_VALUE, 1)
                 slope.mul_(known == image).mul_(known.log_().mul_(gamma - 1).exp_().mul_(gain * gamma))
             ctx.save_for_backward(slope)
         return result.clamp_(0, 1)
@@ -244,28 +274,30 @@ class _Developed(torch.autograd.Function):
 
 
 @lru_cache(maxsize=32)
-def _lens(
+def _warp_and_blur(
     hw: tuple[int, int],
     shift_px: tuple[float, float],
     zoom: float,
     blur_px: float,
     dtype: torch.dtype,
     device: torch.device,
-) -> Separable:
-    """The frame moved and enlarged about its centre, by linear interpolation, then blurred."""
-    rows, columns = (_seen(size, shift, zoom, blur_px) for size, shift in zip(hw, reversed(shift_px), strict=True))
-    return Separable.of(rows, columns, torch.empty(0, dtype=dtype, device=device))
+) -> SeparableMap:
+    """Shift the frame and magnify it about its centre, by linear interpolation, then blur it."""
+    rows, columns = (
+        _warp_and_blur_axis(size, shift, zoom, blur_px) for size, shift in zip(hw, reversed(shift_px), strict=True)
+    )
+    return SeparableMap.from_dense(rows, columns, torch.empty(0, dtype=dtype, device=device))
 
 
-def _seen(size: int, shift_px: float, zoom: float, blur_px: float) -> Matrix:
-    """The same along one side: what each pixel (size,) is made of."""
+def _warp_and_blur_axis(size: int, shift_px: float, zoom: float, blur_px: float) -> Matrix:
+    """The same along one axis: a matrix (size, size) from input to output pixels."""
     middle, pixels = (size - 1) / 2, np.arange(size)
     place = np.clip((pixels - middle - shift_px) / zoom + middle, 0, size - 1)
     first = np.minimum(np.floor(place).astype(np.int64), size - 2)
-    reach = max(_TAPS, math.ceil(_REACH * blur_px))
+    reach = max(_MIN_TAPS, math.ceil(_BLUR_DEVIATIONS * blur_px))
     taps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (taps / blur_px) ** 2) if blur_px > 0 else (taps == 0).astype(np.float64)
-    weights[weights < _NOTHING] = 0
+    weights[weights < _MIN_WEIGHT] = 0
     matrix = np.zeros((size, size))
     for tap, weight in zip(taps, weights / weights.sum(), strict=True):
         source = np.clip(pixels + tap, 0, size - 1)
@@ -274,14 +306,14 @@ def _seen(size: int, shift_px: float, zoom: float, blur_px: float) -> Matrix:
     return matrix
 
 
-def _jpeg(levels: Tensor, quality: int) -> Tensor:
-    """Levels (3, H, W) in [0, 255] through libjpeg."""
+def _encode_and_decode_jpeg(levels: Tensor, quality: int) -> Tensor:
+    """Encode and decode levels (3, H, W) in [0, 255] by libjpeg."""
     red, green, blue = levels.to(torch.uint8).cpu().numpy()
     packed = cv2.imencode(".jpg", cv2.merge((blue, green, red)), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     decoded = cv2.split(cv2.imdecode(packed, cv2.IMREAD_COLOR))  # pyright: ignore[reportArgumentType, reportCallIssue]
     return torch.from_numpy(np.stack(decoded[::-1])).to(levels)
 
 
-_AT_REST = torch.cartesian_prod(*(torch.linspace(0, 1, n) for n in LATTICE)) - torch.tensor([0.5, 1.0, 0.5])
-"""Where the lattice points (64, 3) lie in the unit box: offsets in proportion make a car larger about the middle
-of its bottom face."""
+_LATTICE_POINTS = torch.cartesian_prod(*(torch.linspace(0, 1, n) for n in LATTICE)) - torch.tensor([0.5, 1.0, 0.5])
+"""(64, 3) lattice points in the unit box, from the middle of the bottom face: offsets in proportion to them resize
+a vehicle about that point."""

@@ -16,8 +16,8 @@ from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.bench.scenes import bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.views import NuisanceMarginOracle
 from drivesem.run.frame import FrameSettings, attack_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -94,7 +94,7 @@ def _parts(
     objective = Objective(compositor, space, detector)
     views, feasible = NuisanceMarginOracle.for_objective(objective, Nuisances(), "bench"), objective.feasible_set()
     generator = torch.Generator().manual_seed(seed)
-    weights = torch.ones(len(views.judged))
+    weights = torch.ones(len(views.counted_objects))
     times: dict[str, list[float]] = {}
     for i in range(repetitions + _DRAWS):
         share = torch.rand(space.dim, generator=generator).to(space.lower)

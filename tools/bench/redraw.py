@@ -22,8 +22,8 @@ from torch import Tensor
 from detectors.base import Predictor
 from detectors.registry import load_predictor
 from drivesem.bench.tables import Columns
-from drivesem.failures.second_renderer.photograph import PhotographRedraw
-from drivesem.report.drawing import PAPER, write_text
+from drivesem.failures.second_renderer.photograph import PhotographRenderer
+from drivesem.report.drawing import PAPER_COLOUR, write_text
 from drivesem.run.workers import run_jobs
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
@@ -112,16 +112,16 @@ def judge(
     height = objects.box2d[:, 3] - objects.box2d[:, 1]
     judged = [i for i in cars if height[i] >= LEAST_HEIGHT_PX and objects.occlusion[i] <= MOST_OCCLUSION]
     start = time.process_time()
-    second = PhotographRedraw(name, scene)
+    second = PhotographRenderer(name, scene)
     made = time.process_time()
-    drawn = second.redraw(scene)
+    drawn = second.render(scene)
     ended = time.process_time()
     compositor, eye = Compositor(scene), Eye(predictor)
     ours = compositor.render(scene)
     moves = Moves(scene, cars, rng)
     together = moves.together()
     ours_moved = compositor.render(together.scene)
-    moved = second.redraw(together.scene)
+    moved = second.render(together.scene)
     row_of_moved = [i for i in judged if i in moves.in_crowd]
     first = [eye.look(image, objects.box2d) for image in (scene.photograph, ours.image, drawn.image)]
     then = [eye.look(image, together.boxes_xyxy) for image in (ours_moved.image, moved.image)]
@@ -182,7 +182,7 @@ def _sheet(name: str, pictures: Sequence[np.ndarray]) -> np.ndarray:
     titles = (f"{name}, photograph", "pyrender, without a change", "ours, cars moved", "pyrender, cars moved")
     cells = []
     for title, picture in zip(titles, pictures, strict=True):
-        cell = np.full((picture.shape[0] + 26, picture.shape[1], 3), PAPER, np.uint8)
+        cell = np.full((picture.shape[0] + 26, picture.shape[1], 3), PAPER_COLOUR, np.uint8)
         cell[26:] = picture
         write_text(cell, (4, 2), title)
         cells.append(cell)

@@ -14,35 +14,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from drivesem.failures.second_renderer.placing import Body, Lens, Pose, numbers
-from drivesem.failures.second_renderer.screen import SUPERSAMPLING, Alone, Array, Window
+from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose, to_numpy
+from drivesem.failures.second_renderer.opengl import SUPERSAMPLING, Array, ImageWindow, ObjectDepth
 from scene_ir.types import Part, Source
 
 Mask = NDArray[np.bool_]
 
-_DENSITY = 1.3
+_TEXELS_PER_PIXEL = 1.3
 """Texels a pixel of the photograph."""
-_SIDES = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 64, 80, 96])
+_PATCH_SIZES = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 64, 80, 96])
 """Texels along a triangle's edge that a patch may have."""
 _PAD = 1
 """Texels around a patch, so that interpolation at its edge meets its own."""
-_ATLAS = 512
-_SQUARE = (0.0, 0.08)
+_ATLAS_WIDTH = 512
+_FACING_RANGE = (0.0, 0.08)
 """Cosine towards the camera at which the photograph begins to tell of a surface, and tells all."""
 _FAR_M = 1e6
-_BEHIND_M = 0.15
+_SELF_OCCLUSION_M = 0.15
 """A point this much behind what is seen there is hidden by its own vehicle."""
-_SHOWN, _SOLID = 0.5, 0.95
+_MIN_OPACITY, _OPAQUE = 0.5, 0.95
 """Opacity from which on the photograph shows a vehicle, and its own colours."""
-_ENOUGH = 0.3
+_MIN_OPAQUE_SHARE = 0.3
 """Share of the pixels that show it which are to have its own colours, for others to take theirs."""
 _BLUR_PX = 1.5
 """Colours that are drawn out over the outline would be stripes."""
-_BEYOND = (2.0, 0.03)
+_EXTRAPOLATION = (2.0, 0.03)
 """How far beyond those pixels their colours are drawn out: pixels, and a share of the vehicle's height on top."""
-_TOLD = 0.9
+_MIN_FILL_WEIGHT = 0.9
 """How far a texel is seen, or is paint, that stands for those of its part that never were."""
-_UNSEEN = {
+_DEFAULT_COLOURS = {
     Part.PAINT: (0.45, 0.45, 0.45), Part.GLASS: (0.16, 0.17, 0.18), Part.TYRE: (0.09, 0.09, 0.09),
     Part.LIGHT: (0.55, 0.5, 0.48), Part.OTHER: (0.16, 0.16, 0.16),
 }  # fmt: skip
@@ -50,15 +50,15 @@ _UNSEEN = {
 
 
 @dataclass(frozen=True, slots=True)
-class Atlas:
+class TextureAtlas:
     """uv: (3F, 2), see `screen.Skin`; colour: (h, w, 3) in [0, 1]; paint: (h, w), how much of a texel is paint;
     height: (h, w), 0 at the vehicle's foot, 1 at its roof; base: (3,), the paint's own colour."""
 
     uv: Array
     colour: Array
-    paint: Array
+    paint_share: Array
     height: Array
-    base: Array
+    paint_colour: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class _Layout:
     size: tuple[int, int]
 
 
-class Photographed:
+class BakedAppearance:
     """What a photograph tells of one vehicle: its colours, drawn out beyond its outline, and where they stop.
 
     hidden: (H, W), where something nearer stands.
@@ -81,13 +81,13 @@ class Photographed:
 
     def __init__(self, source: Source, hidden: Mask) -> None:
         crop = source.foreground
-        rgba = numbers(crop.values).transpose(1, 2, 0)
+        rgba = to_numpy(crop.values).transpose(1, 2, 0)
         height, width = rgba.shape[:2]
         rows, columns = slice(crop.y0, crop.y0 + height), slice(crop.x0, crop.x0 + width)
-        shown = (rgba[..., 3] > _SHOWN) & ~hidden[rows, columns]
+        shown = (rgba[..., 3] > _MIN_OPACITY) & ~hidden[rows, columns]
         # At its border a matte mixes in what lies behind.
-        solid = cv2.erode((shown & (rgba[..., 3] > _SOLID)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        solid = solid if np.count_nonzero(solid) > _ENOUGH * np.count_nonzero(shown) else shown
+        solid = cv2.erode((shown & (rgba[..., 3] > _OPAQUE)).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        solid = solid if np.count_nonzero(solid) > _MIN_OPAQUE_SHARE * np.count_nonzero(shown) else shown
         self.known = bool(solid.any())
         self._origin = np.array([crop.x0, crop.y0], np.float32)
         straight = (rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-3)).astype(np.float32)
@@ -101,18 +101,18 @@ class Photographed:
             self._colour = np.where(solid[..., None], drawn_out, soft).astype(np.float32)
         self._paint = None if source.region is None else source.region
         tall = int(np.count_nonzero(solid.any(axis=1)))
-        self.reach = _BEYOND[0] + _BEYOND[1] * tall
+        self.reach = _EXTRAPOLATION[0] + _EXTRAPOLATION[1] * tall
 
     def colour(self, at: Array) -> Array:
         """(T, 3) at pixels (T, 2)."""
-        return np.clip(_sampled(self._colour, at - self._origin, cv2.INTER_CUBIC), 0, 1)
+        return np.clip(_sample_image(self._colour, at - self._origin, cv2.INTER_CUBIC), 0, 1)
 
-    def share(self, at: Array) -> Array:
+    def visibility(self, at: Array) -> Array:
         """How far (T,) in [0, 1] pixels (T, 2) show the vehicle: 0 beyond the reach of its colours."""
         limit = np.array(self._beyond.shape[::-1], np.float32) - 1
         local = at - self._origin
         outside = np.abs(local - np.clip(local, 0, limit)).max(axis=1)
-        beyond = _sampled(self._beyond, local, cv2.INTER_LINEAR) + outside
+        beyond = _sample_image(self._beyond, local, cv2.INTER_LINEAR) + outside
         return np.clip(2 - beyond / self.reach, 0, 1)
 
     def paint(self, at: Array) -> Array | None:
@@ -120,15 +120,17 @@ class Photographed:
         if self._paint is None:
             return None
         local = at - np.array([self._paint.x0, self._paint.y0], np.float32)
-        return _sampled(numbers(self._paint.values)[0], local, cv2.INTER_LINEAR)
+        return _sample_image(to_numpy(self._paint.values)[0], local, cv2.INTER_LINEAR)
 
 
-def bake(body: Body, source: Source, seen: Photographed, lens: Lens, alone: Alone | None) -> Atlas:
+def bake_atlas(
+    body: BodyMesh, source: Source, seen: BakedAppearance, lens: PictureCamera, alone: ObjectDepth | None
+) -> TextureAtlas:
     """The atlas of one vehicle as its photograph shows it. alone: its mesh there; None where it is not in it."""
-    pose = Pose.photographed(source)
-    placed, other = body.placed(pose, lens), body.placed(pose, lens, mirrored=True)
-    squares = [_facing(placed), _facing(other, turned=True)]
-    layout = laid_out(*_edges((placed, other), squares, lens))
+    pose = VehiclePose.from_source(source)
+    placed, other = body.place(pose, lens), body.place(pose, lens, mirrored=True)
+    squares = [_facing_cosine(placed), _facing_cosine(other, turned=True)]
+    layout = pack_patches(*_patch_sizes((placed, other), squares, lens))
     shown = np.zeros(len(layout.face), np.float32)
     colour = np.zeros((len(layout.face), 3), np.float32)
     paint = (body.part == Part.PAINT)[layout.face].astype(np.float32)
@@ -137,16 +139,22 @@ def bake(body: Body, source: Source, seen: Photographed, lens: Lens, alone: Alon
         # The photograph's own side first; the other one where that tells nothing.
         for corners, square in zip((placed, other), squares, strict=True):
             points = np.einsum("tk,tkc->tc", layout.weights, corners[layout.face])
-            at = lens.pixels(points)
-            weight = np.clip((square[layout.face] - _SQUARE[0]) / (_SQUARE[1] - _SQUARE[0]), 0, 1)
-            weight = weight * seen.share(at) * (points[:, 2] <= _at(depth, at, alone.window) + _BEHIND_M)
+            at = lens.project(points)
+            weight = np.clip(
+                (square[layout.face] - _FACING_RANGE[0]) / (_FACING_RANGE[1] - _FACING_RANGE[0]), 0, 1
+            )
+            weight = (
+                weight
+                * seen.visibility(at)
+                * (points[:, 2] <= _lookup_in_window(depth, at, alone.window) + _SELF_OCCLUSION_M)
+            )
             weight = weight * (points[:, 2] > 0) * (1 - shown)
             colour += weight[:, None] * seen.colour(at)
             told = seen.paint(at)
             if told is not None:
                 paint += weight * (told - paint)
             shown += weight
-    filled = _completed(body, layout, colour, shown, paint)
+    filled = _median_colours(body, layout, colour, shown, paint)
     colour += (1 - shown)[:, None] * filled[layout.face]
     unit = np.einsum("tk,tk->t", layout.weights, body.unit[layout.face][..., 1])
 
@@ -155,21 +163,23 @@ def bake(body: Body, source: Source, seen: Photographed, lens: Lens, alone: Alon
         out[layout.row, layout.column] = values
         return out
 
-    return Atlas(layout.uv, spread(colour), spread(paint), spread(np.clip(-unit, 0, 1)), numbers(source.paint))
+    return TextureAtlas(
+        layout.uv, spread(colour), spread(paint), spread(np.clip(-unit, 0, 1)), to_numpy(source.paint)
+    )
 
 
-def _completed(body: Body, layout: _Layout, colour: Array, shown: Array, paint: Array) -> Array:
+def _median_colours(body: BodyMesh, layout: _Layout, colour: Array, shown: Array, paint: Array) -> Array:
     """Colours (F, 3) of triangles that were never seen: their part's median. Lamps and plates that the mesh takes
     for paint are no paint by the photograph."""
     filled = np.empty((len(body.part), 3), np.float32)
     for part in Part:
-        told = (body.part == part)[layout.face] & (shown > _TOLD)
-        told &= (paint > _TOLD) | (part != Part.PAINT)
-        filled[body.part == part] = np.median(colour[told], axis=0) if told.any() else _UNSEEN[part]
+        told = (body.part == part)[layout.face] & (shown > _MIN_FILL_WEIGHT)
+        told &= (paint > _MIN_FILL_WEIGHT) | (part != Part.PAINT)
+        filled[body.part == part] = np.median(colour[told], axis=0) if told.any() else _DEFAULT_COLOURS[part]
     return filled
 
 
-def _facing(placed: Array, turned: bool = False) -> Array:
+def _facing_cosine(placed: Array, turned: bool = False) -> Array:
     """Cosine (F,) towards the camera of triangles (F, 3, 3) m. turned: they wind the other way round."""
     normal = np.cross(placed[:, 1] - placed[:, 0], placed[:, 2] - placed[:, 0])
     middle = placed.mean(axis=1)
@@ -178,8 +188,8 @@ def _facing(placed: Array, turned: bool = False) -> Array:
     return -cos if turned else cos
 
 
-def _edges(
-    sides: tuple[Array, Array], squares: list[Array], lens: Lens
+def _patch_sizes(
+    sides: tuple[Array, Array], squares: list[Array], lens: PictureCamera
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The corner (F,) of each triangle that lies between its shorter edges, and texels (F, 2) along these: as many
     as the photograph has of it, or of the one on the other side.
@@ -187,34 +197,34 @@ def _edges(
     limit, rows = np.array([lens.width, lens.height]), np.arange(len(squares[0]))
     corner, pair = np.zeros(len(rows), np.int64), np.ones((len(rows), 2))
     for k, (corners, square) in enumerate(zip(sides, squares, strict=True)):
-        at = lens.pixels(corners)
+        at = lens.project(corners)
         length = np.linalg.norm(np.roll(at, -1, axis=1) - at, axis=2)
         if k == 0:
             # The edge from a corner leads to the next one: the longest lies opposite to the one after that.
             corner = (length.argmax(axis=1) + 2) % 3
-        shorter = np.stack([length[rows, corner], length[rows, (corner + 2) % 3]], axis=1) * _DENSITY
+        shorter = np.stack([length[rows, corner], length[rows, (corner + 2) % 3]], axis=1) * _TEXELS_PER_PIXEL
         seen = (square > 0) & (at.max(axis=1) > 0).all(axis=1) & (at.min(axis=1) < limit).all(axis=1)
         pair[seen] = np.maximum(pair[seen], shorter[seen])
-    return corner, _SIDES[np.searchsorted(_SIDES, np.minimum(pair, _SIDES[-1]))]
+    return corner, _PATCH_SIZES[np.searchsorted(_PATCH_SIZES, np.minimum(pair, _PATCH_SIZES[-1]))]
 
 
-def _shelved(edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+def _place_on_shelves(edges: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     """Upper left texels (F, 2) of patches, x and y, in rows of one height each; how high all are."""
     places, x, y, shelf = np.zeros((len(edges), 2), np.int64), 0, 0, 0
     for i in np.lexsort((edges[:, 0], edges[:, 1])).tolist():
         wide, tall = edges[i] + 1 + 2 * _PAD
-        if tall != shelf or x + wide > _ATLAS:
+        if tall != shelf or x + wide > _ATLAS_WIDTH:
             x, y, shelf = 0, y + shelf, int(tall)
         places[i] = x, y
         x += int(wide)
     return places, y + shelf
 
 
-def laid_out(corner: NDArray[np.int64], edges: NDArray[np.int64]) -> _Layout:
+def pack_patches(corner: NDArray[np.int64], edges: NDArray[np.int64]) -> _Layout:
     """Patches of so many texels along two edges, (F, 2), from a corner (F,); side by side."""
     faces, weights, rows, columns = [], [], [], []
     corners = np.zeros((len(edges), 3, 2), np.float32)
-    places, height = _shelved(edges)
+    places, height = _place_on_shelves(edges)
     for nu, nv in np.unique(edges, axis=0).tolist():
         mine = np.flatnonzero((edges == (nu, nv)).all(axis=1))
         x0, y0 = places[mine].T
@@ -230,7 +240,7 @@ def laid_out(corner: NDArray[np.int64], edges: NDArray[np.int64]) -> _Layout:
         columns.append((x0[:, None] + _PAD + u[None]).ravel())
         patch = np.array([(0, 0), (nu, 0), (0, nv)]) + _PAD
         corners[mine] = patch[own] + places[mine, None]
-    size = (height, _ATLAS)
+    size = (height, _ATLAS_WIDTH)
     uv = (corners + 0.5) / np.array([size[1], size[0]], np.float32)
     uv[..., 1] = 1 - uv[..., 1]
     return _Layout(
@@ -243,7 +253,7 @@ def laid_out(corner: NDArray[np.int64], edges: NDArray[np.int64]) -> _Layout:
     )
 
 
-def _at(drawn: Array, at: Array, window: Window) -> Array:
+def _lookup_in_window(drawn: Array, at: Array, window: ImageWindow) -> Array:
     """A drawn picture's values (T,) at pixels (T, 2); what lies beside the window is not hidden."""
     local = np.floor((at + 0.5 - np.array([window.x0, window.y0])) * SUPERSAMPLING).astype(int)
     inside = ((local >= 0) & (local < np.array(drawn.shape[::-1]))).all(axis=1)
@@ -251,7 +261,7 @@ def _at(drawn: Array, at: Array, window: Window) -> Array:
     return np.where(inside, drawn[local[:, 1], local[:, 0]], np.float32(_FAR_M))
 
 
-def _sampled(values: Array, at: Array, how: int) -> Array:
+def _sample_image(values: Array, at: Array, how: int) -> Array:
     """Values (T, ...) of a picture (h, w, ...) at its pixels (T, 2); its border goes on beyond it."""
     # OpenCV's pictures and maps have at most 32,767 columns.
     count, columns = len(at), 4096

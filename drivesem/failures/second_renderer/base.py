@@ -13,7 +13,7 @@ from scene_ir.types import SceneIR
 
 
 @dataclass(frozen=True, slots=True)
-class Redrawn:
+class SecondRender:
     """One picture of a second renderer.
 
     image: (3, H, W) RGB in [0, 1], on the 8-bit grid. targets: labels among `CLASSES`; the first N rows are the
@@ -23,7 +23,7 @@ class Redrawn:
 
     image: Tensor
     targets: Targets
-    shown_xyxy: Tensor
+    visible_xyxy: Tensor
 
 
 class SecondRenderer(Protocol):
@@ -32,12 +32,12 @@ class SecondRenderer(Protocol):
     @property
     def name(self) -> str: ...
 
-    def redraw(self, changed: SceneIR) -> Redrawn:
+    def render(self, changed: SceneIR) -> SecondRender:
         """A state of the scene. Raises SceneError where the change cannot be drawn."""
         ...
 
-    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
-        """What of a change `redraw` leaves out, in words; nothing where it draws it whole."""
+    def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
+        """What of a change `render` leaves out, in words; nothing where it draws it whole."""
         ...
 
 
@@ -45,6 +45,6 @@ class NoSecondRendererError(SceneError):
     """Nothing on this machine can draw the scene a second time; the message says what to install."""
 
     @classmethod
-    def of(cls, renderer: str, expected: str, error: BaseException) -> NoSecondRendererError:
+    def from_exception(cls, renderer: str, expected: str, error: BaseException) -> NoSecondRendererError:
         """What a library raised, on one line."""
         return cls(renderer, expected, " ".join(f"{type(error).__name__} {error}".split()))

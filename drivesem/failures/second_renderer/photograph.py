@@ -17,28 +17,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.types import CLASSES, Targets
-from drivesem.attack.contrast import contrasts
 from drivesem.attack.labels import Difficulty
-from drivesem.failures.second_renderer import weathering
-from drivesem.failures.second_renderer.baking import Atlas, Photographed, bake
-from drivesem.failures.second_renderer.base import Redrawn
-from drivesem.failures.second_renderer.placing import Body, Lens, Pose, numbers
-from drivesem.failures.second_renderer.screen import (
+from drivesem.attack.visibility import compute_contrasts
+from drivesem.failures.second_renderer import shading as weathering
+from drivesem.failures.second_renderer.baking import BakedAppearance, TextureAtlas, bake_atlas
+from drivesem.failures.second_renderer.base import SecondRender
+from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose, to_numpy
+from drivesem.failures.second_renderer.opengl import (
     SUPERSAMPLING,
-    Alone,
     Array,
-    Drawn,
-    Skin,
-    Window,
-    shared_screen,
+    ImageWindow,
+    ObjectDepth,
+    TexturedSurface,
+    WindowImage,
+    shared_context,
 )
-from drivesem.failures.second_renderer.shadows import Shadow
+from drivesem.failures.second_renderer.shading import GroundShadow
 from scene_ir.errors import RangeError
-from scene_ir.types import Crop, Front, Render, SceneIR, Source
+from scene_ir.types import Crop, Occluder, Render, SceneIR, Source
 
-_HALF = 0.5
+_MIN_SHARE = 0.5
 """Coverage from which on a pixel shows an object; share of its outline's hull that is to show."""
-_HIDES = 0.05
+_MIN_OCCLUDER_OPACITY = 0.05
 """Opacity from which on what stands nearer may colour a pixel."""
 
 
@@ -47,15 +47,15 @@ class _Vehicle:
     """What of a vehicle no change touches. texture: (h, w, 3) uint8, of its own paint; box_xyxy: (4,) px of its
     mesh as photographed, not cut at the border."""
 
-    body: Body
-    atlas: Atlas
+    body: BodyMesh
+    atlas: TextureAtlas
     texture: NDArray[np.uint8]
-    shadow: Shadow
+    shadow: GroundShadow
     box_xyxy: Array
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class _RenderedScene:
     """One state, drawn and composed. placed: (F, 3, 3) m of each vehicle; image: (H, W, 3) on the 8-bit grid;
     owner: (H, W), object + 1 by pixel; shares: (N,), how much of its outline's hull shows of each."""
 
@@ -65,7 +65,7 @@ class _State:
     shares: Array
 
 
-class PhotographRedraw:
+class PhotographRenderer:
     """Of one photograph's scene, whatever its state. Raises NoSecondRendererError where this machine has no
     OpenGL.
     """
@@ -77,28 +77,28 @@ class PhotographRedraw:
         identifier: str,
         scene: SceneIR,
         difficulty: Difficulty | None = None,
-        before: PhotographRedraw | None = None,
+        before: PhotographRenderer | None = None,
     ) -> None:
         """before: of the scene before vehicles were exchanged, which says how much of each is to show."""
-        still = scene.at_rest()
+        still = scene.unperturbed()
         self._identifier, self._still, self._difficulty = identifier, still, difficulty or Difficulty()
-        self._lens, self._screen = Lens.of(still.camera), shared_screen()
-        self._photograph, self._background = (_picture(p) for p in (still.photograph, still.background))
-        self._depth_m = numbers(still.depth)
-        self._air = weathering.air_of(self._photograph, numbers(still.environment.sky))
-        self._leaves = numbers(still.environment.foliage_map)
-        self._vehicles = [self._vehicle(source, i) for i, source in enumerate(still.objects.source)]
-        rest = self._state(still)
+        self._lens, self._screen = PictureCamera.from_camera(still.camera), shared_context()
+        self._photograph, self._background = (_to_image(p) for p in (still.photograph, still.background))
+        self._depth_m = to_numpy(still.depth)
+        self._air = weathering.estimate_air_colour(self._photograph, to_numpy(still.environment.sky))
+        self._leaves = to_numpy(still.environment.foliage_map)
+        self._vehicles = [self._make_vehicle(source, i) for i, source in enumerate(still.objects.source)]
+        rest = self._render_state(still)
         self._shares = rest.shares if before is None else before._shares
-        self._ignore = self._too_hard(numbers(still.objects.box2d), numbers(still.objects.truncation), rest)
+        self._ignore = self._too_hard(to_numpy(still.objects.box2d), to_numpy(still.objects.truncation), rest)
 
-    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+    def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
         """The sun: textures that are baked from the photograph keep its light."""
         moved = not torch.equal(changed.environment.light, self._still.environment.light)
         return ("the sun, whose light is baked into the textures",) if moved else ()
 
     @torch.no_grad()
-    def redraw(self, changed: SceneIR) -> Redrawn:
+    def render(self, changed: SceneIR) -> SecondRender:
         """A state of the scene. Labels: the photograph's, moved as the boxes of the meshes move. Ignored are
         objects that are too hard in the photograph or now, and those of which most is hidden only now.
         """
@@ -108,47 +108,56 @@ class PhotographRedraw:
                 f"the photograph's {len(self._vehicles)} vehicles",
                 len(changed.objects),
             )
-        state = self._state(changed)
+        state = self._render_state(changed)
         image = torch.from_numpy(np.ascontiguousarray(state.image.transpose(2, 0, 1)))
-        return Redrawn(
-            image, self._targets(changed, state), torch.from_numpy(_boxes(state.owner, len(self._shares)))
+        return SecondRender(
+            image,
+            self._moved_targets(changed, state),
+            torch.from_numpy(_visible_boxes(state.owner, len(self._shares))),
         )
 
-    def skinned(self, changed: SceneIR) -> list[tuple[Array, Skin]]:
+    def textured_vehicles(self, changed: SceneIR) -> list[tuple[Array, TexturedSurface]]:
         """The vehicles of a state of the scene: triangles (F, 3, 3) m in the camera's own axes, and what is on
         them.
         """
-        poses = [Pose.of(changed.objects, i) for i in range(len(changed.objects))]
-        codes = numbers(changed.objects.texture_code)
+        poses = [VehiclePose.from_objects(changed.objects, i) for i in range(len(changed.objects))]
+        codes = to_numpy(changed.objects.texture_code)
         return [
-            (vehicle.body.placed(pose, self._lens), Skin(vehicle.atlas.uv, _texture(vehicle, code)))
+            (
+                vehicle.body.place(pose, self._lens),
+                TexturedSurface(vehicle.atlas.uv, _paint_texture(vehicle, code)),
+            )
             for vehicle, pose, code in zip(self._vehicles, poses, codes, strict=True)
         ]
 
-    def _vehicle(self, source: Source, i: int) -> _Vehicle:
+    def _make_vehicle(self, source: Source, i: int) -> _Vehicle:
         objects = self._still.objects
-        body = Body(self._still.meshes[int(objects.mesh_index[i])])
-        seen = Photographed(source, self._hidden(i))
-        normal = numbers(self._still.environment.ground)[:3]
-        placed, lens = body.placed(Pose.photographed(source), self._lens), self._lens
-        window = _around([placed], lens)
-        alone = None if window is None else self._screen.alone(placed.reshape(-1, 3), lens.intrinsics, window)
-        atlas = bake(body, source, seen, lens, alone)
-        shadow = Shadow(source, lens, normal, self._dark(source, alone))
-        return _Vehicle(body, atlas, _levels(atlas.colour), shadow, lens.box(placed))
+        body = BodyMesh(self._still.meshes[int(objects.mesh_index[i])])
+        seen = BakedAppearance(source, self._occluded_area(i))
+        normal = to_numpy(self._still.environment.ground)[:3]
+        placed, lens = body.place(VehiclePose.from_source(source), self._lens), self._lens
+        window = _enclosing_window([placed], lens)
+        alone = (
+            None if window is None else self._screen.render_depth(placed.reshape(-1, 3), lens.intrinsics, window)
+        )
+        atlas = bake_atlas(body, source, seen, lens, alone)
+        shadow = GroundShadow(source, lens, normal, self._shadow_in_matte(source, alone))
+        return _Vehicle(body, atlas, _to_levels(atlas.colour), shadow, lens.bounding_box(placed))
 
-    def _dark(self, source: Source, alone: Alone | None) -> Array:
+    def _shadow_in_matte(self, source: Source, alone: ObjectDepth | None) -> Array:
         """(H, W, 3): how much darker the photograph is than the background, as optical depth, beside a vehicle's
         mesh and within its matte: what of its shadow the matte has taken in."""
         out, matte = np.zeros_like(self._photograph), np.zeros(self._photograph.shape[:2], bool)
         crop = source.foreground
-        alpha = numbers(crop.values)[3]
-        matte[crop.y0 : crop.y0 + alpha.shape[0], crop.x0 : crop.x0 + alpha.shape[1]] = alpha > _HIDES
+        alpha = to_numpy(crop.values)[3]
+        matte[crop.y0 : crop.y0 + alpha.shape[0], crop.x0 : crop.x0 + alpha.shape[1]] = (
+            alpha > _MIN_OCCLUDER_OPACITY
+        )
         covered = np.zeros_like(matte)
         if alone is not None:
             s, window = SUPERSAMPLING, alone.window
             samples = np.isfinite(alone.depth_m).reshape(window.height, s, window.width, s)
-            covered[window.where] = samples.any(axis=(1, 3))
+            covered[window.slices] = samples.any(axis=(1, 3))
         matte &= ~covered
         floor = 1 / 255
         out[matte] = np.log((self._background[matte] + floor) / (self._photograph[matte] + floor))
@@ -156,62 +165,73 @@ class PhotographRedraw:
         # It goes on under the mesh, whose border covers its pixels in part only.
         return np.where(covered[..., None], cv2.dilate(out, np.ones((5, 5), np.uint8)), out).astype(np.float32)
 
-    def _hidden(self, i: int) -> NDArray[np.bool_]:
+    def _occluded_area(self, i: int) -> NDArray[np.bool_]:
         """(H, W): where the photograph shows something nearer than an object."""
         out = np.zeros((self._lens.height, self._lens.width), bool)
         depth = float(self._still.objects.translation[i, 2])
         nearer = [s.foreground for s in self._still.objects.source if float(s.translation[2]) < depth]
-        nearer += [front.foreground for front in self._still.front if front.depth_m < depth]
+        nearer += [front.foreground for front in self._still.occluders if front.depth_m < depth]
         for crop in nearer:
-            alpha = numbers(crop.values)[3]
-            out[crop.y0 : crop.y0 + alpha.shape[0], crop.x0 : crop.x0 + alpha.shape[1]] |= alpha > _HIDES
+            alpha = to_numpy(crop.values)[3]
+            out[crop.y0 : crop.y0 + alpha.shape[0], crop.x0 : crop.x0 + alpha.shape[1]] |= (
+                alpha > _MIN_OCCLUDER_OPACITY
+            )
         return out
 
-    def _state(self, scene: SceneIR) -> _State:
+    def _render_state(self, scene: SceneIR) -> _RenderedScene:
         objects, lens = scene.objects, self._lens
-        poses = [Pose.of(objects, i) for i in range(len(objects))]
-        placed = [v.body.placed(pose, lens) for v, pose in zip(self._vehicles, poses, strict=True)]
+        poses = [VehiclePose.from_objects(objects, i) for i in range(len(objects))]
+        placed = [v.body.place(pose, lens) for v, pose in zip(self._vehicles, poses, strict=True)]
         environment = scene.environment
         shade = np.zeros_like(self._background)
         for vehicle, pose in zip(self._vehicles, poses, strict=True):
             vehicle.shadow.cast(pose, shade)
         # Leaves stand behind vehicles, or in `front`, which keeps the photograph's.
-        behind = weathering.with_leaves(self._background, numbers(environment.foliage), self._leaves, self._air)
-        image = behind * np.exp(-weathering.shade_left(numbers(environment.weather)) * shade)
+        behind = weathering.apply_foliage(self._background, to_numpy(environment.foliage), self._leaves, self._air)
+        image = behind * np.exp(-weathering.remaining_shade(to_numpy(environment.weather)) * shade)
         depth_m, owner = self._depth_m.copy(), np.zeros(image.shape[:2], np.int64)
-        window = _around(placed, lens)
+        window = _enclosing_window(placed, lens)
         if window is not None:
-            codes = numbers(objects.texture_code)
-            skins = [Skin(v.atlas.uv, _texture(v, code)) for v, code in zip(self._vehicles, codes, strict=True)]
-            drawn = self._screen.draw([p.reshape(-1, 3) for p in placed], skins, lens.intrinsics, window)
-            owner[window.where] = _owners(drawn, len(placed))
-            _compose(image[window.where], depth_m[window.where], owner[window.where], drawn, self._fronts(window))
-        image = weathering.weathered(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
+            codes = to_numpy(objects.texture_code)
+            skins = [
+                TexturedSurface(v.atlas.uv, _paint_texture(v, code))
+                for v, code in zip(self._vehicles, codes, strict=True)
+            ]
+            drawn = self._screen.render([p.reshape(-1, 3) for p in placed], skins, lens.intrinsics, window)
+            owner[window.slices] = _pixel_owners(drawn, len(placed))
+            _composite(
+                image[window.slices],
+                depth_m[window.slices],
+                owner[window.slices],
+                drawn,
+                self._occluder_layers(window),
+            )
+        image = weathering.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
         image = np.rint(np.clip(image, 0, 1) * 255).astype(np.float32) / np.float32(255)
-        shares = np.array([self._share(p, owner == i + 1) for i, p in enumerate(placed)], np.float32)
-        return _State(placed, image, owner, shares)
+        shares = np.array([self._visible_share(p, owner == i + 1) for i, p in enumerate(placed)], np.float32)
+        return _RenderedScene(placed, image, owner, shares)
 
-    def _fronts(self, window: Window) -> list[tuple[Array, float]]:
+    def _occluder_layers(self, window: ImageWindow) -> list[tuple[Array, float]]:
         """What may stand in front, seen through a window: (h, w, 4), premultiplied, and its distance."""
-        return [(_through(front, window), front.depth_m) for front in self._still.front]
+        return [(_crop_to_window(front, window), front.depth_m) for front in self._still.occluders]
 
-    def _share(self, placed: Array, shown: NDArray[np.bool_]) -> float:
+    def _visible_share(self, placed: Array, shown: NDArray[np.bool_]) -> float:
         """How much of the hull of a vehicle's outline shows, of what lies in the picture."""
         corners = placed[(placed[..., 2] > 0).all(axis=1)].reshape(-1, 3)
         if not len(corners):
             return 0.0
         limit = 4 * max(shown.shape)
-        hull = cv2.convexHull(np.clip(self._lens.pixels(corners), -limit, limit).astype(np.float32))
+        hull = cv2.convexHull(np.clip(self._lens.project(corners), -limit, limit).astype(np.float32))
         filled = np.zeros(shown.shape, np.uint8)
         cv2.fillConvexPoly(filled, np.rint(hull).astype(np.int32), 1)
         return float(np.count_nonzero(shown)) / max(int(filled.sum()), 1)
 
-    def _targets(self, changed: SceneIR, state: _State) -> Targets:
+    def _moved_targets(self, changed: SceneIR, state: _RenderedScene) -> Targets:
         """The scene's objects in order, then regions in which no detection counts, each once for each class."""
         objects = self._still.objects
         limit = np.array([self._lens.width - 1, self._lens.height - 1] * 2, np.float32)
-        labelled, truncation = numbers(objects.box2d), numbers(objects.truncation)
-        now = np.array([self._lens.box(placed) for placed in state.placed]).reshape(-1, 4)
+        labelled, truncation = to_numpy(objects.box2d), to_numpy(objects.truncation)
+        now = np.array([self._lens.bounding_box(placed) for placed in state.placed]).reshape(-1, 4)
         then = np.array([vehicle.box_xyxy for vehicle in self._vehicles]).reshape(-1, 4)
         gone = np.isnan(now).any(axis=1) | np.isnan(then).any(axis=1)
         now, then = np.nan_to_num(now), np.nan_to_num(then)
@@ -219,8 +239,8 @@ class PhotographRedraw:
         boxes = labelled + inside - before
         # A label that is drawn beyond the border stays there.
         boxes = np.clip(boxes, np.minimum(labelled, 0), np.maximum(labelled, limit)).astype(np.float32)
-        truncation = np.clip(truncation + _outside(now, inside) - _outside(then, before), 0, 1)
-        hidden = (state.shares < _HALF * self._shares) | (state.shares == 0)
+        truncation = np.clip(truncation + _share_outside(now, inside) - _share_outside(then, before), 0, 1)
+        hidden = (state.shares < _MIN_SHARE * self._shares) | (state.shares == 0)
         ignore = self._ignore | gone | hidden | self._too_hard(boxes, truncation, state)
         regions, count = self._still.ignore.cpu(), len(CLASSES)
         return Targets(
@@ -229,10 +249,10 @@ class PhotographRedraw:
             torch.cat([torch.from_numpy(ignore), torch.ones(count * len(regions), dtype=torch.bool)]),
         )
 
-    def _too_hard(self, boxes_xyxy: Array, truncation: Array, state: _State) -> NDArray[np.bool_]:
+    def _too_hard(self, boxes_xyxy: Array, truncation: Array, state: _RenderedScene) -> NDArray[np.bool_]:
         size, limits = boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], self._difficulty
         occlusion = self._still.objects.occlusion.cpu().numpy()
-        faint = _contrasts(state, len(boxes_xyxy)) < limits.min_contrast
+        faint = _object_contrasts(state, len(boxes_xyxy)) < limits.min_contrast
         return (
             (size[:, 1] < limits.min_height_px)
             | (size <= 0).any(axis=1)
@@ -242,47 +262,53 @@ class PhotographRedraw:
         )
 
 
-def _picture(tensor: Tensor) -> Array:
-    return np.ascontiguousarray(numbers(tensor).transpose(1, 2, 0))
+def _to_image(tensor: Tensor) -> Array:
+    return np.ascontiguousarray(to_numpy(tensor).transpose(1, 2, 0))
 
 
-def _texture(vehicle: _Vehicle, code: Array) -> NDArray[np.uint8]:
+def _paint_texture(vehicle: _Vehicle, code: Array) -> NDArray[np.uint8]:
     if not code.any():
         return vehicle.texture
     atlas = vehicle.atlas
-    return _levels(weathering.painted(atlas.colour, code, atlas.paint, atlas.height, atlas.base))
+    return _to_levels(
+        weathering.apply_paint(atlas.colour, code, atlas.paint_share, atlas.height, atlas.paint_colour)
+    )
 
 
-def _levels(colour: Array) -> NDArray[np.uint8]:
+def _to_levels(colour: Array) -> NDArray[np.uint8]:
     """Of 255, what is in [0, 1]."""
     return np.rint(colour * 255).astype(np.uint8)
 
 
-def _around(placed: Sequence[Array], lens: Lens) -> Window | None:
+def _enclosing_window(placed: Sequence[Array], lens: PictureCamera) -> ImageWindow | None:
     """The part of the picture that shows vehicles; None where none does."""
-    boxes = np.array([lens.box(p) for p in placed]).reshape(-1, 4)
+    boxes = np.array([lens.bounding_box(p) for p in placed]).reshape(-1, 4)
     boxes = boxes[~np.isnan(boxes).any(axis=1)]
     if not len(boxes):
         return None
     limit = np.array([lens.width, lens.height])
     x0, y0 = np.clip(np.floor(boxes[:, :2].min(axis=0)) - 1, 0, limit).astype(int).tolist()
     x1, y1 = np.clip(np.ceil(boxes[:, 2:].max(axis=0)) + 2, 0, limit).astype(int).tolist()
-    return Window(x0, y0, x1 - x0, y1 - y0) if x1 > x0 and y1 > y0 else None
+    return ImageWindow(x0, y0, x1 - x0, y1 - y0) if x1 > x0 and y1 > y0 else None
 
 
-def _owners(drawn: Drawn, count: int) -> NDArray[np.int64]:
+def _pixel_owners(drawn: WindowImage, count: int) -> NDArray[np.int64]:
     """(h, w) object + 1 of which a pixel shows at least half; 0 where of none."""
     height, width = drawn.depth_m.shape
     s = SUPERSAMPLING
     blocks = drawn.owner.reshape(height, s, width, s)
     out = np.zeros((height, width), np.int64)
     for i in range(1, count + 1):
-        out[(blocks == i).sum(axis=(1, 3), dtype=np.uint8) >= _HALF * s * s] = i
+        out[(blocks == i).sum(axis=(1, 3), dtype=np.uint8) >= _MIN_SHARE * s * s] = i
     return out
 
 
-def _compose(
-    image: Array, depth_m: Array, owner: NDArray[np.int64], drawn: Drawn, fronts: Sequence[tuple[Array, float]]
+def _composite(
+    image: Array,
+    depth_m: Array,
+    owner: NDArray[np.int64],
+    drawn: WindowImage,
+    fronts: Sequence[tuple[Array, float]],
 ) -> None:
     """Put vehicles over the background (h, w, 3), and what stands in front of them over both, in place.
 
@@ -294,17 +320,17 @@ def _compose(
         over = (drawn.depth_m > distance)[..., None]
         alpha = np.where(over, rgba[..., 3:], 0)
         veiled, added = veiled * (1 - alpha), added * (1 - alpha) + np.where(over, rgba[..., :3], 0)
-    owner[veiled[..., 0] < _HALF] = 0
+    owner[veiled[..., 0] < _MIN_SHARE] = 0
     image *= 1 - cover
     image += veiled * colour + cover * added
     shown = owner > 0
     depth_m[shown] = drawn.depth_m[shown]
 
 
-def _through(front: Front, window: Window) -> Array:
+def _crop_to_window(front: Occluder, window: ImageWindow) -> Array:
     """A front layer's (h, w, 4) through a window; nothing beside it."""
     crop = front.foreground
-    rgba = numbers(crop.values).transpose(1, 2, 0)
+    rgba = to_numpy(crop.values).transpose(1, 2, 0)
     out = np.zeros((window.height, window.width, 4), np.float32)
     y0, x0 = crop.y0 - window.y0, crop.x0 - window.x0
     top, left = max(y0, 0), max(x0, 0)
@@ -314,13 +340,13 @@ def _through(front: Front, window: Window) -> Array:
     return out
 
 
-def _outside(whole: Array, inside: Array) -> Array:
+def _share_outside(whole: Array, inside: Array) -> Array:
     """Shares (N,) of boxes that lie beyond the border."""
     areas = [np.prod(np.maximum(b[:, 2:] - b[:, :2], 0), axis=1) for b in (whole, inside)]
     return 1 - areas[1] / np.maximum(areas[0], 1e-6)
 
 
-def _boxes(owner: NDArray[np.int64], count: int) -> Array:
+def _visible_boxes(owner: NDArray[np.int64], count: int) -> Array:
     """(N, 4) px of what shows of each object; zeros where nothing does."""
     out = np.zeros((count, 4), np.float32)
     for i in range(count):
@@ -331,12 +357,12 @@ def _boxes(owner: NDArray[np.int64], count: int) -> Array:
     return out
 
 
-def _contrasts(state: _State, count: int) -> NDArray[np.float64]:
+def _object_contrasts(state: _RenderedScene, count: int) -> NDArray[np.float64]:
     """How much (N,) each object stands out in the picture."""
     image = torch.from_numpy(np.ascontiguousarray(state.image.transpose(2, 0, 1)))
     owner = torch.from_numpy(state.owner)
     crops = []
-    for x0, y0, x1, y1 in _boxes(state.owner, count).astype(int).tolist():
+    for x0, y0, x1, y1 in _visible_boxes(state.owner, count).astype(int).tolist():
         mask = owner[y0 : y1 + 1, x0 : x1 + 1] == len(crops) + 1
         crops.append(Crop(mask[None].float(), x0, y0))
-    return contrasts(Render(image, torch.zeros_like(owner, dtype=torch.float32), owner, tuple(crops)))
+    return compute_contrasts(Render(image, torch.zeros_like(owner, dtype=torch.float32), owner, tuple(crops)))

@@ -10,12 +10,17 @@ from torch import Tensor
 from detectors.types import Detections, Targets
 from drivesem.attack.labels import Labeller
 from drivesem.evaluation.resampling import wilson
-from drivesem.failures.certificate import Camera, Rule, SampleOutcome, certify
-from drivesem.failures.grades import Count, Kind
-from drivesem.failures.kinds import Fault, Judged, View
-from drivesem.failures.nuisances import Draw, Nuisances
-from drivesem.failures.second_renderer.base import Redrawn
-from drivesem.failures.second_renderer.compositor import CompositorDraw
+from drivesem.failures.certificate import (
+    CertificateRule,
+    CompositorRenderer,
+    NuisanceCamera,
+    SampleOutcome,
+    certify,
+)
+from drivesem.failures.grades import Certificate, Kind
+from drivesem.failures.kinds import DetectionOutcome, Fault, LabelledDetections
+from drivesem.failures.nuisances import Nuisances, NuisanceSample
+from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.synth.demo import demo_scene
 from scene_ir.errors import RangeError
 from scene_ir.render.compositor import Compositor
@@ -27,7 +32,7 @@ TWICE = Fault(Kind.TWICE, 0, 0)
 PHANTOM = Fault(Kind.BACKGROUND, -1, 0)
 
 
-class Still(Draw):
+class Still(NuisanceSample):
     """A draw that moves nothing."""
 
     def __init__(self) -> None:
@@ -43,11 +48,13 @@ def look(found: bool, twice: bool = False, alarm: float | None = None, hidden: b
     detections = Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), scores)
     targets = Targets(PLACE + 300, torch.tensor([0]), torch.tensor([hidden]))
     background = (0,) if alarm is not None and alarm >= 0.5 else ()
-    judged = Judged(torch.tensor([found]), {}, {0: 0} if twice else {}, background)
-    return SampleOutcome(View(targets, torch.zeros(1, 4), detections), judged, 0.5, Still(), 1)
+    judged = DetectionOutcome(torch.tensor([found]), {}, {0: 0} if twice else {}, background)
+    return SampleOutcome(LabelledDetections(targets, torch.zeros(1, 4), detections), judged, 0.5, Still(), 1)
 
 
-def counted(fault: Fault, before: Sequence[SampleOutcome], after: Sequence[SampleOutcome]) -> tuple[Count, int]:
+def counted(
+    fault: Fault, before: Sequence[SampleOutcome], after: Sequence[SampleOutcome]
+) -> tuple[Certificate, int]:
     """And how many looks were taken."""
     taken: list[int] = []
 
@@ -58,7 +65,7 @@ def counted(fault: Fault, before: Sequence[SampleOutcome], after: Sequence[Sampl
 
         return one
 
-    (count,) = certify([fault], PLACE, side(before), side(after), Rule())
+    (count,) = certify([fault], PLACE, side(before), side(after), CertificateRule())
     return count, len(taken)
 
 
@@ -70,7 +77,7 @@ FOUND, GONE = look(True), look(False)
 )
 def test_the_rule(right: int, wrong: int, certain: bool) -> None:
     count, _ = counted(LOST, [FOUND] * right + [GONE] * (16 - right), [GONE] * wrong + [FOUND] * (16 - wrong))
-    assert Rule().holds(count) is certain
+    assert CertificateRule().holds(count) is certain
 
 
 def test_what_the_rule_promises() -> None:
@@ -82,35 +89,37 @@ def test_what_a_draw_hides_is_not_missed_in_it() -> None:
     """Nobody could see the car there: neither found nor missed."""
     unseen = look(False, hidden=True)
     count, _ = counted(LOST, [FOUND] * 16, [GONE] * 11 + [unseen] * 5)
-    assert (count.after, Rule().holds(count)) == (11, False)
-    assert Rule().holds(counted(LOST, [FOUND] * 16, [GONE] * 12 + [unseen] * 4)[0])
-    assert not Rule().holds(counted(LOST, [FOUND] * 14 + [unseen] * 2, [GONE] * 16)[0])
+    assert (count.after, CertificateRule().holds(count)) == (11, False)
+    assert CertificateRule().holds(counted(LOST, [FOUND] * 16, [GONE] * 12 + [unseen] * 4)[0])
+    assert not CertificateRule().holds(counted(LOST, [FOUND] * 14 + [unseen] * 2, [GONE] * 16)[0])
 
 
 def test_no_more_looks_than_decide() -> None:
     assert counted(LOST, [FOUND] * 16, [GONE] * 16)[1] == 32
     # Five draws in which it is found leave at most 11; nobody looks at the scene before the change then.
     count, taken = counted(LOST, [FOUND] * 16, [FOUND] * 16)
-    assert (taken, count) == (5, Count(0, 0, 0, 5, None, count.margin_after))
+    assert (taken, count) == (5, Certificate(0, 0, 0, 5, None, count.margin_after))
     assert counted(LOST, [GONE] * 16, [GONE] * 16)[1] == 16 + 2
 
 
 def test_twice_and_background() -> None:
     certain = counted(TWICE, [FOUND] * 16, [look(True, twice=True)] * 16)[0]
-    assert Rule().holds(certain)
+    assert CertificateRule().holds(certain)
     assert certain.margin_after is None
-    assert not Rule().holds(counted(TWICE, [look(True, twice=True)] * 16, [look(True, twice=True)] * 16)[0])
+    assert not CertificateRule().holds(
+        counted(TWICE, [look(True, twice=True)] * 16, [look(True, twice=True)] * 16)[0]
+    )
     # A phantom must be silent before: whatever is reported there from t* on speaks against it.
     alarm, hint = look(True, alarm=0.8), look(True, alarm=0.4)
     certain = counted(PHANTOM, [hint] * 16, [alarm] * 16)[0]
-    assert Rule().holds(certain)
+    assert CertificateRule().holds(certain)
     assert (certain.margin_before or 0) > 0
     assert (certain.margin_after or 0) < 0
-    assert not Rule().holds(counted(PHANTOM, [alarm] * 16, [alarm] * 16)[0])
+    assert not CertificateRule().holds(counted(PHANTOM, [alarm] * 16, [alarm] * 16)[0])
 
 
 def test_more_draws_keep_the_shares() -> None:
-    rule = Rule(32)
+    rule = CertificateRule(32)
     assert (rule.before, rule.after) == (30, 24)
 
 
@@ -118,7 +127,7 @@ def test_fewer_draws_than_the_rule_needs() -> None:
     with pytest.raises(
         RangeError, match="draws: expected at least 16, which a certificate's rule needs, found 15"
     ):
-        Rule(15)
+        CertificateRule(15)
 
 
 class Sees:
@@ -146,21 +155,21 @@ def test_a_look_takes_labels_along() -> None:
     scene = demo_scene(0, 0)
     compositor = Compositor(scene)
     labeller = Labeller(scene, compositor.render(scene))
-    drawn = CompositorDraw(compositor, labeller)
+    drawn = CompositorRenderer(compositor, labeller)
     largest = int((scene.objects.box2d[:, 2] - scene.objects.box2d[:, 0]).argmax())
 
     class Masked:
         name = "masked"
 
-        def redraw(self, changed: SceneIR) -> Redrawn:
-            redrawn = drawn.redraw(changed)
+        def render(self, changed: SceneIR) -> SecondRender:
+            redrawn = drawn.render(changed)
             ids = compositor.render(changed).object_id
             return dataclasses.replace(redrawn, image=(ids == largest + 1).float().expand(3, -1, -1))
 
     quiet = dataclasses.replace(Nuisances(), noise=0.0, jpeg=0.0, blur_px=0.0)
-    camera = Camera(Masked(), Sees(), 0.5, quiet, "test")
+    camera = NuisanceCamera(Masked(), Sees(), 0.5, quiet, "test")
     for number in range(3):
-        seen = camera.look(scene, number, torch.zeros(len(scene.objects), dtype=torch.bool))
-        shown = seen.view.shown_xyxy[largest]
-        torch.testing.assert_close(shown, seen.view.detections.boxes_xyxy[0], atol=1.6, rtol=0)
-        assert bool(seen.judged.found[largest])
+        seen = camera.evaluate(scene, number, torch.zeros(len(scene.objects), dtype=torch.bool))
+        shown = seen.labelled.visible_xyxy[largest]
+        torch.testing.assert_close(shown, seen.labelled.detections.boxes_xyxy[0], atol=1.6, rtol=0)
+        assert bool(seen.outcome.detected[largest])

@@ -7,15 +7,15 @@ import torch
 from torch import Tensor
 
 from detectors.types import Detections
-from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import Labeller
+from drivesem.attack.targets import EvaluatedClasses
 from drivesem.evaluation import failures
+from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.grades import Grade
-from drivesem.failures.grading import Case, Grader, Grades
+from drivesem.failures.grading import FrameGrades, Grader, GradingInput
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.second_renderer.base import NoSecondRendererError, Redrawn, SecondRenderer
-from drivesem.failures.second_renderer.compositor import CompositorDraw
-from drivesem.run.frame import State, case_of
+from drivesem.failures.second_renderer.base import NoSecondRendererError, SecondRender, SecondRenderer
+from drivesem.run.frame import EvaluatedScene, build_grading_input
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
@@ -52,12 +52,12 @@ class Oracle:
 class Told:
     """A renderer whose pictures tell the oracle where the cars are."""
 
-    of: CompositorDraw
+    of: CompositorRenderer
     name: str = "told"
     honest: bool = True
 
-    def redraw(self, changed: SceneIR) -> Redrawn:
-        redrawn = self.of.redraw(changed)
+    def render(self, changed: SceneIR) -> SecondRender:
+        redrawn = self.of.render(changed)
         image = torch.zeros_like(redrawn.image)
         count = len(changed.objects)
         image[0, 0, 0] = count / 255
@@ -72,7 +72,7 @@ CAR = 3
 
 
 @pytest.fixture(scope="module")
-def case() -> Case:
+def case() -> GradingInput:
     scene = demo_scene(0, 0)
     painted = torch.zeros_like(scene.objects.texture_code)
     painted[CAR] = 0.3
@@ -80,8 +80,8 @@ def case() -> Case:
     compositor = Compositor(scene)
     render = compositor.render(scene)
     labeller = Labeller(scene, render)
-    renderer = CompositorDraw(compositor, labeller)
-    judged = JudgedClasses.of(Oracle())
+    renderer = CompositorRenderer(compositor, labeller)
+    judged = EvaluatedClasses.from_detector(Oracle())
     paper = labeller.paper()
 
     def seen(boxes: Tensor) -> Detections:
@@ -89,54 +89,54 @@ def case() -> Case:
 
     boxes = paper.boxes_xyxy
     others = torch.cat([boxes[:CAR], boxes[CAR + 1 :]])
-    benign = State(scene, render, paper, seen(boxes))
-    now = State(changed, compositor.render(changed), paper, seen(others))
-    whole = case_of("frame", renderer, judged, benign, now, lambda: scene)
+    benign = EvaluatedScene(scene, render, paper, seen(boxes))
+    now = EvaluatedScene(changed, compositor.render(changed), paper, seen(others))
+    whole = build_grading_input("frame", renderer, judged, benign, now, lambda: scene)
     return dataclasses.replace(whole, renderer=Told(renderer))
 
 
-OFF = Nuisances.of("off")
+OFF = Nuisances.parse("off")
 """The camera stands still: the oracle reads numbers, which must not be shifted."""
-LOST = failures.Failures(lost=(CAR,), phantoms=())
+LOST = failures.FrameFailures(lost=(CAR,), phantoms=())
 
 
-def graded(case: Case, second: SecondRenderer | None = None, peer: Oracle | None = None) -> Grades:
+def graded(case: GradingInput, second: SecondRenderer | None = None, peer: Oracle | None = None) -> FrameGrades:
     grader = Grader(
         Oracle(),
         0.5,
         OFF,
-        second=None if second is None else lambda name, scene: second,
-        peer=None if peer is None else lambda: peer,
+        make_second_renderer=None if second is None else lambda name, scene: second,
+        load_second_detector=None if peer is None else lambda: peer,
     )
     return grader.grade(case, LOST)
 
 
-def told(case: Case, honest: bool = True) -> Told:
+def told(case: GradingInput, honest: bool = True) -> Told:
     assert isinstance(case.renderer, Told)
     return Told(case.renderer.of, "second", honest)
 
 
-def test_certain_where_nobody_else_is_asked(case: Case) -> None:
+def test_certain_where_nobody_else_is_asked(case: GradingInput) -> None:
     grades = graded(case)
     assert grades.lost[CAR].grade is Grade.CERTAIN
     assert grades.lost[CAR].count.after == grades.lost[CAR].count.before == 16
 
 
-def test_confirmed_where_the_second_renderer_fails_too(case: Case) -> None:
+def test_confirmed_where_the_second_renderer_fails_too(case: GradingInput) -> None:
     (one,) = graded(case, told(case)).lost.values()
     assert one.grade is Grade.CONFIRMED
     assert one.second is not None
     assert (one.second.by, one.second.before, one.second.after) == ("second", 4, 4)
 
 
-def test_not_confirmed_where_it_does_not(case: Case) -> None:
+def test_not_confirmed_where_it_does_not(case: GradingInput) -> None:
     (one,) = graded(case, told(case, honest=False)).lost.values()
     assert one.grade is Grade.CERTAIN
     assert one.second is not None
     assert one.second.after == 0
 
 
-def test_shared_where_the_peer_loses_it_too(case: Case) -> None:
+def test_shared_where_the_peer_loses_it_too(case: GradingInput) -> None:
     assert graded(case, told(case), Oracle()).lost[CAR].grade is Grade.SHARED
     kept = graded(case, told(case), Oracle(blind=False)).lost[CAR]
     assert kept.grade is Grade.CONFIRMED
@@ -144,16 +144,16 @@ def test_shared_where_the_peer_loses_it_too(case: Case) -> None:
     assert (kept.peer.before, kept.peer.after) == (4, 0)
 
 
-def test_no_second_renderer_is_said_and_nothing_is_lost(case: Case) -> None:
+def test_no_second_renderer_is_said_and_nothing_is_lost(case: GradingInput) -> None:
     def none(name: str, scene: SceneIR) -> SecondRenderer:
         raise NoSecondRendererError("EGL", "a driver (Debian: libegl1 libgl1-mesa-dri)", "none")
 
-    grades = Grader(Oracle(), 0.5, OFF, second=none).grade(case, LOST)
+    grades = Grader(Oracle(), 0.5, OFF, make_second_renderer=none).grade(case, LOST)
     assert grades.lost[CAR].grade is Grade.CERTAIN
     assert "libegl1" in grades.notes[0]
 
 
-def test_what_holds_only_at_the_threshold(case: Case) -> None:
+def test_what_holds_only_at_the_threshold(case: GradingInput) -> None:
     """The picture that was judged shows it lost, its draws do not."""
     still = dataclasses.replace(case, changed=case.base)
     (one,) = Grader(Oracle(), 0.5, OFF).grade(still, LOST).lost.values()
@@ -161,20 +161,20 @@ def test_what_holds_only_at_the_threshold(case: Case) -> None:
     assert (one.count.after, one.count.after_draws) == (0, 5)
 
 
-def test_a_failure_of_no_kind_has_no_grade_of_its_own(case: Case) -> None:
+def test_a_failure_of_no_kind_has_no_grade_of_its_own(case: GradingInput) -> None:
     found = dataclasses.replace(case, now=case.benign)
     assert not Grader(Oracle(), 0.5, OFF).grade(found, LOST).lost
 
 
-def test_draws_of_the_scene_before_the_change_are_kept(case: Case) -> None:
+def test_draws_of_the_scene_before_the_change_are_kept(case: GradingInput) -> None:
     grader = Grader(Oracle(), 0.5, OFF)
     grader.grade(case, LOST)
     asked: list[SceneIR] = []
 
     class Counting(Told):
-        def redraw(self, changed: SceneIR) -> Redrawn:
+        def render(self, changed: SceneIR) -> SecondRender:
             asked.append(changed)
-            return super().redraw(changed)
+            return super().render(changed)
 
     assert isinstance(case.renderer, Told)
     grader.grade(dataclasses.replace(case, renderer=Counting(case.renderer.of)), LOST)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.failures.jpeg import Codec
+from drivesem.failures.jpeg import DifferentiableJpeg
 from drivesem.synth.demo import demo_scene
 
 
@@ -24,7 +24,7 @@ def photograph(height: int, width: int) -> Tensor:
 def test_values_and_gradients_are_kornias(height: int, width: int, quality: int) -> None:
     one, other = (photograph(height, width).requires_grad_(True) for _ in range(2))
     expected = kornia.enhance.jpeg_codec_differentiable(one[None], one.new_tensor([float(quality)]))[0]
-    packed = Codec.of((height, width), quality, other)(other)
+    packed = DifferentiableJpeg.create((height, width), quality, other)(other)
     torch.testing.assert_close(packed, expected, atol=1e-9, rtol=0)
     cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     (gradient,) = torch.autograd.grad(expected, one, cotangent)
@@ -39,12 +39,15 @@ def test_a_picture_as_libjpeg_packs_it() -> None:
     decoded = cv2.imdecode(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
     assert decoded is not None
     expected = torch.from_numpy(np.ascontiguousarray(decoded[..., ::-1])).permute(2, 0, 1) / 255
-    packed = Codec.of((96, 128), 90, image)(image)
+    packed = DifferentiableJpeg.create((96, 128), 90, image)(image)
     assert packed.dtype == torch.float32
     assert float((packed - expected).abs().mean()) < 2.5 / 255
 
 
 def test_lower_quality_leaves_less() -> None:
     image = photograph(96, 128).float()
-    worst = [float((Codec.of((96, 128), quality, image)(image) - image).norm()) for quality in (95, 75, 20)]
+    worst = [
+        float((DifferentiableJpeg.create((96, 128), quality, image)(image) - image).norm())
+        for quality in (95, 75, 20)
+    ]
     assert worst == sorted(worst)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from detectors.types import Detections, Targets
 from drivesem.failures.grades import Kind
-from drivesem.failures.kinds import Fault, View, find, judge
+from drivesem.failures.kinds import Fault, LabelledDetections, find_faults, match_detections
 
 CAR, TRUCK = 0, 1
 T_STAR = 0.5
@@ -24,14 +24,16 @@ def targets(*boxes: Box, ignore: tuple[int, ...] = ()) -> Targets:
     return Targets(torch.tensor(boxes).reshape(-1, 4), torch.full((len(boxes),), CAR), flags)
 
 
-def view(truth: Targets, *reports: tuple[Box, int, float], shown: dict[int, Box] | None = None) -> View:
+def view(
+    truth: Targets, *reports: tuple[Box, int, float], shown: dict[int, Box] | None = None
+) -> LabelledDetections:
     """Reports: box, label, score."""
     visible = truth.boxes_xyxy.clone()
     for row, box in (shown or {}).items():
         visible[row] = torch.tensor(box)
     boxes = torch.tensor([r[0] for r in reports]).reshape(-1, 4)
     labels = torch.tensor([r[1] for r in reports], dtype=torch.int64)
-    return View(truth, visible, Detections(boxes, labels, torch.tensor([r[2] for r in reports])))
+    return LabelledDetections(truth, visible, Detections(boxes, labels, torch.tensor([r[2] for r in reports])))
 
 
 BOTH = targets(NEAR, FAR)
@@ -39,77 +41,83 @@ RIGHT = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8))
 
 
 def test_nothing_fails_where_all_is_found() -> None:
-    assert find(RIGHT, RIGHT, T_STAR) == ()
+    assert find_faults(RIGHT, RIGHT, T_STAR) == ()
 
 
 def test_missed() -> None:
-    assert find(RIGHT, view(BOTH, (FAR, CAR, 0.8), (NEAR, CAR, 0.4)), T_STAR) == (Fault(Kind.MISSED, 0, -1),)
+    assert find_faults(RIGHT, view(BOTH, (FAR, CAR, 0.8), (NEAR, CAR, 0.4)), T_STAR) == (
+        Fault(Kind.MISSED, 0, -1),
+    )
 
 
 def test_a_flip_of_class_is_one_failure() -> None:
-    assert find(RIGHT, view(BOTH, (NEAR, TRUCK, 0.9), (FAR, CAR, 0.8)), T_STAR) == (Fault(Kind.CLASS, 0, 0),)
+    assert find_faults(RIGHT, view(BOTH, (NEAR, TRUCK, 0.9), (FAR, CAR, 0.8)), T_STAR) == (
+        Fault(Kind.CLASS, 0, 0),
+    )
 
 
 def test_badly_placed() -> None:
-    assert find(RIGHT, view(BOTH, (FAR, CAR, 0.8), (BADLY, CAR, 0.7)), T_STAR) == (Fault(Kind.PLACED, 0, 1),)
+    assert find_faults(RIGHT, view(BOTH, (FAR, CAR, 0.8), (BADLY, CAR, 0.7)), T_STAR) == (
+        Fault(Kind.PLACED, 0, 1),
+    )
 
 
 def test_another_class_says_more_than_a_bad_frame() -> None:
     changed = view(BOTH, (FAR, CAR, 0.8), (BADLY, CAR, 0.7), (NEAR, TRUCK, 0.6))
-    assert find(RIGHT, changed, T_STAR) == (Fault(Kind.CLASS, 0, 2),)
+    assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.CLASS, 0, 2),)
 
 
 def test_found_twice() -> None:
     again = (102.0, 101.0, 201.0, 160.0)
     for label in (CAR, TRUCK):
         changed = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (again, label, 0.6))
-        assert find(RIGHT, changed, T_STAR) == (Fault(Kind.TWICE, 0, 2),)
-        assert find(changed, changed, T_STAR) == ()
+        assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.TWICE, 0, 2),)
+        assert find_faults(changed, changed, T_STAR) == ()
 
 
 def test_background() -> None:
     changed = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (NOWHERE, CAR, 0.6))
-    assert find(RIGHT, changed, T_STAR) == (Fault(Kind.BACKGROUND, -1, 2),)
+    assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.BACKGROUND, -1, 2),)
 
 
 def test_one_phantom_a_place_whatever_its_classes() -> None:
     changed = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (NOWHERE, CAR, 0.6), (NOWHERE, TRUCK, 0.7))
-    assert find(RIGHT, changed, T_STAR) == (Fault(Kind.BACKGROUND, -1, 3),)
+    assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.BACKGROUND, -1, 3),)
 
 
 def test_an_occluded_object_is_found_by_what_shows_of_it() -> None:
     left_half = (100.0, 100.0, 145.0, 160.0)
     changed = view(BOTH, (left_half, CAR, 0.8), (FAR, CAR, 0.8), shown={0: left_half})
-    assert find(RIGHT, changed, T_STAR) == ()
-    assert judge(changed, T_STAR).found.tolist() == [True, True]
+    assert find_faults(RIGHT, changed, T_STAR) == ()
+    assert match_detections(changed, T_STAR).detected.tolist() == [True, True]
 
 
 def test_ignored_objects_are_no_failures_and_excuse_what_lies_on_them() -> None:
     now = targets(NEAR, FAR, ignore=(0,))
-    assert find(RIGHT, view(now, (FAR, CAR, 0.8)), T_STAR) == ()
-    assert find(RIGHT, view(now, (FAR, CAR, 0.8), (NEAR, TRUCK, 0.9)), T_STAR) == ()
+    assert find_faults(RIGHT, view(now, (FAR, CAR, 0.8)), T_STAR) == ()
+    assert find_faults(RIGHT, view(now, (FAR, CAR, 0.8), (NEAR, TRUCK, 0.9)), T_STAR) == ()
 
 
 def test_no_phantom_where_the_benign_picture_was_suspect() -> None:
     changed = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (NOWHERE, CAR, 0.6))
     for score, faults in ((0.26, 0), (0.24, 1)):
         benign = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (NOWHERE, TRUCK, score))
-        assert len(find(benign, changed, T_STAR)) == faults
+        assert len(find_faults(benign, changed, T_STAR)) == faults
 
 
 def test_no_phantom_where_a_witness_sees_an_object() -> None:
     changed = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (NOWHERE, CAR, 0.6))
-    assert find(RIGHT, changed, T_STAR, torch.tensor([NOWHERE])) == ()
-    assert len(find(RIGHT, changed, T_STAR, torch.tensor([NEAR]))) == 1
+    assert find_faults(RIGHT, changed, T_STAR, torch.tensor([NOWHERE])) == ()
+    assert len(find_faults(RIGHT, changed, T_STAR, torch.tensor([NEAR]))) == 1
 
 
 def test_what_lies_inside_an_object_is_no_phantom() -> None:
     wheel = (110.0, 140.0, 120.0, 150.0)
-    assert find(RIGHT, view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (wheel, CAR, 0.7)), T_STAR) == ()
+    assert find_faults(RIGHT, view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (wheel, CAR, 0.7)), T_STAR) == ()
 
 
 def test_what_was_missed_before_is_no_failure() -> None:
-    assert find(view(BOTH, (FAR, CAR, 0.8)), view(BOTH, (FAR, CAR, 0.8)), T_STAR) == ()
+    assert find_faults(view(BOTH, (FAR, CAR, 0.8)), view(BOTH, (FAR, CAR, 0.8)), T_STAR) == ()
 
 
 boxes = st.tuples(*(st.floats(0, 300) for _ in range(2)), *(st.floats(10, 120) for _ in range(2))).map(
@@ -126,9 +134,9 @@ def test_each_object_fails_at_most_once_and_only_if_it_was_found(
     truth: list[Box], before: list[tuple[Box, int, float]], after: list[tuple[Box, int, float]]
 ) -> None:
     benign, changed = view(targets(*truth), *before), view(targets(*truth), *after)
-    faults = find(benign, changed, T_STAR)
+    faults = find_faults(benign, changed, T_STAR)
     of_objects = [fault.target for fault in faults if fault.kind is not Kind.BACKGROUND]
     assert len(of_objects) == len(set(of_objects))
-    found = judge(benign, T_STAR).found
+    found = match_detections(benign, T_STAR).detected
     assert all(bool(found[target]) for target in of_objects)
-    assert find(benign, benign, T_STAR) == ()
+    assert find_faults(benign, benign, T_STAR) == ()

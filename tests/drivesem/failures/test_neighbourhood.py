@@ -8,7 +8,7 @@ import torch
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Budget, ParameterSpace
-from drivesem.failures.neighbourhood import Everywhere, Neighbourhood
+from drivesem.failures.neighbourhood import Neighbourhood, SceneSampler
 from drivesem.failures.nuisances import Nuisances
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
@@ -30,7 +30,7 @@ def theta(objective: Objective) -> torch.Tensor:
 
 
 def around(objective: Objective, theta: torch.Tensor, reach: float = 1.0, name: str = "a") -> Neighbourhood:
-    return Neighbourhood(objective, objective.feasible_set(), theta, CAR, Nuisances.of("off"), name, reach)
+    return Neighbourhood(objective, objective.feasible_set(), theta, CAR, Nuisances.parse("off"), name, reach)
 
 
 def own(objective: Objective) -> torch.Tensor:
@@ -69,7 +69,7 @@ def test_features_are_those_of_the_state(objective: Objective, theta: torch.Tens
     sample = near.sample(1)
     assert sample is not None
     scene = objective.space.apply(objective.space.scene, near.theta(1))
-    x0, y0, x1, y1 = sample.exposure.targets.boxes_xyxy[CAR].tolist()
+    x0, y0, x1, y1 = sample.image.targets.boxes_xyxy[CAR].tolist()
     assert sample.features["height_px"] == pytest.approx(y1 - y0, rel=1e-4)
     assert sample.features["aspect"] == pytest.approx((x1 - x0) / (y1 - y0), rel=1e-4)
     assert sample.features["distance_m"] == pytest.approx(float(scene.objects.translation[CAR, 2]))
@@ -93,22 +93,22 @@ def test_a_place_in_a_draw_is_a_sample(objective: Objective, theta: torch.Tensor
     near = around(objective, theta)
     numbered, placed, moved = (
         near.sample(2),
-        near.sample_at(near.place(2), 2),
-        near.sample_at(1 - near.place(2), 2),
+        near.sample_at(near.unit_point(2), 2),
+        near.sample_at(1 - near.unit_point(2), 2),
     )
     assert numbered is not None
     assert placed is not None
     assert moved is not None
-    assert torch.equal(numbered.exposure.picture, placed.exposure.picture)
-    assert not torch.equal(numbered.exposure.picture, moved.exposure.picture)
+    assert torch.equal(numbered.image.image, placed.image.image)
+    assert not torch.equal(numbered.image.image, moved.image.image)
 
 
 def test_everywhere_tells_of_all_objects_at_once(objective: Objective) -> None:
-    def everywhere(name: str = "a") -> Everywhere:
-        return Everywhere(objective, objective.feasible_set(), Nuisances.of("off"), name)
+    def everywhere(name: str = "a") -> SceneSampler:
+        return SceneSampler(objective, objective.feasible_set(), Nuisances.parse("off"), name)
 
     whole, space = everywhere(), objective.space
-    assert len(whole.judged) > 2
+    assert len(whole.counted_objects) > 2
     thetas = [whole.theta(number) for number in range(3)]
     for theta in thetas:
         assert bool((theta >= space.lower - 1e-6).all() & (theta <= space.upper + 1e-6).all())
@@ -117,18 +117,18 @@ def test_everywhere_tells_of_all_objects_at_once(objective: Objective) -> None:
     assert not torch.equal(thetas[2], everywhere("b").theta(2))
 
     samples = whole.sample(1)
-    assert set(samples) <= set(whole.judged)
-    assert len({id(sample.exposure) for sample in samples.values()}) == 1, "one picture"
+    assert set(samples) <= set(whole.counted_objects)
+    assert len({id(sample.image) for sample in samples.values()}) == 1, "one picture"
     margins = whole.margins(samples)
     assert set(margins) == set(samples)
     index = next(iter(samples))
-    _, y0, _, y1 = samples[index].exposure.targets.boxes_xyxy[index].tolist()
+    _, y0, _, y1 = samples[index].image.targets.boxes_xyxy[index].tolist()
     assert samples[index].features["height_px"] == pytest.approx(y1 - y0, rel=1e-4)
     assert whole.margins({}) == {}
 
 
 def test_everywhere_at_theta0_all_judged_objects_are_found(objective: Objective) -> None:
-    whole = Everywhere(objective, objective.feasible_set(), Nuisances.of("off"), "a")
-    margins = whole.margins(whole.sample_of(objective.space.theta0, 0))
-    assert set(margins) == set(whole.judged)
+    whole = SceneSampler(objective, objective.feasible_set(), Nuisances.parse("off"), "a")
+    margins = whole.margins(whole.sample_at(objective.space.theta0, 0))
+    assert set(margins) == set(whole.counted_objects)
     assert all(margin > 0 for margin in margins.values())

@@ -7,7 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from drivesem.failures.rare import LEVELS, PASSED, Share, State, share_lost
+from drivesem.failures.failure_probability import (
+    LEVEL_SHARE,
+    MAX_LEVELS,
+    FailureProbability,
+    UnitCubePoint,
+    estimate_failure_probability,
+)
 from drivesem.failures.rules import Floats
 
 
@@ -30,16 +36,16 @@ def drawn(share: float) -> Callable[[Floats, int], float]:
     return margin
 
 
-def estimate(margin: Callable[[Floats, int], float], seed: int, count: int = 48) -> Share:
+def estimate(margin: Callable[[Floats, int], float], seed: int, count: int = 48) -> FailureProbability:
     rng = np.random.default_rng(seed)
     places = rng.random((count, 6))
-    states = [State(place, i, margin(place, i)) for i, place in enumerate(places)]
-    return share_lost(states, margin, rng)
+    states = [UnitCubePoint(place, i, margin(place, i)) for i, place in enumerate(places)]
+    return estimate_failure_probability(states, margin, rng)
 
 
 def test_what_is_not_rare_is_counted() -> None:
     found = estimate(slab(0.5), 0)
-    assert (found.by, found.asked) == ("samples", 0)
+    assert (found.by, found.extra_samples) == ("samples", 0)
     assert found.low < 0.5 < found.high
 
 
@@ -56,7 +62,7 @@ def test_few_states_give_a_wide_interval_that_mostly_holds(share: float) -> None
     rare = [one for one in found if one.by == "subset simulation"]
     assert np.mean([one.low <= share <= one.high for one in rare]) > 0.85
     assert np.mean([one.probability for one in rare]) == pytest.approx(share, rel=0.4)
-    assert max(one.asked for one in rare) <= LEVELS * 48
+    assert max(one.extra_samples for one in rare) <= MAX_LEVELS * 48
 
 
 def test_plain_samples_would_be_wider() -> None:
@@ -67,12 +73,12 @@ def test_plain_samples_would_be_wider() -> None:
 def test_what_never_fails_has_an_upper_end_alone() -> None:
     found = estimate(lambda place, draw: 1.0 + float(place[0]), 3)
     assert (found.probability, found.low) == (0.0, 0.0)
-    assert PASSED**LEVELS <= found.high < 0.02
+    assert LEVEL_SHARE**MAX_LEVELS <= found.high < 0.02
 
 
 def test_equal_margins_end_at_once() -> None:
     found = estimate(lambda place, draw: 1.0, 3)
-    assert (found.probability, found.asked) == (0.0, 0)
+    assert (found.probability, found.extra_samples) == (0.0, 0)
 
 
 def test_where_it_does_not_count_is_never_entered() -> None:
@@ -89,6 +95,6 @@ def test_where_it_does_not_count_is_never_entered() -> None:
     shares = []
     for _ in range(100):
         places = rng.random((48, 4)) * [1, 0.5, 1, 1]
-        states = [State(place, 0, margin(place, 0) or 0.0) for place in places]
-        shares.append(share_lost(states, margin, rng).probability)
+        states = [UnitCubePoint(place, 0, margin(place, 0) or 0.0) for place in places]
+        shares.append(estimate_failure_probability(states, margin, rng).probability)
     assert np.mean(shares) == pytest.approx(0.01, rel=0.2)

@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.failures.rules import Flags, Floats, contains, counted, cover, description, fit, overlap
+from drivesem.failures.rules import (
+    Flags,
+    Floats,
+    contains,
+    count_rule,
+    description_length,
+    fit_rule,
+    fit_rule_list,
+    overlap,
+)
 
 NAMES = ("height_px", "aspect", "across", "lightness", "distance_m", "yaw_deg")
 
@@ -25,12 +34,12 @@ def failing(inside: Flags, seed: int, often: float = 0.9, else_: float = 0.05) -
 @pytest.mark.parametrize("band", [(0.2, 0.5), (0.0, 0.3), (0.65, 1.0)])
 def test_one_feature(seed: int, band: tuple[float, float]) -> None:
     features = samples(96, seed)
-    rule = fit(features, failing(contains({"aspect": band}, features, 96), seed))
-    assert next(iter(rule.where)) == "aspect"
-    low, high = rule.where["aspect"]
+    rule = fit_rule(features, failing(contains({"aspect": band}, features, 96), seed))
+    assert next(iter(rule.intervals)) == "aspect"
+    low, high = rule.intervals["aspect"]
     assert (low, high) == pytest.approx(band, abs=0.12)
-    assert rule.fails / rule.count > 0.7
-    assert rule.fails_outside / rule.count_outside < 0.2
+    assert rule.failures / rule.count > 0.7
+    assert rule.failures_outside / rule.count_outside < 0.2
 
 
 def test_two_features() -> None:
@@ -38,8 +47,8 @@ def test_two_features() -> None:
     truth, named = {"height_px": (0.3, 0.7), "lightness": (0.0, 0.4)}, 0
     for seed in range(8):
         features = samples(128, seed)
-        rule = fit(features, failing(contains(truth, features, 128), seed, else_=0.02))
-        named += set(rule.where) == set(truth)
+        rule = fit_rule(features, failing(contains(truth, features, 128), seed, else_=0.02))
+        named += set(rule.intervals) == set(truth)
     assert named >= 6
 
 
@@ -48,23 +57,23 @@ def test_nothing_is_told_of_chance() -> None:
     told = 0
     for seed in range(60):
         features = samples(96, seed)
-        told += bool(fit(features, failing(np.ones(96, np.bool_), seed, often=0.4)).where)
+        told += bool(fit_rule(features, failing(np.ones(96, np.bool_), seed, often=0.4)).intervals)
     assert told <= 3
 
 
 def test_everything_fails_or_nothing() -> None:
     features = samples(50, 0)
     for fails in (np.ones(50, np.bool_), np.zeros(50, np.bool_)):
-        rule = fit(features, fails)
-        assert rule.where == {}
-        assert (rule.fails, rule.count) == (int(fails.sum()), 50)
+        rule = fit_rule(features, fails)
+        assert rule.intervals == {}
+        assert (rule.failures, rule.count) == (int(fails.sum()), 50)
 
 
 def test_a_feature_that_stands_still_tells_nothing() -> None:
     features = samples(60, 3) | {"across": np.full(60, 0.4)}
     fails = features["height_px"] < 0.5
-    assert set(fit(features, fails, only=("across",)).where) == set()
-    assert set(fit(features, fails).where) == {"height_px"}
+    assert set(fit_rule(features, fails, only=("across",)).intervals) == set()
+    assert set(fit_rule(features, fails).intervals) == {"height_px"}
 
 
 @given(st.integers(0, 500), st.floats(0.05, 0.95), st.floats(0.05, 0.95))
@@ -72,12 +81,12 @@ def test_a_feature_that_stands_still_tells_nothing() -> None:
 def test_counts_add_up(seed: int, often: float, else_: float) -> None:
     features = samples(64, seed)
     fails = failing(features["aspect"] < 0.5, seed, often, else_)
-    rule = fit(features, fails)
+    rule = fit_rule(features, fails)
     assert rule.count + rule.count_outside == 64
-    assert rule.fails + rule.fails_outside == int(fails.sum())
-    assert rule == counted(rule.where, features, fails)
-    if rule.where:
-        assert rule.fails * rule.count_outside > rule.fails_outside * rule.count
+    assert rule.failures + rule.failures_outside == int(fails.sum())
+    assert rule == count_rule(rule.intervals, features, fails)
+    if rule.intervals:
+        assert rule.failures * rule.count_outside > rule.failures_outside * rule.count
 
 
 def test_overlap_is_by_the_worst_feature() -> None:
@@ -100,11 +109,11 @@ def test_covering_finds_two_rules() -> None:
     features, objects = of_cars(80, 16, 0)
     first, second = {"height_px": (0.3, 0.6), "lightness": (0.1, 0.5)}, {"yaw_deg": (0.85, 1.0)}
     inside = contains(first, features, len(objects)) | contains(second, features, len(objects))
-    rules = cover(features, failing(inside, 0, else_=0.01), objects)
-    assert [set(rule.where) for rule in rules] in ([set(first), set(second)], [set(second), set(first)])
+    rules = fit_rule_list(features, failing(inside, 0, else_=0.01), objects)
+    assert [set(rule.intervals) for rule in rules] in ([set(first), set(second)], [set(second), set(first)])
     for truth in (first, second):
-        (rule,) = [rule for rule in rules if set(rule.where) == set(truth)]
-        assert overlap(truth, rule.where) > 0.7
+        (rule,) = [rule for rule in rules if set(rule.intervals) == set(truth)]
+        assert overlap(truth, rule.intervals) > 0.7
 
 
 @pytest.mark.parametrize("by_car", [True, False])
@@ -117,7 +126,7 @@ def test_covering_tells_nothing_of_chance(by_car: bool) -> None:
         fails = rng.random(len(objects)) < 0.05
         if by_car:
             fails = np.isin(objects, rng.choice(40, 4, replace=False)) & (rng.random(len(objects)) < 0.5)
-        told += bool(cover(features, fails, objects))
+        told += bool(fit_rule_list(features, fails, objects))
     assert told <= 1
 
 
@@ -126,8 +135,8 @@ def test_three_cars_are_enough(cars: int) -> None:
     """Where there are fewer cars than parts, each car is a part."""
     truth = {"lightness": (0.2, 0.5)}
     features, objects = of_cars(cars, 48, 0)
-    (rule,) = cover(features, failing(contains(truth, features, len(objects)), 0, else_=0.01), objects)
-    assert rule.where["lightness"] == pytest.approx(truth["lightness"], abs=0.1)
+    (rule,) = fit_rule_list(features, failing(contains(truth, features, len(objects)), 0, else_=0.01), objects)
+    assert rule.intervals["lightness"] == pytest.approx(truth["lightness"], abs=0.1)
 
 
 @pytest.mark.parametrize("cars", [3, 4])
@@ -138,21 +147,21 @@ def test_a_few_cars_tell_nothing_of_chance(cars: int) -> None:
         features, objects = of_cars(cars, 48, seed)
         rng = np.random.default_rng(seed)
         for often in (0.05, 0.4, rng.random(cars)[objects]):
-            told += bool(cover(features, rng.random(len(objects)) < often, objects))
+            told += bool(fit_rule_list(features, rng.random(len(objects)) < often, objects))
     assert told <= 4
 
 
 def test_what_fails_in_two_cars_alone_is_no_rule() -> None:
     features, objects = of_cars(40, 12, 1)
-    assert cover(features, objects < 2, objects) == []
+    assert fit_rule_list(features, objects < 2, objects) == []
 
 
 def test_a_description_is_shorter_where_a_rule_tells() -> None:
     features = samples(96, 0)
     truth = {"aspect": (0.2, 0.5)}
     fails = failing(contains(truth, features, 96), 0)
-    assert description(truth, features, fails) < description({}, features, fails)
-    assert description({"yaw_deg": (0.2, 0.5)}, features, fails) > description({}, features, fails)
+    assert description_length(truth, features, fails) < description_length({}, features, fails)
+    assert description_length({"yaw_deg": (0.2, 0.5)}, features, fails) > description_length({}, features, fails)
     # Two bounds, each one of the 48 ends that are tried.
-    more = description(truth, features, fails) - description(truth, features, fails, bounds=0)
+    more = description_length(truth, features, fails) - description_length(truth, features, fails, bounds=0)
     assert more == pytest.approx(2 * np.log(48))

@@ -7,11 +7,11 @@ import torch
 
 from detectors.incremental.reference import LIMIT_MB
 from detectors.registry import load_detector
-from drivesem.attack.aims import Aim
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace
+from drivesem.attack.targets import TargetSelection
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.views import DrawnViews
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 
@@ -26,54 +26,61 @@ def objective() -> Objective:
 
 
 @pytest.fixture(scope="module")
-def views(objective: Objective) -> DrawnViews:
-    return DrawnViews.of(objective, Nuisances(), "search:demo-000:0")
+def views(objective: Objective) -> NuisanceMarginOracle:
+    return NuisanceMarginOracle.for_objective(objective, Nuisances(), "search:demo-000:0")
 
 
-def test_found_objects_count(views: DrawnViews, objective: Objective) -> None:
+def test_found_objects_count(views: NuisanceMarginOracle, objective: Objective) -> None:
     margins = views.margins(objective.space.theta0, 0)
-    assert margins.shape == views.judged.shape
-    assert bool(views.judged.any())
-    assert bool(torch.isinf(margins[~views.judged]).all())
+    assert margins.shape == views.counted_objects.shape
+    assert bool(views.counted_objects.any())
+    assert bool(torch.isinf(margins[~views.counted_objects]).all())
     # As photographed, a shift and a little noise lose none of those that are plainly found.
-    still = DrawnViews.of(objective, Nuisances.of("off"), "any").margins(objective.space.theta0, 0)
-    assert bool((still[views.judged] > 0).all())
-
-
-def test_the_aim_leaves_others_out(objective: Objective, views: DrawnViews) -> None:
-    first = int(views.judged.nonzero()[0])
-    aimed = Objective(
-        objective.compositor, objective.space, objective.detector, aim=Aim(objects=(first,), classes=None)
+    still = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("off"), "any").margins(
+        objective.space.theta0, 0
     )
-    assert DrawnViews.of(aimed, Nuisances(), "any").judged.nonzero().flatten().tolist() == [first]
+    assert bool((still[views.counted_objects] > 0).all())
 
 
-def test_a_number_is_one_draw(views: DrawnViews, objective: Objective) -> None:
+def test_the_aim_leaves_others_out(objective: Objective, views: NuisanceMarginOracle) -> None:
+    first = int(views.counted_objects.nonzero()[0])
+    aimed = Objective(
+        objective.compositor,
+        objective.space,
+        objective.detector,
+        aim=TargetSelection(objects=(first,), classes=None),
+    )
+    assert NuisanceMarginOracle.for_objective(
+        aimed, Nuisances(), "any"
+    ).counted_objects.nonzero().flatten().tolist() == [first]
+
+
+def test_a_number_is_one_draw(views: NuisanceMarginOracle, objective: Objective) -> None:
     before = views.passes
     one, again, other = (views.margins(objective.space.theta0, number) for number in (3, 3, 4))
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
     assert views.passes == before + 3
     # What was kept of a draw changes nothing.
-    anew = DrawnViews.of(objective, Nuisances(), "search:demo-000:0")
+    anew = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search:demo-000:0")
     assert torch.equal(anew.margins(objective.space.theta0, 3), one)
 
 
 def test_gradients_against_differences(objective: Objective) -> None:
     """Along a direction of paint and weather, without the steps that JPEG makes."""
-    views = DrawnViews.of(objective, Nuisances.of("noise=0,jpeg=0"), "search")
+    views = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("noise=0,jpeg=0"), "search")
     generator = torch.Generator().manual_seed(1)
     lower, upper = objective.space.lower, objective.space.upper
     theta = 0.25 * upper + 0.05 * lower
     before = views.passes
-    _, gradient = views.margins_and_grad(theta, 0, torch.ones(len(views.judged)))
+    _, gradient = views.margins_and_grad(theta, 0, torch.ones(len(views.counted_objects)))
     assert views.passes == before + 3
     way = torch.randn(len(theta), generator=generator) * (upper > lower)
     way = way + 3 * gradient / gradient.norm() * way.norm()  # not at right angles to the slope
     reach = 2.5e-4 / way.abs().max()
 
     def total(at: torch.Tensor) -> float:
-        margins = views.soft(at.requires_grad_(True), 0).detach().double()
+        margins = views.soft_margins(at.requires_grad_(True), 0).detach().double()
         return float(margins[torch.isfinite(margins)].sum())
 
     slope = (total(theta + reach * way) - total(theta - reach * way)) / float(2 * reach)
@@ -84,7 +91,7 @@ def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> Non
     scene, detector = demo_scene(0, 0), load_detector("squeezedet")
     space = ParameterSpace(scene, ("color", "translate"))
     of_regions, of_all = (Objective(Compositor(scene), space, detector, whole=whole) for whole in (False, True))
-    regional, whole = (DrawnViews.of(o, Nuisances(), "search") for o in (of_regions, of_all))
+    regional, whole = (NuisanceMarginOracle.for_objective(o, Nuisances(), "search") for o in (of_regions, of_all))
     generator = torch.Generator().manual_seed(0)
     places = [torch.rand(space.dim, generator=generator) * space.upper for _ in range(3)]
     for number in (0, 1):
@@ -92,9 +99,9 @@ def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> Non
             torch.testing.assert_close(
                 regional.margins(place, number), whole.margins(place, number), atol=1e-4, rtol=0
             )
-    kept = [regional.kept_mb, whole.kept_mb]
-    regional.forget()
-    kept.append(regional.kept_mb)
+    kept = [regional.cache_mb, whole.cache_mb]
+    regional.clear_cache()
+    kept.append(regional.cache_mb)
     assert kept[0] > 0
     assert kept[1:] == [0, 0]
 
@@ -102,7 +109,9 @@ def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_picture_seen_again_costs_less_than_a_whole_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, detector = demo_scene(0, 0), load_detector("squeezedet")
     space = ParameterSpace(scene, ("translate",))
-    views = DrawnViews.of(Objective(Compositor(scene), space, detector), Nuisances(), "search")
+    views = NuisanceMarginOracle.for_objective(
+        Objective(Compositor(scene), space, detector), Nuisances(), "search"
+    )
     views.margins(space.theta0, 0)
 
     def whole(*_: object) -> None:
@@ -111,13 +120,13 @@ def test_a_picture_seen_again_costs_less_than_a_whole_pass(monkeypatch: pytest.M
     monkeypatch.setattr(type(detector), "forward", whole)
     views.margins(0.1 * space.upper, 0)
     with pytest.raises(AssertionError, match="a whole pass"):  # with a gradient
-        views.margins_and_grad(space.theta0, 0, torch.ones(len(views.judged)))
+        views.margins_and_grad(space.theta0, 0, torch.ones(len(views.counted_objects)))
 
 
 def test_weather_has_no_regions(objective: Objective) -> None:
-    views = DrawnViews.of(objective, Nuisances(), "search")
+    views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
     views.margins(0.5 * objective.space.upper, 0)
-    kept = views.kept_mb
+    kept = views.cache_mb
     assert kept == 0
 
 
@@ -125,11 +134,11 @@ def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
     scene = demo_scene(0, 0)
     space = ParameterSpace(scene, ("translate",))
     objective = Objective(Compositor(scene), space, load_detector("squeezedet"), keep_mb=LIMIT_MB + 1.0)
-    views = DrawnViews.of(objective, Nuisances(), "search")
+    views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
     kept = []
     for number in range(2):
         views.margins(space.theta0, number)
-        kept.append(views.kept_mb)
+        kept.append(views.cache_mb)
     assert kept[0] == kept[1] > 0
 
 
@@ -138,14 +147,14 @@ def test_the_benign_picture_counts_and_one_picture_keeps_no_more_than_the_proces
     space = ParameterSpace(scene, ("translate",))
     whole = Objective(Compositor(scene), space, detector, whole=True)
     tight = Objective(Compositor(scene), space, detector, keep_mb=10.0)
-    views = DrawnViews.of(tight, Nuisances(), "search")
+    views = NuisanceMarginOracle.for_objective(tight, Nuisances(), "search")
     theta = 0.1 * space.upper
     loss, gradient = tight.loss_and_grad(theta)
     expected, slope = whole.loss_and_grad(theta)
     assert loss == pytest.approx(expected, abs=1e-4)
     torch.testing.assert_close(gradient, slope, atol=1e-3 * float(slope.abs().max()), rtol=1e-3)
-    assert 0 < tight.kept_mb <= 10.0
+    assert 0 < tight.reference_mb <= 10.0
     views.margins(space.theta0, 0)
-    assert views.kept_mb == 0
-    tight.forget()
-    assert tight.kept_mb == 0
+    assert views.cache_mb == 0
+    tight.release_layers()
+    assert tight.reference_mb == 0

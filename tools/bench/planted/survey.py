@@ -16,9 +16,9 @@ from detectors.planted import BLIND_TO, FEATURES, PIXEL_FEATURES, Band, PlantedF
 from detectors.types import CLASSES
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.objective import Objective
-from drivesem.evaluation.failures import IOU
+from drivesem.evaluation.failures import MATCH_IOU
+from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.second_renderer.compositor import CompositorRenderer
 from scene_ir.types import SceneIR
 
 HALTON = 128
@@ -58,7 +58,7 @@ class Sighting:
         placed, scores = told.boxes_for_class(label), told.log_scores[:, label].exp()
         cars = group_cars(placed, scores)
         own = scores[cars.rows]
-        meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= IOU
+        meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= MATCH_IOU
         meets &= (own >= objective.t_star) & ~ignore.to(meets.device)[:, None]
         values = compute_features(image[None], cars.boxes_xyxy[None])[:, 0]
         labelled = compute_features(image[None], labels_xyxy.to(image)[None])[:, 0]
@@ -121,11 +121,11 @@ class SeenFrame:
     def _sighting(self, scene: SceneIR, stream: str | None = None, number: int = 0) -> Sighting:
         renderer = CompositorRenderer(self.objective.compositor, self.objective.labeller)
         if stream is None:
-            drawn = renderer.redraw(scene)
+            drawn = renderer.render(scene)
             image, at = drawn.image, drawn.targets.boxes_xyxy
         else:
             draw = Nuisances().sample(stream, number, scene)
-            drawn = renderer.redraw(draw.perturb_scene(scene))
+            drawn = renderer.render(draw.perturb_scene(scene))
             image, at = draw.degrade_image(drawn.image), draw.transform_boxes(drawn.targets.boxes_xyxy)
         count = len(self.judged)
         return Sighting.of(self.objective, image, at[:count], drawn.targets.ignore[:count] | ~self.judged)

@@ -6,42 +6,41 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from drivesem.config.blocks import DEMO
 from drivesem.config.errors import UsageError
-from drivesem.failures.second_renderer.base import Redrawn, SecondRenderer
-from drivesem.failures.second_renderer.generator import GeneratorRedraw
-from drivesem.failures.second_renderer.photograph import PhotographRedraw
-from drivesem.failures.second_renderer.plans import DemoPlans, FolderPlans, Plans
-from drivesem.failures.second_renderer.screen import shared_screen
+from drivesem.config.options import DEMO
+from drivesem.failures.second_renderer.base import SecondRender, SecondRenderer
+from drivesem.failures.second_renderer.generator import DemoPlans, FolderPlans, GeneratorRenderer, PlanSource
+from drivesem.failures.second_renderer.opengl import shared_context
+from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.store import place
 from scene_ir.errors import FormatError
-from scene_ir.types import SceneIR, scene_to
+from scene_ir.types import SceneIR, convert_scene
 
 
-class Exchanged:
+class ExchangedSceneRenderer:
     """Of a scene whose vehicles were exchanged, added or taken away: the scenes before and after it, each drawn
     from its own textures. The generator's plan has no vehicle for a new one, so that pyrender draws it. scene:
     any state after it. Raises SceneError where a second renderer cannot be had.
     """
 
     def __init__(self, identifier: str, scene: SceneIR) -> None:
-        self._before = PhotographRedraw(identifier, scene.origin)
-        self._after = PhotographRedraw(identifier, scene, before=self._before)
+        self._before = PhotographRenderer(identifier, scene.origin)
+        self._after = PhotographRenderer(identifier, scene, before=self._before)
 
     @property
     def name(self) -> str:
         return self._after.name
 
-    def redraw(self, changed: SceneIR) -> Redrawn:
+    def render(self, changed: SceneIR) -> SecondRender:
         """A state of the scene, before or after."""
-        return (self._before if changed.before is None else self._after).redraw(changed)
+        return (self._before if changed.before is None else self._after).render(changed)
 
-    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
+    def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
         """See `PhotographRedraw`."""
-        return self._after.not_carried(changed)
+        return self._after.unsupported_changes(changed)
 
 
-class OnProcessor:
+class CpuSecondRenderer:
     """Of a scene on a GPU: second renderers draw on the processor; their pictures go where the scene lies."""
 
     def __init__(self, renderer: SecondRenderer) -> None:
@@ -51,14 +50,14 @@ class OnProcessor:
     def name(self) -> str:
         return self._renderer.name
 
-    def redraw(self, changed: SceneIR) -> Redrawn:
+    def render(self, changed: SceneIR) -> SecondRender:
         """A state of the scene."""
-        drawn = self._renderer.redraw(scene_to(changed, None, "cpu"))
+        drawn = self._renderer.render(convert_scene(changed, None, "cpu"))
         return replace(drawn, image=drawn.image.to(changed.photograph.device))
 
-    def not_carried(self, changed: SceneIR) -> tuple[str, ...]:
-        """What of a change `redraw` leaves out."""
-        return self._renderer.not_carried(scene_to(changed, None, "cpu"))
+    def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
+        """What of a change `render` leaves out."""
+        return self._renderer.unsupported_changes(convert_scene(changed, None, "cpu"))
 
 
 class SecondRenderers:
@@ -69,16 +68,16 @@ class SecondRenderers:
 
     def __init__(self, dataset: str, root: str | None) -> None:
         self._dataset = dataset
-        self._folder = _folder_plans(dataset, root)
+        self._folder = _find_folder_plans(dataset, root)
         self._last: tuple[Tensor, Tensor, SecondRenderer] | None = None
 
-    def of(self, identifier: str, scene: SceneIR) -> SecondRenderer:
+    def renderer_for(self, identifier: str, scene: SceneIR) -> SecondRenderer:
         """What draws a frame again. scene: any state of it; attacks on the same scene, one after the other, share
         the renderer. Raises SceneError where nothing can.
         """
         same = (scene.photograph, scene.objects.mesh_index)  # the same state of affairs: no theta touches them
         if self._last is None or any(a is not b for a, b in zip(self._last, same, strict=False)):
-            self._last = (*same, self._made(identifier, scene))
+            self._last = (*same, self._make_renderer(identifier, scene))
         return self._last[2]
 
     @property
@@ -89,20 +88,20 @@ class SecondRenderers:
     def check(self) -> None:
         """Raises NoSecondRendererError where no frame of the data set could be drawn a second time."""
         if not self.generated:
-            shared_screen()
+            shared_context()
 
-    def _made(self, identifier: str, scene: SceneIR) -> SecondRenderer:
+    def _make_renderer(self, identifier: str, scene: SceneIR) -> SecondRenderer:
         if scene.photograph.is_cuda:
-            return OnProcessor(self._made(identifier, scene_to(scene, None, "cpu")))
+            return CpuSecondRenderer(self._make_renderer(identifier, convert_scene(scene, None, "cpu")))
         if scene.before is not None:
-            return Exchanged(identifier, scene)
+            return ExchangedSceneRenderer(identifier, scene)
         plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
         if plans is not None:
-            return GeneratorRedraw(identifier, scene, plans)
-        return PhotographRedraw(identifier, scene)
+            return GeneratorRenderer(identifier, scene, plans)
+        return PhotographRenderer(identifier, scene)
 
 
-def _folder_plans(dataset: str, root: str | None) -> Plans | None:
+def _find_folder_plans(dataset: str, root: str | None) -> PlanSource | None:
     """Of a folder that the generator wrote; None where it did not, or where it is not known how."""
     if dataset != "kitti":
         return None

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.labels import Labeller
-from drivesem.failures.second_renderer.photograph import PhotographRedraw
-from drivesem.failures.second_renderer.screen import Screen
+from drivesem.failures.second_renderer.opengl import OpenGLContext
+from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.synth.demo import demo_scene
 from scene_ir.errors import RangeError
-from scene_ir.types import Crop, Front, SceneIR
+from scene_ir.types import Crop, Occluder, SceneIR
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,9 @@ def scene() -> SceneIR:
 
 
 @pytest.fixture(scope="module")
-def second(scene: SceneIR, screen: Screen) -> PhotographRedraw:
+def second(scene: SceneIR, screen: OpenGLContext) -> PhotographRenderer:
     del screen
-    return PhotographRedraw("demo-000", scene)
+    return PhotographRenderer("demo-000", scene)
 
 
 def mattes(scene: SceneIR) -> Tensor:
@@ -51,8 +51,8 @@ def moved(scene: SceneIR, i: int, x: float = 0.0, z: float = 0.0, turn: float = 
     return scene.with_objects(translation=translation, yaw=yaw)
 
 
-def test_without_a_change_it_is_nearly_the_photograph(second: PhotographRedraw, scene: SceneIR) -> None:
-    drawn = second.redraw(scene)
+def test_without_a_change_it_is_nearly_the_photograph(second: PhotographRenderer, scene: SceneIR) -> None:
+    drawn = second.render(scene)
     apart = (drawn.image - scene.photograph).abs().mean(dim=0)
     matte = mattes(scene)
     assert float(apart[matte == 0].mean()) < 0.004
@@ -60,52 +60,52 @@ def test_without_a_change_it_is_nearly_the_photograph(second: PhotographRedraw, 
     assert torch.equal(drawn.image, (drawn.image * 255).round() / 255)
 
 
-def test_without_a_change_labels_are_the_photographs(second: PhotographRedraw, scene: SceneIR) -> None:
-    drawn, count = second.redraw(scene), len(scene.objects)
+def test_without_a_change_labels_are_the_photographs(second: PhotographRenderer, scene: SceneIR) -> None:
+    drawn, count = second.render(scene), len(scene.objects)
     torch.testing.assert_close(drawn.targets.boxes_xyxy[:count], scene.objects.box2d, atol=1e-3, rtol=0)
     assert torch.equal(drawn.targets.labels[:count], scene.objects.category)
     assert bool(drawn.targets.ignore[count:].all())
     assert not bool(drawn.targets.ignore[largest(scene)])
 
 
-def test_labels_move_as_ours_do(second: PhotographRedraw, scene: SceneIR) -> None:
+def test_labels_move_as_ours_do(second: PhotographRenderer, scene: SceneIR) -> None:
     i = largest(scene)
     changed = moved(scene, i, x=0.4, z=0.5, turn=0.1)
-    drawn, ours = second.redraw(changed), Labeller(scene).moved(changed)
+    drawn, ours = second.render(changed), Labeller(scene).moved(changed)
     torch.testing.assert_close(drawn.targets.boxes_xyxy[i], ours.boxes_xyxy[i], atol=0.05, rtol=0)
-    shown = second.redraw(scene).shown_xyxy[i]
-    assert float(drawn.shown_xyxy[i][0]) > float(shown[0]) + 1
+    shown = second.render(scene).visible_xyxy[i]
+    assert float(drawn.visible_xyxy[i][0]) > float(shown[0]) + 1
 
 
-def test_what_stands_nearer_hides_what_is_behind_it(second: PhotographRedraw, scene: SceneIR) -> None:
+def test_what_stands_nearer_hides_what_is_behind_it(second: PhotographRenderer, scene: SceneIR) -> None:
     objects = scene.objects
     order = objects.translation[:, 2].argsort().tolist()
     near, far = order[0], order[-1]
     translation = objects.translation.clone()
     # The far one comes to stand right behind the near one, as the camera sees it.
     translation[far] = objects.translation[near] * torch.tensor([1.3, 1.0, 1.3])
-    behind = second.redraw(scene.with_objects(translation=translation))
+    behind = second.render(scene.with_objects(translation=translation))
     assert bool(behind.targets.ignore[far])
-    shown = behind.shown_xyxy
+    shown = behind.visible_xyxy
     height = shown[:, 3] - shown[:, 1]
     assert float(height[far]) < 0.5 * float(height[near])
     translation[far] = objects.translation[near] * torch.tensor([0.7, 1.0, 0.7])
-    before = second.redraw(scene.with_objects(translation=translation))
-    assert float(before.shown_xyxy[far][3]) > float(before.shown_xyxy[near][3])
+    before = second.render(scene.with_objects(translation=translation))
+    assert float(before.visible_xyxy[far][3]) > float(before.visible_xyxy[near][3])
 
 
-def test_what_left_the_picture_is_ignored(second: PhotographRedraw, scene: SceneIR) -> None:
+def test_what_left_the_picture_is_ignored(second: PhotographRenderer, scene: SceneIR) -> None:
     i = largest(scene)
-    drawn = second.redraw(moved(scene, i, x=200.0))
+    drawn = second.render(moved(scene, i, x=200.0))
     assert bool(drawn.targets.ignore[i])
-    assert torch.equal(drawn.shown_xyxy[i], torch.zeros(4))
+    assert torch.equal(drawn.visible_xyxy[i], torch.zeros(4))
 
 
-def test_paint_changes_its_vehicle_alone(second: PhotographRedraw, scene: SceneIR) -> None:
+def test_paint_changes_its_vehicle_alone(second: PhotographRenderer, scene: SceneIR) -> None:
     i = largest(scene)
     code = scene.objects.texture_code.clone()
     code[i, 0] = 0.8
-    before, after = second.redraw(scene), second.redraw(scene.with_objects(texture_code=code))
+    before, after = second.render(scene), second.render(scene.with_objects(texture_code=code))
     apart = (after.image - before.image).mean(dim=0)
     x0, y0, x1, y1 = (round(v) for v in scene.objects.box2d[i].tolist())
     assert float(apart[y0:y1, x0:x1].mean()) > 0.02
@@ -115,21 +115,21 @@ def test_paint_changes_its_vehicle_alone(second: PhotographRedraw, scene: SceneI
 
 @pytest.mark.parametrize("code", range(4))
 def test_weather_changes_the_picture_and_code_zero_does_not(
-    code: int, second: PhotographRedraw, scene: SceneIR
+    code: int, second: PhotographRenderer, scene: SceneIR
 ) -> None:
     weather = torch.zeros(4)
     weather[code] = 0.6
-    before = second.redraw(scene).image
-    after = second.redraw(scene.with_environment(weather=weather)).image
+    before = second.render(scene).image
+    after = second.render(scene.with_environment(weather=weather)).image
     assert float((after - before).abs().mean()) > 0.02
     weather[code] = 1e-3
-    barely = second.redraw(scene.with_environment(weather=weather)).image
+    barely = second.render(scene.with_environment(weather=weather)).image
     assert float((barely - before).abs().mean()) < 0.005
 
 
-def test_fog_hides_what_is_far(second: PhotographRedraw, scene: SceneIR) -> None:
-    before = second.redraw(scene).image
-    after = second.redraw(scene.with_environment(weather=torch.tensor([1.0, 0, 0, 0]))).image
+def test_fog_hides_what_is_far(second: PhotographRenderer, scene: SceneIR) -> None:
+    before = second.render(scene).image
+    after = second.render(scene.with_environment(weather=torch.tensor([1.0, 0, 0, 0]))).image
     far = (scene.depth > 100) & torch.isfinite(scene.depth) & (mattes(scene) == 0)
     near = scene.depth < 8
     assert float(after[:, far].std()) < 0.5 * float(before[:, far].std())
@@ -137,11 +137,11 @@ def test_fog_hides_what_is_far(second: PhotographRedraw, scene: SceneIR) -> None
 
 
 @pytest.mark.parametrize("code", range(3))
-def test_leaves_change_where_there_are_some(code: int, second: PhotographRedraw, scene: SceneIR) -> None:
+def test_leaves_change_where_there_are_some(code: int, second: PhotographRenderer, scene: SceneIR) -> None:
     foliage = torch.zeros(3)
     foliage[code] = -0.7
-    before = second.redraw(scene).image
-    apart = (second.redraw(scene.with_environment(foliage=foliage)).image - before).abs().mean(dim=0)
+    before = second.render(scene).image
+    apart = (second.render(scene.with_environment(foliage=foliage)).image - before).abs().mean(dim=0)
     leaves = scene.environment.foliage_map
     assert float(apart[leaves > 0.9].mean()) > 0.01
     assert float(apart[leaves == 0].max()) == 0
@@ -151,7 +151,7 @@ def test_leaves_change_where_there_are_some(code: int, second: PhotographRedraw,
     assert float(apart[rows, columns].mean()) < 1 / 255
 
 
-def test_what_stands_in_front_stays_in_front(screen: Screen, scene: SceneIR) -> None:
+def test_what_stands_in_front_stays_in_front(screen: OpenGLContext, scene: SceneIR) -> None:
     del screen
     i = largest(scene)
     x0, y0, x1, y1 = (round(v) for v in scene.objects.box2d[i].tolist())
@@ -160,31 +160,33 @@ def test_what_stands_in_front_stays_in_front(screen: Screen, scene: SceneIR) -> 
     photograph, background = scene.photograph.clone(), scene.background.clone()
     for picture in (photograph, background):
         picture[:, y : y + 20, x : x + 6] = pole[:3]
-    front = Front(Crop(pole, x, y), 1.0)
-    with_pole = replace(scene, photograph=photograph, background=background, front=(front,))
-    second = PhotographRedraw("demo-000", with_pole)
+    front = Occluder(Crop(pole, x, y), 1.0)
+    with_pole = replace(scene, photograph=photograph, background=background, occluders=(front,))
+    second = PhotographRenderer("demo-000", with_pole)
     for state in (with_pole, moved(with_pole, i, z=0.4)):
-        drawn = second.redraw(state).image[:, y + 2 : y + 18, x + 1 : x + 5]
+        drawn = second.render(state).image[:, y + 2 : y + 18, x + 1 : x + 5]
         torch.testing.assert_close(drawn, pole[:3, 2:18, 1:5], atol=0.01, rtol=0)
-    beyond = replace(with_pole, front=(Front(Crop(pole, x, y), 90.0),))
-    drawn = PhotographRedraw("demo-000", beyond).redraw(beyond).image[:, y + 2 : y + 18, x + 1 : x + 5]
+    beyond = replace(with_pole, occluders=(Occluder(Crop(pole, x, y), 90.0),))
+    drawn = PhotographRenderer("demo-000", beyond).render(beyond).image[:, y + 2 : y + 18, x + 1 : x + 5]
     assert float((drawn - pole[:3, 2:18, 1:5]).abs().mean()) > 0.1
 
 
-def test_without_vehicles_the_background_has_its_weather(screen: Screen, street: Callable[..., SceneIR]) -> None:
+def test_without_vehicles_the_background_has_its_weather(
+    screen: OpenGLContext, street: Callable[..., SceneIR]
+) -> None:
     del screen
     empty = street(())
-    second = PhotographRedraw("empty", empty)
-    drawn = second.redraw(empty)
-    assert (len(drawn.targets), len(drawn.shown_xyxy)) == (0, 0)
+    second = PhotographRenderer("empty", empty)
+    drawn = second.render(empty)
+    assert (len(drawn.targets), len(drawn.visible_xyxy)) == (0, 0)
     assert float((drawn.image - empty.background).abs().max()) < 1 / 255
-    foggy = second.redraw(empty.with_environment(weather=torch.tensor([1.0, 0, 0, 0])))
+    foggy = second.render(empty.with_environment(weather=torch.tensor([1.0, 0, 0, 0])))
     assert float((foggy.image - drawn.image).abs().mean()) > 0.1
 
 
-def test_other_vehicles_than_the_photographs_are_refused(second: PhotographRedraw) -> None:
+def test_other_vehicles_than_the_photographs_are_refused(second: PhotographRenderer) -> None:
     other = demo_scene(0, 1)
-    while len(other.objects) == len(second.redraw(demo_scene(0, 0)).shown_xyxy):
+    while len(other.objects) == len(second.render(demo_scene(0, 0)).visible_xyxy):
         other = demo_scene(0, 2)
     with pytest.raises(RangeError, match="demo-000"):
-        second.redraw(other)
+        second.render(other)

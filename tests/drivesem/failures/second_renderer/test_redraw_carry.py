@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.failures.second_renderer.carry import carried
-from drivesem.failures.second_renderer.plans import Planned
+from drivesem.failures.second_renderer.generator import PlanMatch, transfer_edit
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import Plan, SynthSettings, plan_frame, yaw_in_camera
 from drivesem.synth.layout import Actor, LayoutSettings
@@ -51,8 +50,8 @@ def scene(plan: Plan, street: Callable[..., SceneIR]) -> SceneIR:
     return found.with_objects(translation=poses, yaw=yaws)
 
 
-def planned(plan: Plan, *tracks: int | None) -> Planned:
-    return Planned(plan, tracks)
+def planned(plan: Plan, *tracks: int | None) -> PlanMatch:
+    return PlanMatch(plan, tracks)
 
 
 def tracks_of(plan: Plan) -> list[int]:
@@ -65,7 +64,7 @@ def test_vehicles_go_the_same_way(plan: Plan, scene: SceneIR) -> None:
     changed = scene.with_objects(
         translation=scene.objects.translation + torch.from_numpy(ways.T.copy()), yaw=scene.objects.yaw + turns
     )
-    found = carried(scene, changed, planned(plan, *tracks_of(plan)))
+    found = transfer_edit(scene, changed, planned(plan, *tracks_of(plan)))
     assert found.missing == ()
     after = apply_edit(plan, found.edit)
     for i, actor in enumerate(after.actors[:COUNT]):
@@ -77,17 +76,17 @@ def test_vehicles_go_the_same_way(plan: Plan, scene: SceneIR) -> None:
 
 def test_the_sun_is_carried(plan: Plan, scene: SceneIR) -> None:
     changed = scene.with_environment(light=torch.tensor([0.5, -1.0, 0.25]))
-    found = carried(scene, changed, planned(plan, *tracks_of(plan)))
+    found = transfer_edit(scene, changed, planned(plan, *tracks_of(plan)))
     assert (found.edit.sun, found.missing) == ((0.5, -1.0, 0.25), ())
 
 
 def test_vehicles_grow_by_the_same_share(plan: Plan, scene: SceneIR) -> None:
     factors = torch.tensor([1.1, 0.95, 1.0], dtype=torch.float64)
     changed = scene.with_objects(size_lhw=scene.objects.size_lhw * factors[:, None])
-    after = apply_edit(plan, carried(scene, changed, planned(plan, *tracks_of(plan))).edit)
+    after = apply_edit(plan, transfer_edit(scene, changed, planned(plan, *tracks_of(plan))).edit)
     for old, new, factor in zip(plan.actors, after.actors, factors.tolist(), strict=False):
         assert new.size_lhw == pytest.approx([factor * side for side in old.size_lhw])
-    assert carried(scene, changed, planned(plan, None, None, None)).missing == tuple(
+    assert transfer_edit(scene, changed, planned(plan, None, None, None)).missing == tuple(
         f"objects[{i}]: the generator's plan has no such vehicle" for i in (0, 1)
     )
 
@@ -102,7 +101,7 @@ def test_the_same_metal_is_bent_whichever_way_a_fit_turned_the_car(
     code = torch.linspace(-0.05, 0.08, ffd.SYMMETRIC_DIM, dtype=torch.float64)
     offsets = scene.objects.ffd.clone()
     offsets[0] += ffd.from_symmetric(code)
-    found = carried(scene, scene.with_objects(ffd=offsets), planned(plan, *tracks_of(plan)))
+    found = transfer_edit(scene, scene.with_objects(ffd=offsets), planned(plan, *tracks_of(plan)))
     theirs = ffd.from_symmetric(torch.tensor(found.edit.objects[actor.track].mesh, dtype=torch.float64))
     size = torch.tensor(actor.size_lhw, dtype=torch.float64)
     yaw = torch.tensor(yaw_in_camera(actor, plan.setting.view), dtype=torch.float64)
@@ -120,7 +119,7 @@ def test_paint_weather_and_foliage(plan: Plan, scene: SceneIR) -> None:
     changed = scene.with_objects(texture_code=paint).with_environment(
         weather=torch.tensor([0.3, 0.0, 0.5, 0.0]), foliage=torch.tensor([-0.2, 0.0, 0.1])
     )
-    edit = carried(scene, changed, planned(plan, *tracks_of(plan))).edit
+    edit = transfer_edit(scene, changed, planned(plan, *tracks_of(plan))).edit
     assert edit.objects[plan.actors[1].track].color == pytest.approx((-0.4, 0, 0, 0, 0))
     assert edit.weather == pytest.approx((0.3, 0, 0.5, 0))
     assert edit.foliage == pytest.approx((-0.2, 0, 0.1))
@@ -129,6 +128,6 @@ def test_paint_weather_and_foliage(plan: Plan, scene: SceneIR) -> None:
 def test_what_has_no_counterpart_is_named_where_it_was_changed(plan: Plan, scene: SceneIR) -> None:
     turns = torch.tensor([0.1, 0.1, 0.0], dtype=torch.float64)
     changed = scene.with_objects(yaw=scene.objects.yaw + turns)
-    found = carried(scene, changed, planned(plan, None, tracks_of(plan)[1], None))
+    found = transfer_edit(scene, changed, planned(plan, None, tracks_of(plan)[1], None))
     assert found.missing == ("objects[0]: the generator's plan has no such vehicle",)
     assert list(found.edit.objects) == [tracks_of(plan)[1]]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.config.commands import Attack
-from drivesem.failures.second_renderer.choose import SecondRenderers
-from drivesem.failures.second_renderer.generator import GeneratorRedraw
-from drivesem.failures.second_renderer.photograph import PhotographRedraw
-from drivesem.failures.second_renderer.screen import Screen
-from drivesem.run.attack import Worker
+from drivesem.config.commands import AttackConfig
+from drivesem.failures.second_renderer.generator import GeneratorRenderer
+from drivesem.failures.second_renderer.opengl import OpenGLContext
+from drivesem.failures.second_renderer.photograph import PhotographRenderer
+from drivesem.failures.second_renderer.selection import SecondRenderers
+from drivesem.run.attack import AttackWorker
 from drivesem.scenes.sources import open_source
 from drivesem.synth.demo import demo_scene
 from drivesem.synth.write import Order, synthesise
@@ -28,31 +28,33 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_embedded_scene_is_known_wherever_it_comes_from(tmp_path: Path) -> None:
     scene = demo_scene(0, 0)
     for dataset, root in (("demo", None), ("kitti", str(tmp_path)), ("coco", str(tmp_path))):
-        assert isinstance(SecondRenderers(dataset, root).of("any", scene), GeneratorRedraw)
+        assert isinstance(SecondRenderers(dataset, root).renderer_for("any", scene), GeneratorRenderer)
 
 
 def test_frames_of_a_folder_that_the_generator_wrote(folder: Path) -> None:
-    scene = open_source(Attack(dataset="kitti", root=str(folder))).scene("000000")
+    scene = open_source(AttackConfig(dataset="kitti", root=str(folder))).scene("000000")
     second = SecondRenderers("kitti", str(folder))
-    assert isinstance(second.of("000000", scene), GeneratorRedraw)
+    assert isinstance(second.renderer_for("000000", scene), GeneratorRenderer)
 
 
-def test_photographs_go_to_pyrender(screen: Screen, tmp_path: Path) -> None:
+def test_photographs_go_to_pyrender(screen: OpenGLContext, tmp_path: Path) -> None:
     del screen
     scene = demo_scene(0, 0)
     photograph = replace(scene, provenance={**scene.provenance, "dataset": "kitti"})
     second = SecondRenderers("kitti", str(tmp_path))
     second.check()
-    assert isinstance(second.of("000000", photograph), PhotographRedraw)
+    assert isinstance(second.renderer_for("000000", photograph), PhotographRenderer)
 
 
 def test_attacks_on_one_scene_share_the_renderer() -> None:
     second, one, two = SecondRenderers("demo", None), demo_scene(0, 0), demo_scene(0, 1)
-    first = second.of("demo-000", one)
-    assert second.of("demo-000", one.with_objects(yaw=one.objects.yaw + 0.1)) is first
-    assert second.of("demo-001", two) is not first
+    first = second.renderer_for("demo-000", one)
+    assert second.renderer_for("demo-000", one.with_objects(yaw=one.objects.yaw + 0.1)) is first
+    assert second.renderer_for("demo-001", two) is not first
 
 
 @pytest.mark.parametrize("confirm", [True, False])
 def test_runs_ask_the_second_renderer_if_they_are_to(confirm: bool) -> None:
-    assert (Worker.of(Attack(confirm=confirm)).grader.second is not None) == confirm
+    assert (
+        AttackWorker.from_config(AttackConfig(confirm=confirm)).grader.make_second_renderer is not None
+    ) == confirm

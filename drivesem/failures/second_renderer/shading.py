@@ -13,9 +13,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from drivesem.failures.second_renderer.placing import numbers
-from drivesem.failures.second_renderer.screen import Array
-from scene_ir.types import Environment
+from drivesem.failures.second_renderer.geometry import PictureCamera, VehiclePose, to_numpy
+from drivesem.failures.second_renderer.opengl import Array
+from scene_ir.types import Environment, Source
 
 _GAMMA = 2.2
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -44,7 +44,7 @@ _LEAF_GAMMA = 1.1
 """How lightness code 1 changes the exponent of leaves' values, as a logarithm."""
 
 
-def painted(colour: Array, code: Array, paint: Array, height: Array, base: Array) -> Array:
+def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: Array) -> Array:
     """Texels (h, w, 3) of a vehicle whose paint has a texture code (5,). paint, height: (h, w), base: (3,), see
     `baking.Atlas`."""
     if not code.any():
@@ -68,12 +68,12 @@ def painted(colour: Array, code: Array, paint: Array, height: Array, base: Array
     return out
 
 
-def shade_left(weather: Array) -> float:
+def remaining_shade(weather: Array) -> float:
     """Share of a cast shadow's optical depth that is left under a weather code (4,)."""
     return float(np.prod(1 - _SOFTENING * weather))
 
 
-def air_of(photograph: Array, sky: Array) -> Array:
+def estimate_air_colour(photograph: Array, sky: Array) -> Array:
     """Colour (3,) of the air, as the photograph's sky has it; (H, W, 3), (H, W)."""
     shown = sky > 0.5
     count = int(np.count_nonzero(shown))
@@ -81,7 +81,7 @@ def air_of(photograph: Array, sky: Array) -> Array:
     return grey if count < 500 else photograph[shown].mean(axis=0).astype(np.float32)
 
 
-def with_leaves(image: Array, code: Array, leaves: Array, air: Array) -> Array:
+def apply_foliage(image: Array, code: Array, leaves: Array, air: Array) -> Array:
     """The picture (H, W, 3) with its foliage (H, W) in [0, 1] changed by a code (3,)."""
     if not code.any():
         return image
@@ -96,7 +96,7 @@ def with_leaves(image: Array, code: Array, leaves: Array, air: Array) -> Array:
     hsv[:, 1] = np.clip(hsv[:, 1] * (1 + 0.3 * hue), 0, 1)
     hsv[:, 2] = np.clip(hsv[:, 2], 0, 1) ** np.exp(-_LEAF_GAMMA * lightness)
     rgb = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
-    gaps = _speckles(*leaves.shape)[rows, columns, None]
+    gaps = _leaf_gaps(*leaves.shape)[rows, columns, None]
     rgb = rgb - 0.4 * max(density, 0.0) * (1 - gaps) * rgb
     rgb = rgb + 0.8 * max(-density, 0.0) * gaps * (air - rgb)
     out = image.copy()
@@ -104,13 +104,13 @@ def with_leaves(image: Array, code: Array, leaves: Array, air: Array) -> Array:
     return out
 
 
-def weathered(image: Array, depth_m: Array, open_to: Array, environment: Environment, air: Array) -> Array:
+def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Environment, air: Array) -> Array:
     """The picture (H, W, 3) under the environment's weather. depth_m: (H, W), inf in the sky; open_to: (H, W), 0
     where a vehicle hides the sky and the road."""
     fog, rain, time, overcast = environment.weather.tolist()
     if not (fog or rain or time or overcast):
         return image
-    sky, road = (open_to[..., None] * numbers(m)[..., None] for m in (environment.sky, environment.road))
+    sky, road = (open_to[..., None] * to_numpy(m)[..., None] for m in (environment.sky, environment.road))
     light, air = image**_GAMMA, air**_GAMMA
     if overcast:
         grey = (light @ _LUMA)[..., None]
@@ -127,7 +127,7 @@ def weathered(image: Array, depth_m: Array, open_to: Array, environment: Environ
     if rain:
         grey = (light @ _LUMA)[..., None]
         wet = 0.85 * (0.65 * light + 0.35 * grey)
-        mirror = _smeared(light) * 0.5 + 0.35 * air
+        mirror = _reflect_in_road(light) * 0.5 + 0.35 * air
         wet += road * np.clip(0.1 + depth / 90, 0, 0.5) * (mirror - wet)
         light = light + rain * (wet - light)
     light = np.clip(light, 0, 1)
@@ -136,13 +136,13 @@ def weathered(image: Array, depth_m: Array, open_to: Array, environment: Environ
     air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
         light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.65 * air - light)
-        light += 0.12 * rain * _drops(*light.shape[:2])[..., None] * (air - light)
+        light += 0.12 * rain * _rain_streaks(*light.shape[:2])[..., None] * (air - light)
     if fog:
         light += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - light)
     return (light ** (1 / _GAMMA)).astype(np.float32)
 
 
-def _smeared(light: Array) -> Array:
+def _reflect_in_road(light: Array) -> Array:
     """What a wet road mirrors: what stands above it, drawn out downwards."""
     rows = light.shape[0] // 8
     above = cv2.blur(light, (5, rows))
@@ -151,7 +151,7 @@ def _smeared(light: Array) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _drops(height: int, width: int) -> Array:
+def _rain_streaks(height: int, width: int) -> Array:
     """Streaks of rain (H, W) in [0, 1]; the same for each size."""
     chance = np.random.default_rng(41)
     streaks = np.zeros((height, width), np.float32)
@@ -167,7 +167,105 @@ def _drops(height: int, width: int) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _speckles(height: int, width: int) -> Array:
+def _leaf_gaps(height: int, width: int) -> Array:
     """Where thin leaves let the air through (H, W) in [0, 1]; the same for each size."""
     noise = cv2.GaussianBlur(np.random.default_rng(43).normal(size=(height, width)), (0, 0), 1.5)
     return (1 / (1 + np.exp(1 - 3 * noise / noise.std()))).astype(np.float32)
+
+
+_MIN_FACTOR = 0.05
+"""Factors below this count as this: their logarithms are added."""
+_CONTACT_DEPTH, _CONTACT_PERCENTILE = (0.7, 2.0), 80
+"""Optical depth of the shadow under a vehicle, least and most; the percentile of what the photograph shows of its
+shadow that it is taken for."""
+_EDGE_BLUR_M = 0.15
+"""Over how far that one fades at the footprint's edge."""
+
+
+class GroundShadow:
+    """Of one vehicle, as optical depth. normal: (3,) of the ground, in the camera's axes. dark: (H, W, 3), what
+    the photograph shows of it, besides that of the scene.
+    """
+
+    def __init__(self, source: Source, lens: PictureCamera, normal: Array, dark: Array) -> None:
+        self._lens, self._normal = lens, normal.astype(np.float64)
+        self._before = VehiclePose.from_source(source)
+        if source.shadow is not None and source.shadow.values.numel():
+            crop = source.shadow
+            factor = to_numpy(crop.values).transpose(1, 2, 0)
+            where = slice(crop.y0, crop.y0 + factor.shape[0]), slice(crop.x0, crop.x0 + factor.shape[1])
+            # What is dark about a vehicle above the ground is no shadow.
+            low = np.zeros_like(dark)
+            low[where] = np.maximum(dark[where], -np.log(np.clip(factor, _MIN_FACTOR, 1)))
+            dark = low
+        x, y, width, height = cv2.boundingRect((dark.max(axis=2) > 0).astype(np.uint8))
+        # Nothing is known beyond: there the shadow is to end.
+        density = np.minimum(dark[y : y + height, x : x + width], -np.log(_MIN_FACTOR))
+        self._density = (
+            cv2.copyMakeBorder(density, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(0, 0, 0)) if width else None
+        )
+        self._origin = (x - 1, y - 1)
+        told = density[density > 0]
+        self._core = (
+            float(np.clip(np.percentile(told, _CONTACT_PERCENTILE), *_CONTACT_DEPTH))
+            if len(told)
+            else _CONTACT_DEPTH[0]
+        )
+
+    def cast(self, pose: VehiclePose, density: Array) -> None:
+        """Add what the vehicle casts where it stands now to the picture's optical depth (H, W, 3)."""
+        contact = self._contact(pose)
+        if contact is not None:
+            where, dark = contact
+            density[where] = np.maximum(density[where], dark[..., None])
+        if self._density is None:
+            return
+        matrix = self._ground_motion(pose) @ _translation(*self._origin)
+        height, width = self._density.shape[:2]
+        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], np.float64) @ matrix.T
+        if (corners[:, 2] <= 0).any():
+            return
+        at = corners[:, :2] / corners[:, 2:]
+        limit = [self._lens.width, self._lens.height]
+        x0, y0 = np.clip(np.floor(at.min(axis=0)), 0, limit).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(at.max(axis=0)) + 1, 0, limit).astype(int).tolist()
+        if x1 <= x0 or y1 <= y0:
+            return
+        moved = cv2.warpPerspective(self._density, _translation(-x0, -y0) @ matrix, (x1 - x0, y1 - y0))
+        density[y0:y1, x0:x1] = np.maximum(density[y0:y1, x0:x1], moved)
+
+    def _ground_motion(self, pose: VehiclePose) -> np.ndarray:
+        """(3, 3) by which pixels of the ground under the vehicle move when it does: a plane's homography."""
+        k = self._lens.intrinsics.astype(np.float64)
+        before, after = (p.translation.astype(np.float64) + self._lens.shift_m for p in (self._before, pose))
+        turn = pose.rotation().astype(np.float64) @ self._before.rotation().T
+        level = self._normal @ before
+        return k @ (turn + np.outer(after - turn @ before, self._normal) / level) @ np.linalg.inv(k)
+
+    def _contact(self, pose: VehiclePose) -> tuple[tuple[slice, slice], Array] | None:
+        """Optical depth (h, w) of the contact shadow, and where; None where it is not in the picture."""
+        lens = self._lens
+        half = np.array([pose.size_lhw[0], pose.size_lhw[2]]) / 2 - _EDGE_BLUR_M
+        flat = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half
+        ends = np.stack([flat[:, 0], np.zeros(4), flat[:, 1]], axis=1) @ pose.rotation().T
+        ends += pose.translation + lens.shift_m
+        if ends[:, 2].min() < 1.0:
+            return None
+        at = lens.project(ends.astype(np.float32))
+        soft = max(0.7, _EDGE_BLUR_M * float(lens.intrinsics[0, 0]) / float(ends[:, 2].mean()))
+        # Seen at a slant, the ground is foreshortened by the camera's height over the distance.
+        flatter = max(0.5, soft * abs(float(self._normal @ ends.mean(axis=0))) / float(ends[:, 2].mean()))
+        reach = int(np.ceil(3 * soft))
+        x0, y0 = np.clip(np.floor(at.min(axis=0)) - reach, 0, [lens.width, lens.height]).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(at.max(axis=0)) + reach, 0, [lens.width, lens.height]).astype(int).tolist()
+        if x1 <= x0 or y1 <= y0:
+            return None
+        mask = np.zeros((y1 - y0, x1 - x0), np.float32)
+        fixed = np.rint((at - [x0, y0]) * 16).astype(np.int32)
+        cv2.fillConvexPoly(mask, fixed, 1.0, cv2.LINE_8, 4)
+        mask = cv2.GaussianBlur(mask, (0, 0), soft, sigmaY=flatter)
+        return (slice(y0, y1), slice(x0, x1)), (self._core * mask).astype(np.float32)
+
+
+def _translation(x: float, y: float) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1]], np.float64)

@@ -12,7 +12,7 @@ import pytest
 
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
-from drivesem.failures.second_renderer.plans import DemoPlans, FolderPlans
+from drivesem.failures.second_renderer.generator import DemoPlans, FolderPlans
 from drivesem.synth.frames import render_frame
 from drivesem.synth.write import Order, synthesise
 from scene_ir import files
@@ -38,7 +38,7 @@ def test_plans_draw_the_files(folder: Path, inside: str) -> None:
     plans = FolderPlans(folder / inside)
     labels = read_labels(folder / "training" / "label_2" / "000001.txt")
     rows = [i for i, kind in enumerate(labels.kind) if kind in ("Car", "Van", "Truck")]
-    found = plans.planned("000001", scene_of([*rows[::-1], 99]))
+    found = plans.find_plan("000001", scene_of([*rows[::-1], 99]))
     assert found.plan.variation == "fog"
     assert found.tracks[-1] is None
     actors = {actor.track: actor for actor in found.plan.actors}
@@ -56,7 +56,7 @@ def test_plans_draw_the_files(folder: Path, inside: str) -> None:
 def test_unknown_frames(folder: Path) -> None:
     for name in ("000002", "night"):
         with pytest.raises(FormatError, match=f"frame {name}"):
-            FolderPlans(folder).planned(name, scene_of([]))
+            FolderPlans(folder).find_plan(name, scene_of([]))
 
 
 @pytest.mark.parametrize(
@@ -92,6 +92,6 @@ def test_photographs_are_no_generated_frames(tmp_path: Path) -> None:
 
 def test_an_embedded_scene_names_its_street() -> None:
     with pytest.raises(FormatError, match="seed, index, attempt"):
-        DemoPlans().planned("demo-000", scene_of([], seed="0", index="0"))
+        DemoPlans().find_plan("demo-000", scene_of([], seed="0", index="0"))
     with pytest.raises(FormatError, match="an embedded scene's"):
-        DemoPlans().planned("demo-000", scene_of([], seed="0", index="0", attempt="0"))
+        DemoPlans().find_plan("demo-000", scene_of([], seed="0", index="0", attempt="0"))

@@ -25,13 +25,13 @@ _TO_OPENGL = np.array([1, -1, -1], np.float32)
 SUPERSAMPLING = 2
 """Drawn pixels a pixel, each way; pyrender takes four samples in each of them."""
 NEAR_M, FAR_M = 0.1, 1000.0
-_PLATFORM = "PYOPENGL_PLATFORM"
+_PLATFORM_VARIABLE = "PYOPENGL_PLATFORM"
 _LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
 _EXPECTED = "EGL or OSMesa, for photographs' second renderer (install Debian's libegl1 or libosmesa6)"
 
 
 @dataclass(frozen=True, slots=True)
-class Skin:
+class TexturedSurface:
     """One object's triangles. uv: (3F, 2) in [0, 1], corner by corner, v upwards; texture: (h, w, 3) uint8, w a
     multiple of 4 as OpenGL reads rows."""
 
@@ -40,7 +40,7 @@ class Skin:
 
 
 @dataclass(frozen=True, slots=True)
-class Coat:
+class PaintLayer:
     """Triangles of one gloss under a lamp. points, normals: (3F, 3), corner by corner; colours: (3F, 3), what each
     corner's light is multiplied by, linear under a lamp; roughness, metallic: in [0, 1], see glTF."""
 
@@ -52,7 +52,7 @@ class Coat:
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ImageWindow:
     """The part of a picture that is drawn: its upper left pixel, its size in pixels."""
 
     x0: int
@@ -61,13 +61,13 @@ class Window:
     height: int
 
     @property
-    def where(self) -> tuple[slice, slice]:
+    def slices(self) -> tuple[slice, slice]:
         """Rows and columns of the picture."""
         return slice(self.y0, self.y0 + self.height), slice(self.x0, self.x0 + self.width)
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class WindowImage:
     """What a window shows. colour: (h, w, 4) in [0, 1], premultiplied by coverage; depth_m: (h, w), inf where
     nothing is; owner: (h s, w s) object + 1 by drawn pixel, 0 where none is."""
 
@@ -77,40 +77,42 @@ class Drawn:
 
 
 @dataclass(frozen=True, slots=True)
-class Alone:
+class ObjectDepth:
     """One object without the others. depth_m: (h s, w s), inf beside it."""
 
-    window: Window
+    window: ImageWindow
     depth_m: Array
 
 
-class Screen:
+class OpenGLContext:
     """An OpenGL context of this process. Raises NoSecondRendererError where there is none."""
 
     def __init__(self) -> None:
-        self._library = _pyrender()
+        self._library = _import_pyrender()
         self._open()
 
-    def draw(self, points: Sequence[Array], skins: Sequence[Skin], intrinsics: Array, window: Window) -> Drawn:
+    def render(
+        self, points: Sequence[Array], skins: Sequence[TexturedSurface], intrinsics: Array, window: ImageWindow
+    ) -> WindowImage:
         """Objects, tested by depth among each other. points: (3F, 3) m of each, corner by corner, in the axes of
         the picture's own camera, their fronts winding as `Mesh.faces` do; intrinsics: (3, 3) px."""
         self._reopen()
         flags = self._library.RenderFlags
-        scene, nodes = self._scene(points, skins, intrinsics, window)
-        colour, _ = self._render(scene, flags.FLAT | flags.RGBA, None, window)
+        scene, nodes = self._make_scene(points, skins, intrinsics, window)
+        colour, _ = self._render_scene(scene, flags.FLAT | flags.RGBA, None, window)
         colour = cv2.resize(colour.astype(np.float32), (window.width, window.height), interpolation=cv2.INTER_AREA)
-        owner, depth = self._owners(scene, nodes, window)
-        return Drawn(colour / np.float32(255), _nearest(depth), owner)
+        owner, depth = self._render_owners(scene, nodes, window)
+        return WindowImage(colour / np.float32(255), _nearest_sample(depth), owner)
 
-    def alone(self, points: Array, intrinsics: Array, window: Window) -> Alone:
+    def render_depth(self, points: Array, intrinsics: Array, window: ImageWindow) -> ObjectDepth:
         """One object, see `draw`."""
         self._reopen()
-        nothing = Skin(np.zeros((len(points), 2), np.float32), np.zeros((1, 1, 3), np.uint8))
-        scene, nodes = self._scene([points], [nothing], intrinsics, window)
-        return Alone(window, self._owners(scene, nodes, window)[1])
+        nothing = TexturedSurface(np.zeros((len(points), 2), np.float32), np.zeros((1, 1, 3), np.uint8))
+        scene, nodes = self._make_scene([points], [nothing], intrinsics, window)
+        return ObjectDepth(window, self._render_owners(scene, nodes, window)[1])
 
     def shade(
-        self, coats: Sequence[Coat], lamp: tuple[Array, float] | None, intrinsics: Array, window: Window
+        self, coats: Sequence[PaintLayer], lamp: tuple[Array, float] | None, intrinsics: Array, window: ImageWindow
     ) -> Array:
         """(h s, w s, 4) in [0, 1] by drawn pixel: colour, raised to 1/2.2 under a lamp, and coverage; both are
         averages over a pixel's samples. lamp: where (3,), and its intensity; without one colours show as they are.
@@ -138,11 +140,11 @@ class Screen:
             pose = np.eye(4)
             pose[:3, 3] = lamp[0] * _TO_OPENGL
             scene.add(library.PointLight(color=(1.0, 1.0, 1.0), intensity=lamp[1]), pose=pose)
-        self._look(scene, intrinsics, window)
-        return self._render(scene, flags, None, window)[0].astype(np.float32) / np.float32(255)
+        self._add_camera(scene, intrinsics, window)
+        return self._render_scene(scene, flags, None, window)[0].astype(np.float32) / np.float32(255)
 
-    def _scene(
-        self, points: Sequence[Array], skins: Sequence[Skin], intrinsics: Array, window: Window
+    def _make_scene(
+        self, points: Sequence[Array], skins: Sequence[TexturedSurface], intrinsics: Array, window: ImageWindow
     ) -> tuple[Any, list[Any]]:
         library = self._library
         scene = library.Scene(bg_color=(0.0, 0.0, 0.0, 0.0), ambient_light=(1.0, 1.0, 1.0))
@@ -154,10 +156,10 @@ class Screen:
             material = library.MetallicRoughnessMaterial(baseColorTexture=texture)
             part = library.Primitive(positions=placed * _TO_OPENGL, texcoord_0=skin.uv, material=material, mode=4)
             nodes.append(scene.add(library.Mesh([part])))
-        self._look(scene, intrinsics, window)
+        self._add_camera(scene, intrinsics, window)
         return scene, nodes
 
-    def _look(self, scene: Any, intrinsics: Array, window: Window) -> None:
+    def _add_camera(self, scene: Any, intrinsics: Array, window: ImageWindow) -> None:
         """Add the camera."""
         library, s, k = self._library, SUPERSAMPLING, intrinsics.astype(np.float64)
         # Pixel centres are integers here, and halves there.
@@ -165,13 +167,17 @@ class Screen:
         camera = library.IntrinsicsCamera(k[0, 0] * s, k[1, 1] * s, *centre, znear=NEAR_M, zfar=FAR_M)
         scene.add(camera)
 
-    def _owners(self, scene: Any, nodes: Sequence[Any], window: Window) -> tuple[NDArray[np.uint8], Array]:
+    def _render_owners(
+        self, scene: Any, nodes: Sequence[Any], window: ImageWindow
+    ) -> tuple[NDArray[np.uint8], Array]:
         flags = self._library.RenderFlags
         names = {node: (i + 1, 0, 0) for i, node in enumerate(nodes)}
-        found, depth = self._render(scene, flags.SEG, names, window)
+        found, depth = self._render_scene(scene, flags.SEG, names, window)
         return np.ascontiguousarray(found[..., 0]), np.where(depth > 0, depth, np.float32(np.inf))
 
-    def _render(self, scene: Any, flags: int, names: dict[Any, Any] | None, window: Window) -> tuple[Any, Array]:
+    def _render_scene(
+        self, scene: Any, flags: int, names: dict[Any, Any] | None, window: ImageWindow
+    ) -> tuple[Any, Array]:
         self._renderer.viewport_width = window.width * SUPERSAMPLING
         self._renderer.viewport_height = window.height * SUPERSAMPLING
         return self._renderer.render(scene, flags=flags, seg_node_map=names)
@@ -187,7 +193,7 @@ class Screen:
             GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self._buffer)
             GL.glBufferData(GL.GL_ARRAY_BUFFER, len(self._mark), self._mark, GL.GL_STATIC_DRAW)
         except Exception as error:  # a driver's errors have no common kind
-            raise NoSecondRendererError.of("pyrender", _EXPECTED, error) from error
+            raise NoSecondRendererError.from_exception("pyrender", _EXPECTED, error) from error
 
     def _reopen(self) -> None:
         """Before a scene is made: open another context if this one is gone. All pyrender renderers of a process
@@ -209,24 +215,24 @@ class Screen:
 
 
 @cache
-def shared_screen() -> Screen:
+def shared_context() -> OpenGLContext:
     """The one window of this process."""
-    return Screen()
+    return OpenGLContext()
 
 
-def _nearest(depth: Array) -> Array:
+def _nearest_sample(depth: Array) -> Array:
     """Of the drawn pixels of each pixel the nearest."""
     s = SUPERSAMPLING
     height, width = depth.shape
     return depth.reshape(height // s, s, width // s, s).min(axis=(1, 3))
 
 
-def _pyrender() -> Any:
+def _import_pyrender() -> Any:
     """The library, told which platform to draw on. Raises NoSecondRendererError where there is none."""
-    platform = os.environ.get(_PLATFORM) or next(filter(_is_there, _LIBRARIES), None)
+    platform = os.environ.get(_PLATFORM_VARIABLE) or next(filter(_has_library, _LIBRARIES), None)
     if platform is None:
         raise NoSecondRendererError("pyrender", _EXPECTED, "neither")
-    os.environ[_PLATFORM] = platform
+    os.environ[_PLATFORM_VARIABLE] = platform
     # torch's optimisers load its compiler, where that is installed. Its LLVM and that of Mesa, which draws without
     # a GPU, go together in this order alone: the other way round the process ends.
     with contextlib.suppress(Exception):
@@ -236,11 +242,11 @@ def _pyrender() -> Any:
             warnings.simplefilter("ignore")  # of pyrender's own dependencies, while they are imported
             import pyrender
     except Exception as error:  # OpenGL's bindings raise what they like where a driver is missing
-        raise NoSecondRendererError.of("pyrender", _EXPECTED, error) from error
+        raise NoSecondRendererError.from_exception("pyrender", _EXPECTED, error) from error
     return pyrender
 
 
-def _is_there(platform: str) -> bool:
+def _has_library(platform: str) -> bool:
     try:
         ctypes.CDLL(_LIBRARIES[platform])
     except OSError:

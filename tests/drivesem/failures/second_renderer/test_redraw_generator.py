@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.failures.second_renderer.generator import GeneratorRedraw
-from drivesem.failures.second_renderer.plans import DemoPlans, Planned
+from drivesem.failures.second_renderer.generator import DemoPlans, GeneratorRenderer, PlanMatch
 from drivesem.synth.demo import demo_scene
 from scene_ir.errors import FormatError
 from scene_ir.geometry import project
@@ -22,8 +21,8 @@ AHEAD_M = 0.5
 class FirstUnknown(DemoPlans):
     """Plans that have no counterpart of a scene's first object."""
 
-    def planned(self, identifier: str, scene: SceneIR) -> Planned:
-        found = super().planned(identifier, scene)
+    def find_plan(self, identifier: str, scene: SceneIR) -> PlanMatch:
+        found = super().find_plan(identifier, scene)
         return replace(found, tracks=(None, *found.tracks[1:]))
 
 
@@ -33,8 +32,8 @@ def scene() -> SceneIR:
 
 
 @pytest.fixture(scope="module")
-def generator(scene: SceneIR) -> GeneratorRedraw:
-    return GeneratorRedraw("demo-000", scene, DemoPlans())
+def generator(scene: SceneIR) -> GeneratorRenderer:
+    return GeneratorRenderer("demo-000", scene, DemoPlans())
 
 
 def moved(scene: SceneIR, index: int, x_m: float, z_m: float) -> SceneIR:
@@ -54,8 +53,8 @@ def centre(boxes_xyxy: Tensor) -> Tensor:
     return (boxes_xyxy[..., :2] + boxes_xyxy[..., 2:]) / 2
 
 
-def test_the_unchanged_scene_is_the_photograph(scene: SceneIR, generator: GeneratorRedraw) -> None:
-    drawn = generator.redraw(scene)
+def test_the_unchanged_scene_is_the_photograph(scene: SceneIR, generator: GeneratorRenderer) -> None:
+    drawn = generator.render(scene)
     torch.testing.assert_close(drawn.image, scene.photograph, rtol=0, atol=1e-6)
     count = len(scene.objects)
     torch.testing.assert_close(drawn.targets.boxes_xyxy[:count], scene.objects.box2d)
@@ -65,67 +64,67 @@ def test_the_unchanged_scene_is_the_photograph(scene: SceneIR, generator: Genera
 
 
 def test_what_shows_lies_in_the_label_and_fills_it_where_nothing_hides(
-    scene: SceneIR, generator: GeneratorRedraw
+    scene: SceneIR, generator: GeneratorRenderer
 ) -> None:
-    drawn = generator.redraw(scene)
-    shown, labels = drawn.shown_xyxy, drawn.targets.boxes_xyxy[: len(scene.objects)]
+    drawn = generator.render(scene)
+    shown, labels = drawn.visible_xyxy, drawn.targets.boxes_xyxy[: len(scene.objects)]
     assert (shown[:, :2] >= labels[:, :2] - 1e-4).all()
     assert (shown[:, 2:] <= labels[:, 2:] + 1e-4).all()
     torch.testing.assert_close(shown[clearest(scene)], labels[clearest(scene)], atol=1.0, rtol=0)
 
 
-def test_labels_and_pixels_go_with_a_moved_car(scene: SceneIR, generator: GeneratorRedraw) -> None:
+def test_labels_and_pixels_go_with_a_moved_car(scene: SceneIR, generator: GeneratorRenderer) -> None:
     index = clearest(scene)
     changed = moved(scene, index, AHEAD_M, 0.0)
-    drawn, still = generator.redraw(changed), generator.redraw(scene)
+    drawn, still = generator.render(changed), generator.render(scene)
     middles = (s.objects.translation[index] for s in (scene, changed))
     before, after = (project(middle, scene.camera.matrix) for middle in middles)
     way = centre(drawn.targets.boxes_xyxy[index]) - centre(still.targets.boxes_xyxy[index])
     assert float(way[0]) == pytest.approx(float(after[0] - before[0]), abs=2.0)
-    torch.testing.assert_close(drawn.shown_xyxy[index], drawn.targets.boxes_xyxy[index], atol=1.0, rtol=0)
+    torch.testing.assert_close(drawn.visible_xyxy[index], drawn.targets.boxes_xyxy[index], atol=1.0, rtol=0)
     others = [i for i in range(len(scene.objects)) if i != index]
     torch.testing.assert_close(drawn.targets.boxes_xyxy[others], still.targets.boxes_xyxy[others])
     assert not torch.equal(drawn.image, still.image)
 
 
-def test_drawing_again_gives_the_same_bytes(scene: SceneIR, generator: GeneratorRedraw) -> None:
+def test_drawing_again_gives_the_same_bytes(scene: SceneIR, generator: GeneratorRenderer) -> None:
     """What is kept from one state to the next leaves no trace."""
     index = clearest(scene)
     leaves = scene.with_environment(foliage=torch.tensor([0.4, 0.0, 0.3]))
-    first = generator.redraw(moved(scene, index, AHEAD_M, 0.0)).image
-    generator.redraw(leaves)
-    assert torch.equal(generator.redraw(moved(scene, index, AHEAD_M, 0.0)).image, first)
+    first = generator.render(moved(scene, index, AHEAD_M, 0.0)).image
+    generator.render(leaves)
+    assert torch.equal(generator.render(moved(scene, index, AHEAD_M, 0.0)).image, first)
     assert torch.equal(
-        generator.redraw(scene).image, GeneratorRedraw("demo-000", scene, DemoPlans()).redraw(scene).image
+        generator.render(scene).image, GeneratorRenderer("demo-000", scene, DemoPlans()).render(scene).image
     )
 
 
 def test_what_has_no_counterpart_is_ignored(scene: SceneIR) -> None:
-    drawn = GeneratorRedraw("demo-000", scene, FirstUnknown()).redraw(moved(scene, 0, 1.0, 0.0))
+    drawn = GeneratorRenderer("demo-000", scene, FirstUnknown()).render(moved(scene, 0, 1.0, 0.0))
     assert drawn.targets.ignore[0]
-    assert drawn.shown_xyxy[0].tolist() == [0, 0, 0, 0]
+    assert drawn.visible_xyxy[0].tolist() == [0, 0, 0, 0]
     # it still stands in the street, as a region for every class
     own = scene.objects.box2d[0]
     regions = drawn.targets.boxes_xyxy[len(scene.objects) :]
     assert (regions - own).abs().amax(dim=1).lt(1e-3).sum() >= 1
 
 
-def test_what_left_the_picture_is_ignored(scene: SceneIR, generator: GeneratorRedraw) -> None:
+def test_what_left_the_picture_is_ignored(scene: SceneIR, generator: GeneratorRenderer) -> None:
     index = clearest(scene)
-    drawn = generator.redraw(moved(scene, index, 60.0, 0.0))
+    drawn = generator.render(moved(scene, index, 60.0, 0.0))
     assert drawn.targets.ignore[index]
-    assert drawn.shown_xyxy[index].tolist() == [0, 0, 0, 0]
+    assert drawn.visible_xyxy[index].tolist() == [0, 0, 0, 0]
 
 
 def test_another_photograph_is_refused(scene: SceneIR) -> None:
     darker = replace(scene, photograph=scene.photograph * 0.5)
     with pytest.raises(FormatError, match="photograph of demo-000: expected the picture that the generator makes"):
-        GeneratorRedraw("demo-000", darker, DemoPlans())
+        GeneratorRenderer("demo-000", darker, DemoPlans())
 
 
 def test_a_state_that_was_changed_already_is_known_by_its_origin(
-    scene: SceneIR, generator: GeneratorRedraw
+    scene: SceneIR, generator: GeneratorRenderer
 ) -> None:
     changed = moved(scene, clearest(scene), AHEAD_M, 0.0)
-    drawn = GeneratorRedraw("demo-000", changed, DemoPlans()).redraw(changed)
-    np.testing.assert_array_equal(drawn.image.numpy(), generator.redraw(changed).image.numpy())
+    drawn = GeneratorRenderer("demo-000", changed, DemoPlans()).render(changed)
+    np.testing.assert_array_equal(drawn.image.numpy(), generator.render(changed).image.numpy())

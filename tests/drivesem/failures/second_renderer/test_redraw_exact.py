@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from detectors.types import CLASSES
-from drivesem.failures.second_renderer.exact import exact_labels
+from drivesem.failures.second_renderer.generator import label_before_and_after
 
 BOX = (100.0, 100.0, 160.0, 140.0)
 
@@ -44,7 +44,7 @@ def test_what_is_too_hard_before_or_after_is_ignored() -> None:
     after = frame(
         truth(0, beside(9)), truth(1), truth(2, truncation=0.4), truth(4, labelled=False), truth(6, kind="Van")
     )
-    exact = exact_labels(before, after)
+    exact = label_before_and_after(before, after)
     assert exact.tracks == (0, 1, 2, 3, 4, 6)
     assert exact.changed.ignore.tolist() == [False, True, True, True, True, False]
     assert exact.benign.boxes_xyxy[0].tolist() == list(BOX)
@@ -57,7 +57,7 @@ def test_people_and_what_comes_into_view_are_regions_of_both() -> None:
     person = truth(7, beside(200), "Pedestrian")
     before = frame(truth(0), person, ignore=(beside(400),))
     after = frame(truth(0), person, truth(8, beside(600)), ignore=(beside(400),))
-    exact = exact_labels(before, after)
+    exact = label_before_and_after(before, after)
     for targets in (exact.benign, exact.changed):
         assert targets.ignore.tolist() == [False] + [True] * (len(targets.ignore) - 1)
     regions = exact.changed.boxes_xyxy[1:, 0].unique().tolist()

@@ -18,7 +18,7 @@ NEAR_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
+class PictureCamera:
     """intrinsics: (3, 3) px; shift_m: (3,), from the conventions' axes to those of the picture's own camera."""
 
     intrinsics: Array
@@ -27,32 +27,32 @@ class Lens:
     width: int
 
     @classmethod
-    def of(cls, camera: Camera) -> Lens:
+    def from_camera(cls, camera: Camera) -> PictureCamera:
         """Of a projection K (x + shift)."""
-        matrix = numbers(camera.matrix).astype(np.float64)
+        matrix = to_numpy(camera.matrix).astype(np.float64)
         shift = np.linalg.solve(matrix[:, :3], matrix[:, 3])
         return cls(matrix[:, :3].astype(np.float32), shift.astype(np.float32), camera.height, camera.width)
 
-    def pixels(self, points: Array) -> Array:
+    def project(self, points: Array) -> Array:
         """(..., 2) px of points (..., 3) m in the camera's own axes; those behind it are taken at its plane."""
         seen = points @ self.intrinsics.T
         return (seen[..., :2] / np.maximum(seen[..., 2:], NEAR_M)).astype(np.float32)
 
-    def box(self, corners: Array) -> Array:
+    def bounding_box(self, corners: Array) -> Array:
         """The tight box (4,) px of triangles (F, 3, 3) m, cut at the near plane, not at the picture's border; NaN
         behind it."""
         start, end = corners, np.roll(corners, -1, axis=1)
         crosses = (start[..., 2] >= NEAR_M) != (end[..., 2] >= NEAR_M)
         a, b = start[crosses], end[crosses]
         cut = a + ((NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a)
-        seen = self.pixels(np.concatenate([corners[corners[..., 2] >= NEAR_M], cut]).astype(np.float32))
+        seen = self.project(np.concatenate([corners[corners[..., 2] >= NEAR_M], cut]).astype(np.float32))
         if not len(seen):
             return np.full(4, np.nan, np.float32)
         return np.concatenate([seen.min(axis=0), seen.max(axis=0)])
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class VehiclePose:
     """One vehicle's geometry, with the conventions' meaning."""
 
     translation: Array
@@ -61,35 +61,37 @@ class Pose:
     lattice: Array
 
     @classmethod
-    def of(cls, objects: Objects, i: int) -> Pose:
+    def from_objects(cls, objects: Objects, i: int) -> VehiclePose:
         return cls(
-            numbers(objects.translation[i]),
+            to_numpy(objects.translation[i]),
             float(objects.yaw[i]),
-            numbers(objects.size_lhw[i]),
-            numbers(objects.ffd[i]),
+            to_numpy(objects.size_lhw[i]),
+            to_numpy(objects.ffd[i]),
         )
 
     @classmethod
-    def photographed(cls, source: Source) -> Pose:
-        return cls(numbers(source.translation), float(source.yaw), numbers(source.size_lhw), numbers(source.ffd))
+    def from_source(cls, source: Source) -> VehiclePose:
+        return cls(
+            to_numpy(source.translation), float(source.yaw), to_numpy(source.size_lhw), to_numpy(source.ffd)
+        )
 
     def rotation(self) -> Array:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], np.float32)
 
 
-class Body:
+class BodyMesh:
     """A mesh, corner by corner. unit: (F, 3, 3) in the unit box; part: (F,) a `Part`."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self._vertices = numbers(mesh.vertices)
+        self._vertices = to_numpy(mesh.vertices)
         self._faces = mesh.faces.cpu().numpy()
         self._weights = _bernstein_weights(self._vertices)
         self.unit = self._vertices[self._faces]
         self.part = mesh.part.cpu().numpy()
-        self.colours = None if mesh.colours is None else numbers(mesh.colours)[self._faces].mean(axis=1)
+        self.colours = None if mesh.colours is None else to_numpy(mesh.colours)[self._faces].mean(axis=1)
 
-    def placed(self, pose: Pose, lens: Lens, mirrored: bool = False) -> Array:
+    def place(self, pose: VehiclePose, lens: PictureCamera, mirrored: bool = False) -> Array:
         """Triangles (F, 3, 3) m in the camera's own axes. mirrored: each where its counterpart on the vehicle's
         other side is."""
         bent = self._vertices + self._weights @ pose.lattice
@@ -100,7 +102,7 @@ class Body:
         return placed.astype(np.float32)[self._faces]
 
 
-def numbers(tensor: Tensor) -> Array:
+def to_numpy(tensor: Tensor) -> Array:
     """A tensor's values, wherever it is."""
     return tensor.detach().cpu().numpy().astype(np.float32)
 

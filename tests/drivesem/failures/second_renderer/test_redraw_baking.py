@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.failures.second_renderer import weathering
-from drivesem.failures.second_renderer.baking import laid_out
-from drivesem.failures.second_renderer.placing import Body, Lens, Pose
+from drivesem.failures.second_renderer import shading as weathering
+from drivesem.failures.second_renderer.baking import pack_patches
+from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose
 from scene_ir import ffd
-from scene_ir.geometry import place, project
+from scene_ir.geometry import place_vertices, project
 from scene_ir.types import Camera, SceneIR
 
 
@@ -25,24 +25,24 @@ def test_points_are_where_the_conventions_say(street: Callable[..., SceneIR]) ->
     scene = scene.with_objects(ffd=bend)
     matrix = torch.cat([scene.camera.intrinsics, torch.tensor([[45.0], [0.2], [0.003]])], dim=1)
     camera = Camera(scene.camera.intrinsics, scene.camera.height, scene.camera.width, matrix)
-    lens, mesh = Lens.of(camera), scene.meshes[0]
+    lens, mesh = PictureCamera.from_camera(camera), scene.meshes[0]
     objects = scene.objects
     unit = ffd.deform(mesh.vertices, ffd.lattice_weights(mesh.vertices), objects.ffd)
-    expected = project(place(unit, objects.size_lhw, objects.yaw, objects.translation), matrix)
+    expected = project(place_vertices(unit, objects.size_lhw, objects.yaw, objects.translation), matrix)
     for i in range(len(objects)):
-        found = lens.pixels(Body(mesh).placed(Pose.of(objects, i), lens))
+        found = lens.project(BodyMesh(mesh).place(VehiclePose.from_objects(objects, i), lens))
         np.testing.assert_allclose(found, expected[i][mesh.faces].numpy(), atol=2e-2)
-        mirrored = lens.pixels(Body(mesh).placed(Pose.of(objects, i), lens, mirrored=True))
+        mirrored = lens.project(BodyMesh(mesh).place(VehiclePose.from_objects(objects, i), lens, mirrored=True))
         assert np.abs(mirrored - found).max() > 1
 
 
 def test_boxes_are_cut_at_the_camera() -> None:
-    lens = Lens.of(Camera(torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]), 80, 100))
+    lens = PictureCamera.from_camera(Camera(torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]), 80, 100))
     inside = np.array([[[-1, 0, 2], [1, 0, 2], [0, 1, 2]]], np.float32)
-    np.testing.assert_allclose(lens.box(inside), [0, 40, 100, 90])
+    np.testing.assert_allclose(lens.bounding_box(inside), [0, 40, 100, 90])
     through = np.array([[[0, 0, 2], [0, 1, 2], [0.1, 0, -2]]], np.float32)
-    assert lens.box(through)[2] == pytest.approx(50 + 100 * 0.1 * (1.9 / 4) / 0.1, rel=1e-4)
-    assert np.isnan(lens.box(-inside)).all()
+    assert lens.bounding_box(through)[2] == pytest.approx(50 + 100 * 0.1 * (1.9 / 4) / 0.1, rel=1e-4)
+    assert np.isnan(lens.bounding_box(-inside)).all()
 
 
 @given(
@@ -53,7 +53,7 @@ def test_boxes_are_cut_at_the_camera() -> None:
 @settings(max_examples=30, deadline=None)
 def test_each_triangle_has_texels_of_its_own(triangles: list[tuple[int, int, int]]) -> None:
     corner = np.array([t[0] for t in triangles])
-    layout = laid_out(corner, np.array([t[1:] for t in triangles]))
+    layout = pack_patches(corner, np.array([t[1:] for t in triangles]))
     height, width = layout.size
     assert len(np.unique(layout.row * width + layout.column)) == len(layout.row)
     assert layout.row.max() < height
@@ -83,7 +83,7 @@ BASE = np.array([0.3, 0.3, 0.3], np.float32)
 
 
 def painted(code: list[float], rgb: np.ndarray, paint: float = 1.0) -> np.ndarray:
-    return weathering.painted(rgb, np.array(code, np.float32), paint * ONE, 0 * ONE, BASE)
+    return weathering.apply_paint(rgb, np.array(code, np.float32), paint * ONE, 0 * ONE, BASE)
 
 
 def test_paint_codes_mean_what_they_say() -> None:
@@ -105,5 +105,5 @@ def test_paint_codes_mean_what_they_say() -> None:
 
 def test_shadows_go_under_a_closed_sky() -> None:
     clear, closed = np.zeros(4, np.float32), np.array([0, 0, 0, 1], np.float32)
-    assert weathering.shade_left(clear) == 1
-    assert weathering.shade_left(closed) == pytest.approx(0.4)
+    assert weathering.remaining_shade(clear) == 1
+    assert weathering.remaining_shade(closed) == pytest.approx(0.4)

@@ -1,0 +1,185 @@
+"""Margins of a scene's objects as a function of theta, over nuisance samples: what a search for robust failures
+lowers. Certificates use samples of another stream, which no search sees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from detectors.base import Candidates, Detector, predict
+from detectors.incremental.reference import ReferencePass
+from drivesem.attack import losses
+from drivesem.attack.labels import visible_boxes
+from drivesem.attack.methods.base import GRADIENT_PASSES
+from drivesem.attack.objective import Objective
+from drivesem.failures import margins as margin
+from drivesem.failures.certificate import pad_visible_boxes
+from drivesem.failures.kinds import LabelledDetections, match_detections
+from drivesem.failures.nuisances import Nuisances, NuisanceSample
+from scene_ir.types import Render, SceneIR
+
+SHARPNESS = 4.0
+"""Sharpness of the soft maximum over candidates in gradients, 1 / logits."""
+
+
+@dataclass(frozen=True)
+class NuisanceMarginOracle:
+    """The `attack.methods.base.MarginOracle` of an objective.
+
+    It caches each sample with its noise (5.6 MB at 1242 x 375 px; a search cycles through twelve). Where neither
+    weather nor foliage changes, it also caches the detector's layers for a sample's first image, and evaluates
+    later images only where they differ from it.
+    """
+
+    objective: Objective
+    """Scene, detector and labels."""
+    nuisances: Nuisances
+    """Ranges of the samples."""
+    stream: str
+    """Name of the sample stream."""
+    counted_objects: Tensor
+    """(N,) bool, objects that are detected in the benign image and are targets of the attack."""
+    _samples: dict[int, NuisanceSample] = field(default_factory=dict[int, NuisanceSample])
+    """Cached samples by number."""
+    _references: dict[int, ReferencePass] = field(default_factory=dict[int, ReferencePass])
+    """Cached detector layers by number."""
+
+    @classmethod
+    def for_objective(cls, objective: Objective, nuisances: Nuisances, stream: str) -> NuisanceMarginOracle:
+        """Count the objects that are detected in the benign re-render and that the aim includes.
+
+        Args:
+            objective: Scene, detector and labels.
+            nuisances: Ranges of the samples.
+            stream: Name of the sample stream.
+        """
+        benign = objective.benign
+        targets = objective.classes.map_targets(objective.aim.targets(benign.paper.targets))
+        visible = pad_visible_boxes(visible_boxes(benign.render), targets)
+        labelled = LabelledDetections(targets, visible, benign.detections)
+        detected = match_detections(labelled, objective.t_star).detected
+        counted = detected & ~targets.ignore.to(detected.device)
+        return cls(objective, nuisances, stream, counted[: len(objective.space.scene.objects)])
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether margins have a gradient: the detector must expose its candidates."""
+        detector = self.objective.detector
+        return isinstance(detector, Detector) and type(detector).candidates is not Detector.candidates
+
+    @property
+    def passes(self) -> int:
+        """Detector passes since the objective was created."""
+        return self.objective.passes
+
+    @torch.no_grad()
+    def margins(self, theta: Tensor, number: int) -> Tensor:
+        """Margins (N,) at theta (D,) in one sample; infinite for objects that do not count. Costs a pass."""
+        self.objective.passes += 1
+        return self._compute_margins(theta, number, None)
+
+    def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute soft margins in one sample, and the gradient of their weighted sum. Costs three passes.
+
+        Args:
+            theta: (D,) state.
+            number: Number of the sample.
+            weights: (N,) weights of the margins.
+
+        Returns:
+            Margins (N,), infinite for objects that do not count, and the gradient (D,).
+
+        Raises:
+            RangeError: The detector has no gradient.
+        """
+        leaf = theta.detach().clone().requires_grad_(True)
+        soft = self.soft_margins(leaf, number)
+        self.objective.passes += GRADIENT_PASSES
+        counts = torch.isfinite(soft)
+        total = (weights.to(soft)[counts] * soft[counts]).sum()
+        if not total.requires_grad:  # no object counts in this sample
+            return soft.detach(), torch.zeros_like(theta)
+        (gradient,) = torch.autograd.grad(total, leaf)
+        return soft.detach(), gradient
+
+    def soft_margins(self, theta: Tensor, number: int) -> Tensor:
+        """Differentiable margins (N,) by a soft maximum over candidates. The image is not rounded to 8 bits where
+        theta (D,) requires a gradient.
+        """
+        return self._compute_margins(theta, number, SHARPNESS)
+
+    def clear_cache(self) -> None:
+        """Drop cached samples and layers; they are recomputed when needed."""
+        self._samples.clear()
+        self._references.clear()
+
+    @property
+    def cache_mb(self) -> float:
+        """Size of the cached layers."""
+        return sum(reference.bytes for reference in self._references.values()) / 1e6
+
+    def sample(self, number: int) -> NuisanceSample:
+        """The sample of that number."""
+        if number not in self._samples:
+            self._samples[number] = self.nuisances.sample(self.stream, number, self.objective.space.scene)
+        return self._samples[number]
+
+    def _compute_margins(self, theta: Tensor, number: int, sharpness: float | None) -> Tensor:
+        space, sample = self.objective.space, self.sample(number)
+        scene = sample.perturb_scene(space.apply(space.scene, theta))
+        render = self.objective.compositor.render(scene)
+        candidates = self._find_candidates(sample.degrade_image(render.image), number, render)
+        return self._object_margins(candidates, sample, scene, render, sharpness)
+
+    def _find_candidates(self, image: Tensor, number: int, render: Render) -> Candidates:
+        if not self.differentiable:
+            classes = self.objective.classes
+            detections = classes.map_detections(predict(self.objective.detector, image[None])[0])
+            return losses.candidates_from_detections(detections, len(classes.names))
+        detector, reference = self.objective.differentiable, None
+        if image.requires_grad:
+            return detector.candidates(detector(image[None]))
+        if render.vehicle_regions is not None and not self.objective.whole:
+            reference = self._reference(detector, image, number)
+        raw = detector.forward_for_search(image[None]) if reference is None else reference(image[None], [])
+        return detector.candidates(raw)
+
+    def _reference(self, detector: Detector, image: Tensor, number: int) -> ReferencePass | None:
+        """Layers of a sample's first image; None where they are unknown or do not fit into the cache."""
+        limit = self.objective.layer_limit_mb
+        if (
+            number not in self._references
+            and self.objective.reference_mb + self.cache_mb + limit <= self.objective.keep_mb
+        ):
+            reference = ReferencePass.run(detector, image[None], limit)
+            if reference is not None:
+                self._references[number] = reference
+        return self._references.get(number)
+
+    def _object_margins(
+        self,
+        candidates: Candidates,
+        sample: NuisanceSample,
+        scene: SceneIR,
+        render: Render,
+        sharpness: float | None,
+    ) -> Tensor:
+        """(N,); infinite for objects that do not count here, or not in the benign image."""
+        objective, count = self.objective, len(self.counted_objects)
+        with torch.no_grad():
+            detached = replace(render, image=render.image.detach())
+            moved = objective.labeller.moved(scene, detached).targets
+            targets = objective.classes.map_targets(moved)
+            if self.differentiable:
+                targets = objective.classes.to_detector_targets(targets)
+            counts = self.counted_objects & ~targets.ignore[:count].to(self.counted_objects.device)
+            rows = counts.nonzero()[:, 0]
+            boxes_xyxy, visible = sample.transform_boxes(targets.boxes_xyxy[rows]), visible_boxes(detached)[rows]
+            is_visible = (visible[:, 2:] > visible[:, :2]).all(1, keepdim=True)
+            visible = torch.where(is_visible, sample.transform_boxes(visible), visible)
+        labels = targets.labels[rows]
+        margins = margin.object_margins(candidates, boxes_xyxy, labels, visible, objective.t_star, sharpness)
+        return margins.new_full((count,), torch.inf).index_put((rows.to(margins.device),), margins)
