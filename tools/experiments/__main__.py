@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from drivesem.cli import run_program
-from drivesem.config.blocks import CommandConfig
+from drivesem.config.options import CommandConfig
 from tools.experiments.settings import (
     PlausibilityConfig,
     RealismConfig,
@@ -54,11 +54,11 @@ def _run_study(config: StudyConfig) -> int:
 
     check_device(config.device)
     if config.name == "classification":
-        from tools.experiments.classification.asking import study_run
+        from tools.experiments.classification.asking import study_run as run_study
     else:
-        from tools.experiments.detection.asking import study_run
-    report = study_run(config)
-    (print_report if config.kept is not None and config.out is None else publish_report)(report, config.json)
+        from tools.experiments.detection.study import run_study
+    report = run_study(config)
+    (print_report if config.results is not None and config.out is None else publish_report)(report, config.json)
     return 0
 
 
@@ -90,7 +90,7 @@ def _run_survey(config: SurveyConfig) -> int:
     from drivesem.report.tables import format_count, print_json
     from drivesem.report.terminal import Console
     from drivesem.run.finished import load_runs
-    from drivesem.run.folder import folder_of
+    from drivesem.run.folder import resolve_output_folder
     from scene_ir import files
     from tools.experiments.survey.page import (
         CHANGED,
@@ -104,7 +104,7 @@ def _run_survey(config: SurveyConfig) -> int:
     )
 
     runs = load_runs(config.runs, setting="RUN")
-    out = folder_of(config.out, runs[0].folder / "survey")
+    out = resolve_output_folder(config.out, runs[0].folder / "survey")
     chosen = items_of(runs, config.items, config.controls, config.seed)
     items = [item for item, _ in chosen]
     page = render_page(chosen)

@@ -7,7 +7,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from drivesem.config.blocks import (
+from drivesem.config.commands import MIN_PASSES, Fraction, RunArguments, RunFolders
+from drivesem.config.constraints import POSITIVE, ExistingFolder, NumberRange, Required, at_least
+from drivesem.config.errors import refuse
+from drivesem.config.options import (
     DEMO,
     BootstrapOption,
     CommandConfig,
@@ -22,13 +25,10 @@ from drivesem.config.blocks import (
     RunOption,
     SceneAttackOptions,
     SeededBootstrapOptions,
-    option,
+    option_name,
 )
-from drivesem.config.commands import LEAST_PASSES, Fraction, RunArguments, RunFolders
-from drivesem.config.constraints import POSITIVE, ExistingFolder, NumberRange, Required, at_least
-from drivesem.config.errors import refuse
 
-_AGAIN = ("name", "kept", "out", "bootstrap", "json")
+_REPORT_SETTINGS = ("name", "results", "out", "bootstrap", "json")
 """Settings of a study that is told again."""
 
 
@@ -43,24 +43,24 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
     what labels that stay behind make of an attack; attribution: which part of the paper's protocol takes how many
     points; transfer: counterexamples of combination 2 before other
     detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
-    counterexamples; classification: the paper's tables for image classifiers (docs/classify.md)."""
+    counterexamples; classification: the paper's tables for image classifiers (docs/guide/classifiers.md)."""
     out: FolderOrUrl = None
-    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
-    kept: Annotated[str | None, ExistingFolder(), tyro.conf.arg(aliases=["--from"])] = None
+    """Folder for the results, or its URL (docs/guide/scale.md); a second run with the same goes on where it stopped."""
+    results: Annotated[str | None, ExistingFolder(), tyro.conf.arg(aliases=["--from"])] = None
     """The folder OUT/kept of such a study, whose tables are told again; it
     needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""
     detector: str = "squeezedet"
-    """A shipped detector, a file, or another project's that has a gradient (docs/detectors.md)."""
+    """A shipped detector, a file, or another project's that has a gradient (docs/reference/detectors.md)."""
     bootstrap: NotNegative | None = None
     """Draws of frames for intervals, by default 1000, of classification 200; 0 leaves them out."""
     steps: Count = 10
     """Steps of the attack; steps goes twice as far."""
     queries: Count = 64
     """Samples: queries of each method without gradient."""
-    passes: Annotated[int, at_least(LEAST_PASSES, "which the search needs")] = 90
+    passes: Annotated[int, at_least(MIN_PASSES, "which the search needs")] = 90
     """Searches, and retrain with climb: passes of the detector that each method may take for a frame, a gradient
     counted as 3."""
     pace: Annotated[str | None, ExistingFolder()] = None
@@ -100,7 +100,7 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
     default the benign frames that judge them."""
     arms: str | None = None
     """Retrain: what is trained, with commas: benign, re-rendered, random, generator, ours, certain, consistent,
-    worst, paper (docs/study.md); by default re-rendered, ours and, without --quick, paper."""
+    worst, paper (docs/research/detection.md); by default re-rendered, ours and, without --quick, paper."""
     states: NotNegative = 16
     """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
     consistency: Annotated[float, POSITIVE] = 1.0
@@ -145,10 +145,10 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
             self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
         )
         beside = self.name
-        if self.kept is not None:
+        if self.results is not None:
             for field in fields(self):
-                value, alone = getattr(self, field.name), "none beside --kept, which has the study's own settings"
-                refuse(field.name not in _AGAIN and value != field.default, option(field.name), alone, value)
+                value, alone = getattr(self, field.name), "none with --from, which uses the study's own settings"
+                refuse(field.name not in _REPORT_SETTINGS and value != field.default, option_name(field.name), alone, value)
         refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
         divided = self.split is not None and self.name == "retrain"
         refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)
@@ -168,7 +168,7 @@ class RealismConfig(SeededBootstrapOptions, CommandConfig):
     """Folders of runs of drivesem attack; a table each."""
     metrics: str = "available"
     """With commas: psnr, ssim, perceptual, lpips-alex, lpips-vgg, lpips-squeeze, frechet, frechet-mobilenet,
-    frechet-inception, fid; or available: those whose weights are on disk (docs/realism.md)."""
+    frechet-inception, fid; or available: those whose weights are on disk (docs/research/realism.md)."""
     weights: Annotated[str, ExistingFolder()] | None = None
     """A folder of weight files, looked at before torch's own cache."""
     fetch: Flag = False
@@ -203,7 +203,7 @@ class WorthConfig(SeededBootstrapOptions, CommandConfig):
     """With --study: draws of frames for intervals of its distances, by default 200; 0 leaves them out."""
     distance: str | None = None
     """What realism is counted from: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none; by default
-    lpips-alex where its weights are on disk, else perceptual (docs/realism.md)."""
+    lpips-alex where its weights are on disk, else perceptual (docs/research/realism.md)."""
     weights: Annotated[str, ExistingFolder()] | None = None
     """A folder of weight files of that distance, looked at before torch's own cache."""
     base: str = "e"

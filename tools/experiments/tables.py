@@ -14,7 +14,7 @@ from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from drivesem.config.errors import UsageError
-from drivesem.config.text import command_line
+from drivesem.config.options import format_command_line
 from drivesem.evaluation.resampling import Interval
 from drivesem.run.records import load_record
 from scene_ir import files
@@ -122,7 +122,7 @@ def study_settings(study: StudyConfig) -> dict[str, Any]:
 
 def study_command(study: StudyConfig) -> str:
     """The command that repeats a study."""
-    return command_line("study", study, (*UNRECORDED, "name")).replace("study", f"study {study.name}", 1)
+    return format_command_line("study", study, (*UNRECORDED, "name")).replace("study", f"study {study.name}", 1)
 
 
 def read_metadata(folder: Path, kind: type[T], name: str) -> T:

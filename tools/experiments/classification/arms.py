@@ -12,9 +12,9 @@ from drivesem.classify.attack import WRITTEN, Attacker, frames_of
 from drivesem.classify.pictures import Shown
 from drivesem.classify.results import ClassifiedFrame
 from drivesem.config.commands import ClassifyConfig
-from drivesem.config.presets import presets
+from drivesem.config.presets import find_presets
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
-from drivesem.run.folder import ARMS, FRAMES, SHARING, claim
+from drivesem.run.folder import ARMS, FRAMES, SHARING, claim_folder
 from drivesem.run.frame import RESULT
 from scene_ir import files
 from tools.experiments.settings import StudyConfig
@@ -59,7 +59,7 @@ def preset(network: str, strategy: str) -> Mapping[str, Any]:
     """The paper's settings of a strategy for one of its networks; samples have the same for both."""
     if strategy in _SAMPLES:
         return _SAMPLES[strategy]
-    settings = files.read_yaml(presets()[f"classify-{network}-{strategy}"])
+    settings = files.read_yaml(find_presets()[f"classify-{network}-{strategy}"])
     return {key: value for key, value in settings.items() if key != "for"}
 
 
@@ -93,7 +93,7 @@ def run_arms(arms: Sequence[Arm], study: StudyConfig, title: str) -> dict[str, s
     Raises UsageError or SceneError.
     """
     for arm in arms:
-        claim(arm.out, arm.config, WRITTEN)
+        claim_folder(arm.out, arm.config, WRITTEN)
     jobs = [
         (i, one)
         for i, arm in enumerate(arms)

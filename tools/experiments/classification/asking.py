@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivesem.report.tables import AnalysisReport
-from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim, folder_of
+from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
 from tools.experiments.classification.kept import keep_results, load_results
 from tools.experiments.classification.lab import PICTURES, TABLES, Lab
 from tools.experiments.classification.looking import LOOKED
-from tools.experiments.classification.results import Facts, Results
+from tools.experiments.classification.results import StudyFacts, ClassificationResults
 from tools.experiments.classification.tables import ORDERS, tables_of
 from tools.experiments.detection.kept_rows import KEPT, command_of
 from tools.experiments.settings import StudyConfig
@@ -42,10 +42,10 @@ def study_run(study: StudyConfig) -> AnalysisReport:
     if study.kept is not None:
         return _again(study, Path(study.kept))
     lab = Lab.of(study)
-    claim(lab.out, lab.study, _WRITTEN, _FREE)
+    claim_folder(lab.out, lab.study, _WRITTEN, _FREE)
     lab.attack()
     lab.teach()
-    results = Results(Facts.of(study, lab), lab)
+    results = ClassificationResults(StudyFacts.from_study(study, lab), lab)
     answer = _answer(results, lab.out)
     keep_results(lab.out / KEPT, results)
     answer.write()
@@ -57,13 +57,13 @@ def _again(study: StudyConfig, folder: Path) -> AnalysisReport:
     if study.bootstrap is not None:
         told = replace(results.facts.study, bootstrap=study.bootstrap)
         results.facts = replace(results.facts, study=told)
-    answer = _answer(results, folder_of(study.out, folder))
+    answer = _answer(results, resolve_output_folder(study.out, folder))
     if study.out is not None:
         answer.write()
     return answer
 
 
-def _answer(results: Results, out: Path) -> AnalysisReport:
+def _answer(results: ClassificationResults, out: Path) -> AnalysisReport:
     found, facts = tables_of(results), results.facts
     return AnalysisReport(
         out=out,
@@ -75,7 +75,7 @@ def _answer(results: Results, out: Path) -> AnalysisReport:
             "networks": [one.name for one in facts.networks],
             "objects": facts.study.objects or "embedded",
             "pictures": facts.counts,
-            "bootstrap": results.drawing.draws,
+            "bootstrap": results.bootstrap.draws,
             "tables": {
                 one.name: {"rows": one.rows, "reference": one.reference, "notes": one.notes} for one in found
             },
@@ -83,7 +83,7 @@ def _answer(results: Results, out: Path) -> AnalysisReport:
         },
         csv_tables={one.name: one.rows for one in found if one.rows},
         tables=[one.sheet() for one in found],
-        notes=[_NOTE.format(draws=results.drawing.draws), *(note for one in found for note in one.notes)],
+        notes=[_NOTE.format(draws=results.bootstrap.draws), *(note for one in found for note in one.notes)],
         text_columns=_WORDS,
         printed_tables=[one.sheet(classes=False) for one in found if one.name != ORDERS],
         intro=[f"`{command_of(facts.study)}`", ""],

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesem.evaluation.resampling import Interval, intervals, rate
+from drivesem.evaluation.resampling import Interval, bootstrap_intervals, ratio_metric
 from tools.experiments.worth.measures import Floats, Integers
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class RatioBootstrap:
     """How intervals are drawn."""
 
     draws: int
@@ -24,23 +24,23 @@ class Drawing:
         places, inverse = np.unique(unit, return_inverse=True)
         sums = [np.bincount(inverse, values, len(places)).astype(np.float64) for values in (hits, of)]
         rng = np.random.default_rng(self.seed)
-        return intervals([rate("ratio", *sums)], len(places), self.draws, rng)[0]
+        return bootstrap_intervals([ratio_metric("ratio", *sums)], len(places), self.draws, rng)[0]
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
+class Predictions:
     """What a network made of pictures. right (M,) bool; label (M,): a class's place; unit (M,): which object."""
 
-    right: np.ndarray
+    correct: np.ndarray
     label: Integers
-    unit: Integers
+    object_id: Integers
 
     def by_class(self, count: int) -> list[float | None]:
         """Accuracy within each class; None of a class without pictures."""
-        own = [self.right[self.label == place] for place in range(count)]
+        own = [self.correct[self.label == place] for place in range(count)]
         return [float(right.mean()) if len(right) else None for right in own]
 
-    def overall(self, drawing: Drawing, sizes: Sequence[int] | None = None) -> Interval:
+    def overall(self, drawing: RatioBootstrap, sizes: Sequence[int] | None = None) -> Interval:
         """The mean of the classes' accuracies weighed by their sizes; sizes: by default those of these pictures,
         which is the share of all pictures. Classes without pictures count for nothing.
         """
@@ -48,14 +48,14 @@ class Answers:
         if sizes is not None:
             counts = np.bincount(self.label, minlength=len(sizes))
             weights = (np.asarray(sizes) / np.maximum(counts, 1))[self.label]
-        return drawing.ratio(self.right * weights, weights, self.unit)
+        return drawing.ratio(self.correct * weights, weights, self.object_id)
 
-    def below(self, other: Answers, drawing: Drawing) -> Interval:
+    def accuracy_drop(self, other: Predictions, drawing: RatioBootstrap) -> Interval:
         """By how much the overall accuracy is below the other's on the same pictures, paired."""
-        return drawing.ratio(other.right.astype(np.float64) - self.right, np.ones(len(self.right)), self.unit)
+        return drawing.ratio(other.correct.astype(np.float64) - self.correct, np.ones(len(self.correct)), self.object_id)
 
 
-def keeping_shares(labels: Sequence[int], size: int, generator: np.random.Generator) -> list[int]:
+def sample_stratified(labels: Sequence[int], size: int, generator: np.random.Generator) -> list[int]:
     """Places of `size` of these at random, so that classes keep their shares: of each class its share of `size`
     rounded down, and one more of those that lose most by that. All where there are not more than that.
     """
@@ -71,7 +71,7 @@ def keeping_shares(labels: Sequence[int], size: int, generator: np.random.Genera
     return sorted(int(place) for places in drawn for place in places)
 
 
-def verdict(theirs: float, ours: Interval) -> str:
+def judge_order(theirs: float, ours: Interval) -> str:
     """Whether the order of two figures is the paper's. theirs, ours: by how much the first is below the second;
     undecided: the interval has 0 inside.
     """

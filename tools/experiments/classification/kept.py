@@ -18,7 +18,7 @@ from drivesem.run.records import load_record
 from scene_ir import files
 from scene_ir.errors import FormatError
 from tools.experiments.classification.lab import TABLES
-from tools.experiments.classification.results import OVERALL, Facts, K, Key, Results
+from tools.experiments.classification.results import OVERALL, StudyFacts, K, Key, ClassificationResults
 from tools.experiments.detection.kept_rows import (
     STUDY,
     check_count,
@@ -100,15 +100,15 @@ class CertainRow:
 class _Head:
     """study.json."""
 
-    facts: Facts
+    facts: StudyFacts
     certain: tuple[CertainRow, ...]
 
 
-def keep_results(folder: Path, results: Results) -> None:
+def keep_results(folder: Path, results: ClassificationResults) -> None:
     """Write what was noted, whole."""
     facts = asdict(results.facts) | {"study": settings_of(results.facts.study)}
-    certain = [asdict(CertainRow(*key, count)) for key, count in results.certain.items()]
-    answers = (AnswersRow(*key, "".join("01"[bool(one)] for one in right)) for key, right in results.right.items())
+    certain = [asdict(CertainRow(*key, count)) for key, count in results.certain_failures.items()]
+    answers = (AnswersRow(*key, "".join("01"[bool(one)] for one in right)) for key, right in results.correct.items())
     distances = (
         DistanceRow(*key, place, far)
         for key, column in results.distances.items()
@@ -116,7 +116,7 @@ def keep_results(folder: Path, results: Results) -> None:
     )
     chances = (
         ChancesRow(*key, place, " ".join(map(repr, row)))
-        for key, rows in results.chances.items()
+        for key, rows in results.probabilities.items()
         for place, row in enumerate(rows.tolist())
     )
     sets = (SetRow(*key, distance) for key, distance in results.sets.items())
@@ -128,7 +128,7 @@ def keep_results(folder: Path, results: Results) -> None:
         write_rows(into / _SETS, SetRow, sets)
 
 
-def load_results(folder: Path) -> Results:
+def load_results(folder: Path) -> ClassificationResults:
     """What `keep_results` wrote. Raises FormatError naming file, and row or field."""
     check_name(folder / STUDY, "classification")
     head: _Head = load_record(folder / STUDY, _Head, _SCHEMA)
@@ -136,17 +136,17 @@ def load_results(folder: Path) -> Results:
     _check_facts(facts, f"{folder / STUDY}: facts")
     for one in head.certain:
         check_count(f"{folder / STUDY}: certain", one.failures or 0)
-    return Results(
+    return ClassificationResults(
         facts,
-        right=_right(folder / _ANSWERS, facts),
-        chances=_chances(folder / _CHANCES, facts),
+        correct=_right(folder / _ANSWERS, facts),
+        probabilities=_chances(folder / _CHANCES, facts),
         distances=_distances(folder / _DISTANCES, len(facts.pictures)),
         sets=_sets(folder / _SETS, facts),
-        certain={(one.network, one.strategy): one.failures for one in head.certain},
+        certain_failures={(one.network, one.strategy): one.failures for one in head.certain},
     )
 
 
-def _check_facts(facts: Facts, where: str) -> None:
+def _check_facts(facts: StudyFacts, where: str) -> None:
     check_settings(facts.study, "classification", where)
     classes = facts.classes
     require(bool(classes) and len(set(classes)) == len(classes), f"{where}: classes", "each once", classes)
@@ -159,7 +159,7 @@ def _check_facts(facts: Facts, where: str) -> None:
     require(pairwise, f"{where}: distance", "one of pictures", facts.distance)
     kinds = {name.partition("/")[0] for name in facts.pictures}
     require(bool(kinds) and kinds <= set(classes), f"{where}: pictures", "objects of these classes", sorted(kinds))
-    for place in facts.few:
+    for place in facts.retested:
         check_count(f"{where}: few", place, len(facts.pictures) - 1)
     for name, splits, wanted in (("objects", facts.objects, SPLITS), ("used", facts.used, ("test", "train"))):
         good = set(splits) == set(wanted) and all(set(counts) == set(classes) for counts in splits.values())
@@ -167,12 +167,12 @@ def _check_facts(facts: Facts, where: str) -> None:
     require(set(facts.counts) == {"test", "train", "retrained"}, f"{where}: counts", "three", list(facts.counts))
 
 
-def _right(path: Path, facts: Facts) -> dict[Key, np.ndarray]:
+def _right(path: Path, facts: StudyFacts) -> dict[Key, np.ndarray]:
     found: dict[Key, np.ndarray] = {}
     for where, row in read_rows(path, AnswersRow):
         key = (row.what, row.network, row.strategy, row.other or "")
         require(key not in found, where, "each set of pictures once", key)
-        count = len(facts.few if row.what == "fresh" else facts.pictures)
+        count = len(facts.retested if row.what == "fresh" else facts.pictures)
         good = len(row.right) == count and {*row.right} <= {*"01"}
         require(good, f"{where}: right", f"{count} of the letters 0 and 1", row.right[:20])
         found[key] = np.array([letter == "1" for letter in row.right], np.bool_)
@@ -188,7 +188,7 @@ def _distances(path: Path, count: int) -> dict[Key, Floats]:
     return _columns(values(), count, path)
 
 
-def _chances(path: Path, facts: Facts) -> dict[tuple[str, str, str], Floats]:
+def _chances(path: Path, facts: StudyFacts) -> dict[tuple[str, str, str], Floats]:
     def values() -> Iterator[tuple[str, tuple[str, str, str], int, list[float]]]:
         for where, row in read_rows(path, ChancesRow):
             try:
@@ -217,7 +217,7 @@ def _columns(rows: Iterator[tuple[str, K, int, float | list[float]]], count: int
     return {key: np.array(column, np.float64) for key, column in found.items()}
 
 
-def _sets(path: Path, facts: Facts) -> dict[Key, float | None]:
+def _sets(path: Path, facts: StudyFacts) -> dict[Key, float | None]:
     found: dict[Key, float | None] = {}
     for where, row in read_rows(path, SetRow):
         key = (row.network, row.strategy, row.metric, row.kind)

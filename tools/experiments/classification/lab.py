@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.analysis.transfer.asking import words
+from drivesem.analysis.transfer.run import split_list
 from drivesem.classify.attack import report_run
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
@@ -26,11 +26,11 @@ from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.training import embedded, fit_last
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
-from drivesem.run.folder import FRAMES, RETRAINED, folder_of
+from drivesem.run.folder import FRAMES, RETRAINED, resolve_output_folder
 from scene_ir import files
 from tools.experiments.classification import pixels
 from tools.experiments.classification.arms import GRADIENT, STRATEGIES, Arm, attack_of, preset, run_arms
-from tools.experiments.classification.figures import keeping_shares
+from tools.experiments.classification.figures import sample_stratified
 from tools.experiments.classification.looking import LOOKED, Eyes, apart, kept
 from tools.experiments.realism.asking import AVAILABLE, chosen
 from tools.experiments.realism.measures import load
@@ -79,11 +79,11 @@ class Lab:
     @classmethod
     def of(cls, study: StudyConfig) -> Lab:
         """Raises UsageError or SceneError for settings, objects or networks that cannot be used."""
-        wanted = tuple(words(study.tables)) if study.tables is not None else TABLES
+        wanted = tuple(split_list(study.tables)) if study.tables is not None else TABLES
         if not wanted or not set(wanted) <= set(TABLES):
             raise UsageError("--tables", f"names among {', '.join(TABLES)}", repr(study.tables))
         sizes = {name: getattr(study, name) or pair[study.quick] for name, pair in _SIZES.items()}
-        out = folder_of(study.out, Path("runs") / f"study-classification-seed{study.seed}")
+        out = resolve_output_folder(study.out, Path("runs") / f"study-classification-seed{study.seed}")
         objects = open_objects(study.objects)
         open_backgrounds(study.backgrounds)
         eyes = _eyes_of(study, objects.classes, out)
@@ -112,7 +112,7 @@ class Lab:
     def few(self) -> tuple[Shown, ...]:
         """Those on which retrained networks are attacked; classes have their shares in them."""
         rng = np.random.default_rng(self.study.seed)
-        places = keeping_shares(self.labels(self.done), self.study.fresh or len(self.done), rng)
+        places = sample_stratified(self.labels(self.done), self.study.fresh or len(self.done), rng)
         return tuple(self.done[place] for place in places)
 
     @property
@@ -286,11 +286,11 @@ def _some(objects: ObjectSet, split: Split, size: int, seed: int) -> tuple[Shown
     if not every:
         raise UsageError("--objects", f"objects to {split}", "none")
     labels = [objects.classes.index(one.name.partition("/")[0]) for one in every]
-    return tuple(every[place] for place in keeping_shares(labels, size, np.random.default_rng(seed)))
+    return tuple(every[place] for place in sample_stratified(labels, size, np.random.default_rng(seed)))
 
 
 def _eyes_of(study: StudyConfig, classes: tuple[str, ...], out: Path) -> tuple[Eyes, ...]:
-    specs = words(study.networks)
+    specs = split_list(study.networks)
     names = [Path(spec).stem for spec in specs]
     if not specs or len(set(names)) < len(names):
         raise UsageError("--networks", "networks with commas, each of another name", repr(study.networks))

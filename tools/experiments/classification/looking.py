@@ -12,7 +12,7 @@ from torch import Tensor
 
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.training import embedded
-from drivesem.report.terminal import Console, training_bar
+from drivesem.report.terminal import Console, training_progress_bar
 from drivesem.run.detection_cache import weights_digest
 from scene_ir import files
 from tools.experiments.realism.comparison import Measures
@@ -72,7 +72,7 @@ def apart(path: Path, pairs: Sequence[tuple[Path, Path]], measures: Measures) ->
 
     def compute() -> Mapping[str, np.ndarray]:
         columns: dict[str, list[np.ndarray | float]] = {}
-        with training_bar(Console(stderr=True)) as progress:
+        with training_progress_bar(Console(stderr=True)) as progress:
             for pair in progress.track(pairs, description=f"distances of {path.stem}"):
                 before, after = map(files.read_image, pair)
                 for name, measure in measures.items():

@@ -16,7 +16,7 @@ from drivesem.evaluation.resampling import DRAWS
 from scene_ir.errors import FormatError
 from tools.experiments.classification import pixels
 from tools.experiments.classification.arms import GRADIENT
-from tools.experiments.classification.figures import Answers, Drawing
+from tools.experiments.classification.figures import Predictions, RatioBootstrap
 from tools.experiments.classification.lab import BENIGN, LEARNT, Lab
 from tools.experiments.classification.looking import between
 from tools.experiments.realism.measures import METRICS, missing, psnr_db
@@ -31,18 +31,18 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
-class Network:
+class StudyNetwork:
     """name: for files and people; theirs: the paper's network that it stands beside; deep: whether it is in the
     tables that take long.
     """
 
     name: str
-    theirs: str
-    deep: bool
+    paper_network: str
+    in_slow_tables: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class StudyFacts:
     """What is known before any table. study: its settings; measures: of realism, distance: what its weight is
     counted from; toolbox: whether attacks on pixels could be made; pictures: those to test on that could be used,
     by the object's name; few: places of those on which retrained networks were attacked; counts: of pictures, for
@@ -52,20 +52,20 @@ class Facts:
 
     study: StudyConfig
     classes: tuple[str, ...]
-    networks: tuple[Network, ...]
+    networks: tuple[StudyNetwork, ...]
     tables: tuple[str, ...]
     measures: tuple[str, ...]
     distance: str
     toolbox: bool
     pictures: tuple[str, ...]
-    few: tuple[int, ...]
+    retested: tuple[int, ...]
     counts: dict[str, int]
     objects: dict[str, dict[str, int]]
     used: dict[str, dict[str, int]]
     failed: dict[str, str]
 
     @classmethod
-    def of(cls, study: StudyConfig, lab: Lab) -> Facts:
+    def from_study(cls, study: StudyConfig, lab: Lab) -> StudyFacts:
         """Of a study whose attacks and networks are done. study: its settings, as they were typed."""
         deep = [eyes.name for eyes in lab.deep]
 
@@ -76,7 +76,7 @@ class Facts:
         return cls(
             study=study,
             classes=lab.classes,
-            networks=tuple(Network(eyes.name, eyes.theirs, eyes.name in deep) for eyes in lab.eyes),
+            networks=tuple(StudyNetwork(eyes.name, eyes.theirs, eyes.name in deep) for eyes in lab.eyes),
             tables=lab.tables,
             measures=tuple(lab.measures) if lab.wants("realism") else (),
             distance=next(name for name in PREFERRED if missing(name, None) is None),
@@ -91,28 +91,28 @@ class Facts:
 
 
 @dataclass
-class Results:
+class ClassificationResults:
     """What tables ask for. lab: a study at work, of which each answer is noted; None of one that was kept, which
     has those that were noted. right (M,) bool: of pictures, by what is asked; chances (N, C), distances (N,): of
     all pictures; sets: Frechet distances; certain: how many failures.
     """
 
-    facts: Facts
-    lab: Lab | None = None
-    right: dict[Key, np.ndarray] = field(default_factory=dict[Key, np.ndarray])
-    chances: dict[tuple[str, str, str], Floats] = field(default_factory=dict[tuple[str, str, str], Floats])
+    facts: StudyFacts
+    source: Lab | None = None
+    correct: dict[Key, np.ndarray] = field(default_factory=dict[Key, np.ndarray])
+    probabilities: dict[tuple[str, str, str], Floats] = field(default_factory=dict[tuple[str, str, str], Floats])
     distances: dict[Key, Floats] = field(default_factory=dict[Key, Floats])
     sets: dict[Key, float | None] = field(default_factory=dict[Key, "float | None"])
-    certain: dict[tuple[str, str], int | None] = field(default_factory=dict[tuple[str, str], "int | None"])
+    certain_failures: dict[tuple[str, str], int | None] = field(default_factory=dict[tuple[str, str], "int | None"])
 
     @property
-    def deep(self) -> tuple[Network, ...]:
-        return tuple(one for one in self.facts.networks if one.deep)
+    def slow_networks(self) -> tuple[StudyNetwork, ...]:
+        return tuple(one for one in self.facts.networks if one.in_slow_tables)
 
     @cached_property
-    def drawing(self) -> Drawing:
+    def bootstrap(self) -> RatioBootstrap:
         study = self.facts.study
-        return Drawing(DRAWS if study.bootstrap is None else study.bootstrap, study.seed)
+        return RatioBootstrap(DRAWS if study.bootstrap is None else study.bootstrap, study.seed)
 
     @cached_property
     def labels(self) -> np.ndarray:
@@ -121,11 +121,11 @@ class Results:
         return np.array([self.facts.classes.index(kind) for kind in kinds], np.int64)
 
     @cached_property
-    def units(self) -> np.ndarray:
+    def object_ids(self) -> np.ndarray:
         """Which object each picture (N,) is of."""
         return np.unique(self.facts.pictures, return_inverse=True)[1]
 
-    def answers(self, what: str, network: Network, strategy: str, other: str = "test") -> Answers:
+    def predictions(self, what: str, network: StudyNetwork, strategy: str, other: str = "test") -> Predictions:
         """What a network makes of pictures, under a strategy or, for BENIGN, as they are.
 
         what: "attacked", all, by a kind of the lab's arms (other); "known", of the network as it was or retrained
@@ -133,30 +133,30 @@ class Results:
         another network (other), those made against this one; "pixels", after an attack on pixels.
         """
         key = (what, network.name, strategy, other)
-        found = self._noted(self.right, key, lambda lab: lab.right(*key)).astype(np.bool_)
-        places = list(self.facts.few) if what == "fresh" else slice(None)
-        return Answers(found, self.labels[places], self.units[places])
+        found = self._noted(self.correct, key, lambda lab: lab.right(*key)).astype(np.bool_)
+        places = list(self.facts.retested) if what == "fresh" else slice(None)
+        return Predictions(found, self.labels[places], self.object_ids[places])
 
-    def taught(self, network: Network, trained: str) -> bool:
+    def is_retrained(self, network: StudyNetwork, trained: str) -> bool:
         """Whether it was retrained so."""
-        return network.deep and trained in GRADIENT and any(name in self.facts.tables for name in LEARNT)
+        return network.in_slow_tables and trained in GRADIENT and any(name in self.facts.tables for name in LEARNT)
 
-    def points(self, network: Network, strategy: str, rho: Floats, trained: str = "") -> Points:
+    def points(self, network: StudyNetwork, strategy: str, rho: Floats, trained: str = "") -> Points:
         """Pictures before a network, as it was or retrained; what is drawn together are an object's."""
         key = (network.name, strategy, trained)
-        found = self._noted(self.chances, key, lambda lab: lab.chances(*key))
-        return replace(classified(found, self.labels, rho), unit=self.units)
+        found = self._noted(self.probabilities, key, lambda lab: lab.chances(*key))
+        return replace(classified(found, self.labels, rho), unit=self.object_ids)
 
-    def far(self, network: Network, strategy: str, metric: str, what: str = "counterexamples") -> Floats:
+    def picture_distances(self, network: StudyNetwork, strategy: str, metric: str, what: str = "counterexamples") -> Floats:
         """Distances (N,) of counterexamples from the pictures before; PSNR's as squared errors. what: or "pixels",
         after an attack on these.
         """
         key = (what, network.name, strategy, metric)
         return self._noted(self.distances, key, lambda lab: lab.distances(*key))
 
-    def mean(self, network: Network, strategy: str, metric: str, kind: str) -> float | None:
+    def mean(self, network: StudyNetwork, strategy: str, metric: str, kind: str) -> float | None:
         """The mean distance, or the sets' one, of what was right before. kind: a class, or OVERALL."""
-        kept = self.answers("attacked", network, BENIGN).right
+        kept = self.predictions("attacked", network, BENIGN).correct
         if kind != OVERALL:
             kept = kept & (self.labels == self.facts.classes.index(kind))
         if not METRICS[metric].pairwise:
@@ -164,17 +164,17 @@ class Results:
             return self._noted(self.sets, key, lambda lab: between(lab.apart(*key[:2]), metric, kept))
         if not kept.any():
             return None
-        mean = float(self.far(network, strategy, metric)[kept].mean())
+        mean = float(self.picture_distances(network, strategy, metric)[kept].mean())
         return psnr_db(mean) if METRICS[metric].squared else mean
 
-    def certain_of(self, network: Network, strategy: str) -> int | None:
+    def certain_of(self, network: StudyNetwork, strategy: str) -> int | None:
         """How many failures are certain, where that was asked."""
         key = (network.name, strategy)
-        return self._noted(self.certain, key, lambda lab: lab.certain(*key))
+        return self._noted(self.certain_failures, key, lambda lab: lab.certain(*key))
 
     def _noted(self, store: dict[K, _T], key: K, compute: Callable[[Lab], _T]) -> _T:
         if key not in store:
-            if self.lab is None:
+            if self.source is None:
                 raise FormatError("what was kept", f"figures of {', '.join(filter(None, key))}", "none")
-            store[key] = compute(self.lab)
+            store[key] = compute(self.source)
         return store[key]

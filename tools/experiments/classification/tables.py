@@ -15,9 +15,9 @@ from drivesem.evaluation.resampling import Interval
 from drivesem.report.tables import ReportTable
 from tools.experiments.classification import pixels
 from tools.experiments.classification.arms import GRADIENT, NAMES, STRATEGIES, preset
-from tools.experiments.classification.figures import Answers, verdict
+from tools.experiments.classification.figures import Predictions, judge_order
 from tools.experiments.classification.lab import BENIGN, ONWARD, SINGLE
-from tools.experiments.classification.results import OVERALL, Network, Results
+from tools.experiments.classification.results import OVERALL, StudyNetwork, ClassificationResults
 from tools.experiments.realism.measures import METRICS
 from tools.experiments.worth.measures import MEMBERSHIPS, Setting, gain_of, realism, worth_of
 
@@ -95,7 +95,7 @@ def _bounded(name: str, one: Interval) -> Row:
     return {key: _rounded(value) for key, value in found.items()}
 
 
-def tables_of(lab: Results) -> list[Table]:
+def tables_of(lab: ClassificationResults) -> list[Table]:
     """All that are wanted, and what they say of orders."""
     found = [_BUILDERS[name](lab) for name in lab.facts.tables]
     orders = [row for table in found for row in table.orders]
@@ -114,15 +114,15 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 5)
 
 
-def _overall(lab: Results, answers: Answers) -> Row:
-    found = {"pictures": len(answers.right), **_bounded("overall", answers.overall(lab.drawing))}
+def _overall(lab: ClassificationResults, answers: Predictions) -> Row:
+    found = {"pictures": len(answers.correct), **_bounded("overall", answers.overall(lab.bootstrap))}
     if lab.facts.classes == CLASSES:
         sizes = [counts[0] for counts in figures()["sizes"].values()]
-        found |= _bounded("at_paper_sizes", answers.overall(lab.drawing, sizes))
+        found |= _bounded("at_paper_sizes", answers.overall(lab.bootstrap, sizes))
     return found
 
 
-def _with_classes(lab: Results, answers: Answers) -> Row:
+def _with_classes(lab: ClassificationResults, answers: Predictions) -> Row:
     own = zip(lab.facts.classes, answers.by_class(len(lab.facts.classes)), strict=True)
     return _overall(lab, answers) | {name: _rounded(share) for name, share in own}
 
@@ -144,15 +144,15 @@ def _by_class(values: Sequence[float]) -> Row:
     return dict(zip((*CLASSES, "overall"), values, strict=False))
 
 
-def _degradation(lab: Results) -> Table:
+def _degradation(lab: ClassificationResults) -> Table:
     rows: list[Row] = []
     orders: list[Row] = []
     for eyes in lab.facts.networks:
-        ours = {one: lab.answers("attacked", eyes, one) for one in (BENIGN, *STRATEGIES)}
+        ours = {one: lab.predictions("attacked", eyes, one) for one in (BENIGN, *STRATEGIES)}
         for one, answers in ours.items():
             row = {"network": eyes.name, "strategy": one, **_with_classes(lab, answers)}
             rows.append(row | {"certain": None if one == BENIGN else lab.certain_of(eyes, one)})
-        theirs = {one: figures()["degradation"][eyes.theirs][one][-1] for one in STRATEGIES}
+        theirs = {one: figures()["degradation"][eyes.paper_network][one][-1] for one in STRATEGIES}
         orders += _order(lab, "degradation", eyes, theirs, ours)
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
     columns = ("network", "strategy", *lab.facts.classes, "overall", "at_paper_sizes", "certain")
@@ -160,12 +160,12 @@ def _degradation(lab: Results) -> Table:
     return Table("degradation", title, columns, rows, reference, notes, orders)
 
 
-def _parameters(lab: Results) -> Table:
+def _parameters(lab: ClassificationResults) -> Table:
     rows: list[Row] = []
     orders: list[Row] = []
     moved = (*SINGLE[:3], _BOTH, SINGLE[3])
-    for eyes, strategy in product(lab.deep, GRADIENT):
-        ours = {one: lab.answers("attacked", eyes, strategy, "test" if one == _BOTH else one) for one in moved}
+    for eyes, strategy in product(lab.slow_networks, GRADIENT):
+        ours = {one: lab.predictions("attacked", eyes, strategy, "test" if one == _BOTH else one) for one in moved}
         row = {"network": eyes.name, "strategy": strategy}
         rows += [row | {"params": params, **_overall(lab, one)} for params, one in ours.items()]
         theirs: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
@@ -180,13 +180,13 @@ def _parameters(lab: Results) -> Table:
     return Table("parameters", "Accuracy by what is moved, %", columns, rows, reference, (note,), orders)
 
 
-def _hyperparameters(lab: Results) -> Table:
+def _hyperparameters(lab: ClassificationResults) -> Table:
     rows, reference = [], []
     for network, strategy in product(NETWORKS, GRADIENT):
         settings = {"strategy": strategy, "settings": NETWORKS[network]}
         settings |= {key: preset(network, strategy).get(key) for key in _SETTINGS}
-        for eyes in lab.deep:
-            answers = lab.answers("attacked", eyes, strategy, "test" if network == eyes.theirs else network)
+        for eyes in lab.slow_networks:
+            answers = lab.predictions("attacked", eyes, strategy, "test" if network == eyes.paper_network else network)
             rows.append({"network": eyes.name, **settings, **_overall(lab, answers)})
         value = figures()["degradation"][network][strategy][-1]
         reference.append({"network": NETWORKS[network], **settings, "overall": value})
@@ -195,19 +195,19 @@ def _hyperparameters(lab: Results) -> Table:
     return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference, notes)
 
 
-def _learners(lab: Results, table: str, title: str, trained: Sequence[str], what: str) -> Table:
+def _learners(lab: ClassificationResults, table: str, title: str, trained: Sequence[str], what: str) -> Table:
     """Networks that were trained so, on each of TESTS. what: as of `Results.answers`."""
     rows: list[Row] = []
     orders: list[Row] = []
-    for eyes in lab.deep:
+    for eyes in lab.slow_networks:
         for one in (BENIGN, *trained):
             row: Row = {"network": eyes.name, "trained_on": one}
             for test in TESTS:
-                row |= _bounded(test, lab.answers(what, eyes, test, one).overall(lab.drawing))
-            rows.append(row | {"pictures": len(lab.answers(what, eyes, BENIGN, one).right)})
+                row |= _bounded(test, lab.predictions(what, eyes, test, one).overall(lab.bootstrap))
+            rows.append(row | {"pictures": len(lab.predictions(what, eyes, BENIGN, one).correct)})
         for i, test in enumerate(TESTS):
-            theirs = {one: figures()[table][eyes.theirs][one][i] for one in (BENIGN, *GRADIENT)}
-            ours = {one: lab.answers(what, eyes, test, one) for one in theirs}
+            theirs = {one: figures()[table][eyes.paper_network][one][i] for one in (BENIGN, *GRADIENT)}
+            ours = {one: lab.predictions(what, eyes, test, one) for one in theirs}
             pairs = _order(lab, f"{table}, on {NAMES[test]}", eyes, theirs, ours)
             # Is a retrained network better than the benign one?
             orders += [pair for pair in pairs if pair["first"] == BENIGN]
@@ -216,21 +216,21 @@ def _learners(lab: Results, table: str, title: str, trained: Sequence[str], what
     return Table(table, title, columns, rows, reference, REMARKS.get(table, ()), orders)
 
 
-def _retraining(lab: Results) -> Table:
+def _retraining(lab: ClassificationResults) -> Table:
     title = "Retrained networks on pictures made against the benign one, %"
     return _learners(lab, "retraining", title, (ONWARD, *GRADIENT), "known")
 
 
-def _robustness(lab: Results) -> Table:
+def _robustness(lab: ClassificationResults) -> Table:
     title = "Retrained networks on pictures made against themselves, %"
     return _learners(lab, "robustness", title, GRADIENT, "fresh")
 
 
-def _worth(lab: Results) -> Table:
+def _worth(lab: ClassificationResults) -> Table:
     rows: list[Row] = []
     distance = lab.facts.distance
     for eyes in lab.facts.networks:
-        far = {one: lab.far(eyes, one, distance) for one in STRATEGIES}
+        far = {one: lab.picture_distances(eyes, one, distance) for one in STRATEGIES}
         largest = max(float(distances.max(initial=0)) for distances in far.values())
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
             rho = np.ones(len(lab.labels)) if strategy == BENIGN else realism(far[strategy], largest)
@@ -238,7 +238,7 @@ def _worth(lab: Results) -> Table:
             row: Row = {"network": eyes.name, "strategy": strategy, "membership": kind, "weighted": weighted}
             before = lab.points(eyes, strategy, rho)
             row |= _bounded("worth", worth_of(before, setting))
-            if lab.taught(eyes, strategy):
+            if lab.is_retrained(eyes, strategy):
                 after = lab.points(eyes, strategy, rho, trained=strategy)
                 row |= _bounded("gain", gain_of(before, after, setting))
             rows.append(row)
@@ -253,7 +253,7 @@ def _worth(lab: Results) -> Table:
     return Table("worth", "Information worth", columns, rows, reference, (note, *REMARKS["worth"]))
 
 
-def _realism(lab: Results) -> Table:
+def _realism(lab: ClassificationResults) -> Table:
     rows = []
     for eyes, strategy, metric in product(lab.facts.networks, STRATEGIES, lab.facts.measures):
         name = f"{METRICS[metric].name}{', dB' if METRICS[metric].unit else ''}"
@@ -274,12 +274,12 @@ def _realism(lab: Results) -> Table:
     return Table("realism", "Distances to the pictures before", columns, rows, reference, (note,), plain=True)
 
 
-def _transfer(lab: Results) -> Table:
+def _transfer(lab: ClassificationResults) -> Table:
     rows = []
     for source, target in product(lab.facts.networks, lab.facts.networks):
         for strategy in (BENIGN, *GRADIENT) if source is not target else ():
             row = {"source": source.name, "target": target.name, "strategy": strategy}
-            rows.append(row | _with_classes(lab, lab.answers("crossed", source, strategy, target.name)))
+            rows.append(row | _with_classes(lab, lab.predictions("crossed", source, strategy, target.name)))
     other = dict(zip(NETWORKS.values(), reversed(NETWORKS.values()), strict=True))
     reference = [
         row | {"source": row["network"], "target": other[row["network"]], **_by_class(values)}
@@ -290,19 +290,19 @@ def _transfer(lab: Results) -> Table:
     return Table("transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note)
 
 
-def _pixels(lab: Results) -> Table:
+def _pixels(lab: ClassificationResults) -> Table:
     rows: list[Row] = []
-    for eyes, attack in product(lab.deep if lab.facts.toolbox else (), pixels.ATTACKS):
+    for eyes, attack in product(lab.slow_networks if lab.facts.toolbox else (), pixels.ATTACKS):
         row: Row = {"network": eyes.name, "strategy": attack}
-        row |= _overall(lab, lab.answers("pixels", eyes, attack, ""))
-        rows.append(row | {"distance": round(float(lab.far(eyes, attack, "", "pixels").mean()), 5)})
+        row |= _overall(lab, lab.predictions("pixels", eyes, attack, ""))
+        rows.append(row | {"distance": round(float(lab.picture_distances(eyes, attack, "", "pixels").mean()), 5)})
     note = f"Distance: {METRICS['perceptual'].name}, as in the table of realism."
     notes = (note,) if rows else (f"Attacks on pixels need another library: {pixels.NEEDS}.",)
     columns = ("network", "strategy", "pictures", "overall", "distance")
     return Table("pixels", "Accuracy after attacks on pixels, for comparison, %", columns, rows, (), notes)
 
 
-def _sizes(lab: Results) -> Table:
+def _sizes(lab: ClassificationResults) -> Table:
     objects, used = lab.facts.objects, lab.facts.used
     rows = [
         {"class": one, **{f"{split} objects": objects[split][one] for split in SPLITS}}
@@ -319,18 +319,18 @@ def _sizes(lab: Results) -> Table:
 
 
 def _order(
-    lab: Results, table: str, eyes: Network, theirs: Mapping[str, float], ours: Mapping[str, Answers]
+    lab: ClassificationResults, table: str, eyes: StudyNetwork, theirs: Mapping[str, float], ours: Mapping[str, Predictions]
 ) -> Iterator[Row]:
     """Each two of the paper's figures that differ, and whether ours differ alike, paired over pictures."""
     for first, second in combinations(theirs, 2):
         apart = theirs[second] - theirs[first]
         if apart:
-            one = ours[first].below(ours[second], lab.drawing)
+            one = ours[first].accuracy_drop(ours[second], lab.bootstrap)
             row: Row = {"network": eyes.name, "table": table, "first": first, "second": second}
-            yield row | {"paper": round(apart, 4), **_bounded("ours", one), "verdict": verdict(apart, one)}
+            yield row | {"paper": round(apart, 4), **_bounded("ours", one), "verdict": judge_order(apart, one)}
 
 
-_BUILDERS: dict[str, Callable[[Results], Table]] = {
+_BUILDERS: dict[str, Callable[[ClassificationResults], Table]] = {
     "degradation": _degradation,
     "worth": _worth,
     "realism": _realism,

@@ -11,18 +11,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.analysis.transfer.asking import detector_names, short_names
+from drivesem.analysis.transfer.run import parse_detector_names, shorten_detector_names
 from drivesem.attack.methods.base import GRADIENT_PASSES
-from drivesem.attack.space import SIX, Parameter
-from drivesem.attack.targets import JudgedClasses
-from drivesem.config.blocks import GradingOptions, SceneAttackOptions, WorkerOptions, shared_options
+from drivesem.attack.space import PAPER_PARAMETERS, Parameter
+from drivesem.attack.targets import EvaluatedClasses
 from drivesem.config.commands import COMBO_NUMBERS, DEFAULT_COMBO, AttackConfig
-from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.run.attack import WRITTEN, Worker, attack_frames, select_frames
+from drivesem.config.options import GradingOptions, SceneAttackOptions, WorkerOptions, shared_options
+from drivesem.run.attack import WRITTEN, AttackWorker, attack_frames, select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
-from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, claim
-from drivesem.run.frame import RESULT
-from drivesem.run.protocol import PROTOCOL, follows_paper
+from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, claim_folder
+from drivesem.run.frame import RESULT, write_frame
+from drivesem.run.protocol import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
@@ -76,7 +75,7 @@ class ArmRun:
     """Totals of its run."""
     results: tuple[FrameResult, ...]
     """Results of the frames that all arms have, in the same order."""
-    judged: JudgedClasses
+    judged: EvaluatedClasses
     """Classes of its detector that count."""
 
 
@@ -171,7 +170,7 @@ def _combo_arm(base: AttackConfig, number: int) -> AttackArm:
 
 def _paper_arms(base: AttackConfig, study: StudyConfig, out: Path) -> list[AttackArm]:
     """The six parameters or the four combinations, by our protocol and by the paper's, with controls."""
-    ours = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in SIX]
+    ours = [_arm(p.value, replace(base, params=p.value), PAPER_SINGLE[p]) for p in PAPER_PARAMETERS]
     if study.name == "multi":
         ours = [_combo_arm(base, number) for number in COMBO_NUMBERS]
     arms = list(ours)
@@ -222,9 +221,9 @@ def _add_controls(
 
 def _source_arms(base: AttackConfig, study: StudyConfig) -> list[AttackArm]:
     """The default combination on each source detector; the first has the folder that `multi` gives it."""
-    sources = detector_names(study.sources or study.detector, "--sources")
+    sources = parse_detector_names(study.sources or study.detector, "--sources")
     arms = []
-    for place, (source, short) in enumerate(zip(sources, short_names(sources), strict=True)):
+    for place, (source, short) in enumerate(zip(sources, shorten_detector_names(sources), strict=True)):
         arm = _combo_arm(replace(base, detector=source), DEFAULT_COMBO)
         folder = arm.folder if place == 0 else f"{arm.folder}-{re.sub(r'[^a-zA-Z0-9.]+', '-', short)}"
         arms.append(replace(arm, name=short, folder=folder))
@@ -236,7 +235,7 @@ def _grade_arms(base: AttackConfig, out: Path) -> list[AttackArm]:
     parameter_sets = {
         f"combo {DEFAULT_COMBO}": replace(base, combo=DEFAULT_COMBO),
         "weather": replace(base, params=Parameter.WEATHER.value),
-        "all six": replace(base, params=",".join(p.value for p in SIX)),
+        "all six": replace(base, params=",".join(p.value for p in PAPER_PARAMETERS)),
     }
     arms: list[AttackArm] = []
     for name, config in parameter_sets.items():
@@ -301,7 +300,7 @@ def _label_arms(base: AttackConfig, quick: bool) -> list[AttackArm]:
     return [replace(arm, reference=None) for arm in arms] + [moved]
 
 
-def run_arms(arms: Sequence[AttackArm], workers: Sequence[Worker], out: Path) -> StudyArms:
+def run_arms(arms: Sequence[AttackArm], workers: Sequence[AttackWorker], out: Path) -> StudyArms:
     """Run or continue all arms, in the folder `arms` of `out`; each scene is de-rendered once.
 
     Args:
@@ -317,7 +316,7 @@ def run_arms(arms: Sequence[AttackArm], workers: Sequence[Worker], out: Path) ->
     names, without_vehicles, failed = select_frames(first.source, first.config)
     folders = [out / ARMS / arm.folder for arm in arms]
     for worker, folder in zip(workers, folders, strict=True):
-        claim(folder, worker.config, WRITTEN, _FREE_SETTINGS)
+        claim_folder(folder, worker.config, WRITTEN, _FREE_SETTINGS)
     jobs = run_frame_jobs(
         [name for name in names if not all(_is_done(folder, name) for folder in folders)],
         partial(_attack_frame, workers=workers, folders=folders),
@@ -332,35 +331,36 @@ def run_arms(arms: Sequence[AttackArm], workers: Sequence[Worker], out: Path) ->
     for arm, worker, folder in zip(arms, workers, folders, strict=True):
         summary = attack_frames(worker, names, folder)
         results = tuple(load_frame(folder / FRAMES / name / RESULT) for name in names)
-        runs.append(ArmRun(arm, summary, results, JudgedClasses.of(worker.detector)))
+        runs.append(ArmRun(arm, summary, results, EvaluatedClasses.from_detector(worker.detector)))
     return StudyArms(tuple(runs), without_vehicles + len(empty), dict(sorted(failed.items())))
 
 
-def build_workers(arms: Sequence[AttackArm]) -> list[Worker]:
+def build_workers(arms: Sequence[AttackArm]) -> list[AttackWorker]:
     """One worker for each arm; all share one scene source, and arms on the same detector share that.
 
     Raises UsageError or SceneError for settings that cannot be used.
     """
-    first: dict[str, Worker] = {}
+    first: dict[str, AttackWorker] = {}
     source: SceneSource | None = None
     for config in (arm.config for arm in arms):
         if config.detector not in first:
-            worker = Worker.of(config)
+            worker = AttackWorker.from_config(config)
             source = source or worker.source
             first[config.detector] = replace(worker, source=source)
-    return [first[arm.config.detector].beside(arm.config) for arm in arms]
+    return [first[arm.config.detector].with_config(arm.config) for arm in arms]
 
 
-def _attack_frame(name: str, workers: Sequence[Worker], folders: Sequence[Path]) -> bool:
+def _attack_frame(name: str, workers: Sequence[AttackWorker], folders: Sequence[Path]) -> bool:
     """Attack one frame by all arms that have not done so, in order; False if it has no vehicle."""
     scene = workers[0].source.scene(name)
     for worker, folder in zip(workers, folders, strict=True):
         if _is_done(folder, name):
             continue
         try:
-            worker.attack_scene(name, scene, folder)
+            attacked = worker.attack_scene(name, scene)
         except NoVehicleError:
             return False
+        write_frame(attacked, folder / FRAMES / name)
         # photograph and background, which all arms share, are most of a frame's folder
         if folder != folders[0] and _is_done(folders[0], name):
             files.hardlink_duplicates(folder / FRAMES / name, folders[0] / FRAMES / name)

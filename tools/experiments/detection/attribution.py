@@ -1,97 +1,105 @@
-"""Which part of the protocol takes how many points: what lies between ours and the paper's, one factor at a time.
+"""How many points of AP50 each choice of the paper's protocol accounts for, one factor at a time.
 
-An arm is a set of factors that are the paper's; all others are ours. Its value is how far AP50 falls, by the
-labels that count there. From none to all of them there are many ways; two are walked, the factors in their order
-and in the reverse, and each factor's points are the mean of what it adds on both: on each way, and so here, they
-sum to the difference (two of the orders that Shapley's value averages over). Beside them stands what each adds to
-ours alone.
+An arm is a set of factors set as in the paper; all others are ours. Its value is the drop of AP50 by the labels
+that count there. Of the many orders in which the factors can be switched, two are measured: their order and its
+reverse. A factor's points are the mean of what it adds in both, so that the points of all factors sum to the
+difference between the protocols (two of the orders that a Shapley value averages). The points that each factor adds
+to ours alone are reported too.
 """
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivesem.analysis.transfer.report import bounded
+from drivesem.analysis.transfer.report import format_interval
 from drivesem.attack.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
-from drivesem.evaluation.resampling import Figure, Interval, differences, holm
-from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
-from drivesem.report.plots import COLOURS, STYLE
-from drivesem.report.tables import ReportTable, format_count, format_percent
-from drivesem.run.protocol import PROTOCOL
-from scene_ir import files
-from tools.experiments.detection.arms import PAPER_PROTOCOL, AttackArm
+from drivesem.evaluation.resampling import Interval, NamedMetric, holm, paired_differences
+from drivesem.report.plots import PLOT_COLOURS
+from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
+from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, PROTOCOL
+from tools.experiments.detection.arms import PAPER_PROTOCOL, AttackArm, base_attack, bootstrap_draws
+from tools.experiments.detection.comparison import ArmMetrics, feasible_fraction
 from tools.experiments.detection.counts import StudyCounts
-from tools.experiments.detection.report import StudyText, heading
-from tools.experiments.detection.rows import ArmMetrics, feasible_fraction
+from tools.experiments.detection.plots import write_figure
+from tools.experiments.detection.report import (
+    build_study_report,
+    describe_intervals,
+    describe_skipped,
+    study_facts,
+)
 from tools.experiments.settings import StudyConfig
+from tools.experiments.tables import interval_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COUNTED = "labels that count"
-"""The factor that no attack knows of: the same pictures, counted by other labels."""
-LABELS = (COUNTED, "labels aimed at")
+COUNTED_LABELS, TARGETED_LABELS = "labels that count", "labels aimed at"
+"""The first is a factor that no attack sees: the same pictures, evaluated by other labels."""
+OURS = "ours"
 _SETTINGS = {
-    LABELS[1]: "objective_labels",
+    TARGETED_LABELS: "objective_labels",
     "loss": "objective",
     "iterate kept": "keep",
     "projection": "project",
     "parametrisation": "parametrisation",
 }
 _DETECTOR = "detector"
-OURS = "ours"
-_FACTOR = "factor"
-_Arms = frozenset[str]
-"""The factors that are the paper's."""
+_Factors = frozenset[str]
+"""The factors that are set as in the paper."""
 
 
 @dataclass(frozen=True, slots=True)
 class AttributionPlan:
-    """Factors in their order, and the attack of each set of them."""
+    """The factors in order, and the attack for each set of them."""
 
     factors: tuple[str, ...]
+    """Names of the factors."""
     ours: AttackConfig
+    """The attack without any of them."""
     other_detector: str | None
+    """Detector that counts as the paper's, as one more factor."""
 
     @classmethod
-    def from_study(cls, study: StudyConfig, base: AttackConfig) -> AttributionPlan:
-        """base: what the study gives all arms; its settings that are factors are ours and the paper's here."""
+    def from_study(cls, study: StudyConfig) -> AttributionPlan:
+        """Start from the study's attack, with our defaults for all settings that are factors."""
         default = AttackConfig()
         own = {name: getattr(default, name) for name in _SETTINGS.values()}
-        ours = replace(base, combo=DEFAULT_COMBO, method="si-fgsm", grade=False, **own)
-        factors = (COUNTED, *_SETTINGS, *([_DETECTOR] if study.other_detector else []))
+        ours = replace(base_attack(study), combo=DEFAULT_COMBO, method="si-fgsm", grade=False, **own)
+        factors = (COUNTED_LABELS, *_SETTINGS, *([_DETECTOR] if study.other_detector else []))
         return cls(factors, ours, study.other_detector)
 
-    def config(self, papers: _Arms) -> AttackConfig:
-        """The attack where so many factors are the paper's."""
+    def config(self, papers: _Factors) -> AttackConfig:
+        """The attack with these factors as in the paper."""
         changes: dict[str, Any] = {name: PROTOCOL[name] for f, name in _SETTINGS.items() if f in papers}
         if _DETECTOR in papers:
             changes["detector"] = self.other_detector
         return replace(self.ours, **changes)
 
-    def paths(self) -> list[list[_Arms]]:
-        """From none to all, in the factors' order and in the reverse."""
+    def paths(self) -> list[list[_Factors]]:
+        """From none to all factors, in their order and in the reverse."""
         orders = (self.factors, self.factors[::-1])
         return [[frozenset(order[:k]) for k in range(len(order) + 1)] for order in orders]
 
     def arms(self) -> list[AttackArm]:
-        """Each attack once: of both ways, and of each factor alone."""
+        """Each attack once: those on both paths, and each factor alone."""
         first, second = self.paths()
-        asked = [first[0], first[-1], *first[1:-1], *second[1:-1], *(frozenset([f]) for f in self.factors)]
-        named = {self.arm_name(papers): papers for papers in asked}
-        folders = {name: re.sub(r"[^a-z0-9]+", "-", name) for name in named}
-        return [AttackArm(name, folders[name], self.config(papers)) for name, papers in named.items()]
+        sets = [first[0], first[-1], *first[1:-1], *second[1:-1], *(frozenset([f]) for f in self.factors)]
+        named = {self.arm_name(papers): papers for papers in sets}
+        return [
+            AttackArm(name, re.sub(r"[^a-z0-9]+", "-", name), self.config(papers))
+            for name, papers in named.items()
+        ]
 
-    def arm_name(self, papers: _Arms) -> str:
-        """Of the arm whose attack this is: labels that count make no other."""
+    def arm_name(self, papers: _Factors) -> str:
+        """Name of the arm with this attack; the labels that count make no other."""
         changed = [f for f in self.factors[1:] if f in papers]
         if len(changed) in (0, len(self.factors) - 1):
             return PAPER_PROTOCOL if changed else OURS
@@ -100,226 +108,232 @@ class AttributionPlan:
 
 @dataclass(frozen=True, slots=True)
 class FactorShare:
-    """One factor, or some together, fractions of 1. alone: points that it adds to ours; points: its mean on both
-    ways, of which `ways` are the two; p: of the permutation test of `points`, Holm's, None where it is not tested.
-    """
+    """The points of one factor, or of some together, as fractions of 1."""
 
     name: str
+    """Name of the factor."""
     alone: Interval
+    """What it adds to ours alone."""
     points: Interval
+    """Mean of what it adds on both paths."""
     path_points: tuple[float | None, float | None]
+    """What it adds on each path."""
     p: float | None = None
+    """Holm-adjusted p value of `points`; None if not tested."""
 
     def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON."""
-        found: dict[str, Any] = {"name": self.name}
-        for key, one in (("alone", self.alone), ("points", self.points)):
-            found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
-        return found | {"in_order": self.path_points[0], "in_reverse": self.path_points[1], "p": self.p}
+        row = {
+            "name": self.name,
+            **interval_columns("alone", self.alone),
+            **interval_columns("points", self.points),
+        }
+        return row | {"in_order": self.path_points[0], "in_reverse": self.path_points[1], "p": self.p}
 
 
 @dataclass(frozen=True, slots=True)
 class Attribution:
-    """What was found. falls: of each arm by its name, by labels that moved and by benign ones; ours, papers: where
-    the ways begin and end; shares: of the factors in their order; labels: of both kinds together; total: of all.
-    """
+    """The result of the study `attribution`."""
 
     study: StudyConfig
+    """Settings of the study."""
     draws: int
+    """Bootstrap draws of frames."""
     counts: StudyCounts
+    """Counts of all arms."""
     drops: Mapping[str, Mapping[str, Interval]]
+    """Drop of AP50 by arm and label mode."""
     ours: float | None
+    """Drop where the paths begin."""
     papers: float | None
+    """Drop where they end."""
     shares: Sequence[FactorShare]
-    labels: FactorShare
-    total: FactorShare
-
-    def rows(self) -> list[FactorShare]:
-        """As they are told."""
-        return [*self.shares, self.labels, self.total]
+    """The factors, then both kinds of labels together, then all."""
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        return heading(self.study, self.draws, self.counts) | {
+        return study_facts(self.study, self.draws, self.counts) | {
             "ours": self.ours,
             "papers": self.papers,
-            "rows": [share.to_row() for share in self.rows()],
+            "rows": [share.to_row() for share in self.shares],
             "arms": self.arm_rows(),
         }
 
     def arm_rows(self) -> list[dict[str, Any]]:
-        """The falls of each arm."""
-        found: list[dict[str, Any]] = []
+        """Drops of each arm."""
+        rows: list[dict[str, Any]] = []
         for run in self.counts.arms:
-            line: dict[str, Any] = {"name": run.arm.name, "feasible_fraction": feasible_fraction(run.frames)}
-            for mode, one in self.drops[run.arm.name].items():
-                line |= {f"drop_{mode}": one.value, f"drop_{mode}_low": one.low, f"drop_{mode}_high": one.high}
-            found.append(line)
-        return found
+            row: dict[str, Any] = {"name": run.arm.name, "feasible_fraction": feasible_fraction(run.frames)}
+            for mode, drop in self.drops[run.arm.name].items():
+                row |= interval_columns(f"drop_{mode}", drop)
+            rows.append(row)
+        return rows
 
 
 class _DropMeasurements:
-    """Falls of AP50 of all arms, and what they differ by: all of the same draws of frames."""
+    """Drops of AP50 of all arms and their differences, over the same draws of frames."""
 
     def __init__(self, plan: AttributionPlan, counts: StudyCounts, draws: int, seed: int) -> None:
         self._plan, self._draws, self._seed = plan, draws, seed
-        self._figures = {run.arm.name: ArmMetrics.from_runs(run).ap50_only() for run in counts.arms}
+        self._metrics = {run.arm.name: ArmMetrics.from_runs(run).ap50_only() for run in counts.arms}
         self._detector = {run.arm.name: run.arm.config.detector for run in counts.arms}
 
-    def falls(self, name: str) -> dict[str, Interval]:
-        """Of an arm, by the labels that count."""
-        return {m: self._figures[name].drops(m, self._draws, self._seed)["ap50"] for m in ("moved", "paper")}
+    def drops(self, name: str) -> dict[str, Interval]:
+        """Drops of an arm by label mode."""
+        return {m: self._metrics[name].drops(m, self._draws, self._seed)["ap50"] for m in ("moved", "paper")}
 
-    def fall(self, papers: _Arms) -> float | None:
-        """At one stop on a way."""
-        figures = self._figures[self._plan.arm_name(papers)]
-        before, after = figures.before[0].value(), self._after(papers).value()
+    def drop(self, papers: _Factors) -> float | None:
+        """The drop with these factors as in the paper."""
+        metrics = self._metrics[self._plan.arm_name(papers)]
+        before, after = metrics.before[0].value(), self._after(papers).value()
         return None if before is None or after is None else before - after
 
-    def step(self, one: _Arms, other: _Arms) -> float | None:
-        """How much further AP50 falls at the second stop than at the first."""
-        before, after = self.fall(one), self.fall(other)
+    def step(self, first: _Factors, second: _Factors) -> float | None:
+        """The second drop less the first."""
+        before, after = self.drop(first), self.drop(second)
         return None if before is None or after is None else after - before
 
-    def more(self, steps: Sequence[tuple[_Arms, _Arms]], test: bool) -> tuple[Interval, float | None]:
-        """How much further AP50 falls at the second stop of each pair than at the first: the mean, and p, where a
-        test is asked for.
+    def mean_step(self, steps: Sequence[tuple[_Factors, _Factors]], test: bool) -> tuple[Interval, float | None]:
+        """Mean over steps of the second drop less the first, and its p value with `test`.
 
-        A figure is the mean of its parts. Where the detector differs, so does what its AP50 falls from, and each
-        pair has two parts a side.
+        A metric is the mean of its parts. Where the detector differs, so does the AP50 before the attack, and each
+        step has two parts a side.
         """
-        less: list[Figure] = []
-        more: list[Figure] = []
-        for one, other in steps:
-            more.append(self._after(one))
-            less.append(self._after(other))
-            names = [self._plan.arm_name(papers) for papers in (one, other)]
+        less: list[NamedMetric] = []
+        more: list[NamedMetric] = []
+        for first, second in steps:
+            more.append(self._after(first))
+            less.append(self._after(second))
+            names = [self._plan.arm_name(papers) for papers in (first, second)]
             if len({self._detector[name] for name in names}) > 1:
-                befores = [self._figures[name].before[0] for name in names]
+                befores = [self._metrics[name].before[0] for name in names]
                 less.append(befores[0])
                 more.append(befores[1])
-        first, second = (Figure("ap50", tuple(p for one in side for p in one.parts)) for side in (less, more))
-        frames, rng = self._figures[OURS].frames, np.random.default_rng(self._seed)
-        (found,) = differences([first], [second], frames, self._draws, rng, test)
-        times = len(less) / len(steps)
-        values = (found.difference, found.low, found.high)
-        return Interval("ap50", *(None if value is None else times * value for value in values)), found.p
+        lower, higher = (NamedMetric("ap50", tuple(p for one in side for p in one.parts)) for side in (less, more))
+        frames, rng = self._metrics[OURS].frames, np.random.default_rng(self._seed)
+        (mean,) = paired_differences([lower], [higher], frames, self._draws, rng, test)
+        factor = len(less) / len(steps)
+        values = (mean.difference, mean.low, mean.high)
+        return Interval("ap50", *(None if value is None else factor * value for value in values)), mean.p
 
-    def _after(self, papers: _Arms) -> Figure:
-        mode = "paper" if COUNTED in papers else "moved"
-        return self._figures[self._plan.arm_name(papers)].after[mode][0]
+    def _after(self, papers: _Factors) -> NamedMetric:
+        mode = "paper" if COUNTED_LABELS in papers else "moved"
+        return self._metrics[self._plan.arm_name(papers)].after[mode][0]
 
 
-def attribute_drop(study: StudyConfig, plan: AttributionPlan, counts: StudyCounts, draws: int) -> Attribution:
-    """What each factor takes, of the arms of a plan."""
-    measures, ways = _DropMeasurements(plan, counts, draws, study.seed), plan.paths()
-    none, everything = ways[0][0], ways[0][-1]
+def attribute_drop(study: StudyConfig, counts: StudyCounts) -> Attribution:
+    """Attribute the difference between the protocols to factors, from the counts of the plan's arms."""
+    plan, draws = AttributionPlan.from_study(study), bootstrap_draws(study)
+    measurements, paths = _DropMeasurements(plan, counts, draws, study.seed), plan.paths()
+    none, everything = paths[0][0], paths[0][-1]
 
-    def share(name: str, factors: Sequence[str], test: bool = False) -> tuple[FactorShare, float | None]:
+    def share(name: str, factors: Sequence[str], test: bool = False) -> FactorShare:
         size = len(factors)
         steps = [
-            next((way[k], way[k + size]) for k in range(len(way) - size) if way[k + size] - way[k] == {*factors})
-            for way in ways
+            next(
+                (path[k], path[k + size])
+                for k in range(len(path) - size)
+                if path[k + size] - path[k] == {*factors}
+            )
+            for path in paths
         ]
-        points, p = measures.more(steps, test)
-        alone, _ = measures.more([(none, frozenset(factors))], test=False)
-        in_order, in_reverse = (measures.step(*step) for step in steps)
-        return FactorShare(name, alone, points, (in_order, in_reverse)), p
+        points, p = measurements.mean_step(steps, test)
+        alone, _ = measurements.mean_step([(none, frozenset(factors))], test=False)
+        in_order, in_reverse = (measurements.step(*step) for step in steps)
+        return FactorShare(name, alone, points, (in_order, in_reverse), p)
 
-    found = [share(factor, [factor], test=True) for factor in plan.factors]
-    adjusted = holm([p for _, p in found])
+    tested = [share(factor, [factor], test=True) for factor in plan.factors]
+    shares = [replace(one, p=p) for one, p in zip(tested, holm([one.p for one in tested]), strict=True)]
+    labels = replace(share("labels, both", (COUNTED_LABELS, TARGETED_LABELS)), p=None)
     return Attribution(
         study=study,
         draws=draws,
         counts=counts,
-        drops={run.arm.name: measures.falls(run.arm.name) for run in counts.arms},
-        ours=measures.fall(none),
-        papers=measures.fall(everything),
-        shares=[replace(one, p=p) for (one, _), p in zip(found, adjusted, strict=True)],
-        labels=share("labels, both", LABELS)[0],
-        total=share("all", plan.factors)[0],
+        drops={run.arm.name: measurements.drops(run.arm.name) for run in counts.arms},
+        ours=measurements.drop(none),
+        papers=measurements.drop(everything),
+        shares=[*shares, labels, replace(share("all", plan.factors), p=None)],
     )
 
 
-def attribution_text(found: Attribution) -> StudyText:
-    """The study as text."""
-    tables = {"study": [one.to_row() for one in found.rows()], "arms": found.arm_rows()}
-    sheets = [_shares(found), _arms(found)]
-    return StudyText(found.study.name, sheets, sheets[:1], notes(found), tables, (_FACTOR, "the paper's"))
+def attribution_report(found: Attribution, out: Path) -> AnalysisReport:
+    """The report of the study `attribution`."""
+    shares = _share_table(found)
+    return build_study_report(
+        found.study,
+        out,
+        found.to_json(),
+        {"study": [one.to_row() for one in found.shares], "arms": found.arm_rows()},
+        [shares, _arm_table(found)],
+        [shares],
+        notes=_build_notes(found),
+        text_columns=("factor", "the paper's"),
+        picture=partial(write_waterfall, found=found),
+    )
 
 
-def _shares(found: Attribution) -> ReportTable:
+def _share_table(found: Attribution) -> ReportTable:
     lines = []
-    for one in found.rows():
-        ways = ("-" if value is None else f"{100 * value:.1f}" for value in one.path_points)
+    for one in found.shares:
+        points = ("-" if value is None else f"{100 * value:.1f}" for value in one.path_points)
         p = "-" if one.p is None else f"{one.p:.3f}"
-        lines.append((one.name, bounded(one.alone), bounded(one.points), *ways, p))
-    columns = (_FACTOR, "added to ours alone", "points", "in this order", "in the reverse", "p")
+        lines.append((one.name, format_interval(one.alone), format_interval(one.points), *points, p))
+    columns = ("factor", "added to ours alone", "points", "in this order", "in the reverse", "p")
     ends = f"from {format_percent(found.ours)}, ours, to {format_percent(found.papers)}, the {PAPER_PROTOCOL}"
-    return ReportTable(f"How far {HEADLINE} AP50 falls, points: {ends}", columns, tuple(lines))
+    return ReportTable(f"Drop of {HEADLINE} AP50, points: {ends}", columns, tuple(lines))
 
 
-def _arms(found: Attribution) -> ReportTable:
+def _arm_table(found: Attribution) -> ReportTable:
     lines = []
     for run in found.counts.arms:
-        falls = found.drops[run.arm.name]
-        share = format_percent(feasible_fraction(run.frames))
-        lines.append((run.arm.name, bounded(falls["moved"]), bounded(falls["paper"]), share))
-    columns = ("the paper's", "falls, moved labels", "falls, benign labels", "feasible, %")
-    return ReportTable("Arms, by what in them is the paper's", columns, tuple(lines))
+        drops = found.drops[run.arm.name]
+        feasible = format_percent(feasible_fraction(run.frames))
+        lines.append((run.arm.name, format_interval(drops["moved"]), format_interval(drops["paper"]), feasible))
+    columns = ("the paper's", "drop, moved labels", "drop, benign labels", "feasible, %")
+    return ReportTable("Arms, by what is set as in the paper", columns, tuple(lines))
 
 
-def notes(found: Attribution) -> list[str]:
-    """What the columns mean."""
-    spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
-    lines = [
-        f"Combination {DEFAULT_COMBO} by ten steps of si-FGSM. Points: how much further AP50 falls with the "
-        "paper's choice than with ours, the mean of two ways from ours to the paper's, in this order and in the "
-        f"reverse; they sum to the difference.{spread} p: permutation of frames, Holm's over the factors.",
-        "Labels that count: the same pictures by labels that stay. Labels aimed at: the attack raises its loss by "
-        "them. Which iterate is the best is always decided by labels that moved.",
-        f"There the paper's SqueezeDet fell by {100 * (PAPER_BENIGN - PAPER_COMBOS[DEFAULT_COMBO]):.1f} points on "
+def _build_notes(found: Attribution) -> list[str]:
+    return [
+        f"Combination {DEFAULT_COMBO}, ten steps of si-FGSM. Points: how much further AP50 drops with the paper's "
+        "choice than with ours, the mean of two paths from ours to the paper's, in this order and in the reverse; "
+        f"they sum to the difference.{describe_intervals(found.draws)} p: permutation of frames, Holm-adjusted "
+        "over the factors.",
+        "Labels that count: the same pictures, evaluated by labels that do not move. Labels aimed at: the attack "
+        "raises its loss on them. The best iterate is always chosen by moved labels.",
+        f"The paper's SqueezeDet dropped by {100 * (PAPER_BENIGN - PAPER_COMBOS[DEFAULT_COMBO]):.1f} points on "
         "Virtual KITTI.",
+        *describe_skipped(found.counts.without_vehicles, found.counts.failed),
     ]
-    if found.counts.without_vehicles:
-        lines.append(f"{format_count(found.counts.without_vehicles, 'frame')} without vehicles passed over.")
-    return lines + [f"Frame {name} could not be used: {reason}" for name, reason in found.counts.failed.items()]
 
 
 def write_waterfall(path: Path, found: Attribution) -> None:
-    """From ours to the paper's protocol, a step for each factor, as a PNG."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure as Canvas
-
-    with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
-        figure = Canvas(figsize=(1.6 + 1.15 * (len(found.shares) + 2), 4.6), layout="constrained")
-        _draw(figure.add_subplot(), found)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    files.write_bytes(path, buffer.getvalue())
+    """Draw the way from ours to the paper's protocol, one step for each factor."""
+    factors = found.shares[:-2]
+    write_figure(path, (1.6 + 1.15 * (len(factors) + 2), 4.6), partial(_draw, found=found, factors=factors))
 
 
-def _draw(axes: Axes, found: Attribution) -> None:
-    at = 100 * (found.ours or 0.0)
-    axes.bar(0, at, color=COLOURS[0])
-    axes.text(0, at, f" {at:.1f}", ha="center", va="bottom")
-    for place, one in enumerate(found.shares, start=1):
+def _draw(axes: Axes, found: Attribution, factors: Sequence[FactorShare]) -> None:
+    level = 100 * (found.ours or 0.0)
+    axes.bar(0, level, color=PLOT_COLOURS[0])
+    axes.text(0, level, f" {level:.1f}", ha="center", va="bottom")
+    for place, one in enumerate(factors, start=1):
         points = 100 * (one.points.value or 0.0)
-        axes.bar(place, points, bottom=at, color=COLOURS[1] if points > 0 else COLOURS[2])
-        axes.plot([place - 1, place], [at, at], color=COLOURS[6], linewidth=0.8)
-        top = max(at, at + points)
+        axes.bar(place, points, bottom=level, color=PLOT_COLOURS[1] if points > 0 else PLOT_COLOURS[2])
+        axes.plot([place - 1, place], [level, level], color=PLOT_COLOURS[6], linewidth=0.8)
+        top = max(level, level + points)
         if one.points.low is not None and one.points.high is not None:
-            bounds = [at + 100 * one.points.low, at + 100 * one.points.high]
-            axes.plot([place, place], bounds, color=COLOURS[6], linewidth=1.2, zorder=3)
+            bounds = [level + 100 * one.points.low, level + 100 * one.points.high]
+            axes.plot([place, place], bounds, color=PLOT_COLOURS[6], linewidth=1.2, zorder=3)
             top = max(top, *bounds)
         axes.text(place, top, f"{points:+.1f}", ha="center", va="bottom")
-        at += points
-    last = len(found.shares) + 1
-    axes.plot([last - 1, last], [at, at], color=COLOURS[6], linewidth=0.8)
-    axes.bar(last, at, color=COLOURS[0])
-    axes.text(last, at, f"{at:.1f}", ha="center", va="bottom")
-    axes.axhline(0, color=COLOURS[6], linewidth=0.8)
-    names = [OURS, *(share.name for share in found.shares), PAPER_PROTOCOL]
+        level += points
+    last = len(factors) + 1
+    axes.plot([last - 1, last], [level, level], color=PLOT_COLOURS[6], linewidth=0.8)
+    axes.bar(last, level, color=PLOT_COLOURS[0])
+    axes.text(last, level, f"{level:.1f}", ha="center", va="bottom")
+    axes.axhline(0, color=PLOT_COLOURS[6], linewidth=0.8)
+    names = [OURS, *(share.name for share in factors), PAPER_PROTOCOL]
     axes.set_xticks(range(last + 1), [name.replace(" ", "\n") for name in names])
-    axes.set_ylabel("fall of AP50, points")
-    axes.set_title("From ours to the paper's protocol; lines: 95 % of draws of frames", loc="left", fontsize=11)
+    axes.set_ylabel("drop of AP50, points")
+    axes.set_title("From ours to the paper's protocol; lines: 95 % interval over frames", loc="left", fontsize=11)

@@ -15,21 +15,27 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from tools.experiments.detection.retraining_arms import BENIGN
-from tools.experiments.detection.retraining_results import BenignMatches, RetrainingCounts
-from tools.experiments.detection.robustness import FailureCounts, FrameStateCounts
 
-from drivesem.analysis.confirm.report import Confirmation, Share
-from drivesem.analysis.transfer.matrix import SHOWN, FrameLosses, PairCounts, ShownRun, Target
+from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
+from drivesem.analysis.transfer.matrix import (
+    EVALUATED_PICTURES,
+    FrameLosses,
+    SourceRun,
+    TransferCounts,
+    TransferTarget,
+)
 from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.instances import Booleans
-from drivesem.evaluation.matches import Matches
+from drivesem.evaluation.matches import ThresholdMatches
 from scene_ir import files
 from scene_ir.errors import FormatError
 from tools.experiments.detection.arms import AttackArm, AttackTotals
 from tools.experiments.detection.counts import ArmCounts, DetectedObject, FailureRecord, FrameCounts, StudyCounts
 from tools.experiments.detection.labels import FrameLabels, LabelFailures
-from tools.experiments.detection.transfer import TransferCounts, TransferSource
+from tools.experiments.detection.retraining_arms import BENIGN
+from tools.experiments.detection.retraining_results import BenignMatches, RetrainingCounts
+from tools.experiments.detection.robustness import FailureCounts, FrameStateCounts
+from tools.experiments.detection.transfer import TransferSource, TransferStudyCounts
 from tools.experiments.settings import StudyConfig
 from tools.experiments.tables import matching_tables, read_metadata, read_table, write_metadata, write_table
 
@@ -182,9 +188,9 @@ class StateRow:
 class TestedPair:
     """A run and a detector that it was tested on."""
 
-    source: ShownRun
+    source: SourceRun
     """The attack."""
-    target: Target
+    target: TransferTarget
     """The detector."""
 
 
@@ -327,7 +333,7 @@ def _arm_detections(arms: Sequence[ArmCounts]) -> Iterable[tuple[ArmFrameKey, St
 
 
 def store_detections(
-    picture: str, benign: Matches, moved: Matches | None = None, chosen: Booleans | None = None
+    picture: str, benign: ThresholdMatches, moved: ThresholdMatches | None = None, chosen: Booleans | None = None
 ) -> list[list[StoredDetection]]:
     """Detections of one class as rows, frame by frame.
 
@@ -353,7 +359,9 @@ def store_detections(
     return [stored[start:end] for start, end in pairwise(ends)]
 
 
-def load_matches(frames: Sequence[Sequence[StoredDetection]], objects: Sequence[int], mode: str) -> Matches:
+def load_matches(
+    frames: Sequence[Sequence[StoredDetection]], objects: Sequence[int], mode: str
+) -> ThresholdMatches:
     """Matches of the stored detections of one class.
 
     Args:
@@ -366,7 +374,7 @@ def load_matches(frames: Sequence[Sequence[StoredDetection]], objects: Sequence[
     """
     rows = [row for frame in frames for row in frame]
     marks = [[_MARK_LETTERS.index(letter) for letter in getattr(row, mode)] for row in rows]
-    return Matches(
+    return ThresholdMatches(
         frame=np.repeat(np.arange(len(frames)), [len(one) for one in frames]),
         score=np.array([row.score for row in rows], np.float32).astype(np.float64),
         marks=np.array(marks, np.int64).reshape(-1, len(IOU_THRESHOLDS)),
@@ -442,7 +450,10 @@ def _load_confirmations(folder: Path) -> dict[str, Confirmation]:
         arm: Confirmation(
             own[0].frames,
             {},
-            tuple(Share.of(one.share, [i < one.survive for i in range(one.failures)]) for one in own),
+            tuple(
+                SurvivalRate.from_outcomes(one.share, [i < one.survive for i in range(one.failures)])
+                for one in own
+            ),
             {},
             None,
         )
@@ -450,7 +461,7 @@ def _load_confirmations(folder: Path) -> dict[str, Confirmation]:
     }
 
 
-def _save_pairs(folder: Path, pairs: Sequence[PairCounts]) -> None:
+def _save_pairs(folder: Path, pairs: Sequence[TransferCounts]) -> None:
     """Write frames, objects and detections of runs that were tested on detectors."""
     frames = [
         (pair, place, PairFrameKey(frame.identifier, pair.source.name, pair.target.name), frame)
@@ -476,24 +487,24 @@ def _save_pairs(folder: Path, pairs: Sequence[PairCounts]) -> None:
 
 
 def _pair_detections(
-    pair: PairCounts,
+    pair: TransferCounts,
 ) -> list[tuple[PairFrameKey, list[tuple[CategoryKey, StoredDetection]]]]:
     """The detections of a pair by frame that affect a metric."""
     keys = [PairFrameKey(frame.identifier, pair.source.name, pair.target.name) for frame in pair.frames]
     rows: list[tuple[PairFrameKey, list[tuple[CategoryKey, StoredDetection]]]] = [(key, []) for key in keys]
     for name in ("benign", "rerendered", "paper"):
         for category, matches in pair.pictures[name].items():
-            moved, chosen = None, matches.telling()
+            moved, chosen = None, matches.affects_metrics()
             if name == "paper":
                 moved = pair.pictures["moved"][category]
-                chosen |= moved.telling()
+                chosen |= moved.affects_metrics()
             stored = store_detections(_PICTURES[name], matches, moved, chosen)
             for (_, own), detections in zip(rows, stored, strict=True):
                 own += [(CategoryKey(category), row) for row in detections]
     return rows
 
 
-def _load_pairs(folder: Path, tested: Sequence[TestedPair]) -> list[PairCounts]:
+def _load_pairs(folder: Path, tested: Sequence[TestedPair]) -> list[TransferCounts]:
     frames = read_table(folder / _FRAMES, (PairFrameKey, FrameLosses))
     counts = read_table(folder / _PAIR_OBJECTS, (PairFrameKey, CategoryKey, ObjectCounts))
     objects = {(key, one.category): n for key, one, n in counts}
@@ -515,18 +526,18 @@ def _load_pairs(folder: Path, tested: Sequence[TestedPair]) -> list[PairCounts]:
                     )
                     for category in one.target.classes
                 }
-                for name in SHOWN
+                for name in EVALUATED_PICTURES
                 for mode in ["moved" if name == "moved" else "benign"]
             }
-            pairs.append(PairCounts(one.source, one.target, tuple(frame for _, frame in own), pictures))
+            pairs.append(TransferCounts(one.source, one.target, tuple(frame for _, frame in own), pictures))
     return pairs
 
 
-def _pair_records(pairs: Sequence[PairCounts]) -> list[dict[str, Any]]:
+def _pair_records(pairs: Sequence[TransferCounts]) -> list[dict[str, Any]]:
     return [{"source": asdict(pair.source), "target": asdict(pair.target)} for pair in pairs]
 
 
-def save_transfer(folder: Path, study: StudyConfig, counts: TransferCounts) -> None:
+def save_transfer(folder: Path, study: StudyConfig, counts: TransferStudyCounts) -> None:
     """Write the results of the study `transfer`."""
     with files.atomic_folder(folder) as out:
         write_metadata(
@@ -540,13 +551,13 @@ def save_transfer(folder: Path, study: StudyConfig, counts: TransferCounts) -> N
         _save_pairs(out, counts.pairs)
 
 
-def load_transfer(folder: Path) -> tuple[StudyConfig, TransferCounts]:
+def load_transfer(folder: Path) -> tuple[StudyConfig, TransferStudyCounts]:
     """Read what `save_transfer` wrote. Raises FormatError."""
     metadata = read_metadata(folder, TransferMetadata, "transfer")
     if metadata.attacks is None:
         raise FormatError(f"{folder}: attacks", "totals of the attacks", "none")
     pairs = _load_pairs(folder, metadata.pairs)
-    return metadata.settings, TransferCounts(metadata.attacks, metadata.sources, pairs, metadata.failed or {})
+    return metadata.settings, TransferStudyCounts(metadata.attacks, metadata.sources, pairs, metadata.failed or {})
 
 
 def save_retraining(folder: Path, study: StudyConfig, counts: RetrainingCounts) -> None:
@@ -556,7 +567,9 @@ def save_retraining(folder: Path, study: StudyConfig, counts: RetrainingCounts) 
     detections = (
         (DetectorFrameKey(frame, detector), row)
         for detector, one in counts.benign_matches.items()
-        for frame, rows in _zip(counts, store_detections("photograph", one.matches, None, one.matches.telling()))
+        for frame, rows in _zip(
+            counts, store_detections("photograph", one.matches, None, one.matches.affects_metrics())
+        )
         for row in rows
     )
     states = (

@@ -1,116 +1,133 @@
-"""Counterexamples of combination 2 before other detectors, beside the paper's figures for a YOLOv3."""
+"""The study `transfer`: counterexamples of combination 2 on other detectors, with the paper's numbers for a YOLOv3."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from detectors.yolov3.yolov3 import YoloV3
-from drivesem.analysis.transfer.asking import Asked, detector_names, detectors_of, pairs_of
 from drivesem.analysis.transfer.matrix import (
     AP50,
     BROKEN,
     FRAMES,
     LOST,
     TRANSFER,
-    PairCounts,
+    TransferCounts,
     TransferRow,
-    row_of,
+    compute_transfer_row,
 )
-from drivesem.analysis.transfer.report import bounded
-from drivesem.analysis.transfer.report import sheets as matrix_sheets
+from drivesem.analysis.transfer.report import build_transfer_tables, format_interval, write_heatmap
+from drivesem.analysis.transfer.run import (
+    TargetDetector,
+    evaluate_pairs,
+    load_target_detectors,
+    parse_detector_names,
+)
 from drivesem.attack.targets import HEADLINE
-from drivesem.config.blocks import DetectionOptions
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
-from drivesem.evaluation.resampling import Interval, differences
-from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER
-from drivesem.report.tables import ReportTable, format_count, format_percent
-from drivesem.run.attack import Worker
+from drivesem.config.options import DetectionOptions
+from drivesem.evaluation.resampling import Interval, paired_differences
+from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
+from drivesem.run.attack import AttackWorker
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS
-from drivesem.run.protocol import follows_paper
-from tools.experiments.detection.arms import AttackArm, bootstrap_draws
-from tools.experiments.detection.report import OWN_PROTOCOL, StudyText
-from tools.experiments.detection.rows import MODES
-from tools.experiments.detection.running import AttackTotals, feasible_share, run_arms
+from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER, follows_paper
+from tools.experiments.detection.arms import AttackArm, AttackTotals, bootstrap_draws, feasible_share, run_arms
+from tools.experiments.detection.comparison import MODES
+from tools.experiments.detection.report import (
+    FEASIBLE,
+    LABEL_MODES,
+    OWN_PROTOCOL,
+    build_study_report,
+    describe_intervals,
+    describe_skipped,
+)
 from tools.experiments.settings import StudyConfig
+from tools.experiments.tables import interval_columns
 
 _SIDES = ("source", "target")
-_LABELS = "labels"
-_WORDS = (*_SIDES, _LABELS)
+_TEXT_COLUMNS = (*_SIDES, "labels")
 
 
 @dataclass(frozen=True, slots=True)
 class SourceTargetResult:
-    """Counterexamples of one source before one target. placebo: what one random edit as large as the attack's does
-    there, where controls are asked for; beyond: how far AP50 falls below it, by label mode, paired over frames;
-    reference: the paper's mAP of such a pair, benign and attacked.
-    """
+    """Counterexamples of one source tested on one target."""
 
     row: TransferRow
+    """Metrics of the pair."""
     placebo: TransferRow | None
+    """Metrics of random edits as large as the attack's, with --controls."""
     beyond: Mapping[str, Interval]
+    """Drop of AP50 beyond the placebo's by label mode, paired over frames."""
     reference: tuple[float, float] | None
+    """The paper's mAP of such a pair, benign and attacked."""
 
     def to_row(self) -> dict[str, Any]:
         """Numbers by name, for CSV and JSON: fractions of 1, None where there is nothing to count."""
-        there, attacked = self.reference or (None, None)
-        found = self.row.flat() | {
+        benign, attacked = self.reference or (None, None)
+        row = self.row.to_row() | {
             "recall_paper": self.row.paper.headline.recall,
             "recall_moved": self.row.moved.headline.recall,
             "reference": attacked,
-            "reference_benign": there,
-            "reference_drop": None if there is None or attacked is None else there - attacked,
+            "reference_benign": benign,
+            "reference_drop": None if benign is None or attacked is None else benign - attacked,
         }
         if self.placebo is not None:
-            theirs = self.placebo.flat()
-            told = ("paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "drop_moved_low", "drop_moved_high")
-            found |= {f"placebo_{key}": theirs[key] for key in (*told, BROKEN)}
-        for mode, one in self.beyond.items():
-            key = f"over_placebo_{mode}"
-            found |= {key: one.value, f"{key}_low": one.low, f"{key}_high": one.high}
-        return found
+            placebo = self.placebo.to_row()
+            names = ("paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "drop_moved_low", "drop_moved_high")
+            row |= {f"placebo_{key}": placebo[key] for key in (*names, BROKEN)}
+        for mode, drop in self.beyond.items():
+            row |= interval_columns(f"over_placebo_{mode}", drop)
+        return row
 
 
 @dataclass(frozen=True, slots=True)
 class TransferSource:
-    """An arm that is no control, by its name; placebo: of the arm beside it, None without; references: the paper's
-    mAP of a pair with it by the target's name, benign and attacked.
-    """
+    """An attacked detector."""
 
     name: str
+    """Name of its arm."""
     placebo: str | None
+    """Name of the arm's placebo."""
     references: dict[str, tuple[float, float]]
+    """The paper's mAP by target, benign and attacked."""
 
 
 @dataclass(frozen=True, slots=True)
-class TransferCounts:
-    """What the tables are computed from. pairs: of each arm, controls too, and each target; failed: pictures that
-    could not be used, and why.
-    """
+class TransferStudyCounts:
+    """What the tables are computed from."""
 
     attacks: AttackTotals
+    """Totals of the attacks."""
     sources: tuple[TransferSource, ...]
-    pairs: Sequence[PairCounts]
+    """The attacked detectors."""
+    pairs: Sequence[TransferCounts]
+    """Counts of each arm, controls included, on each target."""
     failed: Mapping[str, str]
+    """Reason by picture that could not be used."""
 
 
 @dataclass(frozen=True, slots=True)
 class TransferMatrix:
-    """All that the study found."""
+    """The result of the study `transfer`."""
 
     study: StudyConfig
+    """Settings of the study."""
     draws: int
-    counts: TransferCounts
+    """Bootstrap draws of frames."""
+    counts: TransferStudyCounts
+    """What it is computed from."""
     rows: Sequence[SourceTargetResult]
+    """One row for each source and target."""
 
     @property
     def failed(self) -> dict[str, str]:
-        """Frames and pictures that could not be used, and why."""
+        """Reason by frame or picture that could not be used."""
         return {**self.counts.attacks.failed, **self.counts.failed}
 
     def to_json(self) -> dict[str, Any]:
@@ -127,63 +144,79 @@ class TransferMatrix:
         }
 
 
-def load_targets(study: StudyConfig, out: Path) -> list[Asked]:
-    """The sources, then the others that are to be asked. Raises UsageError for what is no detector."""
-    named = detector_names(study.detectors)
-    sources = detector_names(study.sources or study.detector, "--sources")
-    return detectors_of(list(dict.fromkeys([*sources, *named])), _settings(study), out, study.t_star)
+def load_targets(study: StudyConfig, out: Path) -> list[TargetDetector]:
+    """Load the sources, then the other detectors to test on. Raises UsageError for what is no detector."""
+    others = parse_detector_names(study.detectors)
+    names = dict.fromkeys([*parse_detector_names(study.sources or study.detector, "--sources"), *others])
+    return load_target_detectors(list(names), detection_settings(study), out, study.t_star)
 
 
-def run(
-    study: StudyConfig, arms: Sequence[AttackArm], workers: Sequence[Worker], asked: Sequence[Asked], out: Path
-) -> TransferCounts:
-    """Attack, then ask. asked: as `detectors_asked` gives them. Raises UsageError or SceneError for bad input."""
-    ran = run_arms(arms, workers, out)
-    runs = load_runs([str(out / ARMS / arm.folder) for arm in arms])
-    named = [replace(run, name=arm.name) for run, arm in zip(runs, arms, strict=True)]
-    pairs, failed = pairs_of(named, asked, _settings(study))
+def run_transfer(
+    study: StudyConfig,
+    arms: Sequence[AttackArm],
+    workers: Sequence[AttackWorker],
+    targets: Sequence[TargetDetector],
+    out: Path,
+) -> TransferStudyCounts:
+    """Run or continue the attacks, then test their pictures on the targets.
+
+    Args:
+        study: Settings of the study.
+        arms: The attacks and their controls.
+        workers: One worker for each arm.
+        targets: Detectors, from `load_targets`.
+        out: Folder of the study.
+
+    Raises:
+        UsageError: Settings that do not fit a run that is there.
+        SceneError: A frame that cannot be used, without --keep-going.
+    """
+    attacks = AttackTotals.from_arms(run_arms(arms, workers, out))
+    loaded = load_runs([str(out / ARMS / arm.folder) for arm in arms])
+    runs = [replace(run, name=arm.name) for run, arm in zip(loaded, arms, strict=True)]
+    pairs, failed = evaluate_pairs(runs, targets, detection_settings(study))
     sources = []
     for arm in (arm for arm in arms if arm.control is None):
         placebo = next((one.name for one in arms if one.control_of == arm.name), None)
-        references = {target.name: _reference(arm.config, target) for target in asked}
-        told = {name: one for name, one in references.items() if one is not None}
-        sources.append(TransferSource(arm.name, placebo, told))
-    return TransferCounts(AttackTotals.from_arms(ran), tuple(sources), pairs, failed)
+        references = {target.name: _paper_reference(arm.config, target) for target in targets}
+        known = {name: one for name, one in references.items() if one is not None}
+        sources.append(TransferSource(arm.name, placebo, known))
+    return TransferStudyCounts(attacks, tuple(sources), pairs, failed)
 
 
-def build_matrix(study: StudyConfig, counts: TransferCounts) -> TransferMatrix:
-    """What follows from it."""
+def build_matrix(study: StudyConfig, counts: TransferStudyCounts) -> TransferMatrix:
+    """Compute the metrics of the study from its counts."""
     draws = bootstrap_draws(study)
-    rows = {(one.source.name, one.target.name): row_of(one, draws, study.seed) for one in counts.pairs}
-    found: list[SourceTargetResult] = []
+    rows = {
+        (one.source.name, one.target.name): compute_transfer_row(one, draws, study.seed) for one in counts.pairs
+    }
+    results: list[SourceTargetResult] = []
     for source in counts.sources:
         for target in dict.fromkeys(name for _, name in rows):
             row = rows[source.name, target]
             placebo = None if source.placebo is None else rows[source.placebo, target]
             beyond = {}
             if placebo is not None:
-                beyond = {mode: _beyond(row, placebo, mode, draws, study.seed) for mode in MODES}
-            found.append(SourceTargetResult(row, placebo, beyond, source.references.get(target)))
-    return TransferMatrix(study, draws, counts, found)
+                beyond = {mode: _drop_beyond(row, placebo, mode, draws, study.seed) for mode in MODES}
+            results.append(SourceTargetResult(row, placebo, beyond, source.references.get(target)))
+    return TransferMatrix(study, draws, counts, results)
 
 
-def _beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed: int) -> Interval:
-    after, theirs = (one.figures[mode][:1] for one in (row, placebo))
-    (one,) = differences(after, theirs, row.frames, draws, np.random.default_rng(seed))
-    return one.interval
+def _drop_beyond(row: TransferRow, placebo: TransferRow, mode: str, draws: int, seed: int) -> Interval:
+    own, other = (one.metrics[mode][:1] for one in (row, placebo))
+    (difference,) = paired_differences(own, other, row.frames, draws, np.random.default_rng(seed))
+    return difference.interval
 
 
-def _settings(study: StudyConfig) -> DetectionOptions:
+def detection_settings(study: StudyConfig) -> DetectionOptions:
+    """The settings with which detectors of a study are run."""
     return DetectionOptions(
-        seed=study.seed,
-        workers=study.workers,
-        device=study.device,
-        keep_going=study.keep_going,
+        seed=study.seed, workers=study.workers, device=study.device, keep_going=study.keep_going
     )
 
 
-def _reference(attack: AttackConfig, target: Asked) -> tuple[float, float] | None:
-    """The paper's mAP under its own protocol: of the SqueezeDet that was attacked, and of a whole YOLOv3."""
+def _paper_reference(attack: AttackConfig, target: TargetDetector) -> tuple[float, float] | None:
+    """The paper's mAP under its own protocol: of the attacked SqueezeDet, and of a full YOLOv3."""
     if not follows_paper(attack):
         return None
     if target.order.detector == attack.detector:
@@ -191,108 +224,111 @@ def _reference(attack: AttackConfig, target: Asked) -> tuple[float, float] | Non
     return PAPER_TRANSFER if type(target.predictor) is YoloV3 else None
 
 
-def transfer_text(found: TransferMatrix) -> StudyText:
-    """The study as text."""
-    sources = list(dict.fromkeys(one.row.source.name for one in found.rows))
-    short = [_plain(sheet(found.rows), sources) for sheet in (_precision, _falls, _broken)]
-    further = matrix_sheets([one.row for one in found.rows])[0]
-    whole = [*short, replace(further, title=f"{HEADLINE}, further figures, %")]
-    tables = {"study": [one.to_row() for one in found.rows]}
-    return StudyText(found.study.name, whole, short, notes(found), tables, _WORDS, _SIDES)
+def transfer_report(matrix: TransferMatrix, out: Path) -> AnalysisReport:
+    """The report of the study `transfer`."""
+    sources = list(dict.fromkeys(one.row.source.name for one in matrix.rows))
+    tables = [table(matrix.rows) for table in (_precision_table, _drop_table, _broken_table)]
+    tables = [_move_source_to_title(table, sources) for table in tables]
+    rows = [one.row for one in matrix.rows]
+    further = replace(build_transfer_tables(rows)[0], title=f"{HEADLINE}, further metrics, %")
+    return build_study_report(
+        matrix.study,
+        out,
+        matrix.to_json(),
+        {"study": [one.to_row() for one in matrix.rows]},
+        [*tables, further],
+        [replace(table, rich_options={"unbroken": _SIDES}) for table in tables],
+        notes=_build_notes(matrix),
+        text_columns=_TEXT_COLUMNS,
+        picture=partial(write_heatmap, rows=rows),
+    )
 
 
-def _plain(sheet: ReportTable, sources: Sequence[str]) -> ReportTable:
-    """The source in the title where there is one only, instead of in each row."""
+def _move_source_to_title(table: ReportTable, sources: Sequence[str]) -> ReportTable:
+    """The source in the title if there is only one, instead of in each row."""
     if len(sources) > 1:
-        return sheet
-    title = f"{sheet.title}; counterexamples of {sources[0]}"
-    return ReportTable(title, sheet.columns[1:], tuple(row[1:] for row in sheet.rows))
+        return table
+    rows = tuple(row[1:] for row in table.rows)
+    return ReportTable(f"{table.title}; counterexamples of {sources[0]}", table.columns[1:], rows)
 
 
-def _precision(rows: Sequence[SourceTargetResult]) -> ReportTable:
-    lines, told = [], _has_references(rows)
+def _precision_table(rows: Sequence[SourceTargetResult]) -> ReportTable:
+    lines, with_paper = [], _has_references(rows)
     for one in rows:
-        row, there = one.row, one.reference or (None, None)
+        row = one.row
         scores = (row.benign, row.rerendered, row.paper, row.moved)
-        cells = (*_sides(row), *(format_percent(s.headline.ap50) for s in scores))
-        lines.append((*cells, *map(format_percent, there)) if told else cells)
-    columns = (*_SIDES, "benign", "re-rendered", *MODES, *(["benign there", "attacked there"] if told else []))
+        cells = (row.source.name, row.target.name, *(format_percent(s.headline.ap50) for s in scores))
+        paper = map(format_percent, one.reference or (None, None))
+        lines.append((*cells, *paper) if with_paper else cells)
+    further = ("paper's mAP, benign", "attacked") if with_paper else ()
+    columns = (*_SIDES, "benign", "re-rendered", *MODES, *further)
     return ReportTable(f"{HEADLINE} AP50, %", columns, tuple(lines))
 
 
-def _falls(rows: Sequence[SourceTargetResult]) -> ReportTable:
-    controlled = any(one.placebo is not None for one in rows)
-    lines, told = [], _has_references(rows)
+def _drop_table(rows: Sequence[SourceTargetResult]) -> ReportTable:
+    controlled, with_paper = any(one.placebo is not None for one in rows), _has_references(rows)
+    lines = []
     for one in rows:
-        there, attacked = one.reference or (None, None)
-        fallen = None if there is None or attacked is None else there - attacked
-        cells = [*_sides(one.row), *(bounded(_fall(one.row, mode)) for mode in MODES)]
+        benign, attacked = one.reference or (None, None)
+        drops = (format_interval(_ap50_drop(one.row, mode)) for mode in MODES)
+        cells = [one.row.source.name, one.row.target.name, *drops]
         if controlled:
-            cells.append("-" if one.placebo is None else bounded(_fall(one.placebo, "moved")))
-            cells.append(bounded(one.beyond["moved"]) if one.beyond else "-")
-        cells += ["-" if fallen is None else f"{100 * fallen:.1f}"] if told else []
+            cells.append("-" if one.placebo is None else format_interval(_ap50_drop(one.placebo, "moved")))
+            cells.append(format_interval(one.beyond["moved"]) if one.beyond else "-")
+        if with_paper:
+            cells.append("-" if benign is None or attacked is None else f"{100 * (benign - attacked):.1f}")
         lines.append(tuple(cells))
     columns = [*_SIDES, *MODES, *(["placebo, moved", "attack less placebo"] if controlled else [])]
-    columns += ["there"] if told else []
-    return ReportTable(f"{HEADLINE} AP50 falls, points", tuple(columns), tuple(lines))
+    columns += ["paper"] if with_paper else []
+    return ReportTable(f"Drop of {HEADLINE} AP50, points", tuple(columns), tuple(lines))
 
 
 def _has_references(rows: Sequence[SourceTargetResult]) -> bool:
     return any(one.reference is not None for one in rows)
 
 
-def _sides(row: TransferRow) -> tuple[str, str]:
-    return row.source.name, row.target.name
+def _ap50_drop(row: TransferRow, mode: str) -> Interval:
+    return next(drop for drop in row.drops[mode] if drop.name == AP50)
 
 
-def _fall(row: TransferRow, mode: str) -> Interval:
-    return next(one for one in row.drops[mode] if one.name == AP50)
-
-
-def _broken(rows: Sequence[SourceTargetResult]) -> ReportTable:
+def _broken_table(rows: Sequence[SourceTargetResult]) -> ReportTable:
     lines = []
     for row in (one.row for one in rows):
-        lost, shared, frames = (
-            f"{row.counts[name][0]} of {row.counts[name][1]}" for name in (LOST, TRANSFER, FRAMES)
-        )
-        lines.append((*_sides(row), bounded(row.shares[BROKEN]), lost, str(row.phantoms), shared, frames))
+        counts = (f"{row.counts[name][0]} of {row.counts[name][1]}" for name in (LOST, TRANSFER, FRAMES))
+        lost, shared, frames = counts
+        sides = (row.source.name, row.target.name)
+        lines.append((*sides, format_interval(row.shares[BROKEN]), lost, str(row.phantoms), shared, frames))
     columns = (*_SIDES, "frames broken", "lost", "phantoms", "lost too", "frames too")
-    return ReportTable("Frames broken, %, and what was lost or made up; moved labels", columns, tuple(lines))
+    return ReportTable("Frames broken, %, lost objects and phantoms; moved labels", columns, tuple(lines))
 
 
-def notes(found: TransferMatrix) -> list[str]:
-    """What the columns mean."""
-    spread = f" In brackets: 95 % of {found.draws} draws of frames, paired." if found.draws else ""
-    stars = "; ".join(dict.fromkeys(f"{o.row.target.name} {o.row.target.t_star:.3f}" for o in found.rows))
-    there = "{:.2f} to {:.2f}".format(*(100 * value for value in PAPER_TRANSFER))
-    lines = [
-        "Each source was attacked by combination 2; each target looked at the photographs, at the same rendered "
-        "again without any change, and at the counterexamples.",
-        f"Paper: by the benign labels, as in the paper; moved: by labels that moved with the cars.{spread}",
+def _build_notes(matrix: TransferMatrix) -> list[str]:
+    thresholds = dict.fromkeys(f"{one.row.target.name} {one.row.target.t_star:.3f}" for one in matrix.rows)
+    benign, attacked = (f"{100 * value:.2f}" for value in PAPER_TRANSFER)
+    notes = [
+        "Each source was attacked by combination 2; each target was tested on the photographs, on the same frames "
+        "re-rendered without a change, and on the counterexamples.",
+        f"{LABEL_MODES}{describe_intervals(matrix.draws)}",
     ]
-    if _has_references(found.rows):
-        lines.append(
-            "Ours, under the paper's protocol. There: in the paper, whose SqueezeDet fell from "
+    if _has_references(matrix.rows):
+        notes.append(
+            "Ours, under the paper's protocol. The paper's SqueezeDet dropped from "
             f"{100 * PAPER_BENIGN:.1f} to {100 * PAPER_COMBOS[DEFAULT_COMBO]:.1f} on Virtual KITTI, and a YOLOv3, "
-            f"trained on KITTI, from {there} before the same pictures."
+            f"trained on KITTI, from {benign} to {attacked} on the same pictures."
         )
     else:
-        lines.append(OWN_PROTOCOL)
-    if any(one.placebo is not None for one in found.rows):
-        lines.append(
-            "Placebo: one random edit as large as the attack's, before the same target. What the attack takes "
-            "beyond it is what transfers."
+        notes.append(OWN_PROTOCOL)
+    if any(one.placebo is not None for one in matrix.rows):
+        notes.append(
+            "Placebo: one random edit as large as the attack's, on the same target. What the attack causes beyond "
+            "it is what transfers."
         )
-    lines += [
-        "Lost: of the objects that the target found in the photograph. Lost too: of those among them that the "
-        "source lost. Frames too: of the frames that fail the source, those that fail the target. Counted from t* "
-        f"on: {stars}.",
-    ]
-    attacks = found.counts.attacks
-    lines.append(
-        f"Feasible by the independent check: {format_percent(feasible_share(attacks))} % of all attacked frames."
+    notes.append(
+        "Lost: of the objects that the target found in the photograph. Lost too: of those that the source lost "
+        "among them. Frames too: of the frames that fail the source, those that fail the target. Counted from t*: "
+        f"{'; '.join(thresholds)}."
     )
-    if attacks.without_vehicles:
-        lines.append(f"{format_count(attacks.without_vehicles, 'frame')} without vehicles passed over.")
-    lines += [f"{name} could not be used: {reason}" for name, reason in found.failed.items()]
-    return lines
+    attacks = matrix.counts.attacks
+    notes.append(FEASIBLE.format(format_percent(feasible_share(attacks))))
+    notes += describe_skipped(attacks.without_vehicles, {})
+    return notes + [f"{name} could not be used: {reason}" for name, reason in matrix.failed.items()]

@@ -13,8 +13,8 @@ from drivesem.attack.space import behind_camera
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count
-from drivesem.run.finished import Frame, Run, load_runs
-from drivesem.run.folder import folder_of
+from drivesem.run.finished import AttackRun, RunFrame, load_runs
+from drivesem.run.folder import resolve_output_folder
 from scene_ir.errors import ShapeError
 from scene_ir.io import load_scene
 from scene_ir.types import Labels, SceneIR
@@ -47,7 +47,7 @@ class FramePair:
 def plausibility_run(config: Config) -> AnalysisReport:
     """Look up all vehicles of a run, and write what is said. Raises UsageError or SceneError for bad input."""
     (run,) = load_runs([config.run or ""], config.limit)
-    out = folder_of(config.out, run.folder / "plausibility")
+    out = resolve_output_folder(config.out, run.folder / "plausibility")
     pairs = [_pair(run, frame) for frame in run.frames]
     if not any(pair.kinds for pair in pairs):
         raise UsageError("--run", "a run with vehicles", run.folder)
@@ -73,7 +73,7 @@ def plausibility_run(config: Config) -> AnalysisReport:
     return answer
 
 
-def _pair(run: Run, frame: Frame) -> FramePair:
+def _pair(run: AttackRun, frame: RunFrame) -> FramePair:
     identifier = frame.result.identifier
     folder = run.folder / "frames" / identifier
     before, after = (read_labels(folder / name) for name in (_BEFORE, _AFTER))

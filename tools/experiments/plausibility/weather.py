@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivesem.attack.feasible.weather import MOST, RULES, TOGETHER
+from drivesem.attack.feasible.weather import CODE_SUM_LIMITS, RULE_NAMES, CODE_SUMS
 from drivesem.run.results import FrameResult
 
 CODES = ("fog", "rain", "time_of_day", "overcast")
@@ -36,6 +36,6 @@ def weather_of(result: FrameResult) -> Weather | None:
     codes = [values[f"weather.{name}"] for name in CODES if f"weather.{name}" in values]
     if len(codes) < len(CODES):
         return None
-    shares = TOGETHER @ np.array(codes) / MOST
+    shares = CODE_SUMS @ np.array(codes) / CODE_SUM_LIMITS
     worst = int(shares.argmax())
-    return Weather(tuple(codes), max(float(shares[worst]), 0.0), RULES[worst])
+    return Weather(tuple(codes), max(float(shares[worst]), 0.0), RULE_NAMES[worst])

@@ -14,8 +14,8 @@ from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.report.tables import AnalysisReport, ReportTable
 from drivesem.report.terminal import Console
-from drivesem.run.finished import Run, load_runs
-from drivesem.run.folder import folder_of
+from drivesem.run.finished import AttackRun, load_runs
+from drivesem.run.folder import resolve_output_folder
 from tools.experiments.realism.comparison import PAIRS, FrameParts, RealismRow, frame_parts, rows
 from tools.experiments.realism.measures import METRICS, load, missing, psnr_db
 from tools.experiments.settings import RealismConfig
@@ -40,7 +40,7 @@ def realism_run(config: RealismConfig) -> AnalysisReport:
     folder = None if config.weights is None else Path(config.weights)
     names, absent = chosen(config.metrics, folder, config.fetch)
     measures = load(names, folder, config.fetch)
-    out = folder_of(config.out, runs[0].folder / "realism")
+    out = resolve_output_folder(config.out, runs[0].folder / "realism")
     console = Console(stderr=True)
     frames: list[tuple[FrameParts, ...]] = []
     for run in runs:
@@ -93,7 +93,7 @@ def chosen(text: str, folder: Path | None, fetch: bool) -> tuple[list[str], dict
     return [name for name in METRICS if name in words], {}
 
 
-def _run_json(run: Run, parts: Sequence[FrameParts]) -> dict[str, Any]:
+def _run_json(run: AttackRun, parts: Sequence[FrameParts]) -> dict[str, Any]:
     return {
         "run": run.name,
         "folder": str(run.folder),
@@ -105,13 +105,13 @@ def _run_json(run: Run, parts: Sequence[FrameParts]) -> dict[str, Any]:
     }
 
 
-def _row_json(run: Run, row: RealismRow) -> dict[str, Any]:
+def _row_json(run: AttackRun, row: RealismRow) -> dict[str, Any]:
     metric = METRICS[row.metric]
     return {"run": run.name, "params": run.params, **asdict(row), "name": metric.name, "unit": metric.unit}
 
 
 def _parts(
-    runs: Sequence[Run], frames: Sequence[Sequence[FrameParts]], names: Sequence[str]
+    runs: Sequence[AttackRun], frames: Sequence[Sequence[FrameParts]], names: Sequence[str]
 ) -> list[dict[str, Any]]:
     """A line for each frame and pair, and for each vehicle and pair; PSNR of equal pictures is empty."""
     pairwise = [name for name in names if METRICS[name].pairwise]
@@ -128,7 +128,7 @@ def _parts(
     return lines
 
 
-def _sheet(table: Sequence[tuple[Run, RealismRow]], several: bool) -> ReportTable:
+def _sheet(table: Sequence[tuple[AttackRun, RealismRow]], several: bool) -> ReportTable:
     """A line a run, region and metric; pairs stand beside one another."""
     columns = ("run", "parameters", "where", "metric", *(_between(*pair) for pair in PAIRS), "pictures")
     lines: dict[tuple[str, ...], list[str]] = {}

@@ -8,8 +8,8 @@ from itertools import combinations
 
 import numpy as np
 
-from drivesem.evaluation.resampling import Figure, Interval, intervals
-from drivesem.run.finished import PICTURES, Frame
+from drivesem.evaluation.resampling import Interval, NamedMetric, bootstrap_intervals
+from drivesem.run.finished import PICTURES, RunFrame
 from drivesem.run.results import BoxRecord, FrameResult
 from scene_ir import files
 from scene_ir.errors import ShapeError
@@ -112,7 +112,7 @@ def vehicles(result: FrameResult) -> list[tuple[BoxRecord, BoxRecord]]:
     return [(one, other) for one, other in pairs if area_of(one.xyxy) > 0 or area_of(other.xyxy) > 0]
 
 
-def frame_parts(frame: Frame, measures: Measures) -> FrameParts:
+def frame_parts(frame: RunFrame, measures: Measures) -> FrameParts:
     """Measure one frame. Raises FormatError for a bad picture, ShapeError where pictures differ in size."""
     pictures: dict[str, Picture] = {}
     for name, path in frame.pictures.items():
@@ -208,6 +208,6 @@ def _set_row(parts: Sequence[Sequence[Part]], region: str, metric: str, pair: tu
 
 def _interval(part: _Mean, frames: int, spread: tuple[int, int]) -> Interval:
     draws, seed = spread
-    figure = Figure("", (part,))  # pyright: ignore[reportArgumentType]
-    (one,) = intervals([figure], frames, draws, np.random.default_rng(seed))
+    figure = NamedMetric("", (part,))  # pyright: ignore[reportArgumentType]
+    (one,) = bootstrap_intervals([figure], frames, draws, np.random.default_rng(seed))
     return one

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from detectors.base import DetectorError
-from detectors.reading import read_state
+from detectors.files import read_state
 from scene_ir.errors import FormatError
 
 _COUNTER = "num_batches_tracked"

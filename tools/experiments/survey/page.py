@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from detectors.types import CLASSES
-from drivesem.evaluation.resampling import Figure, Interval, intervals
+from drivesem.evaluation.resampling import Interval, NamedMetric, bootstrap_intervals
 from drivesem.report import web
-from drivesem.report.drawing import jpeg_address
-from drivesem.run.finished import Frame, Run
+from drivesem.report.drawing import encode_jpeg_data_url
+from drivesem.run.finished import AttackRun, RunFrame
 from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord
 from scene_ir import files
@@ -84,7 +84,7 @@ class Response:
     realism: int
 
 
-def items_of(runs: Sequence[Run], count: int, controls: int, seed: int) -> list[tuple[Item, View]]:
+def items_of(runs: Sequence[AttackRun], count: int, controls: int, seed: int) -> list[tuple[Item, View]]:
     """Counterexamples drawn from the runs, successes before others, and re-renders without any change.
 
     Of each frame the vehicle that was lost, else the one with the largest box, among those that the changed
@@ -110,20 +110,20 @@ def items_of(runs: Sequence[Run], count: int, controls: int, seed: int) -> list[
     return found
 
 
-def _shown_vehicle(frame: Frame, kind: str) -> tuple[BoxRecord, BoxRecord]:
+def _shown_vehicle(frame: RunFrame, kind: str) -> tuple[BoxRecord, BoxRecord]:
     lost = [failure.index for failure in frame.result.failures if failure.kind == "lost"]
     pairs = _seen(frame, kind)
     candidates = [pair for pair in pairs if pair[0].index in lost] or pairs
     return max(candidates, key=lambda pair: area_of(pair[1].xyxy))
 
 
-def _seen(frame: Frame, kind: str) -> list[tuple[BoxRecord, BoxRecord]]:
+def _seen(frame: RunFrame, kind: str) -> list[tuple[BoxRecord, BoxRecord]]:
     """The vehicles, before and after, that the changed picture of an item of this kind shows."""
     place = 1 if kind == CHANGED else 0
     return [pair for pair in vehicles(frame.result) if area_of(pair[place].xyxy) > 0]
 
 
-def _view(frame: Frame, kind: str, before: BoxRecord, after: BoxRecord) -> View:
+def _view(frame: RunFrame, kind: str, before: BoxRecord, after: BoxRecord) -> View:
     original = files.read_image(frame.pictures["benign"])
     changed = files.read_image(frame.pictures["attacked" if kind == CHANGED else "rerendered"])
     height, width = original.shape[:2]
@@ -158,8 +158,8 @@ def render_page(items: Sequence[tuple[Item, View]]) -> str:
     shown = [
         {
             "item": item.item,
-            "original": jpeg_address(view.original),
-            "changed": jpeg_address(view.changed),
+            "original": encode_jpeg_data_url(view.original),
+            "changed": encode_jpeg_data_url(view.changed),
             "outline": view.outline_xyxy,
         }
         for item, view in items
@@ -169,7 +169,7 @@ def render_page(items: Sequence[tuple[Item, View]]) -> str:
     data = json.dumps(told).replace("<", "\\u003c")
     asked = {"count": len(items), "choices": CHOICES, "least": LEAST, "most": MOST}
     home = "tools.experiments.survey"
-    return web.render(f"{home}:survey.html", f"{home}:survey.js", data=data, **asked)
+    return web.render_page(f"{home}:survey.html", f"{home}:survey.js", data=data, **asked)
 
 
 def write_key(path: Path, items: Sequence[Item], facts: Mapping[str, Any]) -> None:
@@ -261,8 +261,8 @@ def summary(items: Sequence[Item], answers: Sequence[Response], draws: int, seed
 
 
 def _interval(values: Floats, person: np.ndarray, people: int, draws: int, seed: int) -> Interval:
-    figure = Figure("", (_Mean(values, person),))  # pyright: ignore[reportArgumentType]
-    (one,) = intervals([figure], people, draws, np.random.default_rng(seed))
+    figure = NamedMetric("", (_Mean(values, person),))  # pyright: ignore[reportArgumentType]
+    (one,) = bootstrap_intervals([figure], people, draws, np.random.default_rng(seed))
     return one
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count
-from drivesem.run.folder import folder_of
+from drivesem.run.folder import resolve_output_folder
 from tools.experiments.settings import SurveyResultsConfig
 from tools.experiments.survey.page import (
     KEY,
@@ -48,7 +48,7 @@ def survey_results(config: SurveyResultsConfig) -> AnalysisReport:
         answers += more
     if not answers:
         raise UsageError("ANSWERS", "files with answers", "none in them")
-    out = folder_of(config.out, key.parent / "results")
+    out = resolve_output_folder(config.out, key.parent / "results")
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     data = {"survey": name, "bootstrap": draws, **summary(items, answers, draws, config.seed), "paper": _PAPER}
     figures = _figures(data)

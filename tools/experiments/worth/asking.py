@@ -15,8 +15,8 @@ import numpy as np
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, Interval
 from drivesem.report.tables import AnalysisReport, ReportTable
-from drivesem.run.finished import Run, load_runs
-from drivesem.run.folder import folder_of
+from drivesem.run.finished import AttackRun, load_runs
+from drivesem.run.folder import resolve_output_folder
 from scene_ir import files
 from scene_ir.errors import FormatError
 from tools.experiments.realism.comparison import frame_parts
@@ -67,7 +67,7 @@ def worth_run(config: WorthConfig) -> AnalysisReport:
     """Count, and write what is said of it. Raises UsageError or SceneError for bad input."""
     base = math.e if config.base == "e" else _number(config.base)
     first = Path(config.table).parent if config.table is not None else Path(config.study or config.runs[0])
-    out = folder_of(config.out, first / "worth")
+    out = resolve_output_folder(config.out, first / "worth")
     if config.study is not None:
         answer = by_arm(
             config, base, DRAWS if config.bootstrap is None else config.bootstrap, distance_of(config), out
@@ -113,7 +113,7 @@ def _number(text: str) -> float:
 
 
 def _runs(
-    runs: Sequence[Run], config: WorthConfig, distance: str | None, out: Path
+    runs: Sequence[AttackRun], config: WorthConfig, distance: str | None, out: Path
 ) -> tuple[list[Entry], list[str]]:
     """Photographs and counterexamples of each run, and the names of the detectors."""
     attacked = sorted({one.detector for one in runs})

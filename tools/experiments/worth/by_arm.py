@@ -11,11 +11,11 @@ from rich.progress import track
 
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import Interval
-from drivesem.report.paper import PAPER_FID, PAPER_LPIPS
 from drivesem.report.tables import AnalysisReport, ReportTable
 from drivesem.report.terminal import Console
-from drivesem.run.finished import Run, load_runs
+from drivesem.run.finished import AttackRun, load_runs
 from drivesem.run.folder import ARMS, CONFIG, HELD_OUT, RETRAINED
+from drivesem.run.protocol import PAPER_FID, PAPER_LPIPS
 from drivesem.training.retraining import WEIGHTS
 from scene_ir import files
 from tools.experiments.realism.asking import REGION, chosen, shown
@@ -64,7 +64,7 @@ class Gain:
 class ArmFigures:
     """One arm. realism: of its photographs and counterexamples; worth: by picture of SHOWN and setting."""
 
-    run: Run
+    run: AttackRun
     realism: Sequence[RealismRow]
     worth: Mapping[tuple[str, Setting], Interval]
     vehicles: int
@@ -130,7 +130,7 @@ def by_arm(config: WorthConfig, base: float, draws: int, distance: str | None, o
     return _answer(config, arms, gains, metrics, absent, distance, out)
 
 
-def _runs(study: Path, limit: int | None) -> list[Run]:
+def _runs(study: Path, limit: int | None) -> list[AttackRun]:
     """The arms that are no controls."""
     settings = files.read_yaml(study / CONFIG) if (study / CONFIG).is_file() else None
     folders = sorted(path for path in (study / ARMS).glob("*") if (path / CONFIG).is_file())
@@ -142,7 +142,7 @@ def _runs(study: Path, limit: int | None) -> list[Run]:
     return runs
 
 
-def _parts(run: Run, metrics: Sequence[str], folder: Path | None) -> list[FrameParts]:
+def _parts(run: AttackRun, metrics: Sequence[str], folder: Path | None) -> list[FrameParts]:
     measures, console = load(metrics, folder, fetch=False), Console(stderr=True)
     looked = track(run.frames, run.name, console=console, transient=True, disable=not console.is_terminal)
     return [frame_parts(frame, measures) for frame in looked]

@@ -29,7 +29,7 @@ from scipy.special import stdtrit  # Student's quantiles; `scipy.stats` takes a 
 
 from detectors import boxes
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.evaluation.failures import IOU
+from drivesem.evaluation.failures import MATCH_IOU
 from drivesem.evaluation.resampling import LEVEL, Interval
 from scene_ir.errors import RangeError, ShapeError
 
@@ -138,14 +138,14 @@ def detected(targets: Targets, found: Detections, t_star: float, rho: Floats | N
     kept = ~targets.ignore
     share = boxes.ioa_matrix(found.boxes_xyxy, targets.boxes_xyxy)
     same = found.labels[:, None] == targets.labels[None]
-    excused = (same & targets.ignore & (share >= IOU)).any(dim=1)
+    excused = (same & targets.ignore & (share >= MATCH_IOU)).any(dim=1)
     overlap, label = overlap[:, kept], targets.labels[kept].numpy().astype(np.int64)
     count = len(label)
     scores = np.zeros((2 * count, len(CLASSES)))
     empty = count
     for d in torch.argsort(found.scores, descending=True, stable=True).tolist():
         best = int(overlap[d].argmax()) if count else 0
-        if count and float(overlap[d, best]) >= IOU:
+        if count and float(overlap[d, best]) >= MATCH_IOU:
             place = best
         elif excused[d] or empty == 2 * count:
             continue

@@ -10,14 +10,14 @@ import torch
 
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections
-from drivesem.analysis.transfer.asking import DETECTIONS
-from drivesem.attack.targets import JudgedClasses, t_star_of
-from drivesem.config.blocks import WorkerOptions
+from drivesem.analysis.transfer.run import DETECTIONS
+from drivesem.attack.targets import EvaluatedClasses, resolve_t_star
 from drivesem.config.errors import UsageError
-from drivesem.run.detection_cache import Memory, Order, look
+from drivesem.config.options import WorkerOptions
+from drivesem.run.detection_cache import DetectionCache, DetectorSpec, cache_detections
 from drivesem.run.finished import METRICS as RUN_FIGURES
-from drivesem.run.finished import Frame, Run
-from drivesem.run.frame import as_detections, as_targets
+from drivesem.run.finished import AttackRun, RunFrame
+from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.run.results import BoxRecord
 from drivesem.training.retraining import WEIGHTS
 from scene_ir import files
@@ -45,14 +45,14 @@ def distance_of(config: WorthConfig) -> str | None:
     return config.distance
 
 
-def _kept(frame: Frame) -> list[tuple[BoxRecord, BoxRecord]]:
+def _kept(frame: RunFrame) -> list[tuple[BoxRecord, BoxRecord]]:
     """Objects that are judged before and after."""
     result = frame.result
     pairs = zip(result.targets_benign, result.targets_moved, strict=True)
     return [(a, b) for a, b in pairs if not (a.ignore or b.ignore)]
 
 
-def distances_of(frame: Frame, parts: FrameParts | None, name: str) -> Floats:
+def distances_of(frame: RunFrame, parts: FrameParts | None, name: str) -> Floats:
     """Of each judged object's surroundings before and after (M,), by that measure; 0 where nothing is measured."""
     kept = _kept(frame)
     if parts is None:
@@ -67,26 +67,26 @@ def realism_of(distances: Sequence[Sequence[Floats]]) -> list[list[Floats]]:
     return [[realism(d, largest) for d in frames] for frames in distances]
 
 
-def own_points(run: Run, picture: str, rho: Sequence[Floats] | None) -> Points:
+def own_points(run: AttackRun, picture: str, rho: Sequence[Floats] | None) -> Points:
     """Before the detector that was attacked. picture: of SHOWN; rho: realism of each frame's objects."""
     t_star = float(files.read_json(run.folder / RUN_FIGURES)["t_star"])
-    found = [as_detections(getattr(f.result, f"detections_{picture}"), CLASSES) for f in run.frames]
+    found = [detections_from_records(getattr(f.result, f"detections_{picture}"), CLASSES) for f in run.frames]
     return _joined(run, picture, found, t_star, rho)
 
 
 def _joined(
-    run: Run, picture: str, found: Sequence[Detections], t_star: float, rho: Sequence[Floats] | None
+    run: AttackRun, picture: str, found: Sequence[Detections], t_star: float, rho: Sequence[Floats] | None
 ) -> Points:
     weights = [None] * len(run.frames) if rho is None else rho
     rows = zip(run.frames, found, weights, strict=True)
     return joined([_points(frame, picture, seen, t_star, own) for frame, seen, own in rows])
 
 
-def _points(frame: Frame, picture: str, found: Detections, t_star: float, rho: Floats | None) -> Points:
+def _points(frame: RunFrame, picture: str, found: Detections, t_star: float, rho: Floats | None) -> Points:
     result = frame.result
     records = result.targets_benign if picture == "benign" else result.targets_moved
     other = result.targets_moved if picture == "benign" else result.targets_benign
-    targets = as_targets(records, CLASSES)
+    targets = targets_from_records(records, CLASSES)
     # The same objects before and after, or the sets could not be compared.
     targets.ignore.logical_or_(torch.tensor([box.ignore for box in other], dtype=torch.bool))
     return detected(targets, found, t_star, rho)
@@ -100,29 +100,31 @@ class SecondDetector:
         path = Path(second)
         name = str(path / WEIGHTS) if (path / WEIGHTS).is_file() else second
         self._settings = WorkerOptions(workers=1)
-        self._order = Order(name, config.device, config.tiles, out / DETECTIONS)
+        self._order = DetectorSpec(name, config.device, config.tiles, out / DETECTIONS)
         try:
             self._predictor = self._order.load()
-            self._names = JudgedClasses.of(self._predictor).names
+            self._names = EvaluatedClasses.from_detector(self._predictor).names
         except DetectorError as error:
-            raise UsageError.of("--second", "a detector, or a run of drivesem retrain", error) from error
-        self._memory = Memory(self._order, self._predictor)
-        self.name, self.t_star = name, t_star_of(self._predictor)
+            raise UsageError.from_detector_error(
+                "--second", "a detector, or a run of drivesem retrain", error
+            ) from error
+        self._memory = DetectionCache(self._order, self._predictor)
+        self.name, self.t_star = name, resolve_t_star(self._predictor)
 
-    def look(self, runs: Sequence[Run], shown: Collection[str] = tuple(SHOWN)) -> None:
+    def look(self, runs: Sequence[AttackRun], shown: Collection[str] = tuple(SHOWN)) -> None:
         """Look at all pictures of runs at once, before `points` are asked for: each look reads all the weights.
         shown: which pictures, of SHOWN.
         """
         pictures = [frame.pictures[name] for run in runs for frame in run.frames for name in shown]
-        look(self._order, self._predictor, pictures, self._settings, self.name)
+        cache_detections(self._order, self._predictor, pictures, self._settings, self.name)
 
-    def points(self, run: Run, picture: str, rho: Sequence[Floats] | None) -> Points:
+    def points(self, run: AttackRun, picture: str, rho: Sequence[Floats] | None) -> Points:
         """As `own_points`, before this detector, which has looked at the run."""
         found = [self._found(frame.pictures[picture]) for frame in run.frames]
         return _joined(run, picture, found, self.t_star, rho)
 
     def _found(self, picture: Path) -> Detections:
         """Detections whose labels are places in CLASSES."""
-        found = self._memory.recall(picture)
+        found = self._memory.load(picture)
         places = torch.tensor([CLASSES.index(name) for name in self._names])
         return Detections(found.boxes_xyxy, places[found.labels], found.scores)
