@@ -1,16 +1,16 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
 # ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare what a loop changes, and
 # evaluates both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
-"""The four verbs as NVIDIA Warp kernels: one source for CPU and CUDA, float32 tensors, used without copies.
+"""The four verbs as Warp kernels: one source for CPU and CUDA, float32 tensors, no copies.
 
-The mathematics, its order of operations and its constants are those of `reference`, so that both decide alike
-which triangle a pixel shows; fusing of multiply and add is off for the same reason. Gradients are written by hand.
+Mathematics, order of operations and constants are those of `reference`, so that both agree which triangle a pixel
+shows; fused multiply-add is off for the same reason. Gradients are written by hand.
 
-On a CPU the draws are dealt out to the threads, a large one in bands of rows, so that each pixel belongs to one
-thread (`Plan`). Triangles are sorted out by the pixels around their corners, which cost one division a vertex;
-for the outlines only those are cut with rows and columns that have a hit pixel beside an empty one.
-A draw whose backs are seen, most of whose triangles therefore lie behind others, goes from the nearest on and passes
-over what is hidden.
+On a CPU the draws are distributed over threads, large ones in bands of rows, so that each pixel belongs to one
+thread (`RasterPlan`). Triangles are rejected by the pixel bounds of their corners, which cost one division per
+vertex; for outlines, only those remain that meet a row or column in which a hit pixel borders an empty one. A draw
+with visible back faces, most of whose triangles lie behind others, is processed front to back and skips what is
+hidden.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ HALF = wp.constant(wp.float64(0.5))
 ONE = wp.constant(wp.float64(1.0))
 ALL_BITS = wp.constant(wp.uint64((1 << 64) - 1))
 FARTHER = wp.constant(wp.float64(1.0 + 1e-6))
-"""A depth so many times another one is farther, as float32 too."""
+"""A depth this many times another one is farther, in float32 too."""
 ROUNDING = wp.constant(wp.float64(1e-12))
-"""Of a sum of edge functions, in shares of what it adds up; some thousand times what float64 rounds."""
+"""Relative error of a sum of edge functions; a thousand times the rounding of float64."""
 LIMIT_PX = wp.constant(wp.float64(1e9))
-"""Places beyond this are as good as there: it keeps them within int32."""
+"""Clamp of pixel positions, which keeps them within int32."""
 BEHIND_NEAR = wp.constant(-(1 << 31))
-"""Marks a vertex in front of the near plane's cut, whose place in the image says nothing."""
+"""Marks a vertex before the near plane, whose image position is meaningless."""
 WIDE_ROW_PX = wp.constant(12)
-"""Rows of more pixels than this are worth the divisions that find where a triangle begins and ends on them."""
+"""Rows longer than this justify the divisions that find a triangle's first and last pixel."""
 MIN_SLOPE = wp.constant(wp.float64(1e-6))
-"""An edge function that changes less than this share of itself over a pixel does not tell where it ends."""
+"""An edge function that changes by a smaller share of itself per pixel does not bound a row."""
 
 TILE_PX = wp.constant(16)
-"""Pixels along each side of the squares of which it is known what they show farthest away."""
+"""Side of the squares for which the farthest visible depth is tracked."""
 EMPTY_KEY = wp.constant(wp.int64((0x7F800000 << 32) | 0xFFFFFFFF))
-"""Key of a pixel that no triangle has reached, (depth bits << 32 | face): infinitely far, face -1."""
+"""Key of a pixel that no triangle has reached, (depth bits << 32 | face): infinite depth, face -1."""
 X0, Y0, X1, Y1, ROW, ROW_END, OFFSET, FACE, FACE_END, CULL, FIRST = (wp.constant(i) for i in range(11))
-"""Columns of Plan.parts."""
+"""Columns of `RasterPlan.parts`."""
 
 
 @wp.struct
 class TriangleEdges:
-    """Signed edge normals and |det| of a triangle; det is 0 where it is not seen."""
+    """Signed edge normals and |det| of a triangle; det is 0 for an invisible one."""
 
     n0: wp.vec3d
     n1: wp.vec3d
@@ -73,7 +73,7 @@ class TriangleEdges:
 
 @wp.func
 def _find_range(offsets: wp.array(dtype=wp.int64), count: int, i: int):
-    """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are passed over."""
+    """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are skipped."""
     if i < count:  # of draws of one pixel each there may be as many as pixels
         if offsets[i] == wp.int64(i) and offsets[i + 1] == wp.int64(i + 1):
             return i
@@ -90,7 +90,7 @@ def _find_range(offsets: wp.array(dtype=wp.int64), count: int, i: int):
 
 @wp.func
 def _find_part(parts: wp.array2d(dtype=wp.int32), i: int):
-    """The part that packed pixel i belongs to."""
+    """The part that holds packed pixel i."""
     low = int(0)
     high = parts.shape[0]
     while high - low > 1:
@@ -110,7 +110,7 @@ def _to_int(value: wp.float64):
 
 @wp.func
 def _pixels_near(u: wp.float64, v: wp.float64):
-    """The first and the last pixel (x, y, x, y) that a point at u, v may touch: none, where the first is later."""
+    """First and last pixel (x, y, x, y) that a point at u, v may touch; none where the first is later."""
     return wp.vec4i(
         _to_int(wp.ceil(u - SLACK_PX)),
         _to_int(wp.ceil(v - SLACK_PX)),
@@ -137,7 +137,7 @@ def _corner_kernel(start: int, clip: wp.array(dtype=wp.vec3f), near: wp.float64,
 
 @wp.func
 def _extend_by_edge(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
-    """`box` widened by corner a and by where the side from a to b passes the near plane."""
+    """`box` extended by corner a and by the crossing of edge a-b with the near plane."""
     grown = box
     if a[2] >= near:
         scale = ONE / a[2]
@@ -155,7 +155,7 @@ def _extend_by_edge(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
 def _triangle_bounds(
     corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(dtype=wp.vec4i), near: wp.float64
 ):
-    """First and last pixel (x, y, x, y) of the part of a triangle that lies beyond the near plane."""
+    """First and last pixel (x, y, x, y) of the part of a triangle beyond the near plane."""
     a = boxes[corner[0]]
     b = boxes[corner[1]]
     c = boxes[corner[2]]
@@ -188,7 +188,7 @@ def _l1_norm(c: wp.vec3d):
 
 @wp.func
 def _owns_pixel(e: wp.float64, n: wp.vec3d):
-    """Whether a pixel with edge function e >= 0 is inside; on the edge, one of the two sides' triangles owns it."""
+    """Whether a pixel with edge function e >= 0 is inside; an edge belongs to one of its two triangles."""
     first = n[0]
     if first == ZERO:
         first = n[1]
@@ -199,7 +199,7 @@ def _owns_pixel(e: wp.float64, n: wp.vec3d):
 
 @wp.func
 def _triangle_edges(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
-    """Edge functions of a triangle; of one seen from behind none, where that is culled."""
+    """Edge functions of a triangle; none for a culled back face."""
     c0 = wp.vec3d(clip[corner[0]])
     c1 = wp.vec3d(clip[corner[1]])
     c2 = wp.vec3d(clip[corner[2]])
@@ -220,8 +220,8 @@ def _triangle_edges(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int)
 
 @wp.func
 def _narrow_span(span: wp.vec2i, n: wp.vec3d, run: wp.float64, y: int):
-    """Columns [first, end) of a row without those that are surely outside an edge: two are kept beyond it. run: 1 /
-    n[0], once for all rows.
+    """Columns [first, end) of a row without those certainly outside an edge, with a margin of two; `run` is 1 /
+    n[0].
     """
     base = n[1] * wp.float64(y) + n[2]
     first = span[0]
@@ -247,8 +247,9 @@ def _fill_triangle(
     layered: bool,
     keys: wp.array(dtype=wp.int64),
 ):
-    """Offers a triangle to the pixels of `box`, half-open. origin: packed index that pixel (0, 0) would have.
-    layered: whether many of them are likely to show something nearer already.
+    """Offer a triangle to the pixels of `box`, half-open.
+
+    `origin` is the packed index of pixel (0, 0); `layered` means that many pixels probably show something nearer.
     """
     n = (e.n0 + e.n1) + e.n2
     # The depth's denominator, n . (x, y, 1), is no more than what the pixel will sum up, and this.
@@ -296,7 +297,7 @@ def _update_tiles(
     keys: wp.array(dtype=wp.int64),
     tiles: wp.array3d(dtype=wp.float32),
 ):
-    """What the tiles of a part show farthest away."""
+    """Record the farthest visible depth of each tile of a part."""
     for ty in range((row_end - row + TILE_PX - 1) // TILE_PX):
         for tx in range((x1 - x0 + TILE_PX - 1) // TILE_PX):
             farthest = wp.int64(0)
@@ -316,7 +317,7 @@ def _is_hidden(
     box: wp.vec4i,
     tiles: wp.array3d(dtype=wp.float32),
 ):
-    """Whether all tiles that a triangle in `box` may touch showed nearer things when they were last looked at."""
+    """Whether all tiles that a triangle in `box` may touch showed nearer surfaces at the last update."""
     nearest = wp.float64(wp.min(clip[corner[0]][2], wp.min(clip[corner[1]][2], clip[corner[2]][2])))
     for ty in range((box[1] - row) // TILE_PX, (box[3] - 1 - row) // TILE_PX + 1):
         for tx in range((box[0] - x0) // TILE_PX, (box[2] - 1 - x0) // TILE_PX + 1):
@@ -400,7 +401,15 @@ def _pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype
 
 @wp.struct
 class TriangleHit:
-    """A triangle at a pixel: its corners, edge functions, 1 over their sum, and perspective-correct weights."""
+    """A triangle at a pixel.
+
+    Attributes:
+        i0, i1, i2: Vertex indices.
+        c0, c1, c2: Clip coordinates.
+        e: Edge functions at the pixel.
+        scale: 1 / sum of `e`.
+        b: Perspective-correct weights.
+    """
 
     i0: int
     i1: int
@@ -417,6 +426,13 @@ class TriangleHit:
 def triangle_hit(
     f: int, x: wp.float64, y: wp.float64, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)
 ):
+    """The hit of face f at pixel (x, y).
+
+    Args:
+        f: Face.
+        x, y: Pixel, px.
+        clip, faces: The mesh.
+    """
     hit = TriangleHit()
     corners = faces[f]
     hit.i0 = corners[0]
@@ -438,7 +454,13 @@ def triangle_hit(
 def add_corner_gradients(
     hit: TriangleHit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip: wp.array(dtype=wp.vec3d)
 ):
-    """Add what gradients to the edge functions, each times the pixel (x, y, 1), mean for the corners."""
+    """Add gradients to the edge functions, each times the pixel (x, y, 1), to the corners' gradients.
+
+    Args:
+        hit: The triangle.
+        q0, q1, q2: Gradient to each edge function times (x, y, 1).
+        grad_clip: (V,) gradient to clip coordinates.
+    """
     # q . (a x b) has the gradients b x q to a and q x a to b; here gathered by corner.
     wp.atomic_add(grad_clip, hit.i0, wp.cross(q1, hit.c2) + wp.cross(hit.c1, q2))
     wp.atomic_add(grad_clip, hit.i1, wp.cross(q2, hit.c0) + wp.cross(hit.c2, q0))
@@ -533,7 +555,7 @@ def _bicubic_slopes(t: float):
 
 @wp.func
 def _clamp_to_crop(value: float, origin: int, size: int):
-    """Place in a crop; beyond 3 px outside all taps lie outside as well. A NaN stays one."""
+    """Position in a crop; farther than 3 px outside, all taps lie outside as well. NaN stays NaN."""
     place = value - float(origin)
     if place < -4.0:
         place = -4.0
@@ -544,7 +566,7 @@ def _clamp_to_crop(value: float, origin: int, size: int):
 
 @wp.func
 def _tap_index(first: int, k: int, size: int):
-    """Index of tap k, of those at first - 1 ... first + 2, kept inside the crop."""
+    """Index of tap k of those at first - 1 ... first + 2, clamped to the crop."""
     return wp.clamp(first + k - 1, 0, size - 1)
 
 
@@ -565,7 +587,9 @@ def _zero_outside(weight: wp.vec4f, first: int, size: int):
 
 @wp.struct
 class BicubicTaps:
-    """The 4 x 4 texels of a sample: flat places of its columns and rows, weights, and the weights' derivatives."""
+    """The 4 x 4 texels of a sample: flat offsets of columns and rows, weights (wx, wy), and their derivatives (sx,
+    sy).
+    """
 
     columns: wp.vec4i
     rows: wp.vec4i
@@ -586,6 +610,15 @@ def bicubic_taps(
     texel_stride: int,
     clamp: bool,
 ):
+    """Taps of a sample in one crop.
+
+    Args:
+        uv: Position in the frame, px.
+        x0, y0, width, height: Crop, px.
+        start: First texel of the crop.
+        texel_stride: Distance between texels.
+        clamp: Whether edge texels repeat beyond the crop.
+    """
     taps = BicubicTaps()
     u = _clamp_to_crop(uv[0], x0, width)
     v = _clamp_to_crop(uv[1], y0, height)
@@ -712,8 +745,11 @@ def _record_outline(
     is_end: bool,
     key: int,
 ):
-    """Enters a triangle's end at `value` on a line of pixels [low, high) for the pair (s, s + 1), if that is a hit
-    pixel on the triangle's side and an empty one. pixel: packed index of s; step: to that of s + 1."""
+    """Record the end of a triangle's interval at `value` for the pair (s, s + 1), if one of the two is a hit pixel
+    on the triangle's side and the other is empty.
+
+    `pixel` is the packed index of s on a line of pixels [low, high); `step` leads to s + 1.
+    """
     beyond = value - wp.float64(s)
     if s >= low and s + 1 < high and beyond > -SNAP_PX and beyond < ONE + SNAP_PX:
         here = face[pixel] >= 0
@@ -739,8 +775,10 @@ def _record_interval_end(
     is_end: bool,
     key: int,
 ):
-    """`_record_outline` to the pair around `value`, and to both its neighbours where it meets a pixel centre. origin: packed
-    index that pixel 0 of the line would have."""
+    """`_record_outline` for the pair around `value`, and for both neighbours where it meets a pixel centre.
+
+    `origin` is the packed index of pixel 0 of the line.
+    """
     if value > wp.float64(low - 1) and value < wp.float64(high):
         below = wp.int32(wp.floor(value))
         _record_outline(keys, face, axis, value, below, low, high, origin + below * step, step, is_end, key)
@@ -759,7 +797,7 @@ def _record_interval_end(
 
 @wp.func
 def _clip_interval(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: wp.float64):
-    """`span` (low, high, low edge, high edge) of a line cut by slope * s + base >= 0; empty where high < low."""
+    """`span` (low, high, low edge, high edge) of a line clipped by slope * s + base >= 0; empty where high < low."""
     low = span[0]
     high = span[1]
     low_edge = span[2]
@@ -782,7 +820,7 @@ def _clip_interval(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: w
 
 @wp.func
 def _read_bits(words: wp.array(dtype=wp.uint64), first: int, count: int):
-    """`count` bits, 1 to 64, from bit `first` on; the lowest is bit `first`. Reads one word beyond them."""
+    """`count` bits, 1 to 64, from bit `first`, which becomes the lowest. Reads one word beyond them."""
     word = first >> 6
     bit = wp.uint64(first & 63)
     high = (words[word + 1] << wp.uint64(1)) << (wp.uint64(63) - bit)
@@ -813,7 +851,7 @@ def _any_bit(words: wp.array(dtype=wp.uint64), x: int, x_end: int, y: int, y_end
 
 @wp.func
 def _lowest_bit(bits: wp.uint64):
-    """The place, 0 to 63, of the lowest bit that is set."""
+    """Position, 0 to 63, of the lowest set bit."""
     return wp.int32(wp.bit_count((bits & (~bits + wp.uint64(1))) - wp.uint64(1)))
 
 
@@ -824,7 +862,7 @@ def _hit_kernel(
     hits: wp.array(dtype=wp.uint64),
     coverage: wp.array(dtype=wp.float32),
 ):
-    """64 packed pixels: a bit of `hits` and a coverage of 1 where one is hit."""
+    """For 64 packed pixels, set a bit of `hits` and a coverage of 1 where a face is hit."""
     word = start + wp.tid()
     bits = wp.uint64(0)
     for i in range(64 * word, wp.min(64 * word + 64, face.shape[0])):
@@ -845,9 +883,11 @@ def _mark_boundaries_kernel(
     right_or_below: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
-    """64 packed pixels: in `right` and `below` a bit where the next pixel in the row or column is hit and this one is
-    not, or the other way, with an empty key; in `right_or_below` both; in `boundary` where any of the four neighbours differs
-    so."""
+    """For 64 packed pixels, mark where hit and empty pixels meet, and clear the pairs' keys.
+
+    `right`, `below`: this pixel and the next in the row or column differ; `right_or_below`: either; `boundary`:
+    any of the four neighbours differs.
+    """
     word = start + wp.tid()
     i = int(64 * word)
     end = wp.min(i + 64, keys.shape[1])
@@ -907,9 +947,9 @@ def _scan_line(
     face: wp.array(dtype=wp.int32),
     keys: wp.array2d(dtype=wp.int64),
 ):
-    """Offers the ends of the triangle's interval on pixels [low, high) of a row (axis 0) or column (axis 1).
+    """Record the ends of the triangle's interval on pixels [low, high) of a row (axis 0) or column (axis 1).
 
-    code: 3 * face; origin: packed index that pixel 0 of the line would have; step: to the next pixel's.
+    `code` is 3 * face; `origin` the packed index of pixel 0 of the line; `step` leads to the next pixel.
     """
     other = 1 - axis
     at = wp.float64(line)
@@ -947,7 +987,7 @@ def _outline_kernel(
     right_or_below: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
-    """Finds for each marked pair of pixels the triangle's edge that reaches farthest from the hit to the empty one."""
+    """For each marked pair, find the triangle edge that reaches farthest from the hit to the empty pixel."""
     i = start + wp.tid()
     part = i // lanes
     x0 = parts[part, X0]
@@ -992,8 +1032,15 @@ def _outline_kernel(
 
 @wp.struct
 class OutlineCrossing:
-    """An outline between a hit pixel and an empty neighbour: both pixels, the edge's corners, its edge function at
-    both, which is 0 at the outline, how far from the hit it lies, and which of the pair (0, 1) it changes."""
+    """An outline between a hit pixel and an empty neighbour.
+
+    Attributes:
+        ia, ib: Vertices of the edge.
+        p_hit, p_empty: The pixels (x, y, 1).
+        e_hit, e_empty: The edge function there; it is 0 at the outline.
+        t: Distance of the outline from the hit, as a share.
+        changes: Which pixel of the pair (0, 1) changes.
+    """
 
     ia: int
     ib: int
@@ -1052,8 +1099,10 @@ def _coverage_kernel(
     choice: wp.array(dtype=wp.int64),
     coverage: wp.array(dtype=wp.float32),
 ):
-    """64 packed pixels: coverage of those that a hit and an empty pixel meet at, and `choice`: the edge that
-    decided it * 4 + the neighbour's side, -1 where none did."""
+    """For 64 packed pixels, coverage where a hit and an empty pixel meet.
+
+    `choice` receives the deciding edge * 4 + the neighbour's side, -1 where there is none.
+    """
     word = start + wp.tid()
     bits = boundary[word]
     while bits != wp.uint64(0):
@@ -1145,7 +1194,14 @@ def _coverage_backward_kernel(
 def rasterize(
     clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterPlan]:
-    """See `verbs.rasterize`. Returns face (T,) int32, depth (T,) and what `antialias` can use again."""
+    """Implement `verbs.rasterize`.
+
+    Args:
+        clip, faces, face_ranges, layout, near, cull: See `verbs.rasterize`.
+
+    Returns:
+        Faces (T,) int32, depths (T,), and the plan for `antialias`.
+    """
     plan = _make_plan(clip, faces, face_ranges, layout, near, cull)
     size = layout.size
     keys = torch.full((size,), int(EMPTY_KEY), dtype=torch.int64, device=clip.device)
@@ -1173,12 +1229,21 @@ def rasterize(
 
 
 def interpolate(fragments: Fragments, clip: Tensor, faces: Tensor, attributes: Tensor) -> Tensor:
-    """See `verbs.interpolate`."""
+    """Implement `verbs.interpolate`.
+
+    Args:
+        fragments, clip, faces, attributes: See `verbs.interpolate`.
+    """
     return _Interpolate.apply(fragments, clip, faces, attributes)
 
 
 def texture(image: Tensor, uv: Tensor, clamp: bool) -> Tensor:
-    """See `verbs.texture`."""
+    """Implement `verbs.texture`.
+
+    Args:
+        image, uv: See `verbs.texture`.
+        clamp: Whether edge pixels repeat beyond the image.
+    """
     channels, height, width = image.shape
     crop = torch.tensor([[0, 0, width, height]], device=uv.device)
     ends = torch.tensor([[0, width * height], [0, uv.shape[0]]], device=uv.device)
@@ -1187,13 +1252,23 @@ def texture(image: Tensor, uv: Tensor, clamp: bool) -> Tensor:
 
 
 def texture_packed(values: Tensor, crops: PixelLayout, layout: PixelLayout, uv: Tensor, clamp: bool) -> Tensor:
-    """See `verbs.texture_packed`."""
+    """Implement `verbs.texture_packed`.
+
+    Args:
+        values, layout, uv: See `verbs.texture_packed`.
+        crops: Positions of the crops.
+        clamp: Whether edge pixels repeat beyond a crop.
+    """
     channels = values.shape[1]
     return _Texture.apply(values, (channels, 1, channels), (crops.rects, crops.offsets), layout.offsets, uv, clamp)
 
 
 def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
-    """See `verbs.antialias`."""
+    """Implement `verbs.antialias`.
+
+    Args:
+        fragments, clip, faces: See `verbs.antialias`.
+    """
     return _Antialias.apply(fragments, clip, faces)
 
 
@@ -1312,19 +1387,19 @@ class _Antialias(torch.autograd.Function):
 
 
 def _single_thread(count: int) -> list[int]:
-    """[0, count) for one thread: its pixels add to vertices or texels that they may share."""
+    """[0, count) for one thread: its pixels may add to the same vertices or texels."""
     return [0, count]
 
 
 def _split_words(size: int) -> list[int]:
-    """Shares of the words of 64 bits that hold `size` bits."""
+    """Ranges of the 64-bit words that hold `size` bits."""
     return [*(edge // 64 for edge in split_range(size)[:-1]), (size + 63) // 64]
 
 
 def _make_plan(
     clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
 ) -> RasterPlan:
-    """How the threads share the draws, and where the vertices fall."""
+    """Divide the draws between threads and bound the vertices."""
     if clip.device.type == "cpu":
         rows, cuts = split_for_threads(layout, face_ranges, cull, threads())
         parts, lanes = torch.tensor(rows, dtype=torch.int32).view(-1, 11), 1
@@ -1339,9 +1414,7 @@ def _make_plan(
 
 
 def _front_to_back_order(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
-    """Faces (F,) int32 from the nearest to the farthest, where that is worth it: of one draw on a CPU whose backs
-    are seen too, so that most of its faces lie behind others. Else none, (0,).
-    """
+    """Faces (F,) int32 from nearest to farthest for a single CPU draw with visible back faces; else empty, (0,)."""
     if clip.device.type != "cpu" or len(face_ranges) != 1 or cull is not None or not len(faces):
         return face_ranges.new_empty(0, dtype=torch.int32)
     start, end = face_ranges[0].tolist()
@@ -1352,7 +1425,7 @@ def _front_to_back_order(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull:
 
 
 def _mesh_arrays(clip: Tensor, faces: Tensor) -> list[Any]:
-    """Vertices, and the three of each face."""
+    """Vertices and faces as arrays."""
     return [array(clip.contiguous(), wp.vec3f), array(int32_faces(faces), wp.vec3i)]
 
 

@@ -1,8 +1,8 @@
-"""Running Warp kernels: on a GPU at once, on a CPU by several threads, each with ranges of its own.
+"""Launch of Warp kernels: in one piece on a GPU, in ranges of several threads on a CPU.
 
-A kernel that is launched here takes the first index of its range as its first argument and adds `wp.tid()` to it.
-Warp's kernels release the interpreter's lock, but its atomic operations are not atomic on a CPU: ranges that may
-write to one place belong to one thread. So gradients that many pixels add to a vertex are split between objects.
+A kernel takes the first index of its range as its first argument and adds `wp.tid()` to it. Warp's kernels release
+the interpreter's lock, but its atomic operations are not atomic on a CPU: ranges that may write to one place
+belong to one thread. Gradients that many pixels add to a vertex are therefore split between objects.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ import warp as wp
 from torch import Tensor
 
 _MIN_PIXELS = 32768
-"""Less work than this many pixels, of some 10 ns each, is not worth a second thread: to wake one up takes up to
-150 microseconds. What takes several kernels is handed over once, by `share`."""
+"""Least pixels (some 10 ns each) for a second thread: waking one takes up to 150 microseconds. Work of several
+kernels is handed over once, by `run_in_threads`.
+"""
 
 
 @contextmanager
 def suppress_stderr() -> Iterator[None]:
-    """Drops what native code writes to the standard error stream meanwhile."""
+    """Discard what native code writes to standard error."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
@@ -39,7 +40,7 @@ def suppress_stderr() -> Iterator[None]:
 
 @cache
 def start_warp() -> None:
-    """Initialise Warp, silently; every module of kernels calls this first."""
+    """Initialise Warp silently; every kernel module calls this first."""
     wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
     wp.config.log_level = 40  # errors only; `quiet` is what older versions look at
     # Else each launch on an x86 CPU puts an arena, which no kernel here needs, on its stack and points to it from
@@ -56,20 +57,20 @@ def _pool(process: int) -> ThreadPoolExecutor:  # a forked process has none of i
 
 
 def threads() -> int:
-    """How many threads share a launch on the CPU: as many as torch uses."""
+    """Threads that share a launch on the CPU: as many as torch uses, at most 16."""
     return min(torch.get_num_threads(), 16)
 
 
 def split_range(count: int) -> list[int]:
-    """Edges of about equal ranges of [0, count), one a thread."""
+    """Bounds of about equal ranges of [0, count), one per thread."""
     parts = threads() if count >= _MIN_PIXELS else 1
     return [count * i // parts for i in range(parts + 1)]
 
 
 def split_by_work(edges: Sequence[int], weights: Sequence[float] | None = None) -> list[int]:
-    """Of ascending edges those that split their ranges between the threads most evenly.
+    """Choose from ascending `edges` those that divide the work most evenly between threads.
 
-    weights: the work of each range, by default its length.
+    weights: work of each range; by default its length.
     """
     work = [float(b - a) for a, b in itertools.pairwise(edges)] if weights is None else list(weights)
     parts, total = threads(), sum(work)
@@ -84,14 +85,14 @@ def split_by_work(edges: Sequence[int], weights: Sequence[float] | None = None) 
 
 
 def load_kernel(kernel: Any) -> None:
-    """Compile or load a kernel's module for the CPU, once, before several threads ask for it."""
+    """Compile or load a kernel's module for the CPU before several threads need it."""
     wp.load_module(kernel.module, "cpu")
 
 
 def run_in_threads(work: Callable[[int, int], None], edges: Sequence[int]) -> None:
-    """Call `work(start, end)` for the ranges between ascending `edges`, each in a thread of its own.
+    """Call `work(start, end)` for each range between ascending `edges` in its own thread.
 
-    For work that launches several kernels in turn, on the CPU; those kernels must have been loaded.
+    For work on the CPU that launches several kernels in turn; the kernels must be loaded.
     """
     ranges = [(a, b) for a, b in itertools.pairwise(edges) if b > a]
     pool = _pool(os.getpid())
@@ -109,10 +110,14 @@ def launch(
     outputs: Sequence[Any] = (),
     device: torch.device | None = None,
 ) -> None:
-    """Run a kernel over the ranges between ascending `edges`, in torch's stream on a GPU, else a thread a range.
+    """Run a kernel over ranges of indices: in torch's stream on a GPU, else in one thread per range.
 
-    inputs, outputs: the kernel's arguments after the first index. device: where they lie, by default where the
-    first of them that is an array does.
+    Args:
+        kernel: Warp kernel whose first argument is the first index.
+        edges: Ascending bounds of the ranges.
+        inputs: Arguments after the first index.
+        outputs: Further arguments.
+        device: Device of the arrays; by default that of the first array.
     """
     if len(edges) < 2 or edges[-1] <= edges[0]:
         return
@@ -133,10 +138,10 @@ def _launch_range(kernel: Any, start: int, count: int, inputs: Sequence[Any], de
 
 
 def array(values: Tensor, dtype: Any = None) -> Any:
-    """A tensor as an array for a kernel, in the form that is made fastest; it keeps the tensor.
+    """A tensor as a Warp array, without a copy; the array keeps the tensor alive.
 
-    A picture hands some two hundred tensors over. Warp looks each over, which takes longer than some kernels: here
-    it does so once for a dtype and shape, but for the number of rows, and then the result is copied.
+    A frame passes some two hundred tensors to kernels, and Warp's own conversion takes longer than some kernels.
+    It runs once per dtype and row shape here; later arrays are copies of its result.
     """
     key = values.dtype, dtype, values.shape[1:]
     seen = _array_templates.get(key)
@@ -155,11 +160,11 @@ def array(values: Tensor, dtype: Any = None) -> Any:
 
 
 _array_templates: dict[tuple[torch.dtype, Any, torch.Size], tuple[Any, bytes]] = {}
-"""Arrays as Warp made them, by the dtypes of tensor and kernel, and the shape of a row."""
+"""Warp's array type and bytes, by the tensor's dtype, the kernel's dtype, and the shape of a row."""
 
 
 class KernelStruct:
-    """A struct of arrays for a kernel, in the form that is made fastest; it keeps their tensors."""
+    """A Warp struct of arrays in the form that is fastest to build; keeps the tensors alive."""
 
     def __init__(self, kind: Any) -> None:
         self._kind, self._ctype = kind, kind.ctype()
@@ -169,13 +174,13 @@ class KernelStruct:
         return self._ctype
 
     def set_array(self, name: str, values: Tensor) -> None:
-        """The array of that name."""
+        """Set the array field `name`."""
         self._held[name] = values
         setattr(self._ctype, name, array(values, self._kind.vars[name].type.dtype))
 
 
 def make_struct(kind: Any, *tensors: Tensor) -> KernelStruct:
-    """A struct of arrays, one a tensor, in the order of its fields."""
+    """A struct with one array per tensor, in the order of its fields."""
     out = KernelStruct(kind)
     for name, values in zip(kind.vars, tensors, strict=True):
         out.set_array(name, values)

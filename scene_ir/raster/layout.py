@@ -1,4 +1,4 @@
-"""Which pixels a draw covers, and what was found there: the tensors that the four verbs share."""
+"""Pixel layouts and rasterisation results shared by the four verbs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from scene_ir.types import check_shape
 
 @dataclass(frozen=True, slots=True)
 class PixelLayout:
-    """The rectangle of the image that each draw covers; the pixels of all draws lie packed one after the other.
-
-    rects: (N, 4) int64 px, half-open (x0, y0, x1, y1), empty where x1 <= x0 or y1 <= y0. offsets: (N + 1,) int64,
-    the first packed pixel of each draw; pixels are row-major inside a draw; offsets[-1] is their count T.
-    """
+    """Rectangles of the image, one per draw; the pixels of all draws are packed one after the other."""
 
     rects: Tensor
+    """(N, 4) int64 px, half-open (x0, y0, x1, y1); empty where x1 <= x0 or y1 <= y0."""
     offsets: Tensor
+    """(N + 1,) int64, first packed pixel of each draw; row-major within a draw; the last is the pixel count T."""
 
     def __post_init__(self) -> None:
         check_shape("layout.rects", self.rects, None, 4, floating=False)
@@ -33,7 +31,7 @@ class PixelLayout:
 
     @classmethod
     def from_rects(cls, rects: Tensor) -> PixelLayout:
-        """The layout of rectangles (N, 4) int64 px, half-open (x0, y0, x1, y1)."""
+        """The layout of rectangles (N, 4) px, half-open (x0, y0, x1, y1)."""
         check_shape("layout.rects", rects, None, 4, floating=False)
         rects = rects.to(torch.int64)
         layout = object.__new__(cls)  # its offsets need no second look
@@ -43,7 +41,7 @@ class PixelLayout:
 
     @classmethod
     def from_pixels(cls, pixels: Tensor) -> PixelLayout:
-        """That of draws of a pixel each, (T, 2) (x, y), whole numbers."""
+        """The layout of one-pixel draws at integer pixels (T, 2), (x, y)."""
         rects = torch.empty(len(pixels), 4, dtype=torch.int64, device=pixels.device)
         rects[:, :2] = pixels
         torch.add(rects[:, :2], 1, out=rects[:, 2:])
@@ -54,11 +52,11 @@ class PixelLayout:
 
     @property
     def size(self) -> int:
-        """The number T of packed pixels."""
+        """Number T of packed pixels."""
         return int(self.offsets[-1])
 
     def draw_index(self) -> Tensor:
-        """The draw (T,) int64 that each packed pixel belongs to."""
+        """Draw (T,) int64 of each packed pixel."""
         count = self.rects.shape[0]
         return torch.repeat_interleave(torch.arange(count, device=self.rects.device), self.offsets.diff())
 
@@ -71,7 +69,7 @@ class PixelLayout:
         return torch.stack([x0 + within % width, y0 + within // width], dim=-1)
 
     def spans(self) -> list[tuple[slice, tuple[int, int]]]:
-        """For each draw its packed pixels as a slice, and the (height, width) px to view them in."""
+        """Packed pixels of each draw as a slice, with the draw's (height, width) in px."""
         edges = self.offsets.tolist()
         shapes = [(max(y1 - y0, 0), max(x1 - x0, 0)) for x0, y0, x1, y1 in self.rects.tolist()]
         return [(slice(edges[i], edges[i + 1]), shape) for i, shape in enumerate(shapes)]
@@ -79,50 +77,54 @@ class PixelLayout:
 
 @dataclass(frozen=True, slots=True)
 class RasterPlan:
-    """What the fast backend prepares for `rasterize` and uses again for `antialias`.
-
-    parts: (P, 11) int32, draws or bands of their rows: the draw's x0, y0, x1, y1; the first row and the end; the
-    draw's first packed pixel; its faces' start and end; 1 where its back faces are culled; the first packed pixel.
-    lanes: how many kernel indices share a part. cuts, outline_cuts: where in [0, lanes * P) the threads' shares
-    begin and end, for each of the two.
-    boxes: (V, 4) int32 px, the first and last pixel (x, y, x, y) that each vertex may touch. clip: (V, 3), the
-    vertices that this was made of, and their `version`, -1 where torch keeps none.
-    """
+    """Work division and vertex bounds that the fast `rasterize` leaves to `antialias`."""
 
     parts: Tensor
+    """(P, 11) int32, draws or bands of their rows: x0, y0, x1, y1 of the draw; first row and end row; first packed
+    pixel of the draw; first face and end face; 1 to cull back faces; first packed pixel of the band.
+    """
     lanes: int
+    """Kernel indices that share one part."""
     cuts: list[int]
+    """Bounds of the threads' ranges in [0, lanes * P] for `rasterize`."""
     outline_cuts: list[int]
+    """The same for `antialias`."""
     boxes: Tensor
+    """(V, 4) int32 px, first and last pixel (x, y, x, y) that each vertex may touch."""
     clip: Tensor
+    """(V, 3) vertices of the plan."""
     version: int
+    """Version counter of `clip`; -1 where torch keeps none."""
 
     def matches(self, clip: Tensor) -> bool:
-        """Whether `clip` is what this was made of, not changed since."""
+        """Whether `clip` is the tensor that the plan was made of, unchanged since."""
         same = self.clip.data_ptr() == clip.data_ptr() and self.clip.shape == clip.shape
         return same and self.clip.stride() == clip.stride() and self.version == tensor_version(clip)
 
 
 def tensor_version(tensor: Tensor) -> int:
-    """Counts torch's changes to a tensor; -1 for tensors of inference mode, which have no count."""
+    """Torch's change counter of a tensor; -1 for inference tensors, which have none."""
     return -1 if tensor.is_inference() else tensor._version
 
 
 @dataclass(frozen=True, slots=True)
 class Fragments:
-    """What `rasterize` found. face: (T,) int32, index into the faces, -1 where nothing is hit;
-    depth: (T,) m, w of the nearest hit, inf where there is none, not differentiable (interpolate w instead).
-    face_ranges: (N, 2) int64 and near: m, as they were given. cull: (N,) bool, the draws without back faces, or
-    None. plan: what the fast backend uses again, or None.
-    """
+    """Result of `rasterize`."""
 
     layout: PixelLayout
+    """Pixels of the draws."""
     face: Tensor
+    """(T,) int32 index of the nearest face, -1 where nothing is hit."""
     depth: Tensor
+    """(T,) w of the nearest hit in m, inf where there is none; not differentiable (interpolate w instead)."""
     face_ranges: Tensor
+    """(N, 2) int64, first face and end face of each draw."""
     near: float
+    """Near plane, m."""
     cull: Tensor | None = None
+    """(N,) bool, draws without back faces; None if there are none."""
     plan: RasterPlan | None = None
+    """Plan of the fast backend; None for the reference."""
 
 
 def _offsets(rects: Tensor) -> Tensor:

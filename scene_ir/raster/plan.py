@@ -1,4 +1,4 @@
-"""How the fast backend shares the draws between threads, and what it knows of a mesh's faces once and for all."""
+"""Division of draws between threads, and cached properties of faces, for the fast backend."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from scene_ir.raster.layout import PixelLayout, tensor_version
 V = TypeVar("V")
 
 _TRIANGLE_WORK = 1.5
-"""What a triangle costs `rasterize`, in pixels of a draw, measured on a CPU with triangles of a few pixels."""
+"""Cost of a triangle in `rasterize`, in pixels of a draw; measured on a CPU with triangles of a few pixels."""
 _OUTLINE_WORK = 10.0
-"""The same for `antialias`, which looks at few of the pixels."""
+"""Cost of a triangle in `antialias`, which visits few of the pixels."""
 _MIN_WORK = 10_000.0
-"""Less work than this is not worth a second thread: handing over costs some 50 microseconds."""
+"""Least work for a second thread, in pixels: handing work over takes about 50 microseconds."""
 _TOLERANCE = 0.1
-"""A thread may have this share more or less than the others before a draw is cut in two."""
+"""Relative imbalance between threads at which a draw is split."""
 _GPU_LANES = 8192
-"""At most this many GPU threads share the triangles of a draw."""
+"""Most GPU threads that share the triangles of a draw."""
 
 
 class _TensorCache(Generic[V]):
-    """What `compute` says of a tensor, asked once while the tensor lives and torch sees no change of it."""
+    """A function of a tensor, computed once while the tensor lives unchanged."""
 
     def __init__(self, compute: Callable[[Tensor], V]) -> None:
         self._compute = compute
@@ -54,12 +54,12 @@ _int32_copies = _TensorCache(lambda faces: faces.to(torch.int32).contiguous())
 
 
 def index_range(faces: Tensor) -> tuple[int, int]:
-    """The lowest and the highest index in faces (F, 3), F > 0."""
+    """Lowest and highest index in faces (F, 3), F > 0."""
     return _index_ranges(faces)
 
 
 def int32_faces(faces: Tensor) -> Tensor:
-    """Faces (F, 3) as contiguous int32, themselves where they are that."""
+    """Faces (F, 3) as contiguous int32; the same tensor if it is that already."""
     if faces.dtype == torch.int32 and faces.is_contiguous():
         return faces
     return _int32_copies(faces)
@@ -68,9 +68,16 @@ def int32_faces(faces: Tensor) -> Tensor:
 def split_for_threads(
     layout: PixelLayout, face_ranges: Tensor, cull: Tensor | None, threads: int
 ) -> tuple[list[list[int]], list[int]]:
-    """Rows of Plan.parts, those without pixels left out, and where the threads' shares begin, for `rasterize`.
+    """Divide the draws of `rasterize` between CPU threads, cutting draws into bands of rows where needed.
 
-    A thread's share is a run of draws; where that is too uneven a draw is cut into bands of rows.
+    Args:
+        layout: Pixels of the draws.
+        face_ranges: (N, 2) first face and end face of each draw.
+        cull: (N,) bool, or None.
+        threads: Most threads to use.
+
+    Returns:
+        Rows of `RasterPlan.parts` without empty draws, and the bounds of the threads' ranges.
     """
     culled = [0] * len(face_ranges) if cull is None else cull.to(torch.int64).tolist()
     draws = [
@@ -108,7 +115,7 @@ def split_for_threads(
 
 
 def split_outlines(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
-    """Where up to `shares` shares of the rows of Plan.parts begin and end, even for `antialias`."""
+    """Bounds of up to `shares` ranges of `RasterPlan.parts` with equal work for `antialias`."""
     work = [_OUTLINE_WORK * max(p[8] - p[7], 0) + (p[5] - p[4]) * (p[2] - p[0]) for p in parts]
     total, done, cuts = sum(work), 0.0, [0]
     for i, each in enumerate(work):
@@ -119,12 +126,18 @@ def split_outlines(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
 
 
 def _row_work(rect: Sequence[int], faces: Sequence[int], row: int) -> float:
-    """What the rows from `row` on of a draw cost, in pixels."""
+    """Cost in pixels of a draw's rows from `row` on."""
     return _TRIANGLE_WORK * max(faces[1] - faces[0], 0) + (rect[3] - row) * (rect[2] - rect[0])
 
 
 def gpu_parts(layout: PixelLayout, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
-    """Plan.parts, one a draw, without waiting for the device."""
+    """`RasterPlan.parts` with one part per draw, without waiting for the device.
+
+    Args:
+        layout: Pixels of the draws.
+        face_ranges: (N, 2) first face and end face of each draw.
+        cull: (N,) bool, or None.
+    """
     flag = torch.zeros_like(face_ranges[:, :1]) if cull is None else cull.to(face_ranges)[:, None]
     first = layout.offsets[:-1, None]
     rows = layout.rects[:, [1, 3]]
@@ -132,5 +145,5 @@ def gpu_parts(layout: PixelLayout, face_ranges: Tensor, cull: Tensor | None) -> 
 
 
 def gpu_lanes(faces: Tensor, draws: int) -> int:
-    """How many GPU threads share the triangles of a draw: about one each."""
+    """GPU threads that share the triangles of a draw: about one per triangle."""
     return max(32, min(_GPU_LANES, -(-faces.shape[0] // max(draws, 1))))

@@ -1,10 +1,10 @@
-"""The four verbs in plain torch: what is correct. Any floating dtype; geometry is computed in float64.
+"""The four verbs in plain torch, the definition of the correct result; any floating dtype, geometry in float64.
 
-A triangle with clip-space vertices c0, c1, c2 (rows (u w, v w, w)) meets the ray of pixel p = (x, y, 1) at
-w p = sum b_i c_i. Its edge functions are e_i = p . (c_j x c_k) for (i, j, k) cyclic; b_i = e_i / sum e and
-w = det / sum e with det = c0 . (c1 x c2), so p is inside where no e_i differs in sign from det (Olano and Greer
-1997). This holds too where vertices lie behind the camera: no hit is decided by dividing by a vertex's w.
-Since c_j x c_k = -(c_k x c_j) also in floating point, two triangles agree about their common edge.
+A triangle with clip-space vertices c0, c1, c2 (rows (u w, v w, w)) meets the ray of pixel p = (x, y, 1) at w p =
+sum b_i c_i. Its edge functions are e_i = p . (c_j x c_k) for (i, j, k) cyclic; b_i = e_i / sum e and w = det / sum
+e with det = c0 . (c1 x c2), so p is inside where no e_i differs in sign from det (Olano and Greer 1997). This also
+holds for vertices behind the camera: no hit is decided by dividing by a vertex's w. Since c_j x c_k = -(c_k x c_j)
+in floating point too, two triangles agree about their common edge.
 """
 
 from __future__ import annotations
@@ -18,19 +18,26 @@ from torch import Tensor
 from scene_ir.raster.layout import Fragments, PixelLayout
 
 PAIRS_PER_CHUNK = 1 << 21
-"""Triangle-pixel pairs looked at together: bounds the memory to a few hundred MB."""
+"""Triangle-pixel pairs processed together; bounds the memory to a few hundred MB."""
 DEGENERATE = 1e-15
-"""A triangle is edge-on where |det| is at most this times the product of its vertices' 1-norms: rounding."""
+"""A triangle is edge-on where |det| is at most this times the product of its vertices' 1-norms (rounding)."""
 SLACK_PX = 1e-3
-"""Widens pixel bounds against the rounding of u = (u w) / w; the edge functions decide which pixels are hit."""
+"""Margin of pixel bounds against the rounding of u = (u w) / w; the edge functions decide what is hit."""
 SNAP_PX = 1e-9
-"""An outline this close to a pixel centre is tried against the pairs on both of its sides."""
+"""An outline this close to a pixel centre is tested against the pairs on both sides."""
 
 
 def rasterize(
     clip: Tensor, faces: Tensor, face_ranges: Tensor, layout: PixelLayout, near: float, cull: Tensor | None
 ) -> tuple[Tensor, Tensor, None]:
-    """See `verbs.rasterize`. Returns face (T,) int32, depth (T,), and nothing to use again."""
+    """Implement `verbs.rasterize`.
+
+    Args:
+        clip, faces, face_ranges, layout, near, cull: See `verbs.rasterize`.
+
+    Returns:
+        Faces (T,) int32, depths (T,), and no plan.
+    """
     size, none = layout.size, faces.shape[0]
     depth = clip.new_full((size,), torch.inf)
     face = torch.full((size,), none, dtype=torch.int64, device=clip.device)
@@ -61,7 +68,11 @@ def rasterize(
 
 
 def interpolate(fragments: Fragments, clip: Tensor, faces: Tensor, attributes: Tensor) -> Tensor:
-    """See `verbs.interpolate`."""
+    """Implement `verbs.interpolate`.
+
+    Args:
+        fragments, clip, faces, attributes: See `verbs.interpolate`.
+    """
     out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
     hit = (fragments.face >= 0).nonzero()[:, 0]
     corners = faces.to(torch.int64)[fragments.face[hit].to(torch.int64)]  # (P, 3)
@@ -73,14 +84,25 @@ def interpolate(fragments: Fragments, clip: Tensor, faces: Tensor, attributes: T
 
 
 def texture(image: Tensor, uv: Tensor, clamp: bool) -> Tensor:
-    """See `verbs.texture`."""
+    """Implement `verbs.texture`.
+
+    Args:
+        image, uv: See `verbs.texture`.
+        clamp: Whether edge pixels repeat beyond the image.
+    """
     height, width = image.shape[1:]
     rect = torch.tensor([[0, 0, width, height]], device=uv.device).expand(uv.shape[0], 4)
     return _sample_crops(image.flatten(1).T, rect, torch.zeros_like(rect[:, 0]), uv, clamp)
 
 
 def texture_packed(values: Tensor, crops: PixelLayout, layout: PixelLayout, uv: Tensor, clamp: bool) -> Tensor:
-    """See `verbs.texture_packed`."""
+    """Implement `verbs.texture_packed`.
+
+    Args:
+        values, layout, uv: See `verbs.texture_packed`.
+        crops: Positions of the crops.
+        clamp: Whether edge pixels repeat beyond a crop.
+    """
     draw = layout.draw_index()
     filled = (crops.offsets.diff() > 0)[draw].nonzero()[:, 0]
     draw = draw[filled]
@@ -89,7 +111,11 @@ def texture_packed(values: Tensor, crops: PixelLayout, layout: PixelLayout, uv: 
 
 
 def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
-    """See `verbs.antialias`."""
+    """Implement `verbs.antialias`.
+
+    Args:
+        fragments, clip, faces: See `verbs.antialias`.
+    """
     layout, size = fragments.layout, fragments.face.shape[0]
     hit = fragments.face >= 0
     pixel = torch.arange(size, device=clip.device)
@@ -122,11 +148,11 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor) -> Tensor:
 def _outline_edges(
     fragments: Fragments, clip: Tensor, faces: Tensor, axis: int, start: Tensor, end: Tensor
 ) -> Tensor:
-    """Which edge makes the outline between packed pixels `start` and `end`, neighbours along `axis` of which one
-    is hit: face * 3 + edge (P,), -1 where there is none.
+    """The edge that makes the outline between packed pixels `start` and `end`, neighbours along `axis` of which
+    one is hit: face * 3 + edge (P,), -1 where there is none.
 
-    Every triangle is cut with the pixel rows (axis 0) or columns (axis 1); it covers an interval of such a line.
-    As no triangle covers the empty pixel, the interval that reaches farthest towards it ends at the outline.
+    Each triangle is cut with the pixel rows (axis 0) or columns (axis 1) and covers an interval of such a line. As
+    no triangle covers the empty pixel, the interval that reaches farthest towards it ends at the outline.
     """
     layout = fragments.layout
     slot = torch.full((fragments.face.shape[0],), -1, dtype=torch.int64, device=clip.device)
@@ -180,7 +206,7 @@ def _outline_edges(
 
 @dataclass(frozen=True, slots=True)
 class _TriangleJobs:
-    """Triangles to draw, one entry (J,) for each draw and each of its faces, without those that are not seen."""
+    """Triangles to draw, one entry per draw and visible face (J)."""
 
     face: Tensor  # (J,) index into faces
     rect: Tensor  # (J, 4) of the draw
@@ -222,7 +248,7 @@ class _TriangleJobs:
 
 
 def _split_chunks(jobs: _TriangleJobs, lines_along: int | None) -> Iterator[_TriangleJobs]:
-    """The jobs in order, cut where their pixels (or lines along an axis, where one is given) fill a chunk."""
+    """The jobs in order, split where their pixels (or their lines along an axis) fill a chunk."""
     extent = (jobs.bounds[:, 2:] - jobs.bounds[:, :2]).clamp(min=0)
     work = (extent.prod(dim=1) if lines_along is None else extent[:, lines_along]).cumsum(0)
     chunk = torch.div(work, PAIRS_PER_CHUNK, rounding_mode="floor")
@@ -233,7 +259,7 @@ def _split_chunks(jobs: _TriangleJobs, lines_along: int | None) -> Iterator[_Tri
 
 
 def first_largest(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum (P,) of values (E, P) over E and its index (P,) int64: of equal ones the first, on every device."""
+    """Maximum (P,) of values (E, P) over E and its index (P,) int64; the first of equal ones on every device."""
     best, index = values[0], torch.zeros(values.shape[1], dtype=torch.int64, device=values.device)
     for i in range(1, values.shape[0]):
         further = values[i] > best
@@ -243,14 +269,14 @@ def first_largest(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _expand_counts(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For counts (J,): the owner (P,) of each of their sum's elements, and the element's place (P,) there."""
+    """Owner (P,) and position within the owner (P,) of each of the sum(counts) elements."""
     owner = torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
     start = counts.cumsum(0) - counts
     return owner, torch.arange(owner.shape[0], device=counts.device) - start[owner]
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """a x b (..., 3), written out so that exchanging a and b gives the exact negative."""
+    """Cross product (..., 3), written out so that exchanging a and b gives the exact negative."""
     return torch.stack(
         [
             a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
@@ -272,7 +298,7 @@ def _edge_values(normal: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _pixel_bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
-    """Pixels (J, 4), half-open, inside rect (J, 4), that hold the part with w >= near of triangles (J, 3, 3)."""
+    """Pixel bounds (J, 4), half-open, inside rect (J, 4), of the part of triangles (J, 3, 3) with w >= near."""
     after = corner[:, [1, 2, 0]]
     w, w_after = corner[..., 2], after[..., 2]
     front, crosses = w >= near, (w >= near) != (w_after >= near)
@@ -291,7 +317,7 @@ def _pixel_bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
 
 
 def _catmull_rom_weights(t: Tensor) -> Tensor:
-    """Catmull-Rom weights (T, 4) of the pixels at -1, 0, 1, 2 for a sample at t (T,) in [0, 1)."""
+    """Catmull-Rom weights (T, 4) of the pixels at -1, 0, 1, 2 for samples at t (T,) in [0, 1)."""
     return torch.stack(
         [
             ((-0.5 * t + 1.0) * t - 0.5) * t,
@@ -304,8 +330,9 @@ def _catmull_rom_weights(t: Tensor) -> Tensor:
 
 
 def _sample_crops(texels: Tensor, rect: Tensor, offset: Tensor, uv: Tensor, clamp: bool) -> Tensor:
-    """Catmull-Rom samples (T, C) at uv (T, 2) px of crops that lie at rect (T, 4) of the frame, each with its own
-    texels, row-major from `offset` (T,) in texels (S, C). Computed in float64."""
+    """Catmull-Rom samples (T, C) at uv (T, 2) px of crops at rect (T, 4) of the frame, computed in float64; texels
+    (S, C), row-major from `offset` (T,).
+    """
     size = rect[:, 2:] - rect[:, :2]
     # Beyond 3 px outside, all 16 taps lie outside as well: the value no longer changes.
     local = (uv.to(torch.float64) - rect[:, :2]).maximum(torch.full_like(size, -4).double())

@@ -1,10 +1,9 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
-"""What kernels are made of that a CPU shall run on eight or sixteen pixels at once; float32, for CUDA as well.
+"""Warp functions for kernels that the CPU runs on 8 or 16 pixels at once; float32, also for CUDA.
 
-The CPU's compiler widens a kernel over its threads where the kernel is a straight line of arithmetic. So: `load`
-and `store` for an array's elements (Warp's own index may be negative, which asks for a branch), `exp_` and `log_`
-for the C library's, `wp.where` for a choice, loops only where they unroll, and no sums over pixels. Writes to few
-arrays: one with planes rather than several.
+The CPU's compiler vectorises a kernel that is a straight line of arithmetic. Such kernels use `load` and `store`
+(Warp's indices may be negative, which costs a branch), `exp_` and `log_` instead of the C library's, `wp.where`
+for a choice, loops that unroll, no sums over pixels, and few output arrays: one with planes instead of several.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ SIMD_OPTIONS: dict[str, Any] = {
         [wp.config.cpu_compiler_flags or "-march=native", *(f"-mllvm=-{name}=1000" for name in _CHECK_LIMITS)]
     ),
 }
-"""Options of modules made of these."""
+"""Module options of kernels that use these functions."""
 wp.set_module_options(SIMD_OPTIONS)
 
 
@@ -41,17 +40,38 @@ def load(values: wp.array(dtype=wp.float32), i: int) -> wp.float32: ...
 
 
 @wp.func_native("((float*)values.data)[i] = value;")
-def store(values: wp.array(dtype=wp.float32), i: int, value: wp.float32): ...
+def store(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
+    """Write a number without a check of the index.
+
+    Args:
+        values: Flat array.
+        i: Index.
+        value: The number.
+    """
 
 
 @wp.func
 def load3(values: wp.array(dtype=wp.float32), i: int, step: int):
-    """Three numbers, `step` apart: of a picture (3, H, W) a colour, with H W for `step`."""
+    """Three numbers `step` apart, such as the colour of a pixel in a picture (3, H, W) with step H * W.
+
+    Args:
+        values: Flat array.
+        i: Index of the first number.
+        step: Distance between the numbers.
+    """
     return wp.vec3f(load(values, i), load(values, i + step), load(values, i + 2 * step))
 
 
 @wp.func
 def store3(values: wp.array(dtype=wp.float32), i: int, step: int, value: wp.vec3f):
+    """Write three numbers `step` apart.
+
+    Args:
+        values: Flat array.
+        i: Index of the first number.
+        step: Distance between the numbers.
+        value: The numbers.
+    """
     store(values, i, value[0])
     store(values, i + step, value[1])
     store(values, i + 2 * step, value[2])
@@ -59,7 +79,9 @@ def store3(values: wp.array(dtype=wp.float32), i: int, step: int, value: wp.vec3
 
 @wp.func
 def exp_(x: wp.float32):
-    """e to the x, to 2e-7 of it; exactly 1 at 0; x is kept in [-87, 88]. Source: Moshier's Cephes, `expf`."""
+    """Exponential with relative error 2e-7; exactly 1 at 0; x is clamped to [-87, 88]. Source: Moshier's Cephes,
+    `expf`.
+    """
     y = wp.min(wp.max(x, -87.0), 88.0)
     n = wp.floor(y * 1.44269504088896341 + 0.5)
     r = (y - n * 0.693359375) + n * 2.12194440e-4
@@ -74,7 +96,9 @@ def exp_(x: wp.float32):
 
 @wp.func
 def log_(x: wp.float32):
-    """Natural logarithm of a normal x > 0, to 2e-7 of it; exactly 0 at 1. Source: Moshier's Cephes, `logf`."""
+    """Natural logarithm of a normal x > 0 with relative error 2e-7; exactly 0 at 1. Source: Moshier's Cephes,
+    `logf`.
+    """
     bits = wp.cast(x, wp.int32)
     n = (bits - 0x3F3504F3) >> 23  # x = 2^n m with m in [sqrt(1/2), sqrt(2))
     r = wp.cast(bits - (n << 23), wp.float32) - 1.0
@@ -94,4 +118,5 @@ def log_(x: wp.float32):
 
 @wp.func
 def sum3(x: wp.vec3f):
+    """Sum of three components."""
     return x[0] + x[1] + x[2]

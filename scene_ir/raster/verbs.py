@@ -1,11 +1,12 @@
 """Four verbs that turn triangles into differentiable pixels: rasterize, interpolate, texture, antialias.
 
-Each verb has two implementations behind one signature: `reference` (plain torch, any floating dtype, defines what
-is correct) and `warp` (float32, one kernel source for CPU and CUDA, imported on first use). Visibility is decided
-by a hard z-buffer and is not differentiated; values at a hit are, and `antialias` differentiates outlines.
+Each verb has two implementations behind one signature: `reference` (plain torch, any floating dtype; defines the
+correct result) and `warp` (float32; one kernel source for CPU and CUDA; imported on first use). Visibility comes
+from a hard z-buffer and is not differentiated; values at a hit are, and `antialias` differentiates outlines.
 
-Clip coordinates are (u w, v w, w), as `geometry.to_clip` gives them: u, v in pixels (centres at integers), w in
-metres in front of the camera. Shapes: N draws, T packed pixels (`Layout`), F triangles, V vertices, K attributes.
+Clip coordinates are (u w, v w, w), as `geometry.to_clip` returns them: u, v in pixels (centres at integers), w in
+metres in front of the camera. Shapes: N draws, T packed pixels (`PixelLayout`), F triangles, V vertices, K
+attributes.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ __all__ = [
 ]
 
 NEAR_M = 0.05
-"""Surfaces closer than this w, m, are cut away: nearer than anything in front of a car's camera."""
+"""Near plane, m: surfaces with a smaller w are cut away. Nothing in front of a car's camera is nearer."""
 
 Backend = Literal["warp", "reference"]
 Border = Literal["clamp", "zero"]
@@ -54,15 +55,24 @@ def rasterize(
 ) -> Fragments:
     """Find the nearest triangle at each pixel centre of each draw.
 
-    clip: (V, 3) = (u w, v w, w). faces: (F, 3) int, both windings are seen. face_ranges: (N, 2) int, draw i is
-    faces [start, end) inside layout.rects[i]; ranges may overlap. near: m, surfaces with w < near are cut away.
-    Of two triangles on either side of a common edge exactly one hits a pixel centre on it; of equal depths the
-    lower face index wins; triangles seen edge-on are skipped.
-    cull: whether triangles seen from behind are left out, for all draws or (N,) bool one a draw. The front of
-    (v0, v1, v2) is where cross(v1 - v0, v2 - v0) points to, in the frame x right, y down, z forward. Closed meshes
-    look the same without their backs, at half the cost, except where the near plane cuts them open.
-    Raises ShapeError or RangeError.
+    Of two triangles on either side of a common edge, exactly one hits a pixel centre on the edge. At equal depth
+    the lower face index wins. Triangles seen edge-on are skipped. The front of (v0, v1, v2) is where cross(v1 -
+    v0, v2 - v0) points in the frame x right, y down, z forward. Closed meshes look the same without back faces, at
+    half the cost, unless the near plane cuts them open.
     Source: Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates".
+
+    Args:
+        clip: (V, 3) clip coordinates.
+        faces: (F, 3) int; both windings are visible.
+        face_ranges: (N, 2) int; draw i covers faces [start, end) inside layout.rects[i]; ranges may overlap.
+        layout: Pixels of the draws.
+        backend: Implementation.
+        near: Near plane, m.
+        cull: Whether to drop back faces, for all draws or (N,) bool.
+
+    Raises:
+        ShapeError: On wrong shapes or dtypes.
+        RangeError: On values that are not finite, or indices out of range.
     """
     _check_mesh(clip, faces, backend)
     _check_finite("raster.clip", clip)
@@ -82,9 +92,16 @@ def rasterize(
 def interpolate(
     fragments: Fragments, clip: Tensor, faces: Tensor, attributes: Tensor, backend: Backend = "warp"
 ) -> Tensor:
-    """Perspective-correct attributes at the hits. attributes: (V, K) -> (T, K), 0 where nothing is hit.
+    """Interpolate vertex attributes at the hits, perspective-correct; differentiable to `clip` and `attributes`.
 
-    clip, faces: as given to `rasterize`. Differentiable to clip and to attributes.
+    Args:
+        fragments: Result of `rasterize`.
+        clip, faces: As given to `rasterize`.
+        attributes: (V, K).
+        backend: Implementation.
+
+    Returns:
+        (T, K), 0 where nothing is hit.
     """
     _check_mesh(clip, faces, backend)
     check_shape("raster.attributes", attributes, clip.shape[0], None)
@@ -93,11 +110,18 @@ def interpolate(
 
 
 def texture(image: Tensor, uv: Tensor, backend: Backend = "warp", border: Border = "clamp") -> Tensor:
-    """Sample an image with the Catmull-Rom kernel (a = -1/2), which is smooth also at pixel centres.
+    """Sample an image with the Catmull-Rom kernel (a = -1/2), which is smooth at pixel centres too.
 
-    image: (C, H, W). uv: (T, 2) px, pixel centres at integers -> (T, C), the pixel itself at integer uv.
-    border: beyond the image its edge pixels repeat ("clamp") or everything is 0 ("zero"). Differentiable to uv and
-    image. Source: Keys 1981, "Cubic convolution interpolation".
+    Differentiable to `uv` and `image`. Source: Keys 1981, "Cubic convolution interpolation".
+
+    Args:
+        image: (C, H, W).
+        uv: (T, 2) px, pixel centres at integers.
+        backend: Implementation.
+        border: Beyond the image, repeat its edge pixels ("clamp") or return 0 ("zero").
+
+    Returns:
+        (T, C); the pixel itself at integer uv.
     """
     check_shape("raster.image", image, None, None, None)
     check_shape("raster.uv", uv, None, 2)
@@ -119,11 +143,19 @@ def texture_packed(
     backend: Backend = "warp",
     border: Border = "zero",
 ) -> Tensor:
-    """`texture` for all draws at once: the pixels of draw i sample crop i of N crops of different sizes.
+    """`texture` for all draws at once: draw i samples crop i; differentiable to `uv` and `values`.
 
-    values: (S, C), the texels of all crops one after the other, row-major. crop_rects: (N, 4) int64 px, half-open
-    (x0, y0, x1, y1), where each crop lies in the frame; crop_offsets: (N + 1,) int64 (both as in `Layout`).
-    uv: (T, 2) px of the *frame* -> (T, C). Samples of an empty crop are 0. Differentiable to uv and values.
+    Args:
+        values: (S, C) texels of all crops, packed row-major.
+        crop_rects: (N, 4) int64 px, half-open (x0, y0, x1, y1), position of each crop in the frame.
+        crop_offsets: (N + 1,) int64, as in `PixelLayout`.
+        layout: Pixels of the draws.
+        uv: (T, 2) px of the frame.
+        backend: Implementation.
+        border: As for `texture`.
+
+    Returns:
+        (T, C); 0 for an empty crop.
     """
     crops = PixelLayout(crop_rects, crop_offsets)
     if crops.rects.shape[0] != layout.rects.shape[0]:
@@ -140,14 +172,18 @@ def texture_packed(
 def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backend = "warp") -> Tensor:
     """Coverage (T,) in [0, 1] of each pixel by its draw, with outlines blended against empty neighbours.
 
-    clip, faces: as given to `rasterize`. Between a hit pixel and an empty 4-neighbour of the same draw the outline
-    crosses the segment of their centres at t in [0, 1], measured from the hit: the hit pixel keeps 1/2 + t, the
-    empty one gets t - 1/2, each at most 1 and at least 0; of its neighbours the one that changes a pixel most
-    counts. So an outline that sweeps over the pixels changes coverage continuously, and one along rows or columns
-    covers exact areas; parts narrower than a pixel are covered too much where they are hit, and not where they are
-    not. Differentiable to clip, through the vertices of the edge that makes the outline.
-    The idea of differentiating analytic edge coverage is from Laine et al. 2020, "Modular primitives for
-    high-performance differentiable rendering".
+    Between a hit pixel and an empty 4-neighbour of the same draw, the outline crosses the segment of their centres
+    at t in [0, 1] from the hit: the hit pixel keeps 1/2 + t and the empty one gets t - 1/2, each clamped to [0,
+    1]; of its neighbours, the one that changes a pixel most counts. An outline that sweeps over pixels therefore
+    changes coverage continuously, and one along rows or columns covers exact areas. Parts narrower than a pixel
+    are covered too much where they are hit, and not at all elsewhere. Differentiable to `clip` through the
+    vertices of the outline's edge. The idea of differentiating analytic edge coverage is from Laine et al. 2020,
+    "Modular primitives for high-performance differentiable rendering".
+
+    Args:
+        fragments: Result of `rasterize`.
+        clip, faces: As given to `rasterize`.
+        backend: Implementation.
     """
     _check_mesh(clip, faces, backend)
     return _backend_module(backend).antialias(fragments, clip, faces)
@@ -156,10 +192,20 @@ def antialias(fragments: Fragments, clip: Tensor, faces: Tensor, backend: Backen
 def bounding_rects(
     clip: Tensor, vertex_ranges: Tensor, height: int, width: int, margin: int = 2, near: float = NEAR_M
 ) -> Tensor:
-    """Pixel rectangles (N, 4) int64, half-open and inside the image, that hold vertices [start, end) of each draw.
+    """Pixel rectangles that hold the vertices of each draw, inside the image.
 
-    clip: (V, 3). vertex_ranges: (N, 2) int. margin: px on each side. A draw with vertices on both sides of the
-    near plane gets the whole image; one wholly behind it, or without vertices, an empty rectangle.
+    A draw on both sides of the near plane gets the whole image; one behind it, or without vertices, an empty
+    rectangle.
+
+    Args:
+        clip: (V, 3).
+        vertex_ranges: (N, 2) int, first vertex and end vertex of each draw.
+        height, width: Image size, px.
+        margin: Margin on each side, px.
+        near: Near plane, m.
+
+    Returns:
+        (N, 4) int64, half-open.
     """
     check_shape("raster.clip", clip, None, 3)
     check_shape("raster.vertex_ranges", vertex_ranges, None, 2, floating=False)
@@ -181,7 +227,7 @@ def bounding_rects(
 
 
 def _backend_module(backend: Backend) -> ModuleType:
-    """The implementation; Warp is imported here, so that only who uses it pays for it."""
+    """The implementation; Warp is imported only when it is used."""
     if backend == "warp":
         from scene_ir.raster import kernels
 
@@ -202,13 +248,13 @@ def _check_mesh(clip: Tensor, faces: Tensor, backend: Backend) -> None:
 
 
 def _check_finite(name: str, values: Tensor) -> None:
-    """`check_finite`, one pass over values that are so: their sum is."""
+    """`check_finite` with one pass over finite values, whose sum is finite too."""
     if not math.isfinite(float(values.detach().sum())):
         check_finite(name, values)
 
 
 def _cull_flags(cull: bool | Tensor, face_ranges: Tensor) -> Tensor | None:
-    """Which draws (N,) bool lose their back faces; None where none does."""
+    """Draws (N,) bool that lose their back faces; None if there are none."""
     if isinstance(cull, Tensor):
         check_shape("raster.cull", cull, face_ranges.shape[0], floating=False)
         return cull.to(face_ranges.device, torch.bool)

@@ -1,4 +1,4 @@
-"""Blending layers into a picture, back to front, and the order in which to do it."""
+"""Layers blended into a picture from back to front, and the order in which to blend them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scene_ir.render.model import SATURATED
 from scene_ir.types import Occluder
 
 _OCCLUDER_WIDTH_M = 0.4
-"""Width of what stands in front of vehicles, on the ground: about a person's."""
+"""Width on the ground of what stands in front of vehicles: about a person's."""
 
 LayerSpan = tuple[slice, tuple[slice, slice], tuple[int, int]]
 """Packed pixels of a layer, its rows and columns in the picture, and its (height, width) px."""
@@ -25,19 +25,30 @@ LayerSpan = tuple[slice, tuple[slice, slice], tuple[int, int]]
 
 @dataclass(frozen=True, slots=True)
 class BlendPlan:
-    """What is blended where. order: the layers back to front; spans, shadow_spans: of each draw; empty rectangles
-    are left out of `order` and `shadows`, the draws that have a shadow."""
+    """Positions and order of the layers and shadows of one picture."""
 
     layout: PixelLayout
+    """Crops of the layers."""
     shadow_layout: PixelLayout
+    """Crops of the shadows."""
     order: tuple[int, ...]
+    """Layers that are not empty, back to front."""
     shadows: tuple[int, ...]
+    """Draws that have a shadow."""
     spans: tuple[LayerSpan, ...]
+    """Position of each layer."""
     shadow_spans: tuple[LayerSpan, ...]
+    """Position of each shadow."""
 
     @classmethod
     def from_layouts(cls, layout: PixelLayout, shadow_layout: PixelLayout, order: Sequence[int]) -> BlendPlan:
-        """order: all layers, back to front."""
+        """The plan for crops and an order of all layers.
+
+        Args:
+            layout: Crops of the layers.
+            shadow_layout: Crops of the shadows.
+            order: All layers, back to front.
+        """
         spans, shadow_spans = _spans(layout), _spans(shadow_layout)
         drawn = tuple(i for i in order if min(spans[i][2]) > 0)
         shadows = tuple(i for i, span in enumerate(shadow_spans) if min(span[2]) > 0)
@@ -50,7 +61,7 @@ class BlendPlan:
 
 
 def _spans(layout: PixelLayout) -> tuple[LayerSpan, ...]:
-    """Where the packed pixels of each draw go."""
+    """Positions of the packed pixels of each draw."""
     out: list[LayerSpan] = []
     for (packed, size), (x0, y0, _, _) in zip(layout.spans(), layout.rects.tolist(), strict=True):
         out.append((packed, (slice(y0, y0 + size[0]), slice(x0, x0 + size[1])), size))
@@ -72,16 +83,22 @@ class _Clamp(torch.autograd.Function):
 
 
 def clamp_colour(image: Tensor) -> Tensor:
-    """Colours kept in [0, 1].
+    """Colours clamped to [0, 1].
 
     Where one just reaches a bound, as saturated pixels of a photograph do, half of the gradient passes: the mean
-    of the slopes to both sides, which is what a central difference finds.
+    of the slopes on both sides, which a central difference measures.
     """
     return _Clamp.apply(image)
 
 
 def visible_background(opacity: Tensor, plan: BlendPlan, frame_hw: tuple[int, int]) -> Tensor:
-    """How much of what lies behind all layers shows, (H, W). opacity: (T,). Differentiable to opacity."""
+    """Share (H, W) of the background that shows between all layers; differentiable to `opacity`.
+
+    Args:
+        opacity: (T,).
+        plan: Positions and order of the layers.
+        frame_hw: Size of the picture, px.
+    """
     shows = opacity.new_ones(frame_hw)
     for i in plan.order:
         packed, (rows, columns), size = plan.spans[i]
@@ -98,13 +115,21 @@ def composite(
     clamped: bool,
     backend: Backend = "reference",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Shadows multiplied onto the canvas, then layers laid over it. Differentiable to canvas, factors, colour,
-    opacity.
+    """Multiply shadows onto the canvas, then lay the layers over it.
 
-    canvas: (C, H, W), RGB and, with C = 4, 1 / depth. depth: (H, W) m behind everything. what: shadow factors (Ts,
-    3); premultiplied colours (T, 4), the fourth opacity / depth; opacity (T,); depth (T,) m. clamped: whether RGB
-    is kept in [0, 1]. -> (C, H, W); (H, W) m and (H, W) int64, i + 1, of the front-most object i that is at least
-    half opaque. Pixels outside the plan's rectangles keep their bits.
+    Differentiable to canvas, factors, colour and opacity. Pixels outside the plan's rectangles keep their bits.
+
+    Args:
+        canvas: (C, H, W), RGB and, with C = 4, 1 / depth.
+        depth: (H, W) m behind all layers.
+        what: Shadow factors (Ts, 3); premultiplied RGB and opacity / depth (T, 4); opacity (T,); depth (T,) m.
+        plan: Positions and order.
+        clamped: Whether RGB is clamped to [0, 1].
+        backend: Implementation.
+
+    Returns:
+        Picture (C, H, W); depth (H, W) m; (H, W) int64, i + 1 for the front-most object i that is at least half
+        opaque.
     """
     factor, colour, opacity, z = what
     if backend == "warp":
@@ -130,12 +155,12 @@ def composite(
     return image, nearest, number
 
 
-def visible_rects(layout: PixelLayout, shown: Tensor) -> Tensor:
-    """Of each draw the rectangle (N, 4) int64 px, half-open, of its pixels where any of `shown` (T, C) is true,
-    and of one more around them, which the smallest change may show. Empty where nothing is.
+def visible_rects(layout: PixelLayout, visible: Tensor) -> Tensor:
+    """Rectangles (N, 4) int64 px, half-open, of the pixels of each draw where any of `visible` (T, C) is true, with
+    a margin of one pixel, which the smallest change may reach; empty where there are none.
     """
     rects: list[list[int]] = []
-    packed, channels = shown.cpu().numpy(), shown.shape[1]
+    packed, channels = visible.cpu().numpy(), visible.shape[1]
     for (part, size), whole in zip(layout.spans(), layout.rects.tolist(), strict=True):
         pixels = packed[part].reshape(size[0], size[1] * channels)
         columns, rows = np.flatnonzero(pixels.any(0)) // channels, np.flatnonzero(pixels.any(1))
@@ -153,8 +178,7 @@ def _stack_inputs(layout: PixelLayout, order: Sequence[int]) -> tuple[Tensor, Te
 
 
 class _ReferenceBlend(torch.autograd.Function):
-    """Works in place on one copy of the picture in both directions, where autograd would copy it for each
-    layer."""
+    """Works in place on one copy of the picture, where autograd would copy it for each layer."""
 
     @staticmethod
     def forward(
@@ -201,13 +225,19 @@ class _ReferenceBlend(torch.autograd.Function):
 def paint_order(
     size_lhw: Tensor, yaw: Tensor, translation: Tensor, centre: Tensor, standing: np.ndarray | None = None
 ) -> list[int]:
-    """Indices of the objects from the farthest to the nearest, as a painter lays them down; not differentiated.
+    """Objects from the farthest to the nearest, as a painter lays them down; not differentiated.
 
-    size_lhw (N, 3) m, yaw (N,) rad, translation (N, 3) m; centre (3,) m, where the camera stands. Of two
-    footprints apart, the one on the camera's side of the line between them is in front (a car beside a long truck
-    may be farther by its middle and yet hide it); where that says nothing, or in a cycle, the nearest point
-    decides. standing: (K, 4, 2) m, footprints of things that are no objects, see `occluder_footprints`: they are
-    N, N + 1, ..., and come right after the last object that they can hide, so that the objects keep their order.
+    Of two separate footprints, the one on the camera's side of the line between them is in front (a car next to a
+    long truck may be farther by its centre and yet hide it). Where that does not decide, or in a cycle, the
+    nearest point does. Occluders have numbers from N on and come right after the last object that they can hide,
+    so that the objects keep their order.
+
+    Args:
+        size_lhw: (N, 3) m.
+        yaw: (N,) rad.
+        translation: (N, 3) m.
+        centre: (3,) m, position of the camera.
+        standing: (K, 4, 2) m, footprints of occluders, see `occluder_footprints`.
     """
     count = int(translation.shape[0])
     corners = ground_footprint(size_lhw.detach(), yaw.detach(), translation.detach()).cpu().double().numpy()
@@ -230,14 +260,13 @@ def paint_order(
 
 
 def _insert_occluders(order: list[int], corners: np.ndarray, standing: np.ndarray, eye: np.ndarray) -> list[int]:
-    """The order of N objects with K standing things among them. corners (N, 4, 2), standing (K, 4, 2), eye (2,),
-    m."""
-    count, things = len(corners), len(standing)
-    first, second = np.repeat(np.arange(things), count), np.tile(np.arange(count), things)
+    """The order of N objects with K occluders inserted. corners (N, 4, 2), standing (K, 4, 2), eye (2,), m."""
+    count, occluder_count = len(corners), len(standing)
+    first, second = np.repeat(np.arange(occluder_count), count), np.tile(np.arange(count), occluder_count)
     nearest, near = _nearest_distance(corners, eye), _nearest_distance(standing, eye)
     hides = _in_front(standing[first], corners[second], eye, nearest[second] - near[first]) > 0
     place = np.argsort(order)
-    after = np.where(hides.reshape(things, count), place[None], -1).max(axis=1, initial=-1)
+    after = np.where(hides.reshape(occluder_count, count), place[None], -1).max(axis=1, initial=-1)
     slots: list[list[int]] = [[] for _ in range(count + 1)]
     for k in np.argsort(-near, kind="stable"):
         slots[int(after[k]) + 1].append(count + int(k))
@@ -248,22 +277,22 @@ def _insert_occluders(order: list[int], corners: np.ndarray, standing: np.ndarra
 
 
 def occluder_footprints(front: Sequence[Occluder], matrix: Tensor) -> np.ndarray:
-    """Corners (K, 4, 2) m, (x, z), of small squares where things stand. matrix: (3, 4) of the camera."""
+    """Corners (K, 4, 2) m, (x, z), of small squares where occluders stand. matrix: (3, 4) of the camera."""
     inverse = np.linalg.inv(matrix[:, :3].detach().cpu().double().numpy())
     centre = -inverse @ matrix[:, 3].detach().cpu().double().numpy()
     places = []
-    for thing in front:
-        height, width = thing.foreground.values.shape[1:]
-        foot = np.array([thing.foreground.x0 + (width - 1) / 2, thing.foreground.y0 + height - 1.0, 1.0])
-        places.append((centre + inverse @ foot * thing.depth_m)[[0, 2]])
+    for occluder in front:
+        height, width = occluder.foreground.values.shape[1:]
+        foot = np.array([occluder.foreground.x0 + (width - 1) / 2, occluder.foreground.y0 + height - 1.0, 1.0])
+        places.append((centre + inverse @ foot * occluder.depth_m)[[0, 2]])
     square = _OCCLUDER_WIDTH_M / 2 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return np.array(places).reshape(-1, 1, 2) + square
 
 
 def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray, farther: np.ndarray) -> np.ndarray:
-    """(P,): 1 where footprint a[i] (P, 4, 2) can hide b[i], -1 the other way round, 0 where neither can.
+    """(P,): 1 where footprint a[i] (P, 4, 2) can hide b[i], -1 for the reverse, 0 for neither.
 
-    farther: (P,) how much farther b's outline is, which decides where the footprints are not apart.
+    farther: (P,) how much farther b's outline is; decides where the footprints are not separate.
     """
     axes = np.concatenate([corners[:, 1:3] - corners[:, 0:2] for corners in (a, b)], axis=1)
     axes = axes / np.maximum(np.linalg.norm(axes, axis=2, keepdims=True), 1e-9)

@@ -1,9 +1,9 @@
-"""What a mesh shows between two looks that see different faces: differentiable to its vertices.
+"""Borders between the faces seen by two neighbouring samples of a mesh, differentiable to its vertices.
 
-A look is a point of the picture at which the z-buffer says which face is seen. Between two of them borders are
-crossed: creases at which a surface goes on, the end of the nearer surface, or the line along which two surfaces
-pass through each other. They follow from walks over the mesh, face by face, from both looks towards each other. So
-a face too thin for a look to meet it is passed, and seen.
+A sample is a point of the picture at which the z-buffer decides which face is visible. Between two samples that
+see different faces lie creases at which the surface continues, the end of the nearer surface, or the line along
+which two surfaces intersect. They follow from walks over the mesh, face by face, from both samples towards each
+other, so that faces too thin for a sample to hit are found too.
 """
 
 from __future__ import annotations
@@ -17,24 +17,29 @@ from scene_ir.geometry import weld_vertices
 from scene_ir.raster.verbs import Backend
 
 MAX_WALK_FACES = 4
-"""How many faces further a surface is followed between two looks."""
+"""Faces over which a surface is followed between two samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeshEdges:
-    """Of a mesh's faces (F, 3). across (3F,) int64: beyond edge 3 * face + i, opposite to the face's corner i, the
-    edge of who shares it, -1 where nobody does or more than one. creased (3F,): whether looks change there.
-    onwards (F, 3) int64: the faces beyond edges at which they do not, -1 where they do.
-    """
+    """Adjacency and creases of a mesh's faces (F, 3); edge 3 * face + i lies opposite to corner i."""
 
     across: Tensor
+    """(3F,) int64, the same edge of the neighbouring face; -1 where there is none or more than one."""
     creased: Tensor
+    """(3F,) bool, whether the appearance changes at the edge."""
     onwards: Tensor
+    """(F, 3) int64, neighbours across edges without crease; -1 at creases."""
 
     @classmethod
-    def from_mesh(cls, vertices: Tensor, faces: Tensor, looks: Tensor, crease_cos: float) -> MeshEdges:
-        """vertices (V, 3): at one place they are one. looks (F, C): of faces' materials. An
-        edge is creased between two that differ, or whose normals' product is less than `crease_cos`.
+    def from_mesh(cls, vertices: Tensor, faces: Tensor, materials: Tensor, crease_cos: float) -> MeshEdges:
+        """Adjacency of a mesh; an edge is a crease where materials differ or normals diverge.
+
+        Args:
+            vertices: (V, 3); equal positions are one vertex.
+            faces: (F, 3).
+            materials: (F, C).
+            crease_cos: Cosine of the normals below which an edge is a crease.
         """
         corners = weld_vertices(vertices)[faces]
         ends = torch.stack([corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]], dim=-1).reshape(-1, 2)
@@ -49,38 +54,45 @@ class MeshEdges:
         normal = torch.linalg.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
         normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-12)
         here, there = torch.arange(len(across)) // 3, across.clamp_min(0) // 3
-        creased = ((normal[here] * normal[there]).sum(dim=1) < crease_cos) | (looks[here] != looks[there]).any(1)
+        creased = ((normal[here] * normal[there]).sum(dim=1) < crease_cos) | (
+            materials[here] != materials[there]
+        ).any(1)
         creased |= across < 0
         return cls(across, creased, torch.where(creased, -1, there).reshape(-1, 3))
 
     def join_smoothly(self, one: Tensor, other: Tensor) -> Tensor:
-        """Whether faces (P,) share an edge with others (P,) at which looks do not change."""
+        """Whether faces (P,) share an edge without crease with others (P,)."""
         return (self.onwards.index_select(0, one) == other[:, None]).any(dim=1)
 
 
 @dataclass(frozen=True, slots=True)
 class VisibleFace:
-    """face (B,) int64, and where (B,) on its way it is seen, as a share."""
+    """Faces visible on paths between samples."""
 
     face: Tensor
+    """(B,) int64."""
     share: Tensor
+    """(B,) position on the path, in [0, 1]."""
 
     def reversed(self) -> VisibleFace:
-        """The same on ways from their ends."""
+        """The same on the reversed paths."""
         return VisibleFace(self.face, 1 - self.share)
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceBorders:
-    """Borders (B,) on ways. way (B,) int64: which; share (B,) in [0, 1]: where on it, differentiable; across (B,):
-    whether it runs across the way rather than along it; before, after: what is seen on both sides.
-    """
+    """Borders (B) on paths between samples."""
 
-    way: Tensor
+    path: Tensor
+    """(B,) int64, index of the path."""
     share: Tensor
+    """(B,) position on it in [0, 1], differentiable."""
     across: Tensor
+    """(B,) bool, whether the border runs across the path rather than along it."""
     before: VisibleFace
+    """Visible before the border."""
     after: VisibleFace
+    """Visible after it."""
 
 
 def find_borders(
@@ -92,8 +104,16 @@ def find_borders(
     step: Tensor,
     backend: Backend,
 ) -> SurfaceBorders:
-    """The borders on ways from looks (P, 3), (x, y, 1), to those a step (P, 3) further, of which the ones see the
-    first faces of `seen` (P,), (P,) int64, and the others the second. clip (V, 3), faces (F, 3).
+    """The borders on paths between samples that see different faces.
+
+    Args:
+        clip: (V, 3) clip coordinates.
+        faces: (F, 3).
+        edges: Adjacency of the faces.
+        seen: (P,), (P,) int64, faces at the start and at the end of each path.
+        start: (P, 3) start (x, y, 1), float64.
+        step: (P, 3) difference between end and start.
+        backend: Implementation.
     """
     points, end = clip.detach().to(torch.float64), start + step
     leave = MeshWalk.trace(points, faces, edges.across, seen, start, end, backend)
@@ -109,25 +129,25 @@ def find_borders(
     # Up to there the first surface is seen, from there on the second.
     until = torch.where(through, meets, torch.where(first_ends, leave.end, 1 - enter.end))
     until = torch.where(leave.met, 1.0, torch.where(enter.met, 0.0, until))
-    way, edge, near, far = leave.creases(edges.creased, until)
-    way_back, edge_back, near_back, far_back = enter.creases(edges.creased, 1 - until)
+    path, edge, near, far = leave.creases(edges.creased, until)
+    path_back, edge_back, near_back, far_back = enter.creases(edges.creased, 1 - until)
     apart = (~leave.met & ~enter.met).nonzero()[:, 0]
     one, other = leave.last_face(apart, until), enter.last_face(apart, 1 - until).reversed()
     ends = torch.where(first_ends, leave.edge[:, -1], enter.edge[:, -1])
-    ways = torch.cat([way, way_back, apart])
-    share, slope = _cross_edges(clip, faces, torch.cat([edge, edge_back, ends[apart]]), start[ways], end[ways])
+    paths = torch.cat([path, path_back, apart])
+    share, slope = _cross_edges(clip, faces, torch.cat([edge, edge_back, ends[apart]]), start[paths], end[paths])
     at = through[apart].nonzero()[:, 0]
     if len(at):
         plane = _face_planes(clip, faces, leave.face[apart[at], -1]) - _face_planes(
             clip, faces, enter.face[apart[at], -1]
         )
-        where = at + len(ways) - len(apart)
-        met = -(plane * start[ways[where]]).sum(dim=1) / (plane * step[ways[where]]).sum(dim=1)
+        where = at + len(paths) - len(apart)
+        met = -(plane * start[paths[where]]).sum(dim=1) / (plane * step[paths[where]]).sum(dim=1)
         share, slope = share.index_put((where,), met), slope.index_put((where,), plane.detach()[:, :2])
     return SurfaceBorders(
-        ways,
+        paths,
         share.clamp(0, 1),
-        _runs_across(slope, step[ways]),
+        _runs_across(slope, step[paths]),
         _concat_faces(near, far_back.reversed(), one),
         _concat_faces(far, near_back.reversed(), other),
     )
@@ -135,35 +155,45 @@ def find_borders(
 
 @dataclass(frozen=True, slots=True)
 class SurfaceRims:
-    """Where surfaces end on ways (P,) to looks that meet nothing. inner: the borders (B,) before that; end (B,):
-    where on the borders' ways the surface ends, as a share, differentiable; across (P,): whether that end runs
-    across the way rather than along it.
-    """
+    """Ends of surfaces on paths to samples that hit nothing."""
 
     inner: SurfaceBorders
+    """Borders (B) before the end."""
     end: Tensor
+    """(B,) end of the surface on the borders' paths, as a share, differentiable."""
     across: Tensor
+    """(P,) bool, whether the end runs across the path rather than along it."""
 
 
 def find_rims(
     clip: Tensor, faces: Tensor, edges: MeshEdges, seen: Tensor, start: Tensor, step: Tensor, backend: Backend
 ) -> SurfaceRims:
-    """Of ways as those of `find_borders`, whose looks see the faces `seen` (P,) and, a step further, nothing."""
+    """The ends of surfaces on paths from samples that see `seen` to samples that hit nothing.
+
+    Args:
+        clip: (V, 3) clip coordinates.
+        faces: (F, 3).
+        edges: Adjacency of the faces.
+        seen: (P,) int64, faces at the start.
+        start: (P, 3) start (x, y, 1), float64.
+        step: (P, 3) difference between end and start.
+        backend: Implementation.
+    """
     points, end = clip.detach().to(torch.float64), start + step
     walk = MeshWalk.trace(points, faces, edges.across, (seen, torch.full_like(seen, -1)), start, end, backend)
-    way, edge, near, far = walk.creases(edges.creased, walk.end)
-    share, slope = _cross_edges(clip, faces, edge, start[way], end[way])
-    ends, _ = _cross_edges(clip, faces, walk.edge[way, -1], start[way], end[way])
+    path, edge, near, far = walk.creases(edges.creased, walk.end)
+    share, slope = _cross_edges(clip, faces, edge, start[path], end[path])
+    ends, _ = _cross_edges(clip, faces, walk.edge[path, -1], start[path], end[path])
     _, slope_of_end = _cross_edges(clip.detach(), faces, walk.edge[:, -1], start, end)
     return SurfaceRims(
-        SurfaceBorders(way, share.clamp(0, 1), _runs_across(slope, step[way]), near, far),
-        torch.where(walk.end[way] < 1, ends.clamp(0, 1), 1.0),
+        SurfaceBorders(path, share.clamp(0, 1), _runs_across(slope, step[path]), near, far),
+        torch.where(walk.end[path] < 1, ends.clamp(0, 1), 1.0),
         _runs_across(slope_of_end, step),
     )
 
 
 def _runs_across(slope: Tensor, step: Tensor) -> Tensor:
-    """Whether (B,) edges whose functions have slopes (B, 2) run across steps (B, 3) rather than along them."""
+    """Whether (B,) edges with slopes (B, 2) of their functions run across steps (B, 3) rather than along them."""
     heading = step[:, :2].abs()
     along, aside = (slope * heading).sum(dim=1).abs(), (slope * (1 - heading)).sum(dim=1).abs()
     return (along > aside) | ((along == aside) & (heading[:, 0] > 0))
@@ -175,19 +205,22 @@ def _concat_faces(*sights: VisibleFace) -> VisibleFace:
 
 @dataclass(frozen=True, slots=True)
 class MeshWalk:
-    """From the faces that are seen at the start of ways towards their ends, over faces (P, MAX_WALK_FACES + 1). share, edge
-    (P, MAX_WALK_FACES + 1): where each is left, in [0, 1], and by which edge, 3 * face + edge; goes_on (P, WALK + 1):
-    whether to the next one. end (P,): where the last is left; plane (P, 3): its inverse depth at pixel (x, y, 1)
-    is its product with it. met (P,): whether it is what is seen at the way's end.
-    """
+    """Walks from the faces at the start of paths towards their ends, over W = MAX_WALK_FACES + 1 faces."""
 
     face: Tensor
+    """(P, W) faces."""
     share: Tensor
+    """(P, W) position at which each face is left, in [0, 1]."""
     edge: Tensor
+    """(P, W) edge by which it is left, 3 * face + edge."""
     goes_on: Tensor
+    """(P, W) bool, whether the walk continues to the next face."""
     end: Tensor
+    """(P,) position at which the last face is left."""
     plane: Tensor
+    """(P, 3) inverse depth of the last face at pixel (x, y, 1), as a product with it."""
     met: Tensor
+    """(P,) bool, whether the last face is the one at the path's end."""
 
     @classmethod
     def trace(
@@ -200,7 +233,16 @@ class MeshWalk:
         end: Tensor,
         backend: Backend,
     ) -> MeshWalk:
-        """Of points (V, 3) float64, faces and `MeshEdges.across`: from the first of `seen` towards the second."""
+        """Walk from the first of `seen` towards the second.
+
+        Args:
+            points: (V, 3) float64 clip coordinates.
+            faces: (F, 3).
+            across: See `MeshEdges`.
+            seen: (P,), (P,) faces at start and end.
+            start, end: (P, 3) pixels (x, y, 1).
+            backend: Implementation.
+        """
         if backend == "warp":
             from scene_ir.render.kernels.mesh_walk import trace_walks
 
@@ -225,36 +267,37 @@ class MeshWalk:
             )
             chain.append((edge // 3, share, edge))
             goes_on.append(going)
-        face, shares, edges = (torch.stack(kept, dim=1) for kept in zip(*chain, strict=True))
+        face, shares, edges = (torch.stack(column, dim=1) for column in zip(*chain, strict=True))
         goes_on.append(torch.zeros_like(going))
         return cls(face, shares, edges, torch.stack(goes_on, dim=1), share, plane, met)
 
     def creases(self, creased: Tensor, room: Tensor) -> tuple[Tensor, Tensor, VisibleFace, VisibleFace]:
-        """Where looks change on the surface before `room` (P,), a share of the way: which ways (B,), by which
-        edges (B,), and what is seen nearer and farther. creased: as in `MeshEdges`.
+        """Creases on the surface before `room` (P,), a share of the path; creased: as in `MeshEdges`.
+
+        Returns:
+            Paths (B,), edges (B,), and the faces visible before and after each crease.
         """
-        way, place = (self.goes_on & (self.share < room[:, None]) & creased[self.edge]).nonzero(as_tuple=True)
-        near, far = self._visible_face(way, place, room), self._visible_face(way, place + 1, room)
-        return way, self.edge[way, place], near, far
+        path, place = (self.goes_on & (self.share < room[:, None]) & creased[self.edge]).nonzero(as_tuple=True)
+        near, far = self._visible_face(path, place, room), self._visible_face(path, place + 1, room)
+        return path, self.edge[path, place], near, far
 
-    def last_face(self, way: Tensor, room: Tensor) -> VisibleFace:
-        """The last that is seen on ways (B,) before `room` (P,)."""
+    def last_face(self, path: Tensor, room: Tensor) -> VisibleFace:
+        """Last faces visible on paths (B,) before `room` (P,)."""
         passed = (self.goes_on & (self.share < room[:, None])).sum(dim=1)
-        return self._visible_face(way, passed[way], room)
+        return self._visible_face(path, passed[path], room)
 
-    def _visible_face(self, way: Tensor, place: Tensor, room: Tensor) -> VisibleFace:
-        """The faces at places (B,) of walks (B,), midway between where they begin and where they are left."""
-        begins = torch.where(place > 0, self.share[way, (place - 1).clamp_min(0)], 0.0)
-        ends = self.share[way, place].minimum(room[way]).maximum(begins)
-        return VisibleFace(self.face[way, place], (begins + ends) / 2)
+    def _visible_face(self, path: Tensor, place: Tensor, room: Tensor) -> VisibleFace:
+        """The faces at places (B,) of walks (B,), midway between entry and exit."""
+        begins = torch.where(place > 0, self.share[path, (place - 1).clamp_min(0)], 0.0)
+        ends = self.share[path, place].minimum(room[path]).maximum(begins)
+        return VisibleFace(self.face[path, place], (begins + ends) / 2)
 
 
 def _exit_face(
     points: Tensor, faces: Tensor, face: Tensor, start: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where (P,) on ways from start to end (P, 3) faces (P,) are left, 1 where they are not; by which edge (P,),
-    3 * face + edge; their planes (P, 3), as in `MeshWalk`; and the edge's normal (P, 3), whose product with what lies
-    beyond it is positive.
+    """Where paths from start to end (P, 3) leave faces (P,): position (P,), 1 if they do not; edge (P,), 3 * face
+    + edge; the face's plane (P, 3), as in `MeshWalk`; and the edge's normal (P, 3), positive beyond it.
     """
     corners = points[faces[face].reshape(-1)].reshape(-1, 3, 3)
     normals = torch.linalg.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
@@ -268,8 +311,8 @@ def _exit_face(
 
 
 def _cross_edges(clip: Tensor, faces: Tensor, edge: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Where (B,) edges (B,), 3 * face + edge, cross ways from start to end (B, 3), as a share, differentiable, 1/2
-    where they do not; and the slopes (B, 2) of their edge functions.
+    """Position (B,), differentiable, at which edges (B,), 3 * face + edge, cross paths from start to end (B, 3),
+    1/2 if they do not; and the slopes (B, 2) of their edge functions.
     """
     face, corner = edge // 3, edge % 3
     one, other = (clip.index_select(0, faces[face, (corner + turn) % 3]).to(torch.float64) for turn in (1, 2))
@@ -281,7 +324,7 @@ def _cross_edges(clip: Tensor, faces: Tensor, edge: Tensor, start: Tensor, end: 
 
 
 def _face_planes(clip: Tensor, faces: Tensor, face: Tensor) -> Tensor:
-    """(B, 3) of faces (B,), as in `MeshWalk`; differentiable."""
+    """Planes (B, 3) of faces (B,), as in `MeshWalk`; differentiable."""
     corners = clip.index_select(0, faces[face].reshape(-1)).reshape(-1, 3, 3).to(torch.float64)
     normals = torch.linalg.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
     return normals.sum(dim=1) / (corners[:, 0] * normals[:, 0]).sum(-1, keepdim=True)

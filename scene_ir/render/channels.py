@@ -1,6 +1,6 @@
-"""What the packed numbers of a pixel, a texel and a vertex hold, for torch and for the kernels alike.
+"""Channel indices of the packed values of texels, pixels and vertices, for torch and kernels alike.
 
-A name is the channel where a quantity begins; one of several numbers ends where the next name begins.
+A name is the index where a quantity begins; a quantity of several numbers ends where the next one begins.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ ALPHA, HIDDEN, INSET, DEPTH, SUPPORT, TEXEL = 3, 4, 5, 6, 7, 8
 # Of a pixel's look at the photograph: displacement of its lookup, px (2); w then and now, m; cosine towards the
 # camera now minus then, and then; share of paint; height, 0 at the vehicle's foot and 1 at its roof; how much
 # brighter the surface is since it turned, see `texture.limit_brightening`.
-MOVE, W_THEN, W_NOW, TURNED, COS_THEN, PAINT, HEIGHT, BRIGHTER, LOOK = 0, 2, 3, 4, 5, 6, 7, 8, 9
+DISPLACEMENT, W_THEN, W_NOW, TURNED, COS_THEN, PAINT, HEIGHT, BRIGHTER, LOOKUP = 0, 2, 3, 4, 5, 6, 7, 8, 9
 
 # Of a vertex before the division that makes it a look, in place of these four: clip then minus now (3), w then.
 CORNER_W, CORNER_THEN = 2, 3

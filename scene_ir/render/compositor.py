@@ -1,7 +1,7 @@
-"""Re-rendering a scene: photograph, perturbed vehicles, weather. Differentiable to all that may be perturbed.
+"""Differentiable re-rendering of a scene: photograph, perturbed vehicles, weather.
 
-In the order of work: `prepare`, then `reference` (plain torch, says what is right) or `fast` (kernels), here for
-several scenes in one go, then `blend` and `environment`.
+In the order of work: `prepare`, then `reference` (plain torch, the definition) or `fast` (kernels), here for
+several scenes at once, then `blend` and `environment`.
 """
 
 from __future__ import annotations
@@ -22,35 +22,36 @@ from scene_ir.types import Crop, Objects, Render, SceneIR
 
 
 def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) -> list[Render]:
-    """Render scenes as they stand. To render many perturbations of one scene, keep its `Compositor`."""
+    """Render scenes as they stand. To render many perturbations of one scene, reuse its `Compositor`."""
     return [Compositor(scene, settings).render(scene) for scene in scenes]
 
 
 class Compositor(PreparedScene):
-    """Draws perturbations of one scene; keeps what no parameter touches."""
+    """Renders perturbations of one scene, and caches what no parameter affects."""
 
     _fixed_geometry: fast.FixedGeometry | None = None
     _compositor_before: Compositor | None = None
 
     @property
     def fixed_geometry(self) -> fast.FixedGeometry | None:
-        """What the fast kernels read, gathered on first use; None where they are not used."""
+        """Input of the fast kernels, gathered on first use; None where they do not apply."""
         if self._fixed_geometry is None and self.texels is not None and self.settings.backend == "warp":
             with torch.no_grad():
                 self._fixed_geometry = fast.FixedGeometry.from_scene(self)
         return self._fixed_geometry
 
     def draw_layers(self, objects: Objects, sun: PerturbedSun | None = None) -> ObjectLayers:
-        """The objects drawn one by one, not yet blended. sun: as of `sun_of`."""
+        """Layers of the objects, not yet blended. sun: as of `perturbed_sun`."""
         fixed = self.fixed_geometry
         if fixed is None:
             return reference.draw_layers(self, objects, self.find_visible(objects, sun), sun)
         return _draw_layers([self], self.batch, fixed, [objects], [sun])[0]
 
     def render(self, perturbed: SceneIR) -> Render:
-        """The picture of a perturbed scene; with nothing perturbed, the photograph. Where vehicles were exchanged,
-        added or taken away, states of the scene before that are drawn too (`SceneIR.before`). Raises RangeError
-        for a state of which this scene is the one before.
+        """The picture of a perturbed scene; the photograph where nothing is perturbed.
+
+        Where vehicles were exchanged, added or removed, states of the scene before that are rendered too
+        (`SceneIR.before`). Raises RangeError for a state of which this scene is the one before.
         """
         if perturbed.before is None and self.scene.before is not None:
             if self._compositor_before is None:
@@ -63,7 +64,7 @@ class Compositor(PreparedScene):
         return self.compose(perturbed, objects, self.draw_layers(objects, sun) if len(objects) else None)
 
     def perturbed_objects(self, perturbed: SceneIR) -> Objects:
-        """The objects of a perturbed scene in this one's dtype. Raises ShapeError where it has other objects."""
+        """The objects of a perturbed scene in this one's dtype. Raises ShapeError for other objects."""
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
@@ -71,8 +72,13 @@ class Compositor(PreparedScene):
         return replace(self.scene.objects, **{name: getattr(objects, name).to(self.like) for name in names})
 
     def compose(self, perturbed: SceneIR, objects: Objects, layers: ObjectLayers | None) -> Render:
-        """The picture of drawn objects. perturbed: for its environment; layers: None where there are no
-        objects."""
+        """Blend drawn objects into the picture.
+
+        Args:
+            perturbed: Scene with the environment to apply.
+            objects: Its objects.
+            layers: Their layers; None without objects.
+        """
         environment, backend = perturbed.environment, self.settings.backend
         weather, foliage = is_active(environment.weather), is_active(environment.foliage)
         canvas = self.canvas if weather else self.canvas[:3]
@@ -101,9 +107,9 @@ class Compositor(PreparedScene):
             )
             if drawn is not None:
                 with torch.no_grad():
-                    shown = blend.visible_rects(layers.layout, layers.opacity[:, None] != 0)[: len(objects)]
+                    visible = blend.visible_rects(layers.layout, layers.opacity[:, None] != 0)[: len(objects)]
                     shaded = blend.visible_rects(layers.shadow_layout, layers.shadow != 1)
-                drawn = torch.cat([shown, shaded])
+                drawn = torch.cat([visible, shaded])
             plan = blend.BlendPlan.from_layouts(layers.layout, layers.shadow_layout, order)
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
@@ -136,7 +142,7 @@ def _draw_layers(
     objects: Sequence[Objects],
     suns: Sequence[PerturbedSun | None],
 ) -> list[ObjectLayers]:
-    """The layers of each member by the fast kernels, all of them in one go."""
+    """The layers of each member by the fast kernels, all at once."""
     drawn = pack.find_visible(objects, suns, with_ground=False)
     code = None
     if any(is_active(o.texture_code) for o in objects):
@@ -147,7 +153,7 @@ def _draw_layers(
             PaintRegions.concat([r for r in regions if r is not None]),
         )
     yaw = concat([o.yaw for o in objects])
-    colour, opacity, depth, shadow = fast.draw_photographed(fixed, drawn, drawn.reach_px, yaw, code)
+    colour, opacity, depth, shadow = fast.draw_photographed(fixed, drawn, yaw, code)
     if len(members) == 1:
         return [ObjectLayers(drawn.mesh.layout, colour, opacity, depth, drawn.patch_layout, shadow)]
     layouts, grounds = (
@@ -164,16 +170,17 @@ def _draw_layers(
 
 @lru_cache(maxsize=2)
 def _batch_compositors(members: tuple[Compositor, ...]) -> tuple[SceneBatch, fast.FixedGeometry]:
-    """Compositors, all of them with fast kernels, as one."""
+    """Compositors with fast kernels, as one batch."""
     return SceneBatch(members), fast.FixedGeometry.concat(
         [m.fixed_geometry for m in members if m.fixed_geometry is not None]
     )
 
 
 def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
-    """The picture of each perturbed scene by its compositor, their objects drawn in one go where they can be.
+    """Pictures of perturbed scenes, each by its compositor, with the objects of all scenes drawn at once where
+    possible.
 
-    A compositor may occur several times. The pictures are those that `Compositor.render` gives, one by one.
+    A compositor may occur several times. The pictures equal those of `Compositor.render`.
     """
     members = tuple(c for c, _ in pairs)
     together = len(pairs) > 1 and all(

@@ -1,7 +1,7 @@
-"""Weather, time of day and foliage: smooth functions of picture, depth and maps; code 0 leaves every bit as it is.
+"""Sun, weather, time of day and foliage as smooth functions of picture, depth and maps; code 0 changes no bit.
 
-Each effect is `x + s(code) * change(x)` with s(0) = 0, so that it passes through the photograph and is
-differentiable there from both sides, though the weather code is bounded to [0, 1].
+Each effect is `x + s(code) * change(x)` with s(0) = 0: it passes through the photograph and is differentiable
+there from both sides, although weather codes are bounded to [0, 1].
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from scene_ir.types import Environment, SceneIR
 
 
 def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
-    """Mean colour (3,) of the photographed sky, where there is some; a bright overcast otherwise."""
+    """Mean colour (3,) of the photographed sky, or a bright overcast where there is none."""
     weight = sky * (sky > 0.5)
     total = weight.sum()
     default = photograph.new_tensor(model.SKY_RGB)
@@ -33,14 +33,15 @@ def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
 
 
 def shadow_softening(weather: Tensor) -> Tensor:
-    """The factor () by which overcast, fog, rain and twilight weaken cast shadows; 1 at code 0. weather (4,)."""
+    """Factor () by which fog, rain, twilight and overcast weaken cast shadows; 1 at code 0. weather: (4,)."""
     fog, rain, time, overcast = (rate * code for rate, code in zip(model.SHADOW_SOFTENING, weather, strict=True))
     return torch.exp(-(fog + rain + time + overcast))
 
 
 def time_gain(time: Tensor) -> Tensor:
-    """What the time of day, a code () in [0, 1], adds to a display value of 1, (3,) RGB: warm light at one half,
-    then blue twilight; 0 at code 0."""
+    """Relative change (3,) of RGB by the time of day, a code () in [0, 1]: warm light at one half, then blue
+    twilight.
+    """
     square = time * time
     darkening, warmth = time.new_tensor(model.DARKENING), time.new_tensor(model.WARMTH)
     dusk, dim = torch.exp(-model.DUSK_ENDS * square), torch.exp(-model.DIMMING_ENDS * square)
@@ -49,9 +50,11 @@ def time_gain(time: Tensor) -> Tensor:
 
 @torch.no_grad()
 def compute_crown_maps(scene: SceneIR) -> Tensor:
-    """What density does to foliage, (5, H, W) in [0, 1]: how far a pixel opens in a thin crown; how far it darkens
-    in a thick one, neither on level ground, as grass is no crown; RGB of what shows through. Behind leaves is what
-    surrounds them: the sky where they stand before it, a wall where they climb it.
+    """Effect of density on foliage, (5, H, W) in [0, 1]: how far a pixel opens in a thin crown; how far it darkens
+    in a thick one; RGB behind the leaves.
+
+    The first two are 0 on the ground, as grass is no crown. Behind leaves lies what surrounds them: the sky where
+    they stand before it, a wall where they climb it.
     """
     amount, photo = scene.environment.foliage_map, scene.background
     gaps = _leaf_gaps(*amount.shape).to(photo)
@@ -68,9 +71,15 @@ def apply_foliage(
 ) -> Tensor:
     """The picture (3, H, W) with its foliage changed by `environment.foliage`, (3,) in [-1, 1].
 
-    Hue turns leaves from spring's blue-green (-1) through as photographed (0) to autumn's orange (1); lightness is
-    a curve in CIE L*; density darkens the crowns (1) or lets what is behind show through them (-1).
-    crowns: of `compute_crown_maps`. Differentiable to all, with backend `warp` (float32, fused) to picture and code.
+    Hue turns leaves from spring's blue-green (-1) through the photographed colour (0) to autumn's orange (1);
+    lightness is a curve in CIE L*; density darkens the crowns (1) or opens them (-1). Differentiable to all; with
+    backend `warp` (float32, fused) to picture and code.
+
+    Args:
+        image: (3, H, W).
+        environment: Foliage code and map.
+        crowns: Result of `compute_crown_maps`.
+        backend: Implementation.
     """
     if backend == "warp":
         from scene_ir.render.kernels import effects
@@ -89,7 +98,7 @@ def apply_foliage(
 
 
 def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
-    """The leaf model on rows (R, 3); maps (R, 5): of `compute_crown_maps`."""
+    """The leaf model on rows (R, 3); maps (R, 5) as of `compute_crown_maps`."""
     hue, shift, density = code.unbind(-1)
     lightness, a, b = rgb_to_lab(clamp_inclusive(rgb, 0.0, 1.0)).unbind(-1)
     level = clamp_inclusive(lightness / 100.0, *model.LEVEL)
@@ -113,9 +122,15 @@ def apply_weather(
 ) -> Tensor:
     """The picture (3, H, W) under `environment.weather`, (4,): fog, rain, time of day, overcast, each in [0, 1].
 
-    inverse_depth: (H, W) 1/m of what is seen, 0 in the sky; air: (3,) RGB, the airlight. Differentiable to all,
-    the environment's maps of sky and road included; with backend `warp` (float32, fused) to all but the airlight,
-    and to the road only where there is some.
+    Differentiable to all, including the maps of sky and road; with backend `warp` (float32, fused) to all but the
+    airlight, and to the road only where there is some.
+
+    Args:
+        image: (3, H, W).
+        inverse_depth: (H, W) 1/m, 0 in the sky.
+        environment: Weather code, maps of sky and road.
+        air: (3,) RGB of the airlight.
+        backend: Implementation.
     """
     if backend == "warp":
         streaks = _rain_streaks(*environment.sky.shape).to(image)
@@ -161,17 +176,22 @@ def apply_weather(
 
 
 def apply_veil(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
-    """A picture (3, H, W) behind a veil, of which a share (H, W) in [0, 1] is air (3, 1, 1); 0 leaves every bit.
+    """A picture behind a veil; a veil of 0 changes no bit.
 
-    Light adds up, display values do not: they are squared first, which is a display's exponent of 2.2 nearly, and
-    the root is bent near black, so that it has a slope there.
+    Light adds up, display values do not: they are squared first, which is close to a display's exponent of 2.2.
+    The root is bent near black, so that it has a slope there.
+
+    Args:
+        image: (3, H, W).
+        veil: (H, W) in [0, 1], share of air.
+        air: (3, 1, 1).
     """
     light = image * image + model.VEIL_BEND**2
     return image + (torch.sqrt(light + veil * (air * air - image * image)) - torch.sqrt(light))
 
 
 def _mirror_road(image: Tensor) -> Tensor:
-    """What a wet road reflects, coarsely: the picture smeared downwards."""
+    """Coarse reflection of a wet road: the picture smeared downwards."""
     height, reach = image.shape[1], model.mirror_reach(image.shape[1])
     smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate", separable=True)[0]
     shift = reach // 2
@@ -180,7 +200,7 @@ def _mirror_road(image: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _rain_streaks(height: int, width: int) -> Tensor:
-    """Rain streaks (H, W) in [0, 1]: sparse drops drawn out along a slight slant; the same for each frame size."""
+    """Rain streaks (H, W) in [0, 1]: sparse drops drawn out along a slight slant; constant per frame size."""
     generator = torch.Generator().manual_seed(20190416)
     drops = (torch.rand(height, width, generator=generator) > 0.9965).float()
     length = max(5, height // 24)
@@ -194,8 +214,7 @@ def _rain_streaks(height: int, width: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _leaf_gaps(height: int, width: int) -> Tensor:
-    """Where thin foliage opens (H, W) in [0, 1]: band-limited noise of a few pixels; the same for each frame
-    size."""
+    """Gaps (H, W) in [0, 1] of thin foliage: band-limited noise of a few pixels; constant per frame size."""
     generator = torch.Generator().manual_seed(19240901)
     noise = torch.rand(1, 1, height, width, generator=generator)
     fine = kornia.filters.gaussian_blur2d(noise, (5, 5), (1.0, 1.0), border_type="replicate")
@@ -206,18 +225,23 @@ def _leaf_gaps(height: int, width: int) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class PerturbedSun:
-    """direction (3,): unit, towards it, in camera axes; strength (): of its light, as a factor on the
-    photograph's; shade (): of the shadows that it casts, likewise. Differentiable to `Environment.light`.
-    """
+    """The sun of a perturbed scene, differentiable to `Environment.light`."""
 
     direction: Tensor
+    """(3,) unit vector towards it, camera axes."""
     strength: Tensor
+    """() Light relative to the photographed sun."""
     shade: Tensor
+    """() Strength of its shadows relative to the photographed ones."""
 
     @classmethod
     def from_environment(cls, environment: Environment, like: Tensor, sunlight: Tensor) -> PerturbedSun:
-        """Under `environment.light`, in the dtype of `like`; sunlight (): how strong the photograph's is, as
-        `Source.sunlight`. At code 0 the photograph's to the last bit, with both factors 1.
+        """The sun under `environment.light`; at code 0 exactly the photographed one, with both factors 1.
+
+        Args:
+            environment: Sun, ground and light code.
+            like: Tensor of the wanted dtype and device.
+            sunlight: () Strength of the photographed sun, as in `Source.sunlight`.
         """
         sun, up = environment.sun.to(like), environment.ground[:3].to(like)
         code = environment.light.to(like)
@@ -232,8 +256,13 @@ class PerturbedSun:
 
 
 def move_sun(sun: Tensor, up: Tensor, code: Tensor) -> Tensor:
-    """The direction (3,) towards a sun (3,) under a light code (3,): turned about `up` (3,), to the right for who
-    looks at it, and risen."""
+    """Direction (3,) towards the sun under a light code: turned about `up`, clockwise seen from above, and risen.
+
+    Args:
+        sun: (3,) unit.
+        up: (3,) unit.
+        code: (3,) light code.
+    """
     sine = (sun * up).sum()
     flat = torch.nn.functional.normalize(sun - sine * up, dim=0)
     azimuth, height = model.SUN_TURN_RAD * code[0], torch.asin(sine) + model.SUN_RISE_RAD * code[1]
@@ -242,6 +271,6 @@ def move_sun(sun: Tensor, up: Tensor, code: Tensor) -> Tensor:
 
 
 def _shadow_strength(sun: Tensor, up: Tensor, sunlight: Tensor) -> Tensor:
-    """The share of the light on the ground that a shadow takes away."""
+    """Share of the light on the ground that a shadow removes."""
     direct = sunlight * (sun * up).sum().clamp(min=0.0)
     return direct / (sum(model.AMBIENT) + direct)

@@ -1,6 +1,6 @@
-"""The fast path: what the plain torch of `reference` and `texture` does, in few passes.
+"""The fast path: what `reference` and `texture` compute in plain torch, by Warp kernels in few passes.
 
-The kernels are in `kernels.photographed_pixels`, which is imported on first use. Shapes as in `reference`.
+Kernels are imported on first use. Shapes as in `reference`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -41,27 +41,32 @@ _QUIET_S, _POLL_S = 2.0, 0.5
 
 @dataclass(frozen=True, slots=True)
 class FixedGeometry:
-    """What no parameter touches. faces, beside (F, 3) int32, see `surfaces.Surface`; base_clip (V, 3), then;
-    base (V, 3): cosine towards the camera then, paint, height; own (V, channels.OWN), with local normals, without
-    depth; texels, dark: values (S, channels.TEXEL) and (S, 4), the fourth 0, rects (N, 4), offsets (N + 1,);
-    patches (N, 3, 3) float64: from (s, t, 1) on a shadow's patch, 0 to 1 both ways, to its clip coordinates then;
-    frame_wh (N, 2) px; unproject (N, 3, 3).
-    """
+    """Input of the kernels that no parameter affects."""
 
     faces: Tensor
+    """(F, 3) int32."""
     neighbours: Tensor
+    """(F, 3) int32, see `surfaces.TemplateSurface`."""
     base_clip: Tensor
-    base: Tensor
-    own: Tensor
+    """(V, 3) photographed clip coordinates."""
+    base_attributes: Tensor
+    """(V, 3) photographed cosine towards the camera, paint share, height."""
+    template: Tensor
+    """(V, channels.OWN) template attributes with local normals and depth 0."""
     texels: tuple[Tensor, Tensor, Tensor]
-    patches: Tensor
-    dark: tuple[Tensor, Tensor, Tensor]
+    """Values (S, channels.TEXEL), rects (N, 4), offsets (N + 1,)."""
+    base_patches: Tensor
+    """(N, 3, 3) float64, from (s, t, 1) on a shadow's patch, each in [0, 1], to photographed clip coordinates."""
+    darkness: tuple[Tensor, Tensor, Tensor]
+    """Values (S, 4) of the shadows, the fourth 0, rects (N, 4), offsets (N + 1,)."""
     frame_wh: Tensor
+    """(N, 2) px."""
     unproject: Tensor
+    """(N, 3, 3), from a pixel (x, y, 1) to its ray."""
 
     @classmethod
     def from_scene(cls, prepared: PreparedScene) -> FixedGeometry:
-        """Of one scene."""
+        """The input for one scene."""
         object_surfaces, base, count = (
             prepared.object_surfaces,
             prepared.base_geometry,
@@ -74,15 +79,17 @@ class FixedGeometry:
             faces=object_surfaces.faces.to(torch.int32).contiguous(),
             neighbours=object_surfaces.neighbours.to(torch.int32).contiguous(),
             base_clip=base.clip,
-            base=torch.stack([base.facing_cos, object_surfaces.paint, prepared.vertex_height], dim=1),
-            own=prepared.completion_attributes(prepared.sharp_normals, torch.zeros_like(prepared.vertex_height)),
+            base_attributes=torch.stack([base.facing_cos, object_surfaces.paint, prepared.vertex_height], dim=1),
+            template=prepared.completion_attributes(
+                prepared.sharp_normals, torch.zeros_like(prepared.vertex_height)
+            ),
             texels=(
                 prepared.texels.values[: int(prepared.texels.offsets[count])],
                 prepared.texels.rects[:count],
                 prepared.texels.offsets[: count + 1],
             ),
-            patches=prepared.batch.patch_matrices([photographed_at(prepared.scene.objects)]),
-            dark=(
+            base_patches=prepared.batch.patch_matrices([photographed_at(prepared.scene.objects)]),
+            darkness=(
                 torch.nn.functional.pad(prepared.shadows.values, (0, 1)),
                 prepared.shadows.rects,
                 prepared.shadows.offsets,
@@ -93,21 +100,21 @@ class FixedGeometry:
 
     @classmethod
     def concat(cls, parts: Sequence[FixedGeometry]) -> FixedGeometry:
-        """Several scenes' objects, one after the other."""
+        """Several scenes' objects, concatenated."""
         if len(parts) == 1:
             return parts[0]
-        plain = ("base_clip", "base", "own", "patches", "frame_wh", "unproject")
+        plain = ("base_clip", "base_attributes", "template", "base_patches", "frame_wh", "unproject")
         return cls(
             faces=torch.cat(offset_indices([p.faces for p in parts], [p.base_clip.shape[0] for p in parts])),
             neighbours=torch.cat(offset_indices([p.neighbours for p in parts], [p.faces.shape[0] for p in parts])),
             texels=_concat_crops([p.texels for p in parts]),
-            dark=_concat_crops([p.dark for p in parts]),
+            darkness=_concat_crops([p.darkness for p in parts]),
             **{name: torch.cat([getattr(p, name) for p in parts]) for name in plain},
         )
 
 
 def _concat_crops(crops: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """Values, rectangles and offsets of several packs of crops as one."""
+    """Values, rects and offsets of several sets of crops, concatenated."""
     starts = [sum(c[0].shape[0] for c in crops[:i]) for i in range(len(crops))]
     ends = [c[2][1:] + start for c, start in zip(crops, starts, strict=True)]
     offsets = torch.cat([crops[0][2][:1], *ends])
@@ -116,63 +123,65 @@ def _concat_crops(crops: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tenso
 
 @dataclass(frozen=True, slots=True)
 class PaintCodes:
-    """Texture codes (N, 5), CIE L* (N,) of the objects' paint, and where they are paint."""
+    """Texture codes, and what they change."""
 
     values: Tensor
+    """(N, 5)."""
     lightness: Tensor
+    """(N,) CIE L* of the objects' paint."""
     regions: texture.PaintRegions
+    """Where the objects are paint."""
 
 
 def draw_photographed(
     fixed: FixedGeometry,
     drawn: VisibleSurfaces,
-    reach_px: Sequence[float],
     yaw: Tensor,
     code: PaintCodes | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; the factors
-    (Ts, 3) by which their shadows darken the ground.
+    """Draw photographed objects and their shadows.
 
-    reach_px: of each halo; code: texture codes, if there are any.
+    Args:
+        fixed: Input that no parameter affects.
+        drawn: Visible surfaces of the perturbation.
+        yaw: (N,) rad.
+        code: Texture codes; None if all are 0.
+
+    Returns:
+        Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m of all packed pixels; shadow
+        factors (Ts, 3) of the ground.
     """
     from scene_ir.render.kernels.photographed_pixels import PhotographedPixels, ShadingInputs
 
     def paint(
-        mesh: Tensor, halo: Tensor, look: Tensor, fill: Tensor, values: Tensor, table: Tensor, nearest: Tensor
+        mesh: Tensor, halo: Tensor, lookup: Tensor, fill: Tensor, values: Tensor, table: Tensor, nearest: Tensor
     ) -> tuple[Tensor, Tensor]:
         assert code is not None
         draw = table[:, 0].long()
         rows, lightness = values.index_select(0, draw), code.lightness.index_select(0, draw)
         texels, known = code.regions.texels, code.regions.known.index_select(0, draw)
-        anchor = look.index_select(0, nearest.clamp(min=0))
+        anchor = lookup.index_select(0, nearest.clamp(min=0))
 
-        def painted(rgba: Tensor, looked: Tensor, unseen: Tensor) -> Tensor:
-            paint = looked[:, channels.PAINT]
+        def painted(rgba: Tensor, lookup: Tensor, unseen: Tensor) -> Tensor:
+            paint = lookup[:, channels.PAINT]
             if texels.values.numel():
-                uv = table[:, 1:3].to(looked) + looked[:, : channels.W_THEN]
-                found = verbs.texture_packed(
+                uv = table[:, 1:3].to(lookup) + lookup[:, : channels.W_THEN]
+                region = verbs.texture_packed(
                     texels.values, texels.rects, texels.offsets, drawn.mesh.layout, uv, "warp", "zero"
                 )
-                paint = texture.paint_share(paint, found[:, 0], unseen, known)
+                paint = texture.paint_share(paint, region[:, 0], unseen, known)
             colour = texture.apply_texture_code(
-                rgba[:, :3], rgba[:, 3], rows, paint, looked[:, channels.HEIGHT], lightness, "warp"
+                rgba[:, :3], rgba[:, 3], rows, paint, lookup[:, channels.HEIGHT], lightness, "warp"
             )
             return torch.cat([colour, rgba[:, 3:]], dim=1)
 
-        return painted(mesh, look, fill), painted(halo, anchor, torch.zeros_like(fill))
+        return painted(mesh, lookup, fill), painted(halo, anchor, torch.zeros_like(fill))
 
     geometry = drawn.geometry
     assert geometry.pixel_to_patch is not None
     assert geometry.lights is not None
-    then = fixed.patches @ geometry.pixel_to_patch
-    inputs = ShadingInputs(
-        fragments=drawn.mesh,
-        ground=drawn.patch_layout,
-        inside=geometry.pixel_to_patch.detach(),
-        reach_px=reach_px,
-        painter=paint if code is not None else None,
-        **{f.name: getattr(fixed, f.name) for f in fields(fixed) if f.name != "patches"},
-    )
+    then = fixed.base_patches @ geometry.pixel_to_patch
+    inputs = ShadingInputs(fixed, drawn, paint if code is not None else None)
     codes = code.values if code is not None else yaw.new_zeros(0)
     return PhotographedPixels.apply(
         geometry.clip,

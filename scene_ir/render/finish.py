@@ -1,8 +1,8 @@
-"""The finish of a vehicle beside its template's: what the photograph shows of the surface, carried on to the rest.
+"""Finish of a vehicle: the photograph's colours relative to the template's, extended to what was never seen.
 
-Where a template has to stand for what was never seen, its colours in daylight are multiplied by a *gain* a vertex:
-photograph over template, as seen nearby on the same part, fading into the part's own mean. So the template goes on
-where the photograph ends, in the vehicle's own paint, glass and rubber, and in the photograph's own light.
+Where a template stands for unseen surface, its colours in daylight are multiplied by a *gain* per vertex:
+photograph over template, as seen nearby on the same part, fading into the part's mean. So the template continues
+the photograph in the vehicle's own paint, glass and rubber, and in the photograph's light.
 
 Shapes: K samples, pixels that show the surface; V vertices of one object.
 """
@@ -28,54 +28,61 @@ from scene_ir.types import Part
 Array = NDArray[np.float64]
 
 _MIN_GAIN = 0.03
-"""Of any part, by night."""
+"""Of any part, at night."""
 _MAX_GAIN = (3.0, 1.4)
-"""Of paint, whose colour is the vehicle's own, and of all else, whose colour the template knows but for the
-light."""
+"""Of paint, with a colour of its own, and of the rest, where the template knows the colour but not the light."""
 _DARK_SHARE = 0.05
-"""Share of a vehicle that is as dark as its darkest parts: tyres, grilles and gaps are on all sides."""
+"""Share of a vehicle as dark as its darkest parts: tyres, grilles and gaps are on all sides."""
 _MAX_LIFT = 0.25
 _STRENGTHS = np.linspace(0.0, 2.4, 13)
-"""Of the sun; with the largest, a side that faces it gets six times the light of one that does not."""
+"""Candidate strengths of the sun; at the largest, a side that faces it gets six times the light of one that does
+not.
+"""
 _PAINT_SAMPLES, _PAINT_SCATTER, _STRENGTH_SCATTER = 10.0, 0.25, 0.3
-"""Independent samples that a car's paint is worth, their scatter about one colour (logarithm), and that of the
-expected strength."""
+"""Independent samples that a car's paint is worth, their scatter about one colour (logarithm), and the scatter of
+the expected strength.
+"""
 _EXPECTED_STRENGTH, _PRIOR_WEIGHT = 0.3, 0.02
-"""Sunlight to expect where nothing tells, between an overcast sky's and a clear one's; weight of that."""
+"""Prior strength, between an overcast sky's and a clear one's; weight of the prior."""
 _MIN_EXPOSURE_PX = 50
-"""Pixels that tell how a frame is exposed."""
+"""Least pixels that determine the exposure of a frame."""
 _HALF_EVIDENCE_PX, _MAX_COST = 200.0, 20.0
-"""Samples of paint at which a vehicle counts half; how much one vehicle's disagreement may cost."""
+"""Paint samples at which a vehicle counts half; largest cost of one vehicle's disagreement."""
 _DARKEST, _BRIGHTEST = 0.02, 0.97
-"""Display values beyond which a template's or a photograph's colour says nothing of their ratio."""
+"""Display values beyond which the ratio of template and photograph is meaningless."""
 _PRIOR_PULL = 0.02
-"""Pull of a part's mean, beside a bond of 1 between neighbours: it is felt from about seven vertices on."""
+"""Pull of a part's mean, relative to a bond of 1 between neighbours: noticeable from about seven vertices on."""
 _MAX_VERTEX_SAMPLES = 4.0
 """Samples of a vertex beyond which more add no weight: large panels would not bend at all."""
 _TWIN_BOND = 0.3
 """Bond of a vertex to its twin on the other side: cars are symmetric, their light is not."""
 _MIN_SAMPLES = 4.0
-"""Samples below which a part's mean is taken from all that is no paint, and the paint's from all of the car."""
+"""Samples below which a part's mean comes from everything except paint, and the paint's from the whole car."""
 
 
 @dataclass(frozen=True, slots=True)
 class FinishSamples:
-    """What the photograph shows of one object. vertex (K, 3) int64, the corners of the triangle at each pixel, and
-    share (K, 3), how near it is to them; template, photograph (K, 3) RGB; sky, direct (K,): light on it by
-    `texture.daylight` without a sun, and what a sun of strength 1 adds; weight (K,) in [0, 1]."""
+    """Samples of one object's photographed surface."""
 
     vertex: NDArray[np.int64]
+    """(K, 3) int64, corners of the triangle at each pixel."""
     share: Array
+    """(K, 3) weights of the corners."""
     template: Array
+    """(K, 3) RGB of the template in daylight."""
     photograph: Array
+    """(K, 3) RGB."""
     sky: Array
+    """(K,) light without sun, see `texture.daylight`."""
     direct: Array
+    """(K,) light that a sun of strength 1 adds."""
     weight: Array
+    """(K,) in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True)
 class _VertexGraph:
-    """A surface's vertices as nodes, one for each place and part. node (V,); part (M,); bonds: their Laplacian."""
+    """A surface's vertices as nodes, one per place and part. node (V,); part (M,); bonds: their Laplacian."""
 
     node: NDArray[np.int64]
     part: NDArray[np.int64]
@@ -83,7 +90,7 @@ class _VertexGraph:
 
 
 def estimate_paint(surface: TemplateSurface, samples: FinishSamples) -> Tensor | None:
-    """The paint (3,) RGB as the photograph shows it most: the median in CIE L*a*b*; None where it shows none."""
+    """Most common photographed paint (3,) RGB: the median in CIE L*a*b*; None where no paint is visible."""
     part = surface.part.cpu().numpy()
     clear = (part[samples.vertex] == Part.PAINT).all(axis=1) & (samples.weight > 0.5)
     if np.count_nonzero(clear) < _MIN_SAMPLES:
@@ -95,11 +102,15 @@ def estimate_paint(surface: TemplateSurface, samples: FinishSamples) -> Tensor |
 def estimate_sunlight(
     seen: Sequence[tuple[TemplateSurface, FinishSamples]], expected: Sequence[float | None]
 ) -> float:
-    """How strongly the sun lights a frame's vehicles, as `texture.shade_template` counts it: the strength for which sides
-    of a vehicle that face it and others are of one colour, for most vehicles, not far from what is expected.
+    """Strength of the sun on a frame's vehicles, as `texture.shade_template` counts it.
 
-    seen: the vehicles; expected: of each, by its shadow, None where it has none. A vehicle counts by how much of
-    its paint is seen, and one that disagrees with the rest, in the shade of a tree, by no more than `_MAX_COST`.
+    The strength at which the sides of a vehicle that face the sun and the others have one colour, for most
+    vehicles, close to the expected strength. A vehicle counts by its visible paint, and one that disagrees with
+    the rest, in the shade of a tree, by at most `_MAX_COST`.
+
+    Args:
+        seen: Surfaces and samples of the vehicles.
+        expected: Strength by each vehicle's shadow; None without one.
     """
     cost = _PRIOR_WEIGHT * np.square((_STRENGTHS - _EXPECTED_STRENGTH) / _STRENGTH_SCATTER)
     for (surface, samples), strength in zip(seen, expected, strict=True):
@@ -120,8 +131,8 @@ def estimate_sunlight(
 
 
 def estimate_exposure(surface: TemplateSurface, samples: FinishSamples) -> tuple[float, float] | None:
-    """Gain and lift of `texture.apply_finish` for another vehicle in the same light: the median over what is not
-    paint, whose colour templates know; None where too little of it is seen.
+    """Gain and lift of `texture.apply_finish` for another vehicle in the same light: the median over everything
+    except paint; None where too little is visible.
     """
     known = (surface.part.cpu().numpy()[samples.vertex[:, 0]] != Part.PAINT) & (samples.weight > 0.5)
     if np.count_nonzero(known) < _MIN_EXPOSURE_PX:
@@ -133,9 +144,9 @@ def estimate_exposure(surface: TemplateSurface, samples: FinishSamples) -> tuple
 
 
 def fit_finish(surface: TemplateSurface, samples: FinishSamples) -> Array:
-    """For each vertex (V, 4) the gains (3) and the lift of `texture.apply_finish`.
+    """Gains (3) and lift of `texture.apply_finish` for each vertex, (V, 4).
 
-    The lift is how bright the vehicle's darkest parts are, by haze and by what they mirror; paint has none.
+    The lift is the brightness of the vehicle's darkest parts, by haze and mirrored light; paint has none.
     """
     web = _build_graph(surface.weld, surface.faces, surface.part, surface.unit)
     count = len(web.part)
@@ -163,17 +174,17 @@ def fit_finish(surface: TemplateSurface, samples: FinishSamples) -> Array:
 
 
 def _sum_at_nodes(node: NDArray[np.int64], values: Array, count: int) -> Array:
-    """The sum of values (L,) at each of `count` nodes (L,)."""
+    """Sum of values (L,) at each of `count` nodes (L,)."""
     return np.bincount(node, values, count).astype(np.float64)
 
 
 def display_to_light(display: Array) -> Array:
-    """The light that `texture.apply_finish` shows as these display values."""
+    """Light that `texture.apply_finish` shows as these display values."""
     return -np.log(1.0 - np.clip(display, _DARKEST / 2, _BRIGHTEST))
 
 
 def _estimate_lift(surface: TemplateSurface, samples: FinishSamples) -> float:
-    """How much brighter the darkest of the vehicle, paint apart, is than its template's darkest."""
+    """Brightness of the vehicle's darkest parts, paint excluded, above its template's darkest."""
     part = surface.part.cpu().numpy()[samples.vertex[:, 0]]
     clear = (samples.weight > 0.5) & (part != Part.PAINT)
     if np.count_nonzero(clear) < _MIN_SAMPLES:
@@ -183,8 +194,7 @@ def _estimate_lift(surface: TemplateSurface, samples: FinishSamples) -> float:
 
 
 def _prior_gains(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
-    """The logarithm (M, 3) of the gain that nodes of a part have by the median; of other parts' where it is
-    unseen."""
+    """Logarithm (M, 3) of the median gain of each node's part; of other parts where it is unseen."""
     out = np.zeros((len(part), 3))
     rest = _weighted_median(mean, total * (part != Part.PAINT))
     for kind in np.unique(part):
@@ -201,7 +211,7 @@ def _prior_gains(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
 
 
 def _weighted_median(values: Array, weight: Array) -> Array:
-    """The weighted median (3,) of values (M, 3); 0 where there is no weight."""
+    """Weighted median (3,) of values (M, 3); 0 without weight."""
     if weight.sum() < _MIN_SAMPLES:
         return np.zeros(3)
     order = np.argsort(values, axis=0, kind="stable")

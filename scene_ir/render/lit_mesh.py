@@ -1,8 +1,7 @@
-"""A mesh with materials under a point light and an environment, without a photograph: pixels that are
-differentiable to its vertices, and through them to its pose, and to the lights.
+"""A mesh with materials under a point light and an environment: pixels differentiable to its vertices and lights.
 
-Everything is in camera space (x right, y down, z forward). Visibility and outlines are those of `scene_ir.raster`,
-by either of its backends; what is done here with its pixels is plain torch for both.
+Camera space (x right, y down, z forward). Visibility and outlines come from `scene_ir.raster`, with either
+backend; the rest is plain torch.
 """
 
 from __future__ import annotations
@@ -24,54 +23,62 @@ from scene_ir.render.pixel_samples import GRID_SCALE, PixelSamples, SampleOffset
 from scene_ir.types import Camera, check_finite, check_shape
 
 GAMMA = 1 / 2.2
-"""Exponent from linear light to picture values."""
+"""Exponent from linear light to display values."""
 _DARKEST = 1e-4
-"""Of linear light: gamma has a slope there."""
+"""Least linear light, where gamma still has a slope."""
 _CREASE_COS = 0.766
-"""Cosine of 40 degrees: faces of one corner that meet at less are shaded as one smooth surface."""
+"""Cosine of 40 degrees: faces at one corner whose normals diverge by less are shaded as one smooth surface."""
 UPWARD_SHARE = 0.4
-"""How much more of the environment's light comes from above than from below, either way from the mean."""
+"""Environment light from above minus its mean, relative; from below, the reverse."""
 MIRRORED_SHARE = 0.2
-"""Share of the environment's light that a glossy surface mirrors, where the lamp's counts in full."""
+"""Share of the environment's light that a glossy surface mirrors; the lamp's counts in full."""
 SAMPLES_PER_SIDE = 2
-"""A pixel is looked at so many times along each side."""
+"""Samples along each side of a pixel."""
 _TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class Materials:
-    """One material a face: diffuse (F, 3) linear RGB and specular (F,), in [0, 1]; shininess (F,), Phong's."""
+    """One material per face."""
 
     diffuse: Tensor
+    """(F, 3) linear RGB in [0, 1]."""
     specular: Tensor
+    """(F,) in [0, 1]."""
     shininess: Tensor
+    """(F,) Phong exponent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lights:
-    """point: (3,), where a white lamp is; strength: (), what it gives a surface that faces it at distance `reach`,
-    falling with the square of the distance; environment: (), what comes from all around.
-    """
+    """A white point light and an environment."""
 
     point: Tensor
+    """(3,) m, position of the point light."""
     strength: Tensor
+    """() Light on a surface that faces it at distance `reach`; falls with the squared distance."""
     environment: Tensor
+    """() Light from all around."""
     reach: float = 2.0
+    """Reference distance, m."""
 
 
 @dataclass(frozen=True)
 class LitMesh:
-    """A mesh to be drawn again and again: faces (F, 3) int64, and which faces each corner's normal is averaged
-    over, told from `vertices` (V, 3) as they are at rest. Raises ShapeError, and RangeError for what is not
-    finite.
-    """
+    """A mesh to render repeatedly. Raises ShapeError, and RangeError for values that are not finite."""
 
     vertices: Tensor
+    """(V, 3) at rest; determines which corners are smooth."""
     faces: Tensor
+    """(F, 3) int64."""
     materials: Materials
+    """Material of each face."""
     edges: MeshEdges = field(init=False)
+    """Adjacency of the faces."""
     _corner: Tensor = field(init=False)
+    """(Q,) int64, corner 3 * face + place of each pair of corner and averaged face."""
     _face: Tensor = field(init=False)
+    """(Q,) int64, face of each pair."""
 
     def __post_init__(self) -> None:
         check_shape("lit.vertices", self.vertices, None, 3)
@@ -92,14 +99,21 @@ class LitMesh:
         camera: Camera,
         lights: Lights,
         backend: verbs.Backend = "warp",
-        looks: int = SAMPLES_PER_SIDE,
+        samples_per_side: int = SAMPLES_PER_SIDE,
     ) -> Tensor:
-        """The mesh with its vertices (V, 3) moved into camera space: (4, H, W), RGB after gamma and coverage, both
-        of looks x looks a pixel. RGB is that of what covers; elsewhere it is 0.
+        """Render the mesh: (4, H, W), RGB after gamma and coverage, averaged over the samples of a pixel.
 
-        Differentiable to vertices and lights, at outlines and at borders between faces too.
+        RGB is that of the covering surface, 0 elsewhere. Differentiable to vertices and lights, also at outlines
+        and at borders between faces.
+
+        Args:
+            vertices: (V, 3) in camera space.
+            camera: The camera.
+            lights: The lights.
+            backend: Implementation.
+            samples_per_side: Samples along each side of a pixel.
         """
-        part, x, y = self.render_part(vertices, camera, lights, backend, looks)
+        part, x, y = self.render_part(vertices, camera, lights, backend, samples_per_side)
         height, width = part.shape[1:]
         return torch.nn.functional.pad(part, (x, camera.width - x - width, y, camera.height - y - height))
 
@@ -109,37 +123,45 @@ class LitMesh:
         camera: Camera,
         lights: Lights,
         backend: verbs.Backend = "warp",
-        looks: int = SAMPLES_PER_SIDE,
+        samples_per_side: int = SAMPLES_PER_SIDE,
     ) -> tuple[Tensor, int, int]:
-        """The part (4, h, w) of `render` that the mesh is in, and the column and row at which that begins."""
-        clip = to_clip(vertices, _scale_camera(camera.matrix.to(vertices), looks))
-        height, width = looks * camera.height, looks * camera.width
+        """The part (4, h, w) of `render` that holds the mesh, and its first column and row.
+
+        Args:
+            vertices, camera, lights, backend, samples_per_side: As for `render`.
+        """
+        clip = to_clip(vertices, _scale_camera(camera.matrix.to(vertices), samples_per_side))
+        height, width = samples_per_side * camera.height, samples_per_side * camera.width
         rects = verbs.bounding_rects(clip, torch.tensor([[0, len(vertices)]]), height, width)
-        rects = torch.cat([rects[:, :2] // looks, -(-rects[:, 2:] // looks)], dim=1)
+        rects = torch.cat([rects[:, :2] // samples_per_side, -(-rects[:, 2:] // samples_per_side)], dim=1)
         x0, y0, x1, y1 = rects[0].tolist()
         if x1 <= x0 or y1 <= y0:
             return vertices.new_zeros(4, 0, 0), 0, 0
         fragments = verbs.rasterize(
-            clip, self.faces, torch.tensor([[0, len(self.faces)]]), PixelLayout.from_rects(looks * rects), backend
+            clip,
+            self.faces,
+            torch.tensor([[0, len(self.faces)]]),
+            PixelLayout.from_rects(samples_per_side * rects),
+            backend,
         )
         coverage = verbs.antialias(fragments, clip, self.faces, backend)
-        seen = PixelSamples.from_fragments(fragments, looks)
-        blend = _ShadedSamples.from_samples(self, seen, clip, coverage, backend)
+        samples = PixelSamples.from_fragments(fragments, samples_per_side)
+        blend = _ShadedSamples.from_samples(self, samples, clip, coverage, backend)
         colour = self._colours(blend.face, blend.at, clip, vertices, lights, backend)
-        own = seen.pixel, colour[: len(seen.face)] * seen.share[:, None].to(colour)
-        amounts = [own, *blend.strip_changes(seen, colour)]
+        own = samples.pixel, colour[: len(samples.face)] * samples.share[:, None].to(colour)
+        amounts = [own, *blend.strip_changes(samples, colour)]
         total = colour.new_zeros((y1 - y0) * (x1 - x0), 3)
         # All in one go: a sum out of place copies the whole picture.
         total.index_add_(0, *(torch.cat(parts) for parts in zip(*amounts, strict=True)))
-        cover = coverage.reshape(y1 - y0, looks, x1 - x0, looks)
-        cover = reduce(torch.add, reduce(torch.add, cover.unbind(1)).unbind(2)) / looks**2
+        cover = coverage.reshape(y1 - y0, samples_per_side, x1 - x0, samples_per_side)
+        cover = reduce(torch.add, reduce(torch.add, cover.unbind(1)).unbind(2)) / samples_per_side**2
         rgb = _Transpose.apply(total).reshape(3, y1 - y0, x1 - x0) / torch.where(cover > 0, cover, 1.0)
         return torch.cat([rgb, cover[None]]), x0, y0
 
     def _colours(
         self, face: Tensor, at: Tensor, clip: Tensor, vertices: Tensor, lights: Lights, backend: verbs.Backend
     ) -> Tensor:
-        """(S, 3) after gamma of faces (S,) at (S, 2) px."""
+        """Colours (S, 3) after gamma of faces (S,) at (S, 2) px."""
         corners, normals, _ = self.corners(vertices)
         attributes = torch.cat([corners.reshape(-1, 3), normals], dim=1)
         flat = torch.arange(3 * len(self.faces)).reshape(-1, 3)
@@ -159,8 +181,8 @@ class LitMesh:
         return (GAMMA * clamp_inclusive(light, _DARKEST, 1).log()).exp()  # `**` takes almost twice as long
 
     def corners(self, vertices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of vertices (V, 3) in camera space each face's corners (F, 3, 3); their unit normals (3F, 3), towards
-        the side that is seen; and which faces (F,) look away, by their winding.
+        """Corners (F, 3, 3) of the faces, their unit normals (3F, 3) towards the visible side, and which faces
+        (F,) look away by their winding. vertices: (V, 3) in camera space.
         """
         corners = vertices.index_select(0, self.faces.reshape(-1)).reshape(-1, 3, 3)
         across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -174,11 +196,15 @@ class LitMesh:
 def shade_phong(
     point: Tensor, normal: Tensor, diffuse: Tensor, specular: Tensor, shininess: Tensor, lights: Lights
 ) -> Tensor:
-    """Linear RGB (P, 3) of points (P, 3) in camera space with normals (P, 3): Lambert's and Phong's terms of the
-    lamp, and the environment's light, of which more comes from above.
+    """Linear RGB (P, 3) by Lambert's and Phong's terms of the lamp and the environment's light.
 
-    diffuse (P, 3), specular (P,), shininess (P,). Source: Phong 1975, "Illumination for computer generated
-    pictures".
+    Source: Phong 1975, "Illumination for computer generated pictures".
+
+    Args:
+        point, normal: (P, 3) in camera space.
+        diffuse: (P, 3).
+        specular, shininess: (P,).
+        lights: The lights.
     """
     point, normal, diffuse = (vectors.T.contiguous() for vectors in (point, normal, diffuse))
     normal = normal / _length(normal)
@@ -197,8 +223,8 @@ def shade_phong(
 
 
 class _Transpose(torch.autograd.Function):
-    """Vectors (P, 3) as (3, P), or back. Sums over the three, and products with a number each, take a fraction of
-    the time where each coordinate lies in one piece; so do their gradients, which this keeps in that order.
+    """Vectors (P, 3) as (3, P), or back. Sums over the three, and products with a number each, are several times
+    faster where each coordinate is contiguous; so are their gradients.
     """
 
     @staticmethod
@@ -211,12 +237,12 @@ class _Transpose(torch.autograd.Function):
 
 
 def composite_over(drawn: Tensor, background: Tensor) -> Tensor:
-    """What `LitMesh.render` drew (4, H, W) before a background (3, H, W); differentiable to both."""
+    """A result of `LitMesh.render` (4, H, W) over a background (3, H, W); differentiable to both."""
     return _CompositeOver.apply(drawn, background)
 
 
 class _CompositeOver(torch.autograd.Function):
-    """`composite_over`. torch's own gradient of it sums whole pictures up, which takes longer than any other part of one."""
+    """`composite_over`; torch's own gradient sums whole pictures, which takes longer than the rest."""
 
     @staticmethod
     def forward(ctx: Any, drawn: Tensor, background: Tensor) -> Tensor:
@@ -235,7 +261,7 @@ class _CompositeOver(torch.autograd.Function):
 
 
 def _smoothing_pairs(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Pairs (Q,), (Q,) int64: a corner (3 * face + place) and a face that its normal is averaged over."""
+    """Pairs (Q,), (Q,) int64: a corner (3 * face + place) and a face over which its normal is averaged."""
     welded = weld_vertices(vertices)[faces].reshape(-1)  # (3F,)
     order = torch.argsort(welded, stable=True)
     counts = torch.bincount(welded)
@@ -252,7 +278,9 @@ def _smoothing_pairs(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """(P,) of vectors (3, P), no less than _TINY. `vector_norm` along the first axis takes eight times as long."""
+    """Lengths (P,) of vectors (3, P), at least _TINY. `vector_norm` along the first axis takes eight times as
+    long.
+    """
     return ((vectors * vectors).sum(dim=0) + _TINY**2).sqrt()
 
 
@@ -260,14 +288,14 @@ def _unit(vectors: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vectors, dim=-1, eps=_TINY)
 
 
-def _scale_camera(matrix: Tensor, looks: int) -> Tensor:
-    """A camera's matrix (3, 4), of pictures of `looks` x `looks` pixels where it has one."""
-    finer = looks * matrix[:2] + (looks - 1) / 2 * matrix[2]
+def _scale_camera(matrix: Tensor, samples_per_side: int) -> Tensor:
+    """A camera's matrix (3, 4) for pictures of samples instead of pixels."""
+    finer = samples_per_side * matrix[:2] + (samples_per_side - 1) / 2 * matrix[2]
     return torch.cat([finer, matrix[2:]])
 
 
 def _edge_on_faces(clip: Tensor, faces: Tensor) -> Tensor:
-    """Which faces (F,) are too thin in the picture to interpolate on: they have no place on the grid of sights."""
+    """Faces (F,) too thin in the picture to interpolate on: they have no point on the grid of groups."""
     corners = (clip[:, :2] / clip[:, 2:]).index_select(0, faces.reshape(-1)).reshape(-1, 3, 2)
     sides = corners - corners.roll(1, dims=1)
     double = (sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).abs()
@@ -276,18 +304,20 @@ def _edge_on_faces(clip: Tensor, faces: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class _SampleStrip:
-    """Parts of looks (P,) that are of another colour than a look: amount (P,), of a look, differentiable, of the
-    first sights (P,), and less of the second ones, where there are any.
+    """Parts of samples (P,) with another colour: amount (P,) of a sample, differentiable, added of the first
+    groups (P,) and removed of the second ones, if any.
     """
 
-    look: Tensor
+    sample: Tensor
     amount: Tensor
-    sights: tuple[Tensor, ...]
+    groups: tuple[Tensor, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class _ShadedSamples:
-    """What is to be shaded, face (S,) and place (S, 2), looks' sights first, and how it makes pixels."""
+    """What to shade, face (S,) and position (S, 2), the samples' groups first, and the strips that complete the
+    pixels.
+    """
 
     face: Tensor
     at: Tensor
@@ -295,71 +325,73 @@ class _ShadedSamples:
 
     @classmethod
     def from_samples(
-        cls, mesh: LitMesh, seen: PixelSamples, clip: Tensor, coverage: Tensor, backend: verbs.Backend
+        cls, mesh: LitMesh, samples: PixelSamples, clip: Tensor, coverage: Tensor, backend: verbs.Backend
     ) -> _ShadedSamples:
-        """coverage (T,): of looks."""
-        inner, outer = seen.offsets_at_borders(mesh.edges)
+        """Find the borders and outlines between samples. coverage: (T,) of the samples."""
+        inner, outer = samples.offsets_at_borders(mesh.edges)
         edge_on = _edge_on_faces(clip.detach(), mesh.faces)
-        faces, places = [seen.face], [seen.at]
+        faces, places = [samples.face], [samples.at]
 
-        def numbers(sight: VisibleFace, ways: SampleOffsets, way: Tensor) -> Tensor:
+        def numbers(visible: VisibleFace, offsets: SampleOffsets, path: Tensor) -> Tensor:
             """Of what is seen on ways (B,): of the look that sees it, or where none does of a place of its own."""
-            here, there = ways.here.index_select(0, way), ways.there.index_select(0, way)
-            is_there = (sight.face == seen.face_at(there)) | (edge_on[sight.face] & (sight.share > 0.5))
-            is_there &= seen.face_at(there) >= 0
-            is_here = ~is_there & ((sight.face == seen.face_at(here)) | edge_on[sight.face])
+            here, there = offsets.here.index_select(0, path), offsets.there.index_select(0, path)
+            is_there = (visible.face == samples.face_at(there)) | (edge_on[visible.face] & (visible.share > 0.5))
+            is_there &= samples.face_at(there) >= 0
+            is_here = ~is_there & ((visible.face == samples.face_at(here)) | edge_on[visible.face])
             new = (~is_here & ~is_there).nonzero()[:, 0]
-            number = seen.sight.index_select(0, torch.where(is_there, there, here))
+            number = samples.group.index_select(0, torch.where(is_there, there, here))
             number = number.index_put((new,), sum(map(len, faces)) + torch.arange(len(new)))
-            faces.append(sight.face[new])
-            places.append(ways.start[way[new], :2] + sight.share[new, None] * ways.step[way[new], :2])
+            faces.append(visible.face[new])
+            places.append(offsets.start[path[new], :2] + visible.share[new, None] * offsets.step[path[new], :2])
             return number
 
-        ends = seen.face_at(inner.here), seen.face_at(inner.there)
+        ends = samples.face_at(inner.here), samples.face_at(inner.there)
         between = find_borders(clip, mesh.faces, mesh.edges, ends, inner.start, inner.step, backend)
-        alone = seen.face_at(outer.here)
+        alone = samples.face_at(outer.here)
         rim = find_rims(clip, mesh.faces, mesh.edges, alone, outer.start, outer.step, backend)
         # PixelSamples that an outline cuts beside or below: of them less is seen of the borders along the other axis.
         cut = [torch.zeros_like(coverage, dtype=torch.bool) for _ in range(2)]
         for axis, along in enumerate((~outer.down, outer.down)):
             cut[axis][outer.here[rim.across & along]] = True
-        way, share = between.way, torch.where(between.across, between.share, 0.5)
-        before, after = (numbers(sight, inner, way) for sight in (between.before, between.after))
-        part = ((seen.fragments.face >= 0) & (coverage.detach() < 1)).nonzero()[:, 0]
+        path, share = between.path, torch.where(between.across, between.share, 0.5)
+        before, after = (numbers(visible, inner, path) for visible in (between.before, between.after))
+        part = ((samples.fragments.face >= 0) & (coverage.detach() < 1)).nonzero()[:, 0]
         # What meets nothing goes on with the colour from which its outline is reached, rather across it.
         order = torch.arange(len(outer.there)) + len(outer.there) * ~rim.across
         ends, which = torch.unique(outer.there, return_inverse=True)
         first = order.new_full((len(ends),), 2 * len(order)).scatter_reduce(0, which, order, "amin")
         source = (first[which] == order) & (coverage.detach()[outer.there] > 0)
-        here, there, beyond = inner.here[way], inner.there[way], outer.there[source]
+        here, there, beyond = inner.here[path], inner.there[path], outer.there[source]
         here_covers, there_covers, part_covers, beyond_covers = _gather_all(coverage, (here, there, part, beyond))
         strips = []
         # Of a border along the way, the looks to its sides are the ones that share it.
-        for look, covers, amount, more, less in (
+        for sample, covers, amount, more, less in (
             (here, here_covers, 0.5 - share, after, before),
             (there, there_covers, share - 0.5, before, after),
         ):
-            aside = torch.where(inner.down[way], cut[0][look], cut[1][look])
-            strips.append(_SampleStrip(look, amount.clamp_min(0) * torch.where(aside, covers, 1.0), (more, less)))
-        strips.append(_SampleStrip(part, part_covers - 1, (seen.sight[part],)))
-        strips.append(_SampleStrip(beyond, beyond_covers, (seen.sight[outer.here[source]],)))
-        way, share, end = rim.inner.way, rim.inner.share, rim.end
-        before, after = (numbers(sight, outer, way) for sight in (rim.inner.before, rim.inner.after))
-        for look, amount, shown in (
-            (outer.here[way], end.clamp_max(0.5) - share, rim.inner.across),
-            (outer.there[way], end - share.clamp_min(0.5), rim.inner.across & source[way]),
+            aside = torch.where(inner.down[path], cut[0][sample], cut[1][sample])
+            strips.append(
+                _SampleStrip(sample, amount.clamp_min(0) * torch.where(aside, covers, 1.0), (more, less))
+            )
+        strips.append(_SampleStrip(part, part_covers - 1, (samples.group[part],)))
+        strips.append(_SampleStrip(beyond, beyond_covers, (samples.group[outer.here[source]],)))
+        path, share, end = rim.inner.path, rim.inner.share, rim.end
+        before, after = (numbers(visible, outer, path) for visible in (rim.inner.before, rim.inner.after))
+        for sample, amount, counts in (
+            (outer.here[path], end.clamp_max(0.5) - share, rim.inner.across),
+            (outer.there[path], end - share.clamp_min(0.5), rim.inner.across & source[path]),
         ):
-            strips.append(_SampleStrip(look, torch.where(shown, amount.clamp_min(0), 0.0), (after, before)))
+            strips.append(_SampleStrip(sample, torch.where(counts, amount.clamp_min(0), 0.0), (after, before)))
         return cls(torch.cat(faces), torch.cat(places), strips)
 
-    def strip_changes(self, seen: PixelSamples, colour: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Pixels (P,), and what each gets more of (P, 3), by strip; colour (S, 3): of sights."""
-        picked = iter(_gather_all(colour, [sight for strip in self.strips for sight in strip.sights]))
+    def strip_changes(self, samples: PixelSamples, colour: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Pixels (P,) and their changes (P, 3), strip by strip; colour: (S, 3) of the groups."""
+        gathered = iter(_gather_all(colour, [group for strip in self.strips for group in strip.groups]))
         for strip in self.strips:
-            change = reduce(torch.sub, islice(picked, len(strip.sights)))
-            yield seen.pixel_of(strip.look), (strip.amount.to(colour) / seen.count**2)[:, None] * change
+            change = reduce(torch.sub, islice(gathered, len(strip.groups)))
+            yield samples.pixel_of(strip.sample), (strip.amount.to(colour) / samples.count**2)[:, None] * change
 
 
 def _gather_all(values: Tensor, places: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Of values (N, ...) those at places (P,), for each. In one go: each gradient fills an array (N, ...)."""
+    """Values (N, ...) at several sets of places (P,), at once: each gradient fills an array (N, ...)."""
     return values.index_select(0, torch.cat(list(places))).split([len(one) for one in places])

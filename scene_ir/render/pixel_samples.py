@@ -1,4 +1,4 @@
-"""Pixels of several looks each: which faces a pixel sees, and by how much of it."""
+"""Several samples per pixel, grouped by the face they hit."""
 
 from __future__ import annotations
 
@@ -12,87 +12,96 @@ from scene_ir.raster.layout import Fragments
 from scene_ir.render.borders import MeshEdges
 
 GRID_SCALE = 256
-"""Sights lie on a grid so much finer than that of looks."""
+"""Resolution of the groups' centres, relative to the grid of samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class PixelSamples:
-    """What `rasterize` found in one draw, count x count looks a pixel. A sight is a face in a pixel: face, pixel
-    (S,) int64, the pixel counted row by row; share (S,): of the pixel's looks that meet it; at (S, 2): its middle,
-    (x, y) in looks. sight (T,) int64: of each look, where it meets a face.
+    """Result of `rasterize` for one draw with count x count samples per pixel; samples of one pixel that hit one
+    face form a group (S).
     """
 
     fragments: Fragments
+    """Faces at the samples (T)."""
     count: int
+    """Samples along each side of a pixel."""
     face: Tensor
+    """(S,) int64, face of each group."""
     pixel: Tensor
+    """(S,) int64, pixel of each group, row-major in the draw."""
     share: Tensor
+    """(S,) share of the pixel's samples in the group."""
     at: Tensor
-    sight: Tensor
+    """(S, 2) centre of the group, (x, y) in samples."""
+    group: Tensor
+    """(T,) int64, group of each sample that hits a face."""
 
     @classmethod
     def from_fragments(cls, fragments: Fragments, count: int) -> PixelSamples:
-        """Of a draw whose rectangle begins and ends with pixels."""
+        """Group the samples of a draw; its rectangle starts and ends at pixel borders."""
         x0, y0, x1, y1 = fragments.layout.rects[0].tolist()
-        wide, rows, columns = x1 - x0, (y1 - y0) // count, (x1 - x0) // count
+        row_length, rows, columns = x1 - x0, (y1 - y0) // count, (x1 - x0) // count
         face = fragments.face.reshape(rows, count, columns, count)
         low, high = (reduce(of, reduce(of, face.unbind(1)).unbind(2)) for of in (torch.minimum, torch.maximum))
         low, same = low.reshape(-1), (low == high).reshape(-1)
         row, column = (same & (low >= 0)).reshape(rows, columns).nonzero().unbind(1)
         whole = row * columns + column
         numbers = torch.zeros_like(low, dtype=torch.int64).index_put((whole,), torch.arange(len(whole)))
-        sight = numbers.reshape(rows, 1, columns, 1).expand(rows, count, columns, count).reshape(-1)
+        group = numbers.reshape(rows, 1, columns, 1).expand(rows, count, columns, count).reshape(-1)
         corner = torch.tensor([x0, y0])
         middle = torch.stack([column, row], dim=1) * count + corner + (count - 1) / 2
-        # Of pixels that see several faces, or none in part, looks in the order of their faces.
+        # Of pixels that see several faces, or none in part, samples in the order of their faces.
         mixed = (~same).nonzero()[:, 0]
         step = torch.arange(count)
-        first = mixed // columns * count * wide + mixed % columns * count
-        looks = first[:, None] + (step[:, None] * wide + step).reshape(-1)
-        seen, order = fragments.face.index_select(0, looks.reshape(-1)).reshape_as(looks).sort(dim=1)
-        looks = looks.gather(1, order)
-        begins = seen >= 0
-        begins[:, 1:] &= seen[:, 1:] != seen[:, :-1]
+        first = mixed // columns * count * row_length + mixed % columns * count
+        samples = first[:, None] + (step[:, None] * row_length + step).reshape(-1)
+        seen_faces, order = fragments.face.index_select(0, samples.reshape(-1)).reshape_as(samples).sort(dim=1)
+        samples = samples.gather(1, order)
+        begins = seen_faces >= 0
+        begins[:, 1:] &= seen_faces[:, 1:] != seen_faces[:, :-1]
         number = begins.reshape(-1).cumsum(0) - 1
-        hit = (seen >= 0).reshape(-1)
-        number, looks = number[hit], looks.reshape(-1)[hit]
+        hit = (seen_faces >= 0).reshape(-1)
+        number, samples = number[hit], samples.reshape(-1)[hit]
         some = int(begins.sum())
-        places = torch.stack([looks % wide, looks // wide], dim=1).to(middle)
+        places = torch.stack([samples % row_length, samples // row_length], dim=1).to(middle)
         counts = torch.bincount(number, minlength=some).to(middle)
         centre = middle.new_zeros(some, 2).index_add(0, number, places) / counts[:, None] + corner
-        sight[looks] = number + len(whole)
+        group[samples] = number + len(whole)
         return cls(
             fragments,
             count,
-            torch.cat([low.index_select(0, whole), seen[begins]]).to(torch.int64),
+            torch.cat([low.index_select(0, whole), seen_faces[begins]]).to(torch.int64),
             torch.cat([whole, mixed[begins.nonzero()[:, 0]]]),
             torch.cat([torch.ones_like(middle[:, 0]), counts / count**2]),
             torch.cat([middle, centre]),
-            sight,
+            group,
         )
 
     @property
-    def wide(self) -> int:
-        """Looks in a row."""
+    def row_length(self) -> int:
+        """Samples per row."""
         return int(self.fragments.layout.rects[0, 2] - self.fragments.layout.rects[0, 0])
 
-    def pixel_of(self, look: Tensor) -> Tensor:
-        """The pixels (P,) of looks (P,)."""
-        return look // self.wide // self.count * (self.wide // self.count) + look % self.wide // self.count
+    def pixel_of(self, sample: Tensor) -> Tensor:
+        """Pixels (P,) of samples (P,)."""
+        return (
+            sample // self.row_length // self.count * (self.row_length // self.count)
+            + sample % self.row_length // self.count
+        )
 
-    def face_at(self, look: Tensor) -> Tensor:
-        """(P,) int64, what looks (P,) see, -1 where that is nothing."""
-        return self.fragments.face.index_select(0, look).to(torch.int64)
+    def face_at(self, sample: Tensor) -> Tensor:
+        """(P,) int64, faces at samples (P,), -1 where nothing is hit."""
+        return self.fragments.face.index_select(0, sample).to(torch.int64)
 
     def offsets_at_borders(self, edges: MeshEdges) -> tuple[SampleOffsets, SampleOffsets]:
-        """Between looks that are neighbours: those that see two faces, but for those of one smooth surface, and
-        those from a look that sees one to a look that sees nothing.
+        """Pairs of neighbouring samples: those that hit different faces of no common smooth surface, and those
+        from a sample that hits a face to one that hits nothing.
         """
-        face, wide = self.fragments.face, self.wide
+        face, row_length = self.fragments.face, self.row_length
         here, there = [], []
-        for step in (1, wide):
+        for step in (1, row_length):
             first = (face[step:] != face[:-step]).nonzero()[:, 0]
-            first = first[first % wide != wide - 1] if step == 1 else first
+            first = first[first % row_length != row_length - 1] if step == 1 else first
             here.append(first)
             there.append(first + step)
         here, there = torch.cat(here), torch.cat(there)
@@ -106,21 +115,30 @@ class PixelSamples:
 
 @dataclass(frozen=True, slots=True)
 class SampleOffsets:
-    """From looks here to there (P,). start, step (P, 3) float64: where (x, y, 1) the one is, and how far the other
-    from it; down (P,): along a column, not along a row.
-    """
+    """Paths (P) between neighbouring samples."""
 
     here: Tensor
+    """(P,) int64, sample at the start."""
     there: Tensor
+    """(P,) int64, sample at the end."""
     start: Tensor
+    """(P, 3) float64, position (x, y, 1) of the start."""
     step: Tensor
+    """(P, 3) float64, difference between end and start."""
     down: Tensor
+    """(P,) bool, whether the path runs along a column."""
 
     @classmethod
     def between(cls, samples: PixelSamples, here: Tensor, there: Tensor) -> SampleOffsets:
-        wide = samples.wide
+        """Paths between pairs of samples.
+
+        Args:
+            samples: Grid of samples.
+            here, there: (P,) int64, samples at start and end.
+        """
+        row_length = samples.row_length
         x0, y0 = samples.fragments.layout.rects[0, :2].tolist()
-        start = torch.stack([here % wide + x0, here // wide + y0, torch.ones_like(here)], dim=1)
+        start = torch.stack([here % row_length + x0, here // row_length + y0, torch.ones_like(here)], dim=1)
         down = (there - here).abs() != 1
         sign = (there - here).sign()
         step = torch.stack([sign * ~down, sign * down, torch.zeros_like(here)], dim=1)

@@ -1,11 +1,10 @@
-"""What no parameter touches, made ready once: placed meshes, the ground that takes their shadows, and what the
-photograph knows of each vehicle; and the z-buffers, which find what the pixels of a perturbation see.
+"""Everything about a scene that no parameter affects, computed once, and the z-buffers of its perturbations.
 
 A vehicle's *mesh* shows the photograph where the photograph saw that point, and completes what it did not see. Its
-*halo*, the pixels around the mesh, carries what of the matte lies beyond the mesh, and moves as the nearest piece
-of outline does. A pixel's lookup is `pixel + displacement`, the displacement interpolated from the difference of
-the clip coordinates then and now: with nothing perturbed it is exactly zero, every lookup falls on a pixel centre,
-and the picture is the photograph.
+*halo*, the pixels around the mesh, carries the part of the matte beyond the mesh, and moves with the nearest piece
+of outline. A pixel's lookup is `pixel + displacement`, with the displacement interpolated from the difference of
+clip coordinates then and now: with nothing perturbed it is exactly zero, every lookup hits a pixel centre, and the
+picture is the photograph.
 
 Shapes: N objects, V vertices, T packed pixels of all objects' crops.
 """
@@ -29,61 +28,66 @@ from scene_ir.render.texture import PaintRegions, PhotographTexels, smoothstep
 from scene_ir.types import Crop, Environment, Objects, SceneIR, convert_scene
 
 MAX_HALO_PX = 64.0
-"""However near a vehicle is, its halo reaches no farther: of a car that fills the picture's height this is a
-sixth."""
+"""Largest reach of a halo: of a car that fills the picture's height, a sixth."""
 
 
 _MAX_SAMPLES, _GOLDEN = 5000, 0.6180339887
-"""Pixels of one object that its finish is read off, some for each vertex; steps by the golden section spread
-them."""
+"""Pixels of one object from which its finish is measured, several per vertex; golden-section steps spread them."""
 _PATCH_MARGIN_PX = 4
-"""Ground kept around a photographed shadow: the reach of the lookups' kernel, and two pixels."""
+"""Ground kept around a photographed shadow: the reach of the lookup's kernel, plus two pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class RenderSettings:
-    """backend: `warp` (float32, fast) or `reference` (plain torch, the scene's dtype, for gradient checks).
-    shadows: whether vehicles darken the ground. lod: whether meshes are drawn as coarsely as their size in pixels
-    allows; a scene is rendered as it was taken apart where both were done alike.
-    """
+    """Settings of the renderer."""
 
     backend: verbs.Backend = "warp"
+    """`warp` (float32, fast) or `reference` (plain torch in the scene's dtype, for gradient checks)."""
     shadows: bool = True
+    """Whether vehicles darken the ground."""
     lod: bool = True
+    """Whether meshes are simplified to their size in pixels; use the value with which the scene was de-rendered.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectLayers:
-    """The objects of one scene, drawn but not yet blended.
-
-    layout: crops of the objects; colour (T, 4): premultiplied RGB and opacity / depth; opacity (T,); depth (T,) m.
-    shadow_layout, shadow (Ts, 3): the shadows' crops and factors.
-    """
+    """The objects of one scene, drawn but not yet blended."""
 
     layout: verbs.PixelLayout
+    """Crops of the objects."""
     colour: Tensor
+    """(T, 4) premultiplied RGB and opacity / depth."""
     opacity: Tensor
+    """(T,)."""
     depth: Tensor
+    """(T,) m."""
     shadow_layout: verbs.PixelLayout
+    """Crops of the shadows."""
     shadow: Tensor
+    """(Ts, 3) factors on the ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class OccluderLayers:
-    """What stands in front of vehicles, as layers after theirs. footprints (K, 4, 2) m, see `blend`; layout,
-    colour (T, 4), opacity (T,), depth (T,) m as in `Layers`; pixel (T,) int64: of the frame, for each of theirs.
-    """
+    """What stands in front of vehicles, as layers after theirs."""
 
     footprints: np.ndarray
+    """(K, 4, 2) m, see `blend`."""
     layout: verbs.PixelLayout
+    """Crops of the occluders."""
     colour: Tensor
+    """(T, 4) premultiplied RGB and opacity / depth."""
     opacity: Tensor
+    """(T,)."""
     depth: Tensor
+    """(T,) m."""
     pixel: Tensor
+    """(T,) int64, frame pixel of each packed pixel."""
 
     @classmethod
     def from_scene(cls, scene: SceneIR, like: Tensor) -> OccluderLayers:
-        """Of a scene's `front`. `like`: a tensor of the dtype and device to work in."""
+        """Layers of a scene's occluders in the dtype and on the device of `like`."""
         texels = PhotographTexels.from_crops([f.foreground for f in scene.occluders], like)
         layout = verbs.PixelLayout.from_rects(texels.rects)
         rgba, draw = texels.values, layout.draw_index()
@@ -94,8 +98,9 @@ class OccluderLayers:
         return cls(footprints, layout, colour, rgba[:, 3], depth, y * scene.camera.width + x)
 
     def append_to(self, layers: ObjectLayers | None, change: Tensor | None) -> ObjectLayers:
-        """Layers of objects, if there are any, and these after them. change: (3, H, W), what the season does to
-        the background, and so to these."""
+        """Layers of objects, if any, followed by these. change: (3, H, W) change of the background by the season,
+        applied to these too.
+        """
         colour = self.colour
         if change is not None:
             moved = change.flatten(1)[:, self.pixel].T * self.opacity[:, None]
@@ -115,43 +120,51 @@ class OccluderLayers:
 
 @dataclass(frozen=True, slots=True)
 class PlacedGeometry:
-    """Placed vertices. clip (V, 3) of the meshes; cos (V,) between their welded normals and the way to the
-    camera; ground_clip (4N, 3) of the shadows' patches; brighter (V,): see `texture.limit_brightening`, by what the
-    objects turned since the photograph. lights (N, 4) and inside (N, 3, 3) float64, of the fast kernels alone: the
-    sun on each object, and from a pixel (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways."""
+    """Vertices placed in the camera frame."""
 
     clip: Tensor
+    """(V, 3) clip coordinates of the meshes."""
     facing_cos: Tensor
+    """(V,) cosine between welded normals and the direction to the camera."""
     patch_clip: Tensor
+    """(4N, 3) clip coordinates of the shadows' patches."""
     brightening: Tensor
+    """(V,) change since the photograph, see `texture.limit_brightening`."""
     lights: Tensor | None = None
+    """(N, 4) direction and strength of the sun on each object; fast kernels only."""
     pixel_to_patch: Tensor | None = None
+    """(N, 3, 3) float64, from a pixel (x, y, 1) to (s, t, 1) / w on the patch, s and t in [0, 1]; fast kernels
+    only.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class VisibleSurfaces:
-    """What the z-buffers found for one perturbation. coverage (T,); reach_px: of each object's halo;
-    ground_layout: of the patches; ground: what was found there, None where the fast kernels find out themselves.
-    """
+    """What the z-buffers found for one perturbation."""
 
     geometry: PlacedGeometry
+    """Placed vertices."""
     mesh: verbs.Fragments
+    """Visible faces of the meshes."""
     coverage: Tensor
+    """(T,) coverage by the meshes."""
     reach_px: tuple[float, ...]
+    """Reach of each object's halo, px."""
     patch_layout: verbs.PixelLayout
+    """Crops of the shadows' patches."""
     patch_fragments: verbs.Fragments | None
+    """Visible patches; None for the fast kernels, which need none."""
 
     def nearest_hits(self) -> Tensor:
-        """(T,) int64: the packed pixel that the same object's mesh hits nearest to each, -1 where no halo
-        reaches."""
+        """(T,) int64, nearest packed pixel that the same object's mesh hits, -1 beyond its halo."""
         return surfaces.nearest_hits(self.mesh, self.reach_px)
 
 
 class PreparedScene:
-    """One scene, made ready to draw its perturbations: all that no parameter touches.
+    """One scene, prepared for its perturbations: everything that no parameter affects.
 
     A perturbed scene may differ from `scene` in objects.translation, yaw, size_lhw, ffd, texture_code and in
-    environment.weather, foliage, light. With backend `warp` the scene is worked on in float32.
+    environment.weather, foliage, light. With backend `warp` the scene is processed in float32.
     """
 
     def __init__(
@@ -161,8 +174,14 @@ class PreparedScene:
         hidden: Sequence[Tensor] | None = None,
         whole_patches: bool = False,
     ) -> None:
-        """hidden: one (H, W) an object, where nearer objects stood before it; found from the mattes if not given.
-        whole_patches: keep all of the ground that a vehicle may darken, not only what its source's shadow does."""
+        """Prepare a scene.
+
+        Args:
+            scene: The scene.
+            settings: Settings of the renderer.
+            hidden: One (H, W) per object, where nearer objects covered it; computed from the mattes by default.
+            whole_patches: Keep all ground that a vehicle may darken, not only what its source's shadow darkens.
+        """
         self.settings = settings or RenderSettings()
         if self.settings.backend == "warp":
             scene = convert_scene(scene, torch.float32)
@@ -182,7 +201,7 @@ class PreparedScene:
             self._prepare(scene.objects, hidden)
 
     def _prepare(self, objects: Objects, hidden: Sequence[Tensor] | None) -> None:
-        """Everything that hangs on the unperturbed objects: normals, and what the photograph knows."""
+        """Compute what depends on the unperturbed objects: normals, and the photograph's content."""
         base = at_photographed_pose(objects)
         meshes = [self.scene.meshes[int(i)] for i in objects.mesh_index]
         if self.settings.lod:
@@ -239,7 +258,7 @@ class PreparedScene:
                 continue
             steps = x.new_tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
             pixels = (torch.stack([x, y], dim=1)[:, None] + steps).reshape(-1, 2).to(self.like)
-            found = surfaces.pixels_to_ground(
+            ground_points = surfaces.pixels_to_ground(
                 pixels,
                 self.unproject,
                 self.centre,
@@ -247,16 +266,16 @@ class PreparedScene:
                 base.yaw[i],
                 self.scene.environment.ground,
             )
-            if found is None:
+            if ground_points is None:
                 continue
-            low = torch.maximum(found.amin(dim=0), corners[i].amin(dim=0))
-            high = torch.minimum(found.amax(dim=0), corners[i].amax(dim=0))
+            low = torch.maximum(ground_points.amin(dim=0), corners[i].amin(dim=0))
+            high = torch.minimum(ground_points.amax(dim=0), corners[i].amax(dim=0))
             if bool((high > low).all()):
                 corners[i] = surfaces.rectangle_corners(low, high)
         return corners
 
     def _heights_px(self, objects: Objects) -> list[float]:
-        """How high the objects are in the image at their nearest point, at least."""
+        """Lower bounds of the objects' heights in the image at their nearest point."""
         middle = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2]
         nearest = (middle - 0.5 * objects.size_lhw[:, [0, 2]].norm(dim=1)).clamp(min=1.0)
         return (self.scene.camera.matrix[1, 1].to(nearest) * objects.size_lhw[:, 1] / nearest).tolist()
@@ -273,7 +292,7 @@ class PreparedScene:
         )
         self.mirror_cos = surfaces.facing_cosine(mirrored, flipped, self.centre)
         order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self.centre, self.footprints)
-        nearer = [thing.foreground for thing in (*objects.source, *self.scene.occluders)]
+        nearer = [occluder.foreground for occluder in (*objects.source, *self.scene.occluders)]
         mattes = [replace(crop, values=crop.values[3:]) for crop in nearer]
         crops = []
         rects = drawn.mesh.layout.rects.tolist()
@@ -298,16 +317,16 @@ class PreparedScene:
 
     @property
     def finish(self) -> Tensor:
-        """(V, 4): gains (3) and lift that make the templates' colours the vehicles'; found on first use."""
+        """(V, 4) gains (3) and lift that match the templates' colours to the vehicles; computed on first use."""
         if self._finish is None:
             parts = zip(self.object_surfaces.surfaces, self.sample_photograph(), strict=True)
-            found = [torch.from_numpy(finish.fit_finish(surface, samples)) for surface, samples in parts]
-            self._finish = torch.cat(found).to(self.like)
+            ground_points = [torch.from_numpy(finish.fit_finish(surface, samples)) for surface, samples in parts]
+            self._finish = torch.cat(ground_points).to(self.like)
             self._base_visible = None
         return self._finish
 
     def _base_lightness(self, objects: Objects) -> Tensor:
-        """CIE L* (N,) of the objects' paint, about which gloss turns contrast."""
+        """CIE L* (N,) of the objects' paint, about which gloss changes contrast."""
         if objects.source:
             paint = torch.stack([s.paint for s in objects.source]).to(self.like)
         else:
@@ -315,7 +334,7 @@ class PreparedScene:
         return texture.rgb_to_lab(paint.clamp(0.0, 1.0))[:, 0]
 
     def _template_paint(self) -> Tensor:
-        """The mean colour (N, 3) of the templates' paint."""
+        """Mean colour (N, 3) of the templates' paint."""
         object_surfaces = self.object_surfaces
         total = self.base_size_lhw.new_zeros(len(self.base_size_lhw), 3)
         total = total.index_add(0, object_surfaces.owner, object_surfaces.colours * object_surfaces.paint[:, None])
@@ -323,24 +342,23 @@ class PreparedScene:
         return total / count.clamp(min=1e-3)[:, None]
 
     def estimate_paint(self, samples: Sequence[finish.FinishSamples]) -> Tensor:
-        """The paint (N, 3) of the objects as the photograph shows it, by their `samples`; the templates' where it
-        shows none."""
+        """Paint (N, 3) of the objects in the photograph, by their samples; the templates' where it shows none."""
         paint = self._template_paint()
         for i, (surface, own) in enumerate(zip(self.object_surfaces.surfaces, samples, strict=True)):
-            found = finish.estimate_paint(surface, own)
-            if found is not None:
-                paint[i] = found.to(paint)
+            ground_points = finish.estimate_paint(surface, own)
+            if ground_points is not None:
+                paint[i] = ground_points.to(paint)
         return paint
 
     def _place(self, objects: Objects) -> PlacedGeometry:
         return self.batch.place([objects], [None], with_ground=True)
 
     def find_visible(self, objects: Objects, sun: PerturbedSun | None = None) -> VisibleSurfaces:
-        """Find which surfaces the pixels see. sun: as of `sun_of`."""
+        """Find which surfaces the pixels see. sun: as of `perturbed_sun`."""
         return self.batch.find_visible([objects], [sun])
 
     def perturbed_sun(self, environment: Environment) -> PerturbedSun | None:
-        """The sun of a perturbed scene; None where it is the photograph's."""
+        """The sun of a perturbed scene; None where it is the photographed one."""
         if not len(self.sunlight) or not is_active(environment.light):
             return None
         return PerturbedSun.from_environment(
@@ -354,8 +372,9 @@ class PreparedScene:
         return self.object_surfaces.local_vertices(objects.ffd, objects.size_lhw) if changed else self._base_local
 
     def compute_brightening(self, objects: Objects, sun: PerturbedSun | None = None) -> Tensor:
-        """By how much (V,) the surfaces are brighter than in the photograph, since they or the sun turned, or its
-        light changed: see `texture.limit_brightening`."""
+        """Brightening (V,) of the surfaces since the photograph, by turns of objects and sun or its strength: see
+        `texture.limit_brightening`.
+        """
         turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
         if not objects.source or not (turned or sun is not None):
             return self.like.new_zeros(self.object_surfaces.owner.shape[0])
@@ -376,7 +395,7 @@ class PreparedScene:
         return texture.limit_brightening(sunlight * more / then, self.object_surfaces.paint)
 
     def _sun_exposure(self, yaw: Tensor, moved: PerturbedSun | None = None) -> Tensor:
-        """How squarely (V,) the sun meets the surfaces of objects that stand at yaw (N,)."""
+        """How squarely (V,) the sun meets the surfaces of objects at yaw (N,)."""
         direction = self.scene.environment.sun.to(self.like) if moved is None else moved.direction
         sun = direction.expand(len(yaw), 3)
         x, y, z = self.object_surfaces.per_vertex(surfaces.rotate_y(sun, -yaw)).unbind(-1)
@@ -387,9 +406,9 @@ class PreparedScene:
     def place_patches(self, objects: Objects, sun: PerturbedSun | None = None) -> Tensor:
         """Clip coordinates (4N, 3) of the corners of the shadows' patches.
 
-        A patch turns with its object, but what the sun casts beyond the footprint stays on the side away from the
+        A patch turns with its object, but the shadow cast beyond the footprint stays on the side away from the
         sun: the patch is sheared the more, the farther out. It grows with its object, and hardly shrinks. Where
-        the sun moves, only shadows that are the objects' own follow (`casts`).
+        the sun moves, only shadows that are the objects' own follow (`shadow_is_own`).
         """
         ground = self.scene.environment.ground
         offset = surfaces.shadow_offset(self.scene.environment.sun, objects.yaw, self.base_size_lhw[:, 1])
@@ -409,7 +428,7 @@ class PreparedScene:
         return surfaces.project_vertices(corners, self.scene.camera)
 
     def patch_inputs(self, sun: PerturbedSun | None) -> tuple[Tensor, ...]:
-        """What the kernels take of the patches besides poses: the tensors of `kernels.shadow_patches.Photographed`."""
+        """Inputs of the patches' kernels except poses: the tensors of `shadow_patches.PatchInputs`."""
         count, environment = len(self.base_size_lhw), self.scene.environment
         direction, ground = (t.to(self.like) for t in (environment.sun, environment.ground))
         casts = self.like.new_zeros(count) if sun is None else self.shadow_is_own[:, 0].contiguous()
@@ -426,15 +445,16 @@ class PreparedScene:
 
     @property
     def crown_maps(self) -> Tensor:
-        """Of `environment.compute_crown_maps`; found on first use."""
+        """Result of `environment.compute_crown_maps`; computed on first use."""
         if self._crown_maps is None:
             self._crown_maps = compute_crown_maps(self.scene)
         return self._crown_maps
 
     @property
     def shadow_is_own(self) -> Tensor:
-        """(N, 1): 1 where the photographed shadow is that of the object's box in the scene's sun, 0 where it is
-        much else's too, such as a house's, or the picture's border cuts it; found on first use."""
+        """(N, 1): 1 where the photographed shadow is that of the object's box in the scene's sun, 0 where it
+        includes others, such as a house's, or is cut by the picture's border; computed on first use.
+        """
         if self._shadow_is_own is None:
             with torch.no_grad():
                 self._shadow_is_own = self._compare_shadows()
@@ -459,13 +479,13 @@ class PreparedScene:
         return casts
 
     def objects_without_shadow(self) -> list[bool]:
-        """Which objects darken no ground."""
+        """Which objects do not darken the ground."""
         source = self.scene.objects.source
         count = len(self.scene.objects)
         return [not self.settings.shadows or (bool(source) and source[i].shadow is None) for i in range(count)]
 
     def reach_px(self, objects: Objects) -> list[float]:
-        """How far the halo of each object reaches beyond its mesh."""
+        """Reach of each object's halo beyond its mesh, px."""
         if not objects.source:
             return [0.0] * len(objects)
         distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
@@ -473,30 +493,36 @@ class PreparedScene:
         return (halo / distance).clamp(max=MAX_HALO_PX).tolist()
 
     def template_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
-        """(V, channels.PLAIN): the templates' own looks. normals (V, 3); depth (V,) m."""
+        """(V, channels.PLAIN) appearance of the templates. normals (V, 3); depth (V,) m."""
         shares = torch.stack(
             [self.object_surfaces.paint, self.object_surfaces.glass, depth, self.vertex_height], dim=1
         )
         return torch.cat([self.object_surfaces.colours, normals, shares], dim=1)
 
     def completion_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
-        """(V, channels.OWN): `own_attributes`, and what completes a photographed vehicle."""
+        """(V, channels.OWN): `template_attributes`, and what completes a photographed vehicle."""
         own = self.template_attributes(normals, depth)
         return torch.cat([own, self.mirror_clip, self.mirror_cos[:, None], self.finish], dim=1)
 
     def rotated_normals(self, objects: Objects) -> Tensor:
-        """Unit normals (V, 3) of objects where they stand, with sharp edges."""
+        """Unit normals (V, 3) with sharp edges, in camera axes."""
         return surfaces.rotate_y(self.sharp_normals, self.object_surfaces.per_vertex(objects.yaw))
 
     def object_lights(self, sun: PerturbedSun | None = None) -> Tensor:
-        """(N, 4): direction and strength of the sun on each object."""
+        """(N, 4) direction and strength of the sun on each object."""
         direction = self.scene.environment.sun.to(self.like) if sun is None else sun.direction
         strength = self.sunlight if sun is None else self.sunlight * sun.strength
         return torch.cat([direction.expand(len(strength), 3), strength[:, None]], dim=1)
 
     def shade_template(self, xy: Tensor, owner: Tensor, own: Tensor, sun: PerturbedSun | None = None) -> Tensor:
-        """The templates' colours (K, 3) in daylight, not clamped, at pixels xy (K, 2) of objects `owner` (K,), by
-        `own_attributes` (K, ...)."""
+        """Template colours (K, 3) in daylight, not clamped.
+
+        Args:
+            xy: (K, 2) px.
+            owner: (K,) object of each pixel.
+            own: (K, ...) attributes as of `template_attributes`.
+            sun: As of `perturbed_sun`.
+        """
         light = self.object_lights(sun).index_select(0, owner)
         albedo, normal = own[:, : channels.NORMAL], own[:, channels.NORMAL : channels.OWN_PAINT]
         sheen, height = own[:, channels.OWN_PAINT : channels.OWN_DEPTH], own[:, channels.OWN_HEIGHT]
@@ -507,8 +533,9 @@ class PreparedScene:
 
     @torch.no_grad()
     def project_paint(self) -> list[Crop]:
-        """For each object, where its foreground is: Crop (1, h, w), 1 where the mesh at its place in the
-        photograph is paint, 0 where not; beyond the mesh as at its nearest pixel."""
+        """Paint maps of the objects: Crop (1, h, w) at their foregrounds, 1 where the mesh at its photographed
+        pose is paint, else 0; beyond the mesh as at its nearest pixel.
+        """
         objects = at_photographed_pose(self.scene.objects)
         drawn = self.find_visible(objects)
         dense = verbs.interpolate(
@@ -535,8 +562,10 @@ class PreparedScene:
 
     @torch.no_grad()
     def sample_photograph(self) -> list[finish.FinishSamples]:
-        """What the photograph shows of each object, beside its template in daylight: a row a pixel, of large
-        objects about `_MOST_SAMPLES` pixels, spread evenly."""
+        """Samples of the photographed colours of each object and of its template in daylight.
+
+        Large objects are sampled at about `_MAX_SAMPLES` evenly spread pixels.
+        """
         objects, drawn = at_photographed_pose(self.scene.objects), self._base_visible
         if drawn is None:
             drawn = self.find_visible(objects)
@@ -557,8 +586,8 @@ class PreparedScene:
         pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
         corner = self.object_surfaces.faces[drawn.mesh.face[pixel].long()]
         share = surfaces.perspective_weights(drawn.geometry.clip[corner], xy).to(self.like)
-        looks = self.template_attributes(self.rotated_normals(objects), drawn.geometry.clip[:, 2])
-        own = torch.cat([looks, drawn.geometry.facing_cos[:, None]], dim=1)
+        template_appearance = self.template_attributes(self.rotated_normals(objects), drawn.geometry.clip[:, 2])
+        own = torch.cat([template_appearance, drawn.geometry.facing_cos[:, None]], dim=1)
         own = (own[corner] * share[..., None]).sum(dim=1)
         weight = weight * smoothstep(own[:, channels.PLAIN], *model.SQUARE)
         template = self.shade_template(xy, owner, own)
@@ -574,7 +603,7 @@ class PreparedScene:
         return out
 
     def patch_density(self, drawn: VisibleSurfaces) -> Tensor:
-        """How much the objects' boxes darken the pixels (Ts,) of their patches, in [0, 1]."""
+        """Darkening (Ts,) in [0, 1] of the patches' pixels by the objects' boxes."""
         clip = drawn.geometry.patch_clip
         assert drawn.patch_fragments is not None
         faces, _, _ = patch_faces(self.patch_corners.shape[0], clip.device)
@@ -586,10 +615,9 @@ class PreparedScene:
 
 
 class SceneBatch:
-    """Prepared scenes whose objects are drawn in one go: each stage passes once over all pixels, of however many
-    scenes.
+    """Prepared scenes that are drawn together: each stage passes once over the pixels of all scenes.
 
-    A scene may occur more than once, for several perturbations of one scene.
+    A scene may occur more than once, for several of its perturbations.
     """
 
     def __init__(self, members: Sequence[PreparedScene]) -> None:
@@ -619,8 +647,13 @@ class SceneBatch:
     def place(
         self, objects: Sequence[Objects], suns: Sequence[PerturbedSun | None], with_ground: bool
     ) -> PlacedGeometry:
-        """Where the vertices of perturbed objects, of each member, come to lie, and the light on them.
-        with_ground: the patches by plain torch."""
+        """Place the vertices of each member's perturbed objects, and compute the light on them.
+
+        Args:
+            objects: Perturbed objects of each member.
+            suns: As of `perturbed_sun`, for each member.
+            with_ground: Whether to place the patches in plain torch.
+        """
         if self._placement is None:
             ((m,), (o,), (sun,)) = self._members, objects, suns
             matrix = m.scene.camera.matrix.to(m.like)
@@ -642,8 +675,9 @@ class SceneBatch:
         return PlacedGeometry(clip, cos, ground, brighter, lights, inside)
 
     def patch_matrices(self, objects: Sequence[Objects]) -> Tensor:
-        """(N, 3, 3) float64: from a patch's (s, t, 1), 0 to 1 both ways, to its clip coordinates, under the
-        photographed sun."""
+        """(N, 3, 3) float64, from (s, t, 1) on a patch, each in [0, 1], to its clip coordinates under the
+        photographed sun.
+        """
         lights, fixed = (
             concat([m.object_lights() for m in self._members]),
             self._patch_inputs([None] * len(objects)),
@@ -652,23 +686,29 @@ class SceneBatch:
         return surfaces.place_patches(yaw, place, size, lights, fixed)[1]
 
     def _patch_inputs(self, suns: Sequence[PerturbedSun | None]) -> tuple[Tensor, ...]:
-        """What of the shadows' patches poses do not touch; kept where no sun moves."""
+        """Inputs of the patches' kernels that poses do not affect; cached while no sun moves."""
         if self._still_patch_inputs is None or any(sun is not None for sun in suns):
             parts = [m.patch_inputs(sun) for m, sun in zip(self._members, suns, strict=True)]
-            found = tuple(concat(rows) for rows in zip(*parts, strict=True))
+            ground_points = tuple(concat(rows) for rows in zip(*parts, strict=True))
             if any(sun is not None for sun in suns):
-                return found
-            self._still_patch_inputs = found
+                return ground_points
+            self._still_patch_inputs = ground_points
         return self._still_patch_inputs
 
     def reach_px(self, objects: Sequence[Objects]) -> list[float]:
-        """How far the halo of each object reaches beyond its mesh."""
+        """Reach of each object's halo beyond its mesh, px."""
         return [r for m, o in zip(self._members, objects, strict=True) for r in m.reach_px(o)]
 
     def find_visible(
         self, objects: Sequence[Objects], suns: Sequence[PerturbedSun | None], with_ground: bool = True
     ) -> VisibleSurfaces:
-        """Find which surfaces the pixels see; the draws are the members' objects, one after the other."""
+        """Find which surfaces the pixels see; the draws are the members' objects, concatenated.
+
+        Args:
+            objects: Perturbed objects of each member.
+            suns: As of `perturbed_sun`, for each member.
+            with_ground: Whether to rasterise the patches.
+        """
         backend, reach = self._backend, self.reach_px(objects)
         geometry = self.place(objects, suns, with_ground)
         rects = surfaces.crop_rects(
@@ -693,7 +733,7 @@ class SceneBatch:
 
 
 def concat(parts: Sequence[Tensor]) -> Tensor:
-    """Several scenes' rows, one after the other."""
+    """Rows of several scenes, concatenated."""
     return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
@@ -708,8 +748,7 @@ def at_photographed_pose(objects: Objects) -> Objects:
 
 
 def _shadow_darkness(shadow: Crop | None, frame_hw: tuple[int, int]) -> Crop:
-    """What a shadow takes away, (3, h, w), continued a little beyond the frame, since the lookups' kernel reaches
-    there."""
+    """Light that a shadow removes, (3, h, w), continued beyond the frame for the lookup's kernel."""
     if shadow is None or shadow.values.numel() == 0:
         return Crop(torch.zeros(3, 0, 0), 0, 0)
     h, w = shadow.values.shape[1:]
@@ -726,5 +765,5 @@ def patch_faces(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
 
 
 def is_active(code: Tensor) -> bool:
-    """Whether a code has to be applied: it is not 0, or somebody wants its gradient."""
+    """Whether a code must be applied: it is not 0, or needs a gradient."""
     return code.requires_grad or bool((code.detach() != 0).any())

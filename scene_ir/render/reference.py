@@ -1,4 +1,4 @@
-"""Drawing objects in plain torch, in any dtype: what the fast path has to agree with.
+"""Objects drawn in plain torch in any dtype: the definition that the fast path must match.
 
 Shapes: N objects, V vertices, T packed pixels of all objects' crops, R rows: pixels of the mesh or of its halo.
 """
@@ -21,11 +21,11 @@ from scene_ir.types import Objects
 
 @dataclass(frozen=True, slots=True)
 class _PixelRows:
-    """Pixels to be coloured, mesh rows first, each part grouped by object.
+    """Pixels to colour, mesh rows first, each part grouped by object.
 
-    pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,): how much of the pixel this
-    row fills; counts (2N,) int64 rows of each mesh, then of each halo; fringe: see `_OutlineRows`; anchor (R - Rm,)
-    int64: the mesh row that each row of a halo moves with.
+    pixel (R,) int64 into the packed pixels; owner (R,) int64; xy (R, 2) px; share (R,) of the pixel that the row
+    fills; counts (2N,) int64, rows of each mesh, then of each halo; anchor (R - Rm,) int64, mesh row that each row
+    of a halo moves with.
     """
 
     pixel: Tensor
@@ -34,13 +34,13 @@ class _PixelRows:
     share: Tensor
     counts: Tensor
     mesh_rows: int
-    fringe: _OutlineRows
+    outline: _OutlineRows
     anchor: Tensor
 
 
 @dataclass(frozen=True, slots=True)
 class _ShadedRows:
-    """Rows with their looks: premultiplied colour (R, 3), opacity (R,), depth (R,) m, paint and height (R,)."""
+    """Appearance of rows: premultiplied colour (R, 3), opacity (R,), depth (R,) m, paint and height (R,)."""
 
     colour: Tensor
     opacity: Tensor
@@ -51,12 +51,12 @@ class _ShadedRows:
 
 @dataclass(frozen=True, slots=True)
 class _OutlineRows:
-    """Pixels at a mesh's outline continue what their neighbours inside show: those whose centres the mesh misses
-    have nothing of their own, the others lean on their neighbours the more, the less they are covered. So nothing
-    jumps when the outline passes over a pixel's centre.
+    """Blend of the pixels at a mesh's outline with their neighbours inside, so that nothing jumps when the outline
+    passes a pixel's centre: the less a pixel is covered, the more it takes from its neighbours; missed centres
+    have no values of their own.
 
-    hit (Rm,) 1 or 0; row (K,) int64: rows at the outline; own (K,) in [0, 1]: how much they keep of their own
-    values; neighbour (K, 4) int64 rows; weight (K, 4), of sum 1, or 0 where no neighbour is hit.
+    hit (Rm,) 1 or 0; row (K,) int64 rows at the outline; own (K,) in [0, 1], weight of their own values; neighbour
+    (K, 4) int64 rows; weight (K, 4) with sum 1, or 0 where no neighbour is hit.
     """
 
     hit: Tensor
@@ -69,7 +69,9 @@ class _OutlineRows:
     def from_coverage(
         cls, layout: verbs.PixelLayout, hit: Tensor, coverage: Tensor, mesh_pixel: Tensor, owner: Tensor
     ) -> _OutlineRows:
-        """hit, coverage, owner (T,): of all packed pixels; mesh_pixel (Rm,) int64: those that have a row."""
+        """The blend for all packed pixels: hit, coverage, owner (T,); mesh_pixel (Rm,) int64: those that have a
+        row.
+        """
         row = (coverage.detach()[mesh_pixel] < 1).nonzero()[:, 0]
         pixel = mesh_pixel[row]
         draw = owner[pixel]
@@ -89,7 +91,7 @@ class _OutlineRows:
         return cls(hit[mesh_pixel].to(coverage), row, own, rank[neighbour], weight)
 
     def fill(self, values: Tensor) -> Tensor:
-        """Values (Rm, Q), read at the hits, continued over the outline."""
+        """Values (Rm, Q), read at the hits, extended over the outline."""
         known = values * self.hit[:, None]
         if self.row.numel() == 0:
             return known
@@ -100,7 +102,14 @@ class _OutlineRows:
 def draw_layers(
     prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, sun: PerturbedSun | None = None
 ) -> ObjectLayers:
-    """`layers` in plain torch."""
+    """Draw objects in plain torch.
+
+    Args:
+        prepared: The prepared scene.
+        objects: Perturbed objects.
+        drawn: Their visible surfaces.
+        sun: As of `PreparedScene.perturbed_sun`.
+    """
     rows = _collect_rows(prepared, drawn, bool(objects.source))
     size = drawn.mesh.layout.size
     if objects.source:
@@ -156,25 +165,26 @@ def _collect_rows(prepared: PreparedScene, drawn: VisibleSurfaces, with_halo: bo
     x0, y0, x1, _ = layout.rects[rows_owner].unbind(-1)
     within, width = pixel - layout.offsets[rows_owner], x1 - x0
     xy = torch.stack([x0 + within % width, y0 + within // width], dim=-1)
-    fringe = _OutlineRows.from_coverage(layout, hit, drawn.coverage, mesh_pixel, owner)
-    return _PixelRows(pixel, rows_owner, xy.to(prepared.like), share, counts, mesh_pixel.shape[0], fringe, anchor)
+    outline = _OutlineRows.from_coverage(layout, hit, drawn.coverage, mesh_pixel, owner)
+    return _PixelRows(pixel, rows_owner, xy.to(prepared.like), share, counts, mesh_pixel.shape[0], outline, anchor)
 
 
 def _interpolate_attributes(
     prepared: PreparedScene, drawn: VisibleSurfaces, rows: _PixelRows, attributes: Tensor
 ) -> Tensor:
-    """Attributes (V, K) of the mesh at the mesh rows (Rm, K), continued over the fringe."""
+    """Attributes (V, K) of the mesh at the mesh rows (Rm, K), extended over the outline."""
     dense = verbs.interpolate(
         drawn.mesh, drawn.geometry.clip, prepared.object_surfaces.faces, attributes, prepared.settings.backend
     )
-    return rows.fringe.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
+    return rows.outline.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
 
 def _average_attributes(
     prepared: PreparedScene, drawn: VisibleSurfaces, rows: _PixelRows, attributes: Tensor
 ) -> Tensor:
-    """`_mesh_attributes`, but the mean over the pixels, at `model.SUBPIXELS`: what is thinner than a pixel would
-    else be a row of dots. A place that is not reached counts as the pixel's centre."""
+    """`_interpolate_attributes`, averaged over the pixel at `model.SUBPIXELS`: parts thinner than a pixel would
+    otherwise be rows of dots. A position that is not reached counts as the pixel's centre.
+    """
     object_surfaces, clip = prepared.object_surfaces, drawn.geometry.clip.double()
     face = drawn.mesh.face[rows.pixel[: rows.mesh_rows]].long()
     hit = (face >= 0).nonzero()[:, 0]
@@ -188,12 +198,13 @@ def _average_attributes(
         share = surfaces.perspective_weights(clip[corner], xy)
         total = total + (share[..., None] * attributes.double()[corner]).sum(dim=1)
     mean = clip.new_zeros(len(face), attributes.shape[1]).index_copy(0, hit, total / len(model.SUBPIXELS))
-    return rows.fringe.fill(mean.to(attributes))
+    return rows.outline.fill(mean.to(attributes))
 
 
-def _walk_mesh(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Tensor) -> Tensor:
-    """Faces (K,) that places xy (K, 2) px lie in, reached from `face` (K,) over the mesh's edges; -1 where it ends
-    or turns away before, or that takes more than `model.WALK` faces."""
+def _walk_mesh(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, neighbours: Tensor) -> Tensor:
+    """Faces (K,) at positions xy (K, 2) px, reached from `face` (K,) over the mesh's edges; -1 where the surface
+    ends or turns away before, or after more than `model.WALK` faces.
+    """
     found, here = torch.full_like(face, -1), face
     first = clip.new_zeros(len(face))
     for passed in range(model.WALK):
@@ -205,7 +216,7 @@ def _walk_mesh(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, beside: Te
         least, nearest = (edge * det.sign()[:, None]).min(dim=1)
         walks = (here >= 0) & (found < 0) & (det * first > 0.0)
         found = torch.where(walks & (least >= 0.0), here, found)
-        across = beside[here.clamp(min=0)].gather(1, nearest[:, None])[:, 0]
+        across = neighbours[here.clamp(min=0)].gather(1, nearest[:, None])[:, 0]
         here = torch.where(walks, across, torch.full_like(here, -1))
     return found
 
@@ -235,15 +246,15 @@ def _shade_photographed(
     dense = verbs.interpolate(
         drawn.mesh, geometry.clip, object_surfaces.faces, attributes, prepared.settings.backend
     )
-    mesh = rows.fringe.fill(_photograph_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
-    look = torch.cat([mesh, mesh.index_select(0, rows.anchor)])
-    move, rest = look.split([channels.W_THEN, channels.LOOK - channels.W_THEN], dim=1)
-    z_then, z_now, turned, cos_then, paint, up, brighter = rest.unbind(1)
+    mesh = rows.outline.fill(_photograph_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
+    lookup = torch.cat([mesh, mesh.index_select(0, rows.anchor)])
+    move, rest = lookup.split([channels.W_THEN, channels.LOOKUP - channels.W_THEN], dim=1)
+    z_then, z_now, turned, cos_then, paint, height, brighter = rest.unbind(1)
 
     assert prepared.texels is not None
     uv = rows.xy + move
-    seen = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
-    rgb, rest = seen.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
+    texels = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
+    rgb, rest = texels.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
     alpha, hidden, inset, z_seen, support = rest.unbind(1)
     rgb = texture.relight(rgb, brighter)
     clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
@@ -256,9 +267,9 @@ def _shade_photographed(
         near = near * smoothstep(alpha, *model.SOLID_ALPHA)
         weight = weight + facing * (1.0 - inside) * near * clear
     weight = weight * (1.0 - smoothstep(z_then - z_seen, *model.DEPTH_TOLERANCE_M))
-    kept = smoothstep(texture.outline_share(inset[m:]), 0.0, 1.0) * texture.outline_weight(turned[m:])
-    kept = kept * (1.0 - smoothstep(inset[rows.anchor], *model.BESIDE_OUTLINE_PX))
-    weight = torch.cat([weight[:m], weight[m:] * kept])
+    halo_weight = smoothstep(texture.outline_share(inset[m:]), 0.0, 1.0) * texture.outline_weight(turned[m:])
+    halo_weight = halo_weight * (1.0 - smoothstep(inset[rows.anchor], *model.OUTER_OUTLINE_PX))
+    weight = torch.cat([weight[:m], weight[m:] * halo_weight])
     rim = 1.0 - smoothstep(cos_then[:m], *model.RIM)
     opened = smoothstep(turned[:m], *model.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
     # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
@@ -268,18 +279,18 @@ def _shade_photographed(
     gain = torch.cat([closed / alpha[:m].clamp(min=model.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
     fill = (1.0 - weight[:m]) * (1.0 - empty)
     colour, opacity = (weight + gain)[:, None] * rgb, (weight + gain) * alpha
-    need = (fill != 0.0).nonzero()[:, 0]
-    if need.numel():
-        filled = fill.index_select(0, need)
-        completed = _complete_unseen(prepared, objects, drawn, rows, need, cos_then[:m] + turned[:m], sun)
-        colour = colour.index_add(0, need, filled[:, None] * completed)
-        opacity = opacity.index_add(0, need, filled)
+    unseen_rows = (fill != 0.0).nonzero()[:, 0]
+    if unseen_rows.numel():
+        filled = fill.index_select(0, unseen_rows)
+        completed = _complete_unseen(prepared, objects, drawn, rows, unseen_rows, cos_then[:m] + turned[:m], sun)
+        colour = colour.index_add(0, unseen_rows, filled[:, None] * completed)
+        opacity = opacity.index_add(0, unseen_rows, filled)
     assert prepared.regions is not None
     if is_active(objects.texture_code) and bool(prepared.regions.known.any()):
         unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
         found = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.settings.backend)[:, 0]
         paint = texture.paint_share(paint, found, unseen, prepared.regions.known[rows.owner])
-    return _ShadedRows(colour, opacity, z_now, paint, up)
+    return _ShadedRows(colour, opacity, z_now, paint, height)
 
 
 def _complete_unseen(
@@ -287,43 +298,43 @@ def _complete_unseen(
     objects: Objects,
     drawn: VisibleSurfaces,
     rows: _PixelRows,
-    need: Tensor,
+    unseen_rows: Tensor,
     cos_now: Tensor,
     sun: PerturbedSun | None,
 ) -> Tensor:
-    """Colours (K, 3) of mesh rows `need` that the photograph did not see: the car's other side, or the
-    template in the car's own finish.
-
-    cos_now: (Rm,) towards the camera.
+    """Colours (K, 3) of mesh rows `unseen_rows` that the photograph did not see: the car's other side, or the template in
+    the car's own finish. cos_now: (Rm,) towards the camera.
     """
     attributes = prepared.completion_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
-    own = _average_attributes(prepared, drawn, rows, attributes)[need]
+    own = _average_attributes(prepared, drawn, rows, attributes)[unseen_rows]
     gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
-    colour = texture.apply_finish(prepared.shade_template(rows.xy[need], rows.owner[need], own, sun), gain, lift)
+    colour = texture.apply_finish(
+        prepared.shade_template(rows.xy[unseen_rows], rows.owner[unseen_rows], own, sun), gain, lift
+    )
     clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
     z = clip[:, 2]
     safe = z.clamp(min=model.NEAREST_MIRRORED_M)
     uv = clip[:, :2] / safe[:, None]
-    counts = torch.bincount(rows.owner[need], minlength=rows.counts.shape[0])
+    counts = torch.bincount(rows.owner[unseen_rows], minlength=rows.counts.shape[0])
     assert prepared.texels is not None
-    seen = prepared.texels.sample(uv, counts, prepared.settings.backend, "clamp")
+    texels = prepared.texels.sample(uv, counts, prepared.settings.backend, "clamp")
     height, width = prepared.frame_hw
     weight = (
         texture.inside_weight(uv, height, width)
-        * (1.0 - smoothstep(seen[:, channels.HIDDEN], 0.0, 1.0))
-        * smoothstep(seen[:, channels.ALPHA], *model.SOLID_ALPHA)
-        * (1.0 - smoothstep(z - seen[:, channels.DEPTH], *model.DEPTH_TOLERANCE_M))
-        * texture.facing_weight(cos_now[need] - cos_then, cos_then, own[:, channels.OWN_PAINT])
+        * (1.0 - smoothstep(texels[:, channels.HIDDEN], 0.0, 1.0))
+        * smoothstep(texels[:, channels.ALPHA], *model.SOLID_ALPHA)
+        * (1.0 - smoothstep(z - texels[:, channels.DEPTH], *model.DEPTH_TOLERANCE_M))
+        * texture.facing_weight(cos_now[unseen_rows] - cos_then, cos_then, own[:, channels.OWN_PAINT])
         * smoothstep(cos_then, *model.MIRRORED_COS)
-        * (1.0 - smoothstep(texture.outline_share(seen[:, channels.INSET]), *model.MIRRORED_RIM))
+        * (1.0 - smoothstep(texture.outline_share(texels[:, channels.INSET]), *model.MIRRORED_RIM))
     )
-    rgb, alpha = seen[:, : channels.ALPHA], seen[:, channels.ALPHA : channels.HIDDEN]
+    rgb, alpha = texels[:, : channels.ALPHA], texels[:, channels.ALPHA : channels.HIDDEN]
     straight = rgb / alpha.clamp(min=model.LEAST_MIRRORED_ALPHA)
     return colour + weight[:, None] * (clamp_inclusive(straight, 0.0, 1.0) - colour)
 
 
 def _sample_shadows(prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces) -> Tensor:
-    """Factors (Ts, 3) on the ground, of all patches."""
+    """Shadow factors (Ts, 3) on the ground, of all patches."""
     clip, layout = drawn.geometry.patch_clip, drawn.patch_layout
     assert drawn.patch_fragments is not None
     if layout.size == 0:
@@ -352,11 +363,10 @@ def _sample_shadows(prepared: PreparedScene, objects: Objects, drawn: VisibleSur
 
 
 def _photograph_lookup(attributes: Tensor, xy: Tensor) -> Tensor:
-    """From interpolated clip differences to where the photograph shows this point.
+    """Photograph position of each pixel from interpolated clip differences.
 
-    attributes (R, 4 + K): clip then minus now (3), w then, and K more; xy (R, 2) px
-    -> (R, 4 + K): displacement in px (2), w then, w now, and the K more. A point that was behind the camera is
-    looked up far outside the photograph.
+    attributes (R, 4 + K): clip then minus now (3), w then, and K more; xy (R, 2) px -> (R, 4 + K): displacement in
+    px (2), w then, w now, and the K more. A point that was behind the camera is looked up far outside.
     """
     delta, then = attributes[:, :3], attributes[:, 3:4]
     before = then > verbs.NEAR_M

@@ -1,7 +1,7 @@
-"""Taking a photograph apart: from mattes and a background to `Source`s that give the photograph back, exactly.
+"""Decomposition of a photograph into `Source`s and a background that render to exactly the photograph.
 
 Given photograph I, background B and matte a, the foreground is F = (I - (1 - a) B) / a. That is an identity for
-any matte, so the matte is raised only as far as F needs to stay in gamut; vehicles are solved from the farthest to
+any matte, so the matte is raised only as far as F needs to stay in gamut. Vehicles are solved from the farthest to
 the nearest, each against what lies behind it, completions of hidden parts included.
 """
 
@@ -26,31 +26,33 @@ from scene_ir.render.surfaces import nearest_true_pixel
 from scene_ir.types import Crop, Objects, SceneIR, Source
 
 _EXTENSION_PX = 4.5
-"""How far colours are continued under a nearer object: beyond `model.HIDDEN_PX`, plus the lookups' kernel."""
+"""Distance over which colours continue under a nearer object: `model.HIDDEN_PX` plus the lookup's kernel."""
 _KEEP = 0.02
-"""A given background is kept under a shadow where background times shadow is this near to the photograph."""
+"""A given background stays under a shadow where background times shadow is this close to the photograph."""
 _SOLID = 0.95
-"""Opacity from which on a pixel is taken to show nothing but the vehicle."""
+"""Opacity from which a pixel shows nothing but the vehicle."""
 _COLOUR_SLACK = 0.1
-"""How far a foreground colour may leave the range between photograph and vehicle: thin trims do; what a wrong
-matte or background asks for goes farther, and would travel with the vehicle as dark or bright specks."""
+"""Distance by which a foreground colour may leave the range between photograph and vehicle: thin trims do; a wrong
+matte or background needs more, and would move with the vehicle as dark or bright specks.
+"""
 _OPEN = 0.9
-"""Share of the light of the sky, in display values, that reaches the ground beside a vehicle."""
+"""Share of the sky's light, in display values, that reaches the ground next to a vehicle."""
 _LEVELS = 255.0
-"""Backgrounds are stored with 8 bit."""
+"""Backgrounds are stored with 8 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class SolveSettings:
-    """margin_px: how far the halo reaches beyond the mesh; min_inflation_m: but at least so far;
-    complete_shadows: whether shadows are continued under the vehicles, where the photograph could not show them;
-    backend: see `RenderSettings`.
-    """
+    """Settings of the decomposition."""
 
     margin_px: float = 3.0
+    """Reach of the halo beyond the mesh, px."""
     min_inflation_m: float = 0.02
+    """Least reach of the halo, m."""
     complete_shadows: bool = True
+    """Whether shadows continue under the vehicles, where the photograph cannot show them."""
     backend: verbs.Backend = "warp"
+    """See `RenderSettings`."""
 
 
 def solve_sources(
@@ -62,11 +64,18 @@ def solve_sources(
 ) -> SceneIR:
     """The scene with `objects.source` and a background such that its unperturbed render is its photograph.
 
-    scene: with photograph, background and placed objects; sources that it has are replaced. alphas: one Crop (1,
-    h, w) an object, the matte of what the photograph shows of it (0 where a nearer object hides it). shadows: one
-    Crop (3, h, w) an object, the factor by which it darkens the ground, or None. Where nothing covers the
-    background, it becomes the photograph (freed of the shadows). margins_px: for each object instead of
-    `settings.margin_px`. Of what stands in front, `scene.occluders`, the opacity is taken, and the colours are solved.
+    Where nothing covers the background, it becomes the photograph without shadows. Of occluders, the opacity is
+    taken and the colours are solved.
+
+    Args:
+        scene: Photograph, background and placed objects; existing sources are replaced.
+        alphas: Matte (1, h, w) of each object, 0 where a nearer object hides it.
+        shadows: Factor (3, h, w) by which each object darkens the ground, or None.
+        settings: Settings.
+        margins_px: Margin of each object, instead of `settings.margin_px`.
+
+    Raises:
+        ShapeError: Unless there is one matte and one shadow per object.
     """
     settings = settings or SolveSettings()
     count = len(scene.objects)
@@ -79,8 +88,9 @@ def solve_sources(
 
 
 def photograph_scene(bare: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
-    """`bare` after a photograph of it, of 8 bit and drawn by the compositor itself, was taken apart. bare: its
-    objects stand before its background, and have no sources. backend: see `RenderSettings`.
+    """A scene without sources, rendered to an 8-bit photograph and decomposed again.
+
+    bare: objects in front of its background, without sources. backend: see `RenderSettings`.
     """
     settings, objects = RenderSettings(backend), bare.objects
     with torch.no_grad():
@@ -99,7 +109,7 @@ def photograph_scene(bare: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
 
 
 def analytic_shadows(scene: SceneIR, settings: RenderSettings | None = None) -> tuple[Crop, ...]:
-    """For each object a Crop (3, h, w): the factor by which its box, in the scene's sun, darkens the ground."""
+    """Factor (3, h, w) by which each object's box, in the scene's sun, darkens the ground."""
     bare = replace(scene, objects=replace(scene.objects, source=()))
     with torch.no_grad():
         compositor = Compositor(bare, settings)
@@ -206,7 +216,7 @@ def _estimate_lighting(
     hidden: list[Tensor],
     settings: SolveSettings,
 ) -> list[Source]:
-    """Sources with the paint that the photograph shows, and the strength of the sun: one for the whole frame."""
+    """Sources with the photographed paint, and the strength of the sun, one for the whole frame."""
     if not blank:
         return blank
     plain = []
@@ -232,20 +242,20 @@ def _select_object(objects: Objects, index: int) -> Objects:
 
 
 def _crop_view(frame: Tensor, crop: Crop) -> Tensor:
-    """The view of a frame (C, H, W) that a crop lies on."""
+    """The view of a frame (C, H, W) at a crop."""
     h, w = crop.values.shape[1:]
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
 
 
 def _touches(rect: Sequence[int], matte: Crop) -> bool:
-    """Whether a matte has pixels in a rectangle x0, y0, x1, y1, half-open, or right beside it."""
+    """Whether a matte has pixels in a rectangle x0, y0, x1, y1, half-open, or adjacent to it."""
     h, w = matte.values.shape[1:]
     across = matte.x0 <= rect[2] and rect[0] <= matte.x0 + w
     return bool(h and w) and across and matte.y0 <= rect[3] and rect[1] <= matte.y0 + h
 
 
 def _cut_matte(alpha: Crop, drawn: VisibleSurfaces, nearest: Tensor, index: int, like: Tensor) -> Crop:
-    """The matte where mesh and halo carry it, trimmed to where it is above 0 and what it may be continued to."""
+    """The matte where mesh and halo carry it, trimmed to where it is above 0 and may be extended."""
     packed, size = drawn.mesh.layout.spans()[index]
     x0, y0, x1, y1 = drawn.mesh.layout.rects[index].tolist()
     height, width = like.shape[1:]
@@ -272,7 +282,7 @@ def _complete_shadows(
     covered: Tensor,
     settings: SolveSettings,
 ) -> list[Crop]:
-    """The shadows' factors (3, h, w) on the patches that carry them, continued under the vehicles."""
+    """Shadow factors (3, h, w) on the patches that carry them, continued under the vehicles."""
     density = compositor.patch_density(drawn)
     assert drawn.patch_fragments is not None
     out = []
@@ -297,7 +307,8 @@ def _complete_shadows(
 
 def _extend_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
     """Darkness (3, h, w) with its unseen pixels, `covered` (h, w), taken from the expected one (h, w), fitted to
-    the seen ones in strength and, near them, in value."""
+    the visible pixels in strength and, near them, in value.
+    """
     seen = (~covered).to(dark)
     sure = seen * (expected > 0.05)
     # Row by row: a sum that threads share depends on their number.
@@ -317,7 +328,7 @@ def _extend_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
 def _balance_background(image: Tensor, background: Tensor, factors: list[Crop], covered: Tensor) -> Tensor:
     """The background for which background times shadows is the photograph where no vehicle covers it.
 
-    Changes `factors` in place where the quantised background asks for it.
+    Changes `factors` in place where the quantised background requires it.
     """
     product = torch.ones_like(image)
     for factor in factors:
@@ -353,9 +364,9 @@ def _balance_background(image: Tensor, background: Tensor, factors: list[Crop], 
 
 
 def _solve_foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor, coverage: Crop) -> Crop:
-    """Premultiplied foreground and matte (4, h, w) over the canvas, continued a little under nearer objects.
+    """Premultiplied foreground and matte (4, h, w) over the canvas, extended a little under nearer objects.
 
-    nearer: (H, W) bool, where they are; coverage: Crop (1, h, w) by the mesh, the opacity under them.
+    nearer: (H, W) bool, where they are; coverage: (1, h, w) by the mesh, the opacity under them.
     """
     h, w = matte.values.shape[1:]
     if h == 0 or w == 0:
@@ -385,8 +396,9 @@ def _solve_foreground(matte: Crop, image: Tensor, canvas: Tensor, nearer: Tensor
 
 
 def _plausible_range(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
-    """Lowest and highest foreground (3, h, w) to believe in: between the photograph's colour and that of the
-    nearest pixel that is all vehicle, `solid` (h, w), and a little beyond."""
+    """Lowest and highest plausible foreground (3, h, w): between the photograph's colour and that of the nearest
+    pixel that is all vehicle, `solid` (h, w), with some slack.
+    """
     if not bool(solid.any()):
         return torch.zeros_like(goal), torch.ones_like(goal)
     index = torch.from_numpy(nearest_true_pixel(solid.numpy())[1])
@@ -396,7 +408,7 @@ def _plausible_range(goal: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sunlight_from_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
-    """How strong the sun (3,) is that casts this shadow, by what it takes away; None without one."""
+    """Strength of the sun (3,) that casts this shadow, from the light it removes; None without one."""
     if shadow is None or not shadow.values.numel():
         return None
     core = 1.0 - shadow.values.mean(dim=0)

@@ -1,4 +1,4 @@
-"""What the compositor draws: a vehicle's mesh, its halo and the patch of ground that carries its shadow.
+"""Geometry of what is drawn: vehicle meshes, their halos, and the ground patches that carry their shadows.
 
 Shapes: N objects; V vertices and F triangles of all objects together, object after object.
 """
@@ -24,41 +24,46 @@ from scene_ir.render import model
 from scene_ir.types import Camera, Mesh, Objects, Part
 
 CREASE_RAD = 0.7
-"""Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling
-tools."""
+"""Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling tools.
+"""
 SHADOW_MARGIN_M = 0.8
-"""How far the shadow's patch reaches beyond the footprint, besides the sun's offset."""
+"""Margin of the shadow's patch around the footprint, besides the sun's offset."""
 _GRAIN_SIZE = 1 << 15
-"""So many values torch computes in one thread (ATen's GRAIN_SIZE)."""
+"""Values that torch computes in one thread (ATen's GRAIN_SIZE)."""
 _WELD_DISTANCE = 1e-5
-"""Vertices of the unit box nearer than this are one point."""
+"""Vertices of the unit box closer than this are one point."""
 
 
 @dataclass(frozen=True, slots=True)
 class TemplateSurface:
-    """A mesh made ready to draw, sharp edges split.
-
-    unit (V, 3), faces (F, 3) int64; beside (F, 3) int64: the face across the edge that is opposite to each corner,
-    -1 where there is none or more than one; weights, mirror_weights (V, 64): lattice weights of each vertex and of
-    its mirror image; weld (V,) int64: vertices at one place share a number; colours (V, 3); paint, glass (V,) in
-    [0, 1]; part (V,) int64, a `Part` of a face around it; closed: whether faces bound volumes and look outwards.
-    """
+    """A mesh prepared for drawing, with sharp edges split."""
 
     unit: Tensor
+    """(V, 3) in the unit box."""
     faces: Tensor
+    """(F, 3) int64."""
     neighbours: Tensor
+    """(F, 3) int64, face across the edge opposite to each corner; -1 where there is none or more than one."""
     weights: Tensor
+    """(V, 64) lattice weights."""
     mirror_weights: Tensor
+    """(V, 64) lattice weights of the mirrored vertices."""
     weld: Tensor
+    """(V,) int64, equal for vertices at one place."""
     colours: Tensor
+    """(V, 3)."""
     paint: Tensor
+    """(V,) in [0, 1]."""
     glass: Tensor
+    """(V,) in [0, 1]."""
     part: Tensor
+    """(V,) int64, a `Part` of a face around the vertex."""
     closed: bool
+    """Whether faces bound volumes and look outwards."""
 
     @classmethod
     def from_mesh(cls, mesh: Mesh, dtype: torch.dtype) -> TemplateSurface:
-        """The surface of `mesh`; prepared once a mesh and kept while few others are used."""
+        """The surface of `mesh`; computed once per mesh and cached while few others are used."""
         return _build_surface(mesh.vertices, mesh.faces, mesh.part, mesh.colours, dtype)
 
 
@@ -96,7 +101,7 @@ def _build_surface(
 
 
 def _face_neighbours(faces: np.ndarray) -> np.ndarray:
-    """See `Surface.beside`. faces (F, 3): of welded points."""
+    """See `TemplateSurface.neighbours`. faces: (F, 3) of welded points."""
     edges = np.sort(
         np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1
     )
@@ -104,16 +109,17 @@ def _face_neighbours(faces: np.ndarray) -> np.ndarray:
     ordered = edges[order]
     same = (ordered[1:] == ordered[:-1]).all(axis=1)
     pair = np.flatnonzero(same & ~np.append(same[1:], False) & ~np.insert(same[:-1], 0, False))
-    beside = np.full(len(edges), -1)
-    beside[order[pair]], beside[order[pair + 1]] = order[pair + 1] // 3, order[pair] // 3
-    return beside.reshape(-1, 3)
+    missed = np.full(len(edges), -1)
+    missed[order[pair]], missed[order[pair + 1]] = order[pair + 1] // 3, order[pair] // 3
+    return missed.reshape(-1, 3)
 
 
 def _is_closed(corners: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether faces (F, 3) of welded points bound volumes and look outwards, so that their backs are never seen.
+    """Whether faces (F, 3) of welded points bound volumes and look outwards, so that their backs are never
+    visible.
 
-    corners (F, 3, 3): where the faces' corners lie. Each edge must be passed once in each direction, and every
-    piece that hangs together must have a positive volume.
+    Each edge must be passed once in each direction, and every connected piece must have a positive volume.
+    corners: (F, 3, 3) positions of the faces' corners.
     """
     if not len(faces):
         return False
@@ -129,8 +135,9 @@ def _is_closed(corners: np.ndarray, faces: np.ndarray) -> bool:
 
 
 def _crease_normals(points: np.ndarray, faces: np.ndarray, weld: np.ndarray) -> np.ndarray:
-    """Unit normals (3F, 3) of the corners: area-weighted over the faces around the point that bend less than a
-    crease."""
+    """Unit normals (3F, 3) of the corners, area-weighted over the faces around the point that bend by less than a
+    crease.
+    """
     a, b, c = (points[faces[:, k]] for k in range(3))
     area = np.cross(b - a, c - a)
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-20)
@@ -150,7 +157,7 @@ def _crease_normals(points: np.ndarray, faces: np.ndarray, weld: np.ndarray) -> 
 
 
 def _part_share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
-    """The share (V,) of the faces around each vertex that are of one part."""
+    """Share (V,) of the faces around each vertex that belong to one part."""
     index = faces.reshape(-1)
     flags = is_part.to(like.dtype).repeat_interleave(3)
     total = like.new_zeros(like.shape[0]).index_add(0, index, torch.ones_like(flags))
@@ -158,31 +165,36 @@ def _part_share(faces: Tensor, is_part: Tensor, like: Tensor) -> Tensor:
 
 
 def offset_indices(numbers: Sequence[Tensor], counts: Sequence[int]) -> list[Tensor]:
-    """Numbers of what lies in several sets, so many in each, once these lie one after the other; -1 stays."""
+    """Indices into several sets, made indices into their concatenation; -1 stays. counts: size of each set."""
     return [torch.where(n < 0, n, n + sum(counts[:i])) for i, n in enumerate(numbers)]
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectSurfaces:
-    """The surfaces of N objects, one after the other.
-
-    owner (V,) int64: the object of each vertex; vertex_ranges, face_ranges (N, 2) int64; faces (F, 3) int64 into
-    the V vertices; beside (F, 3) int64, see `Surface`, into the F faces; colours (V, 3); paint, glass (V,).
-    """
+    """The surfaces of N objects, concatenated."""
 
     surfaces: tuple[TemplateSurface, ...]
+    """Surface of each object."""
     owner: Tensor
+    """(V,) int64, object of each vertex."""
     vertex_ranges: Tensor
+    """(N, 2) int64."""
     face_ranges: Tensor
+    """(N, 2) int64."""
     faces: Tensor
+    """(F, 3) int64 into the V vertices."""
     neighbours: Tensor
+    """(F, 3) int64 into the F faces, see `TemplateSurface`."""
     colours: Tensor
+    """(V, 3)."""
     paint: Tensor
+    """(V,)."""
     glass: Tensor
+    """(V,)."""
 
     @classmethod
     def from_surfaces(cls, surfaces: Sequence[TemplateSurface], like: Tensor) -> ObjectSurfaces:
-        """`like`: a tensor of the dtype and device to work in."""
+        """The surfaces concatenated, in the dtype and on the device of `like`."""
         device = like.device
         ends = np.cumsum([0] + [s.unit.shape[0] for s in surfaces])
         face_ends = np.cumsum([0] + [s.faces.shape[0] for s in surfaces])
@@ -195,14 +207,14 @@ class ObjectSurfaces:
             return torch.cat(parts) if parts else like.new_zeros(shape)
 
         faces = offset_indices([s.faces for s in surfaces], counts.tolist())
-        beside = offset_indices([s.neighbours for s in surfaces], [s.faces.shape[0] for s in surfaces])
+        missed = offset_indices([s.neighbours for s in surfaces], [s.faces.shape[0] for s in surfaces])
         return cls(
             tuple(surfaces),
             torch.repeat_interleave(torch.arange(len(surfaces)), counts).to(device),
             ranges(ends),
             ranges(face_ends),
             packed(faces, 0, 3).to(torch.int64),
-            packed(beside, 0, 3).to(torch.int64),
+            packed(missed, 0, 3).to(torch.int64),
             packed([s.colours for s in surfaces], 0, 3),
             packed([s.paint for s in surfaces], 0),
             packed([s.glass for s in surfaces], 0),
@@ -210,7 +222,7 @@ class ObjectSurfaces:
 
     @staticmethod
     def concat_faces(surface_sets: Sequence[ObjectSurfaces]) -> tuple[Tensor, list[list[int]], list[list[int]]]:
-        """Faces (F, 3) of several fleets' vertices, one after the other; vertex and face ranges of all objects."""
+        """Faces (F, 3) of several sets of objects, concatenated; vertex and face ranges of all objects."""
         vertex_ranges: list[list[int]] = []
         face_ranges: list[list[int]] = []
         faces, vertices, triangles = [], 0, 0
@@ -223,8 +235,13 @@ class ObjectSurfaces:
         return torch.cat(faces), vertex_ranges, face_ranges
 
     def local_vertices(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
-        """Vertices (V, 3) m in their objects' frames. ffd (N, P, 3); size_lhw (N, 3) m; mirrored: left and right
-        swapped."""
+        """Vertices (V, 3) m in their objects' frames.
+
+        Args:
+            ffd: (N, P, 3) lattice offsets.
+            size_lhw: (N, 3) m.
+            mirrored: Whether left and right are swapped.
+        """
         parts = []
         for i, surface in enumerate(self.surfaces):
             if mirrored:
@@ -253,35 +270,48 @@ class ObjectSurfaces:
         return values.index_select(0, self.owner)
 
     def place(self, local: Tensor, yaw: Tensor, translation: Tensor) -> Tensor:
-        """Camera-space points (V, 3) m of local ones. yaw (N,) rad; translation (N, 3) m."""
+        """Camera-space points (V, 3) m.
+
+        Args:
+            local: (V, 3) m in the objects' frames.
+            yaw: (N,) rad.
+            translation: (N, 3) m.
+        """
         return rotate_y(local, self.per_vertex(yaw)) + self.per_vertex(translation)
 
 
 @dataclass(frozen=True, slots=True)
 class VertexPlacement:
-    """What placing vertices by kernels takes besides poses. unit (V, 3); weights: of each object, (v, P); normal
-    (V, 3) unit, local; owner (V,) int32; paint (V,); ffd (N, P, 3) and bent (V, 3): the photograph's offsets, and
-    what they are at the vertices; lit (V,): how squarely its sun meets them; sunlight (N,): how strong that is, 0
-    where nothing was photographed; matrix (N, 3, 4) and centre (N, 3) m of the objects' cameras; edges: the
-    objects' first vertices, and V.
-    """
+    """Input of the kernels that place vertices, besides poses."""
 
     unit: Tensor
+    """(V, 3) in the unit box."""
     weights: tuple[Tensor, ...]
+    """Lattice weights (v, P) of each object."""
     normal: Tensor
+    """(V, 3) unit, local."""
     owner: Tensor
+    """(V,) int32."""
     paint: Tensor
+    """(V,)."""
     base_ffd: Tensor
+    """(N, P, 3) photographed lattice offsets."""
     base_bend: Tensor
+    """(3, V) their effect at the vertices."""
     base_exposure: Tensor
+    """(V,) how squarely the photographed sun meets the vertices."""
     sunlight: Tensor
+    """(N,) strength of that sun, 0 without photograph."""
     matrix: Tensor
+    """(N, 3, 4) cameras of the objects."""
     centre: Tensor
+    """(N, 3) m, positions of the cameras."""
     vertex_edges: list[int]
+    """First vertex of each object, and V."""
 
     @classmethod
     def concat(cls, placements: Sequence[VertexPlacement]) -> VertexPlacement:
-        """Several scenes' objects, one after the other."""
+        """Several scenes' objects, concatenated."""
         if len(placements) == 1:
             return placements[0]
         counts = [r.matrix.shape[0] for r in placements]
@@ -308,8 +338,16 @@ class VertexPlacement:
         sun: Tensor,
         sunlight: Tensor,
     ) -> VertexPlacement:
-        """Of one scene's objects, as photographed. normal (V, 3), welded; sun (3,) and sunlight (N,): the
-        photograph's."""
+        """The input for one scene's photographed objects.
+
+        Args:
+            object_surfaces: Surfaces of the objects.
+            base: Objects at their photographed poses.
+            normal: (V, 3) welded normals.
+            camera: The camera.
+            sun: (3,) photographed direction.
+            sunlight: (N,) photographed strength.
+        """
         count, like = len(base), normal
         placement = cls(
             unit=torch.cat([s.unit for s in object_surfaces.surfaces]) if count else like,
@@ -335,8 +373,9 @@ class VertexPlacement:
         )
 
     def bend_vertices(self, ffd: Tensor) -> Tensor:
-        """What offsets (N, P, 3) are at the vertices, as fractions of the unit box: rows x, y, z (3, V), which a
-        product with three rows gives three times as fast as one with three columns.
+        """Effect (3, V) of lattice offsets (N, P, 3) at the vertices, as fractions of the unit box.
+
+        Rows x, y, z: a product with three rows is three times as fast as one with three columns.
         """
         if torch.equal(ffd, self.base_ffd):
             return self.base_bend
@@ -345,7 +384,7 @@ class VertexPlacement:
         return torch.cat(parts, 1)
 
     def bend_gradient(self, to_bent: Tensor) -> Tensor:
-        """A gradient to that (3, V), as one to offsets (N, P, 3)."""
+        """A gradient (3, V) to the bend as one to the offsets (N, P, 3)."""
         parts = [
             (to_bent[:, a:b].contiguous() @ w).T
             for (a, b), w in zip(itertools.pairwise(self.vertex_edges), self.weights, strict=True)
@@ -356,9 +395,19 @@ class VertexPlacement:
 def place_with_kernels(
     placement: VertexPlacement, ffd: Tensor, size_lhw: Tensor, yaw: Tensor, translation: Tensor, lights: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """By the kernels, in float32: clip coordinates (V, 3) of objects' vertices, the cosines (V,) of their normals
-    to the camera, how much brighter they are (V,), see `texture.limit_brightening`, and how squarely the sun meets them
-    (V,). lights (N, 4): direction and strength of the sun on each object.
+    """Place vertices by the kernels, in float32.
+
+    Args:
+        placement: Input besides poses.
+        ffd: (N, P, 3) lattice offsets.
+        size_lhw: (N, 3) m.
+        yaw: (N,) rad.
+        translation: (N, 3) m.
+        lights: (N, 4) direction and strength of the sun on each object.
+
+    Returns:
+        Clip coordinates (V, 3), cosine (V,) towards the camera, brightening (V,), see `texture.limit_brightening`,
+        and how squarely the sun meets the vertices (V,).
     """
     from scene_ir.render.kernels.placement import PlaceVertices
 
@@ -370,9 +419,18 @@ def place_with_kernels(
 def place_patches(
     yaw: Tensor, translation: Tensor, size_lhw: Tensor, lights: Tensor, fixed: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """By the kernels: from a pixel (x, y, 1) to its place (s, t, 1) / w on an object's patch of ground (N, 3, 3)
-    float64, 0 to 1 both ways; and without gradient the same back, and clip coordinates (4N, 3) of the corners.
-    lights as of `placed`; fixed: as of `Prepared.patched`.
+    """Place the shadows' patches by the kernels.
+
+    Args:
+        yaw: (N,) rad.
+        translation: (N, 3) m.
+        size_lhw: (N, 3) m.
+        lights: (N, 4) direction and strength of the sun on each object.
+        fixed: As of `PreparedScene.patch_inputs`.
+
+    Returns:
+        (N, 3, 3) float64 from a pixel (x, y, 1) to (s, t, 1) / w on the patch, s and t in [0, 1]; without
+        gradient, its inverse and the corners' clip coordinates (4N, 3).
     """
     from scene_ir.render.kernels.shadow_patches import PlacePatches
 
@@ -384,8 +442,18 @@ def place_patches(
 def place_vertices(
     local: Tensor, normal: Tensor, owner: Tensor, objects: Objects, matrix: Tensor, centre: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """In plain torch: clip coordinates (V, 3) of local vertices (V, 3) m, and the cosines (V,) of their normals
-    (V, 3) to the camera. owner (V,) int64; matrix (3, 4), centre (3,) m of the camera.
+    """Place vertices in plain torch.
+
+    Args:
+        local: (V, 3) m in the objects' frames.
+        normal: (V, 3) local normals.
+        owner: (V,) int64.
+        objects: Poses.
+        matrix: (3, 4) of the camera.
+        centre: (3,) m, position of the camera.
+
+    Returns:
+        Clip coordinates (V, 3) and cosines (V,) of the normals towards the camera.
     """
     turn = objects.yaw.index_select(0, owner)
     points = rotate_y(local, turn) + objects.translation.index_select(0, owner)
@@ -394,8 +462,7 @@ def place_vertices(
 
 
 class _LatticeBend(torch.autograd.Function):
-    """weights (V, 64) @ offsets (64, 3), in the order of operands that is several times faster for three
-    columns."""
+    """weights (V, 64) @ offsets (64, 3), in the operand order that is several times faster for three columns."""
 
     @staticmethod
     def forward(ctx: Any, offsets: Tensor, weights: Tensor) -> Tensor:
@@ -415,19 +482,30 @@ def rotate_y(local: Tensor, yaw: Tensor) -> Tensor:
 
 
 def facing_cosine(points: Tensor, normals: Tensor, centre: Tensor) -> Tensor:
-    """Cosine (V,) between normals (V, 3) and the way to the camera at `centre` (3,), points (V, 3) m."""
+    """Cosine (V,) between normals and the direction to the camera.
+
+    Args:
+        points: (V, 3) m.
+        normals: (V, 3) unit.
+        centre: (3,) m, position of the camera.
+    """
     towards = centre - points
     return (towards * normals).sum(-1) / towards.norm(dim=-1).clamp(min=1e-6)
 
 
 def camera_centre(matrix: Tensor) -> Tensor:
-    """Where the camera stands (3,) m; its fourth column moves KITTI's camera 2 off the origin."""
+    """Position (3,) m of the camera; the fourth column of KITTI's camera 2 moves it off the origin."""
     return -torch.linalg.solve(matrix[:, :3], matrix[:, 3])
 
 
 def shadow_offset(sun: Tensor, yaw: Tensor, height_m: Tensor) -> Tensor:
-    """How far (N, 2) m, (x, z) in the objects' frames, the shadow of a point at `height_m` (N,) falls. sun
-    (3,)."""
+    """Offset (N, 2) m, (x, z) in the objects' frames, at which the shadow of a point at a height falls.
+
+    Args:
+        sun: (3,) unit.
+        yaw: (N,) rad.
+        height_m: (N,).
+    """
     away = -sun / (-sun[1]).clamp(min=model.LEAST_SINE)
     world = torch.stack([away[0].expand_as(yaw), torch.zeros_like(yaw), away[2].expand_as(yaw)], dim=-1)
     offset = rotate_y(world, -yaw)[:, [0, 2]] * height_m[:, None]
@@ -442,8 +520,17 @@ def shadow_corners(size_lhw: Tensor, offset: Tensor) -> Tensor:
 
 
 def outwardness(points: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
-    """How far out (N, K) along their shadows' offsets (N, 2) m points (N, K, 2) m lie: 0 in the objects' middle, 1
-    where the shadow of the roof's far edge ends. Linear in the points, which are (x, z) in the objects' frames."""
+    """Distance of points along the shadow's offset: 0 in the object's centre, 1 where the shadow of the roof's far
+    edge ends; linear in the points.
+
+    Args:
+        points: (N, K, 2) m, (x, z) in the objects' frames.
+        size_lhw: (N, 3) m.
+        offset: (N, 2) m, as of `shadow_offset`.
+
+    Returns:
+        (N, K).
+    """
     length = offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     along = offset / length
     edge = (along.abs() * size_lhw[:, [0, 2]] / 2).sum(dim=-1, keepdim=True)
@@ -451,7 +538,7 @@ def outwardness(points: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
 
 
 def rectangle_corners(low: Tensor, high: Tensor) -> Tensor:
-    """Corners (..., 4, 2), one after the other, of rectangles from low to high (..., 2)."""
+    """Corners (..., 4, 2), in order, of rectangles from low to high (..., 2)."""
     x = torch.stack([low[..., 0], high[..., 0], high[..., 0], low[..., 0]], dim=-1)
     z = torch.stack([low[..., 1], low[..., 1], high[..., 1], high[..., 1]], dim=-1)
     return torch.stack([x, z], dim=-1)
@@ -460,10 +547,16 @@ def rectangle_corners(low: Tensor, high: Tensor) -> Tensor:
 def pixels_to_ground(
     pixels: Tensor, unproject: Tensor, centre: Tensor, translation: Tensor, yaw: Tensor, ground: Tensor
 ) -> Tensor | None:
-    """Points (K, 2) m, (x, z) in an object's frame, that pixels (K, 2) show of the ground at its foot.
+    """Points (K, 2) m, (x, z) in an object's frame, of the ground at its foot that pixels show; None where a pixel
+    shows no ground.
 
-    unproject (3, 3): the inverse of the camera's; centre, translation (3,) m; yaw (); ground (4,): the plane, to
-    which the object's foot is parallel. None where a pixel shows no ground.
+    Args:
+        pixels: (K, 2) px.
+        unproject: (3, 3) inverse of the camera's matrix.
+        centre: (3,) m, position of the camera.
+        translation: (3,) m of the object.
+        yaw: () rad of the object.
+        ground: (4,) plane, to which the object's foot is parallel.
     """
     normal = ground[:3].to(pixels)
     ray = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1) @ unproject.T
@@ -477,8 +570,14 @@ def pixels_to_ground(
 
 
 def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: Tensor) -> Tensor:
-    """Points (4N, 3) m, on planes parallel to the ground through the objects' feet, of (N, 4, 2) m local (x,
-    z)."""
+    """Points (4N, 3) m on planes parallel to the ground through the objects' feet.
+
+    Args:
+        corners: (N, 4, 2) m, local (x, z).
+        yaw: (N,) rad.
+        translation: (N, 3) m.
+        ground: (4,) plane.
+    """
     flat = torch.stack([corners[..., 0], torch.zeros_like(corners[..., 0]), corners[..., 1]], dim=-1).reshape(
         -1, 3
     )
@@ -489,11 +588,15 @@ def place_on_ground(corners: Tensor, yaw: Tensor, translation: Tensor, ground: T
 
 
 def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor:
-    """How dark (T,) in [0, 1] a box-like vehicle makes the ground at (x, z) (T, 2) m of its frame; smooth.
+    """Darkness (T,) in [0, 1] of the ground under and next to a box-like vehicle; smooth.
 
-    size_lhw (T, 3) m and offset (T, 2) m of `sun_offset`, a row a point; for S suns offset (S, T, 2) -> (S, T).
     The contact shadow under the body fades over some tens of centimetres; the cast one is that of a box tapering
     to the roof, moved along the sun's offset.
+
+    Args:
+        local_xz: (T, 2) m, (x, z) in the vehicle's frame.
+        size_lhw: (T, 3) m.
+        offset: (T, 2) m, as of `shadow_offset`; (S, T, 2) for S suns, which gives (S, T).
     """
     half = size_lhw[:, [0, 2]] / 2
 
@@ -512,8 +615,8 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
 
 
 def _thread_invariant_sigmoid(values: Tensor) -> Tensor:
-    """Of any shape, alike for any number of threads: where torch shares values out, the last ones of each share
-    are rounded otherwise.
+    """Sigmoid with the same bits for any number of threads: torch rounds the last values of each thread's share
+    differently.
     """
     return torch.cat([part.sigmoid() for part in values.flatten().split(_GRAIN_SIZE)]).view_as(values)
 
@@ -526,12 +629,15 @@ def crop_rects(
     frames_hw: Sequence[tuple[int, int]],
     margins_px: Sequence[float],
 ) -> Tensor:
-    """Pixel rectangles (N, 4) int64, half-open, cut at the image, that hold the draws: exact across the near
-    plane.
+    """Pixel rectangles (N, 4) int64, half-open, clipped to the image, that hold the draws; exact across the near
+    plane. Empty for a draw behind the camera or outside its image.
 
-    clip (V, 3); faces (F, 3); vertex_ranges, face_ranges: [start, end) of each draw, the vertices' one after the
-    other; frames_hw, margins_px: of each draw. A draw wholly behind the camera or beside its image has an empty
-    rectangle.
+    Args:
+        clip: (V, 3).
+        faces: (F, 3).
+        vertex_ranges, face_ranges: [start, end) of each draw; vertex ranges are consecutive.
+        frames_hw: Image size of each draw, px.
+        margins_px: Margin of each draw.
     """
     rects = np.zeros((len(vertex_ranges), 4), dtype=np.int64)
     filled = [i for i, (start, end) in enumerate(vertex_ranges) if end > start]
@@ -554,10 +660,7 @@ def crop_rects(
 
 
 def _clipped_bounds(points: np.ndarray, faces: Tensor, face_range: Sequence[int]) -> np.ndarray | None:
-    """Bounds (4,) px of what of a draw lies in front of the near plane; None where nothing does.
-
-    points: (V, 3) clip coordinates.
-    """
+    """Bounds (4,) px of the part of a draw beyond the near plane; None if there is none. points: (V, 3) clip."""
     corners = faces[face_range[0] : face_range[1]].cpu().numpy()
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     a, b = points[edges[:, 0]], points[edges[:, 1]]
@@ -575,8 +678,14 @@ def _clipped_bounds(points: np.ndarray, faces: Tensor, face_range: Sequence[int]
 def nearest_hits(
     fragments: verbs.Fragments, reach_px: Sequence[float], draws: range | None = None, out: Tensor | None = None
 ) -> Tensor:
-    """For each packed pixel (T,) int64 the nearest one of its draw that is hit, itself where it is; -1 where none
-    is within `reach_px`, one a draw. draws: those that are looked at, their part of `out` (T,) is written."""
+    """Nearest hit pixel of the same draw for each packed pixel (T,) int64: itself where hit, -1 beyond `reach_px`.
+
+    Args:
+        fragments: Visible faces.
+        reach_px: Reach of each draw.
+        draws: Draws to process; all by default.
+        out: (T,) to write the draws' part into.
+    """
     layout = fragments.layout
     nearest = torch.empty_like(fragments.face, dtype=torch.int64) if out is None else out
     spans, rects = layout.offsets.tolist(), layout.rects.tolist()
@@ -585,11 +694,11 @@ def nearest_hits(
         if end == start:
             continue
         x0, y0, x1, y1 = rects[i]
-        beside = (fragments.face[start:end].cpu().numpy() < 0).reshape(y1 - y0, x1 - x0)
-        if beside.all():
+        missed = (fragments.face[start:end].cpu().numpy() < 0).reshape(y1 - y0, x1 - x0)
+        if missed.all():
             nearest[start:end] = -1
             continue
-        distance, index = nearest_true_pixel(~beside)
+        distance, index = nearest_true_pixel(~missed)
         index += start
         index[distance > reach_px[i]] = -1
         nearest[start:end].copy_(torch.from_numpy(index.reshape(-1)))
@@ -609,7 +718,7 @@ def nearest_true_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def perspective_weights(corners: Tensor, xy: Tensor) -> Tensor:
-    """Perspective-correct weights (K, 3) of corners, clip coordinates (K, 3, 3) of triangles, at pixels xy."""
+    """Perspective-correct weights (K, 3) of corners (K, 3, 3), clip coordinates of triangles, at pixels xy (K, 2)."""
     ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1).double()
     a, b, c = corners.double().unbind(dim=1)
     edges = [torch.linalg.cross(p, q) for p, q in ((b, c), (c, a), (a, b))]

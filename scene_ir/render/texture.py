@@ -1,6 +1,6 @@
-"""Projective texture: a vehicle's surface takes its colours from the photograph; paint changes on top of them.
+"""Projective texture: colours of a vehicle's surface from the photograph, and paint changes on top of them.
 
-Shapes: R rows, one a pixel of some object's layer; S texels of all sources together. RGB in [0, 1].
+Shapes: R rows, one per pixel of an object's layer; S texels of all sources. RGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -22,18 +22,23 @@ from scene_ir.render.surfaces import nearest_true_pixel
 from scene_ir.types import Crop, Source
 
 _PAD = 2
-"""Texels around a crop, so that the 4x4 Catmull-Rom footprint of its edge is complete."""
+"""Texels around a crop that complete the 4x4 Catmull-Rom footprint at its edge."""
 _DEEP_PX = 4.0
-"""Deeper inside the mesh than this, texels are all alike: none is near the outline."""
+"""Deeper inside the mesh than this, texels are equally far from the outline."""
 
 
 def smoothstep(x: Tensor, low: float, high: float) -> Tensor:
-    """Exactly 0 up to `low`, exactly 1 from `high` on, continuously differentiable between (Hermite cubic)."""
+    """Hermite cubic: exactly 0 up to `low`, exactly 1 from `high` on, continuously differentiable.
+
+    Args:
+        x: Values.
+        low, high: Bounds.
+    """
     return _Smoothstep.apply(x, low, high)
 
 
 class _Smoothstep(torch.autograd.Function):
-    """One node where autograd would keep six: rendering asks for it twenty times, a pixel each."""
+    """One node instead of autograd's six: rendering evaluates it twenty times per pixel."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, low: float, high: float) -> Tensor:
@@ -51,15 +56,18 @@ class _Smoothstep(torch.autograd.Function):
 
 @dataclass(frozen=True, slots=True)
 class PhotographTexels:
-    """What the photograph knows of each object. values: (S, C); rects (N, 4) int64 px; offsets (N + 1,) int64."""
+    """The photograph's content for each object, as packed crops."""
 
     values: Tensor
+    """(S, C)."""
     rects: Tensor
+    """(N, 4) int64 px, half-open, position of each crop in the frame."""
     offsets: Tensor
+    """(N + 1,) int64, first texel of each crop."""
 
     @classmethod
     def from_crops(cls, crops: Sequence[Crop], like: Tensor) -> PhotographTexels:
-        """Crops of one channel count, packed. `like`: a tensor of the dtype and device wanted."""
+        """Packed crops with equal channel counts, in the dtype and on the device of `like`."""
         rows = [crop.values.flatten(1).T.to(like) for crop in crops]
         rects = [
             [c.x0, c.y0, c.x0 + c.values.shape[2], c.y0 + c.values.shape[1]] if c.values.numel() else [0, 0, 0, 0]
@@ -73,14 +81,26 @@ class PhotographTexels:
         )
 
     def sample(self, uv: Tensor, counts: Tensor, backend: verbs.Backend, border: verbs.Border) -> Tensor:
-        """Catmull-Rom lookups (R, C) at uv (R, 2) px of the frame, the rows grouped by object, counts (N,) of
-        each."""
+        """Catmull-Rom lookups (R, C).
+
+        Args:
+            uv: (R, 2) px of the frame, grouped by object.
+            counts: (N,) rows of each object.
+            backend: Implementation.
+            border: Values beyond the crops, see `verbs.texture`.
+        """
         zero = torch.zeros_like(counts)
         layout = verbs.PixelLayout.from_rects(torch.stack([zero, zero, counts, torch.ones_like(counts)], dim=-1))
         return verbs.texture_packed(self.values, self.rects, self.offsets, layout, uv, backend, border)
 
     def sample_mesh_and_halo(self, uv: Tensor, counts: Tensor, backend: verbs.Backend) -> Tensor:
-        """As `sample`, 0 beyond the crops, with counts (2N,): rows of the objects' meshes, then of their halos."""
+        """`sample` with 0 beyond the crops, for rows of the objects' meshes, then of their halos.
+
+        Args:
+            uv: (R, 2) px.
+            counts: (2N,) rows of each mesh, then of each halo.
+            backend: Implementation.
+        """
         twice = PhotographTexels(
             torch.cat([self.values, self.values]),
             torch.cat([self.rects, self.rects]),
@@ -91,14 +111,16 @@ class PhotographTexels:
 
 @dataclass(frozen=True, slots=True)
 class PaintRegions:
-    """Where N objects are paint, by the photograph. texels: of one channel, empty where known (N,) is false."""
+    """Where N objects are paint according to the photograph."""
 
     texels: PhotographTexels
+    """One channel in [0, 1]."""
     known: Tensor
+    """(N,) bool; where false, the object's texels are empty."""
 
     @classmethod
     def concat(cls, parts: Sequence[PaintRegions]) -> PaintRegions:
-        """Those of several scenes' objects, one after the other."""
+        """The regions of several scenes' objects, concatenated."""
         if len(parts) == 1:
             return parts[0]
         starts = np.cumsum([0] + [p.texels.values.shape[0] for p in parts])
@@ -113,15 +135,29 @@ class PaintRegions:
 
 
 def paint_share(mesh: Tensor, region: Tensor, unseen: Tensor, known: Tensor) -> Tensor:
-    """How much of each pixel (R,) is paint: by the photograph's region where it was seen, by the mesh's parts
-    where it was not, or where no region is known (R,)."""
+    """Paint share of each pixel (R,): from the photographed region where seen, else from the mesh's parts.
+
+    Args:
+        mesh: (R,) share by the mesh.
+        region: (R,) share by the photographed region.
+        unseen: (R,) share of the pixel that the photograph did not see.
+        known: (R,) bool, whether there is a region.
+    """
     return torch.where(known, region + unseen * (mesh - region), mesh)
 
 
 def extract_crop(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> Tensor:
-    """The values (C, h, w) of `crop` seen through `rect` (x0, y0, x1, y1), which may reach beyond the frame.
+    """The part of a crop inside a rectangle that may reach beyond the frame.
 
-    Zero where the crop says nothing; beyond the frame its edge pixels repeat, since a vehicle goes on there.
+    Beyond the frame, edge pixels repeat, since a vehicle continues there.
+
+    Args:
+        crop: (C, h, w).
+        rect: x0, y0, x1, y1 px, half-open.
+        frame_hw: Frame size, px.
+
+    Returns:
+        (C, y1 - y0, x1 - x0), 0 outside the crop.
     """
     height, width = frame_hw
     x0, y0, x1, y1 = rect
@@ -138,10 +174,16 @@ def extract_crop(crop: Crop, rect: Sequence[int], frame_hw: tuple[int, int]) -> 
 def build_texels(
     source: Source, mesh_depth: Crop, hidden: Tensor, rect: Sequence[int], frame_hw: tuple[int, int]
 ) -> Crop:
-    """The `channels.TEXEL` numbers of the texels of one object inside `rect`, padded.
+    """The `channels.TEXEL` channels of one object's texels inside a padded rectangle.
 
-    mesh_depth: Crop (1, h, w) m of the unperturbed mesh, inf beside it; hidden: (H, W) in [0, 1], 1 where a nearer
-    object stands before this one. Beyond the mesh, texels are of the outline and as far away as its nearest piece.
+    Beyond the mesh, texels belong to the outline and have the depth of its nearest piece.
+
+    Args:
+        source: Foreground of the object.
+        mesh_depth: (1, h, w) m of the unperturbed mesh, inf outside.
+        hidden: (H, W) in [0, 1], 1 where a nearer object covers this one.
+        rect: x0, y0, x1, y1 px, half-open.
+        frame_hw: Frame size, px.
     """
     x0, y0, x1, y1 = rect[0] - _PAD, rect[1] - _PAD, rect[2] + _PAD, rect[3] + _PAD
     window = (x0, y0, x1, y1)
@@ -162,7 +204,9 @@ def build_texels(
 
 
 def extend_nearest(values: Tensor, known: Tensor) -> Tensor:
-    """Values (C, h, w) where `known` (h, w), elsewhere those of the nearest known pixel; unchanged if none is."""
+    """Values (C, h, w) where `known` (h, w), elsewhere those of the nearest known pixel; unchanged if none is
+    known.
+    """
     mask = known.cpu().numpy()
     if not mask.any():
         return values
@@ -171,10 +215,14 @@ def extend_nearest(values: Tensor, known: Tensor) -> Tensor:
 
 
 def occlusion_map(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tensor) -> Tensor:
-    """(H, W) in [0, 1]: 1 well inside the mattes Crop (1, h, w) of nearer objects, 0 wherever they are
-    transparent.
+    """(H, W) in [0, 1]: 1 well inside the mattes of nearer objects, 0 where they are transparent.
 
-    It depends on where the mattes are above 0 only, not on their values, which the solution raises as it goes.
+    Depends only on where mattes are above 0, as the solution raises their values as it proceeds.
+
+    Args:
+        mattes: Crops (1, h, w).
+        frame_hw: Frame size, px.
+        like: Tensor of the wanted dtype and device.
     """
     support = np.zeros(frame_hw, dtype=np.uint8)
     for matte in mattes:
@@ -194,10 +242,14 @@ def occlusion_map(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tenso
 
 
 def facing_weight(turned: Tensor, cos_source: Tensor, paint: Tensor) -> Tensor:
-    """1 where a texel was seen squarely enough for how squarely it is shown now, 0 where it would smear.
+    """1 where a texel was seen squarely enough for how it is shown now, 0 where it would smear.
 
-    turned: cosine towards the camera now minus then; cos_source: then; paint: share of the mesh. Exactly 1, with
-    zero slope, where nothing turned.
+    Exactly 1, with zero slope, where nothing turned.
+
+    Args:
+        turned: Cosine towards the camera now minus then.
+        cos_source: Cosine then.
+        paint: Paint share of the mesh.
     """
     positive = 0.5 * (cos_source + (cos_source.square() + model.SQUARED_COS).sqrt())
     rest, coat = model.GRAZING
@@ -205,22 +257,27 @@ def facing_weight(turned: Tensor, cos_source: Tensor, paint: Tensor) -> Tensor:
 
 
 def outline_share(inset: Tensor) -> Tensor:
-    """How much of a texel is the outline: 1 beside the photographed mesh and up to `model.OUTLINE_PX` inside it.
+    """Outline share of a texel: 1 outside the photographed mesh and up to `model.OUTLINE_PX` inside it.
 
-    inset (R,): distance, px, to the nearest texel's centre that the mesh does not cover, 0 for such.
+    inset: (R,) px to the nearest texel centre that the mesh does not cover, 0 there.
     """
     return 1.0 - smoothstep(inset, *model.OUTLINE_PX)
 
 
 def outline_weight(turned: Tensor) -> Tensor:
-    """1 where a point of the outline still is one, 0 where it turned away or towards the camera; 1 where turned is
-    0."""
+    """1 where a point of the outline still is one, 0 where it turned away or towards the camera."""
     low, high = model.OUTLINE_TURN
     return 1.0 - smoothstep(turned.square(), low * low, high * high)
 
 
 def inside_weight(uv: Tensor, height: int, width: int, fade_px: tuple[float, float] = model.BORDER_PX) -> Tensor:
-    """1 for pixels uv (R, 2) in the photograph and up to fade_px[0] beyond it, fading to 0 at fade_px[1]."""
+    """1 in the photograph and up to fade_px[0] beyond it, falling to 0 at fade_px[1].
+
+    Args:
+        uv: (R, 2) px.
+        height, width: Size of the photograph, px.
+        fade_px: Distances beyond the border.
+    """
     limit = uv.new_tensor([width - 1.0, height - 1.0])
     beyond = torch.maximum(-uv, uv - limit)
     return (1.0 - smoothstep(beyond, *fade_px)).prod(dim=-1)
@@ -235,12 +292,18 @@ def apply_texture_code(
     base_lightness: Tensor,
     backend: verbs.Backend = "reference",
 ) -> Tensor:
-    """Premultiplied colours (R, 3) with the paint changed; untouched bits where the code is 0.
+    """Premultiplied colours (R, 3) with the paint changed; the same bits where the code is 0.
 
-    opacity (R,); code (R, 5): lightness, a*, b*, gloss, dirt in (-1, 1); paint (R,): how much of the pixel is
-    paint; height (R,): 0 at the foot of the vehicle, 1 at its roof (dirt gathers low); base_lightness (R,): CIE L*
-    of the paint, about which gloss turns contrast. The change is f(colour, code) - f(colour, 0): zero at 0, its
-    slope is not.
+    The change is f(colour, code) - f(colour, 0): it is 0 at code 0, its slope is not.
+
+    Args:
+        colour: (R, 3) premultiplied RGB.
+        opacity: (R,).
+        code: (R, 5) lightness, a*, b*, gloss, dirt in (-1, 1).
+        paint: (R,) paint share of the pixel.
+        height: (R,) 0 at the vehicle's foot, 1 at its roof (dirt gathers low).
+        base_lightness: (R,) CIE L* of the paint, about which gloss changes contrast.
+        backend: Implementation.
     """
     if backend == "warp":
         from scene_ir.render.kernels.colour import repaint
@@ -281,8 +344,8 @@ def rgb_to_lab(rgb: Tensor) -> Tensor:
 def lab_to_soft_rgb(lab_rows: Tensor) -> Tensor:
     """sRGB rows (R, 3) in (0, 1) of CIE L*a*b* rows (R, 3).
 
-    Colours out of gamut bend back softly; so near black and white the result is not the inverse of `rgb_to_lab`: take
-    differences of two results.
+    Colours out of gamut bend back softly, so that near black and white this is not the inverse of `rgb_to_lab`:
+    use differences of two results.
     """
     rgb = lab_to_rgb(lab_rows)
     softplus = torch.nn.functional.softplus
@@ -290,20 +353,24 @@ def lab_to_soft_rgb(lab_rows: Tensor) -> Tensor:
 
 
 def lab_to_rgb(lab_rows: Tensor) -> Tensor:
-    """sRGB rows (R, 3) of CIE L*a*b* rows (R, 3): the inverse of `rgb_to_lab`, out of [0, 1] where no display shows
-    it."""
+    """sRGB rows (R, 3) of CIE L*a*b* rows (R, 3): the inverse of `rgb_to_lab`, beyond [0, 1] out of gamut."""
     return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
 
 
 def daylight(normal: Tensor, sun: Tensor, sunlight: Tensor | float) -> Tensor:
-    """Light (R,) on surfaces in the open: sky dome and ground bounce, and a sun of a strength (R,). normal (R, 3),
-    sun (3,) unit; sun (R, 3) too."""
+    """Light (R,) on surfaces in the open: sky dome, ground bounce and sun.
+
+    Args:
+        normal: (R, 3) unit.
+        sun: (3,) or (R, 3) unit vector towards the sun.
+        sunlight: (R,) strength of the sun.
+    """
     around, above = model.AMBIENT
     return (around + above * (0.5 - 0.5 * normal[:, 1])) + sunlight * sun_exposure((normal * sun).sum(-1))
 
 
 def sun_exposure(cos: Tensor) -> Tensor:
-    """How squarely the sun meets a surface whose normal has this cosine to it: 0 from behind, smooth."""
+    """How squarely the sun meets a surface with this cosine to it; smooth, 0 from behind."""
     return 0.5 * (cos + (cos.square() + model.TERMINATOR).sqrt())
 
 
@@ -316,11 +383,17 @@ def shade_template(
     sun: Tensor,
     sunlight: Tensor | float = model.SUNLIGHT,
 ) -> Tensor:
-    """Daylight on a vehicle's own colours: RGB (R, 3), not clamped, the template's look where no photograph helps.
+    """Daylight on a vehicle's template colours: RGB (R, 3), not clamped.
 
-    normal, to_eye (R, 3) unit; albedo (R, 3); sheen (R, 2): paint, glass in [0, 1]; height (R,) 0 at the foot, 1
-    at the roof; sun (3,) unit; sunlight (R,). Sky dome and ground bounce, a sun with a highlight, and a Fresnel
-    reflection of a plain street and sky.
+    Sky dome and ground bounce, a sun with a highlight, and a Fresnel reflection of a plain street and sky.
+
+    Args:
+        normal, to_eye: (R, 3) unit.
+        albedo: (R, 3).
+        sheen: (R, 2) shares of paint and glass in [0, 1].
+        height: (R,) 0 at the foot, 1 at the roof.
+        sun: (3,) or (R, 3) unit.
+        sunlight: (R,) strength of the sun.
     """
     foot, *heights = model.OCCLUDED
     occluded = foot + (1.0 - foot) * smoothstep(height, *heights)
@@ -346,23 +419,30 @@ def shade_template(
 
 
 def limit_brightening(ratio: Tensor, paint: Tensor) -> Tensor:
-    """How much brighter a surface is after it turned: a share of what it was, within `model.RELIT_MOST`.
+    """Relative change of a surface's colour after the light on it changed, within `model.RELIT_MOST`; 0 for 0.
 
-    ratio: by how much the light on it grew, relative, above -1; paint: share of it. 0 for 0.
+    Args:
+        ratio: Relative change of the light, above -1.
+        paint: Paint share.
     """
     share = model.RELIT[0] + (model.RELIT[1] - model.RELIT[0]) * paint
     return share * ratio / (1.0 + (ratio / model.RELIT_MOST).square()).sqrt()
 
 
 def relight(rgb: Tensor, brighter: Tensor) -> Tensor:
-    """Photographed colours (R, 3) in other light: brighter (R,) as by `limit_brightening`. The same bits where it is 0.
+    """Photographed colours (R, 3) in other light; the same bits where `brighter` (R,) is 0.
 
-    What is white in the photograph hardly changes: film saturates.
+    brighter: as of `limit_brightening`. Photographed white hardly changes, as film saturates.
     """
     return rgb * (1.0 + brighter[:, None] * (1.0 - rgb * rgb))
 
 
 def apply_finish(light: Tensor, gain: Tensor, lift: Tensor) -> Tensor:
-    """Light (R, 3) of a template as a photograph shows the vehicle: gain (R, 3), and lift (R, 1) that the darkest
-    has. Bright light saturates as on film: 1 is never reached."""
+    """Light (R, 3) on a template as a photograph shows the vehicle; bright light saturates and never reaches 1.
+
+    Args:
+        light: (R, 3).
+        gain: (R, 3).
+        lift: (R, 1) value of the darkest parts.
+    """
     return 1.0 - (1.0 - lift) * torch.exp(-(light * gain))

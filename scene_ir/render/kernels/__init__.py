@@ -1,1 +1,1 @@
-"""The renderer's per-pixel work as Warp kernels, one source for CPU and CUDA; imported where they are used."""
+"""Warp kernels of the renderer."""

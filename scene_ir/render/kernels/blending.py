@@ -1,8 +1,8 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
 # ruff: noqa: E501 - the line above.
-"""Shadows and layers laid onto a picture, row by row, as Warp kernels: what `blend` defines in plain torch.
+"""Shadows and layers blended into a picture row by row, as Warp kernels: what `blend` defines in plain torch.
 
-A thread owns whole rows of the picture, so that layers which overlap are laid down in order without waiting.
+A thread owns whole rows of the picture, so that overlapping layers are blended in order without waiting.
 """
 
 from __future__ import annotations
@@ -24,7 +24,13 @@ wp.set_module_options({"fuse_fp": True, "fast_math": False, "enable_backward": F
 
 @wp.struct
 class LayerStack:
-    """What is laid where. order: the draws, back to front; rects (N, 4) px; offsets (N + 1,) into packed pixels."""
+    """Layers to blend.
+
+    Attributes:
+        order: Draws, back to front.
+        rects: (N, 4) px.
+        offsets: (N + 1,) first packed pixel of each draw.
+    """
 
     order: wp.array(dtype=wp.int32)
     rects: wp.array2d(dtype=wp.int64)
@@ -33,7 +39,7 @@ class LayerStack:
 
 @wp.struct
 class RowSpan:
-    """A draw's part of a row: columns [x0, x1), the packed pixel that column 0 would have; empty where it has none."""
+    """A draw's part of a row: columns [x0, x1) and the packed pixel of column 0; empty if it has none."""
 
     draw: int
     x0: int
@@ -215,7 +221,7 @@ def _shade_row(
     factor: wp.array(dtype=wp.vec3f),
     under_shadow: wp.array(dtype=wp.vec3f),
 ):
-    """Columns [x0, x1) of a row darkened; origin: the packed pixel that column 0 would have."""
+    """Multiply columns [x0, x1) of a row by a shadow; origin: packed pixel of column 0."""
 
 
 @wp.func_native(_LAY_CODE)
@@ -233,15 +239,15 @@ def _lay_row(
     nearest: wp.array2d(dtype=wp.float32),
     number: wp.array2d(dtype=wp.int64),
 ):
-    """A layer over them."""
+    """Lay a layer over them."""
 
 
 @wp.func_native(_CLAMP_CODE.replace("SATURATED", str(model.SATURATED)))
 def _clamp_row(
     image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, clamp_flags: wp.array2d(dtype=wp.uint8)
 ):
-    """Kept in [0, 1], remembering which channels had left it (bits 0 to 2) or reached a bound (3 to 5), and that it was
-    done (6): rectangles overlap, and a pixel that was clamped before stays as it is.
+    """Clamp to [0, 1] and record which channels had left it (bits 0 to 2) or reached a bound (3 to 5), and that it
+    was done (6): rectangles overlap, and a clamped pixel stays as it is.
     """
 
 
@@ -254,7 +260,7 @@ def _start_row(
     clamp_flags: wp.array2d(dtype=wp.uint8),
     grad: wp.array3d(dtype=wp.float32),
 ):
-    """The gradient to pixels before they were clamped: see `blend.clamp_colour`."""
+    """The gradient to pixels before clamping: see `blend.clamp_colour`."""
 
 
 @wp.func_native(_LIFT_CODE)
@@ -353,11 +359,17 @@ def _blend_backward_kernel(
 
 
 class BlendLayers(torch.autograd.Function):
-    """See `blend.composite`. plan: (order, rects, offsets) of the shadows and of the layers, and the edges of the
-    rows that threads share."""
+    """See `blend.composite`."""
 
     @staticmethod
     def forward(ctx: Any, canvas, factor, colour, opacity, depth, background_depth, plan, clamped):
+        """Blend the layers.
+
+        Args:
+            canvas, factor, colour, opacity, depth, clamped: See `blend.composite`.
+            background_depth: (H, W) m behind all layers.
+            plan: (order, rects, offsets) of the shadows and of the layers, and the bounds of the threads' rows.
+        """
         shadows, layers, edges = plan
         factor, colour, opacity, depth = (t.contiguous() for t in (factor, colour, opacity, depth))
         image = canvas.clone(memory_format=torch.contiguous_format)
@@ -415,7 +427,7 @@ class BlendLayers(torch.autograd.Function):
 
 
 def row_edges(height: int, rects: np.ndarray) -> list[int]:
-    """The rows [first, last) that rectangles (K, 4) px touch, split into ranges of about equal area."""
+    """Rows [first, last) that rectangles (K, 4) px touch, split into ranges of about equal area."""
     rects = rects[(rects[:, 2] > rects[:, 0]) & (rects[:, 3] > rects[:, 1])]
     if not len(rects):
         return []

@@ -1,8 +1,8 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
-"""CIE L*a*b* and back, and the paint of vehicles, as NVIDIA Warp functions with gradients by hand; float32.
+"""CIE L*a*b* conversions and paint changes as Warp functions with gradients by hand; float32.
 
-What they compute is in `texture` (`lab`, `lab_to_rgb`, `apply_texture_code`); a test holds both together.
-A function's gradient is the function that ends in `_adjoint`: arguments, then the gradient to the result.
+Their definitions are in `texture` (`rgb_to_lab`, `lab_to_soft_rgb`, `apply_texture_code`); a test compares both.
+The gradient of a function is the function that ends in `_adjoint`: arguments, then the gradient to the result.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _to_linear_slope(x: wp.float32, value: wp.float32):
 
 @wp.func
 def _lab_root(x: wp.float32):
-    """The cube root of CIE L*a*b*, straight near 0."""
+    """Cube root of CIE L*a*b*, linear near 0."""
     return wp.where(x > 0.008856, exp_(log_(wp.max(x, 0.008856)) * (1.0 / 3.0)), 7.787 * x + 4.0 / 29.0)
 
 
@@ -133,7 +133,7 @@ def _xyz_roots(lab: wp.vec3f):
 
 @wp.func
 def lab_to_rgb(lab: wp.vec3f):
-    """sRGB in (0, 1): what is out of gamut bends back softly."""
+    """sRGB in (0, 1): colours out of gamut bend back softly."""
     f = _xyz_roots(lab)
     xyz = wp.vec3f(_lab_cube(f[0]), _lab_cube(f[1]), _lab_cube(wp.max(f[2], 0.0)))
     return wp.vec3f(
@@ -164,7 +164,12 @@ def lab_to_rgb_adjoint(lab: wp.vec3f, g: wp.vec3f):
 
 @wp.func
 def clamp_slope(x: wp.float32, low: wp.float32, high: wp.float32):
-    """The slope of clamping: 1 from low to high."""
+    """Slope of clamping: 1 from low to high.
+
+    Args:
+        x: Value.
+        low, high: Bounds.
+    """
     return wp.where(x >= low, 1.0, 0.0) * wp.where(x <= high, 1.0, 0.0)
 
 
@@ -193,7 +198,7 @@ def scale_odds(level: wp.float32, odds: wp.float32):
 
 @wp.struct
 class PaintChange:
-    """What changes a paint: shifts of lightness, a*, b*; gloss; dirt; and how much of it sticks at this height."""
+    """Shifts of lightness, a* and b*; gloss; dirt; and the share of dirt that sticks at this height."""
 
     shift: wp.float32
     red: wp.float32
@@ -205,7 +210,7 @@ class PaintChange:
 
 @wp.func
 def _repaint(lab: wp.vec3f, change: PaintChange, base: wp.float32):
-    """The paint model before dust: L*a*b*. base: L* about which gloss turns contrast."""
+    """The paint model without dust: L*a*b*. base: L* about which gloss changes contrast."""
     odds = exp_(model.LIGHTNESS_GAIN * change.shift + change.gloss * GLOSS_PER_L * (lab[0] - base))
     level = scale_odds(lightness_level(lab[0]), odds)
     room = 4.0 * model.CHROMA_GAIN * level * (1.0 - level)
@@ -219,7 +224,7 @@ def _add_dust(rgb: wp.vec3f, change: PaintChange):
 
 @wp.func
 def _repaint_adjoint(lab: wp.vec3f, change: PaintChange, base: wp.float32, g: wp.vec3f):
-    """-> the colour, dusted; gradients to lab, (shift, red, yellow), (gloss, dirt, grip), base."""
+    """The colour with dust; gradients to lab, (shift, red, yellow), (gloss, dirt, grip), base."""
     odds = exp_(model.LIGHTNESS_GAIN * change.shift + change.gloss * GLOSS_PER_L * (lab[0] - base))
     before = lightness_level(lab[0])
     level = scale_odds(before, odds)
@@ -276,7 +281,7 @@ def _change_size(change: PaintChange):
 
 @wp.func
 def _paint_difference(rgb: wp.vec3f, change: PaintChange, base: wp.float32):
-    """What a coat adds to an opaque colour in [0, 1]; exactly 0 where it is bare, whatever the rounding."""
+    """Change of an opaque colour in [0, 1]; exactly 0 without change, for any rounding."""
     lab = rgb_to_lab(rgb)
     difference = _add_dust(lab_to_rgb(_repaint(lab, change, base)), change) - lab_to_rgb(
         _repaint(lab, _no_change(), base)
@@ -286,7 +291,7 @@ def _paint_difference(rgb: wp.vec3f, change: PaintChange, base: wp.float32):
 
 @wp.func
 def _paint_difference_adjoint(rgb: wp.vec3f, change: PaintChange, base: wp.float32, g: wp.vec3f):
-    """-> the change itself; gradients to rgb, (shift, red, yellow), (gloss, dirt, grip), base."""
+    """The change itself; gradients to rgb, (shift, red, yellow), (gloss, dirt, grip), base."""
     lab = rgb_to_lab(rgb)
     now, g_lab, g_tint, g_finish, g_base = _repaint_adjoint(lab, change, base, g)
     then, g_bare, _tint, _finish, _base = _repaint_adjoint(lab, _no_change(), base, g)
@@ -381,12 +386,17 @@ class _Paint(torch.autograd.Function):
 
 
 def flat_array(values: Tensor) -> Any:
-    """A float tensor as Warp's array of its numbers, one after the other."""
+    """A float tensor as a Warp array of its numbers in order."""
     return wp.from_torch(values.detach().contiguous().view(-1), dtype=wp.float32)
 
 
 def repaint(
     colour: Tensor, opacity: Tensor, code: Tensor, share: Tensor, height: Tensor, base_lightness: Tensor
 ) -> Tensor:
-    """See `texture.apply_texture_code`. All float32; differentiable to all."""
+    """See `texture.apply_texture_code`; float32, differentiable to all.
+
+    Args:
+        colour, opacity, code, height, base_lightness: As there.
+        share: Paint share of the pixels.
+    """
     return _Paint.apply(colour, opacity, code, share, height, base_lightness)

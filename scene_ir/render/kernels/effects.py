@@ -1,9 +1,9 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
-"""Weather over the whole picture as fused NVIDIA Warp kernels, with gradients written by hand; float32.
+"""Weather and foliage over the whole picture as fused Warp kernels, with gradients by hand; float32.
 
-The model is in `environment`, and what its numbers mean in `model`. Only a wet road looks at other pixels than its
-own: it mirrors the column above it. So the rows that hold some road (the wet rows) go through three kernels: what
-comes before the mirror, the mirror, the rest; all other rows go through one.
+The model is in `environment`, its constants in `model`. Only a wet road depends on other pixels: it mirrors the
+column above it. The rows that hold road (the wet rows) therefore go through three kernels: before the mirror, the
+mirror, after the mirror; all other rows go through one.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ DARKENING = wp.constant(wp.vec3d(*model.DARKENING))
 WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 
 _STRIP = 64
-"""Columns that a thread of the CPU smears at a time; `_mirror_columns` and `_mirror_columns_adjoint` have room for this many."""
+"""Columns that a CPU thread smears at a time; `_mirror_columns` and its adjoint have room for this many."""
 (
     SETTING_OVERCAST,
     SETTING_RAIN,
@@ -72,9 +72,10 @@ _STRIP = 64
     *(0, 1, 2, 3, 4),
     *(7, 10, 13, 16, 19, 22),
 )
-"""Numbers that are the same for all pixels: where they begin, and their count. Overcast as a share; rain; fog;
-what overcast makes of a black sky; gain of the time of day (3) and its slope (3); airlight (3), its slopes along
-overcast (3), time (3), and what either of fog and rain, fully on alone, does to it (3)."""
+"""First index of each setting, equal for all pixels, and their count: weight of overcast; rain; fog; overcast of a
+black sky; gain of the time of day (3) and its slope (3); airlight (3), its slopes along overcast (3) and time (3),
+and its change by either of fog and rain, fully on alone (3).
+"""
 
 
 @wp.func
@@ -89,7 +90,7 @@ def _settings_kernel(
     air: wp.array(dtype=wp.float32),
     settings: wp.array(dtype=wp.float32),
 ):
-    """One thread a channel."""
+    """One thread per channel."""
     c = start + wp.tid()
     time = wp.float64(code[2])
     overcast = wp.float64(model.OVERCAST) * wp.float64(code[3])
@@ -147,7 +148,7 @@ def _apply_gain(x: wp.vec3f, gain: wp.vec3f):
 
 @wp.func
 def _overcast_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
-    """What overcast, fully on, would add."""
+    """Change by full overcast."""
     y = _luma(x)
     flat = FLAT * x + _splat(FLAT_GREY * y + FLAT_LIGHT)
     return (flat + sky * (_splat(load(settings, SETTING_COVER) + model.COVER_STRUCTURE * y) - flat)) - x
@@ -155,7 +156,7 @@ def _overcast_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.f
 
 @wp.func
 def _damp_change(x: wp.vec3f):
-    """What rain, at 1 / `model.DAMP`, would add by wetting."""
+    """Change by wetting, at rain 1 / `model.DAMP`."""
     return (DAMP * x + _splat(DAMP_GREY * _luma(x))) - x
 
 
@@ -198,7 +199,7 @@ def _apply_veil(x: wp.vec3f, veil: wp.float32, air: wp.vec3f):
 
 @wp.func
 def _apply_veil_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3f):
-    """-> gradients to x, to the veil and to the air."""
+    """Gradients to x, to the veil and to the air."""
     square = wp.cw_mul(x, x)
     light = square + _splat(VEIL_BEND)
     more = wp.cw_mul(air, air) - square
@@ -219,7 +220,7 @@ def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp
 
 @wp.func
 def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
-    """A pixel with the road's sheen, of which `wet` in [0, 1] is seen."""
+    """A pixel with the share `wet` in [0, 1] of the road's sheen."""
     return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, SETTING_AIR, 1) - x)
 
 
@@ -278,7 +279,7 @@ def _wet_kernel(
 
 @wp.func
 def _before_mirror_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
-    """Of `_before_mirror`: the gradient to x, to rain, time and overcast (3), and to sky."""
+    """Gradients of `_before_mirror` to x, to rain, time and overcast (3), and to sky."""
     overcast = load(settings, SETTING_OVERCAST)
     damping = model.DAMP * load(settings, SETTING_RAIN)
     gain = load3(settings, SETTING_GAIN, 1)
@@ -305,7 +306,7 @@ def _after_mirror_adjoint(
     g: wp.vec3f,
     settings: wp.array(dtype=wp.float32),
 ):
-    """Of `_apply_sheen` and `_apply_haze`: gradients to x, to mirrored, to (fog, rain, time, overcast), to inverse, to road."""
+    """Gradients of `_apply_sheen` and `_apply_haze` to x, mirrored, (fog, rain, time, overcast), inverse, road."""
     rain = load(settings, SETTING_RAIN)
     fog = load(settings, SETTING_FOG)
     air = load3(settings, SETTING_AIR, 1)
@@ -363,16 +364,17 @@ def _dry_adjoint_kernel(
     code_parts: wp.array(dtype=wp.float32),
     grad_maps: wp.array(dtype=wp.float32),
 ):
-    """shares: each pixel's part of the gradients to fog, rain, time, overcast, a plane each; grad_maps: to sky and
-    road, likewise."""
+    """shares: each pixel's part of the gradients to fog, rain, time, overcast, one plane each; grad_maps: to sky
+    and road, likewise.
+    """
     i = start + wp.tid()
     colour = load3(image, i, plane)
-    cover = load(sky, i)
-    x = _before_mirror(colour, cover, settings)
+    sky_share = load(sky, i)
+    x = _before_mirror(colour, sky_share, settings)
     g, _mirrored, code, g_inverse, _road = _after_mirror_adjoint(
         x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
     )
-    g_colour, parts, g_sky = _before_mirror_adjoint(colour, cover, g, settings)
+    g_colour, parts, g_sky = _before_mirror_adjoint(colour, sky_share, g, settings)
     store3(grad_image, i, plane, g_colour)
     store(grad_inverse, i, g_inverse)
     store(code_parts, i, code[0])
@@ -401,7 +403,7 @@ def _wet_adjoint_kernel(
     code_parts: wp.array(dtype=wp.float32),
     grad_maps: wp.array(dtype=wp.float32),
 ):
-    """Back to the mirror: to grad_image goes the gradient to the picture before it."""
+    """Back to the mirror: grad_image receives the gradient to the picture before it."""
     i = start + wp.tid()
     x = _before_mirror(load3(image, i, plane), load(sky, i), settings)
     g, g_mirrored, code, g_inverse, g_road = _after_mirror_adjoint(
@@ -435,7 +437,7 @@ def _damp_adjoint_kernel(
     code_parts: wp.array(dtype=wp.float32),
     grad_maps: wp.array(dtype=wp.float32),
 ):
-    """From before the mirror back to the picture; grad_damp: what comes through the mirror."""
+    """From before the mirror back to the picture; grad_damp comes through the mirror."""
     i = start + wp.tid()
     g = load3(grad_image, i, plane) + load3(grad_damp, i - first, wet_pixels)
     g_colour, parts, g_sky = _before_mirror_adjoint(load3(image, i, plane), load(sky, i), g, settings)
@@ -480,7 +482,7 @@ def _mirror_columns(
     source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, wet_pixels: int, x0: int,
     columns: int, width: int, top: int, bottom: int, road_top: int, radius: int,
 ):  # fmt: skip
-    """What a wet road mirrors, in columns [x0, x0 + columns), rows [road_top, bottom); 0 above, from `top` on."""
+    """Reflection in columns [x0, x0 + columns), rows [road_top, bottom); 0 above, from `top` on."""
 
 
 @wp.func_native("""
@@ -513,7 +515,7 @@ def _mirror_columns_adjoint(
     source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, wet_pixels: int, x0: int,
     columns: int, width: int, top: int, bottom: int, radius: int,
 ):  # fmt: skip
-    """The transpose of `_mirror_columns`: from gradients to the mirror, 0 where it is, to those to the picture."""
+    """The transpose of `_mirror_columns`."""
 
 
 @wp.kernel
@@ -529,7 +531,7 @@ def _mirror_kernel(
     radius: int,
     forward: bool,
 ):
-    """A thread takes `columns` columns of a channel."""
+    """A thread processes `columns` columns of a channel."""
     t = start + wp.tid()
     strips = (width + columns - 1) // columns
     wet_pixels = (bottom - top) * width
@@ -542,7 +544,7 @@ def _mirror_kernel(
 
 @dataclass(frozen=True, slots=True)
 class _WetRows:
-    """Rows [top, bottom) that hold what a wet road mirrors, or the road, which begins at row road_top."""
+    """Rows [top, bottom) that hold the road or what it mirrors; the road starts at row road_top."""
 
     top: int
     bottom: int
@@ -563,7 +565,7 @@ class _WetRows:
 
 
 def _rows(values: Tensor, above: float) -> tuple[int, int]:
-    """The rows [top, bottom) of a map (H, W) that hold all that is above a number."""
+    """Rows [top, bottom) of a map (H, W) that hold all values above a number."""
     rows = (values.amax(dim=1) > above).nonzero()[:, 0]
     return (int(rows[0]), int(rows[-1]) + 1) if rows.numel() else (0, 0)
 
@@ -573,14 +575,13 @@ def _ranges(first: int, last: int) -> list[int]:
 
 
 class _ScratchMemory(threading.local):
-    """Room for numbers that are dropped when a call ends; new room each time would cost the CPU more to be given
-    than to be written."""
+    """Temporary memory: allocating it on every call would cost the CPU more than writing to it."""
 
     def __init__(self) -> None:
         self._room = torch.empty(0)
 
     def planes(self, like: Tensor, *sizes: int) -> list[Tensor]:
-        """Vectors of these sizes, until the next call, of float32."""
+        """Float32 vectors of these sizes, valid until the next call."""
         if like.is_cuda:  # torch keeps its own there, stream by stream
             return [like.new_empty(size) for size in sizes]
         if self._room.numel() < sum(sizes):
@@ -615,16 +616,36 @@ class _Weather(torch.autograd.Function):
         )
         damp, mirrored = _scratch.planes(image, 3 * wet_pixels)[0], image.new_empty(3 * wet_pixels)
         saved_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
-        picture, sight, cover, way, drops = (flat_array(t) for t in saved_maps)
-        given, target, held, shown = flat_array(settings), flat_array(out), flat_array(damp), flat_array(mirrored)
-        launch(_settings_kernel, [0, 3], [flat_array(code), flat_array(air)], [given])
+        image_array, inverse_array, sky_array, road_array, streak_array = (flat_array(t) for t in saved_maps)
+        setting_array, out_array, damp_array, mirror_array = (
+            flat_array(settings),
+            flat_array(out),
+            flat_array(damp),
+            flat_array(mirrored),
+        )
+        launch(_settings_kernel, [0, 3], [flat_array(code), flat_array(air)], [setting_array])
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
-            inputs = [given, picture, sight, cover, drops, plane]
-            launch(_dry_kernel, _ranges(top * width, bottom * width), inputs, [target])
-        launch(_damp_kernel, _ranges(first, last), [given, picture, cover, plane, first, wet_pixels], [held])
-        _launch_mirror(wet, width, held, shown, True)
-        inputs = [given, held, shown, first, wet_pixels, sight, way, drops, plane]
-        launch(_wet_kernel, _ranges(first, last), inputs, [target])
+            inputs = [setting_array, image_array, inverse_array, sky_array, streak_array, plane]
+            launch(_dry_kernel, _ranges(top * width, bottom * width), inputs, [out_array])
+        launch(
+            _damp_kernel,
+            _ranges(first, last),
+            [setting_array, image_array, sky_array, plane, first, wet_pixels],
+            [damp_array],
+        )
+        _launch_mirror(wet, width, damp_array, mirror_array, True)
+        inputs = [
+            setting_array,
+            damp_array,
+            mirror_array,
+            first,
+            wet_pixels,
+            inverse_array,
+            road_array,
+            streak_array,
+            plane,
+        ]
+        launch(_wet_kernel, _ranges(first, last), inputs, [out_array])
         ctx.save_for_backward(*saved_maps, settings, mirrored)
         ctx.wet = wet
         return out
@@ -634,45 +655,48 @@ class _Weather(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         wet: _WetRows = ctx.wet
         image, inverse, *_ = ctx.saved_tensors
-        picture, sight, cover, way, drops, given, shown = (flat_array(t) for t in ctx.saved_tensors)
+        image_array, inverse_array, sky_array, road_array, streak_array, setting_array, mirror_array = (
+            flat_array(t) for t in ctx.saved_tensors
+        )
         height, width = inverse.shape
         plane, first, last = height * width, wet.top * width, wet.bottom * width
         grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
         grad_maps = image.new_empty(2, height, width)
         scratch = _scratch.planes(image, 4 * plane, 3 * (last - first), 3 * (last - first))
         parts, to_mirror, to_damp = (flat_array(t) for t in scratch)
-        inputs = [given, picture, sight, cover, drops, plane, flat_array(grad)]
+        inputs = [setting_array, image_array, inverse_array, sky_array, streak_array, plane, flat_array(grad)]
         outputs = [flat_array(grad_image), flat_array(grad_inverse), parts, flat_array(grad_maps)]
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
             launch(_dry_adjoint_kernel, _ranges(top * width, bottom * width), inputs, outputs)
-        through = [way, shown, first, last - first, to_mirror]
+        through = [road_array, mirror_array, first, last - first, to_mirror]
         launch(_wet_adjoint_kernel, _ranges(first, last), [*inputs, *through], outputs)
         _launch_mirror(wet, width, to_mirror, to_damp, False)
-        inputs = [given, picture, cover, plane, to_damp, first, last - first]
+        inputs = [setting_array, image_array, sky_array, plane, to_damp, first, last - first]
         launch(_damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], *outputs[2:]])
         grad_code = _sum_rows_first(scratch[0].view(4, height, width))
         return grad_image, grad_inverse, grad_code, None, *grad_maps, None
 
 
 def _sum_rows_first(code_parts: Tensor) -> Tensor:
-    """Sums (K,) of planes (K, H, W), rows first: so they do not hang on the number of threads."""
+    """Sums (K,) of planes (K, H, W), rows first, so that they do not depend on the number of threads."""
     return code_parts.sum(dim=2).sum(dim=1)
 
 
-def _launch_mirror(wet: _WetRows, width: int, source: Any, target: Any, forward: bool) -> None:
+def _launch_mirror(wet: _WetRows, width: int, source: Any, out_array: Any, forward: bool) -> None:
     columns = 1 if source.device.is_cuda else _STRIP
     count = 3 * -(-width // columns) if wet.bottom > wet.top else 0
     parts = 1 if source.device.is_cuda else threads()
     edges = [count * i // parts for i in range(parts + 1)]
-    inputs = [source, target, columns, width, wet.top, wet.bottom, wet.road_top, wet.radius, forward]
+    inputs = [source, out_array, columns, width, wet.top, wet.bottom, wet.road_top, wet.radius, forward]
     launch(_mirror_kernel, edges, inputs)
 
 
 ODDS, CHROMA, COS, SIN, RED, YELLOW, THICKER, THINNER, TURN_SLOPE, THICKER_SLOPE, THINNER_SLOPE = range(11)
 LEAF_SETTING_COUNT = 11
-"""Numbers that are the same for all leaves: where they stand, and their count. Factor of the odds of lightness; of
-chroma; cosine and sine of the turn of hue; shift of a* and b*; how much thicker and thinner; slopes of the turn
-along hue, of thicker and thinner along density."""
+"""Indices of the settings, equal for all leaves, and their count: factor of the odds of lightness; of chroma;
+cosine and sine of the turn of hue; shift of a* and b*; thicker and thinner; slopes of the turn along hue, of
+thicker and thinner along density.
+"""
 
 
 @wp.kernel
@@ -708,7 +732,7 @@ def _leaf_settings_kernel(
 
 @wp.func
 def _leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
-    """The leaf model before its crown's density: L*a*b*."""
+    """The leaf model without density: L*a*b*."""
     _before_mirror = lightness_level(lab[0])
     odds = load(settings, at + ODDS)
     level = scale_odds(_before_mirror, odds)
@@ -732,7 +756,7 @@ class CrownPixel:
 
 @wp.func
 def _read_crown(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
-    """crowns: five planes: thinned, thickened, behind."""
+    """crowns: five planes: thinned, thickened, behind (3)."""
     at = CrownPixel()
     at.thinned = load(crowns, i)
     at.thickened = load(crowns, plane + i)
@@ -749,7 +773,7 @@ def _apply_crown(rgb: wp.vec3f, at: CrownPixel, settings: wp.array(dtype=wp.floa
 
 @wp.func
 def _leaf_adjoint(lab: wp.vec3f, crown: CrownPixel, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
-    """-> gradients to lab and to hue, lightness and density (3)."""
+    """Gradients to lab and to hue, lightness and density (3)."""
     changed = _leaf_lab(lab, settings, at)
     rgb = lab_to_rgb(changed)
     keep = 1.0 - THICK * load(settings, at + THICKER) * crown.thickened
@@ -830,7 +854,9 @@ def _foliage_code_kernel(
     wet_pixels: int,
     code_parts: wp.array(dtype=wp.float32),
 ):
-    """shares: each pixel's part of the gradient to the code, planes of `wet_pixels` numbers, from pixel `first` on."""
+    """shares: each pixel's part of the gradient to the code, planes of `wet_pixels` numbers, from pixel `first`
+    on.
+    """
     i = start + wp.tid()
     g = _leaf_share(load(amount, i)) * load3(grad, i, plane)
     _lab, code = _leaf_adjoint(
@@ -873,9 +899,9 @@ class _Foliage(torch.autograd.Function):
         saved_maps = [t.detach().contiguous() for t in (image, amount, crowns)]
         settings = image.new_empty(2 * LEAF_SETTING_COUNT)
         out = saved_maps[0].clone()
-        given, own_code, maps = flat_array(settings), flat_array(code), [flat_array(t) for t in saved_maps]
-        launch(_leaf_settings_kernel, [0, 2], [own_code], [given])
-        inputs = [given, own_code, *maps, plane]
+        setting_array, own_code, maps = flat_array(settings), flat_array(code), [flat_array(t) for t in saved_maps]
+        launch(_leaf_settings_kernel, [0, 2], [own_code], [setting_array])
+        inputs = [setting_array, own_code, *maps, plane]
         launch(_foliage_kernel, _ranges(top * width, bottom * width), inputs, [flat_array(out)])
         ctx.save_for_backward(*saved_maps, settings)
         ctx.rows = (top, bottom)
@@ -914,12 +940,22 @@ class _Foliage(torch.autograd.Function):
 def apply_weather(
     image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, streaks: Tensor
 ) -> Tensor:
-    """See `environment.weather`; streaks: (H, W). All float32, the airlight constant."""
+    """See `environment.apply_weather`; float32, the airlight constant.
+
+    Args:
+        image, inverse, environment, air: As there.
+        streaks: (H, W) in [0, 1].
+    """
     code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 
 def apply_foliage(image: Tensor, environment: Environment, crowns: Tensor) -> Tensor:
-    """See `environment.foliage`; crowns: (5, H, W). All float32."""
+    """See `environment.apply_foliage`; float32.
+
+    Args:
+        image, environment: As there.
+        crowns: (5, H, W).
+    """
     code, amount = environment.foliage.to(image), environment.foliage_map.to(image)
     return _Foliage.apply(image, code, amount, crowns.to(image))

@@ -1,6 +1,6 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
 # ruff: noqa: RUF046, UP018 - Warp needs int(0) to declare what a loop changes.
-"""Walks over a mesh between looks, as a Warp kernel: what `borders.Walk.over` does in plain torch, in float64."""
+"""Walks over a mesh between samples, as a Warp kernel: what `borders.MeshWalk.trace` does in plain torch; float64."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ ONE = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class WalkExit:
-    """Where a face is left on a way, by which of its edges, its plane, and the edge's normal, from it outwards."""
+    """Position at which a path leaves a face, the edge by which it does, the face's plane, and the edge's normal,
+    outwards.
+    """
 
     share: wp.float64
     edge: int
@@ -30,7 +32,7 @@ class WalkExit:
 
 @wp.func
 def _earlier_exit(found: WalkExit, n: wp.vec3d, sign: wp.float64, edge: int, start: wp.vec3d, end: wp.vec3d):
-    """`found`, or the edge with normal n, where the way leaves by it earlier."""
+    """`found`, or the edge with normal n if the path leaves by it earlier."""
     outside = wp.dot(n, end) * sign
     share = ONE
     if outside < ZERO:
@@ -125,7 +127,16 @@ def trace_walks(
     end: Tensor,
     most: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """face, share, edge, goes_on, plane, met of `borders.MeshWalk`, over at most `most` faces further."""
+    """Trace walks; returns face, share, edge, goes_on, plane, met of `borders.MeshWalk`.
+
+    Args:
+        points: (V, 3) float64 clip coordinates.
+        faces: (F, 3).
+        across: See `borders.MeshEdges`.
+        seen: (P,), (P,) faces at start and end.
+        start, end: (P, 3) pixels (x, y, 1).
+        most: Most faces to follow.
+    """
     here, goal = seen
     count = len(here)
     face, edge = (here.new_empty(count, most + 1) for _ in range(2))

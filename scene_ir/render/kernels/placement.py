@@ -1,6 +1,7 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
 # ruff: noqa: UP018 - Warp needs float(1.0) to declare what a branch changes.
-"""Placing vertices, as Warp kernels: what `surfaces.place` and `Prepared.brighter` do in plain torch; float32.
+"""Vertex placement as Warp kernels: what `surfaces.place_vertices` and `PreparedScene.compute_brightening` do in
+plain torch; float32.
 
 Gradients are written by hand. Shapes: N objects, V vertices.
 """
@@ -26,8 +27,15 @@ RELIT, RELIT_MORE = model.RELIT[0], model.RELIT[1] - model.RELIT[0]
 
 @wp.struct
 class TemplateVertices:
-    """Of vertices: where they are in the unit box, by how much they are bent there (3, V), their unit normals,
-    their objects, how much of them is paint, and how squarely the photograph's sun meets them.
+    """Vertices of the templates.
+
+    Attributes:
+        unit: (V,) position in the unit box.
+        bend: (3, V) lattice displacement.
+        normal: (V,) unit normal.
+        owner: (V,) object.
+        paint: (V,) paint share.
+        lit: (V,) photographed exposure to the sun.
     """
 
     unit: wp.array(dtype=wp.vec3f)
@@ -40,8 +48,14 @@ class TemplateVertices:
 
 @wp.struct
 class PoseInputs:
-    """Of objects: cosine and sine of the yaws; translation, size; cameras; how strong the photograph's sun is;
-    direction and strength of theirs.
+    """Poses of the objects.
+
+    Attributes:
+        turn: (N,) cosine and sine of yaw.
+        translation, size: (N,) m.
+        matrix, centre: (N, 3), (N,) cameras.
+        sunlight: (N,) strength of the photographed sun.
+        lights: (N,) direction and strength of the sun.
     """
 
     turn: wp.array(dtype=wp.vec2f)
@@ -55,8 +69,8 @@ class PoseInputs:
 
 @wp.struct
 class PlacedVertices:
-    """Of vertices: clip coordinates, cosines towards the camera, how squarely the sun meets them, and how much
-    brighter they are; or gradients to these, of which the third is not asked for.
+    """Clip coordinates, cosine towards the camera, exposure to the sun, and brightening of the vertices (V); or
+    gradients to them, of which the third is unused.
     """
 
     clip: wp.array(dtype=wp.vec3f)
@@ -67,7 +81,7 @@ class PlacedVertices:
 
 @wp.struct
 class PoseGradients:
-    """Gradients: to bends (3, V); to translations and yaws, to sizes, and to lights."""
+    """Gradients to bends (3, V), to translations and yaws, to sizes, and to lights."""
 
     bend: wp.array2d(dtype=wp.float32)
     pose: wp.array(dtype=wp.vec4d)
@@ -95,14 +109,14 @@ def _sun_direction(poses: PoseInputs, o: int):
 
 @wp.func
 def _photographed_light(templates: TemplateVertices, poses: PoseInputs, i: int, o: int):
-    """The light on a vertex in the photograph."""
+    """Light on a vertex in the photograph."""
     dome = 0.5 - 0.5 * templates.normal[i][1]
     return AMBIENT + SKYLIGHT * dome + poses.sunlight[o] * templates.lit[i]
 
 
 @wp.func
 def _relative_strength(poses: PoseInputs, o: int):
-    """How strong the sun is, as a factor on the photograph's; 1 where there it is none."""
+    """Strength of the sun relative to the photographed one; 1 where that is 0."""
     strength = float(1.0)
     if poses.sunlight[o] != 0.0:
         strength = poses.lights[o][3] / poses.sunlight[o]
@@ -187,13 +201,24 @@ def _place_backward_kernel(
 
 
 class PlaceVertices(torch.autograd.Function):
-    """Offsets ffd (N, P, 3), size (N, 3) m, yaw (N,), translation (N, 3) m, lights (N, 4) -> clip (V, 3), cosine
-    towards the camera (V,), how much brighter (V,); and how squarely the sun meets each vertex (V,), without
-    gradient. placement: `surfaces.Rig`.
-    """
+    """Placement of vertices."""
 
     @staticmethod
     def forward(ctx: Any, ffd, size, yaw, translation, lights, placement):
+        """Place the vertices.
+
+        Args:
+            ffd: (N, P, 3) lattice offsets.
+            size: (N, 3) m.
+            yaw: (N,) rad.
+            translation: (N, 3) m.
+            lights: (N, 4) direction and strength of the sun.
+            placement: A `surfaces.VertexPlacement`.
+
+        Returns:
+            Clip coordinates (V, 3), cosine towards the camera (V,), brightening (V,), and, without gradient,
+            exposure to the sun (V,).
+        """
         bend = placement.bend_vertices(ffd.detach())
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1)
         count, like = placement.unit.shape[0], placement.unit
@@ -215,6 +240,12 @@ class PlaceVertices(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_clip: Tensor | None, grad_facing: Tensor | None, grad_brighter: Tensor | None, _):
+        """Gradients in the order of `forward`.
+
+        Args:
+            grad_clip, grad_facing, grad_brighter: Gradients to its results; None for 0.
+            others: Gradient to the exposure, which is ignored.
+        """
         placement, like = ctx.placement, ctx.placement.unit
         count, objects = like.shape[0], len(placement.vertex_edges) - 1
         grads = [

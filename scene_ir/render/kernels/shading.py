@@ -1,11 +1,15 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
 # ruff: noqa: E501, UP018, RUF046, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
 # returns the gradients of all arguments.
-"""The pixels of photographed vehicles as Warp kernels: one pass a stage, forward and backward, float32.
+"""Pixels of photographed vehicles as Warp kernels: one pass per stage, forward and backward; float32.
 
-What each stage computes is defined by the plain torch of `reference` and `texture`; constants are `model`'s, channels
-`channels`'. Gradients of the per-pixel functions come from `wp.grad`, those that gather at vertices are written by
-hand. `photographed` runs the stages. Shapes: N objects, V vertices, T packed pixels.
+Each stage is defined by the plain torch of `reference` and `texture`; constants are in `model`, channels in
+`channels`. Gradients of the per-pixel functions come from `wp.grad`; those that gather at vertices are written by
+hand. `photographed_pixels` runs the stages. Shapes: N objects, V vertices, T packed pixels.
+
+Arguments of kernels: `start` is the first index; `pixels`, `vertices`, `photograph`, `lookups`, `layers` and
+`grads` are the structs below; `partial` and `need` list the pixels to process; `final` means that no painter runs
+before mesh and halo are merged; `to_layers` holds gradients to `layers`.
 """
 
 from __future__ import annotations
@@ -30,11 +34,11 @@ start_warp()
 wp.set_module_options({"fuse_fp": True, "fast_math": False, "max_unroll": ch.OWN})
 
 DARKNESS = 4
-"""Numbers of a shadow's texel: three, and one that fills it up to what a CPU takes at once."""
+"""Numbers per texel of a shadow: three, and one that completes what a CPU processes at once."""
 texel_type = wp.types.vector(length=ch.TEXEL, dtype=wp.float32)
 texel_samples = wp.types.matrix(shape=(3, ch.TEXEL), dtype=wp.float32)
 darkness_samples = wp.types.matrix(shape=(3, DARKNESS), dtype=wp.float32)
-lookup_type = wp.types.vector(length=ch.LOOK, dtype=wp.float32)
+lookup_type = wp.types.vector(length=ch.LOOKUP, dtype=wp.float32)
 attributes_type = wp.types.vector(length=ch.OWN, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 SUBPIXEL_COUNT = len(model.SUBPIXELS)
@@ -53,7 +57,7 @@ DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE_TURN, BORDER, EXTENDED = (
 )
 (
     OUTLINE_PX,
-    BESIDE_OUTLINE,
+    OUTER_OUTLINE,
     MIRRORED_RIM,
     MIRRORED_COS,
     SOLID,
@@ -68,7 +72,7 @@ DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE_TURN, BORDER, EXTENDED = (
     for edges in (
         *(
             model.OUTLINE_PX,
-            model.BESIDE_OUTLINE_PX,
+            model.OUTER_OUTLINE_PX,
             model.MIRRORED_RIM,
             model.MIRRORED_COS,
             model.SOLID_ALPHA,
@@ -90,13 +94,20 @@ GROUND_RGB, HORIZON_RGB, ZENITH_RGB = (
     wp.constant(wp.vec3f(*rgb)) for rgb in (model.GROUND_RGB, model.HORIZON_RGB, model.ZENITH_RGB)
 )
 UNSEEN = 4
-"""Of `_mesh_colour`: how much is left to be completed; premultiplied RGB and opacity come before it."""
+"""Index in `_mesh_colour` of the share to complete; premultiplied RGB and opacity come first."""
 
 
 @wp.struct
 class PackedPixels:
-    """The packed pixels of all objects' crops. table: draw, x, y px, and the width of its rectangle; rects (N, 4);
-    face: the triangle that is hit, or -1; coverage; nearest: see `surfaces.nearest_hits`."""
+    """The packed pixels of all objects' crops.
+
+    Attributes:
+        table: (T,) draw, x, y px, and the width of the draw's rectangle.
+        rects: (N, 4) px.
+        face: (T,) face that is hit, or -1.
+        coverage: (T,).
+        nearest: (T,) see `surfaces.nearest_hits`.
+    """
 
     table: wp.array(dtype=wp.vec4i)
     rects: wp.array2d(dtype=wp.int64)
@@ -107,8 +118,9 @@ class PackedPixels:
 
 @wp.struct
 class MeshVertices:
-    """The meshes' faces and what is beside them, and their vertices: `prepare.Geometry`'s clip, cosine and brightness,
-    and `fast.FixedGeometry`'s."""
+    """Faces of the meshes and their neighbours, and the vertices: fields of `prepare.PlacedGeometry` and
+    `fast.FixedGeometry`.
+    """
 
     faces: wp.array(dtype=wp.vec3i)
     neighbours: wp.array(dtype=wp.vec3i)
@@ -122,8 +134,15 @@ class MeshVertices:
 
 @wp.struct
 class PhotographArrays:
-    """What is known of each object: its texels, rects (N, 4) and offsets (N + 1,) of their crops; the frame's width
-    and height; cosine and sine of its yaw; direction and strength of the sun; from a pixel to its ray."""
+    """The photograph of each object.
+
+    Attributes:
+        texels, rects, offsets: Packed crops.
+        frame_wh: (N,) px.
+        turn: (N,) cosine and sine of yaw.
+        sun: (N,) direction and strength.
+        unproject: (N,) from a pixel to its ray.
+    """
 
     texels: wp.array(dtype=texel_type)
     rects: wp.array2d(dtype=wp.int64)
@@ -136,7 +155,7 @@ class PhotographArrays:
 
 @wp.struct
 class PixelHit:
-    """A place, px, and what is hit there."""
+    """A position, px, and what is hit there."""
 
     hit: TriangleHit
     x: wp.float64
@@ -145,19 +164,25 @@ class PixelHit:
 
 @wp.struct
 class LookupArrays:
-    """What packed pixels show, stage by stage: where they look, continued over the outline, and of leaning pixels also
-    as found there; premultiplied RGB and opacity of mesh and halo; how much of the mesh is left to be completed."""
+    """Values of packed pixels, stage by stage.
+
+    Attributes:
+        found: Lookups of partly covered pixels before `extend_lookups_kernel`.
+        lookup: Lookups, extended over the outline.
+        mesh, halo: Premultiplied RGB and opacity.
+        unseen: Share of the mesh to complete.
+    """
 
     found: wp.array(dtype=lookup_type)
-    look: wp.array(dtype=lookup_type)
+    lookup: wp.array(dtype=lookup_type)
     mesh: wp.array(dtype=wp.vec4f)
     halo: wp.array(dtype=wp.vec4f)
-    fill: wp.array(dtype=wp.float32)
+    unseen: wp.array(dtype=wp.float32)
 
 
 @wp.struct
 class LayerArrays:
-    """Mesh and halo as one: premultiplied RGB and opacity / depth, opacity, depth, m; or gradients to these."""
+    """Mesh and halo merged: premultiplied RGB and opacity / depth, opacity, depth in m; or gradients to these."""
 
     colour: wp.array(dtype=wp.vec4f)
     opacity: wp.array(dtype=wp.float32)
@@ -166,13 +191,13 @@ class LayerArrays:
 
 @wp.struct
 class ShadingGradients:
-    """To what `LookupArrays`, `PackedPixels`, `MeshVertices` and `PhotographArrays` hold. kept: see `move_gradients_kernel`."""
+    """Gradients to the other structs; moved_lookup: see `move_gradients_kernel`."""
 
-    look: wp.array(dtype=lookup_type)
-    kept: wp.array(dtype=lookup_type)
+    lookup: wp.array(dtype=lookup_type)
+    moved_lookup: wp.array(dtype=lookup_type)
     mesh: wp.array(dtype=wp.vec4f)
     halo: wp.array(dtype=wp.vec4f)
-    fill: wp.array(dtype=wp.float32)
+    unseen: wp.array(dtype=wp.float32)
     coverage: wp.array(dtype=wp.float32)
     clip: wp.array(dtype=wp.vec3d)
     facing: wp.array(dtype=wp.float32)
@@ -190,7 +215,7 @@ def _smoothstep(x: float, edges: wp.vec2f):
 
 @wp.func
 def _smoothstep_slope(x: float, edges: wp.vec2f):
-    """The derivative of `_smoothstep`."""
+    """Derivative of `_smoothstep`."""
     t = wp.clamp((x - edges[0]) * (1.0 / (edges[1] - edges[0])), 0.0, 1.0)
     return 6.0 * (t - t * t) * (1.0 / (edges[1] - edges[0]))
 
@@ -205,7 +230,13 @@ def table_kernel(
     offsets: wp.array(dtype=wp.int64),
     table: wp.array(dtype=wp.vec4i),
 ):
-    """For each packed pixel of a draw: the draw, x, y px, and the width of its rectangle."""
+    """Fill the table of the packed pixels of draws.
+
+    Args:
+        start: First draw.
+        rects, offsets: Layout of the draws.
+        table: See `PackedPixels`.
+    """
     draw = start + wp.tid()
     x0 = wp.int32(rects[draw, 0])
     y0 = wp.int32(rects[draw, 1])
@@ -223,7 +254,7 @@ def table_kernel(
 
 @wp.func
 def _corner_values(vertices: MeshVertices, i: int):
-    """A look before its division: clip then minus now (3) and w then stand in place of the lookup and the w's."""
+    """A lookup before its division: clip then minus now (3) and w then instead of displacement and depths."""
     then = vertices.base_clip[i]
     delta = then - vertices.clip[i]
     fixed = vertices.base[i]
@@ -234,15 +265,15 @@ def _corner_values(vertices: MeshVertices, i: int):
 
 @wp.func
 def _scaled_pixel(hit: TriangleHit, x: wp.float64, y: wp.float64):
-    """A pixel (x, y, 1) over the sum of the edge functions there: what their gradients are times."""
+    """A pixel (x, y, 1) over the sum of the edge functions there: factor of their gradients."""
     return wp.vec3d(x, y, wp.float64(1.0)) * hit.scale
 
 
 @wp.func
 def _lookup_dot(a: lookup_type, b: lookup_type):
-    """In double precision: differences between corners matter, which are small beside the values."""
+    """In double precision: differences between corners matter, which are small compared to the values."""
     total = wp.float64(a[0]) * wp.float64(b[0])
-    for k in range(1, ch.LOOK):
+    for k in range(1, ch.LOOKUP):
         total += wp.float64(a[k]) * wp.float64(b[k])
     return total
 
@@ -258,21 +289,26 @@ def _attributes_dot(a: attributes_type, b: attributes_type):
 
 @wp.func
 def is_partly_covered(pixels: PackedPixels, i: int):
-    """Whether a pixel belongs to the mesh and is not wholly covered by it."""
+    """Whether a pixel belongs to the mesh and is not fully covered."""
     return pixels.coverage[i] < 1.0 and (pixels.face[i] >= 0 or pixels.coverage[i] > 0.0)
 
 
 @wp.func
-def _saved_lookup(pixels: PackedPixels, looks: LookupArrays, i: int):
-    """Where a pixel looks, as found, not continued over the outline."""
-    found = looks.look[i]
+def _saved_lookup(pixels: PackedPixels, lookups: LookupArrays, i: int):
+    """Lookup of a pixel before its extension over the outline."""
+    found = lookups.lookup[i]
     if is_partly_covered(pixels, i):
-        found = looks.found[i]
+        found = lookups.found[i]
     return found
 
 
 @wp.kernel(enable_backward=False)
-def lookup_kernel(start: int, pixels: PackedPixels, vertices: MeshVertices, looks: LookupArrays):
+def lookup_kernel(start: int, pixels: PackedPixels, vertices: MeshVertices, lookups: LookupArrays):
+    """Find where pixels look up the photograph.
+
+    Args:
+        start, pixels, vertices, lookups: See the module.
+    """
     i = start + wp.tid()
     value = lookup_type()
     if pixels.face[i] >= 0:
@@ -284,28 +320,33 @@ def lookup_kernel(start: int, pixels: PackedPixels, vertices: MeshVertices, look
         value = a
         then = a[ch.CORNER_THEN]
         change = a[ch.CORNER_W]
-        value[ch.MOVE] = model.FAR_AWAY_PX
-        value[ch.MOVE + 1] = model.FAR_AWAY_PX
+        value[ch.DISPLACEMENT] = model.FAR_AWAY_PX
+        value[ch.DISPLACEMENT + 1] = model.FAR_AWAY_PX
         value[ch.W_THEN] = then
         value[ch.W_NOW] = then - change
         if then > NEAR_M:
-            value[ch.MOVE] = (a[0] - wp.float32(at[1]) * change) / then
-            value[ch.MOVE + 1] = (a[1] - wp.float32(at[2]) * change) / then
-    looks.look[i] = value
+            value[ch.DISPLACEMENT] = (a[0] - wp.float32(at[1]) * change) / then
+            value[ch.DISPLACEMENT + 1] = (a[1] - wp.float32(at[2]) * change) / then
+    lookups.lookup[i] = value
 
 
 @wp.kernel(enable_backward=False)
 def lookup_backward_kernel(
-    start: int, pixels: PackedPixels, vertices: MeshVertices, looks: LookupArrays, grads: ShadingGradients
+    start: int, pixels: PackedPixels, vertices: MeshVertices, lookups: LookupArrays, grads: ShadingGradients
 ):
+    """Gradient of `lookup_kernel`.
+
+    Args:
+        start, pixels, vertices, lookups, grads: See the module.
+    """
     i = start + wp.tid()
     if pixels.face[i] >= 0:
         at = pixels.table[i]
         x = wp.float32(at[1])
         y = wp.float32(at[2])
         hit = triangle_hit(pixels.face[i], wp.float64(at[1]), wp.float64(at[2]), vertices.clip, vertices.faces)
-        v = _saved_lookup(pixels, looks, i)
-        go = grads.look[i]
+        v = _saved_lookup(pixels, lookups, i)
+        go = grads.lookup[i]
         # Back through the division, to the interpolated values.
         g = go
         g[0] = float(0.0)
@@ -313,10 +354,10 @@ def lookup_backward_kernel(
         g[ch.CORNER_W] = -go[ch.W_NOW]
         g[ch.CORNER_THEN] = go[ch.W_THEN] + go[ch.W_NOW]
         if v[ch.W_THEN] > NEAR_M:
-            g[0] = go[ch.MOVE] / v[ch.W_THEN]
-            g[1] = go[ch.MOVE + 1] / v[ch.W_THEN]
+            g[0] = go[ch.DISPLACEMENT] / v[ch.W_THEN]
+            g[1] = go[ch.DISPLACEMENT + 1] / v[ch.W_THEN]
             g[ch.CORNER_W] -= g[0] * x + g[1] * y
-            g[ch.CORNER_THEN] -= g[0] * v[ch.MOVE] + g[1] * v[ch.MOVE + 1]
+            g[ch.CORNER_THEN] -= g[0] * v[ch.DISPLACEMENT] + g[1] * v[ch.DISPLACEMENT + 1]
         s0 = _lookup_dot(g, _corner_values(vertices, hit.i0))
         s1 = _lookup_dot(g, _corner_values(vertices, hit.i1))
         s2 = _lookup_dot(g, _corner_values(vertices, hit.i2))
@@ -341,7 +382,7 @@ def lookup_backward_kernel(
 
 @wp.struct
 class OutlineBlend:
-    """How a pixel at a mesh's outline leans on its neighbours: `reference._Fringe`, one row of it."""
+    """Blend of a pixel at a mesh's outline with its neighbours: a row of `reference._OutlineRows`."""
 
     known: wp.vec4f
     weight: wp.vec4f
@@ -385,42 +426,55 @@ def _outline_blend(pixels: PackedPixels, i: int):
 
 
 @wp.kernel(enable_backward=False)
-def save_lookups_kernel(start: int, partial: wp.array(dtype=wp.int64), looks: LookupArrays):
-    """Keeps what leaning pixels found, before `extend_lookups_kernel` continues what is beside them."""
+def save_lookups_kernel(start: int, partial: wp.array(dtype=wp.int64), lookups: LookupArrays):
+    """Save the lookups of partly covered pixels before `extend_lookups_kernel`.
+
+    Args:
+        start, partial, lookups: See the module.
+    """
     i = wp.int32(partial[start + wp.tid()])
-    looks.found[i] = looks.look[i]
+    lookups.found[i] = lookups.lookup[i]
 
 
 @wp.kernel(enable_backward=False)
 def extend_lookups_kernel(
-    start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, looks: LookupArrays
+    start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, lookups: LookupArrays
 ):
+    """Extend the lookups over the outline.
+
+    Args:
+        start, partial, pixels, lookups: See the module.
+    """
     i = wp.int32(partial[start + wp.tid()])
     f = _outline_blend(pixels, i)
     mean = (
-        _saved_lookup(pixels, looks, f.pixel[0]) * f.weight[0]
-        + _saved_lookup(pixels, looks, f.pixel[1]) * f.weight[1]
+        _saved_lookup(pixels, lookups, f.pixel[0]) * f.weight[0]
+        + _saved_lookup(pixels, lookups, f.pixel[1]) * f.weight[1]
     )
     mean += (
-        _saved_lookup(pixels, looks, f.pixel[2]) * f.weight[2]
-        + _saved_lookup(pixels, looks, f.pixel[3]) * f.weight[3]
+        _saved_lookup(pixels, lookups, f.pixel[2]) * f.weight[2]
+        + _saved_lookup(pixels, lookups, f.pixel[3]) * f.weight[3]
     )
-    looks.look[i] = looks.found[i] * (f.own * f.hit) + mean * (1.0 - f.own)
+    lookups.lookup[i] = lookups.found[i] * (f.own * f.hit) + mean * (1.0 - f.own)
 
 
 @wp.kernel(enable_backward=False)
 def move_gradients_kernel(start: int, partial: wp.array(dtype=wp.int64), grads: ShadingGradients):
-    """Moves gradients of leaning pixels from `grad` to `kept`, so that `extend_lookups_backward_kernel` can spread them."""
+    """Move the gradients of partly covered pixels aside, for `extend_lookups_backward_kernel` to distribute.
+
+    Args:
+        start, partial, grads: See the module.
+    """
     i = wp.int32(partial[start + wp.tid()])
-    grads.kept[i] = grads.look[i]
-    grads.look[i] = lookup_type()
+    grads.moved_lookup[i] = grads.lookup[i]
+    grads.lookup[i] = lookup_type()
 
 
 @wp.func
 def _outline_to_coverage(
     pixels: PackedPixels, i: int, f: OutlineBlend, to_own: float, to_weight: wp.vec4f, grads: ShadingGradients
 ):
-    """Add what gradients to a pixel's own share and to its neighbours' weights mean for their coverages."""
+    """Add gradients to a pixel's own weight and its neighbours' weights to their coverages."""
     shared = wp.dot(to_weight, f.weight)
     for n in range(4):
         if f.known[n] > 0.0:
@@ -435,20 +489,25 @@ def extend_lookups_backward_kernel(
     start: int,
     partial: wp.array(dtype=wp.int64),
     pixels: PackedPixels,
-    looks: LookupArrays,
+    lookups: LookupArrays,
     grads: ShadingGradients,
 ):
+    """Gradient of `extend_lookups_kernel`.
+
+    Args:
+        start, partial, pixels, lookups, grads: See the module.
+    """
     i = wp.int32(partial[start + wp.tid()])
     f = _outline_blend(pixels, i)
-    g = grads.kept[i]
+    g = grads.moved_lookup[i]
     rest = 1.0 - f.own
-    wp.atomic_add(grads.look, i, g * (f.own * f.hit))
-    to_own = f.hit * wp.dot(g, looks.found[i])
+    wp.atomic_add(grads.lookup, i, g * (f.own * f.hit))
+    to_own = f.hit * wp.dot(g, lookups.found[i])
     to_weight = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     for n in range(4):
         if f.known[n] > 0.0:
-            wp.atomic_add(grads.look, f.pixel[n], g * (rest * f.weight[n]))
-            along = wp.dot(g, _saved_lookup(pixels, looks, f.pixel[n]))
+            wp.atomic_add(grads.lookup, f.pixel[n], g * (rest * f.weight[n]))
+            along = wp.dot(g, _saved_lookup(pixels, lookups, f.pixel[n]))
             to_own -= f.weight[n] * along
             to_weight[n] = rest * along
     _outline_to_coverage(pixels, i, f, to_own, to_weight, grads)
@@ -493,7 +552,12 @@ def sample_texels(
     sx: wp.vec4f,
     sy: wp.vec4f,
 ) -> texel_samples:
-    """A texel between texels, how it changes along u, and along v: by the fields of `BicubicTaps`."""
+    """A texel between texels and its changes along u and v; the other arguments are fields of `BicubicTaps`.
+
+    Args:
+        texels: Packed texels.
+        others: Fields of `BicubicTaps`.
+    """
 
 
 @wp.func_native(_SAMPLE.replace("WIDTH", str(DARKNESS)))
@@ -506,12 +570,17 @@ def sample_darkness(
     sx: wp.vec4f,
     sy: wp.vec4f,
 ) -> darkness_samples:
-    """The same of what a shadow takes away."""
+    """`sample_texels` for shadows.
+
+    Args:
+        texels: Packed texels.
+        others: Fields of `BicubicTaps`.
+    """
 
 
 @wp.struct
 class TexelSample:
-    """A texel between texels, and how it changes along u and v."""
+    """A texel between texels, and its changes along u and v."""
 
     value: texel_type
     to_u: texel_type
@@ -540,12 +609,20 @@ def read_rect(rects: wp.array2d(dtype=wp.int64), i: int):
 
 @wp.func
 def crop_taps(uv: wp.vec2f, rect: wp.vec4i, start: wp.int64, clamp: bool):
+    """Taps of a position in a crop.
+
+    Args:
+        uv: Position in the frame, px.
+        rect: The crop.
+        start: Its first texel.
+        clamp: Whether edge texels repeat.
+    """
     return bicubic_taps(uv, rect[0], rect[1], rect[2] - rect[0], rect[3] - rect[1], wp.int32(start), 1, clamp)
 
 
 @wp.func
 def _texel_at(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
-    """The texel at a place of the frame; 0 in an empty crop."""
+    """The texel at a position of the frame; 0 in an empty crop."""
     out = texel_type()
     rect = read_rect(photograph.rects, draw)
     if rect[2] > rect[0]:
@@ -555,7 +632,7 @@ def _texel_at(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
 
 @wp.func
 def _texel_with_slopes(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
-    """`_texel_at`, and how it changes."""
+    """`_texel_at`, and its changes."""
     out = TexelSample()
     rect = read_rect(photograph.rects, draw)
     if rect[2] > rect[0]:
@@ -568,7 +645,13 @@ def _texel_with_slopes(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
 
 @wp.func
 def inside_weight(u: float, v: float, wh: wp.vec2f, edges: wp.vec2f):
-    """`texture.inside_weight`."""
+    """`texture.inside_weight`.
+
+    Args:
+        u, v: Position, px.
+        wh: Width and height, px.
+        edges: Distances beyond the border.
+    """
     beyond_u = wp.max(-u, u - (wh[0] - 1.0))
     beyond_v = wp.max(-v, v - (wh[1] - 1.0))
     return (1.0 - _smoothstep(beyond_u, edges)) * (1.0 - _smoothstep(beyond_v, edges))
@@ -576,7 +659,7 @@ def inside_weight(u: float, v: float, wh: wp.vec2f, edges: wp.vec2f):
 
 @wp.func
 def _facing_weight(turned: float, cos_then: float, paint: float):
-    """`texture._facing_weight`."""
+    """`texture.facing_weight`."""
     positive = 0.5 * (cos_then + wp.sqrt(cos_then * cos_then + model.SQUARED_COS))
     slack = GRAZING + (PAINT_GRAZING - GRAZING) * paint
     return 1.0 - _smoothstep(turned / (positive + slack), STRETCH)
@@ -584,36 +667,36 @@ def _facing_weight(turned: float, cos_then: float, paint: float):
 
 @wp.func
 def _pixel_xy(pixels: PackedPixels, i: int):
-    """Of a packed pixel, px."""
+    """Position of a packed pixel, px."""
     at = pixels.table[i]
     return wp.vec2f(wp.float32(at[1]), wp.float32(at[2]))
 
 
 @wp.func
-def _photograph_xy(look: lookup_type, xy: wp.vec2f):
-    """Where a pixel looks at the photograph, px."""
-    return wp.vec2f(xy[0] + look[ch.MOVE], xy[1] + look[ch.MOVE + 1])
+def _photograph_xy(lookup: lookup_type, xy: wp.vec2f):
+    """Photograph position of a pixel, px."""
+    return wp.vec2f(xy[0] + lookup[ch.DISPLACEMENT], xy[1] + lookup[ch.DISPLACEMENT + 1])
 
 
 @wp.func
-def _visible_weight(look: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
-    """How much of what is shown the photograph knows; and how much of it it sees there at all."""
-    u = xy[0] + look[ch.MOVE]
-    v = xy[1] + look[ch.MOVE + 1]
+def _visible_weight(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
+    """Share of the pixel that the photograph knows; and share that it sees there at all."""
+    u = xy[0] + lookup[ch.DISPLACEMENT]
+    v = xy[1] + lookup[ch.DISPLACEMENT + 1]
     clear = 1.0 - _smoothstep(texel[ch.HIDDEN], UNIT)
     inside = inside_weight(u, v, wh, BORDER)
-    facing = _facing_weight(look[ch.TURNED], look[ch.COS_THEN], look[ch.PAINT])
+    facing = _facing_weight(lookup[ch.TURNED], lookup[ch.COS_THEN], lookup[ch.PAINT])
     weight = facing * inside * clear
     if inside < 1.0:
         near = inside_weight(u, v, wh, EXTENDED) * _smoothstep(texel[ch.ALPHA], SOLID)
         weight = weight + facing * (1.0 - inside) * near * clear
-    weight = weight * (1.0 - _smoothstep(look[ch.W_THEN] - texel[ch.DEPTH], DEPTH))
+    weight = weight * (1.0 - _smoothstep(lookup[ch.W_THEN] - texel[ch.DEPTH], DEPTH))
     return wp.vec2f(weight, inside * clear)
 
 
 @wp.func
 def _relight(c: float, brighter: float):
-    """`texture.relight`, one channel of it."""
+    """`texture.relight`, one channel."""
     return c * (1.0 + brighter * (1.0 - c * c))
 
 
@@ -624,78 +707,77 @@ def _relight_slope(c: float, brighter: float):
 
 
 @wp.func
-def _mesh_colour(look: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
-    """Premultiplied RGB, opacity, and how much is left to be completed."""
-    seen = _visible_weight(look, texel, xy, wh)
+def _mesh_colour(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
+    """Premultiplied RGB, opacity, and the share to complete."""
+    seen = _visible_weight(lookup, texel, xy, wh)
     weight = seen[0]
     alpha = texel[ch.ALPHA]
-    rim = 1.0 - _smoothstep(look[ch.COS_THEN], RIM)
-    opened = _smoothstep(look[ch.TURNED], OPEN_TURN) * rim * wp.max(1.0 - alpha, 0.0)
+    rim = 1.0 - _smoothstep(lookup[ch.COS_THEN], RIM)
+    opened = _smoothstep(lookup[ch.TURNED], OPEN_TURN) * rim * wp.max(1.0 - alpha, 0.0)
     empty = seen[1] * (1.0 - _smoothstep(texel[ch.SUPPORT], SUPPORTED))
     closed = weight * opened * (1.0 - empty) * _smoothstep(alpha, OPEN_ALPHA)
-    shown = weight + closed / wp.max(alpha, OPEN_ALPHA[0])
+    texel_weight = weight + closed / wp.max(alpha, OPEN_ALPHA[0])
     out = vec5()
-    out[0] = shown * _relight(texel[0], look[ch.BRIGHTER])
-    out[1] = shown * _relight(texel[1], look[ch.BRIGHTER])
-    out[2] = shown * _relight(texel[2], look[ch.BRIGHTER])
-    out[ch.ALPHA] = shown * alpha
+    out[0] = texel_weight * _relight(texel[0], lookup[ch.BRIGHTER])
+    out[1] = texel_weight * _relight(texel[1], lookup[ch.BRIGHTER])
+    out[2] = texel_weight * _relight(texel[2], lookup[ch.BRIGHTER])
+    out[ch.ALPHA] = texel_weight * alpha
     out[UNSEEN] = (1.0 - weight) * (1.0 - empty)
     return out
 
 
 @wp.func
-def _is_plainly_visible(look: lookup_type, texel: texel_type, u: float, v: float, wh: wp.vec2f):
-    """Whether every weight of `_mesh_colour` is flat at full: then it is the texel, relit, and so is its gradient."""
+def _is_plainly_visible(lookup: lookup_type, texel: texel_type, u: float, v: float, wh: wp.vec2f):
+    """Whether all weights of `_mesh_colour` are constant at full: then it is the relit texel, and so is its
+    gradient.
+    """
     seen = (
         texel[ch.HIDDEN] <= 0.0
         and texel[ch.SUPPORT] >= SUPPORTED[1]
-        and look[ch.W_THEN] - texel[ch.DEPTH] <= DEPTH[0]
+        and lookup[ch.W_THEN] - texel[ch.DEPTH] <= DEPTH[0]
     )
     if seen:
         seen = (
             u >= -BORDER[0] and u <= wh[0] - 1.0 + BORDER[0] and v >= -BORDER[0] and v <= wh[1] - 1.0 + BORDER[0]
         )
     if seen:  # nothing opens up: it did not turn, lies inside, or is opaque
-        seen = look[ch.TURNED] <= OPEN_TURN[0] or look[ch.COS_THEN] >= RIM[1] or texel[ch.ALPHA] >= OPAQUE
+        seen = lookup[ch.TURNED] <= OPEN_TURN[0] or lookup[ch.COS_THEN] >= RIM[1] or texel[ch.ALPHA] >= OPAQUE
     if seen:
-        seen = look[ch.TURNED] <= STRETCH[0] * (PAINT_GRAZING + wp.max(look[ch.COS_THEN], 0.0))
+        seen = lookup[ch.TURNED] <= STRETCH[0] * (PAINT_GRAZING + wp.max(lookup[ch.COS_THEN], 0.0))
     return seen
 
 
 @wp.func
-def _mesh_loss(look: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_fill: float):
-    p = _mesh_colour(look, texel, xy, wh)
-    return p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3] + p[UNSEEN] * to_fill
+def _mesh_loss(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_unseen: float):
+    p = _mesh_colour(lookup, texel, xy, wh)
+    return p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3] + p[UNSEEN] * to_unseen
 
 
 @wp.func
 def _outline_share(texel: texel_type):
-    """`texture._outline_share`."""
+    """`texture.outline_share`."""
     return 1.0 - _smoothstep(texel[ch.INSET], OUTLINE_PX)
 
 
 @wp.func
-def _halo_colour(look: lookup_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f):
-    """Premultiplied RGB and opacity. inset: of the mesh pixel that this one moves with."""
-    seen = _visible_weight(look, texel, xy, wh)
-    on_outline = 1.0 - _smoothstep(look[ch.TURNED] * look[ch.TURNED], OUTLINE_TURN)
-    shown = (
-        seen[0]
-        * _smoothstep(_outline_share(texel), UNIT)
-        * on_outline
-        * (1.0 - _smoothstep(inset, BESIDE_OUTLINE))
+def _halo_colour(lookup: lookup_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f):
+    """Premultiplied RGB and opacity. inset: of the mesh pixel with which this one moves."""
+    seen = _visible_weight(lookup, texel, xy, wh)
+    on_outline = 1.0 - _smoothstep(lookup[ch.TURNED] * lookup[ch.TURNED], OUTLINE_TURN)
+    texel_weight = (
+        seen[0] * _smoothstep(_outline_share(texel), UNIT) * on_outline * (1.0 - _smoothstep(inset, OUTER_OUTLINE))
     )
     return wp.vec4f(
-        shown * _relight(texel[0], look[ch.BRIGHTER]),
-        shown * _relight(texel[1], look[ch.BRIGHTER]),
-        shown * _relight(texel[2], look[ch.BRIGHTER]),
-        shown * texel[ch.ALPHA],
+        texel_weight * _relight(texel[0], lookup[ch.BRIGHTER]),
+        texel_weight * _relight(texel[1], lookup[ch.BRIGHTER]),
+        texel_weight * _relight(texel[2], lookup[ch.BRIGHTER]),
+        texel_weight * texel[ch.ALPHA],
     )
 
 
 @wp.func
-def _halo_loss(look: lookup_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
-    return wp.dot(_halo_colour(look, texel, inset, xy, wh), g)
+def _halo_loss(lookup: lookup_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
+    return wp.dot(_halo_colour(lookup, texel, inset, xy, wh), g)
 
 
 @wp.func
@@ -712,15 +794,17 @@ def _in_halo(pixels: PackedPixels, i: int):
 
 
 @wp.func
-def _write_layer(pixels: PackedPixels, looks: LookupArrays, layers: LayerArrays, i: int, m: wp.vec4f, h: wp.vec4f):
-    """A pixel's mesh m and halo h as one."""
+def _write_layer(
+    pixels: PackedPixels, lookups: LookupArrays, layers: LayerArrays, i: int, m: wp.vec4f, h: wp.vec4f
+):
+    """Merge a pixel's mesh m and halo h."""
     c = wp.vec3f(0.0, 0.0, 0.0)
     inverse = float(0.0)
     solid = float(0.0)
     z = float(wp.inf)
     if _in_mesh(pixels, i):
         share = pixels.coverage[i]
-        near = looks.look[i][ch.W_NOW]
+        near = lookups.lookup[i][ch.W_NOW]
         a = m[3] * share
         c = wp.vec3f(m[0], m[1], m[2]) * share
         solid = a
@@ -728,7 +812,7 @@ def _write_layer(pixels: PackedPixels, looks: LookupArrays, layers: LayerArrays,
         z = near
     if _in_halo(pixels, i):
         share = 1.0 - pixels.coverage[i]
-        near = looks.look[wp.int32(pixels.nearest[i])][ch.W_NOW]
+        near = lookups.lookup[wp.int32(pixels.nearest[i])][ch.W_NOW]
         a = h[3] * share
         c += wp.vec3f(h[0], h[1], h[2]) * share
         solid += a
@@ -740,43 +824,53 @@ def _write_layer(pixels: PackedPixels, looks: LookupArrays, layers: LayerArrays,
 
 
 @wp.func
-def _layer_gradient(looks: LookupArrays, to_layers: LayerArrays, i: int, j: int):
-    """The gradient to what pixel i shows of mesh or halo, by the look of pixel j, before its share."""
+def _layer_gradient(lookups: LookupArrays, to_layers: LayerArrays, i: int, j: int):
+    """Gradient to the mesh or halo of pixel i, by the lookup of pixel j, before its share."""
     g = to_layers.colour[i]
-    return wp.vec4f(g[0], g[1], g[2], to_layers.opacity[i] + g[3] / wp.max(looks.look[j][ch.W_NOW], NEAR_M))
+    return wp.vec4f(g[0], g[1], g[2], to_layers.opacity[i] + g[3] / wp.max(lookups.lookup[j][ch.W_NOW], NEAR_M))
 
 
 @wp.func
 def _add_depth_gradient(
-    looks: LookupArrays, to_layers: LayerArrays, i: int, j: int, solid: float, grads: ShadingGradients
+    lookups: LookupArrays, to_layers: LayerArrays, i: int, j: int, solid: float, grads: ShadingGradients
 ):
-    """Adds what the gradient to opacity / depth means for the depth there. solid: the part's opacity."""
+    """Add the gradient to opacity / depth to that of the depth there. solid: opacity of the part."""
     inverse = to_layers.colour[i][3]
-    z = looks.look[j][ch.W_NOW]
+    z = lookups.lookup[j][ch.W_NOW]
     if inverse != 0.0 and z > NEAR_M:
         to_z = lookup_type()
         to_z[ch.W_NOW] = -inverse * solid / (z * z)
-        wp.atomic_add(grads.look, j, to_z)
+        wp.atomic_add(grads.lookup, j, to_z)
 
 
 @wp.kernel(enable_backward=False)
-def combine_kernel(start: int, pixels: PackedPixels, looks: LookupArrays, layers: LayerArrays):
+def combine_kernel(start: int, pixels: PackedPixels, lookups: LookupArrays, layers: LayerArrays):
+    """Merge mesh and halo.
+
+    Args:
+        start, pixels, lookups, layers: See the module.
+    """
     i = start + wp.tid()
-    _write_layer(pixels, looks, layers, i, looks.mesh[i], looks.halo[i])
+    _write_layer(pixels, lookups, layers, i, lookups.mesh[i], lookups.halo[i])
 
 
 @wp.kernel(enable_backward=False)
 def combine_backward_kernel(
-    start: int, pixels: PackedPixels, looks: LookupArrays, to_layers: LayerArrays, grads: ShadingGradients
+    start: int, pixels: PackedPixels, lookups: LookupArrays, to_layers: LayerArrays, grads: ShadingGradients
 ):
+    """Gradient of `combine_kernel` to mesh and halo.
+
+    Args:
+        start, pixels, lookups, to_layers, grads: See the module.
+    """
     i = start + wp.tid()
     to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     if _in_mesh(pixels, i):
-        to_mesh = _layer_gradient(looks, to_layers, i, i) * pixels.coverage[i]
+        to_mesh = _layer_gradient(lookups, to_layers, i, i) * pixels.coverage[i]
     if _in_halo(pixels, i):
         j = wp.int32(pixels.nearest[i])
-        to_halo = _layer_gradient(looks, to_layers, i, j) * (1.0 - pixels.coverage[i])
+        to_halo = _layer_gradient(lookups, to_layers, i, j) * (1.0 - pixels.coverage[i])
     grads.mesh[i] = to_mesh
     grads.halo[i] = to_halo
 
@@ -786,20 +880,24 @@ def shade_kernel(
     start: int,
     pixels: PackedPixels,
     photograph: PhotographArrays,
-    looks: LookupArrays,
+    lookups: LookupArrays,
     final: bool,
     layers: LayerArrays,
 ):
-    """final: whether no painter comes before mesh and halo become one."""
+    """Colour mesh and halo by the photograph.
+
+    Args:
+        start, pixels, photograph, lookups, final, layers: See the module.
+    """
     i = start + wp.tid()
     at = pixels.table[i]
     to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-    left = float(0.0)
+    unseen_share = float(0.0)
     xy = _pixel_xy(pixels, i)
     wh = photograph.frame_wh[at[0]]
     if _in_mesh(pixels, i):
-        a = looks.look[i]
+        a = lookups.lookup[i]
         uv = _photograph_xy(a, xy)
         texel = _texel_at(photograph, at[0], uv)
         bright = a[ch.BRIGHTER]
@@ -810,19 +908,19 @@ def shade_kernel(
         if not _is_plainly_visible(a, texel, uv[0], uv[1], wh):
             p = _mesh_colour(a, texel, xy, wh)
             to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
-            left = p[UNSEEN]
+            unseen_share = p[UNSEEN]
     if _in_halo(pixels, i):
         j = wp.int32(pixels.nearest[i])
-        a = looks.look[j]
+        a = lookups.lookup[j]
         texel = _texel_at(photograph, at[0], _photograph_xy(a, xy))
         if texel[ch.ALPHA] != 0.0:  # else there is nothing to show
             inset = _texel_at(photograph, at[0], _photograph_xy(a, _pixel_xy(pixels, j)))[ch.INSET]
             to_halo = _halo_colour(a, texel, inset, xy, wh)
-    looks.mesh[i] = to_mesh
-    looks.halo[i] = to_halo
-    looks.fill[i] = left
+    lookups.mesh[i] = to_mesh
+    lookups.halo[i] = to_halo
+    lookups.unseen[i] = unseen_share
     if final:
-        _write_layer(pixels, looks, layers, i, to_mesh, to_halo)
+        _write_layer(pixels, lookups, layers, i, to_mesh, to_halo)
 
 
 @wp.kernel(enable_backward=False)
@@ -830,67 +928,78 @@ def shade_backward_kernel(
     start: int,
     pixels: PackedPixels,
     photograph: PhotographArrays,
-    looks: LookupArrays,
+    lookups: LookupArrays,
     final: bool,
     to_layers: LayerArrays,
     grads: ShadingGradients,
 ):
+    """Gradient of `shade_kernel`.
+
+    Args:
+        start, pixels, photograph, lookups, final, to_layers, grads: See the module.
+    """
     i = start + wp.tid()
     to_share = float(0.0)
     at = pixels.table[i]
     xy = _pixel_xy(pixels, i)
     wh = photograph.frame_wh[at[0]]
     if _in_mesh(pixels, i):
-        a = looks.look[i]
+        a = lookups.lookup[i]
         uv = _photograph_xy(a, xy)
-        g = _layer_gradient(looks, to_layers, i, i)
-        m = looks.mesh[i]
+        g = _layer_gradient(lookups, to_layers, i, i)
+        m = lookups.mesh[i]
         to_share = wp.dot(g, m)
-        _add_depth_gradient(looks, to_layers, i, i, m[3] * pixels.coverage[i], grads)
+        _add_depth_gradient(lookups, to_layers, i, i, m[3] * pixels.coverage[i], grads)
         g = g * pixels.coverage[i]
         if not final:
             g = grads.mesh[i]
         texel = _texel_with_slopes(photograph, at[0], uv)
         c = texel.value
-        to_look = lookup_type()
+        to_lookup = lookup_type()
         to_texel = texel_type()
         to_texel[ch.ALPHA] = g[3]
         for k in range(3):
             to_texel[k] = g[k] * _relight_slope(c[k], a[ch.BRIGHTER])
-            to_look[ch.BRIGHTER] += g[k] * c[k] * (1.0 - c[k] * c[k])
+            to_lookup[ch.BRIGHTER] += g[k] * c[k] * (1.0 - c[k] * c[k])
         # Where opacity changes along a surface that turned, so does how much of it opens up.
         even = (
             a[ch.TURNED] <= OPEN_TURN[0]
             or wp.max(wp.abs(texel.to_u[ch.ALPHA]), wp.abs(texel.to_v[ch.ALPHA])) <= EVEN_SLOPE
         )
         if not (even and _is_plainly_visible(a, texel.value, uv[0], uv[1], wh)):
-            to_look, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(_mesh_loss)(
-                a, texel.value, xy, wh, g, grads.fill[i]
+            to_lookup, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(_mesh_loss)(
+                a, texel.value, xy, wh, g, grads.unseen[i]
             )
-        to_look[ch.MOVE] += wp.dot(to_texel, texel.to_u)
-        to_look[ch.MOVE + 1] += wp.dot(to_texel, texel.to_v)
-        wp.atomic_add(grads.look, i, to_look)
+        to_lookup[ch.DISPLACEMENT] += wp.dot(to_texel, texel.to_u)
+        to_lookup[ch.DISPLACEMENT + 1] += wp.dot(to_texel, texel.to_v)
+        wp.atomic_add(grads.lookup, i, to_lookup)
     if _in_halo(pixels, i):
         j = wp.int32(pixels.nearest[i])
-        b = looks.look[j]
-        g2 = _layer_gradient(looks, to_layers, i, j)
-        h = looks.halo[i]
-        to_share -= wp.dot(g2, h)
-        _add_depth_gradient(looks, to_layers, i, j, h[3] * (1.0 - pixels.coverage[i]), grads)
-        g2 = g2 * (1.0 - pixels.coverage[i])
+        b = lookups.lookup[j]
+        halo_g = _layer_gradient(lookups, to_layers, i, j)
+        h = lookups.halo[i]
+        to_share -= wp.dot(halo_g, h)
+        _add_depth_gradient(lookups, to_layers, i, j, h[3] * (1.0 - pixels.coverage[i]), grads)
+        halo_g = halo_g * (1.0 - pixels.coverage[i])
         if not final:
-            g2 = grads.halo[i]
-        texel2 = _texel_with_slopes(photograph, at[0], _photograph_xy(b, xy))
+            halo_g = grads.halo[i]
+        halo_texel = _texel_with_slopes(photograph, at[0], _photograph_xy(b, xy))
         if (
-            texel2.value[ch.ALPHA] != 0.0 or texel2.to_u[ch.ALPHA] != 0.0 or texel2.to_v[ch.ALPHA] != 0.0
+            halo_texel.value[ch.ALPHA] != 0.0
+            or halo_texel.to_u[ch.ALPHA] != 0.0
+            or halo_texel.to_v[ch.ALPHA] != 0.0
         ):  # else there is nothing near
             anchor = _texel_with_slopes(photograph, at[0], _photograph_xy(b, _pixel_xy(pixels, j)))
-            to_look2, to_texel2, to_inset, to_xy2, to_wh2, to_g2 = wp.grad(_halo_loss)(
-                b, texel2.value, anchor.value[ch.INSET], xy, wh, g2
+            to_halo_lookup, to_halo_texel, to_inset, _to_halo_xy, _to_halo_wh, _to_halo_g = wp.grad(_halo_loss)(
+                b, halo_texel.value, anchor.value[ch.INSET], xy, wh, halo_g
             )
-            to_look2[ch.MOVE] += wp.dot(to_texel2, texel2.to_u) + to_inset * anchor.to_u[ch.INSET]
-            to_look2[ch.MOVE + 1] += wp.dot(to_texel2, texel2.to_v) + to_inset * anchor.to_v[ch.INSET]
-            wp.atomic_add(grads.look, j, to_look2)
+            to_halo_lookup[ch.DISPLACEMENT] += (
+                wp.dot(to_halo_texel, halo_texel.to_u) + to_inset * anchor.to_u[ch.INSET]
+            )
+            to_halo_lookup[ch.DISPLACEMENT + 1] += (
+                wp.dot(to_halo_texel, halo_texel.to_v) + to_inset * anchor.to_v[ch.INSET]
+            )
+            wp.atomic_add(grads.lookup, j, to_halo_lookup)
     wp.atomic_add(grads.coverage, i, to_share)
 
 
@@ -910,7 +1019,7 @@ def _centre_hit(pixels: PackedPixels, vertices: MeshVertices, i: int):
 
 @wp.func
 def _subpixel_hit(centre: PixelHit, face: int, k: int, vertices: MeshVertices):
-    """`reference._walked`, to the k-th place within a pixel whose centre hits a face."""
+    """`reference._walk_mesh` to the k-th position within a pixel whose centre hits a face."""
     spot = PixelHit()
     spot.x = centre.x + SUBPIXELS[k, 0]
     spot.y = centre.y + SUBPIXELS[k, 1]
@@ -941,7 +1050,7 @@ def _subpixel_hit(centre: PixelHit, face: int, k: int, vertices: MeshVertices):
 
 @wp.func
 def _average_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
-    """The mesh's own attributes over a pixel that it hits, else 0."""
+    """Mesh attributes averaged over a pixel that it hits, else 0."""
     value = attributes_type()
     if pixels.face[i] >= 0:
         centre = _centre_hit(pixels, vertices, i)
@@ -957,7 +1066,7 @@ def _average_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
 
 @wp.func
 def _blended_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
-    """`_average_attributes`, continued over the outline."""
+    """`_average_attributes`, extended over the outline."""
     value = _average_attributes(pixels, vertices, i)
     if is_partly_covered(pixels, i):
         f = _outline_blend(pixels, i)
@@ -972,7 +1081,7 @@ def _blended_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
 def _attributes_to_clip(
     pixels: PackedPixels, vertices: MeshVertices, i: int, g: attributes_type, share: float, grads: ShadingGradients
 ):
-    """Add what `share` of a gradient to `_average_attributes` means for the corners; returns g . own_at."""
+    """Add `share` of a gradient to `_average_attributes` to the corners; returns g . attributes."""
     centre = _centre_hit(pixels, vertices, i)
     each = ONE / wp.float64(SUBPIXEL_COUNT)
     total = ZERO
@@ -996,7 +1105,7 @@ def _attributes_to_clip(
 def _attributes_backward(
     pixels: PackedPixels, vertices: MeshVertices, i: int, g: attributes_type, grads: ShadingGradients
 ):
-    """Add what a gradient to `_blended_attributes` means for corners and coverages."""
+    """Add a gradient to `_blended_attributes` to corners and coverages."""
     if is_partly_covered(pixels, i):
         f = _outline_blend(pixels, i)
         rest = 1.0 - f.own
@@ -1034,7 +1143,7 @@ def _shade(
     height: float,
     sunlit: wp.vec4f,
 ):
-    """`texture.shade_template`, one row of it. sunlit: direction and strength of the sun."""
+    """`texture.shade_template`, one row. sunlit: direction and strength of the sun."""
     sun = wp.vec3f(sunlit[0], sunlit[1], sunlit[2])
     dome = 0.5 - 0.5 * normal[1]
     soft = wp.dot(normal, sun)
@@ -1050,8 +1159,8 @@ def _shade(
     mirrored = model.PAINT_MIRRORS * paint * fresnel + glass * (GLASS_LEAST + GLASS_MORE * fresnel)
     strength = mirrored * (0.5 + 0.5 * occluded)
     g = wp.clamp(wp.dot(mirror, sun), 0.0, 1.0)
-    g2 = g * g
-    g4 = g2 * g2
+    halo_g = g * g
+    g4 = halo_g * halo_g
     g8 = g4 * g4
     g32 = (g8 * g8) * (g8 * g8)
     glint = (g32 * g8) * (GLINT_PAINT * paint + GLINT_GLASS * glass)
@@ -1061,7 +1170,7 @@ def _shade(
 
 @wp.func
 def _mirrored_xy(own: attributes_type):
-    """Where the photograph shows the other side of the car, px."""
+    """Photograph position of the car's other side, px."""
     safe = wp.max(own[ch.MIRROR + 2], model.NEAREST_MIRRORED_M)
     return wp.vec2f(own[ch.MIRROR] / safe, own[ch.MIRROR + 1] / safe)
 
@@ -1076,7 +1185,9 @@ def _complete(
     sun: wp.vec4f,
     wh: wp.vec2f,
 ):
-    """`reference._completion`, one row of it. own: with local normals; facing: cosine towards the camera now."""
+    """`reference._complete_unseen`, one row. own: attributes with local normals; facing: cosine towards the camera
+    now.
+    """
     # Each use reads `own` anew: gradients are added up use by use, and rounded as they always were.
     normal = _unit(
         wp.vec3f(
@@ -1087,12 +1198,12 @@ def _complete(
     )
     albedo = wp.vec3f(own[0], own[1], own[2])
     light = _shade(normal, to_eye, albedo, own[ch.OWN_PAINT], own[ch.OWN_GLASS], own[ch.OWN_HEIGHT], sun)
-    left = wp.vec3f(
+    dark = wp.vec3f(
         wp.exp(-light[0] * own[ch.GAIN]),
         wp.exp(-light[1] * own[ch.GAIN + 1]),
         wp.exp(-light[2] * own[ch.GAIN + 2]),
     )
-    colour = wp.vec3f(1.0, 1.0, 1.0) - left * (1.0 - own[ch.LIFT])  # `texture.apply_finish`
+    colour = wp.vec3f(1.0, 1.0, 1.0) - dark * (1.0 - own[ch.LIFT])  # `texture.apply_finish`
     uv = _mirrored_xy(own)
     weight = inside_weight(uv[0], uv[1], wh, BORDER)
     weight = weight * (1.0 - _smoothstep(texel[ch.HIDDEN], UNIT)) * _smoothstep(texel[ch.ALPHA], SOLID)
@@ -1139,24 +1250,29 @@ def complete_kernel(
     pixels: PackedPixels,
     vertices: MeshVertices,
     photograph: PhotographArrays,
-    looks: LookupArrays,
+    lookups: LookupArrays,
     final: bool,
     layers: LayerArrays,
 ):
+    """Complete what the photograph did not see.
+
+    Args:
+        start, need, pixels, vertices, photograph, lookups, final, layers: See the module.
+    """
     i = wp.int32(need[start + wp.tid()])
     at = pixels.table[i]
     o = at[0]
     v = _blended_attributes(pixels, vertices, i)
     texel = _texel_at(photograph, o, _mirrored_xy(v))
-    a = looks.look[i]
+    a = lookups.lookup[i]
     facing = a[ch.TURNED] + a[ch.COS_THEN]
     eye = _to_eye(photograph, at)
     c = _complete(v, facing, texel, photograph.turn[o], eye, photograph.sun[o], photograph.frame_wh[o])
-    f = looks.fill[i]
-    m = looks.mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
-    looks.mesh[i] = m
+    f = lookups.unseen[i]
+    m = lookups.mesh[i] + wp.vec4f(c[0] * f, c[1] * f, c[2] * f, f)
+    lookups.mesh[i] = m
     if final:
-        _write_layer(pixels, looks, layers, i, m, looks.halo[i])
+        _write_layer(pixels, lookups, layers, i, m, lookups.halo[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -1166,36 +1282,41 @@ def complete_backward_kernel(
     pixels: PackedPixels,
     vertices: MeshVertices,
     photograph: PhotographArrays,
-    looks: LookupArrays,
+    lookups: LookupArrays,
     final: bool,
     to_layers: LayerArrays,
     grads: ShadingGradients,
 ):
+    """Gradient of `complete_kernel`.
+
+    Args:
+        start, need, pixels, vertices, photograph, lookups, final, to_layers, grads: See the module.
+    """
     i = wp.int32(need[start + wp.tid()])
     at = pixels.table[i]
     o = at[0]
     v = _blended_attributes(pixels, vertices, i)
-    a = looks.look[i]
+    a = lookups.lookup[i]
     texel = _texel_with_slopes(photograph, o, _mirrored_xy(v))
     eye = _to_eye(photograph, at)
     facing = a[ch.TURNED] + a[ch.COS_THEN]
     c = _complete(v, facing, texel.value, photograph.turn[o], eye, photograph.sun[o], photograph.frame_wh[o])
-    g = _layer_gradient(looks, to_layers, i, i) * pixels.coverage[i]
+    g = _layer_gradient(lookups, to_layers, i, i) * pixels.coverage[i]
     if not final:
         g = grads.mesh[i]
-    f = looks.fill[i]
+    f = lookups.unseen[i]
     to_colour = wp.vec3f(g[0] * f, g[1] * f, g[2] * f)
-    grads.fill[i] = grads.fill[i] + g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
+    grads.unseen[i] = grads.unseen[i] + g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
     to_own, to_facing, to_texel, to_turn, to_eye, to_sun, to_wh, to_g = wp.grad(_completion_loss)(
         v, facing, texel.value, photograph.turn[o], eye, photograph.sun[o], photograph.frame_wh[o], to_colour
     )
     move = wp.vec2f(wp.dot(to_texel, texel.to_u), wp.dot(to_texel, texel.to_v))
     more, to_move = wp.grad(_mirror_loss)(v, move)
     _attributes_backward(pixels, vertices, i, to_own + more, grads)
-    to_look = lookup_type()
-    to_look[ch.TURNED] = to_facing
-    to_look[ch.COS_THEN] = to_facing
-    wp.atomic_add(grads.look, i, to_look)
+    to_lookup = lookup_type()
+    to_lookup[ch.TURNED] = to_facing
+    to_lookup[ch.COS_THEN] = to_facing
+    wp.atomic_add(grads.lookup, i, to_lookup)
     wp.atomic_add(grads.turn, o, wp.vec2d(wp.float64(to_turn[0]), wp.float64(to_turn[1])))
     light = wp.vec4d(wp.float64(to_sun[0]), wp.float64(to_sun[1]), wp.float64(to_sun[2]), wp.float64(to_sun[3]))
     wp.atomic_add(grads.sun, o, light)
@@ -1203,8 +1324,9 @@ def complete_backward_kernel(
 
 @wp.kernel(enable_backward=True)
 def _adjoints_kernel(out: wp.array(dtype=wp.float32)):
-    """Never run. Warp writes adjoints of what a differentiable kernel calls; those that `wp.grad` alone asks for may
-    miss some of the functions below them (Warp 1.19), and then their gradients are silently 0."""
+    """Never run. Warp generates adjoints of what a differentiable kernel calls; with `wp.grad` alone, some
+    functions further down may be missed (Warp 1.19), and their gradients are silently 0.
+    """
     a = texel_type()
     xy = wp.vec2f(0.0, 0.0)
     c = wp.vec3f(0.0, 0.0, 0.0)

@@ -1,9 +1,10 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
 # ruff: noqa: E501, RUF059 - the line above; `wp.grad` returns the gradients of all arguments.
-"""Where the shadows' patches of ground come to lie, as Warp kernels: what `Prepared.ground` does in plain torch.
+"""Placement of the shadows' ground patches, as Warp kernels: what `PreparedScene.place_patches` does in plain
+torch.
 
-A dozen numbers an object, in double precision: torch would take a hundred calls for them. Gradients of the corners come
-from `wp.grad`. Shapes: N objects.
+A dozen numbers per object in double precision, for which torch would need a hundred calls. Gradients of the
+corners come from `wp.grad`. Shapes: N objects.
 """
 
 from __future__ import annotations
@@ -30,9 +31,17 @@ MIN_SINE, MAX_OFFSET_M, SHRUNK = (
 
 @wp.struct
 class PatchInputs:
-    """Of objects: the patches' corners (N, 4), m, in their frames, and how far out along the shadow's offset each lies;
-    that offset, m; sizes; direction of the sun; plane of the ground; cameras; where patches follow another sun, 1,
-    else 0.
+    """Inputs besides poses.
+
+    Attributes:
+        corners: (N, 4) m, corners in the objects' frames.
+        outwards: (N, 4) `surfaces.outwardness` of the corners.
+        offset: (N,) m, photographed `surfaces.shadow_offset`.
+        size: (N,) m, photographed sizes.
+        sun: (N,) photographed direction.
+        ground: (N,) ground planes.
+        matrix: (N, 3) cameras.
+        casts: (N,) 1 where the patch follows another sun, else 0.
     """
 
     corners: wp.array2d(dtype=wp.vec2f)
@@ -47,7 +56,7 @@ class PatchInputs:
 
 @wp.struct
 class PatchPoses:
-    """Of objects: yaws, translations, sizes, directions and strengths of the sun."""
+    """Yaw, translation, size, and direction and strength of the sun of each object."""
 
     yaw: wp.array(dtype=wp.float32)
     translation: wp.array(dtype=wp.vec3f)
@@ -57,7 +66,7 @@ class PatchPoses:
 
 @wp.struct
 class PatchOutputs:
-    """Clip coordinates (N, 4) of the corners; from (s, t, 1) on a patch to its clip coordinates, and back."""
+    """Clip coordinates (N, 4) of the corners; from (s, t, 1) on a patch to its clip coordinates, and the inverse."""
 
     clip: wp.array2d(dtype=wp.vec3f)
     patch: wp.array(dtype=wp.mat33d)
@@ -76,7 +85,7 @@ class PatchPoseGradients:
 
 @wp.func
 def _shadow_offset(sun: wp.vec3d, yaw: wp.float64, height: wp.float64):
-    """`surfaces.sun_offset`."""
+    """`surfaces.shadow_offset`."""
     scale = -height / wp.max(-sun[1], MIN_SINE)
     c = wp.cos(yaw)
     s = wp.sin(yaw)
@@ -89,7 +98,7 @@ def _shadow_offset(sun: wp.vec3d, yaw: wp.float64, height: wp.float64):
 
 @wp.func
 def _soft_growth(share: wp.float64):
-    """How much a patch grows with its object: softly no less than 0."""
+    """Growth of a patch with its object: softly at least 0."""
     return HALF * (share + (wp.sqrt(share * share + SHRUNK * SHRUNK) - SHRUNK))
 
 
@@ -107,7 +116,7 @@ def _patch_corner(
     casts: wp.float64,
     ground: wp.vec4d,
 ):
-    """A corner of a patch, m, in camera axes: see `Prepared.ground`."""
+    """A corner of a patch, m, in camera axes: see `PreparedScene.place_patches`."""
     still = _shadow_offset(sun_then, yaw, then[1])
     falls = still + (_shadow_offset(sun, yaw, then[1]) - still) * casts
     x0 = corner[0] + outwards * (falls[0] - offset[0])
@@ -230,13 +239,23 @@ def _adjoints_kernel(out: wp.array(dtype=wp.float64)):
 
 
 class PlacePatches(torch.autograd.Function):
-    """yaw (N,), translation (N, 3) m, size (N, 3) m, lights (N, 4) -> float64 (N, 3, 3) from clip coordinates to (s, t,
-    1) on the patches, 0 to 1 both ways, differentiable; the same back, and clip coordinates (4N, 3) of the corners,
-    which are not. fixed: the tensors of `PatchInputs`.
-    """
+    """Placement of the patches."""
 
     @staticmethod
     def forward(ctx: Any, yaw, translation, size, lights, fixed):
+        """Place the patches.
+
+        Args:
+            yaw: (N,) rad.
+            translation: (N, 3) m.
+            size: (N, 3) m.
+            lights: (N, 4) direction and strength of the sun.
+            fixed: Tensors of `PatchInputs`.
+
+        Returns:
+            (N, 3, 3) float64 from clip coordinates to (s, t, 1) on the patches, s and t in [0, 1], differentiable;
+            its inverse and the corners' clip coordinates (4N, 3), which are not.
+        """
         poses = [t.detach().contiguous() for t in (yaw, translation, size, lights)]
         count, like = len(yaw), yaw
         clip = like.new_empty(count, 4, 3)
@@ -247,14 +266,14 @@ class PlacePatches(torch.autograd.Function):
             make_struct(PatchOutputs, clip, patch, inside),
         ]
         launch(_patch_kernel, [0, count], inputs, (), like.device)
-        ctx.kept = fixed, poses, clip, patch, inside
+        ctx.saved = fixed, poses, clip, patch, inside
         ctx.mark_non_differentiable(patch, clip)
         return inside, patch, clip.view(-1, 3)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_inside: Tensor, *_: Tensor):
-        fixed, poses, clip, patch, inside = ctx.kept
+        fixed, poses, clip, patch, inside = ctx.saved
         to = [torch.zeros_like(t, dtype=torch.float64) for t in poses]
         inputs = [
             make_struct(PatchInputs, *fixed),

@@ -1,9 +1,9 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
 # ruff: noqa: E501, UP018, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
 # returns the gradients of all arguments.
-"""Photographed shadows on the ground as Warp kernels: what `reference` does in plain torch; float32.
+"""Photographed shadows on the ground, as Warp kernels: what `reference` does in plain torch; float32.
 
-A patch of ground is a plane: a 3 x 3 matrix takes a pixel to the photograph, and no triangles are drawn.
+A patch of ground is a plane: a 3 x 3 matrix maps a pixel to the photograph, without triangles.
 """
 
 from __future__ import annotations
@@ -25,9 +25,15 @@ EXTENDED = wp.constant(wp.vec2f(*model.SHADOW_EXTENDED_PX))
 
 @wp.struct
 class ShadowArrays:
-    """Photographed shadows: what they take away, three numbers a texel and a 0, and where the crops lie; from a pixel
-    (x, y, 1) to its place (s, t, 1) / w on the patch, 0 to 1 both ways, and to that point's clip coordinates then,
-    over w now.
+    """Photographed shadows.
+
+    Attributes:
+        inside: (N,) from a pixel (x, y, 1) to its place (s, t, 1) / w on the patch, s and t in [0, 1].
+        then: (N,) from the pixel to the photographed clip coordinates of that point, divided by w now.
+        dark: (S,) light that the shadows remove, three numbers per texel and a 0.
+        rects: (N, 4) crops of the texels.
+        offsets: (N + 1,) first texel of each crop.
+        frame_wh: (N,) px.
     """
 
     inside: wp.array(dtype=wp.mat33d)
@@ -40,7 +46,7 @@ class ShadowArrays:
 
 @wp.func
 def _photographed_ground(ground: ShadowArrays, o: int, x: int, y: int):
-    """Where the photograph shows the ground point that a pixel shows, px, and 1 where the patch reaches, else 0."""
+    """Photograph position, px, of the ground point at a pixel, and 1 where the patch reaches, else 0."""
     p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
     q = ground.inside[o] @ p
     out = wp.vec3f(model.FAR_AWAY_PX, model.FAR_AWAY_PX, 0.0)
@@ -54,13 +60,13 @@ def _photographed_ground(ground: ShadowArrays, o: int, x: int, y: int):
 
 @wp.func
 def _clamp_to_frame(uv: wp.vec2f, wh: wp.vec2f):
-    """Kept within two pixels of the frame, where crops repeat their border."""
+    """Clamped to two pixels around the frame, where crops repeat their border."""
     return wp.vec2f(wp.min(wp.max(uv[0], -2.0), wh[0] + 1.0), wp.min(wp.max(uv[1], -2.0), wh[1] + 1.0))
 
 
 @wp.func
 def _reaches_crop(uv: wp.vec2f, rect: wp.vec4i):
-    """Whether a lookup can find anything in a crop."""
+    """Whether a lookup can hit a crop."""
     found = uv[0] > wp.float32(rect[0] - 2) and uv[0] < wp.float32(rect[2] + 1)
     return found and uv[1] > wp.float32(rect[1] - 2) and uv[1] < wp.float32(rect[3] + 1)
 
@@ -69,6 +75,14 @@ def _reaches_crop(uv: wp.vec2f, rect: wp.vec4i):
 def shadow_kernel(
     start: int, table: wp.array(dtype=wp.vec4i), ground: ShadowArrays, out: wp.array(dtype=wp.vec3f)
 ):
+    """Shadow factors of packed patch pixels.
+
+    Args:
+        start: First index.
+        table: Draw, x, y and row width of each pixel.
+        ground: The shadows.
+        out: Factors.
+    """
     i = start + wp.tid()
     at = table[i]
     factor = wp.vec3f(1.0, 1.0, 1.0)
@@ -97,6 +111,13 @@ def shadow_backward_kernel(
     grad_out: wp.array(dtype=wp.vec3f),
     grad_then: wp.array(dtype=wp.mat33d),
 ):
+    """Gradient of `shadow_kernel` to `then`.
+
+    Args:
+        start, table, ground: As for `shadow_kernel`.
+        grad_out: Gradient to the factors.
+        grad_then: Gradient to `ShadowArrays.then`.
+    """
     i = start + wp.tid()
     g = grad_out[i]
     if g[0] == 0.0 and g[1] == 0.0 and g[2] == 0.0:
