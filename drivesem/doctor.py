@@ -56,11 +56,11 @@ def _version(module: str, also: str = "") -> str:
 
 _EGL = (
     "import os; os.environ.setdefault('PYOPENGL_PLATFORM', 'egl'); "
-    "from drivesem.failures.second_renderer.screen import Screen; Screen(); print('draws')"
+    "from drivesem.failures.second_renderer.opengl import Screen; Screen(); print('draws')"
 )
 _WEIGHTS = (
     "from detectors.registry import load_detector; from scene_ir.derender import pose; "
-    "[load_detector(name) for name in ('squeezedet', 'yolov3-slim')]; pose.shipped(); print('read')"
+    "[load_detector(name) for name in ('squeezedet', 'yolov3-slim')]; pose.load_network(); print('read')"
 )
 _KERNELS = "import warp; warp.config.quiet = True; warp.init(); print(warp.__version__)"
 _PRESETS = (

@@ -230,8 +230,8 @@ def _sunlight(scene: SceneIR) -> float:
 
 
 def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, float]:
-    """Gain and lift as of `finish.estimate_exposure`: the medians of the others, of the gain as large a multiple of what
-    the road shows where each stands, which differs along a street, in the shade of a house.
+    """Gain and lift as of `finish.estimate_exposure`: the medians of the others, of the gain as large a multiple
+    of what the road shows where each stands, which differs along a street, in the shade of a house.
     """
     if not len(scene.objects):
         return 1.0, 0.0

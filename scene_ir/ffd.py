@@ -101,6 +101,8 @@ def jacobian(unit: Tensor, offsets: Tensor) -> Tensor:
 
 
 def _bernstein_slope(t: Tensor, degree: int) -> Tensor:
-    """Derivatives (..., degree + 1) of the Bernstein polynomials: degree * (b[k-1] - b[k]) of the next lower degree."""
+    """Derivatives (..., degree + 1) of the Bernstein polynomials: degree * (b[k-1] - b[k]) of the next lower
+    degree.
+    """
     lower = _bernstein(t, degree - 1)
     return degree * (torch.nn.functional.pad(lower, (1, 0)) - torch.nn.functional.pad(lower, (0, 1)))

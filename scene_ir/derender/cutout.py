@@ -32,7 +32,7 @@ from scene_ir.geometry import to_clip
 from scene_ir.meshes.lod import detail
 from scene_ir.raster import verbs
 from scene_ir.types import Camera
-from scene_ir.weights import load_weights, read_weights
+from scene_ir.weights import load_frozen
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -155,11 +155,8 @@ class CutoutNet(nn.Module):
 
 @lru_cache(maxsize=1)
 def load_network() -> CutoutNet:
-    """The network with the package's weights, in eval mode. FormatError where they are missing or damaged."""
-    network = CutoutNet()
-    load_weights(network, read_weights(WEIGHTS)[1], WEIGHTS)
-    network.requires_grad_(False)
-    return network.eval()
+    """The shipped network, in eval mode. Raises FormatError if its weights are missing or damaged."""
+    return load_frozen(CutoutNet(), WEIGHTS)
 
 
 def crop_rectangle(placement: Placement, camera: Camera) -> tuple[int, int, int, int] | None:
@@ -262,9 +259,9 @@ def cut_out(
     nearer: Sequence[Mask],
     ground: Tensor,
     camera: Camera,
-    network: CutoutNet | None = None,
     backend: verbs.Backend = "warp",
     refine_borders: bool = True,
+    network: CutoutNet | None = None,
 ) -> list[Cutout]:
     """Each placed vehicle's pixels. image (H, W, 3) RGB; nearer: for each vehicle the pixels (H, W) of nearer
     ones, as far as they are known; ground (4,): plane n.x + d = 0; network: another than the shipped

@@ -26,7 +26,7 @@ from scene_ir.derender import ground_geometry as maps
 from scene_ir.derender import unet
 from scene_ir.derender.unet import UNet
 from scene_ir.types import Camera
-from scene_ir.weights import load_weights, read_weights
+from scene_ir.weights import load_frozen
 
 Array = NDArray[np.float32]
 
@@ -68,11 +68,9 @@ def nearness_excess(numbers: Tensor) -> Tensor:
 
 @lru_cache(maxsize=2)
 def load_network(path: Path = WEIGHTS) -> DepthNet:
-    """The network of a weights file, in eval mode. FormatError naming file and key."""
-    network = DepthNet()
-    load_weights(network, read_weights(path)[1], path)
-    network.requires_grad_(False)
-    return network.eval().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    """The network of a weights file, in eval mode. Raises FormatError."""
+    network = load_frozen(DepthNet(), path)
+    return network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 @dataclass(frozen=True, slots=True)

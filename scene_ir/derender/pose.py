@@ -32,7 +32,7 @@ from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.outlines import KINDS
 from scene_ir.types import Camera, check_shape
-from scene_ir.weights import load_weights, read_weights
+from scene_ir.weights import load_frozen
 
 Array = NDArray[np.float32]
 
@@ -140,18 +140,10 @@ class VehiclePoses:
     ground: Tensor
 
 
-@lru_cache(maxsize=1)
-def shipped() -> PoseNet:
-    """The network with the package's weights, in eval mode. FormatError where they are missing or damaged."""
-    return load(WEIGHTS)
-
-
-def load(path: Path) -> PoseNet:
-    """The network with the weights of a file, in eval mode. FormatError naming file and key."""
-    network = PoseNet()
-    load_weights(network, read_weights(path)[1], path)
-    network.requires_grad_(False)
-    return network.eval()
+@lru_cache(maxsize=2)
+def load_network(path: Path = WEIGHTS) -> PoseNet:
+    """The network of a weights file, in eval mode. Raises FormatError."""
+    return load_frozen(PoseNet(), path)
 
 
 def box_features(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
@@ -323,7 +315,7 @@ def estimate_poses(
             torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane)
         )
     image = np.ascontiguousarray(photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
-    network = network or shipped()
+    network = network or load_network()
     poses = _look(network, image, boxes, kinds, camera, ground)
     for _ in range(rounds - 1):
         found = project_boxes(poses.size_lhw, poses.yaw, poses.translation, camera.matrix.float())

@@ -24,7 +24,7 @@ from scene_ir.derender import unet
 from scene_ir.derender.unet import UNet, compute_elevation
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.types import Camera, Frame
-from scene_ir.weights import load_weights, read_weights
+from scene_ir.weights import load_frozen
 
 Array = NDArray[np.float32]
 
@@ -119,11 +119,9 @@ class SegmentNet(UNet):
 
 @lru_cache(maxsize=2)
 def load_network(path: Path = WEIGHTS) -> SegmentNet:
-    """The network of a weights file, in eval mode. FormatError naming file and key."""
-    network = SegmentNet()
-    load_weights(network, read_weights(path)[1], path)
-    network.requires_grad_(False)
-    return network.eval().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    """The network of a weights file, in eval mode. Raises FormatError."""
+    network = load_frozen(SegmentNet(), path)
+    return network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def predict_shares(image: Array, ground: Tensor, camera: Camera, network: SegmentNet | None = None) -> Array:
@@ -138,8 +136,8 @@ def segment_photograph(
     ground: Tensor,
     camera: Camera,
     segmenter: Segmenter | None = None,
-    network: SegmentNet | None = None,
     shrink: int = 1,
+    network: SegmentNet | None = None,
 ) -> Segmentation:
     """The maps of a photograph (H, W, 3) RGB float32 in [0, 1].
 

@@ -1,4 +1,4 @@
-"""The shadows of the cars on the ground: where they are, how dark, and which way the sun throws them."""
+"""Shadows of vehicles on the ground: their pixels, their factors, and the direction of the sun."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from scene_ir.derender.silhouette import Placement, grow_mask, mask_bounds
-from scene_ir.image_filters import push_pull
+from scene_ir.image_filters import channel_max, push_pull
 from scene_ir.render.surfaces import shadow_corners, shadow_density, shadow_offset
 from scene_ir.types import Camera
 
@@ -21,76 +21,81 @@ Mask = NDArray[np.bool_]
 
 _AZIMUTHS = 24
 _LENGTHS = (0.25, 0.5, 0.8, 1.2, 1.7, 2.3)
-"""Lengths of a shadow over the height of what throws it that are tried: a sun of 76 to 23 degrees."""
-_EVERY, _LIKELY = 4, 10
-"""Of the pixels every fourth says which suns are the likeliest; among so many of them all pixels choose."""
-_FINER = 3
-"""How often azimuth and length are searched again around the best ones, each time in steps half as large."""
-_LOW = 0.04
-"""How much better than a sun of 40 degrees one must explain the darkness whose shadows are longer by a height:
-long ones meet more that is dark for other reasons."""
+"""Tried shadow lengths, over the height of the vehicle: sun elevations from 76 to 23 degrees."""
+_STRIDE, _SHORTLIST = 4, 10
+"""Every fourth pixel shortlists this many suns; all pixels choose among them."""
+_REFINEMENTS = 3
+"""Rounds of search around the best azimuth and length, each with half the step."""
+_LENGTH_COST = 0.04
+"""Cost, in explained variance, of each height of shadow length beyond 1.2: longer shadows cover more ground that
+is dark for other reasons."""
+_GAIN = 0.03
+"""Explained variance by which an estimated sun must surpass the assumed one."""
 STRETCHES = (1.0, 1.25, 1.5)
-"""Of a sun's shadows, tried in turn where theirs go on beyond what was expected."""
+"""Factors of shadow length, tried in turn while shadows extend beyond the expected reach."""
 MAX_SPILL_RATIO = 0.5
-"""Share of the dark pixels beyond reach that may be left for longer shadows to be believed."""
-_CAST = 0.12
-"""Darkness of the box shadow from which on a pixel counts as shaded by it."""
+"""Share of the dark pixels beyond reach that may remain for a longer shadow to be accepted."""
+_BOX_SHADOW = 0.12
+"""Darkness of the box shadow from which a pixel counts as shaded by it."""
 _CORE = 0.4
-"""Darkness of the box shadow from which on dark ground is the car's without hanging together with its foot."""
+"""Darkness of the box shadow from which dark ground is the vehicle's shadow even if it does not touch its foot."""
+_DARK, _SOFT = 0.72, 0.86
+"""Share of the lit ground's brightness below which ground is shaded, and below which it is a shadow's rim."""
+_REACH_M = 2.6
+"""Distance from the footprint at which most shadows end: the ground beyond shows the lit brightness."""
+_FAR_M = 4.0
+"""Largest distance of a shadow from the footprint."""
+_RIM_M = 0.8
+"""How far beyond that shade is followed."""
+_CONTACT_M = 0.25
+"""Width of the strip around the footprint that counts as touching."""
+_LOOSE_M = 0.35
+"""How far true shadows extend beyond a box's."""
+_SPILL_SHARE = 0.08
+"""A shadow with more than this share beyond reach is a house's or a tree's."""
 _SAMPLES = 6000
-"""Ground pixels a car that vote on the sun: with a third of them it is found behind the street on some frames."""
+"""Ground pixels per vehicle that vote on the sun; with a third of them it is wrong on some frames."""
 _AROUND_M, _AROUND_PX = 6.0, 8
-"""How far around a footprint the ground is looked at: farther than shadows are looked for, and grown."""
+"""Extent of the ground around a footprint: farther than shadows reach, and are grown."""
 _NEAR_M = 0.1
-"""Ground that is nearer to the camera's plane is in no photograph."""
-
-
-@dataclass(frozen=True, slots=True)
-class ShadowSettings:
-    """reach_m: how far from the footprint most shadows end, so that the ground beyond tells how bright it is lit;
-    far_m: how far from it a shadow is looked for; contact_m: width of the strip around the footprint that counts
-    as touching; dark: share of the lit ground's brightness below which ground is shaded; soft: likewise, of the
-    rim of a shadow; gain: by how much an estimated sun must explain the darkness better than the assumed one;
-    rim_m: how far beyond the reach shade is followed; open_share: a shadow of which more than this lies out of
-    reach is not a car's; loose_m: how far true shadows leave that of a box.
-    """
-
-    reach_m: float = 2.6
-    far_m: float = 4.0
-    contact_m: float = 0.25
-    dark: float = 0.72
-    gain: float = 0.03
-    soft: float = 0.86
-    rim_m: float = 0.8
-    open_share: float = 0.08
-    loose_m: float = 0.35
+"""Ground nearer to the camera's plane is in no photograph."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundView:
-    """What each pixel sees of the plane parallel to the ground through a car's foot, in the car's frame, some
-    metres around the footprint.
-
-    local (H, W, 2) m, (x, z), inf where nothing; distance (H, W) m from the footprint, negative inside, inf where
-    nothing; window: rows and columns beyond which there is nothing.
+    """The ground plane through a vehicle's foot, as seen at each pixel near its footprint, in the
+    vehicle's frame.
     """
 
     local: Array
+    """(H, W, 2) m, (x, z); inf outside the window."""
     distance: Array
+    """(H, W) m from the footprint, negative inside; inf outside the window."""
     window: tuple[slice, slice]
+    """Rows and columns of the ground near the footprint."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundLight:
-    """grey (H, W): the photograph's brightness; lit (H, W): how bright the ground would be without cars'
-    shadows."""
+    """Brightness of the photograph and of its ground without the vehicles' shadows."""
 
     grey: Array
+    """(H, W) in [0, 1], the photograph's brightness."""
     lit: Array
+    """(H, W) in [0, 1], the ground's brightness without shadows."""
 
 
 def view_ground(placement: Placement, ground: torch.Tensor, camera: Camera) -> GroundView:
-    """The ground around one car as the camera sees it. ground (4,): plane n.x + d = 0."""
+    """Map pixels to the ground around one vehicle.
+
+    Args:
+        placement: The vehicle.
+        ground: Plane (4,) n.x + d = 0.
+        camera: The photograph's camera.
+
+    Returns:
+        The pixels' positions on the ground.
+    """
     matrix = camera.matrix.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
     centre = -inverse @ matrix[:, 3]
@@ -102,15 +107,15 @@ def view_ground(placement: Placement, ground: torch.Tensor, camera: Camera) -> G
     x, z = np.array([[1, 1, -1, -1], [1, -1, -1, 1]]) * reach[:, None]
     along = np.stack([cos * x + sin * z, np.zeros(4), cos * z - sin * x])
     along[1] = -(normal[0] * along[0] + normal[2] * along[2]) / normal[1]
-    window = _pictured(matrix[:, :3] @ (along + foot[:, None]) + matrix[:, 3:], camera)
+    window = _image_window(matrix[:, :3] @ (along + foot[:, None]) + matrix[:, 3:], camera)
     v, u = (np.arange(part.start, part.stop, dtype=np.float64) for part in window)
     v = v[:, None]
     ray = [inverse[i, 0] * u + inverse[i, 1] * v + inverse[i, 2] for i in range(3)]
     slope = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
     with np.errstate(divide="ignore", invalid="ignore"):
         step = normal @ (foot - centre) / slope
-    seen = np.isfinite(step) & (step > 0) & (step < 400)
-    step = np.where(seen, step, 0.0)
+    hit = np.isfinite(step) & (step > 0) & (step < 400)
+    step = np.where(hit, step, 0.0)
     east, north = (centre[i] - foot[i] + step * ray[i] for i in (0, 2))
     local = np.stack([cos * east - sin * north, sin * east + cos * north], -1)
     across, ahead = np.abs(local[..., 0]) - half[0], np.abs(local[..., 1]) - half[1]
@@ -120,13 +125,13 @@ def view_ground(placement: Placement, ground: torch.Tensor, camera: Camera) -> G
         np.full((camera.height, camera.width), np.inf, np.float32),
         window,
     )
-    view.local[window] = np.where(seen[..., None], local, np.inf)
-    view.distance[window] = np.where(seen, apart, np.inf)
+    view.local[window] = np.where(hit[..., None], local, np.inf)
+    view.distance[window] = np.where(hit, apart, np.inf)
     return view
 
 
-def _pictured(corners: NDArray[np.float64], camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns of the image around a convex polygon's picture. corners (3, K): in clip space, in turn."""
+def _image_window(corners: NDArray[np.float64], camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns of the image around a convex polygon with corners (3, K) in clip space, in order."""
     depth = corners[2] - _NEAR_M
     following, after = np.roll(corners, -1, 1), np.roll(depth, -1)
     crossing = depth * after < 0
@@ -143,40 +148,42 @@ def _pictured(corners: NDArray[np.float64], camera: Camera) -> tuple[slice, slic
 
 
 def estimate_ground_light(
-    image: Array,
-    road: Array,
-    vehicles: Mask,
-    views: Sequence[GroundView],
-    settings: ShadowSettings | None = None,
-    behind: Callable[[Mask], Array] | None = None,
+    image: Array, vehicles: Mask, views: Sequence[GroundView], continue_street: Callable[[Mask], Array]
 ) -> GroundLight:
-    """Brightness as it is, and of the ground as it would be lit: continued from the road around the cars' places.
+    """Brightness of the photograph, and of its ground continued over the area of shadows.
 
-    image (H, W, 3); road (H, W) in [0, 1]; vehicles (H, W): all cars' pixels; behind: gives the image (H, W, 3)
-    with a mask's pixels continued from the others, so that light and dark strips along the road are no shadows.
+    Args:
+        image: The photograph (H, W, 3).
+        vehicles: All vehicles' pixels (H, W).
+        views: The ground around each vehicle.
+        continue_street: The image (H, W, 3) with a mask's pixels continued from the others along the road, so that
+            light and dark strips of the road do not count as shadows.
+
+    Returns:
+        Both brightnesses.
     """
-    settings = settings or ShadowSettings()
-    grey = _brightness(image)
-    zone = np.logical_or.reduce([view.distance < settings.reach_m for view in views]) | grow_mask(vehicles, 3)
-    if behind is not None:
-        return GroundLight(grey, _brightness(behind(zone)))
-    known = (road > 0.5) & ~zone
-    if not known.any():
-        known = ~zone
-    lit = push_pull(np.ascontiguousarray(grey[..., None]), known.astype(np.float32))[..., 0]
-    return GroundLight(grey, lit)
+    zone = np.logical_or.reduce([view.distance < _REACH_M for view in views]) | grow_mask(vehicles, 3)
+    return GroundLight(_brightness(image), _brightness(continue_street(zone)))
 
 
 def _brightness(image: Array) -> Array:
-    """The brightest channel (H, W) of an image (H, W, 3), smoothed: in a shadow all three fall, on a red or blue
-    thing one stays."""
-    # Many times as fast as numpy's maximum over an axis of three.
-    brightest = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2])
-    return np.asarray(cv2.GaussianBlur(brightest, (0, 0), 1.0), np.float32)
+    """The brightest channel (H, W) of an image (H, W, 3), smoothed: in a shadow all channels are dark, on a red or
+    blue surface one stays bright.
+    """
+    return np.asarray(cv2.GaussianBlur(channel_max(image), (0, 0), 1.0), np.float32)
 
 
 def cast_box_shadow(placement: Placement, view: GroundView, sun: torch.Tensor) -> Array:
-    """How dark (H, W), in [0, 1], the car's box makes the ground in this sun; 0 where it cannot reach."""
+    """Darkness of the ground in the shadow of a vehicle's box.
+
+    Args:
+        placement: The vehicle.
+        view: The ground around it.
+        sun: Direction (3,) towards the sun.
+
+    Returns:
+        (H, W) in [0, 1]; 0 out of the shadow's reach.
+    """
     dark = np.zeros(view.distance.shape, np.float32)
     near = reachable_ground(placement, view, sun)
     local = torch.from_numpy(view.local[near])
@@ -192,64 +199,70 @@ def find_shadows(
     views: Sequence[GroundView],
     allowed: Sequence[Mask],
     casts: Sequence[Array],
-    settings: ShadowSettings | None = None,
 ) -> tuple[list[Mask], int]:
-    """Each car's shadow on the visible ground (H, W): darker than the lit ground, joined to the car's foot; and
-    how many dark pixels go on beyond reach.
+    """Find each vehicle's shadow on the visible ground: darker than the lit ground and connected to its foot.
 
-    allowed: ground that each car's shadow can reach; casts: how dark (H, W) each car's box makes it. Shade that
-    goes on beyond reach is a house's or a tree's: then only what is darker than it counts, and what is dark in the
-    box's shadow but lit around it.
+    Shade that extends beyond reach is a house's or a tree's: then only ground darker than it counts, and ground
+    that is dark in the box's shadow but lit around it.
+
+    Args:
+        lighting: Actual and shadow-free brightness.
+        vehicles: All vehicles' pixels (H, W).
+        views: The ground around each vehicle.
+        allowed: Ground (H, W) that each vehicle's shadow can reach.
+        casts: Darkness (H, W) of each vehicle's box shadow.
+
+    Returns:
+        Each vehicle's shadow (H, W), and the number of dark pixels beyond reach.
     """
-    settings = settings or ShadowSettings()
     if not views:
         return [], 0
     frame = vehicles.shape
-    part = _all_windows(views)
+    part = _union_window(views)
     lighting = GroundLight(lighting.grey[part], lighting.lit[part])
     vehicles, allowed, casts = vehicles[part], [a[part] for a in allowed], [c[part] for c in casts]
     near = np.stack([view.distance[part] for view in views])
     owner, nearest = near.argmin(0), near.min(0)
-    around = (nearest < settings.far_m + settings.rim_m) & ~vehicles
-    free = around & (np.max(casts, axis=0) < _CAST) & (nearest > settings.loose_m)
+    around = (nearest < _FAR_M + _RIM_M) & ~vehicles
+    free = around & (np.max(casts, axis=0) < _BOX_SHADOW) & (nearest > _LOOSE_M)
     open_light = push_pull(np.ascontiguousarray(lighting.grey[..., None]), free.astype(np.float32))[..., 0]
-    dark = around & (lighting.grey < settings.dark * np.maximum(lighting.lit, open_light))
-    stands_out = dark & (lighting.grey < settings.dark * open_light)
-    within = np.logical_or.reduce(allowed) & (nearest < settings.far_m)
-    soft = around & (lighting.grey < settings.soft * lighting.lit) & (lighting.grey < settings.soft * open_light)
-    found, spilled = [], 0
+    dark = around & (lighting.grey < _DARK * np.maximum(lighting.lit, open_light))
+    stands_out = dark & (lighting.grey < _DARK * open_light)
+    within = np.logical_or.reduce(allowed) & (nearest < _FAR_M)
+    soft = around & (lighting.grey < _SOFT * lighting.lit) & (lighting.grey < _SOFT * open_light)
+    shadows, spilled = [], 0
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     for index in range(len(views)):
-        touching = (near[index] < settings.contact_m) & ~vehicles & (owner == index)
+        touching = (near[index] < _CONTACT_M) & ~vehicles & (owner == index)
         core = stands_out & (casts[index] > _CORE)
-        own = _joined(dark, touching)
+        own = _connected_to(dark, touching)
         beyond = own & ~within
-        if np.count_nonzero(beyond) > settings.open_share * max(np.count_nonzero(own), 1):
+        if np.count_nonzero(beyond) > _SPILL_SHARE * max(np.count_nonzero(own), 1):
             shade = float(np.median(lighting.grey[beyond]))
-            own = _joined(dark & (lighting.grey < settings.dark * shade), touching)
-            own |= _joined(stands_out & (casts[index] > _CAST), core)
+            own = _connected_to(dark & (lighting.grey < _DARK * shade), touching)
+            own |= _connected_to(stands_out & (casts[index] > _BOX_SHADOW), core)
             spilled += int(np.count_nonzero(beyond))
         else:
-            own |= _joined(stands_out, core)
-        own |= _joined(soft & (casts[index] > _CAST), own)
+            own |= _connected_to(stands_out, core)
+        own |= _connected_to(soft & (casts[index] > _BOX_SHADOW), own)
         closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
         mask = np.zeros(frame, bool)
-        mask[part] = closed & ~vehicles & allowed[index] & (owner == index) & (nearest < settings.far_m)
-        found.append(mask)
-    return found, spilled
+        mask[part] = closed & ~vehicles & allowed[index] & (owner == index) & (nearest < _FAR_M)
+        shadows.append(mask)
+    return shadows, spilled
 
 
-def _all_windows(views: Sequence[GroundView]) -> tuple[slice, slice]:
-    """Rows and columns beyond which there is nothing in any of the views; of at least one pixel."""
+def _union_window(views: Sequence[GroundView]) -> tuple[slice, slice]:
+    """The window of at least one pixel that holds all views' windows."""
     spans = [[(view.window[axis].start, view.window[axis].stop) for view in views] for axis in (0, 1)]
     starts, stops = zip(*((min(a for a, _ in span), max(b for _, b in span)) for span in spans), strict=True)
     return slice(starts[0], max(stops[0], starts[0] + 1)), slice(starts[1], max(stops[1], starts[1] + 1))
 
 
-def _joined(candidates: Mask, seeds: Mask) -> Mask:
-    """The candidates that hang together with the seeds."""
-    count, found = cv2.connectedComponents((candidates | seeds).astype(np.uint8), connectivity=4)
-    parts = np.asarray(found, np.int64)
+def _connected_to(candidates: Mask, seeds: Mask) -> Mask:
+    """The candidates connected to the seeds."""
+    count, components = cv2.connectedComponents((candidates | seeds).astype(np.uint8), connectivity=4)
+    parts = np.asarray(components, np.int64)
     wanted = np.zeros(count, bool)
     wanted[parts[seeds]] = True
     return wanted[parts] & candidates
@@ -261,17 +274,23 @@ def estimate_sun(
     placements: Sequence[Placement],
     views: Sequence[GroundView],
     assumed: torch.Tensor,
-    settings: ShadowSettings | None = None,
 ) -> torch.Tensor:
-    """The direction towards the sun (3,) whose box shadows explain best how dark the ground around the cars is.
+    """Estimate the sun whose box shadows best explain how dark the ground around the vehicles is.
 
-    Tries azimuths and heights; keeps `assumed` unless another one explains clearly more.
+    Args:
+        lighting: Actual and shadow-free brightness.
+        vehicles: All vehicles' pixels (H, W).
+        placements: The vehicles.
+        views: The ground around each of them.
+        assumed: Direction (3,) towards the sun that is returned unless another one explains clearly more.
+
+    Returns:
+        Direction (3,) towards the sun.
     """
-    settings = settings or ShadowSettings()
     points, sizes, yaws, darkness = [], [], [], []
     owner = np.stack([view.distance for view in views]).argmin(0)
     for index, (placement, view) in enumerate(zip(placements, views, strict=True)):
-        ground = (view.distance < settings.reach_m) & ~grow_mask(vehicles, 2) & (owner == index)
+        ground = (view.distance < _REACH_M) & ~grow_mask(vehicles, 2) & (owner == index)
         flat = np.nonzero(ground.reshape(-1))[0]
         flat = flat[:: max(1, len(flat) // _SAMPLES)]
         if not len(flat):
@@ -295,21 +314,23 @@ def estimate_sun(
         rest = (dark - strength.clamp(0.0, 1.2)[:, None] * model).square().sum(-1)
         return (1 - rest.double() / dark.square().sum().clamp(min=1e-6)).tolist()
 
-    def worth(places: Sequence[tuple[float, float]], every: int = 1) -> list[float]:
+    def rate(places: Sequence[tuple[float, float]], every: int = 1) -> list[float]:
         lengths = [length for length, _ in places]
-        shares = explained([_sun(*place) for place in places], every)
-        return [share - _LOW * max(length - 1.2, 0.0) for share, length in zip(shares, lengths, strict=True)]
+        shares = explained([_sun_direction(*place) for place in places], every)
+        return [
+            share - _LENGTH_COST * max(length - 1.2, 0.0) for share, length in zip(shares, lengths, strict=True)
+        ]
 
-    score, best = explained([assumed])[0] + settings.gain, None
+    score, best = explained([assumed])[0] + _GAIN, None
     tried = [(length, 2 * math.pi * step / _AZIMUTHS) for length in _LENGTHS for step in range(_AZIMUTHS)]
-    likely = [tried[place] for place in np.argsort(worth(tried, _EVERY))[: -_LIKELY - 1 : -1]]
-    for place, value in zip(likely, worth(likely), strict=True):
+    shortlist = [tried[place] for place in np.argsort(rate(tried, _STRIDE))[: -_SHORTLIST - 1 : -1]]
+    for place, value in zip(shortlist, rate(shortlist), strict=True):
         if value > score:
             score, best = value, place
     if best is None:
         return assumed
     turn, stretch = math.pi / _AZIMUTHS, 1.2
-    for _ in range(_FINER):
+    for _ in range(_REFINEMENTS):
         length, angle = best
         around = [
             (length * stretch, angle),
@@ -317,27 +338,36 @@ def estimate_sun(
             (length, angle + turn),
             (length, angle - turn),
         ]
-        for near, value in zip(around, worth(around), strict=True):
+        for near, value in zip(around, rate(around), strict=True):
             if value > score:
                 score, best = value, near
         turn, stretch = turn / 2, math.sqrt(stretch)
-    return _sun(*best)
+    return _sun_direction(*best)
 
 
 def lengthen_shadows(sun: torch.Tensor, factor: float) -> torch.Tensor:
-    """Towards the sun (3,) whose shadows are `factor` times as long as those of `sun` (3,)."""
+    """Direction (3,) towards a sun with shadows `factor` times as long as those of `sun` (3,)."""
     lower = sun * sun.new_tensor([factor, 1.0, factor])
     return lower / lower.norm()
 
 
-def _sun(length: float, angle: float) -> torch.Tensor:
-    """Towards a sun (3,) that throws shadows of `length` heights; angle: rad from x to z."""
+def _sun_direction(length: float, angle: float) -> torch.Tensor:
+    """Direction (3,) towards a sun that casts shadows of `length` heights, at `angle` rad from x to z."""
     sun = torch.tensor([length * math.cos(angle), -1.0, length * math.sin(angle)])
     return sun / sun.norm()
 
 
 def reachable_ground(placement: Placement, view: GroundView, sun: torch.Tensor) -> Mask:
-    """Ground (H, W) that the renderer's patch for this car's shadow covers."""
+    """Ground that the renderer's patch for a vehicle's shadow covers.
+
+    Args:
+        placement: The vehicle.
+        view: The ground around it.
+        sun: Direction (3,) towards the sun.
+
+    Returns:
+        Mask (H, W).
+    """
     size = placement.size_lhw.detach()[None]
     offset = shadow_offset(sun, placement.yaw.detach()[None], size[:, 1])
     corners = shadow_corners(size, offset)[0].numpy()
@@ -350,8 +380,16 @@ def reachable_ground(placement: Placement, view: GroundView, sun: torch.Tensor) 
 
 
 def shadow_factors(image: Array, background: Array, region: Mask) -> Array:
-    """The factor (H, W, 3) in [0, 1] by which one car darkens the ground: photograph / background in its
-    `region`."""
+    """Factor by which one vehicle darkens the ground: photograph / background.
+
+    Args:
+        image: The photograph (H, W, 3).
+        background: The background (H, W, 3).
+        region: The vehicle's shadow (H, W).
+
+    Returns:
+        (H, W, 3) in [0, 1]; 1 outside the region.
+    """
     factor = np.ones(image.shape, np.float32)
     if region.any():
         x0, y0, x1, y1 = mask_bounds(region)

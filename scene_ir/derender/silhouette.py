@@ -1,8 +1,7 @@
-"""Where a car is in the photograph: its template placed by the label, GrabCut around it, and the fit of one to the
-other.
+"""Placed meshes, their silhouettes, and the fit of silhouettes to vehicle masks.
 
-The fit moves pose, size and a few symmetric modes of the free-form deformation through the project's own renderer
-until the outline of the mesh runs along the border of the mask; it never leaves the label's neighbourhood.
+The fit changes pose, size and a few symmetric modes of the free-form deformation, by gradients through the
+project's own rasteriser, until the mesh's outline runs along the mask's border. It stays near the label.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir import ffd as lattice
-from scene_ir.derender import edge_matching as borders
+from scene_ir.derender import edge_matching
 from scene_ir.geometry import place_vertices, to_clip
 from scene_ir.meshes.lod import detail
 from scene_ir.meshes.templates import template
@@ -27,46 +26,49 @@ from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh
 Mask = NDArray[np.bool_]
 
 _WORK_PX = 160
-"""Larger side of the windows in which outlines are fitted: more changes nothing that shows, less loses the
-wheels."""
+"""Larger side of the windows in which outlines are fitted: more changes nothing visible, less loses the wheels."""
 _DETAIL_PX = 90.0
-"""Height for which meshes are drawn in those windows: their edges do not show finer triangles."""
+"""Height that selects a mesh's level of detail in those windows."""
 _BAND = 0.12
-"""Width of the band in which mask and outline pull at each other, as a fraction of the window."""
-
+"""Width of the band in which the mask attracts the outline, as a fraction of the window."""
 _FREE_MODE_SCALE = 0.5
-"""How far single points of the lattice move where the shaped modes move by 1."""
+"""How far the free modes move single lattice points, against 1 for the shaped modes."""
 _ANCHORED_SHARE = 0.25
-"""How far pose and size of what is held move, as a share of how far others' do."""
+"""Range of pose and size of an anchored placement, as a share of the usual range."""
 _RETRACE_STEPS = 10
-"""Steps after which the edges that are seen are found anew."""
+"""Steps between traces of the visible edges."""
 _MISSED_WEIGHT = 2.0
-"""How much more a pixel of the mask that the mesh leaves out weighs than one that it covers in vain."""
+"""Weight of a mask pixel that the mesh leaves out, against a pixel outside the mask that it covers."""
 _ADAM = (0.9, 0.999)
-"""Decay of the means of gradients and of their squares, as its authors recommend."""
+"""Decay of the running means of gradients and of their squares, as its authors recommend."""
 _BODIES_BY_LABEL = {
     "Car": ("sedan", "hatchback", "estate", "suv", "pickup"),
     "Van": ("van", "suv"),
     "Truck": ("truck", "bus"),
 }
-"""Kinds of templates that a label's type may mean."""
+"""Template kinds by a label's type."""
 _FALLBACK_KINDS = {"van": ("suv",)}
-"""What is left to choose where a kind that is alone is withheld."""
+"""Kinds to choose from where a label's only kind is withheld."""
 _MAX_USER_MESHES = 6
-"""Of the user's meshes, tried for one label: each costs a draw."""
+"""Number of the user's meshes tried for one label: each costs a render."""
 _LOW_PART = 0.3
-"""Lower part of a car, as a fraction of its height, beside which its shadow lies."""
+"""Lower part of a car, as a fraction of its height, next to its shadow."""
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A mesh at its place. translation (3,) m, bottom-face centre; yaw () rad; size_lhw (3,) m; ffd (64, 3)."""
+    """A mesh placed in camera space."""
 
     mesh: Mesh
+    """Mesh in the unit box."""
     translation: Tensor
+    """(3,) m, bottom-face centre."""
     yaw: Tensor
+    """() rad."""
     size_lhw: Tensor
+    """(3,) m, length, height, width."""
     ffd: Tensor
+    """(64, 3) lattice offsets, fractions of the unit box."""
 
     def vertices(self) -> Tensor:
         """Vertices (V, 3) m in camera space."""
@@ -75,89 +77,137 @@ class Placement:
             deformed = lattice.deform(unit, lattice.lattice_weights(unit), self.ffd)
         return place_vertices(deformed, self.size_lhw, self.yaw, self.translation)
 
+    def adjusted(self, change: Tensor) -> Placement:
+        """After a change (7,): x, y, z in m, yaw in rad, logarithms of length, height, width."""
+        step = change.to(self.yaw)
+        return replace(
+            self,
+            translation=self.translation + step[:3],
+            yaw=self.yaw + step[3],
+            size_lhw=self.size_lhw * torch.exp(step[4:]),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """steps of Adam at `rate` (in units of the standard deviations below); then bounds around the label, and the
-    weights of staying there (prior), of filling the label's 2D box (box), and of the picture's edges (edges).
-    """
+    """Steps, bounds and weights of the silhouette fit."""
 
     steps: int = 30
+    """Steps of Adam; 0 fits nothing."""
     rate: float = 0.25
+    """Learning rate, in standard deviations: half the bounds below."""
     max_shift_m: float = 0.3
+    """Bound of the position on the ground, m; a third of it for the height."""
     max_turn_rad: float = 0.087
+    """Bound of the yaw, rad."""
     max_stretch: float = 0.08
+    """Bound of the logarithm of each size."""
     max_offset: float = 0.08
+    """Bound of each deformation mode, in fractions of the unit box."""
     prior: float = 0.004
+    """Weight of staying at the label."""
     box: float = 15.0
+    """Weight of filling the label's 2D box."""
     edges: float = 1.5
+    """Weight of the distance to the photograph's edges."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitEvidence:
-    """What a fit may know beside masks and boxes. picture (H, W, 3) RGB; held: one a placement, whether
-    it is to stay nearly where it stands: a laser measured it, or hardly anything of it shows; empty: none."""
+    """What a fit may use besides masks and boxes."""
 
     picture: NDArray[np.uint8] | None = None
+    """(H, W, 3) RGB, for its edges."""
     anchored: Sequence[bool] = ()
+    """Whether each placement stays nearly where it is, since a laser measured it or little of it is visible; empty
+    for none."""
 
 
 @dataclass(frozen=True, slots=True)
 class LabelBoxes:
-    """Labels' boxes xyxy (N, 4) px, and how much to trust each side, (N, 4) in [0, 1]: 0 where something cuts
-    it."""
+    """2D boxes of N labels and the trust in each of their sides."""
 
     xyxy: Tensor
+    """(N, 4) px."""
     trust: Tensor
+    """(N, 4) in [0, 1]; 0 where something cuts the side off."""
 
     def select(self, index: int) -> LabelBoxes:
-        """One of them, as one row."""
+        """One box, as one row."""
         return LabelBoxes(self.xyxy[index : index + 1], self.trust[index : index + 1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UserMesh:
-    """A user's mesh to choose from. kind: of the templates' kinds, its body's; size_lhw: its usual size, m."""
+    """A user's mesh that a label may be fitted with."""
 
     mesh: Mesh
+    """Mesh in the unit box."""
     kind: str
+    """The template kind that its body is of."""
     size_lhw: tuple[float, float, float]
+    """Its usual length, height, width, m."""
 
 
 def rank_template_kinds(kind: str, size_lhw: Sequence[float], withheld: str = "") -> tuple[str, ...]:
-    """Template kinds that may stand for a label of type `kind`, the likeliest by its proportions first; without
-    `withheld`, where that leaves any."""
+    """Template kinds for a label, the likeliest by its proportions first.
+
+    Args:
+        kind: The label's type, "Car", "Van" or "Truck".
+        size_lhw: The label's length, height, width, m.
+        withheld: A kind to leave out.
+
+    Returns:
+        At least one kind.
+    """
     length, height, _width = size_lhw
     if kind == "Truck":
-        found = ("truck", "bus") if length < 10 else ("bus", "truck")
+        ranked = ("truck", "bus") if length < 10 else ("bus", "truck")
     elif kind == "Van":
-        found = ("van", "suv") if height < 2.4 else ("van",)
+        ranked = ("van", "suv") if height < 2.4 else ("van",)
     elif height > 1.75:
-        found = ("suv", "van", "hatchback", "pickup", "estate", "sedan")
+        ranked = ("suv", "van", "hatchback", "pickup", "estate", "sedan")
     elif height > 1.6:
-        found = ("suv", "hatchback", "estate", "sedan", "pickup")
+        ranked = ("suv", "hatchback", "estate", "sedan", "pickup")
     elif length < 4.05:
-        found = ("hatchback", "sedan", "suv", "estate")
+        ranked = ("hatchback", "sedan", "suv", "estate")
     else:
-        found = ("sedan", "estate", "hatchback", "suv", "pickup")
-    return tuple(k for k in found if k != withheld) or _FALLBACK_KINDS.get(withheld, found)
+        ranked = ("sedan", "estate", "hatchback", "suv", "pickup")
+    return tuple(k for k in ranked if k != withheld) or _FALLBACK_KINDS.get(withheld, ranked)
 
 
 def select_user_meshes(kind: str, size_lhw: Sequence[float], own: Sequence[UserMesh]) -> tuple[Mesh, ...]:
-    """The user's meshes that may stand for a label of type `kind`: of a body that is called so, and those whose
-    usual size is nearest to the label's first, not more than a few."""
+    """The user's meshes for a label, nearest in size first.
 
-    def apart(choice: UserMesh) -> float:
+    Args:
+        kind: The label's type, "Car", "Van" or "Truck".
+        size_lhw: The label's length, height, width, m.
+        own: The meshes to choose from.
+
+    Returns:
+        At most `_MAX_USER_MESHES` meshes of a suitable body.
+    """
+
+    def size_distance(choice: UserMesh) -> float:
         return float(np.square(np.log(np.divide(choice.size_lhw, size_lhw))).sum())
 
-    fitting = [choice for choice in own if choice.kind in _BODIES_BY_LABEL[kind]]
-    return tuple(choice.mesh for choice in sorted(fitting, key=apart)[:_MAX_USER_MESHES])
+    suitable = [choice for choice in own if choice.kind in _BODIES_BY_LABEL[kind]]
+    return tuple(choice.mesh for choice in sorted(suitable, key=size_distance)[:_MAX_USER_MESHES])
 
 
 def render_silhouettes(
     placements: Sequence[Placement], camera: Camera, backend: verbs.Backend = "warp"
 ) -> list[Mask]:
-    """Pixels (H, W) whose centre each placed mesh covers, one mask a placement."""
+    """Rasterise placed meshes.
+
+    Args:
+        placements: N placed meshes.
+        camera: The camera.
+        backend: Of the rasteriser.
+
+    Returns:
+        N masks (H, W) of the pixels with a covered centre.
+    """
     if not placements:
         return []
     clip, faces, vertex_ranges, face_ranges = _pack_meshes(placements, camera.matrix)
@@ -173,7 +223,16 @@ def render_silhouettes(
 
 
 def mask_iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
-    """Intersection over union of two masks, counted outside `unknown`; 0 where both are empty."""
+    """Intersection over union of two masks.
+
+    Args:
+        first: Mask (H, W).
+        second: Mask (H, W).
+        unknown: Pixels (H, W) that do not count.
+
+    Returns:
+        A number in [0, 1]; 0 if both masks are empty.
+    """
     if unknown is not None:
         first, second = first & ~unknown, second & ~unknown
     union = np.count_nonzero(first | second)
@@ -181,16 +240,16 @@ def mask_iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
 
 
 def mask_bounds(mask: Mask) -> tuple[int, int, int, int]:
-    """Bounding rectangle of a mask that is not empty: x0, y0, x1, y1, half-open."""
+    """Bounding rectangle x0, y0, x1, y1, half-open, of a non-empty mask."""
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def grow_mask(mask: Mask, radius: float) -> Mask:
-    """The mask with everything within `radius` px (negative: without what is that near to its border)."""
+    """The mask grown by `radius` px, or shrunk by a negative one."""
     if not mask.any():
         return mask.copy()
-    # Only where something can change: a frame has many more pixels than a car.
+    # Work only where the mask can change: a frame has many more pixels than a car.
     margin = int(max(radius, 0)) + 2
     x0, y0, x1, y1 = mask_bounds(mask)
     window = (slice(max(y0 - margin, 0), y1 + margin), slice(max(x0 - margin, 0), x1 + margin))
@@ -207,11 +266,18 @@ def grow_mask(mask: Mask, radius: float) -> Mask:
 def grabcut_mask(
     image: NDArray[np.uint8], outline: Mask, unknown: Mask, band_px: tuple[float, float, float], rounds: int = 3
 ) -> Mask:
-    """The car's pixels by GrabCut (Rother 2004) in a band around the template's outline.
+    """Segment an object by GrabCut (Rother 2004) in a band around an outline.
 
-    image (H, W, 3) RGB; outline: the placed template; unknown: pixels of nearer things, which are nobody's;
-    band_px: how far the border is searched inside of the outline, outside of it near the ground (where shadows
-    look like cars), and outside of it higher up -> mask (H, W), without `unknown`.
+    Args:
+        image: (H, W, 3) RGB.
+        outline: Rough mask (H, W) of the object.
+        unknown: Pixels (H, W) of nearer objects, which belong to neither side.
+        band_px: Width of the band inside the outline, outside it near the ground (where shadows look like
+            objects), and outside it higher up, px.
+        rounds: GrabCut iterations.
+
+    Returns:
+        Mask (H, W) without `unknown`.
     """
     visible = outline & ~unknown
     if not visible.any():
@@ -244,19 +310,18 @@ def grabcut_mask(
     # OpenCV seeds its clusters from one process-wide generator.
     cv2.setRNGSeed(0)
     cv2.grabCut(crop, labels, (0, 0, 1, 1), *models, rounds, cv2.GC_INIT_WITH_MASK)
-    found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)) & ~hidden
-    found = _clean_grabcut(found, enlarge(outline), scale)
+    mask = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)) & ~hidden
+    mask = _clean_grabcut(mask, enlarge(outline), scale)
     result = np.zeros_like(outline)
-    back = cv2.resize(found.astype(np.float32), (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
-    result[window] = back >= 0.5
+    result[window] = cv2.resize(mask.astype(np.float32), (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA) >= 0.5
     return result & ~unknown
 
 
-def _clean_grabcut(found: Mask, outline: Mask, scale: float) -> Mask:
-    """Without specks and hairs, holes closed, only parts that reach well into the template."""
+def _clean_grabcut(mask: Mask, outline: Mask, scale: float) -> Mask:
+    """The mask without specks and hairs, holes closed, limited to components that lie mostly in the outline."""
     radius = max(1, round(1.2 * scale))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc)
     opened = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, disc)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     keep = np.zeros(count, bool)
@@ -264,12 +329,12 @@ def _clean_grabcut(found: Mask, outline: Mask, scale: float) -> Mask:
     for part in range(1, count):
         area = stats[part, cv2.CC_STAT_AREA]
         keep[part] = area >= 0.05 * largest and np.count_nonzero(outline & (parts == part)) >= 0.6 * area
-    kept = keep[np.asarray(parts, np.int64)]
+    cleaned = keep[np.asarray(parts, np.int64)]
     # Holes are windows or reflections, never background: fill what the outside cannot reach.
-    padded = np.pad(~kept, 1, constant_values=True).astype(np.uint8)
+    padded = np.pad(~cleaned, 1, constant_values=True).astype(np.uint8)
     _, regions = cv2.connectedComponents(padded, connectivity=4)
     enclosed = regions[1:-1, 1:-1] != regions[0, 0]
-    return kept | (enclosed & outline)
+    return cleaned | (enclosed & outline)
 
 
 def fit_silhouettes(
@@ -282,20 +347,30 @@ def fit_silhouettes(
     backend: verbs.Backend = "warp",
     evidence: FitEvidence | None = None,
 ) -> list[Placement]:
-    """Placements whose outlines run along the masks, all fitted at once; pixels that are `unknown` pull at
-    nothing.
+    """Fit placements, all at once, so that their outlines run along masks.
 
-    boxes: what the labels' boxes say of the outlines' extent, which no reflection can mislead. beside: what else
-    is known. With a picture, edges between the meshes' parts, and outlines, are drawn to its edges.
+    Minimises the signed distance to the mask, clamped to the band, summed over the pixels that the mesh covers:
+    its gradient moves each piece of outline towards the mask's border from anywhere in the band (Chan and Vese
+    2001).
 
-    Minimises the signed distance to the mask, cut at +-band, summed over what the mesh covers: its gradient moves
-    each piece of outline towards the mask's border from as far as the band reaches (Chan and Vese 2001).
+    Args:
+        placements: N meshes at their labels.
+        masks: N masks (H, W) of the vehicles' visible pixels.
+        unknown: N masks (H, W) of pixels that attract nothing.
+        boxes: The labels' 2D boxes, which bound the outlines' extent and which no reflection can mislead.
+        camera: The photograph's camera.
+        settings: Steps, bounds and weights.
+        backend: Of the rasteriser.
+        evidence: With a picture, outlines and edges between mesh parts are attracted by its edges.
+
+    Returns:
+        N fitted placements.
     """
     if not placements or settings.steps == 0:
         return list(placements)
     evidence = evidence or FitEvidence()
-    windows = [_make_window(mask, hidden, outline, evidence.picture) for mask, hidden, outline in
-               zip(masks, unknown, render_silhouettes(placements, camera, backend), strict=True)]  # fmt: skip
+    outlines = render_silhouettes(placements, camera, backend)
+    windows = [_make_window(*pixels, evidence.picture) for pixels in zip(masks, unknown, outlines, strict=True)]
     rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
     layout = verbs.PixelLayout.from_rects(rects)
     whole, placements = placements, _with_coarse_meshes(placements)
@@ -306,14 +381,14 @@ def fit_silhouettes(
     modes = _deformation_modes()
     spread, bound = _code_scales(settings, len(modes))
     spread, bound = spread.repeat(len(placements), 1), bound.repeat(len(placements), 1)
-    for row, held in enumerate(evidence.anchored):
-        if held:
+    for row, anchored in enumerate(evidence.anchored):
+        if anchored:
             spread[row, :7], bound[row, :7] = _ANCHORED_SHARE * spread[row, :7], _ANCHORED_SHARE * bound[row, :7]
     code = torch.zeros_like(spread, requires_grad=True)
     mean, square = torch.zeros_like(code), torch.zeros_like(code)
     best = torch.full((len(placements),), torch.inf)
     best_code = code.detach().clone()
-    followed: list[borders.VisibleContour] = []
+    contours: list[edge_matching.VisibleContour] = []
     for step in range(settings.steps + 1):
         clips = []
         for i, (placement, weight, matrix) in enumerate(zip(placements, weights, matrices, strict=True)):
@@ -324,16 +399,17 @@ def fit_silhouettes(
         fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
         covered = verbs.antialias(fragments, clip, faces, backend) * pull
         energy = torch.stack([covered[span].sum() for span, _ in layout.spans()])
-        apart = [_box_distances(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
-        filling = (torch.stack(apart) * boxes.trust).sum(1)
-        loss = energy + settings.prior * code.square().sum(1) + settings.box * filling
+        sides = [_box_distances(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
+        box_loss = (torch.stack(sides) * boxes.trust).sum(1)
+        loss = energy + settings.prior * code.square().sum(1) + settings.box * box_loss
         if evidence.picture is not None and settings.edges > 0:
             if step % _RETRACE_STEPS == 0:
-                followed = _trace_contours(placements, windows, clips, fragments)
-                # Other edges make another sum: what was found with the last ones does not compare.
+                contours = _trace_contours(placements, windows, clips, fragments)
+                # Losses with other edges do not compare.
                 best = torch.full_like(best, torch.inf)
             inner = [
-                borders.contour_distance(w.edges, f, c) for w, f, c in zip(windows, followed, clips, strict=True)
+                edge_matching.contour_distance(window.edges, contour, c)
+                for window, contour, c in zip(windows, contours, clips, strict=True)
             ]
             loss = loss + settings.edges * torch.stack(inner)
         better = loss.detach() < best
@@ -343,7 +419,7 @@ def fit_silhouettes(
             break
         gradient = torch.autograd.grad(loss.sum(), code)[0]
         with torch.no_grad():
-            # Vertices at the near plane can give infinite slopes; one car's must not spoil the others.
+            # Vertices at the near plane can have infinite gradients; one car's must not spoil the others'.
             torch.nan_to_num_(gradient, nan=0.0, posinf=0.0, neginf=0.0)
             # Adam (Kingma and Ba 2015) by hand: importing torch's optimisers takes longer than this whole fit.
             mean.lerp_(gradient, 1 - _ADAM[0])
@@ -355,7 +431,7 @@ def fit_silhouettes(
 
 
 def _with_coarse_meshes(placements: Sequence[Placement]) -> list[Placement]:
-    """With no more triangles than windows show."""
+    """The placements with the meshes' level of detail for windows."""
     return [replace(p, mesh=detail(p.mesh, _DETAIL_PX)) for p in placements]
 
 
@@ -366,24 +442,33 @@ def measure_edge_distances(
     camera: Camera,
     backend: verbs.Backend = "warp",
 ) -> list[float]:
-    """How far the edges of each placed mesh are from those of the picture (H, W, 3), in [0, 1]: which of several
-    meshes at one place is the likeliest. 1 where nothing of it is seen."""
-    outlines = render_silhouettes(placements, camera, backend)
-    seen = np.logical_or.reduce(outlines)
-    if not seen.any():
+    """Distance of each mesh's visible edges from the photograph's, to compare meshes at one place.
+
+    Args:
+        placements: N placed meshes.
+        unknown: Pixels (H, W) of nearer objects.
+        picture: The photograph (H, W, 3) RGB.
+        camera: Its camera.
+        backend: Of the rasteriser.
+
+    Returns:
+        N distances in [0, 1]; 1 for a mesh that is not visible.
+    """
+    covered = np.logical_or.reduce(render_silhouettes(placements, camera, backend))
+    if not covered.any():
         return [1.0] * len(placements)
-    windows = [_make_window(seen, unknown, seen, picture)] * len(placements)
+    windows = [_make_window(covered, unknown, covered, picture)] * len(placements)
     placements = _with_coarse_meshes(placements)
     height, width = windows[0].known.shape
     layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, width, height]] * len(placements)))
     clip, faces, vertex_ranges, face_ranges = _pack_meshes(placements, windows[0].zoom @ camera.matrix)
     fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
     clips = [clip[start:end] for start, end in vertex_ranges.tolist()]
-    followed = _trace_contours(placements, windows, clips, fragments)
-    found = [
-        float(borders.contour_distance(w.edges, f, c)) for w, f, c in zip(windows, followed, clips, strict=True)
+    contours = _trace_contours(placements, windows, clips, fragments)
+    return [
+        float(edge_matching.contour_distance(window.edges, contour, clip)) if len(contour.channel) else 1.0
+        for window, contour, clip in zip(windows, contours, clips, strict=True)
     ]
-    return [d if len(f.channel) else 1.0 for d, f in zip(found, followed, strict=True)]
 
 
 def _trace_contours(
@@ -391,9 +476,9 @@ def _trace_contours(
     windows: Sequence[_FitWindow],
     clips: Sequence[Tensor],
     fragments: verbs.Fragments,
-) -> list[borders.VisibleContour]:
-    """The edges of each placed mesh that are seen in its window as it stands."""
-    found = []
+) -> list[edge_matching.VisibleContour]:
+    """The visible edges of each placed mesh in its window."""
+    contours = []
     spans = fragments.layout.spans()
     start = 0
     for placement, window, clip, (span, shape) in zip(placements, windows, clips, spans, strict=True):
@@ -401,19 +486,19 @@ def _trace_contours(
         face = fragments.face[span].reshape(shape).long()
         face = torch.where(face >= 0, face - start, face)
         depth = fragments.depth[span].reshape(shape)
-        found.append(borders.trace_contour(face, depth, clip, mesh.faces, mesh.part, window.known))
+        contours.append(edge_matching.trace_contour(face, depth, clip, mesh.faces, mesh.part, window.known))
         start += len(mesh.faces)
-    return found
+    return contours
 
 
 def _box_distances(clip: Tensor, box_xyxy: Tensor, window: _FitWindow) -> Tensor:
-    """How far (4,) the extent of a mesh is from a label's box on each side, squared, in units of the band."""
-    # What lies beyond the image's border shows in no box; what is nearer than half a metre projects anywhere.
+    """Squared distances (4,) of a mesh's extent from a label's box on each side, in units of the band."""
+    # Points beyond the image's border are in no box; points nearer than half a metre project anywhere.
     pixels = clip[:, :2] / clip[:, 2:].clamp(min=0.5)
-    shown = ((pixels >= window.frame[:2]) & (pixels <= window.frame[2:])).all(1) & (clip[:, 2] > 0.5)
-    if not bool(shown.any()):
+    visible = ((pixels >= window.frame[:2]) & (pixels <= window.frame[2:])).all(1) & (clip[:, 2] > 0.5)
+    if not bool(visible.any()):
         return box_xyxy.new_zeros(4)
-    extremes = torch.cat([pixels[shown].amin(0), pixels[shown].amax(0)])
+    extremes = torch.cat([pixels[visible].amin(0), pixels[visible].amax(0)])
     scale = window.zoom.diagonal()[:2].repeat(2)
     offset = window.zoom[:2, 2].repeat(2)
     band = _BAND * max(window.pull.shape)
@@ -422,17 +507,20 @@ def _box_distances(clip: Tensor, box_xyxy: Tensor, window: _FitWindow) -> Tensor
 
 @dataclass(frozen=True, slots=True)
 class _FitWindow:
-    """pull (h, w): signed distance to the mask over the band, in [-1, 1], 0 where unknown; length: px of outline;
-    zoom (3, 3): image pixels to window pixels; frame (4,): the image's border xyxy in window pixels; edges
-    (C, h, w): distance to the picture's edges; known (h, w): that nothing hides.
-    """
+    """The part of the photograph in which one outline is fitted, resized."""
 
     pull: NDArray[np.float32]
+    """(h, w) in [-2, 1], signed distance to the mask over the band, 0 where unknown."""
     length: float
+    """Perimeter of the window, px."""
     zoom: Tensor
+    """(3, 3), image pixels to window pixels."""
     frame: Tensor
+    """(4,) px, the image's border xyxy in the window."""
     edges: Tensor
+    """(C, h, w), distance to the photograph's edges."""
     known: Mask
+    """(h, w), pixels that nothing nearer hides."""
 
 
 def _make_window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8] | None) -> _FitWindow:
@@ -444,16 +532,17 @@ def _make_window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.u
     scale = min(_WORK_PX / max(x1 - x0, y1 - y0), 4.0)
     size = (max(round((x1 - x0) * scale), 1), max(round((y1 - y0) * scale), 1))
     inner = mask[y0:y1, x0:x1]
-    # Hidden pixels next to the mask belong to neither side: distances are taken to what is surely not the car.
-    shown = ~unknown[y0:y1, x0:x1]
+    # Hidden pixels next to the mask belong to neither side: distances are to pixels that are certainly not the
+    # car.
+    visible = ~unknown[y0:y1, x0:x1]
     to_car = cv2.distanceTransform((~inner).astype(np.uint8), cv2.DIST_L2, 5)
-    to_rest = cv2.distanceTransform((inner | ~shown).astype(np.uint8), cv2.DIST_L2, 5)
+    to_rest = cv2.distanceTransform((inner | ~visible).astype(np.uint8), cv2.DIST_L2, 5)
     to_car = np.where(inner.any(), to_car, max(size))
-    to_rest = np.where((~inner & shown).any(), to_rest, max(size))
+    to_rest = np.where((~inner & visible).any(), to_rest, max(size))
     signed = np.where(inner, 0.5 - to_rest, to_car - 0.5) * scale
     band = _BAND * max(size)
-    pull = np.clip(signed / band, -1, 1) * shown
-    # A piece of car outside the mesh tears off when the car turns; a piece of road inside it only travels along.
+    pull = np.clip(signed / band, -1, 1) * visible
+    # A piece of car outside the mesh tears off when the car turns; a piece of road inside it only moves along.
     pull = np.where(pull < 0, _MISSED_WEIGHT * pull, pull)
     zoom = torch.tensor(
         [
@@ -466,12 +555,12 @@ def _make_window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.u
         pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     )
     corners = torch.tensor([[0.0, 0.0, 1.0], [width - 1.0, height - 1.0, 1.0]]) @ zoom.T
-    known = cv2.resize(shown.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).reshape(size[::-1]) > 0
+    known = cv2.resize(visible.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).reshape(size[::-1]) > 0
     edges = torch.zeros(0)
     if picture is not None:
         method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
         crop = cv2.resize(picture[y0:y1, x0:x1], size, interpolation=method)
-        edges = borders.compute_edge_field(
+        edges = edge_matching.compute_edge_field(
             np.asarray(crop, np.uint8).reshape(*size[::-1], 3), grow_mask(~known, 1)
         )
     return _FitWindow(
@@ -500,7 +589,8 @@ def _pack_meshes(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tenso
 
 def _deformation_modes() -> Tensor:
     """Symmetric deformations (K, 64, 3) that turn one car's outline into another's; the lowest layer stays
-    down."""
+    level.
+    """
     modes = []
 
     def grid() -> Tensor:
@@ -511,7 +601,7 @@ def _deformation_modes() -> Tensor:
     for station in range(LATTICE[0]):
         grid()[station, 0, :, 1] = 1.0  # roof up and down along the length
     for station in (1, 2):
-        grid()[station, :2, :, 0] = 1.0  # cabin forth and back, longer and shorter
+        grid()[station, :2, :, 0] = 1.0  # cabin forward and back, longer and shorter
     grid()[:, 0, :, 2] = across  # roof broader
     grid()[:, 1:3, :, 2] = across  # waist broader
     for station in (0, 3):
@@ -544,6 +634,16 @@ def _apply_change(placement: Placement, change: Tensor, modes: Tensor) -> Placem
 
 
 def place_mesh(mesh: str | Mesh, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
-    """A mesh, or the canonical template of a kind, at a label's place and size."""
+    """Place a mesh by a label.
+
+    Args:
+        mesh: A mesh, or a template kind for its canonical template.
+        translation: Bottom-face centre (3,) m.
+        yaw: () rad.
+        size_lhw: Length, height, width (3,) m.
+
+    Returns:
+        The placement, undeformed.
+    """
     shape = template(mesh) if isinstance(mesh, str) else mesh
     return Placement(shape, translation, yaw, size_lhw, torch.zeros(LATTICE_POINTS, 3))

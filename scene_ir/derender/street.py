@@ -1,10 +1,10 @@
-"""What a street's plane tells of a hole: lane lines, kerbs and verges go on along the road, colours sideways.
+"""Continue a street smoothly into unknown pixels: lane lines, kerbs and verges along the road, colours sideways.
 
-The ground is laid out in metres, straightened along the road, whose heading and bend the edges on the ground vote
-for. What stays the same along the road is a profile across it; what is left is continued sideways, row by row.
-What stands on the ground, and the sky, go on by themselves: no colours run over the ground's end. The result is
-smooth but has the street's structure: `upright.copied` and `background.fill` add the texture. Huang et al.
-(SIGGRAPH 2014) guide completion by planes and their translations in a like way.
+Edges on the ground vote for the road's heading and curvature. The ground is laid out in metres and straightened
+along the road. What stays the same along the road is a profile across it; the rest is continued sideways, row by
+row. Upright surfaces and the sky are continued separately, so that no colours run across the ground's end. The
+result is smooth but has the street's structure; `standing_surfaces` and `patch_fill` add the texture. Huang et al.
+(SIGGRAPH 2014) guide completion by planes and their translations in a similar way.
 """
 
 from __future__ import annotations
@@ -25,93 +25,93 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _HEADINGS = np.linspace(-0.5, 0.5, 81)
-"""Slopes of the road against the camera's axis that are tried."""
+"""Tried slopes of the road against the camera's axis."""
 _BENDS = np.linspace(-0.012, 0.012, 13)
-"""1/m, curvatures that are tried: down to a radius of 83 m."""
+"""Tried curvatures, 1/m: down to a radius of 83 m."""
 _VOTERS = 6000
+"""Edge pixels that vote, divided by the square of `coarse`."""
+_VOTE_M = 45.0
+"""Edges nearer than this vote."""
 _VOTE_SLOPE = 0.03
-"""Difference in slope at which an edge's vote has fallen to 1/e."""
+"""Difference in slope at which an edge's vote falls to 1/e."""
 _BEND_COST = 4.0
-"""A straight road is likelier than a bent one: share of the votes that each 1/m costs."""
+"""Share of the votes that each 1/m of curvature costs: straight roads are likelier."""
 _EDGE = 0.08
 _ACROSS_M, _ALONG = 0.07, 0.03
-"""Cells of the profile: m across, and natural logarithm of the distance."""
+"""Size of the profile's cells: m across, and natural logarithm of the distance."""
 _COLUMNS, _ROWS = 700, 160
 _AROUND = 12.0
-"""Columns of the profile: 0.8 m, wider than lines and narrower than a shadow's two sides."""
+"""Blur across the profile, in columns: 0.8 m, wider than lines and narrower than a shadow."""
 _TINT = 0.15
-"""Difference in tint from the street's colour at which a cell of the ground counts half."""
+"""Difference in tint from the street's colour at which a ground cell has half weight."""
 _SQUASH = 8
-"""Columns that become one before colours are continued: so they go on sideways rather than up and down."""
-
+"""Columns averaged into one before colours are continued, so that they go on sideways."""
+_FAR_M = 90.0
+"""Ground beyond is not distinguished from upright surfaces."""
+_ROBUST = 0.04
+"""Difference from the profile at which a pixel has half weight."""
+_MARKING = 0.08
+"""Difference from the surrounding ground at which a ground pixel has half weight in the sideways continuation."""
 _DOUBT = 1.0
-"""Splits of a column that are worse by as many px of the wrong class are as good."""
-_BESIDE_M = 2.5
-"""How far beyond what is surely ground, as parked cars' places, walls and hedges stand: a pavement."""
+"""Splits of a column are equally good up to this many more px of the wrong class."""
+_PAVEMENT_M = 2.5
+"""Width of the ground between certain ground, such as a parking space, and walls and hedges: a pavement."""
 _FARTHEST_M = 7.0
-"""So much ground lies hidden at most where one side tells only how far it goes there."""
-_FIT_PX, _LEAST_COLUMNS = 100, 20
-"""Columns beside a hidden stretch that tell where the foot goes on, and how many at least."""
+"""Most hidden ground where the foot is known on one side only."""
+_FIT_PX, _MIN_COLUMNS = 100, 20
+"""Range and least number of columns next to a hidden stretch that the foot is extrapolated from."""
 _FAR_PX = 60
-"""So near to the vanishing point a foot is the road's far end and tells nothing of walls beside it."""
+"""This near to the vanishing point, a foot is the road's far end, not a wall's."""
 _DROP = 2.0
-"""Rows that a skyline falls in each column behind the edge of what stands out from it, as trees do."""
+"""Rows per column by which the skyline falls behind the edge of a tree or house."""
 _PAINT_PX = 6.0
-"""So near to what is unknown colours of walls are not trusted."""
+"""Colours of walls this near to unknown pixels are not used."""
 _SURE_PX = 8
 """Range of good splits up to which a column counts as known."""
 
 
 @dataclass(frozen=True, slots=True)
-class StreetSettings:
-    """far_m: ground beyond is not told apart from what stands on it; vote_m: edges nearer than this vote for the
-    road's course; robust: difference of colour from the profile at which a pixel counts half; marking: difference
-    from the ground around it at which a pixel of the ground counts half when colours are continued sideways;
-    coarse: times as large cells of the profile, and times as few edges that vote, the latter squared.
-    """
-
-    far_m: float = 90.0
-    vote_m: float = 45.0
-    robust: float = 0.04
-    marking: float = 0.08
-    coarse: int = 1
-
-
-@dataclass(frozen=True, slots=True)
 class StreetShares:
-    """ground, sky (H, W) in [0, 1]: how much each known pixel looks like it; stood (H, W): where vehicles stood,
-    which is ground though it is hidden; flat (H, W): ground again, given that known pixels show no vehicle, to
-    tell what lies on the ground below its end; left out, it is the same."""
+    """Shares of ground and sky in known pixels."""
 
     ground: NDArray[np.float32]
+    """(H, W) in [0, 1]."""
     sky: NDArray[np.float32]
+    """(H, W) in [0, 1]."""
     stood: Mask
+    """(H, W), footprints of vehicles: hidden ground."""
     flat: NDArray[np.float32] | None = None
+    """(H, W) in [0, 1], share of ground given that a pixel shows no vehicle; by default the same as `ground`."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundCoordinates:
-    """Where each pixel's ray meets the ground. across, along (H, W) m, to the right and ahead; along is inf above
-    the horizon."""
+    """Point at which each pixel's ray meets the ground."""
 
     across: NDArray[np.float32]
+    """(H, W) m to the right."""
     along: NDArray[np.float32]
+    """(H, W) m ahead; inf above the horizon."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreetContinuation:
-    """image (H, W, 3): known pixels and their smooth continuation; ground (H, W): pixels that see ground, the
-    hidden ones by interpolation; heading, bend: of the road, slope and 1/m; foot (W,): row of the ground's end."""
+    """A photograph with its street continued into unknown pixels."""
 
     image: Image
+    """(H, W, 3), known pixels and their smooth continuation."""
     ground: Mask
+    """(H, W), pixels of ground, hidden ones by interpolation."""
     heading: float
+    """Slope of the road against the camera's axis."""
     bend: float
+    """Curvature of the road, 1/m."""
     foot: NDArray[np.float64]
+    """(W,), row of the ground's end."""
 
 
 def ground_coordinates(ground: torch.Tensor, camera: Camera) -> GroundCoordinates:
-    """The ground as the camera sees it. ground (4,): plane n.x + d = 0."""
+    """Ground coordinates of a camera's pixels; `ground` (4,) is the plane n.x + d = 0."""
     matrix = camera.matrix.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
     centre = -inverse @ matrix[:, 3]
@@ -133,27 +133,31 @@ def continue_street(
     share: StreetShares,
     plane: GroundCoordinates,
     horizon: float,
-    settings: StreetSettings | None = None,
+    coarse: int = 1,
 ) -> StreetContinuation:
-    """What the known pixels say of the unknown ones.
+    """Continue the street of the known pixels into the unknown ones.
 
-    image (H, W, 3) in [0, 1]; unknown (H, W): must not be used; share: what known pixels look like; horizon: its
-    row, px.
+    Args:
+        image: (H, W, 3) in [0, 1].
+        unknown: Pixels (H, W) that must not be used.
+        share: Shares of ground and sky in known pixels.
+        plane: Ground coordinates of the pixels.
+        horizon: Its row, px.
+        coarse: Size of the profile's cells, in those of a full-size photograph.
+
+    Returns:
+        The continued photograph and the road's course.
     """
-    settings = settings or StreetSettings()
     rows = np.arange(image.shape[0])[:, None]
     seen = ~unknown & (share.ground > 0.5)
-    coarse = settings.coarse
-    heading, bend = estimate_road_course(
-        image, seen & (plane.along < settings.vote_m), plane, _VOTERS // coarse**2
-    )
+    heading, bend = estimate_road_course(image, seen & (plane.along < _VOTE_M), plane, _VOTERS // coarse**2)
     level = np.where(share.stood, 1, share.ground).astype(np.float32)
-    foot = find_foot_rows(level, unknown & ~share.stood, plane, horizon, _column_ahead(plane, heading))
+    foot = find_foot_rows(level, unknown & ~share.stood, plane, horizon, _vanishing_column(plane, heading))
     below = rows >= foot[None]
-    ground = below & (plane.along < settings.far_m)
+    ground = below & (plane.along < _FAR_M)
     sky = (rows < find_skyline_rows(share.sky, unknown, horizon)[None]) & ~below
     upright = ~ground & ~sky
-    # What is known is what it looks like: trees before the sky, signs on the verge.
+    # Known pixels are classified by their own shares: trees in front of the sky, signs on the verge.
     flat = np.where(unknown, ground, ground & ((share.ground if share.flat is None else share.flat) > 0.5))
     clear = np.where(unknown, sky, share.sky > 0.5)
     along = np.where(flat, plane.along, 1.0)
@@ -163,27 +167,27 @@ def continue_street(
     row = np.rint(np.log(np.maximum(along, 1.0)) / (coarse * _ALONG)).astype(np.int64)
     laid_out = flat & (column >= 0) & (column < columns) & (row < rows)
     cell = np.where(laid_out, row * columns + column, 0)
-    local, profile = _profile(image, cell, laid_out & ~unknown, settings)
+    local, profile = _road_profile(image, cell, laid_out & ~unknown, coarse)
     local = np.where(laid_out[..., None], local.reshape(-1, 3)[cell], 0)
     profile = np.where(laid_out[..., None], profile.reshape(-1, 3)[cell], 0)
     rest = (image - profile).astype(np.float32)
-    # What differs from the ground around it is a line, a dash or a crossing's bar: continued, it would be a smear.
-    odd = channel_max(np.abs(image - local)) / settings.marking
-    weight = np.where(unknown | ~flat, 0, np.where(laid_out, 1 / (1 + odd**4), 1)).astype(np.float32)
-    guess = _sideways(rest, weight) + profile
-    # Paint at the borders of removed cars must not tint what stands behind them.
+    # Lines, dashes and crossings differ from the ground around them; continued, they would smear.
+    marking = channel_max(np.abs(image - local)) / _MARKING
+    weight = np.where(unknown | ~flat, 0, np.where(laid_out, 1 / (1 + marking**4), 1)).astype(np.float32)
+    guess = _fill_sideways(rest, weight) + profile
+    # Paint at the borders of removed cars must not tint the walls behind them.
     apart = cv2.distanceTransform((~unknown).astype(np.uint8), cv2.DIST_L2, 5) > _PAINT_PX
     standing = (apart & ~flat & ~clear).astype(np.float32)
-    walls = (_sideways(image, standing) + push_pull(image, standing)) / 2
+    walls = (_fill_sideways(image, standing) + push_pull(image, standing)) / 2
     guess = np.where(upright[..., None], walls, guess)
-    guess = np.where(sky[..., None], _sideways(image, (~unknown & clear).astype(np.float32)), guess)
+    guess = np.where(sky[..., None], _fill_sideways(image, (~unknown & clear).astype(np.float32)), guess)
     guess = np.clip(guess, 0, 1)
     return StreetContinuation(
         np.where(unknown[..., None], guess, image).astype(np.float32), ground, heading, bend, foot
     )
 
 
-def _column_ahead(plane: GroundCoordinates, heading: float) -> float:
+def _vanishing_column(plane: GroundCoordinates, heading: float) -> float:
     """Column of the road's vanishing point: where the farthest row of the ground lies straight ahead."""
     rows = np.flatnonzero((plane.along < 399).all(1))
     if rows.size == 0:
@@ -194,30 +198,40 @@ def _column_ahead(plane: GroundCoordinates, heading: float) -> float:
 def find_foot_rows(
     ground: NDArray[np.float32], unknown: Mask, plane: GroundCoordinates, horizon: float, ahead: float
 ) -> NDArray[np.float64]:
-    """Row (W,) at which each column's ground ends, by how much (H, W) known pixels look like ground.
+    """Find the row at which each column's ground ends.
 
-    Where that is hidden, it goes on straight from what is seen beside, at most towards the road's vanishing point
-    in the horizon's column `ahead`; where nothing is seen beside, walls are taken to stand `_BESIDE_M` further out
-    than the last that is surely ground. It stays within what is hidden.
+    A hidden foot continues straight from the visible columns next to it, at most towards the road's vanishing
+    point. Without such columns, walls are assumed `_PAVEMENT_M` beyond the last certain ground. A hidden foot
+    stays within the hidden rows.
+
+    Args:
+        ground: Share of ground (H, W) in known pixels.
+        unknown: Hidden pixels (H, W).
+        plane: Ground coordinates of the pixels.
+        horizon: Its row, px.
+        ahead: Column of the road's vanishing point.
+
+    Returns:
+        Rows (W,).
     """
     height = ground.shape[0]
     start = int(np.clip(np.ceil(horizon + 1), 0, height - 2))
-    top, bottom = (start + part for part in _splits(ground[start:], unknown[start:]))
+    top, bottom = (start + part for part in _class_splits(ground[start:], unknown[start:]))
     columns = np.arange(len(top))
     sure = bottom - top <= _SURE_PX
     foot = (top + bottom) / 2
     foot[sure] = median_filter(foot[sure], 15, mode="nearest") if sure.any() else foot[sure]
     last = np.minimum(bottom, height - 1).astype(np.int64)
     aside = np.abs(plane.across[last, columns] - (plane.across[last, np.full_like(columns, int(ahead))]))
-    beside, farthest = (horizon + (last - horizon) * aside / (aside + gap) for gap in (_BESIDE_M, _FARTHEST_M))
+    default, farthest = (horizon + (last - horizon) * aside / (aside + gap) for gap in (_PAVEMENT_M, _FARTHEST_M))
     edges = np.flatnonzero(np.diff(np.concatenate([[True], sure, [True]]).astype(np.int8)))
     for first, end in zip(edges[::2], edges[1::2], strict=True):
         here = columns[first:end]
-        left = _onward(columns, foot, sure & (columns < first), (horizon, ahead), here)
-        right = _onward(columns, foot, sure & (columns >= end), (horizon, ahead), here)
+        left = _extrapolate_foot(columns, foot, sure & (columns < first), (horizon, ahead), here)
+        right = _extrapolate_foot(columns, foot, sure & (columns >= end), (horizon, ahead), here)
         if left is None or right is None:
-            one = right if left is None else left
-            foot[here] = beside[here] if one is None else np.maximum(one, farthest[here])
+            side = right if left is None else left
+            foot[here] = default[here] if side is None else np.maximum(side, farthest[here])
         elif (first - 1 - ahead) * (end - ahead) > 0:
             foot[here] = np.interp(here, [first - 1, end], [foot[first - 1], foot[end]])
         else:
@@ -225,17 +239,17 @@ def find_foot_rows(
     return np.clip(foot, np.where(sure, foot, top), np.where(sure, foot, bottom))
 
 
-def _onward(
+def _extrapolate_foot(
     columns: NDArray[np.int64],
     foot: NDArray[np.float64],
     known: Mask,
     vanishing: tuple[float, float],
     to: NDArray[np.int64],
 ) -> NDArray[np.float64] | None:
-    """Rows at columns `to` of the line through the known columns next to them; None where these tell nothing."""
+    """Rows at columns `to` of the line through the known columns next to them; None if these determine no line."""
     horizon, ahead = vanishing
     near = columns[known & (np.abs(columns - to.mean()) < to.size / 2 + _FIT_PX)]
-    if near.size < _LEAST_COLUMNS:
+    if near.size < _MIN_COLUMNS:
         return None
     end = near[np.abs(near - to.mean()).argmin()]
     apart = float(end - ahead)
@@ -249,13 +263,21 @@ def _onward(
 
 
 def find_skyline_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -> NDArray[np.float64]:
-    """Row (W,) below which each column shows no sky any more.
+    """Find the row of each column's skyline, below which there is no sky.
 
-    Where that is hidden, it is the lower of both sides: what is higher than the rest of the skyline, a tree or a
-    house, ends soon behind its own edge.
+    A hidden skyline is the lower of both sides: a tree or house that rises above the rest ends soon behind its
+    edge.
+
+    Args:
+        sky: Share of sky (H, W) in known pixels.
+        unknown: Hidden pixels (H, W).
+        horizon: Its row, px.
+
+    Returns:
+        Rows (W,).
     """
     end = int(np.clip(np.ceil(horizon + 1), 2, sky.shape[0]))
-    top, bottom = _splits(1 - sky[:end], unknown[:end])
+    top, bottom = _class_splits(1 - sky[:end], unknown[:end])
     sure = bottom - top <= _SURE_PX
     if not sure.any():
         return top
@@ -271,12 +293,13 @@ def find_skyline_rows(sky: NDArray[np.float32], unknown: Mask, horizon: float) -
     return np.clip(np.where(sure, np.interp(columns, known, rows), hidden), top, bottom)
 
 
-def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rows (W,) between which each column begins to belong to a class below, by its share (H, W) in known
-    pixels."""
+def _class_splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """First and last row (W,) of the equally good splits of each column into other pixels above and a class below,
+    by the class's share (H, W) in known pixels.
+    """
     height, width = share.shape
     gain = np.where(unknown, 0.0, share - 0.5)
-    # Of all splits the one with most of the class below it and least above it.
+    # The best split has most of the class below it and least above it.
     total = np.concatenate([np.cumsum(gain[::-1], 0)[::-1], np.zeros((1, width))])
     total = 2 * total - gain.sum(0)
     good = total >= total.max(0) - _DOUBT
@@ -286,8 +309,17 @@ def _splits(share: NDArray[np.float32], unknown: Mask) -> tuple[NDArray[np.float
 def estimate_road_course(
     image: Image, known: Mask, plane: GroundCoordinates, voters: int = _VOTERS
 ) -> tuple[float, float]:
-    """Heading (slope) and bend (1/m) of the road: the course that most edges on the known ground follow, of
-    some `voters`; 0, 0 where there are too few."""
+    """Estimate the road's course: the one that most edges on the ground follow.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        known: Ground pixels (H, W) that may vote.
+        plane: Ground coordinates of the pixels.
+        voters: About how many edge pixels vote.
+
+    Returns:
+        Heading (slope) and curvature (1/m); 0, 0 if there are too few edges.
+    """
     smooth: Any = cv2.GaussianBlur(channel_mean(image), (0, 0), 1.0)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
     strength = np.hypot(gx, gy)
@@ -301,7 +333,7 @@ def estimate_road_course(
     tangent_u, tangent_v = -gy[rows, columns], gx[rows, columns]
 
     def change(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Along the edge: central differences in the image."""
+        """Central differences along the edges."""
         right, left = values[rows, columns + 1], values[rows, columns - 1]
         down, up = values[rows + 1, columns], values[rows - 1, columns]
         return ((right - left) * tangent_u + (down - up) * tangent_v) / 2
@@ -319,10 +351,11 @@ def estimate_road_course(
     return best[1], best[2]
 
 
-def _profile(image: Image, cell: NDArray[np.int64], known: Mask, settings: StreetSettings) -> tuple[Image, Image]:
-    """The ground's colour around each cell, and how much what runs along the road differs from the street's, both
-    (rows, columns, 3) of the straightened ground."""
-    shape = (_ROWS // settings.coarse, _COLUMNS // settings.coarse)
+def _road_profile(image: Image, cell: NDArray[np.int64], known: Mask, coarse: int) -> tuple[Image, Image]:
+    """The ground's colour around each cell, and the difference of lines along the road from it, both (rows,
+    columns, 3) of the straightened ground.
+    """
+    shape = (_ROWS // coarse, _COLUMNS // coarse)
     where, size = cell[known], shape[0] * shape[1]
     count = np.bincount(where, minlength=size).reshape(shape)
     colour = np.stack([np.bincount(where, image[..., c][known], size) for c in range(3)], -1).reshape(*shape, 3)
@@ -330,30 +363,28 @@ def _profile(image: Image, cell: NDArray[np.int64], known: Mask, settings: Stree
     filled = known_cells = (count > 0).astype(np.float32)
 
     def mean(values: Image, weight: NDArray[np.float32], sigma: tuple[float, float]) -> tuple[Image, Image]:
-        down, across = sigma[0] / settings.coarse, sigma[1] / settings.coarse
+        down, across = sigma[0] / coarse, sigma[1] / coarse
         total = cv2.GaussianBlur(weight, (0, 0), sigmaX=across, sigmaY=down)
         blurred = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigmaX=across, sigmaY=down)
         return (blurred / np.maximum(total, 1e-4)[..., None]).astype(np.float32), np.asarray(total, np.float32)
 
     street, _ = mean(colour, filled, (1.5, 40.0))
     difference = colour - street
-    # Paint has colours that no ground has: a car that nobody labelled must not run on along the road.
+    # Car paint has colours that no ground has: an unlabelled car must not continue along the road.
     tint = channel_max(np.abs(difference - channel_mean(difference)[..., None]))
     filled = np.asarray(filled / (1 + (tint / _TINT) ** 4), np.float32)
     weight = filled
     line, total = mean(difference, weight, (10.0, 0.5))
     for _ in range(3):
-        # Reweighted, the mean comes near to a median: dashes do not become lines, lines stay.
-        weight = np.asarray(
-            filled / (1 + (channel_max(np.abs(difference - line)) / settings.robust) ** 2), np.float32
-        )
+        # Reweighting brings the mean near to the median: dashes do not become lines, lines stay.
+        weight = np.asarray(filled / (1 + (channel_max(np.abs(difference - line)) / _ROBUST) ** 2), np.float32)
         line, total = mean(difference, weight, (10.0, 0.5))
     local, _ = mean(colour, known_cells, (1.5, _AROUND))
     return local, line * np.clip(total * 10, 0, 1)[..., None]
 
 
-def _sideways(image: Image, weight: NDArray[np.float32]) -> Image:
-    """Smooth continuation (H, W, 3), mostly within rows, of pixels that count by weight (H, W)."""
+def _fill_sideways(image: Image, weight: NDArray[np.float32]) -> Image:
+    """Smooth continuation (H, W, 3), mostly within rows, of weighted pixels; weight (H, W)."""
     height, width = weight.shape
     size = (max(width // _SQUASH, 1), height)
     mass = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)

@@ -1,7 +1,7 @@
-"""Which mesh a labelled car is likeliest of, and which way it heads, before anything is known of its outline.
+"""Choose the likeliest template and heading of a labelled car by edges, before its mask is known.
 
-Labels are off by degrees, and an outline hardly tells: a car that is turned a little and longer looks alike. Edges
-within the outline do not.
+Labels are off by degrees, and an outline hardly determines the heading: a car turned a little and a longer car
+look alike. Edges inside the outline differ.
 """
 
 from __future__ import annotations
@@ -19,78 +19,84 @@ from scene_ir.raster import verbs
 from scene_ir.types import Camera
 
 _TRIED_TURNS_RAD = (-0.1, -0.05, 0.05, 0.1)
-"""Headings that are tried beside a label's, rad: it is off by some five degrees; two the fit finds by itself."""
+"""Turns from the label's heading that are tried: labels are off by some 5 degrees; the fit corrects 2."""
 _LABEL_TURN_RAD = 0.08
-"""Standard deviation of a label's heading."""
+"""Standard deviation of a label's heading, rad."""
 _TURN_COST = 0.005
-"""What one such deviation, half squared, costs in distance of edges: all others are evidence, this is a habit."""
+"""Cost, in edge distance, of a turn by that deviation, twice: half its square counts."""
 MIN_VISIBLE_SHARE = 0.5
-"""Share of a car that must show for its edges to be believed against its label."""
-_RANK_COST, _PICKUP_COST = 0.004, 0.04
-"""What it costs a mesh to be less likely by its proportions, each place, and to be a pickup, in distance of edges:
-seen from its ends a car hardly differs from others, and on Europe's roads one in fifty is a pickup."""
+"""Share of a car that must be visible for its edges to outweigh its label."""
+_RANK_COST = 0.004
+"""Cost, in edge distance, of each rank of a template by its proportions."""
+_PICKUP_COST = 0.04
+"""Cost, in edge distance, of a pickup: seen from its ends it looks like other cars, and on Europe's roads one car
+in fifty is one."""
 _FIXED_HEADING = BoxAlignmentSettings(turn_rad=0.01)
-"""A box may move what is tried, not turn it back."""
+"""A tried heading may be moved to fill the box, but not turned back."""
 _FIXED_POSE = BoxAlignmentSettings(shift_m=0.05, lift_m=0.02, turn_rad=0.01, stretch=0.02)
-"""How far a box may move a car that a laser measured."""
+"""For a car that a laser measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPhotograph:
-    """The photograph as one car's. picture (H, W, 3) RGB; hidden (H, W): pixels of nearer things."""
+    """A photograph as evidence about one object."""
 
     picture: NDArray[np.uint8]
+    """(H, W, 3) RGB."""
     hidden: Mask
+    """(H, W), pixels of nearer objects."""
     camera: Camera
+    """The photograph's camera."""
     backend: verbs.Backend = "warp"
+    """Of the rasteriser."""
 
+    def visible_share(self, placement: Placement) -> float:
+        """Share of a placed mesh's pixels that nothing nearer hides; 0 if it has none."""
+        outline = render_silhouettes([placement], self.camera, self.backend)[0]
+        total = np.count_nonzero(outline)
+        return np.count_nonzero(outline & ~self.hidden) / total if total else 0.0
 
-def visible_share(placement: Placement, view: ObjectPhotograph) -> float:
-    """Share of a placed mesh's pixels that nothing nearer hides, 0 where it has none."""
-    outline = render_silhouettes([placement], view.camera, view.backend)[0]
-    whole = np.count_nonzero(outline)
-    return np.count_nonzero(outline & ~view.hidden) / whole if whole else 0.0
+    def edge_distances(self, placements: Sequence[Placement]) -> NDArray[np.float64]:
+        """Distances (N,) of each placed mesh's edges from the photograph's."""
+        return np.array(measure_edge_distances(placements, self.hidden, self.picture, self.camera, self.backend))
 
 
 def choose_pose(
-    options: Sequence[Placement], box: LabelBoxes | None, view: ObjectPhotograph, measured: bool = False
+    options: Sequence[Placement], box: LabelBoxes | None, photograph: ObjectPhotograph, measured: bool = False
 ) -> tuple[list[Placement], NDArray[np.float64]]:
-    """The options where they stand best, and how far their edges are from the photograph's, (N,), a little more
-    for what is rare: the likeliest has the least.
+    """Align each option with the label's 2D box and rate it; try other headings for the best one.
 
-    options: meshes at the label, the likeliest by what the label says first; box: the label's (1 row), where its
-    sides can be trusted; measured: by a laser. Then, and where little of it shows, no other headings are tried.
+    Args:
+        options: N meshes at the label, the likeliest by its proportions first.
+        box: The label's 2D box (one row) if its sides can be trusted.
+        photograph: The photograph, for its edges.
+        measured: Whether a laser measured the pose. Then, and where little is visible, no other heading is tried.
+
+    Returns:
+        The N placements, and their edge distances (N,) plus penalties: the likeliest has the least.
     """
 
-    def filling(placements: list[Placement], settings: BoxAlignmentSettings | None) -> list[Placement]:
+    def align(placements: list[Placement], settings: BoxAlignmentSettings | None) -> list[Placement]:
         if box is None:
             return placements
         count = len(placements)
         boxes = LabelBoxes(box.xyxy.expand(count, 4), box.trust.expand(count, 4))
-        return align_to_boxes(placements, boxes, view.camera, settings)[0]
+        return align_to_boxes(placements, boxes, photograph.camera, settings)
 
-    def distances(placements: Sequence[Placement]) -> NDArray[np.float64]:
-        return np.array(measure_edge_distances(placements, view.hidden, view.picture, view.camera, view.backend))
-
-    standing = filling(list(options), _FIXED_POSE if measured else None)
-    habit = [
-        _RANK_COST * i + _PICKUP_COST * option.mesh.name.startswith("pickup-") for i, option in enumerate(options)
-    ]
-    apart = distances(standing) + np.array(habit)
-    best = int(np.argmin(apart))
-    if measured or visible_share(standing[best], view) < MIN_VISIBLE_SHARE:
-        return standing, apart
-    start = options[best] if box is not None else standing[best]
-    middle = standing[best].yaw
-    others = filling([replace(start, yaw=middle + turn) for turn in _TRIED_TURNS_RAD], _FIXED_HEADING)
-    tried = [standing[best], *others]
-    # all at once: one window, or their distances would not compare
-    off = distances(tried)
-    label = float(options[best].yaw)
-    doubt = [
-        _TURN_COST * (math.remainder(float(p.yaw) - label, 2 * math.pi) / _LABEL_TURN_RAD) ** 2 / 2 for p in tried
-    ]
-    chosen = int(np.argmin(off + np.array(doubt)))
-    standing[best] = tried[chosen]
-    apart[best] += min(off[chosen] - off[0], 0.0)
-    return standing, apart
+    aligned = align(list(options), _FIXED_POSE if measured else None)
+    penalties = [_RANK_COST * i + _PICKUP_COST * o.mesh.name.startswith("pickup-") for i, o in enumerate(options)]
+    costs = photograph.edge_distances(aligned) + np.array(penalties)
+    best = int(np.argmin(costs))
+    if measured or photograph.visible_share(aligned[best]) < MIN_VISIBLE_SHARE:
+        return aligned, costs
+    start = options[best] if box is not None else aligned[best]
+    yaw = aligned[best].yaw
+    tried = [aligned[best], *align([replace(start, yaw=yaw + turn) for turn in _TRIED_TURNS_RAD], _FIXED_HEADING)]
+    # in one call: distances compare only within one window
+    distances = photograph.edge_distances(tried)
+    label_yaw = float(options[best].yaw)
+    turns = [math.remainder(float(p.yaw) - label_yaw, 2 * math.pi) / _LABEL_TURN_RAD for p in tried]
+    chosen = int(np.argmin(distances + np.array([_TURN_COST * turn**2 / 2 for turn in turns])))
+    aligned[best] = tried[chosen]
+    costs[best] += min(distances[chosen] - distances[0], 0.0)
+    return aligned, costs

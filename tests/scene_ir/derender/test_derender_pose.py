@@ -217,12 +217,12 @@ def test_damaged_weights_are_named(tmp_path: Path) -> None:
     for data in (whole[:4], whole[:100], whole[:-2000], b"\x02\0\0\0\0\0\0\0[]"):
         path.write_bytes(data)
         with pytest.raises(FormatError, match=r"pose\.safetensors"):
-            pose.load(path)
+            pose.load_network(path)
     with pytest.raises(FormatError, match=r"none\.safetensors"):
-        pose.load(tmp_path / "none.safetensors")
+        pose.load_network(tmp_path / "none.safetensors")
     path.write_bytes(whole.replace(b"out.bias", b"not.bias"))
     with pytest.raises(FormatError, match=r"not\.bias: expected none|out\.bias: expected a tensor"):
-        pose.load(path)
+        pose.load_network(path)
 
 
 def test_the_weights_are_small() -> None:
