@@ -1,8 +1,8 @@
-"""Pages of the documentation's site whose text stands elsewhere: the README, model cards, what the parser knows.
+"""Generate the pages of the documentation site that are not in docs/: README, model cards, commands, API.
 
     mkdocs build --strict -f tools/site/mkdocs.yml
 
-Links between files of the repository become links between pages; what is no page is named without a link.
+Links between files of the repository become links between pages. A link to a file that has no page becomes its name.
 """
 
 from __future__ import annotations
@@ -20,52 +20,58 @@ from drivesem.config.commands import COMMANDS
 from drivesem.config.help import TOPICS, command_help
 
 ROOT = Path(__file__).resolve().parents[2]
-WRITTEN = {
+PAGES_OUTSIDE_DOCS = {
     "index.md": "README.md",
     "conventions.md": "scene_ir/conventions.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
 }
-"""Pages whose text is a file beside docs/."""
+"""Pages whose text is a file outside docs/."""
 CARDS = ("detectors/weights", "scene_ir/derender/weights")
 API = {
     "drivesem": ("drivesem.scenes.scene", "drivesem.run.counterexample", "drivesem.run.finished"),
     "detectors": ("detectors.base", "detectors.registry", "detectors.planted"),
     "scene_ir": ("scene_ir.types", "scene_ir.geometry", "scene_ir.files"),
 }
-"""Modules of the reference, by package: what others build on."""
+"""Modules of the API reference, by package."""
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
 
 
-def sources() -> dict[str, str]:
-    """Where each page's text stands, by its place in the site; both relative, to docs/ and to the repository."""
+def page_sources() -> dict[str, str]:
+    """Source file of each page outside docs/, by the page's path in the site."""
     cards = (card for folder in CARDS for card in sorted((ROOT / folder).glob("*.md")))
-    return WRITTEN | {f"cards/{card.stem}.md": card.relative_to(ROOT).as_posix() for card in cards}
+    return PAGES_OUTSIDE_DOCS | {f"cards/{card.stem}.md": card.relative_to(ROOT).as_posix() for card in cards}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the pages that docs/ does not hold."""
-    for place, source in sources().items():
+    """Add the pages that are not in docs/."""
+    for place, source in page_sources().items():
         text = (ROOT / source).read_text(encoding="utf-8")
-        files.append(File.generated(config, place, content=relinked(text, source, place)))
+        files.append(File.generated(config, place, content=relink(text, source, place)))
     for place, text in (
-        ("cards.md", "".join(cards_page())),
-        ("reference/commands.md", "".join(commands_page())),
-        ("reference/python.md", "".join(api_page())),
+        ("cards.md", "".join(iterate_cards())),
+        ("reference/commands.md", "".join(iterate_commands())),
+        ("reference/api.md", "".join(iterate_api())),
     ):
         files.append(File.generated(config, place, content=text))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links of docs/ that lead out of it."""
+    """Rewrite links of pages in docs/ to files outside it."""
     place = page.file.src_uri
-    return markdown if page.file.generated_by else relinked(markdown, f"docs/{place}", place)
+    return markdown if page.file.generated_by else relink(markdown, f"docs/{place}", place)
 
 
-def relinked(markdown: str, source: str, place: str) -> str:
-    """Links of a file of the repository as links from a page. source: the file, place: the page."""
-    pages = {file: page for page, file in sources().items()} | {"detectors/weights": "cards.md"}
+def relink(markdown: str, source: str, place: str) -> str:
+    """Rewrite links of a repository file for the site.
+
+    Args:
+        markdown: Text of the file.
+        source: Its path in the repository.
+        place: Path of its page in the site.
+    """
+    pages = {file: page for page, file in page_sources().items()} | {"detectors/weights": "cards.md"}
 
     def link(match: re.Match[str]) -> str:
         picture, text, target, anchor = match[1], match[2], match[3], match[4] or ""
@@ -80,18 +86,18 @@ def relinked(markdown: str, source: str, place: str) -> str:
     return _LINK.sub(link, markdown)
 
 
-def cards_page() -> Iterator[str]:
-    """What ships with weights, a line each."""
-    yield "# Model cards\n\nEach network that ships: where its weights come from, and what was measured.\n\n"
-    for place, source in sources().items():
+def iterate_cards() -> Iterator[str]:
+    """Yield an index of the model cards."""
+    yield "# Model cards\n\nEach bundled network: origin of its weights, and measurements.\n\n"
+    for place, source in page_sources().items():
         if place.startswith("cards/"):
             title = (ROOT / source).read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
             yield f"- [{title}]({place})\n"
 
 
-def commands_page() -> Iterator[str]:
-    """What `drivesem COMMAND --help` says of every command, by topic."""
-    yield "# Every option\n\nWhat `drivesem COMMAND --help` says.\n"
+def iterate_commands() -> Iterator[str]:
+    """Yield the options of every command, by topic."""
+    yield "# Commands\n\nAll options, as `drivesem COMMAND --help-all` prints them.\n"
     for topic, names in TOPICS.items():
         yield f"\n## {topic}\n"
         for name in names:
@@ -99,9 +105,9 @@ def commands_page() -> Iterator[str]:
                 yield f"\n### {name}\n\n```text\n{command_help(name)}```\n"
 
 
-def api_page() -> Iterator[str]:
-    """The public names of what others build on, by their docstrings."""
-    yield "# The Python API\n\nShapes, units and errors as the docstrings tell them.\n\n"
+def iterate_api() -> Iterator[str]:
+    """Yield the public API from its docstrings."""
+    yield "# Signatures\n\nThe public API, generated from docstrings.\n\n"
     for modules in API.values():
         for module in modules:
             yield f"::: {module}\n\n"

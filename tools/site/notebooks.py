@@ -23,7 +23,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from PIL import Image
 
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from scene_ir import files
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             continue
         if not words.check:
             files.write_text(path, nbformat.writes(notebook) + "\n")
-        print(f"{path.name}: {number_of(len(notebook.cells), 'cell')}", file=sys.stderr)
+        print(f"{path.name}: {format_count(len(notebook.cells), 'cell')}", file=sys.stderr)
     return failed
 
 
