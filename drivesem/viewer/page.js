@@ -187,7 +187,7 @@ async function load(name, told) {
   $("words").textContent = "loading";
   const answer = await ask("/frame", {frame: name});
   frame = await answer.json();
-  knobs = new Map(frame.knobs.map(knob => [knob.name, knob]));
+  knobs = new Map(frame.sliders.map(knob => [knob.name, knob]));
   seen = pictured = null;
   $("title").textContent = [overview.title, overview.detector, frame.change].filter(Boolean).join(" · ");
   $("frame").value = name;
@@ -202,19 +202,19 @@ async function load(name, told) {
     return chip;
   }));
   sliders = new Map();
-  fill($("scene-knobs"), frame.knobs.filter(knob => knob.car === null));
+  fill($("scene-knobs"), frame.sliders.filter(knob => knob.car === null));
   $("street").replaceChildren();
   take(told);
   changed();
 }
-const carKnobs = car => frame.knobs.filter(knob => knob.car === car);
+const carKnobs = car => frame.sliders.filter(knob => knob.car === car);
 const movable = () => frame.cars.filter(car => carKnobs(car.car).length).map(car => car.car);
 
 /* The car that sliders, keys and the map are about; -1: the one to begin with. */
 function choose(car, x = null, y = null, tell = true) {
   if (!movable().includes(car)) car = frame.focus;
   const last = shown.x.startsWith("objects[") ? [shown.x, shown.y].map(n => n.slice(n.indexOf("].") + 2)) : null;
-  const axes = frame.knobs.filter(knob => knob.car === null || knob.car === car).map(knob => knob.name);
+  const axes = frame.sliders.filter(knob => knob.car === null || knob.car === car).map(knob => knob.name);
   const first = [x, last && named(car, last[0]), named(car, "translate.across"), axes[0]].find(n => n && axes.includes(n));
   const second = [y, last && named(car, last[1]), named(car, "translate.along"), ...axes].find(n => n && n !== first && axes.includes(n));
   if (shown.car !== car || shown.x !== first || shown.y !== second || $("map-x").dataset.of !== `${frame.name} ${car}`) {

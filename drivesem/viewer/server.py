@@ -1,8 +1,7 @@
-"""The page and its answers over HTTP, for this machine alone.
+"""Serve the viewer's page and data over HTTP on this machine.
 
-Bound to 127.0.0.1. Everything is a GET that changes nothing. A request must name this server as its host, so that
-no other site's page can ask by a name of its own that leads here, and what it asks must be known: anything else
-gets one line and a 4xx.
+The server listens on 127.0.0.1 and only answers GET requests, which change nothing. A request must name this server as
+its host, so that no other site can reach it through DNS rebinding. Anything unknown gets one line and a 4xx status.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from urllib.parse import parse_qsl, urlsplit
 
 from detectors.base import Predictor
 from drivesem.attack.space import Budget
-from drivesem.viewer.knobs import State
-from drivesem.viewer.stage import Stage
-from scene_ir.errors import SceneError, shown
+from drivesem.viewer.scene import InteractiveScene
+from drivesem.viewer.sliders import State
+from scene_ir.errors import SceneError, make_printable
 
 HOST = "127.0.0.1"
 GRID = 9
-"""Cells of a failure map each way: a minute at most on two cores."""
+"""Cells of a failure map per axis: at most a minute on two cores."""
 POLICY = (
     "default-src 'none'; img-src 'self' blob: data:; style-src 'self'; script-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""What the page may do."""
+"""Content security policy of the page."""
 _ASSETS = {
     "/": ("drivesem.viewer", "page.html", "text/html; charset=utf-8"),
     "/page.css": ("drivesem.viewer", "page.css", "text/css; charset=utf-8"),
@@ -45,171 +44,198 @@ _ASSETS = {
     "/report.css": ("drivesem.report", "style.css", "text/css; charset=utf-8"),
 }
 _JSON, _JPEG, _PNG, _TEXT = "application/json", "image/jpeg", "image/png", "text/plain; charset=utf-8"
-_KEPT_STAGES, _KEPT_PAGES = 2, 64
+_MAX_SCENES, _MAX_PAGES = 2, 64
 _MOST_FIELDS = 2000
-_PATIENCE_S = 10.0
-_ASIDE = "aside"
-"""A kind of request: for what is looked at while nothing moves."""
+_CLOSE_TIMEOUT_S = 10.0
+_BACKGROUND = "background"
+"""Kind of a background request, which runs while nothing moves."""
 _LONGEST_LINE = 300
 
 T = TypeVar("T")
 
 
 class RefusedError(ValueError):
-    """A request that gets one line and a status."""
+    """A request that is answered with one line and an error status."""
 
-    def __init__(self, words: str, status: HTTPStatus = HTTPStatus.BAD_REQUEST) -> None:
-        super().__init__(words)
+    def __init__(self, message: str, status: HTTPStatus = HTTPStatus.BAD_REQUEST) -> None:
+        super().__init__(message)
         self.status = status
 
 
 @dataclass(frozen=True, slots=True)
-class ShownFrame:
-    """A scene's folder, and what is said of it beside its name."""
+class ViewerFrame:
+    """One frame of the viewer."""
 
     folder: Path
+    """Folder of its scene."""
     words: str = ""
+    """Text after its name in the list of frames."""
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
-    """Which of a page's states a request is about. page: "" where it does not say."""
+class RequestOrder:
+    """Position of a request among those of its page, to drop superseded ones."""
 
     page: str
+    """Identifier of the page; "" if it sends none."""
     number: int
+    """Increases with each state of the page."""
 
 
 class Viewer:
-    """What the server answers. frames: by name; title: of the page. budget, t_star: as of `Stage`; grid: cells of
-    the failure map, each way.
+    """Answers the requests of the page.
 
-    Drawing and looking have a thread each, so that the next picture is drawn while the detector looks at the last
-    one. A request that a page has followed by a later one is dropped where it waits: queues don't grow.
+    Rendering and detecting run in one thread each, so the next picture is rendered while the detector evaluates the
+    last one. A waiting request is dropped when its page sends a later one.
     """
 
     def __init__(
         self,
         title: str,
-        frames: Mapping[str, ShownFrame],
+        frames: Mapping[str, ViewerFrame],
         detector: Predictor,
         budget: Budget,
         t_star: float | None = None,
         grid: int = GRID,
     ) -> None:
+        """Create a viewer.
+
+        Args:
+            title: Title of the page.
+            frames: Frames by name.
+            detector: Detector that evaluates each state.
+            budget: Range of the sliders.
+            t_star: Score from which a detection counts; None: the detector's own.
+            grid: Cells of the failure map per axis.
+        """
         self.grid = grid
         self.title, self.frames, self.detector = title, frames, detector
         self._budget, self._t_star = budget, t_star
-        self._stages: OrderedDict[str, Stage] = OrderedDict()
+        self._scenes: OrderedDict[str, InteractiveScene] = OrderedDict()
         self._latest: OrderedDict[str, dict[str, int]] = OrderedDict()
-        self._making, self._turns = threading.Lock(), threading.Lock()
-        self._draw, self._see = (ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("draw", "see"))
+        self._loading, self._orders_lock = threading.Lock(), threading.Lock()
+        self._render_pool, self._detect_pool = (
+            ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("render", "detect")
+        )
 
     def overview(self) -> dict[str, Any]:
-        """What there is to see; for JSON."""
+        """Title, detector and frames, as JSON values."""
         frames = [{"name": name, "words": frame.words} for name, frame in self.frames.items()]
         return {"title": self.title, "detector": self.detector.name, "grid": self.grid, "frames": frames}
 
     def facts(self, name: str) -> dict[str, Any]:
-        """A frame's knobs and vehicles."""
-        stage = self.stage(name)
-        return {"name": name, **self._see.submit(stage.facts).result()}
+        """Sliders and vehicles of a frame, as JSON values."""
+        scene = self.scene(name)
+        return {"name": name, **self._detect_pool.submit(scene.facts).result()}
 
     def photograph(self, name: str) -> bytes:
-        """A frame's photograph, JPEG."""
-        return self.stage(name).photograph()
+        """JPEG of a frame's photograph."""
+        return self.scene(name).encode_photograph()
 
     def street(self, name: str) -> bytes:
-        """A frame's ground from above, PNG."""
-        return self.stage(name).street()
+        """PNG of a frame's ground from above."""
+        return self.scene(name).encode_street()
 
-    def picture(self, name: str, values: Mapping[str, float], turn: Turn) -> bytes:
-        """A state's picture, JPEG."""
-        stage, state = self._asked(name, values, turn, "picture")
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn, "picture")
-        return stage.picture(drawn)
+    def picture(self, name: str, values: Mapping[str, float], order: RequestOrder) -> bytes:
+        """JPEG of a state.
 
-    def detections(self, name: str, values: Mapping[str, float], turn: Turn) -> dict[str, Any]:
-        """What the detector finds in a state."""
-        stage, state = self._asked(name, values, turn, "detections")
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn, "detections")
-        return self._in_turn(self._see, lambda: stage.seen(state, drawn), turn, "detections")
+        Args:
+            name: Name of the frame.
+            values: Slider values.
+            order: Position of the request.
+        """
+        scene, state = self._register_request(name, values, order, "picture")
+        rendered = self._run_latest(self._render_pool, lambda: scene.render_state(state), order, "picture")
+        return scene.encode_picture(rendered)
 
-    def score(self, name: str, values: Mapping[str, float], turn: Turn, car: int) -> dict[str, Any]:
-        """What the detector makes of one vehicle in a state."""
-        stage, state = self._asked(name, values, turn, _ASIDE)
-        if not 0 <= car < len(stage.knobs.rest.objects):
+    def detections(self, name: str, values: Mapping[str, float], order: RequestOrder) -> dict[str, Any]:
+        """Detections in a state, as JSON values; arguments as `picture`."""
+        scene, state = self._register_request(name, values, order, "detections")
+        rendered = self._run_latest(self._render_pool, lambda: scene.render_state(state), order, "detections")
+        return self._run_latest(self._detect_pool, lambda: scene.detect(state, rendered), order, "detections")
+
+    def score(self, name: str, values: Mapping[str, float], order: RequestOrder, car: int) -> dict[str, Any]:
+        """Status and score of one vehicle (row `car`) in a state; other arguments as `picture`."""
+        scene, state = self._register_request(name, values, order, _BACKGROUND)
+        if not 0 <= car < len(scene.sliders.rest.objects):
             raise RefusedError(f"car: expected a row of the scene, found {car}")
-        known = stage.known_score(state, car)
+        known = scene.known_score(state, car)
         if known is not None:
             return known
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state, keep=False), turn, _ASIDE)
-        return self._in_turn(self._see, lambda: stage.score(state, car, drawn), turn, _ASIDE)
+        rendered = self._run_latest(
+            self._render_pool, lambda: scene.render_state(state, keep=False), order, _BACKGROUND
+        )
+        return self._run_latest(self._detect_pool, lambda: scene.score(state, car, rendered), order, _BACKGROUND)
 
-    def notes(self, name: str, values: Mapping[str, float], turn: Turn) -> list[str]:
-        """What no car can do in a state."""
-        stage, state = self._asked(name, values, turn, _ASIDE)
-        drawn = self._in_turn(self._draw, lambda: stage.drawn(state), turn, _ASIDE)
-        return self._in_turn(self._see, lambda: stage.notes(drawn), turn, _ASIDE)
+    def notes(self, name: str, values: Mapping[str, float], order: RequestOrder) -> list[str]:
+        """Violated constraints in a state; arguments as `picture`."""
+        scene, state = self._register_request(name, values, order, _BACKGROUND)
+        rendered = self._run_latest(self._render_pool, lambda: scene.render_state(state), order, _BACKGROUND)
+        return self._run_latest(self._detect_pool, lambda: scene.notes(rendered), order, _BACKGROUND)
 
-    def stage(self, name: str) -> Stage:
-        """A frame made ready, or as it was before."""
+    def scene(self, name: str) -> InteractiveScene:
+        """Load a frame, or return the cached one."""
         frame = self.frames.get(name)
         if frame is None:
-            raise RefusedError(f"frame: expected one of {len(self.frames)} frames, found {shown(name) or 'none'}")
-        with self._making:
-            known = self._stages.get(name)
+            raise RefusedError(
+                f"frame: expected one of {len(self.frames)} frames, found {make_printable(name) or 'none'}"
+            )
+        with self._loading:
+            known = self._scenes.get(name)
             if known is None:
-                make = partial(Stage, frame.folder, self.detector, self._budget, self._t_star)
-                # it draws and looks: neither thread may do so for another frame meanwhile
-                known = self._draw.submit(lambda: self._see.submit(make).result()).result()
-                self._stages[name] = known
-                while len(self._stages) > _KEPT_STAGES:
-                    self._stages.popitem(last=False)
+                make = partial(InteractiveScene, frame.folder, self.detector, self._budget, self._t_star)
+                # loading renders and detects, so it needs both threads
+                known = self._render_pool.submit(lambda: self._detect_pool.submit(make).result()).result()
+                self._scenes[name] = known
+                while len(self._scenes) > _MAX_SCENES:
+                    self._scenes.popitem(last=False)
             else:
-                self._stages.move_to_end(name)
+                self._scenes.move_to_end(name)
             return known
 
     def close(self) -> None:
-        """Let go of the threads."""
-        for pool in (self._draw, self._see):
+        """Stop the threads."""
+        for pool in (self._render_pool, self._detect_pool):
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _asked(self, name: str, values: Mapping[str, float], turn: Turn, kind: str) -> tuple[Stage, State]:
-        stage = self.stage(name)
-        state = stage.knobs.state(values)
-        if turn.page:
-            with self._turns:
-                latest = self._latest.setdefault(turn.page, {})
-                latest[kind] = max(turn.number, latest.get(kind, 0))
-                self._latest.move_to_end(turn.page)
-                while len(self._latest) > _KEPT_PAGES:
+    def _register_request(
+        self, name: str, values: Mapping[str, float], order: RequestOrder, kind: str
+    ) -> tuple[InteractiveScene, State]:
+        scene = self.scene(name)
+        state = scene.sliders.state(values)
+        if order.page:
+            with self._orders_lock:
+                latest = self._latest.setdefault(order.page, {})
+                latest[kind] = max(order.number, latest.get(kind, 0))
+                self._latest.move_to_end(order.page)
+                while len(self._latest) > _MAX_PAGES:
                     self._latest.popitem(last=False)
-        return stage, state
+        return scene, state
 
-    def _in_turn(self, pool: ThreadPoolExecutor, work: Callable[[], T], turn: Turn, kind: str) -> T:
-        """Work in its thread. RefusedError where the page asked for a later state's meanwhile; of what is asked
-        aside, where it asked anything about one.
+    def _run_latest(self, pool: ThreadPoolExecutor, work: Callable[[], T], order: RequestOrder, kind: str) -> T:
+        """Run `work` in a pool. Raises RefusedError if the page has sent a later request of the same kind, or for a
+        background request any later one.
         """
 
-        def do() -> T:
-            with self._turns:
-                latest = self._latest.get(turn.page, {})
-                newest = max(latest.values(), default=0) if kind == _ASIDE else latest.get(kind, 0)
-            if turn.number < newest:
+        def work_if_latest() -> T:
+            with self._orders_lock:
+                latest = self._latest.get(order.page, {})
+                newest = max(latest.values(), default=0) if kind == _BACKGROUND else latest.get(kind, 0)
+            if order.number < newest:
                 raise RefusedError("superseded by a later request", HTTPStatus.CONFLICT)
             return work()
 
-        return pool.submit(do).result()
+        return pool.submit(work_if_latest).result()
 
 
 class Server(ThreadingHTTPServer):
-    """A viewer at a port of this machine; 0 is any that is free."""
+    """The HTTP server of one viewer; port 0 is any free one."""
 
     daemon_threads = True
 
     def __init__(self, viewer: Viewer, port: int) -> None:
         self.viewer = viewer
-        self._answering, self._ended = 0, False
+        self._active_requests, self._ended = 0, False
         self._changed = threading.Condition()
         super().__init__((HOST, port), _Handler)
         number = self.server_port
@@ -217,36 +243,36 @@ class Server(ThreadingHTTPServer):
 
     @contextmanager
     def answering(self) -> Iterator[None]:
-        """While a request is answered. RefusedError at the end of the server."""
+        """Count a request that is being answered. Raises RefusedError after the server has ended."""
         with self._changed:
             if self._ended:
                 raise RefusedError("drivesem view has ended", HTTPStatus.SERVICE_UNAVAILABLE)
-            self._answering += 1
+            self._active_requests += 1
         try:
             yield
         finally:
             with self._changed:
-                self._answering -= 1
+                self._active_requests -= 1
                 self._changed.notify_all()
 
     def server_close(self) -> None:
-        """Ends, once what is being answered is: an interpreter that goes while a library's code runs in another
-        thread is aborted by it.
+        """Close after running requests have finished: the interpreter would abort while library code runs in another
+        thread.
         """
         super().server_close()
         with self._changed:
             self._ended = True
-            self._changed.wait_for(lambda: self._answering == 0, _PATIENCE_S)
+            self._changed.wait_for(lambda: self._active_requests == 0, _CLOSE_TIMEOUT_S)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A page that goes away is no error; anything else is told in one line."""
+        """Report errors in one line; a closed connection is none."""
         error = sys.exception()
         if not isinstance(error, ConnectionError | TimeoutError):
             sys.stderr.write(f"drivesem: {type(error).__name__}: {' '.join(str(error).split())}\n")
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{HOST}:{self.server_port}/"
 
 
@@ -265,19 +291,21 @@ class _Handler(BaseHTTPRequestHandler):
             content, kind, status = _line(error), _TEXT, error.status
         except SceneError as error:
             content, kind, status = _line(error), _TEXT, HTTPStatus.BAD_REQUEST
-        except Exception as error:  # a fault of ours: the page says so, and goes on
-            sys.stderr.write(f"drivesem: {shown(self.path, _LONGEST_LINE)}: {type(error).__name__}: {error}\n")
+        except Exception as error:  # an internal error: the page displays it and continues
+            sys.stderr.write(
+                f"drivesem: {make_printable(self.path, _LONGEST_LINE)}: {type(error).__name__}: {error}\n"
+            )
             content, kind, status = _line(error), _TEXT, HTTPStatus.INTERNAL_SERVER_ERROR
         self._send(content, kind, status)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Other methods, and what is no HTTP: one line too."""
+        """Answer other methods, and malformed requests, with one line."""
         self.close_connection = True
         status = HTTPStatus(code)
         self._send(f"{message or status.phrase}\n".encode(), _TEXT, status)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: a slider asks thirty times a second."""
+        """Log nothing: a slider sends thirty requests a second."""
 
     def _answer(self) -> tuple[bytes, str]:
         if self.headers.get("Host", "").lower() not in self.server.hosts:
@@ -290,8 +318,8 @@ class _Handler(BaseHTTPRequestHandler):
             return resources.files(package).joinpath(name).read_bytes(), kind
         route = _ROUTES.get(address.path)
         if route is None:
-            raise RefusedError(f"{shown(address.path)}: expected a known address", HTTPStatus.NOT_FOUND)
-        return route(self.server.viewer, _Query.of(address.query))
+            raise RefusedError(f"{make_printable(address.path)}: expected a known address", HTTPStatus.NOT_FOUND)
+        return route(self.server.viewer, _Query.parse(address.query))
 
     def _send(self, content: bytes, kind: str, status: HTTPStatus) -> None:
         try:
@@ -308,7 +336,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header(name, value)
             self.end_headers()
             self.wfile.write(content)
-        except ConnectionError:  # the page has gone, or asks for something later
+        except ConnectionError:  # the page was closed, or sent a later request
             self.close_connection = True
 
     def version_string(self) -> str:
@@ -317,33 +345,35 @@ class _Handler(BaseHTTPRequestHandler):
 
 @dataclass(frozen=True, slots=True)
 class _Query:
-    """What a request says. values: by knob's name."""
+    """The parsed query of a request; `values` by slider name."""
 
     frame: str
-    turn: Turn
+    order: RequestOrder
     car: int
     values: dict[str, float]
 
     @classmethod
-    def of(cls, text: str) -> _Query:
-        """RefusedError for what cannot be read."""
+    def parse(cls, text: str) -> _Query:
+        """Parse a query string. Raises RefusedError."""
         try:
             pairs = parse_qsl(text, keep_blank_values=True, max_num_fields=_MOST_FIELDS, errors="strict")
         except ValueError as error:
             raise RefusedError("query: expected NAME=VALUE with &, found something else") from error
-        told = dict(pairs)
-        if len(told) < len(pairs):
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
             raise RefusedError("query: expected each name once, found one twice")
-        frame, page = told.pop("frame", ""), told.pop("page", "")
-        number, car = (_whole(name, told.pop(name, "0")) for name in ("n", "car"))
+        frame, page = fields.pop("frame", ""), fields.pop("page", "")
+        number, car = (_whole(name, fields.pop(name, "0")) for name in ("n", "car"))
         if len(page) > 40:
             raise RefusedError("page: expected at most 40 characters, found more")
-        return cls(frame, Turn(page, number), car, {name: _number(name, value) for name, value in told.items()})
+        return cls(
+            frame, RequestOrder(page, number), car, {name: _number(name, value) for name, value in fields.items()}
+        )
 
 
 def _whole(name: str, text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 15):
-        raise RefusedError(f"{name}: expected a whole number from 0, found {shown(text)}")
+        raise RefusedError(f"{name}: expected a whole number from 0, found {make_printable(text)}")
     return int(text)
 
 
@@ -353,12 +383,12 @@ def _number(name: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise RefusedError(f"{shown(name)}: expected a number, found {shown(text)}")
+        raise RefusedError(f"{make_printable(name)}: expected a number, found {make_printable(text)}")
     return value
 
 
 def _line(error: Exception) -> bytes:
-    return (" ".join(shown(error, _LONGEST_LINE).split()) + "\n").encode()
+    return (" ".join(make_printable(error, _LONGEST_LINE).split()) + "\n").encode()
 
 
 def _json(value: object) -> tuple[bytes, str]:
@@ -370,8 +400,8 @@ _ROUTES: Mapping[str, Callable[[Viewer, _Query], tuple[bytes, str]]] = {
     "/frame": lambda viewer, q: _json(viewer.facts(q.frame)),
     "/photograph": lambda viewer, q: (viewer.photograph(q.frame), _JPEG),
     "/street": lambda viewer, q: (viewer.street(q.frame), _PNG),
-    "/picture": lambda viewer, q: (viewer.picture(q.frame, q.values, q.turn), _JPEG),
-    "/detections": lambda viewer, q: _json(viewer.detections(q.frame, q.values, q.turn)),
-    "/score": lambda viewer, q: _json(viewer.score(q.frame, q.values, q.turn, q.car)),
-    "/notes": lambda viewer, q: _json(viewer.notes(q.frame, q.values, q.turn)),
+    "/picture": lambda viewer, q: (viewer.picture(q.frame, q.values, q.order), _JPEG),
+    "/detections": lambda viewer, q: _json(viewer.detections(q.frame, q.values, q.order)),
+    "/score": lambda viewer, q: _json(viewer.score(q.frame, q.values, q.order, q.car)),
+    "/notes": lambda viewer, q: _json(viewer.notes(q.frame, q.values, q.order)),
 }

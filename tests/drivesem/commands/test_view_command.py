@@ -12,17 +12,15 @@ import sys
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from drivesem.cli import main
 from drivesem.commands import view
-from drivesem.config.commands import View
+from drivesem.config.commands import ViewConfig
 from drivesem.config.parsing import parse
-from drivesem.viewer import frames, window
+from drivesem.viewer import frames
 from scene_ir.io import load_scene, save_scene
 
 Refused = Callable[..., str]
@@ -32,7 +30,7 @@ Refused = Callable[..., str]
 def two_scenes(small_run: Path, tmp_path: Path) -> Path:
     """A folder of derender: its settings, and two scenes."""
     folder = tmp_path / "scenes"
-    scene = load_scene(small_run / "frames" / "demo-000" / "scene").at_rest()
+    scene = load_scene(small_run / "frames" / "demo-000" / "scene").unperturbed()
     for name in ("a", "b"):
         save_scene(scene, folder / name)
     (folder / "config.yaml").write_text("dataset: kitti\nlimit: 2\n")
@@ -40,13 +38,13 @@ def two_scenes(small_run: Path, tmp_path: Path) -> Path:
 
 
 def test_defaults() -> None:
-    assert parse(["view", "a"]) == View(scene="a")
+    assert parse(["view", "a"]) == ViewConfig(scene="a")
     config = parse(["view", "a", "--no-browser", "--port", "0", "--detector", "yolov3-slim", "--frame", "b"])
-    assert config == View(scene="a", browser=False, port=0, detector="yolov3-slim", frame="b")
+    assert config == ViewConfig(scene="a", browser=False, port=0, detector="yolov3-slim", frame="b")
 
 
 def test_a_run_shows_its_frames_to_its_detector(small_run: Path) -> None:
-    shown = frames.opened(View(scene=str(small_run)))
+    shown = frames.open_viewer_frames(ViewConfig(scene=str(small_run)))
     assert list(shown.frames) == ["demo-000"]
     assert shown.frames["demo-000"].words == "withstood"
     assert shown.frames["demo-000"].folder == small_run / "frames" / "demo-000" / "scene"
@@ -55,14 +53,14 @@ def test_a_run_shows_its_frames_to_its_detector(small_run: Path) -> None:
 
 
 def test_scenes_of_derender_are_no_run(two_scenes: Path) -> None:
-    assert list(frames.opened(View(scene=str(two_scenes))).frames) == ["a", "b"]
-    assert list(frames.opened(View(scene=str(two_scenes), frame="b")).frames) == ["b", "a"]
-    assert list(frames.opened(View(scene=str(two_scenes / "b"))).frames) == ["b"]
+    assert list(frames.open_viewer_frames(ViewConfig(scene=str(two_scenes))).frames) == ["a", "b"]
+    assert list(frames.open_viewer_frames(ViewConfig(scene=str(two_scenes), frame="b")).frames) == ["b", "a"]
+    assert list(frames.open_viewer_frames(ViewConfig(scene=str(two_scenes / "b"))).frames) == ["b"]
 
 
 def test_it_begins_with_a_frame_that_has_vehicles(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frames, "count_objects", lambda folder: 1 if folder.name == "b" else 0)
-    assert list(frames.opened(View(scene=str(two_scenes))).frames) == ["b", "a"]
+    assert list(frames.open_viewer_frames(ViewConfig(scene=str(two_scenes))).frames) == ["b", "a"]
 
 
 @pytest.mark.parametrize(
@@ -114,9 +112,9 @@ def test_the_next_port_that_is_free(two_scenes: Path, monkeypatch: pytest.Monkey
         other.listen()
         port = other.getsockname()[1]
         monkeypatch.setattr(view, "_PORT", port)
-        server = view._server(frames.opened(View(scene=str(two_scenes))), None)
+        server = view._create_server(frames.open_viewer_frames(ViewConfig(scene=str(two_scenes))), None)
         try:
-            assert port < server.server_port < port + view._TRIED
+            assert port < server.server_port < port + view._MAX_TRIES
         finally:
             server.server_close()
             server.viewer.close()
@@ -158,81 +156,3 @@ def test_the_browser_is_opened_at_the_page(two_scenes: Path, monkeypatch: pytest
     assert main(["view", str(two_scenes / "a")]) == 0
     (url,) = opened
     assert url.startswith("http://127.0.0.1:")
-
-
-def test_a_window_needs_a_display(two_scenes: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window, "has_display", lambda *_: False)
-    said = refused("view", str(two_scenes), "--window")
-    expected = "a display (the page needs none), found no DISPLAY and no WAYLAND_DISPLAY"
-    assert said == f"drivesem: --window: expected {expected}"
-
-
-def test_where_a_display_is() -> None:
-    assert not window.has_display("linux", {})
-    assert not window.has_display("linux", {"DISPLAY": ""})
-    assert window.has_display("linux", {"DISPLAY": ":0"})
-    assert window.has_display("linux", {"WAYLAND_DISPLAY": "wayland-0"})
-    assert window.has_display("darwin", {})
-
-
-class Library:
-    """What is asked of Open3D: a model of one mesh, and a window that notes what is done to it."""
-
-    def __init__(self, opens: bool) -> None:
-        self.opens, self.read, self.shown, self.ran = opens, b"", [], 0
-        self.mesh = SimpleNamespace(triangle_uvs=np.array([[0.2, 0.3]]), triangles=[0])
-        self.utility = SimpleNamespace(Vector2dVector=np.array, IntVector=list)
-        self.geometry = SimpleNamespace(Image=np.array)
-        self.visualization = SimpleNamespace(Visualizer=lambda: self)
-        self.io = SimpleNamespace(read_triangle_model=self.model)
-
-    def model(self, path: str) -> SimpleNamespace:
-        self.read = Path(path).read_bytes()
-        skin = SimpleNamespace(albedo_img=np.full((2, 2, 3), 7, np.uint8))
-        return SimpleNamespace(meshes=[SimpleNamespace(mesh=self.mesh, material_idx=0)], materials=[skin])
-
-    def create_window(self, title: str, width: int, height: int) -> bool:
-        return self.opens
-
-    def add_geometry(self, mesh: Any) -> None:
-        self.shown.append(mesh)
-
-    def get_render_option(self) -> SimpleNamespace:
-        return SimpleNamespace()
-
-    def get_view_control(self) -> Any:
-        names = ("set_lookat", "set_front", "set_up", "set_zoom")
-        return SimpleNamespace(**dict.fromkeys(names, lambda _: None))
-
-    def run(self) -> None:
-        self.ran += 1
-
-    def destroy_window(self) -> None:
-        self.ran += 1
-
-
-@pytest.mark.parametrize("opens", [True, False])
-def test_the_window_shows_the_scene(
-    opens: bool, two_scenes: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    library = Library(opens)
-    monkeypatch.setitem(sys.modules, "open3d", library)
-    monkeypatch.setattr(window, "has_display", lambda *_: True)
-    monkeypatch.setattr(window, "glb_of", lambda name, scene: f"glb of {name}".encode())
-    monkeypatch.setattr(window, "mapping", lambda sharing, apart: map)
-    assert main(["view", str(two_scenes), "--window", "--frame", "b"]) == (0 if opens else 2)
-    assert library.read == b"glb of b"
-    if opens:
-        assert (library.shown, library.ran) == ([library.mesh], 2)
-        assert library.mesh.triangle_uvs.tolist() == [[0.2, 0.7]]
-        assert (library.mesh.textures[0] == 7).all()
-    else:
-        said = "drivesem: --window: expected a display with OpenGL, found none that Open3D can use\n"
-        assert capsys.readouterr().err == said
-
-
-def test_a_window_needs_open3d(two_scenes: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    monkeypatch.setattr(window, "has_display", lambda *_: True)
-    said = refused("view", str(two_scenes), "--window")
-    assert "--window: expected Open3D (drivesem doctor says how to get it)" in said

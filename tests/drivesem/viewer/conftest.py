@@ -13,7 +13,7 @@ from torch import Tensor
 
 from detectors.types import CLASSES, Detections
 from drivesem.attack.budgets import PRESETS
-from drivesem.viewer.server import Server, ShownFrame, Viewer
+from drivesem.viewer.server import Server, Viewer, ViewerFrame
 from scene_ir.io import load_scene, save_scene
 from scene_ir.types import SceneIR
 
@@ -53,7 +53,7 @@ def changed(small_run: Path) -> Path:
 def still(changed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same scene's as it was photographed."""
     folder = tmp_path_factory.mktemp("scenes") / "it's still"
-    save_scene(load_scene(changed).at_rest(), folder)
+    save_scene(load_scene(changed).unperturbed(), folder)
     return folder
 
 
@@ -64,7 +64,7 @@ def stubborn(still: Path) -> Stubborn:
 
 @pytest.fixture(scope="session")
 def viewer(still: Path, changed: Path, stubborn: Stubborn) -> Iterator[Viewer]:
-    frames = {"still": ShownFrame(still), "<b>changed</b>": ShownFrame(changed, "1 lost")}
+    frames = {"still": ViewerFrame(still), "<b>changed</b>": ViewerFrame(changed, "1 lost")}
     made = Viewer("<script>title</script>", frames, stubborn, PRESETS["street"], grid=GRID)
     yield made
     made.close()

@@ -90,9 +90,9 @@ def test_a_slider_moves_picture_boxes_link_and_command(opened: Callable[..., Any
     assert state(page)["objects[0].translate.along"] == "0.5"
     assert "'objects[0].translate=0.5m,0m'" in page.inner_text("#command")
     assert page.locator("output[for='knob-objects[0].translate.along']").inner_text() == "0.50 m"
-    stage = viewer.stage("still")
+    stage = viewer.scene("still")
     expected, still = (
-        to_uint8(stage.drawn(values).render.image) for values in ({"objects[0].translate.along": 0.5}, {})
+        to_uint8(stage.render_state(values).render.image) for values in ({"objects[0].translate.along": 0.5}, {})
     )
     assert cv2.PSNR(pixels(page), expected) > FAITHFUL_DB > cv2.PSNR(still, expected)
     slider.focus()
@@ -172,7 +172,7 @@ def test_keys(opened: Callable[..., Any]) -> None:
 
 def test_arrows_go_where_one_looks(opened: Callable[..., Any], viewer: Viewer) -> None:
     page = opened(frame="still", car=0)
-    rest = viewer.stage("still").knobs
+    rest = viewer.scene("still").sliders
     for key, axis, sign in (("ArrowUp", 2, 1), ("ArrowDown", 2, -1), ("ArrowRight", 0, 1), ("ArrowLeft", 0, -1)):
         page.keyboard.press(f"Shift+{key}")
         values = {name: float(text) for name, text in state(page).items() if name.startswith("objects[0]")}
@@ -183,7 +183,7 @@ def test_arrows_go_where_one_looks(opened: Callable[..., Any], viewer: Viewer) -
 
 def test_cars_are_dragged_from_above(opened: Callable[..., Any], viewer: Viewer) -> None:
     page = opened(frame="still", car=1)
-    scene = viewer.stage("still").knobs
+    scene = viewer.scene("still").sliders
     body = page.locator('#street .car[data-car="0"] .body')
     body.scroll_into_view_if_needed()
     scale = page.evaluate("document.getElementById('street').getScreenCTM().a")

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from drivesem.attack.budgets import PRESETS
-from drivesem.viewer.server import HOST, POLICY, Server, ShownFrame, Viewer
-from drivesem.viewer.stage import Stage
+from drivesem.viewer.scene import InteractiveScene
+from drivesem.viewer.server import HOST, POLICY, Server, Viewer, ViewerFrame
 from tests.drivesem.viewer.conftest import GRID, Stubborn
 
 STILL = {"frame": "still"}
-KNOB = "objects[0].translate.along"
+SLIDER = "objects[0].translate.along"
 
 
 class Answer:
@@ -91,12 +91,12 @@ def test_what_there_is_to_see(server: Server) -> None:
     frame = json.loads(get(server, query("/frame", frame="<b>changed</b>")).body)
     assert frame["name"] == "<b>changed</b>"
     assert frame["found"]
-    assert {knob["name"] for knob in frame["knobs"]} >= {KNOB, "weather.fog", "sun.azimuth"}
+    assert {slider["name"] for slider in frame["sliders"]} >= {SLIDER, "weather.fog", "sun.azimuth"}
     assert json.loads(get(server, query("/frame", **STILL)).body)["found"] == {}
 
 
 def test_a_state_as_picture_and_as_what_is_found(server: Server, viewer: Viewer) -> None:
-    values = STILL | {KNOB: 0.5, "weather.fog": "0.25"}
+    values = STILL | {SLIDER: 0.5, "weather.fog": "0.25"}
     answer = get(server, query("/picture", **values))
     assert (answer.status, answer.kind) == (200, "image/jpeg")
     shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)
@@ -105,10 +105,10 @@ def test_a_state_as_picture_and_as_what_is_found(server: Server, viewer: Viewer)
     assert shown.shape == before.shape
     assert np.abs(shown.astype(int) - before).mean() > 1
     found = json.loads(get(server, query("/detections", **values)).body)
-    assert found["command"] == viewer.stage("still").knobs.command(
-        viewer.frames["still"].folder.resolve(), {KNOB: 0.5, "weather.fog": 0.25}
+    assert found["command"] == viewer.scene("still").sliders.command(
+        viewer.frames["still"].folder.resolve(), {SLIDER: 0.5, "weather.fog": 0.25}
     )
-    assert len(found["cars"]) == len(viewer.stage("still").knobs.rest.objects)
+    assert len(found["cars"]) == len(viewer.scene("still").sliders.rest.objects)
     one = json.loads(get(server, query("/score", **values, car=0)).body)
     assert one == found["cars"][0]
     assert json.loads(get(server, query("/notes", **values)).body) == []
@@ -191,10 +191,10 @@ def test_what_is_not_http_gets_one_line(server: Server) -> None:
 def test_a_fault_of_ours_is_one_line_too(
     server: Server, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def broken(self: Stage, drawn: object) -> bytes:
+    def broken(self: InteractiveScene, drawn: object) -> bytes:
         raise AssertionError("two\nlines")
 
-    monkeypatch.setattr(Stage, "picture", broken)
+    monkeypatch.setattr(InteractiveScene, "picture", broken)
     answer = get(server, query("/picture", **STILL))
     assert answer.status == 500
     assert answer.line == "two lines"
@@ -206,19 +206,19 @@ def test_a_fault_of_ours_is_one_line_too(
 def test_a_later_request_of_a_page_supersedes_those_that_wait(
     still: Path, stubborn: Stubborn, served: Callable[[Viewer], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    viewer = Viewer("t", {"still": ShownFrame(still)}, stubborn, PRESETS["street"])
-    viewer.stage("still")
+    viewer = Viewer("t", {"still": ViewerFrame(still)}, stubborn, PRESETS["street"])
+    viewer.scene("still")
     drawn: list[float] = []
     begun, go_on = threading.Event(), threading.Event()
-    really = Stage.drawn
+    really = InteractiveScene.render_state
 
-    def slow(self: Stage, state: Any, keep: bool = True) -> Any:
+    def slow(self: InteractiveScene, state: Any, keep: bool = True) -> Any:
         drawn.append(state.get("weather.fog", 0.0))
         begun.set()
         assert go_on.wait(30)
         return really(self, state, keep)
 
-    monkeypatch.setattr(Stage, "drawn", slow)
+    monkeypatch.setattr(InteractiveScene, "drawn", slow)
     statuses: dict[int, int] = {}
     with served(viewer) as server:
 
@@ -232,7 +232,7 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
         for thread in threads[1:]:
             thread.start()
         for _ in range(3000):
-            if viewer._latest.get("p") == {"picture": 20} and viewer._draw._work_queue.qsize() == 19:
+            if viewer._latest.get("p") == {"picture": 20} and viewer._render_pool._work_queue.qsize() == 19:
                 break
             threading.Event().wait(0.01)
         go_on.set()
@@ -255,7 +255,7 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
 def test_the_end_waits_for_what_is_being_answered(
     still: Path, stubborn: Stubborn, served: Callable[[Viewer], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    viewer = Viewer("t", {"still": ShownFrame(still)}, stubborn, PRESETS["street"])
+    viewer = Viewer("t", {"still": ViewerFrame(still)}, stubborn, PRESETS["street"])
     begun, go_on = threading.Event(), threading.Event()
 
     def slow(self: Viewer) -> dict[str, Any]:
@@ -296,9 +296,9 @@ def test_few_frames_and_pages_are_kept(
             made.append(folder)
 
     monkeypatch.setattr("drivesem.viewer.server.Stage", Made)
-    frames = {name: ShownFrame(Path(name)) for name in "abc"}
+    frames = {name: ViewerFrame(Path(name)) for name in "abc"}
     viewer = Viewer("t", frames, stubborn, PRESETS["street"])
     for name in "abacab":
-        viewer.stage(name)
+        viewer.scene(name)
     viewer.close()
     assert made == [Path(name) for name in "abcb"]

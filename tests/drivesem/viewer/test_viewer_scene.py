@@ -13,56 +13,58 @@ from detectors.registry import load_detector
 from detectors.types import Detections, Targets
 from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.objective import Objective, Rendered
-from drivesem.viewer.stage import Stage, best_score
+from drivesem.attack.objective import Objective, RenderEvaluation
+from drivesem.viewer.scene import InteractiveScene, best_score
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import Render, SceneIR
 from tests.drivesem.viewer.conftest import SCORE, Stubborn
 
 
 @pytest.fixture(scope="module")
-def stage(still: Path, stubborn: Stubborn) -> Stage:
-    return Stage(still, stubborn, PRESETS["street"], None)
+def stage(still: Path, stubborn: Stubborn) -> InteractiveScene:
+    return InteractiveScene(still, stubborn, PRESETS["street"], None)
 
 
 def pixels(encoded: bytes) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
-def judged(stage: Stage) -> int:
+def judged(stage: InteractiveScene) -> int:
     """A vehicle that is found as photographed, and may go a metre."""
     cars = stage.facts()["cars"]
-    reach = {knob.car: knob.high for knob in stage.knobs.knobs.values() if knob.name.endswith("along")}
+    reach = {knob.car: knob.high for knob in stage.sliders.sliders.values() if knob.name.endswith("along")}
     return next(car["car"] for car in cars if car["status"] == "found" and reach.get(car["car"], 0) >= 1)
 
 
-def test_at_rest_it_is_the_photograph(stage: Stage) -> None:
-    drawn = stage.drawn({})
-    assert (to_uint8(drawn.render.image) == to_uint8(stage.knobs.rest.photograph)).all()
-    shown = pixels(stage.picture(drawn))[..., ::-1]
-    assert shown.shape == (stage.knobs.rest.camera.height, stage.knobs.rest.camera.width, 3)
-    assert cv2.PSNR(shown, to_uint8(stage.knobs.rest.photograph)) > 35
-    assert (pixels(stage.photograph())[..., ::-1] == shown).all()
+def test_at_rest_it_is_the_photograph(stage: InteractiveScene) -> None:
+    drawn = stage.render_state({})
+    assert (to_uint8(drawn.render.image) == to_uint8(stage.sliders.rest.photograph)).all()
+    shown = pixels(stage.encode_picture(drawn))[..., ::-1]
+    assert shown.shape == (stage.sliders.rest.camera.height, stage.sliders.rest.camera.width, 3)
+    assert cv2.PSNR(shown, to_uint8(stage.sliders.rest.photograph)) > 35
+    assert (pixels(stage.encode_photograph())[..., ::-1] == shown).all()
 
 
-def test_a_drawn_state_is_kept_and_few_are(stage: Stage) -> None:
-    first = stage.drawn({"weather.fog": 0.5})
-    assert stage.drawn({"weather.fog": 0.5}) is first
-    assert stage.drawn({"weather.fog": 0.4}, keep=False) is not stage.drawn({"weather.fog": 0.4}, keep=False)
+def test_a_drawn_state_is_kept_and_few_are(stage: InteractiveScene) -> None:
+    first = stage.render_state({"weather.fog": 0.5})
+    assert stage.render_state({"weather.fog": 0.5}) is first
+    assert stage.render_state({"weather.fog": 0.4}, keep=False) is not stage.render_state(
+        {"weather.fog": 0.4}, keep=False
+    )
     for i in range(4):
-        stage.drawn({"weather.rain": 0.1 * (i + 1)})
-    assert stage.drawn({"weather.fog": 0.5}) is not first
+        stage.render_state({"weather.rain": 0.1 * (i + 1)})
+    assert stage.render_state({"weather.fog": 0.5}) is not first
 
 
-def test_who_is_driven_from_where_it_is_looked_for_is_lost(stage: Stage) -> None:
+def test_who_is_driven_from_where_it_is_looked_for_is_lost(stage: InteractiveScene) -> None:
     car = judged(stage)
-    state = stage.knobs.state({f"objects[{car}].translate.along": 1.0, f"objects[{car}].yaw": 20.0})
-    still, after = stage.seen({}, stage.drawn({})), stage.seen(state, stage.drawn(state))
+    state = stage.sliders.state({f"objects[{car}].translate.along": 1.0, f"objects[{car}].yaw": 20.0})
+    still, after = stage.detect({}, stage.render_state({})), stage.detect(state, stage.render_state(state))
     assert (still["lost"], still["phantoms"], still["words"]) == (0, 0, "nothing lost, no phantom")
     assert still["cars"][car] == {"status": "found", "score": pytest.approx(SCORE)}
     boxes = {mark["car"]: mark for mark in still["boxes"] if mark["car"] is not None}
-    assert boxes[car]["xyxy"] == stage.knobs.rest.objects.box2d[car].tolist()
-    assert sum(mark["kind"] == "found" for mark in still["boxes"]) == len(stage.knobs.rest.objects)
+    assert boxes[car]["xyxy"] == stage.sliders.rest.objects.box2d[car].tolist()
+    assert sum(mark["kind"] == "found" for mark in still["boxes"]) == len(stage.sliders.rest.objects)
     moved = {mark["car"]: mark for mark in after["boxes"] if mark["car"] is not None}
     assert moved[car]["xyxy"] != boxes[car]["xyxy"], "labels move"
     overlap = best_score(*_one(moved[car]["xyxy"], boxes[car]["xyxy"]), 0)
@@ -80,7 +82,7 @@ def _one(truth: list[float], found: list[float]) -> tuple[Targets, Detections]:
 def test_far_away_it_is_lost_for_certain(still: Path) -> None:
     scene = load_scene(still)
     detector = Stubborn(scene)
-    stage = Stage(still, detector, PRESETS["street"], None)
+    stage = InteractiveScene(still, detector, PRESETS["street"], None)
     car = judged(stage)
     # a detector that looks a box's width beside what is there, once the scene moves
     detector.found = Detections(
@@ -89,38 +91,38 @@ def test_far_away_it_is_lost_for_certain(still: Path) -> None:
         detector.found.scores,
     )
     state = {"weather.fog": 0.1}
-    seen = stage.seen(state, stage.drawn(state))
+    seen = stage.detect(state, stage.render_state(state))
     assert seen["cars"][car]["status"] == "lost"
     assert next(mark["kind"] for mark in seen["boxes"] if mark["car"] == car) == "lost"
     assert seen["lost"] >= 1
     assert seen["words"].startswith(f"{seen['lost']} object")
     assert stage.known_score(state, car) is None
-    told = stage.score(state, car, stage.drawn(state))
+    told = stage.score(state, car, stage.render_state(state))
     assert told == seen["cars"][car] == stage.known_score(state, car)
 
 
 def test_the_detector_looks_where_something_changed(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = Stage(still, load_detector("squeezedet"), PRESETS["street"], None)
+    stage = InteractiveScene(still, load_detector("squeezedet"), PRESETS["street"], None)
     car = judged(stage)
-    drawn = stage.drawn({f"objects[{car}].translate.along": 0.5})
+    drawn = stage.render_state({f"objects[{car}].translate.along": 0.5})
     objective, seen = stage.objective, []
-    everywhere = objective.look(drawn.scene, drawn.render)
+    everywhere = objective.evaluate_render(drawn.scene, drawn.render)
 
-    def look(scene: SceneIR, render: Render) -> Rendered:
-        seen.append(render.drawn)
-        return Objective.look(objective, scene, render)
+    def look(scene: SceneIR, render: Render) -> RenderEvaluation:
+        seen.append(render.vehicle_regions)
+        return Objective.evaluate_render(objective, scene, render)
 
     monkeypatch.setattr(objective, "look", look)
-    told = stage.seen({f"objects[{car}].translate.along": 0.5}, drawn)
-    assert drawn.render.drawn is not None
-    assert 0 < len(seen[0]) < len(drawn.render.drawn)
+    told = stage.detect({f"objects[{car}].translate.along": 0.5}, drawn)
+    assert drawn.render.vehicle_regions is not None
+    assert 0 < len(seen[0]) < len(drawn.render.vehicle_regions)
     first = everywhere.detections
     marks = [mark for mark in told["boxes"] if mark["kind"] in ("found", "phantom")]
     above = first.scores >= objective.t_star
     boxes = torch.tensor([mark["xyxy"] for mark in marks])
     torch.testing.assert_close(boxes, first.boxes_xyxy[above], atol=0.01, rtol=0)
-    fog = stage.drawn({"weather.fog": 0.5})
-    stage.seen({"weather.fog": 0.5}, fog)
+    fog = stage.render_state({"weather.fog": 0.5})
+    stage.detect({"weather.fog": 0.5}, fog)
     assert seen[1] is None, "fog is everywhere"
 
 
@@ -138,26 +140,26 @@ def test_best_score_is_of_what_meets_the_target() -> None:
     assert best_score(targets, nothing, 0) == 0
 
 
-def test_what_no_car_can_do_is_said(stage: Stage) -> None:
-    assert stage.notes(stage.drawn({})) == []
-    knobs = [k for k in stage.knobs.knobs.values() if k.name.endswith(("along", "across"))]
+def test_what_no_car_can_do_is_said(stage: InteractiveScene) -> None:
+    assert stage.notes(stage.render_state({})) == []
+    knobs = [k for k in stage.sliders.sliders.values() if k.name.endswith(("along", "across"))]
     for state in ({k.name: k.high for k in knobs}, {k.name: k.low for k in knobs}):
-        drawn = stage.drawn(state)
-        rows = range(len(stage.knobs.rest.objects))
-        assert stage.notes(drawn) == check_places(stage.knobs.rest, drawn.scene, rows)
+        drawn = stage.render_state(state)
+        rows = range(len(stage.sliders.rest.objects))
+        assert stage.notes(drawn) == check_places(stage.sliders.rest, drawn.scene, rows)
 
 
-def test_the_street_is_as_wide_as_its_vehicles(stage: Stage) -> None:
+def test_the_street_is_as_wide_as_its_vehicles(stage: InteractiveScene) -> None:
     x0, x1, z0, z1 = stage.street_m()
     for car in stage.facts()["cars"]:
         assert x0 < car["x"] < x1
         assert z0 < car["z"] < z1
-    rgba = pixels(stage.street())
+    rgba = pixels(stage.encode_street())
     assert rgba.shape[2] == 4
     assert rgba.shape[1] / rgba.shape[0] == pytest.approx((x1 - x0) / (z1 - z0), rel=0.01)
     assert 0 < (rgba[..., 3] > 0).mean() < 1
     # straight ahead, ten metres off, the ground has the colour of its pixel in the background
-    rest, z = stage.knobs.rest, 10.0
+    rest, z = stage.sliders.rest, 10.0
     ground = rest.environment.ground.tolist()
     point = torch.tensor([0.0, -(ground[2] * z + ground[3]) / ground[1], z, 1.0])
     u, v, w = (rest.camera.matrix.float() @ point).tolist()
@@ -166,12 +168,16 @@ def test_the_street_is_as_wide_as_its_vehicles(stage: Stage) -> None:
     assert np.abs(here[2::-1].astype(int) - there).max() < 40
 
 
-def test_the_vehicle_to_begin_with(stage: Stage, changed: Path, stubborn: Stubborn) -> None:
+def test_the_vehicle_to_begin_with(stage: InteractiveScene, changed: Path, stubborn: Stubborn) -> None:
     cars = stage.facts()["cars"]
     found = [car for car in cars if car["status"] == "found"]
     assert stage.focus == min(found, key=lambda car: car["z"])["car"]
-    other = Stage(changed, stubborn, PRESETS["street"], None)
-    assert other.facts()["found"] == other.knobs.found != {}
-    state = other.knobs.found
-    lost = [i for i, car in enumerate(other.seen(state, other.drawn(state))["cars"]) if car["status"] == "lost"]
+    other = InteractiveScene(changed, stubborn, PRESETS["street"], None)
+    assert other.facts()["found"] == other.sliders.found != {}
+    state = other.sliders.found
+    lost = [
+        i
+        for i, car in enumerate(other.detect(state, other.render_state(state))["cars"])
+        if car["status"] == "lost"
+    ]
     assert not lost or other.focus in lost

@@ -1,8 +1,7 @@
-"""What can be moved in a scene, in the units that people write; the states this makes, and a command for each.
+"""Sliders of a scene in physical units, the states that they set, and the command that renders each state.
 
-Everything follows from theta (`drivesem.attack.space`): its names, units and bounds. Mesh offsets are 96 a
-vehicle, which nobody moves by hand: where a scene holds other shapes than its photograph, they move together, by a
-share.
+Names, units and bounds are those of theta (`drivesem.attack.space`). The 96 mesh offsets of a vehicle share one slider:
+the share of the shape that the scene holds.
 """
 
 from __future__ import annotations
@@ -26,85 +25,97 @@ from drivesem.attack.space import (
     behind_camera,
     ground_axes,
 )
-from drivesem.config.edits import FOLIAGE_NAMES, SUN_NAMES, WEATHER_NAMES
-from scene_ir.errors import RangeError, shown
+from drivesem.config.edits import FOLIAGE_CODES, SUN_CODES, WEATHER_CODES
+from scene_ir.errors import RangeError, make_printable
 from scene_ir.types import SceneIR
 
 State = Mapping[str, float]
-"""Values by the names of knobs, in their units. Those that are not named are 0: as photographed."""
+"""Slider values by name, in the slider's unit. A missing name is 0: as photographed."""
 PICTURE = "view.png"
-"""What a state's command writes."""
+"""File that a state's command writes."""
 _STEPS = {"m": 0.01, "deg": 0.1, "%": 0.5, "": 0.01}
-"""Of sliders, by unit; "" is a code's."""
+"""Step of a slider by unit; "" is the unit of codes."""
 _DIGITS = 6
-"""Decimals of values: as float32 holds them."""
+"""Decimals of values, the precision of float32."""
 _SHAPE = "shape"
 _CODES = (Parameter.COLOR, Parameter.WEATHER, Parameter.FOLIAGE, Parameter.SUN)
-_SCENE_CODES = {Parameter.WEATHER: WEATHER_NAMES, Parameter.FOLIAGE: FOLIAGE_NAMES, Parameter.SUN: SUN_NAMES}
+_SCENE_CODES = {Parameter.WEATHER: WEATHER_CODES, Parameter.FOLIAGE: FOLIAGE_CODES, Parameter.SUN: SUN_CODES}
 
 
 @dataclass(frozen=True, slots=True)
-class Knob:
-    """One slider. name: as theta has it, such as `objects[3].yaw`; title: its last word; unit: m, deg, % or "" of
-    a code; low, high: how far it goes; step: from one place to the next; found: the value that the scene holds;
-    car: whose it is, None of what belongs to the scene; group: its parameter, or shape.
-    """
+class Slider:
+    """One slider."""
 
     name: str
+    """Name of the coordinate of theta, such as `objects[3].yaw`."""
     title: str
+    """Last word of the name."""
     unit: str
+    """m, deg, % or "" for a code."""
     low: float
+    """Smallest value."""
     high: float
+    """Largest value."""
     step: float
+    """Distance between two values."""
     found: float
+    """Value that the scene holds."""
     car: int | None
+    """Row of the vehicle; None for the scene's own sliders."""
     group: str
+    """Its parameter, or "shape"."""
 
 
-class Knobs:
-    """The knobs of a scene as a folder holds it. budget: how far they go; they reach what the scene holds, however
-    far that is. Raises RangeError for a scene that no photograph was the source of.
+class SceneSliders:
+    """The sliders of a scene.
 
-    rest: the scene as photographed, of which states are changes; space: theta of it.
+    Attributes:
+        rest: The scene as photographed; states are changes of it.
+        space: Theta of `rest`.
+        sliders: Sliders by name.
     """
 
     def __init__(self, scene: SceneIR, budget: Budget) -> None:
+        """Create the sliders within a budget, extended to the values that the scene holds.
+
+        Raises RangeError for a scene without a photograph as its source.
+        """
         self.scene = scene
-        self.rest = scene.at_rest()
+        self.rest = scene.unperturbed()
         if len(scene.objects) and not scene.objects.source:
             raise RangeError("scene", "one that was made from a photograph", "meshes alone")
-        found = _changes(self.rest, scene)
-        budget = _reaching(budget, found)
+        found = _perturbation_between(self.rest, scene)
+        budget = _widen_budget(budget, found)
         params = [p for p in Parameter if p is not Parameter.MESH and getattr(budget, p.value) > 0]
         self.space = ParameterSpace(self.rest, params, budget)
         found = replace(found, **{p.value: None for p in Parameter if p not in params})
         self._bent = scene.objects.ffd - self.rest.objects.ffd
         self._places: dict[str, tuple[int, float]] = {}
-        self.knobs: dict[str, Knob] = {}
-        self._of_space(self.space.flatten(found))
+        self.sliders: dict[str, Slider] = {}
+        self._add_space_sliders(self.space.flatten(found))
         for car, bend in enumerate(self._bent):
             if bool((bend != 0).any()):
                 name = f"objects[{car}].{_SHAPE}"
-                self.knobs[name] = Knob(name, _SHAPE, "%", 0.0, 100.0, 1.0, 100.0, car, _SHAPE)
+                self.sliders[name] = Slider(name, _SHAPE, "%", 0.0, 100.0, 1.0, 100.0, car, _SHAPE)
 
     @property
     def found(self) -> dict[str, float]:
-        """The state that the scene holds."""
-        return {name: knob.found for name, knob in self.knobs.items() if knob.found}
+        """State that the scene holds."""
+        return {name: slider.found for name, slider in self.sliders.items() if slider.found}
 
     def state(self, values: Mapping[str, float]) -> State:
-        """Values as a state. RangeError naming the knob that there is none of, or the value beyond its ends."""
+        """Validate values and drop zeros. Raises RangeError for an unknown slider or a value out of range."""
         for name, value in values.items():
-            knob = self.knobs.get(name)
-            if knob is None:
-                raise RangeError(shown(name), "a parameter of this scene", "an unknown name")
-            if not knob.low <= value <= knob.high:
-                unit = f" {knob.unit}" if knob.unit else ""
-                raise RangeError(name, f"{knob.low:g} to {knob.high:g}{unit}", value)
+            slider = self.sliders.get(name)
+            if slider is None:
+                raise RangeError(make_printable(name), "a parameter of this scene", "an unknown name")
+            if not slider.low <= value <= slider.high:
+                unit = f" {slider.unit}" if slider.unit else ""
+                raise RangeError(name, f"{slider.low:g} to {slider.high:g}{unit}", value)
         return {name: value for name, value in values.items() if value}
 
     def apply(self, state: State) -> SceneIR:
-        """The scene in a state."""
+        """Return the scene in a state."""
         theta = self.space.theta0.clone()
         shares = self._bent.new_zeros(len(self._bent))
         for name, value in state.items():
@@ -112,14 +123,14 @@ class Knobs:
                 place, factor = self._places[name]
                 theta[place] = value / factor
             else:
-                shares[self.knobs[name].car or 0] = value / 100
+                shares[self.sliders[name].car or 0] = value / 100
         scene = self.space.apply(self.rest, theta)
         if not shares.any():
             return scene
         return scene.with_objects(ffd=self.rest.objects.ffd + shares[:, None, None] * self._bent)
 
     def command(self, folder: Path, state: State) -> str:
-        """The line that draws a state of the scene in `folder`, for a POSIX shell."""
+        """Command line, for a POSIX shell, that renders a state of the scene in `folder`."""
         settings = [f"{place}={value}" for place, value in self._settings(state).items()]
         words = ["drivesem", "edit", str(folder)]
         if self.found:
@@ -131,25 +142,28 @@ class Knobs:
         return shlex.join([*words, "--out", PICTURE])
 
     def _settings(self, state: State) -> dict[str, str]:
-        """A state by the words of `drivesem edit --set`."""
-        told: dict[str, str] = {}
+        """A state as the assignments of `drivesem edit --set`."""
+        assignments: dict[str, str] = {}
         for parameter, where in self.space.blocks.items():
             spec, names = SPECS[parameter], _SCENE_CODES.get(parameter)
             for start in range(where.start, where.stop, spec.size):
                 here = [self.space.name(i) for i in range(start, start + spec.size)]
                 values = [state.get(name, 0.0) for name in here]
                 if names is not None:
-                    told |= {f"{parameter}.{n}": _plain(v) for n, v in zip(names, values, strict=True) if v}
+                    assignments |= {
+                        f"{parameter}.{n}": _format_number(v) for n, v in zip(names, values, strict=True) if v
+                    }
                 elif any(values):
-                    unit = self.knobs[here[0]].unit
+                    unit = self.sliders[here[0]].unit
                     car = (start - where.start) // spec.size
-                    told[f"objects[{car}].{parameter}"] = ",".join(f"{_plain(v)}{unit}" for v in values)
-        for name, knob in self.knobs.items():
-            if knob.group == _SHAPE and state.get(name):
-                told[f"objects[{knob.car}].{Parameter.MESH}"] = f"{_plain(state[name])}%"
-        return told
+                    texts = (f"{_format_number(value)}{unit}" for value in values)
+                    assignments[f"objects[{car}].{parameter}"] = ",".join(texts)
+        for name, slider in self.sliders.items():
+            if slider.group == _SHAPE and state.get(name):
+                assignments[f"objects[{slider.car}].{Parameter.MESH}"] = f"{_format_number(state[name])}%"
+        return assignments
 
-    def _of_space(self, found: Tensor) -> None:
+    def _add_space_sliders(self, found: Tensor) -> None:
         lower, upper, values = self.space.lower.tolist(), self.space.upper.tolist(), found.tolist()
         away = behind_camera(self.rest).tolist()
         for parameter, where in self.space.blocks.items():
@@ -158,18 +172,18 @@ class Knobs:
                 car = (i - where.start) // spec.size if spec.per_object else None
                 factor, unit = self.space.physical(i, 1.0) or (1.0, "")
                 step, value = _STEPS[unit], round(values[i] * factor, _DIGITS)
-                low, high = (_inward(bound * factor, step) for bound in (lower[i], upper[i]))
+                low, high = (_round_inward(bound * factor, step) for bound in (lower[i], upper[i]))
                 low, high = min(low, value), max(high, value)
                 if low == high or (car is not None and away[car]):
-                    continue  # nothing to move
+                    continue
                 name = self.space.name(i)
                 self._places[name] = (i, factor)
                 title = name.rpartition(".")[2].replace("_", " ")
-                self.knobs[name] = Knob(name, title, unit, low, high, step, value, car, str(parameter))
+                self.sliders[name] = Slider(name, title, unit, low, high, step, value, car, str(parameter))
 
 
-def _changes(rest: SceneIR, scene: SceneIR) -> Perturbation:
-    """What a scene differs by from itself at rest, but for the shapes."""
+def _perturbation_between(rest: SceneIR, scene: SceneIR) -> Perturbation:
+    """Differences between a scene and the same scene as photographed, without shapes."""
     there, here = rest.objects, scene.objects
     flat = ground_axes(there.yaw, torch.ones_like(there.yaw), rest.environment.ground)[..., [0, 2]]
     moved_m = (flat @ (here.translation - there.translation)[:, [0, 2], None])[..., 0]
@@ -185,8 +199,8 @@ def _changes(rest: SceneIR, scene: SceneIR) -> Perturbation:
     )
 
 
-def _reaching(budget: Budget, found: Perturbation) -> Budget:
-    """The budget, with codes and sizes as far as the scene holds them."""
+def _widen_budget(budget: Budget, found: Perturbation) -> Budget:
+    """Extend the budget to the codes and sizes that the scene holds."""
     wider: dict[str, Any] = {}
     for parameter in (*_CODES, Parameter.SIZE):
         values = getattr(found, parameter.value)
@@ -196,11 +210,11 @@ def _reaching(budget: Budget, found: Perturbation) -> Budget:
     return replace(budget, **wider)
 
 
-def _inward(bound: float, step: float) -> float:
-    """A bound as a whole number of steps, not beyond itself but for float32's rounding."""
+def _round_inward(bound: float, step: float) -> float:
+    """Round a bound towards zero to a whole number of steps, tolerating float32 rounding."""
     return math.copysign(math.floor(abs(bound) / step + 1e-3) * step, bound)
 
 
-def _plain(value: float) -> str:
-    """A number without an exponent."""
+def _format_number(value: float) -> str:
+    """Format a number without an exponent."""
     return f"{value:.{_DIGITS}f}".rstrip("0").rstrip(".")

@@ -12,16 +12,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS, budget_of
-from drivesem.attack.scene_edits import moved
+from drivesem.attack.budgets import PRESETS, parse_budget
+from drivesem.attack.scene_edits import apply_changes
 from drivesem.attack.space import Parameter
-from drivesem.config.commands import Edit, Render
-from drivesem.config.edits import frame_edit, merged, parse_setting
+from drivesem.config.commands import EditConfig, RenderConfig
+from drivesem.config.edits import merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.parsing import parse
-from drivesem.viewer.knobs import PICTURE, Knobs
+from drivesem.viewer.sliders import PICTURE, SceneSliders
 from scene_ir import ffd
 from scene_ir.errors import RangeError
-from scene_ir.exchange import without
+from scene_ir.exchange import remove_vehicle
 from scene_ir.io import load_scene
 from scene_ir.types import SceneIR
 
@@ -29,18 +29,18 @@ STREET = PRESETS["street"]
 
 
 @pytest.fixture(scope="module")
-def knobs(still: Path) -> Knobs:
-    return Knobs(load_scene(still), STREET)
+def knobs(still: Path) -> SceneSliders:
+    return SceneSliders(load_scene(still), STREET)
 
 
 @pytest.fixture(scope="module")
 def bent(still: Path) -> SceneIR:
     """The scene with vehicle 1 in another shape and paint, vehicle 0 elsewhere, in fog."""
     scene = load_scene(still)
-    edit = frame_edit("edit", {"objects": {0: {"translate": ["1.25m", "-0.5m"], "rotate": "-7.5deg"}}})
-    scene = moved(scene, edit)
+    edit = parse_frame_edit("edit", {"objects": {0: {"translate": ["1.25m", "-0.5m"], "rotate": "-7.5deg"}}})
+    scene = apply_changes(scene, edit)
     offsets, paint = scene.objects.ffd.clone(), scene.objects.texture_code.clone()
-    offsets[1] += ffd.from_symmetric(0.05 * ffd.low_modes()[2])
+    offsets[1] += ffd.from_symmetric(0.05 * ffd.low_order_modes()[2])
     paint[1, 0] = -0.5
     scene = scene.with_objects(ffd=offsets, texture_code=paint)
     return scene.with_environment(weather=torch.tensor([0.25, 0.0, 0.0, 0.0]))
@@ -49,14 +49,14 @@ def bent(still: Path) -> SceneIR:
 def drawn_by(command: str, scene: SceneIR) -> SceneIR:
     """The scene that a command draws, by what it says alone."""
     config = parse(shlex.split(command)[1:])
-    if isinstance(config, Render):
+    if isinstance(config, RenderConfig):
         return scene
-    assert isinstance(config, Edit)
+    assert isinstance(config, EditConfig)
     changes: dict[Any, Any] = {}
     for text in config.set:
-        changes = merged(changes, parse_setting(text))
-    edit = frame_edit("edit", changes)
-    return moved(scene.at_rest(), edit, scene) if config.photographed else moved(scene, edit)
+        changes = merge_edits(changes, parse_setting(text))
+    edit = parse_frame_edit("edit", changes)
+    return apply_changes(scene.unperturbed(), edit, scene) if config.photographed else apply_changes(scene, edit)
 
 
 def assert_alike(one: SceneIR, other: SceneIR) -> None:
@@ -67,30 +67,30 @@ def assert_alike(one: SceneIR, other: SceneIR) -> None:
         torch.testing.assert_close(mine, theirs, atol=2e-6, rtol=0)
 
 
-def test_knobs_are_thetas_coordinates_in_peoples_units(knobs: Knobs) -> None:
+def test_knobs_are_thetas_coordinates_in_peoples_units(knobs: SceneSliders) -> None:
     space = knobs.space
     assert set(space.params) == set(Parameter) - {Parameter.MESH}
     for i in range(space.dim):
         factor, unit = space.physical(i, 1.0) or (1.0, "")
         low, high = float(space.lower[i]) * factor, float(space.upper[i]) * factor
         if low == high:
-            assert space.name(i) not in knobs.knobs, "nothing to move"
+            assert space.name(i) not in knobs.sliders, "nothing to move"
             continue
-        knob = knobs.knobs[space.name(i)]
+        knob = knobs.sliders[space.name(i)]
         assert knob.unit == unit
         assert low - 1e-4 <= knob.low < knob.high <= high + 1e-4
         assert (high - knob.high, knob.low - low) == pytest.approx((0, 0), abs=knob.step)
-    assert {knob.unit for knob in knobs.knobs.values()} == {"m", "deg", "%", ""}
+    assert {knob.unit for knob in knobs.sliders.values()} == {"m", "deg", "%", ""}
 
 
-def test_as_photographed_nothing_is_found_and_all_is_drawn_by_render(knobs: Knobs, still: Path) -> None:
+def test_as_photographed_nothing_is_found_and_all_is_drawn_by_render(knobs: SceneSliders, still: Path) -> None:
     assert knobs.found == {}
     assert_alike(knobs.apply({}), load_scene(still))
     assert knobs.command(still, {}) == shlex.join(["drivesem", "render", str(still), "--out", PICTURE])
 
 
 def test_what_a_scene_holds_is_found(bent: SceneIR) -> None:
-    knobs = Knobs(bent, STREET)
+    knobs = SceneSliders(bent, STREET)
     found = knobs.found
     expected = {
         "objects[0].translate.along": 1.25,
@@ -105,7 +105,7 @@ def test_what_a_scene_holds_is_found(bent: SceneIR) -> None:
 
 
 def test_a_shape_goes_by_its_share(bent: SceneIR, still: Path) -> None:
-    knobs, rest = Knobs(bent, STREET), load_scene(still).objects.ffd
+    knobs, rest = SceneSliders(bent, STREET), load_scene(still).objects.ffd
     half = knobs.apply(knobs.state({"objects[1].shape": 50.0})).objects.ffd
     torch.testing.assert_close(half, rest + 0.5 * (bent.objects.ffd - rest))
     command = knobs.command(Path("S"), {"objects[1].shape": 50.0})
@@ -115,12 +115,12 @@ def test_a_shape_goes_by_its_share(bent: SceneIR, still: Path) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_the_command_says_the_state(data: st.DataObject, knobs: Knobs, bent: SceneIR) -> None:
-    mine = data.draw(st.sampled_from([knobs, Knobs(bent, STREET)]))
-    names = data.draw(st.lists(st.sampled_from(sorted(mine.knobs)), max_size=6, unique=True))
+def test_the_command_says_the_state(data: st.DataObject, knobs: SceneSliders, bent: SceneIR) -> None:
+    mine = data.draw(st.sampled_from([knobs, SceneSliders(bent, STREET)]))
+    names = data.draw(st.lists(st.sampled_from(sorted(mine.sliders)), max_size=6, unique=True))
     values = {}
     for name in names:
-        knob = mine.knobs[name]
+        knob = mine.sliders[name]
         values[name] = round(data.draw(st.floats(knob.low, knob.high)), 5)
         values[name] = min(max(values[name], knob.low), knob.high)
     state = mine.state(values)
@@ -128,23 +128,23 @@ def test_the_command_says_the_state(data: st.DataObject, knobs: Knobs, bent: Sce
 
 
 def test_a_narrow_budget_reaches_what_is_there(bent: SceneIR) -> None:
-    knobs = Knobs(bent, budget_of("translate=0.5m,color=0.1,weather=0.1"))
-    along = knobs.knobs["objects[0].translate.along"]
+    knobs = SceneSliders(bent, parse_budget("translate=0.5m,color=0.1,weather=0.1"))
+    along = knobs.sliders["objects[0].translate.along"]
     assert (along.low, along.high) == pytest.approx((-0.5, 1.25), abs=1e-4)
-    assert knobs.knobs["objects[1].paint.lightness"].low == -0.5
+    assert knobs.sliders["objects[1].paint.lightness"].low == -0.5
     held = ("size", "sun")
-    assert not any(knob.group in held for knob in knobs.knobs.values()), "by the paper's budget"
+    assert not any(knob.group in held for knob in knobs.sliders.values()), "by the paper's budget"
     assert_alike(knobs.apply(knobs.found), bent)
 
 
 def test_what_is_not_there_cannot_be_moved(still: Path) -> None:
     scene = load_scene(still)
-    knobs = Knobs(without(scene, 0), STREET)
-    assert {knob.car for knob in knobs.knobs.values()} == {None, *range(1, len(scene.objects))}
+    knobs = SceneSliders(remove_vehicle(scene, 0), STREET)
+    assert {knob.car for knob in knobs.sliders.values()} == {None, *range(1, len(scene.objects))}
     objects = scene.objects
     nobody = {entry.name: getattr(objects, entry.name)[:0] for entry in fields(objects)}
-    empty = Knobs(replace(scene, objects=replace(objects, **nobody)), STREET)
-    assert {knob.car for knob in empty.knobs.values()} == {None}
+    empty = SceneSliders(replace(scene, objects=replace(objects, **nobody)), STREET)
+    assert {knob.car for knob in empty.sliders.values()} == {None}
     assert float(empty.apply({"weather.rain": 0.5}).environment.weather[1]) == 0.5
 
 
@@ -161,11 +161,11 @@ def test_what_is_not_there_cannot_be_moved(still: Path) -> None:
         ({"weather.fog": float("nan")}, "weather.fog: expected 0 to 1, found nan"),
     ],
 )
-def test_values_that_are_none(values: dict[str, float], message: str, knobs: Knobs) -> None:
+def test_values_that_are_none(values: dict[str, float], message: str, knobs: SceneSliders) -> None:
     with pytest.raises(RangeError, match=message):
         knobs.state(values)
 
 
 def test_meshes_alone_are_refused(street: Any) -> None:
     with pytest.raises(RangeError):
-        Knobs(street(), STREET)
+        SceneSliders(street(), STREET)
