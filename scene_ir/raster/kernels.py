@@ -1,6 +1,6 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare what a loop changes, and
-# evaluates both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
+# ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare a loop variable, and evaluates
+# both sides of `and`, so that a cheap test first saves time only as a separate `if`.
 """The four verbs as Warp kernels: one source for CPU and CUDA, float32 tensors, no copies.
 
 Mathematics, order of operations and constants are those of `reference`, so that both agree which triangle a pixel
@@ -9,7 +9,7 @@ shows; fused multiply-add is off for the same reason. Gradients are written by h
 On a CPU the draws are distributed over threads, large ones in bands of rows, so that each pixel belongs to one
 thread (`RasterPlan`). Triangles are rejected by the pixel bounds of their corners, which cost one division per
 vertex; for outlines, only those remain that meet a row or column in which a hit pixel borders an empty one. A draw
-with visible back faces, most of whose triangles lie behind others, is processed front to back and skips what is
+with visible back faces, with most triangles behind others, is processed front to back and skips what is
 hidden.
 """
 
@@ -47,7 +47,7 @@ ROUNDING = wp.constant(wp.float64(1e-12))
 LIMIT_PX = wp.constant(wp.float64(1e9))
 """Clamp of pixel positions, which keeps them within int32."""
 BEHIND_NEAR = wp.constant(-(1 << 31))
-"""Marks a vertex before the near plane, whose image position is meaningless."""
+"""Marks a vertex before the near plane; its image position is meaningless."""
 WIDE_ROW_PX = wp.constant(12)
 """Rows longer than this justify the divisions that find a triangle's first and last pixel."""
 MIN_SLOPE = wp.constant(wp.float64(1e-6))
@@ -74,7 +74,7 @@ class TriangleEdges:
 @wp.func
 def _find_range(offsets: wp.array(dtype=wp.int64), count: int, i: int):
     """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are skipped."""
-    if i < count:  # of draws of one pixel each there may be as many as pixels
+    if i < count:  # a shortcut for draws of one pixel each
         if offsets[i] == wp.int64(i) and offsets[i + 1] == wp.int64(i + 1):
             return i
     low = int(0)
@@ -252,7 +252,7 @@ def _fill_triangle(
     `origin` is the packed index of pixel (0, 0); `layered` means that many pixels probably show something nearer.
     """
     n = (e.n0 + e.n1) + e.n2
-    # The depth's denominator, n . (x, y, 1), is no more than what the pixel will sum up, and this.
+    # Bounds the rounding error of the depth's denominator, n . (x, y, 1).
     reach = wp.max(wp.max(wp.abs(box[0]), wp.abs(box[1])), wp.max(wp.abs(box[2]), wp.abs(box[3])))
     slack = ROUNDING * (_l1_norm(e.n0) + _l1_norm(e.n1) + _l1_norm(e.n2)) * wp.float64(reach + 1)
     runs = wp.vec3d(ONE / e.n0[0], ONE / e.n1[0], ONE / e.n2[0])
@@ -461,7 +461,7 @@ def add_corner_gradients(
         q0, q1, q2: Gradient to each edge function times (x, y, 1).
         grad_clip: (V,) gradient to clip coordinates.
     """
-    # q . (a x b) has the gradients b x q to a and q x a to b; here gathered by corner.
+    # q . (a x b) has the gradients b x q to a and q x a to b, gathered by corner here.
     wp.atomic_add(grad_clip, hit.i0, wp.cross(q1, hit.c2) + wp.cross(hit.c1, q2))
     wp.atomic_add(grad_clip, hit.i1, wp.cross(q2, hit.c0) + wp.cross(hit.c2, q0))
     wp.atomic_add(grad_clip, hit.i2, wp.cross(q0, hit.c1) + wp.cross(hit.c0, q1))
@@ -894,7 +894,7 @@ def _mark_boundaries_kernel(
     boundary_bits = wp.uint64(0)
     right_bits = wp.uint64(0)
     below_bits = wp.uint64(0)
-    while i < end:  # a run of pixels in one row
+    while i < end:  # pixels of one row
         part = _find_part(parts, i)
         width = parts[part, X1] - parts[part, X0]
         within = i - parts[part, OFFSET]
@@ -994,7 +994,7 @@ def _outline_kernel(
     x1 = parts[part, X1]
     row = parts[part, ROW]
     row_end = parts[part, ROW_END]
-    column_end = wp.min(row_end + 1, parts[part, Y1])  # a column's last pair reaches into the next part
+    column_end = wp.min(row_end + 1, parts[part, Y1])  # a column's last pair extends into the next part
     width = x1 - x0
     origin = parts[part, OFFSET] - parts[part, Y0] * width - x0
     f = parts[part, FACE] + (i - part * lanes)
@@ -1115,7 +1115,7 @@ def _coverage_kernel(
         hit = face[i] >= 0
         largest = ZERO
         chosen = wp.int64(-1)
-        # Sides in this order: the pairs that begin here and that end here along the row, then along the column.
+        # Order of sides: the pairs that start and end here along the row, then along the column.
         side = int(0)
         while side < 4:
             axis = side // 2
@@ -1338,7 +1338,7 @@ class _Antialias(torch.autograd.Function):
         size, like = fragments.face.shape[0], fragments.face
         coverage = torch.empty(size, dtype=clip.dtype, device=clip.device)
         count = (size + 63) // 64
-        marks = torch.empty((5, count + 1), dtype=torch.int64, device=clip.device)  # the last is only looked at
+        marks = torch.empty((5, count + 1), dtype=torch.int64, device=clip.device)  # the last is read, never written
         keys, choice = like.new_empty((2, size), dtype=torch.int64), like.new_empty(size, dtype=torch.int64)
         if size:
             parts, mesh, face = array(plan.parts), _mesh_arrays(clip, faces), array(like)

@@ -28,13 +28,13 @@ kernels is handed over once, by `run_in_threads`.
 @contextmanager
 def suppress_stderr() -> Iterator[None]:
     """Discard what native code writes to standard error."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)
         os.close(nowhere)
 
 
@@ -42,17 +42,17 @@ def suppress_stderr() -> Iterator[None]:
 def start_warp() -> None:
     """Initialise Warp silently; every kernel module calls this first."""
     wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
-    wp.config.log_level = 40  # errors only; `quiet` is what older versions look at
-    # Else each launch on an x86 CPU puts an arena, which no kernel here needs, on its stack and points to it from
-    # one static variable: with several threads one finds another's pointer, or none, and crashes (Warp 1.19).
+    wp.config.log_level = 40  # errors only; older versions read `quiet`
+    # Otherwise each launch on an x86 CPU puts an arena on its stack and stores its address in one static variable:
+    # with several threads, one reads another's pointer, or none, and crashes (Warp 1.19).
     wp.config.enable_tiles_in_stack_memory = None
-    # On a machine without a GPU, Warp's native code warns that it found no CUDA driver and heeds no log level.
+    # Without a GPU, Warp's native code warns of the missing CUDA driver at any log level.
     with nullcontext() if torch.cuda.is_available() else suppress_stderr():
         wp.init()
 
 
 @cache
-def _pool(process: int) -> ThreadPoolExecutor:  # a forked process has none of its parent's threads
+def _pool(process: int) -> ThreadPoolExecutor:  # a forked process has no threads of its parent
     return ThreadPoolExecutor(max_workers=15, thread_name_prefix="warp")
 
 
@@ -76,9 +76,9 @@ def split_by_work(edges: Sequence[int], weights: Sequence[float] | None = None) 
     parts, total = threads(), sum(work)
     if parts < 2 or total < _MIN_PIXELS or len(work) < 2:
         return [edges[0], edges[-1]]
-    cuts, done, wanted = [edges[0]], 0.0, total / parts
+    cuts, done, target = [edges[0]], 0.0, total / parts
     for i, share in enumerate(work):
-        if len(cuts) < parts and done + share / 2 > wanted * len(cuts) and edges[i] > cuts[-1]:
+        if len(cuts) < parts and done + share / 2 > target * len(cuts) and edges[i] > cuts[-1]:
             cuts.append(edges[i])
         done += share
     return [*cuts, edges[-1]] if edges[-1] > cuts[-1] else cuts
@@ -113,7 +113,7 @@ def launch(
     """Run a kernel over ranges of indices: in torch's stream on a GPU, else in one thread per range.
 
     Args:
-        kernel: Warp kernel whose first argument is the first index.
+        kernel: Warp kernel; its first argument is the first index.
         edges: Ascending bounds of the ranges.
         inputs: Arguments after the first index.
         outputs: Further arguments.
@@ -144,19 +144,19 @@ def array(values: Tensor, dtype: Any = None) -> Any:
     It runs once per dtype and row shape here; later arrays are copies of its result.
     """
     key = values.dtype, dtype, values.shape[1:]
-    seen = _array_templates.get(key)
-    if seen is not None and values.is_contiguous():
-        kind, head = seen
-        made = kind.from_buffer_copy(head)
-        made.data = values.data_ptr()
-        made.shape[0] = values.shape[0]
-        made._ref = values
-        return made
-    made: Any = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-    # Of a single vector Warp makes an array of one: only where the first side is the rows' can it be replaced.
-    if seen is None and values.ndim and values.is_contiguous() and made.shape[0] == values.shape[0] > 1:
-        _array_templates[key] = type(made), bytes(made)
-    return made
+    template = _array_templates.get(key)
+    if template is not None and values.is_contiguous():
+        kind, head = template
+        warp_array = kind.from_buffer_copy(head)
+        warp_array.data = values.data_ptr()
+        warp_array.shape[0] = values.shape[0]
+        warp_array._ref = values
+        return warp_array
+    warp_array: Any = wp.from_torch(values.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    # Warp turns a single vector into an array of one: only an array's number of rows can be replaced.
+    if template is None and values.ndim and values.is_contiguous() and warp_array.shape[0] == values.shape[0] > 1:
+        _array_templates[key] = type(warp_array), bytes(warp_array)
+    return warp_array
 
 
 _array_templates: dict[tuple[torch.dtype, Any, torch.Size], tuple[Any, bytes]] = {}

@@ -34,7 +34,7 @@ class PixelLayout:
         """The layout of rectangles (N, 4) px, half-open (x0, y0, x1, y1)."""
         check_shape("layout.rects", rects, None, 4, floating=False)
         rects = rects.to(torch.int64)
-        layout = object.__new__(cls)  # its offsets need no second look
+        layout = object.__new__(cls)  # skips the check of its offsets
         object.__setattr__(layout, "rects", rects)
         object.__setattr__(layout, "offsets", _offsets(rects))
         return layout

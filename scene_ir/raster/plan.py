@@ -30,17 +30,17 @@ class _TensorCache(Generic[V]):
 
     def __init__(self, compute: Callable[[Tensor], V]) -> None:
         self._compute = compute
-        self._kept: dict[int, tuple[weakref.ref[Tensor], int, V]] = {}
+        self._entries: dict[int, tuple[weakref.ref[Tensor], int, V]] = {}
 
     def __call__(self, tensor: Tensor) -> V:
-        if tensor.is_inference():  # these do not count their changes
+        if tensor.is_inference():  # these have no change counter
             return self._compute(tensor)
         key = id(tensor)
-        kept = self._kept.get(key)
-        if kept is not None and kept[0]() is tensor and kept[1] == tensor_version(tensor):
-            return kept[2]
+        entry = self._entries.get(key)
+        if entry is not None and entry[0]() is tensor and entry[1] == tensor_version(tensor):
+            return entry[2]
         value = self._compute(tensor)
-        self._kept[key] = (weakref.ref(tensor, lambda _: self._kept.pop(key, None)), tensor_version(tensor), value)
+        self._entries[key] = (weakref.ref(tensor, lambda _: self._entries.pop(key, None)), tensor_version(tensor), value)
         return value
 
 
@@ -96,10 +96,10 @@ def split_for_threads(
         x0, y0, x1, y1 = rect
         row = y0
         while row < y1:
-            room, left = target * len(cuts) - done, _row_work(rect, faces, row)
+            room, remaining = target * len(cuts) - done, _row_work(rect, faces, row)
             end = y1
-            if len(cuts) < shares and left - room > _TOLERANCE * target:
-                end = row + round((y1 - row) * max(room, 0.0) / left)
+            if len(cuts) < shares and remaining - room > _TOLERANCE * target:
+                end = row + round((y1 - row) * max(room, 0.0) / remaining)
                 if room <= _TOLERANCE * target or end <= row:
                     if len(parts) > cuts[-1]:
                         cuts.append(len(parts))
@@ -107,7 +107,7 @@ def split_for_threads(
                     end = y1
             first = offset + (row - y0) * (x1 - x0)
             parts.append([x0, y0, x1, y1, row, end, offset, *faces, flag, first])
-            done += left * (end - row) / (y1 - row)
+            done += remaining * (end - row) / (y1 - row)
             row = end
             if row < y1:
                 cuts.append(len(parts))
@@ -118,10 +118,10 @@ def split_outlines(parts: Sequence[Sequence[int]], shares: int) -> list[int]:
     """Bounds of up to `shares` ranges of `RasterPlan.parts` with equal work for `antialias`."""
     work = [_OUTLINE_WORK * max(p[8] - p[7], 0) + (p[5] - p[4]) * (p[2] - p[0]) for p in parts]
     total, done, cuts = sum(work), 0.0, [0]
-    for i, each in enumerate(work):
-        if i > cuts[-1] and len(cuts) < shares and done + each / 2 > total * len(cuts) / shares:
+    for i, part_work in enumerate(work):
+        if i > cuts[-1] and len(cuts) < shares and done + part_work / 2 > total * len(cuts) / shares:
             cuts.append(i)
-        done += each
+        done += part_work
     return [*cuts, len(parts)]
 
 

@@ -51,7 +51,7 @@ def rasterize(
         y = bounds[job, 1] + within // width[job]
         normal, sign = jobs.normal[job], jobs.sign[job, None]  # (P, 3, 3), (P, 1)
         edge = _edge_values(normal, x, y) * sign  # (P, 3)
-        # The pixel on an edge goes to the triangle on one side of it: the normals of the two are opposite.
+        # A pixel on an edge belongs to one of its two triangles, which have opposite normals there.
         facing = normal * sign[..., None]
         first = torch.where(facing[..., 0] != 0, facing[..., 0], facing[..., 1])
         first = torch.where(first != 0, first, facing[..., 2])
@@ -306,7 +306,7 @@ def _pixel_bounds(corner: Tensor, rect: Tensor, near: float) -> Tensor:
     cut = corner + share[..., None] * (after - corner)
     points = torch.cat([corner, cut], dim=1)
     used = torch.cat([front, crosses], dim=1)[..., None]
-    # A cut lies at w = near by construction; dividing by near, not by the rounded w, is what both backends do.
+    # A cut lies at w = near by construction; both backends divide by near, not by the rounded w.
     depth = torch.cat([w, torch.full_like(w, near)], dim=1)[..., None]
     px = points[..., :2] / torch.where(used, depth, 1.0)
     low = torch.where(used, px, torch.inf).amin(dim=1) - SLACK_PX

@@ -16,8 +16,8 @@ from scene_ir.raster.launch import start_warp
 
 start_warp()
 
-# The kernels name many arrays. By default LLVM gives up before it has compared whether so many might overlap, and
-# whether so many indices might overflow; a CPU that compares a hundred addresses once a launch does not feel it.
+# With many arrays, LLVM's default limits end its runtime checks for overlaps and overflows before it can vectorise;
+# a hundred comparisons per launch cost nothing.
 _CHECK_LIMITS = (
     "vectorize-memory-check-threshold",
     "memory-check-merge-threshold",

@@ -248,7 +248,7 @@ def _check_mesh(clip: Tensor, faces: Tensor, backend: Backend) -> None:
 
 
 def _check_finite(name: str, values: Tensor) -> None:
-    """`check_finite` with one pass over finite values, whose sum is finite too."""
+    """`check_finite`, in one pass over values with a finite sum."""
     if not math.isfinite(float(values.detach().sum())):
         check_finite(name, values)
 

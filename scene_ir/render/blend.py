@@ -102,7 +102,7 @@ def visible_background(opacity: Tensor, plan: BlendPlan, frame_hw: tuple[int, in
     shows = opacity.new_ones(frame_hw)
     for i in plan.order:
         packed, (rows, columns), size = plan.spans[i]
-        # A copy, as the product's factors must outlive what is written over them.
+        # A copy: autograd needs the factors that are overwritten.
         shows[rows, columns] = shows[rows, columns].clone() * (1.0 - opacity[packed].reshape(size))
     return shows
 
@@ -156,8 +156,8 @@ def composite(
 
 
 def visible_rects(layout: PixelLayout, visible: Tensor) -> Tensor:
-    """Rectangles (N, 4) int64 px, half-open, of the pixels of each draw where any of `visible` (T, C) is true, with
-    a margin of one pixel, which the smallest change may reach; empty where there are none.
+    """Rectangles (N, 4) int64 px, half-open, of the pixels of each draw where any of `visible` (T, C) is true,
+    with a margin of one pixel, which the smallest change may reach; empty where there are none.
     """
     rects: list[list[int]] = []
     packed, channels = visible.cpu().numpy(), visible.shape[1]
@@ -251,9 +251,8 @@ def paint_order(
     order: list[int] = []
     while remaining:
         hidden = behind[np.ix_(remaining, remaining)].any(axis=0)
-        chosen = remaining[
-            int(np.argmin(hidden))
-        ]  # the first that hides none of the others; in a cycle, the first
+        # The first that hides none of the others; in a cycle, the first.
+        chosen = remaining[int(np.argmin(hidden))]
         order.append(chosen)
         remaining.remove(chosen)
     return order if standing is None or not len(standing) else _insert_occluders(order, corners, standing, eye)
@@ -298,7 +297,7 @@ def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray, farther: np.ndarray
     axes = axes / np.maximum(np.linalg.norm(axes, axis=2, keepdims=True), 1e-9)
     pa, pb = (np.einsum("pkc,pac->pak", corners, axes) for corners in (a, b))
     at = axes @ eye
-    # Along each axis and against it, in turn.
+    # Along each axis, then against it.
     low = np.stack([pa.max(axis=2), -pa.min(axis=2)], axis=2).reshape(len(a), 8)
     high = np.stack([pb.min(axis=2), -pb.max(axis=2)], axis=2).reshape(len(a), 8)
     where = np.stack([at, -at], axis=2).reshape(len(a), 8)

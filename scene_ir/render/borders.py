@@ -118,7 +118,7 @@ def find_borders(
     points, end = clip.detach().to(torch.float64), start + step
     leave = MeshWalk.trace(points, faces, edges.across, seen, start, end, backend)
     enter = MeshWalk.trace(points, faces, edges.across, (seen[1], seen[0]), end, start, backend)
-    # How much nearer the first surface is, as inverse depth, where it ends and where the second one begins.
+    # Difference of inverse depths, first surface minus second, where the first ends and where the second begins.
     nearer = leave.plane - enter.plane
     at_leave, at_enter = (
         (nearer * (start + share[:, None] * step)).sum(dim=1) for share in (leave.end, 1 - enter.end)
@@ -126,7 +126,7 @@ def find_borders(
     through = (1 - enter.end < leave.end) & (at_enter > 0) & (at_leave < 0) & (at_enter - at_leave).isfinite()
     meets = 1 - enter.end + (leave.end - 1 + enter.end) * at_enter / torch.where(through, at_enter - at_leave, 1.0)
     first_ends = at_leave + at_enter >= 0
-    # Up to there the first surface is seen, from there on the second.
+    # The first surface is visible up to here, the second one beyond.
     until = torch.where(through, meets, torch.where(first_ends, leave.end, 1 - enter.end))
     until = torch.where(leave.met, 1.0, torch.where(enter.met, 0.0, until))
     path, edge, near, far = leave.creases(edges.creased, until)

@@ -114,7 +114,7 @@ class Compositor(PreparedScene):
             what = (factors, layers.colour, layers.opacity, layers.depth)
             canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
             number = number if self.occluders is None else number.masked_fill(number > len(objects), 0)
-            if weather:  # what stands before the sky is not covered with it, nor what stands on a wet road wet
+            if weather:  # objects are not part of the sky or the road behind them
                 shows = blend.visible_background(layers.opacity, plan, self.frame_hw)
                 behind = replace(
                     behind, sky=behind.sky.to(self.like) * shows, road=behind.road.to(self.like) * shows

@@ -158,7 +158,7 @@ def apply_weather(
     image = image + gain[:, None, None] * image
     air = air + gain * air
 
-    # Rain: wet and dark, haze, a sheen on the road that mirrors what stands above, streaks.
+    # Rain: wet and dark, haze, a sheen on the road that mirrors what is above, streaks.
     grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
     damp = model.DAMP_LIGHT * (model.DAMP_COLOUR * image + (1.0 - model.DAMP_COLOUR) * grey)
     image = image + model.DAMP * rain * (damp - image)
@@ -246,7 +246,7 @@ class PerturbedSun:
         sun, up = environment.sun.to(like), environment.ground[:3].to(like)
         code = environment.light.to(like)
         still = torch.zeros_like(code)
-        # What the code adds, so that nothing is rounded where it is 0.
+        # The change by the code is added, so that code 0 rounds nothing.
         direction = sun + (move_sun(sun, up, code) - move_sun(sun, up, still))
         strength = 1.0 + model.SUN_STRENGTH * code[2]
         shade = _shadow_strength(direction, up, sunlight * strength) / _shadow_strength(sun, up, sunlight).clamp(

@@ -165,7 +165,7 @@ def fit_finish(surface: TemplateSurface, samples: FinishSamples) -> Array:
     data = np.minimum(total, _MAX_VERTEX_SAMPLES)
     matrix = web.bonds + scipy.sparse.diags_array(data + _PRIOR_PULL)
     known = data[:, None] * mean + _PRIOR_PULL * _prior_gains(web.part, total, mean)
-    # Symmetric and dominated by its diagonal: no pivots, and an order that fills in little.
+    # Symmetric and diagonally dominant: no pivoting, and an ordering with little fill-in.
     solver = scipy.sparse.linalg.splu(
         matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )

@@ -27,7 +27,7 @@ GAMMA = 1 / 2.2
 _DARKEST = 1e-4
 """Least linear light, where gamma still has a slope."""
 _CREASE_COS = 0.766
-"""Cosine of 40 degrees: faces at one corner whose normals diverge by less are shaded as one smooth surface."""
+"""Cosine of 40 degrees: faces at one corner are smooth where their normals diverge by less."""
 UPWARD_SHARE = 0.4
 """Environment light from above minus its mean, relative; from below, the reverse."""
 MIRRORED_SHARE = 0.2
@@ -151,7 +151,7 @@ class LitMesh:
         own = samples.pixel, colour[: len(samples.face)] * samples.share[:, None].to(colour)
         amounts = [own, *blend.strip_changes(samples, colour)]
         total = colour.new_zeros((y1 - y0) * (x1 - x0), 3)
-        # All in one go: a sum out of place copies the whole picture.
+        # At once: a sum out of place copies the whole picture.
         total.index_add_(0, *(torch.cat(parts) for parts in zip(*amounts, strict=True)))
         cover = coverage.reshape(y1 - y0, samples_per_side, x1 - x0, samples_per_side)
         cover = reduce(torch.add, reduce(torch.add, cover.unbind(1)).unbind(2)) / samples_per_side**2
@@ -349,14 +349,14 @@ class _ShadedSamples:
         between = find_borders(clip, mesh.faces, mesh.edges, ends, inner.start, inner.step, backend)
         alone = samples.face_at(outer.here)
         rim = find_rims(clip, mesh.faces, mesh.edges, alone, outer.start, outer.step, backend)
-        # PixelSamples that an outline cuts beside or below: of them less is seen of the borders along the other axis.
+        # Samples cut by an outline along one axis: borders along the other axis count only for their covered part.
         cut = [torch.zeros_like(coverage, dtype=torch.bool) for _ in range(2)]
         for axis, along in enumerate((~outer.down, outer.down)):
             cut[axis][outer.here[rim.across & along]] = True
         path, share = between.path, torch.where(between.across, between.share, 0.5)
         before, after = (numbers(visible, inner, path) for visible in (between.before, between.after))
         part = ((samples.fragments.face >= 0) & (coverage.detach() < 1)).nonzero()[:, 0]
-        # What meets nothing goes on with the colour from which its outline is reached, rather across it.
+        # Samples that hit nothing continue the colour of the neighbour across the outline, if possible.
         order = torch.arange(len(outer.there)) + len(outer.there) * ~rim.across
         ends, which = torch.unique(outer.there, return_inverse=True)
         first = order.new_full((len(ends),), 2 * len(order)).scatter_reduce(0, which, order, "amin")
@@ -364,7 +364,7 @@ class _ShadedSamples:
         here, there, beyond = inner.here[path], inner.there[path], outer.there[source]
         here_covers, there_covers, part_covers, beyond_covers = _gather_all(coverage, (here, there, part, beyond))
         strips = []
-        # Of a border along the way, the looks to its sides are the ones that share it.
+        # A border along the path is shared by the samples on both sides.
         for sample, covers, amount, more, less in (
             (here, here_covers, 0.5 - share, after, before),
             (there, there_covers, share - 0.5, before, after),

@@ -19,7 +19,7 @@ which the completion looks better: stretched to two and three times their width.
 """
 GRAZING = (0.06, 0.04)
 """Added to the photographed cosine of all but paint and of paint, which would be 0 at the outline. Tyres, arches
-and trims are small and curved; stretched a little, they look better than templates, whose dark edges follow the
+and trims are small and curved; stretched a little, they look better than templates with dark edges along the
 mesh.
 """
 SQUARED_COS = 1e-4

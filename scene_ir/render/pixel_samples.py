@@ -50,7 +50,7 @@ class PixelSamples:
         group = numbers.reshape(rows, 1, columns, 1).expand(rows, count, columns, count).reshape(-1)
         corner = torch.tensor([x0, y0])
         middle = torch.stack([column, row], dim=1) * count + corner + (count - 1) / 2
-        # Of pixels that see several faces, or none in part, samples in the order of their faces.
+        # Pixels with several faces, or partly empty: samples ordered by face.
         mixed = (~same).nonzero()[:, 0]
         step = torch.arange(count)
         first = mixed // columns * count * row_length + mixed % columns * count

@@ -34,7 +34,7 @@ MAX_HALO_PX = 64.0
 _MAX_SAMPLES, _GOLDEN = 5000, 0.6180339887
 """Pixels of one object from which its finish is measured, several per vertex; golden-section steps spread them."""
 _PATCH_MARGIN_PX = 4
-"""Ground kept around a photographed shadow: the reach of the lookup's kernel, plus two pixels."""
+"""Margin of ground around a photographed shadow: the reach of the lookup's kernel, plus two pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,13 +231,13 @@ class PreparedScene:
             )
         self.base_size_lhw = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
-        # Weak, or each compositor, with its texels, would live on until the collector finds the circle.
+        # A weak reference: a cycle would keep each compositor and its texels alive until garbage collection.
         self.batch = SceneBatch([weakref.proxy(self)])
         self.base_geometry = self._place(base)
         self.vertex_height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self.like.new_zeros(0)
         self.texels, self.shadows, self.regions = None, None, None
         self._finish: Tensor | None = None
-        self._base_visible: VisibleSurfaces | None = None  # until the finish is found
+        self._base_visible: VisibleSurfaces | None = None  # until the finish is computed
         self.paint_lightness = self._base_lightness(objects)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
@@ -253,7 +253,7 @@ class PreparedScene:
             x, y = columns + source.shadow.x0, rows + source.shadow.y0
             margin = _PATCH_MARGIN_PX
             if not len(x) or int(x.min()) < margin or int(y.min()) < margin:
-                continue  # a shadow that the border cuts goes on beyond it
+                continue  # a shadow cut by the border continues beyond it
             if int(x.max()) >= width - margin or int(y.max()) >= height - margin:
                 continue
             steps = x.new_tensor([[-margin, -margin], [margin, -margin], [-margin, margin], [margin, margin]])
@@ -399,7 +399,7 @@ class PreparedScene:
         direction = self.scene.environment.sun.to(self.like) if moved is None else moved.direction
         sun = direction.expand(len(yaw), 3)
         x, y, z = self.object_surfaces.per_vertex(surfaces.rotate_y(sun, -yaw)).unbind(-1)
-        # Written out: sums along an axis may differ in their last bit with the number of rows.
+        # Written out: the last bit of a sum along an axis may depend on the number of rows.
         soft = self.smooth_normals[:, 0] * x + self.smooth_normals[:, 1] * y + self.smooth_normals[:, 2] * z
         return texture.sun_exposure(soft)
 
@@ -420,7 +420,7 @@ class PreparedScene:
             self.patch_corners + self.corner_outwardness[..., None] * (offset - self.base_shadow_offset)[:, None]
         )
         more = (objects.size_lhw / self.base_size_lhw - 1.0)[:, None, ::2]
-        # Softly no less than 0, and 0 where it is 0: a patch that shrank would leave its photographed rim behind.
+        # Softly at least 0, and exactly 0 at 0: a patch that shrank would leave its photographed rim behind.
         soft = torch.full_like(more, model.SHRUNK)
         more = 0.5 * (more + (more.square() + soft.square()).sqrt() - soft.square().sqrt())
         corners = corners + more * corners
@@ -579,7 +579,7 @@ class PreparedScene:
         for part in (seen[:, channels.HIDDEN], texture.outline_share(seen[:, channels.INSET])):
             weight = weight * (1.0 - smoothstep(part, 0.0, 1.0))
         plain = (weight > 0.0).nonzero()[:, 0]
-        # By their places within the object, so that others beside it change nothing.
+        # By position within the object, so that other objects have no influence.
         size = torch.bincount(owner[plain], minlength=count)
         place = torch.arange(len(plain), device=plain.device) - (size.cumsum(0) - size)[owner[plain]]
         chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MAX_SAMPLES / size.clamp(min=1))[owner[plain]]]

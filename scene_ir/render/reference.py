@@ -272,9 +272,9 @@ def _shade_photographed(
     weight = torch.cat([weight[:m], weight[m:] * halo_weight])
     rim = 1.0 - smoothstep(cos_then[:m], *model.RIM)
     opened = smoothstep(turned[:m], *model.OPEN_TURN) * rim * (1.0 - alpha[:m]).clamp(min=0.0)
-    # Where the photograph shows that there is no vehicle, the mesh sticks out of it: a visual hull.
+    # Where the photograph shows no vehicle, the mesh is larger than the vehicle and stays empty: a visual hull.
     empty = visible[:m] * (1.0 - smoothstep(support[:m], *model.SUPPORTED))
-    # What opens up is as opaque as the inside, in its own colour, where there is enough of it to tell.
+    # Newly exposed outline becomes as opaque as the inside, in its own colour where that is reliable.
     closed = weight[:m] * opened * (1.0 - empty) * smoothstep(alpha[:m], *model.OPEN_ALPHA)
     gain = torch.cat([closed / alpha[:m].clamp(min=model.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
     fill = (1.0 - weight[:m]) * (1.0 - empty)
@@ -302,8 +302,8 @@ def _complete_unseen(
     cos_now: Tensor,
     sun: PerturbedSun | None,
 ) -> Tensor:
-    """Colours (K, 3) of mesh rows `unseen_rows` that the photograph did not see: the car's other side, or the template in
-    the car's own finish. cos_now: (Rm,) towards the camera.
+    """Colours (K, 3) of mesh rows `unseen_rows` that the photograph did not see: the car's other side, or the template
+    in the car's own finish. cos_now: (Rm,) towards the camera.
     """
     attributes = prepared.completion_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
     own = _average_attributes(prepared, drawn, rows, attributes)[unseen_rows]
@@ -349,7 +349,7 @@ def _sample_shadows(prepared: PreparedScene, objects: Objects, drawn: VisibleSur
     xy = layout.pixel_xy()[hit].to(prepared.like)
     wanted = xy + _photograph_lookup(dense.index_select(0, hit), xy)[:, :2]
     height, width = prepared.frame_hw
-    # Constant from the border on, where `_darkness` repeats it: clamping two pixels beyond leaves no kink.
+    # Beyond the border `_shadow_darkness` is constant: clamping two pixels outside leaves no kink.
     uv = wanted.clamp(min=-2.0).minimum(wanted.new_tensor([width + 1.0, height + 1.0]))
     assert prepared.shadows is not None
     owner = layout.draw_index()[hit]

@@ -183,7 +183,7 @@ def _solve_scene(
         solved[i] = source
         rect = drawn.mesh.layout.rects[i].tolist()
         if not any(_touches(rect, mattes[j]) for j in order[place + 1 :]):
-            continue  # nothing is solved against what it shows
+            continue  # no later object is solved against it
         one = replace(
             scene, background=canvas, objects=replace(_select_object(objects, i), source=(source,)), occluders=()
         )
@@ -220,7 +220,7 @@ def _estimate_lighting(
     if not blank:
         return blank
     plain = []
-    for source, matte in zip(blank, mattes, strict=False):  # those of what stands in front come after
+    for source, matte in zip(blank, mattes, strict=False):  # mattes of occluders follow
         colour = _crop_view(scene.photograph, matte) * matte.values
         plain.append(replace(source, foreground=replace(matte, values=torch.cat([colour, matte.values]))))
     whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), occluders=())
@@ -311,7 +311,7 @@ def _extend_shadow(dark: Tensor, expected: Tensor, covered: Tensor) -> Tensor:
     """
     seen = (~covered).to(dark)
     sure = seen * (expected > 0.05)
-    # Row by row: a sum that threads share depends on their number.
+    # Row by row: a sum split between threads depends on their number.
     total = (expected.square() * sure).sum(dim=1).sum()
     strength = (dark * expected * sure).sum(dim=2).sum(dim=1) / total.clamp(min=1e-6)
     strength = strength.clamp(0.3, 1.2) if float(sure.sum()) > 20.0 else torch.ones_like(strength)
@@ -339,7 +339,7 @@ def _balance_background(image: Tensor, background: Tensor, factors: list[Crop], 
     lifted = (image / product.clamp(min=0.05)).clamp(max=1.0)
     out = torch.where(near | covered, background, lifted).clamp(0.0, 1.0)
     out = torch.where(plain, image, (out * _LEVELS).round() / _LEVELS)
-    # The darkest shadow of a pixel takes up what rounding left; where that would brighten, the background does.
+    # The darkest shadow of a pixel absorbs the rounding error, or the background where the shadow would brighten.
     darkest = torch.full(covered.shape, torch.inf, dtype=image.dtype)
     chosen = torch.full(covered.shape, -1)
     for i, factor in enumerate(factors):

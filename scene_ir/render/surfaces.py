@@ -560,7 +560,7 @@ def pixels_to_ground(
     """
     normal = ground[:3].to(pixels)
     ray = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1) @ unproject.T
-    # No product of matrices: shared among threads, it rounds by their number.
+    # No matrix product: its rounding depends on the number of threads.
     along, down = (ray * normal).sum(dim=1), (translation - centre) @ normal
     distance = down / torch.where(along.abs() > 1e-6, along, torch.full_like(along, 1e-6))
     if not bool(((distance > 0) & (along.abs() > 1e-6)).all()):
@@ -718,7 +718,7 @@ def nearest_true_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def perspective_weights(corners: Tensor, xy: Tensor) -> Tensor:
-    """Perspective-correct weights (K, 3) of corners (K, 3, 3), clip coordinates of triangles, at pixels xy (K, 2)."""
+    """Perspective-correct weights (K, 3) of triangles (K, 3, 3) in clip coordinates at pixels xy (K, 2)."""
     ray = torch.cat([xy, torch.ones_like(xy[:, :1])], dim=1).double()
     a, b, c = corners.double().unbind(dim=1)
     edges = [torch.linalg.cross(p, q) for p, q in ((b, c), (c, a), (a, b))]

@@ -233,7 +233,7 @@ def occlusion_map(mattes: Sequence[Crop], frame_hw: tuple[int, int], like: Tenso
     x, y, w, h = cv2.boundingRect(support)
     if not w:
         return out
-    # A pixel around what is there, within the frame: the distance to it is measured, the frame's border is none.
+    # One pixel of margin, clipped to the frame: distances are measured to the mattes' edges, not to the frame's.
     window = (slice(max(y - 1, 0), y + h + 1), slice(max(x - 1, 0), x + w + 1))
     padded = np.pad(support[window], 1, mode="edge")
     distance = np.ascontiguousarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1])

@@ -60,8 +60,8 @@ def _row_span(stack: LayerStack, k: int, y: int):
     return out
 
 
-# What follows is written in C, a row of a draw at a time: of Warp's own indices and vectors a CPU makes one number after
-# the other. The pragma lets its compiler take several pixels at once, which lie in arrays of their own.
+# Rows are processed in C: the CPU's compiler does not vectorise Warp's own indices and vectors. The pragma lets it
+# process several pixels at once.
 
 _ROW_POINTERS = """
     float* const red = (float*)((char*)PLANES.data + y * PLANES.strides[1]);
@@ -409,7 +409,7 @@ class BlendLayers(torch.autograd.Function):
             if with_canvas
             else torch.empty_like(grad_image, memory_format=contiguous)
         )
-        # Packed pixels that lie in no picture do not exist: every entry is written.
+        # Every packed pixel lies in the picture: all entries are written.
         grad_factor, grad_colour = torch.empty_like(factor), torch.empty_like(under_layer)
         grad_opacity = torch.empty_like(opacity)
         inputs = [

@@ -27,7 +27,7 @@ GLOSS_PER_L = model.GLOSS_GAIN / model.GLOSSY_L
 LEVEL_LOW, LEVEL_HIGH = model.LEVEL
 DUST = wp.constant(wp.vec3f(*model.DUST_RGB))
 
-# sRGB to and from XYZ relative to white, D65: kornia's matrices, their rows divided, columns multiplied, by it.
+# sRGB to and from XYZ relative to D65 white: kornia's matrices with rows divided or columns multiplied by white.
 TO_X = wp.constant(wp.vec3f(0.412453 / 0.95047, 0.357580 / 0.95047, 0.180423 / 0.95047))
 TO_Y = wp.constant(wp.vec3f(0.212671, 0.715160, 0.072169))
 TO_Z = wp.constant(wp.vec3f(0.019334 / 1.08883, 0.119193 / 1.08883, 0.950227 / 1.08883))

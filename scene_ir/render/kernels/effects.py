@@ -555,7 +555,7 @@ class _WetRows:
     def of(cls, road: Tensor) -> _WetRows:
         height = road.shape[0]
         radius = model.mirror_reach(height) // 2
-        if road.is_cuda:  # to look where the road is would make the CPU wait
+        if road.is_cuda:  # finding the road would make the CPU wait
             return cls(0, height, 0, radius)
         first, last = _rows(road, 0.0)
         if first == last:
@@ -582,7 +582,7 @@ class _ScratchMemory(threading.local):
 
     def planes(self, like: Tensor, *sizes: int) -> list[Tensor]:
         """Float32 vectors of these sizes, valid until the next call."""
-        if like.is_cuda:  # torch keeps its own there, stream by stream
+        if like.is_cuda:  # torch caches memory per stream there
             return [like.new_empty(size) for size in sizes]
         if self._room.numel() < sum(sizes):
             self._room = torch.empty(sum(sizes))

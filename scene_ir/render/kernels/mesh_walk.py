@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
-# ruff: noqa: RUF046, UP018 - Warp needs int(0) to declare what a loop changes.
+# ruff: noqa: RUF046, UP018 - Warp needs int(0) to declare a variable that a loop changes.
 """Walks over a mesh between samples, as a Warp kernel: what `borders.MeshWalk.trace` does in plain torch; float64."""
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
-# returns the gradients of all arguments.
 """All pixels of photographed vehicles and of their shadows: the stages of `shading` and `shadows` in order.
 
 Shapes: N objects, V vertices, T packed pixels, Ts packed pixels of the shadows' patches.
@@ -64,7 +62,7 @@ class _ObjectRanges:
         work = [
             2.0 * (self.pixels[i + 1] - self.pixels[i]) + self.ground[i + 1] - self.ground[i] for i in range(count)
         ]
-        # A GPU works on all at once; a painter is torch's.
+        # A GPU and a painter process all objects at once.
         whole = s.fixed.faces.device.type != "cpu" or code is not None
         self.edges = [0, count] if whole else split_by_work(list(range(count + 1)), work)
 

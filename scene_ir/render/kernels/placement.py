@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
-# ruff: noqa: UP018 - Warp needs float(1.0) to declare what a branch changes.
+# ruff: noqa: UP018 - Warp needs float(1.0) to declare a variable that a branch changes.
 """Vertex placement as Warp kernels: what `surfaces.place_vertices` and `PreparedScene.compute_brightening` do in
 plain torch; float32.
 
@@ -179,7 +179,7 @@ def _place_backward_kernel(
             bound = ratio * (1.0 / model.RELIT_MOST)
             squared = 1.0 + bound * bound
             share = RELIT + RELIT_MORE * templates.paint[i]
-            to_more = gb * share / (squared * wp.sqrt(squared)) / then  # of the light, not of its share
+            to_more = gb * share / (squared * wp.sqrt(squared)) / then  # gradient to the light
             to_soft = to_more * poses.sunlight[o] * strength * (0.5 + 0.5 * soft / root)
             to_n += sun * to_soft
             d = n * to_soft

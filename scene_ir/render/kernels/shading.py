@@ -1,6 +1,6 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, RUF046, SIM102, RUF059 - the line above; Warp needs int(0) to declare what a loop changes; `wp.grad`
-# returns the gradients of all arguments.
+# ruff: noqa: E501, UP018, RUF046, SIM102, RUF059 - the line above; Warp needs int(0) to declare a variable that a loop changes;
+# `wp.grad` returns gradients to all arguments.
 """Pixels of photographed vehicles as Warp kernels: one pass per stage, forward and backward; float32.
 
 Each stage is defined by the plain torch of `reference` and `texture`; constants are in `model`, channels in
@@ -740,7 +740,7 @@ def _is_plainly_visible(lookup: lookup_type, texel: texel_type, u: float, v: flo
         seen = (
             u >= -BORDER[0] and u <= wh[0] - 1.0 + BORDER[0] and v >= -BORDER[0] and v <= wh[1] - 1.0 + BORDER[0]
         )
-    if seen:  # nothing opens up: it did not turn, lies inside, or is opaque
+    if seen:  # no exposed outline: it did not turn, lies inside, or is opaque
         seen = lookup[ch.TURNED] <= OPEN_TURN[0] or lookup[ch.COS_THEN] >= RIM[1] or texel[ch.ALPHA] >= OPAQUE
     if seen:
         seen = lookup[ch.TURNED] <= STRETCH[0] * (PAINT_GRAZING + wp.max(lookup[ch.COS_THEN], 0.0))
@@ -913,7 +913,7 @@ def shade_kernel(
         j = wp.int32(pixels.nearest[i])
         a = lookups.lookup[j]
         texel = _texel_at(photograph, at[0], _photograph_xy(a, xy))
-        if texel[ch.ALPHA] != 0.0:  # else there is nothing to show
+        if texel[ch.ALPHA] != 0.0:  # else it is empty
             inset = _texel_at(photograph, at[0], _photograph_xy(a, _pixel_xy(pixels, j)))[ch.INSET]
             to_halo = _halo_colour(a, texel, inset, xy, wh)
     lookups.mesh[i] = to_mesh
@@ -961,7 +961,7 @@ def shade_backward_kernel(
         for k in range(3):
             to_texel[k] = g[k] * _relight_slope(c[k], a[ch.BRIGHTER])
             to_lookup[ch.BRIGHTER] += g[k] * c[k] * (1.0 - c[k] * c[k])
-        # Where opacity changes along a surface that turned, so does how much of it opens up.
+        # Where opacity changes along a surface that turned, so does the share of exposed outline.
         even = (
             a[ch.TURNED] <= OPEN_TURN[0]
             or wp.max(wp.abs(texel.to_u[ch.ALPHA]), wp.abs(texel.to_v[ch.ALPHA])) <= EVEN_SLOPE
@@ -988,7 +988,7 @@ def shade_backward_kernel(
             halo_texel.value[ch.ALPHA] != 0.0
             or halo_texel.to_u[ch.ALPHA] != 0.0
             or halo_texel.to_v[ch.ALPHA] != 0.0
-        ):  # else there is nothing near
+        ):  # else its surroundings are empty
             anchor = _texel_with_slopes(photograph, at[0], _photograph_xy(b, _pixel_xy(pixels, j)))
             to_halo_lookup, to_halo_texel, to_inset, _to_halo_xy, _to_halo_wh, _to_halo_g = wp.grad(_halo_loss)(
                 b, halo_texel.value, anchor.value[ch.INSET], xy, wh, halo_g
@@ -1019,7 +1019,7 @@ def _centre_hit(pixels: PackedPixels, vertices: MeshVertices, i: int):
 
 @wp.func
 def _subpixel_hit(centre: PixelHit, face: int, k: int, vertices: MeshVertices):
-    """`reference._walk_mesh` to the k-th position within a pixel whose centre hits a face."""
+    """`reference._walk_mesh` to the k-th position within a pixel, if its centre hits a face."""
     spot = PixelHit()
     spot.x = centre.x + SUBPIXELS[k, 0]
     spot.y = centre.y + SUBPIXELS[k, 1]
@@ -1188,7 +1188,7 @@ def _complete(
     """`reference._complete_unseen`, one row. own: attributes with local normals; facing: cosine towards the camera
     now.
     """
-    # Each use reads `own` anew: gradients are added up use by use, and rounded as they always were.
+    # Each use reads `own` again, which fixes the order in which gradients are summed.
     normal = _unit(
         wp.vec3f(
             turn[0] * own[ch.NORMAL] + turn[1] * own[ch.NORMAL + 2],

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false, reportReturnType=false
-# ruff: noqa: E501, RUF059 - the line above; `wp.grad` returns the gradients of all arguments.
+# ruff: noqa: E501, RUF059 - the line above; `wp.grad` returns gradients to all arguments.
 """Placement of the shadows' ground patches, as Warp kernels: what `PreparedScene.place_patches` does in plain
 torch.
 
@@ -91,7 +91,7 @@ def _shadow_offset(sun: wp.vec3d, yaw: wp.float64, height: wp.float64):
     s = wp.sin(yaw)
     x = (c * sun[0] - s * sun[2]) * scale
     z = (c * sun[2] + s * sun[0]) * scale
-    length = wp.sqrt(wp.max(x * x + z * z, TINY * TINY))  # under the root: of 0, a root has no gradient
+    length = wp.sqrt(wp.max(x * x + z * z, TINY * TINY))  # inside the root, which has no gradient at 0
     part = wp.min(length, MAX_OFFSET_M) / length
     return wp.vec2d(x * part, z * part)
 

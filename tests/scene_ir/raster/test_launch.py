@@ -34,7 +34,7 @@ def test_arrays_are_those_that_warp_makes(
     shape: tuple[int, ...], torch_dtype: torch.dtype, dtype: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of other lengths too, and of parts of a tensor; whether they were seen before or not."""
-    monkeypatch.setattr(launch, "_seen", {})
+    monkeypatch.setattr(launch, "_array_templates", {})
     for rows in (7, 2, 1, 0, 9):
         values = torch.zeros(rows, *shape[1:], dtype=torch_dtype) if len(shape) else torch.zeros(shape)
         if shape == (3,):  # one vector

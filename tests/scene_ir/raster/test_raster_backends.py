@@ -74,7 +74,7 @@ def test_warp_is_loaded_on_first_use_only_and_says_nothing(tmp_path):
 import sys, torch
 from scene_ir.raster import verbs
 assert "warp" not in sys.modules
-layout = verbs.Layout.of(torch.tensor([[0, 0, 4, 4]]))
+layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 4, 4]]))
 clip = torch.tensor([[0.0, 0, 1], [9, 0, 1], [0, 9, 1]])
 found = verbs.rasterize(clip, torch.tensor([[0, 1, 2]]), torch.tensor([[0, 1]]), layout)
 assert int((found.face >= 0).sum()) == 16 - (4 if found.face[0] < 0 else 0)

@@ -30,7 +30,7 @@ def sharing(threads: int) -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        with mock.patch.object(plan, "_WORTH", 1.0), mock.patch.object(launch, "_WORTH", 1):
+        with mock.patch.object(plan, "_MIN_WORK", 1.0), mock.patch.object(launch, "_MIN_PIXELS", 1):
             yield
     finally:
         torch.set_num_threads(before)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scene_ir.geometry import to_clip
-from scene_ir.render.borders import WALK, MeshEdges, MeshWalk
+from scene_ir.render.borders import MAX_WALK_FACES, MeshEdges, MeshWalk
 from scene_ir.render.lit_mesh import GAMMA, Lights, LitMesh, Materials
 from scene_ir.types import Camera
 
@@ -103,7 +103,7 @@ def test_walks_by_the_kernel_are_those_by_torch():
         assert torch.equal(getattr(fast, name), getattr(plain, name)), name
     for name in ("share", "plane", "end"):
         torch.testing.assert_close(getattr(fast, name), getattr(plain, name), rtol=1e-12, atol=0, equal_nan=True)
-    assert int(fast.goes_on.sum(dim=1).max()) == WALK
+    assert int(fast.goes_on.sum(dim=1).max()) == MAX_WALK_FACES
 
 
 def test_edges_know_their_neighbours_and_where_looks_change():

@@ -170,7 +170,7 @@ def test_shadows_grow_with_their_vehicle_and_hardly_shrink(photographed: SceneIR
     dark = []
     for grown in (1.0, 1.1, 0.9):
         scene = photographed.with_objects(size_lhw=grown * photographed.objects.size_lhw)
-        layers = Compositor(photographed, REFERENCE).layers(scene.objects)
+        layers = Compositor(photographed, REFERENCE).draw_layers(scene.objects)
         dark.append(float((1 - layers.shadow).sum()))
     assert 1.1 < dark[1] / dark[0] < 1.35
     # Its photographed rim would be left behind.

@@ -92,13 +92,13 @@ def test_a_veil_bends_near_black_only() -> None:
     grey = torch.linspace(0, 1, 6, dtype=torch.float64).expand(3, 1, 6)
     air = torch.full((3, 1, 1), 0.8, dtype=torch.float64)
     veil = torch.full((1, 6), 0.3, dtype=torch.float64)
-    out = env.veiled(grey, veil, air)
+    out = env.apply_veil(grey, veil, air)
     light = torch.sqrt(0.7 * grey**2 + 0.3 * 0.8**2)
     assert float((out - light).abs()[..., 1:].max()) < 0.02
     assert 0.0 < float(light[0, 0, 0] - out[0, 0, 0]) < model.VEIL_BEND
-    assert torch.equal(env.veiled(grey, torch.zeros_like(veil), air), grey)
+    assert torch.equal(env.apply_veil(grey, torch.zeros_like(veil), air), grey)
     thin = 1e-7
-    slope = float((env.veiled(grey, thin * torch.ones_like(veil), air) - grey)[0, 0, 0]) / thin
+    slope = float((env.apply_veil(grey, thin * torch.ones_like(veil), air) - grey)[0, 0, 0]) / thin
     assert slope == pytest.approx(0.8**2 / (2 * model.VEIL_BEND), rel=1e-3)
 
 

@@ -89,7 +89,7 @@ def test_a_frames_vehicles_share_their_sunlight(photographed: SceneIR) -> None:
 
 def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a hidden car's completion would change once the others are there, and the picture with it."""
-    monkeypatch.setattr("scene_ir.render.prepare._MOST_SAMPLES", 150)
+    monkeypatch.setattr("scene_ir.render.prepare._MAX_SAMPLES", 150)
     names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "mesh_index", "category")
     names = (*names, "box2d", "truncation", "occlusion")
     objects, clear = photographed.objects, torch.zeros_like(photographed.depth)

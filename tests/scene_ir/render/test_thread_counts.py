@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from scene_ir.render.sources import _continue_shadow
+from scene_ir.render.sources import _extend_shadow
 from scene_ir.render.surfaces import _thread_invariant_sigmoid, pixels_to_ground
 
 RANDOM = torch.Generator()
@@ -41,7 +41,7 @@ def test_continued_shadow() -> None:
     dark = torch.rand(3, 171, 498, generator=RANDOM.manual_seed(0))
     expected = torch.rand(171, 498, generator=RANDOM)
     covered = torch.rand(171, 498, generator=RANDOM) > 0.6
-    one, *others = by_threads(lambda: _continue_shadow(dark, expected, covered))
+    one, *others = by_threads(lambda: _extend_shadow(dark, expected, covered))
     assert all(torch.equal(one, other) for other in others)
 
 
