@@ -1,14 +1,14 @@
-"""Large vehicles whose template does not fit: what looks like the vehicle beside its mask becomes part of it.
+"""Extend masks of large vehicles beyond a template that does not fit, by colours.
 
-The network that cuts vehicles out follows the placed template where colours tell little, so roofs, bonnets and
-mirrors that the template lacks are left out. Near vehicles are large enough for their own colours to tell: what
-lies along the border is compared with what is surely the vehicle near by, and with what is surely not, and
-borders prefer edges of the photograph (random walks with priors, Grady 2005).
+The network that cuts vehicles out follows the placed template where colours are ambiguous, so it misses roofs,
+bonnets and mirrors that the template lacks. Near vehicles are large enough for their colours to decide: pixels
+along the border are compared with certain pixels of the vehicle and of its surroundings nearby, and borders prefer
+edges of the photograph (random walks with priors, Grady 2005).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -22,181 +22,164 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 MIN_HEIGHT_PX = 80.0
-"""Height of vehicles whose colours tell enough."""
+"""Lower vehicles have too few pixels for their colours to decide."""
+_WORKING_PX = 128.0
+"""Higher vehicles are scaled down to this height."""
+_BAND, _INNER = 0.1, 0.05
+"""How far outside and inside the mask, in heights, the border may be."""
+_NEAR = 0.2
+"""Half the side of the squares in which colours are compared, in heights."""
+_CLUSTERS = 20
+"""Number of colour clusters."""
 _SAMPLE = 7
-"""One of so many pixels is enough to find the kinds of colours; a prime, so that samples lie in all columns."""
-
+"""Every such pixel is used to find the clusters; a prime, so that samples lie in all columns."""
+_PRIOR_PX = 12.0
+"""Pixels that weigh as much as the statistics of the whole vehicle."""
+_NETWORK_WEIGHT, _OUTLINE_WEIGHT = 0.6, 1.6
+"""Weights of the network's shares and of the template's outline against the colours'."""
+_DARK = 0.25
+"""Brightness from which colours have full weight; black has none."""
+_PULL = 0.04
+"""Weight of all those against smoothness."""
+_CONTRAST = 0.05
+"""Difference of neighbouring colours that is an edge."""
+_SHADE = 0.3
+"""Share of shadow from which a pixel is ground."""
+_THIN = 0.02
+"""Half the width, in heights, of pieces too thin to be added."""
 _FIRM = 4.0
 """Steepness of shares about one half once they are decided."""
 
 
-@dataclass(frozen=True, slots=True)
-class MaskExtensionSettings:
-    """How far a vehicle may go on, and what tells it. Lengths are in its heights.
+def extend_mask(image: NDArray[np.uint8], first: Cutout, other: Cutout, covered: Array, allowed: Mask) -> Cutout:
+    """Add pixels next to a cut-out that look like the vehicle.
 
-    working_px: height to which larger vehicles are scaled down: colours tell as much there. band, inner: how far
-    beyond the mask it may go on, and how far inside the mask is not sure. near: half the side of the squares in
-    which colours are compared. colours: kinds that are told apart. few: pixels that tell as much as what is known
-    from the whole vehicle. looks, outline: weights against the colours' of the network's opinion and of the
-    template's outline. dark: brightness from which on colours tell fully; in black none does. pull: of all those
-    against smoothness. contrast: difference of neighbours' colours that is an edge. shade: share of shadow from
-    which on a pixel is ground. thin: half the width of what is too thin to be added.
+    Args:
+        image: (H, W, 3) RGB.
+        first: The unrefined cut-out with the template at its place.
+        other: The same with the template at its label. Colours decide where the two differ.
+        covered: Share (H, W) of the two outlines that cover each pixel.
+        allowed: Pixels (H, W) that may be the vehicle's.
+
+    Returns:
+        The extended cut-out; the same object for a vehicle lower than `MIN_HEIGHT_PX`.
     """
-
-    working_px: float = 128.0
-    band: float = 0.1
-    inner: float = 0.05
-    near: float = 0.2
-    colours: int = 20
-    few: float = 12.0
-    looks: float = 0.6
-    outline: float = 1.6
-    dark: float = 0.25
-    pull: float = 0.04
-    contrast: float = 0.05
-    shade: float = 0.3
-    thin: float = 0.02
-
-
-def extend_mask(
-    image: NDArray[np.uint8],
-    seen: Cutout,
-    other: Cutout,
-    drawn: Array,
-    allowed: Mask,
-    settings: MaskExtensionSettings | None = None,
-) -> Cutout:
-    """The cut-out with what beside it looks like the vehicle.
-
-    image (H, W, 3) RGB. seen, other: after the first look, with the template at two places; what only one of them
-    takes for the vehicle is decided by colours. drawn (H, W): share of the two places whose outline a pixel is in.
-    allowed (H, W): where the vehicle may be: not what is nearer. Vehicles lower than `LEAST_PX` stay as they are.
-    """
-    settings = settings or MaskExtensionSettings()
-    solid = seen.visible >= 0.5
+    solid = first.visible >= 0.5
     rows = np.flatnonzero(solid.any(1))
     if not len(rows) or rows[-1] + 1 - rows[0] < MIN_HEIGHT_PX:
-        return seen
-    high = rows[-1] + 1 - rows[0]
-    scale = min(settings.working_px / high, 1.0)
-    second = other.full_map("visible", image.shape)[seen.window]
-    parts = (seen.visible, second, seen.front, seen.shadow, np.asarray(drawn[seen.window], np.float32))
+        return first
+    height = rows[-1] + 1 - rows[0]
+    scale = min(_WORKING_PX / height, 1.0)
+    second = other.full_map("visible", image.shape)[first.window]
+    parts = (first.visible, second, first.front, first.shadow, np.asarray(covered[first.window], np.float32))
     size = (max(round(solid.shape[1] * scale), 1), max(round(solid.shape[0] * scale), 1))
     small = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts]).astype(np.float32)
-    free = cv2.resize(allowed[seen.window].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    photo = cv2.resize(image[seen.window], size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    more = _more(photo, small, free, high * scale, settings)
-    wide = cv2.resize(more, solid.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    # What is in front stays there.
-    visible = np.clip(np.maximum(seen.visible, wide * allowed[seen.window]), 0, 1 - seen.front)
-    return replace(seen, visible=visible, shadow=np.minimum(seen.shadow, 1 - visible - seen.front).clip(0))
+    free = cv2.resize(allowed[first.window].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    photo = cv2.resize(image[first.window], size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    share = _extended_share(photo, small, free, height * scale)
+    wide = cv2.resize(share, solid.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    visible = np.clip(np.maximum(first.visible, wide * allowed[first.window]), 0, 1 - first.front)
+    return replace(first, visible=visible, shadow=np.minimum(first.shadow, 1 - visible - first.front).clip(0))
 
 
-def _more(
-    photo: NDArray[np.uint8], shares: Array, free: Mask, high: float, settings: MaskExtensionSettings
-) -> Array:
-    """How much (h, w) of each pixel is vehicle. shares (5, h, w): visible at either look, front, shadow, drawn."""
-    first, second, front, shade, drawn = shares
+def _extended_share(photo: NDArray[np.uint8], shares: Array, free: Mask, height: float) -> Array:
+    """Share (h, w) of the vehicle in each pixel. shares (5, h, w): visible in either cut-out, front, shadow,
+    covered.
+    """
+    first, second, front, shade, covered = shares
     solid = first >= 0.5
-    either = solid | (second >= 0.5) | (drawn >= 0.5)
-    inside = _depth(solid) > settings.inner * high
-    ground = (shade >= settings.shade) & ~solid & (drawn < 0.5)
-    outside = (_depth(~either) > settings.band * high) | ground | (front >= 0.5) | ~free
-    open_ = ~inside & ~outside
-    if not inside.any() or not outside.any() or not open_.any():
+    either = solid | (second >= 0.5) | (covered >= 0.5)
+    inside = _distance_inside(solid) > _INNER * height
+    ground = (shade >= _SHADE) & ~solid & (covered < 0.5)
+    outside = (_distance_inside(~either) > _BAND * height) | ground | (front >= 0.5) | ~free
+    undecided = ~inside & ~outside
+    if not inside.any() or not outside.any() or not undecided.any():
         return first
-    ratio = _likelier(photo, inside, outside & free, high, settings)
-    # What one look has missed is more often vehicle than not.
-    seen = np.clip(0.25 * np.minimum(first, second) + 0.75 * np.maximum(first, second), 0.05, 0.95)
-    light = np.clip(photo.max(-1) / np.float32(255 * settings.dark), 0, 1)
-    odds = light * ratio + settings.looks * np.log(seen / (1 - seen)) + settings.outline * (drawn - 0.25)
-    found = _walked(photo, inside, open_, 1 / (1 + np.exp(-odds)), settings)
-    # Spikes along what is behind are none of the vehicle's.
-    added = cv2.morphologyEx(
-        ((found >= 0.5) | solid).astype(np.uint8), cv2.MORPH_OPEN, _disc(settings.thin * high)
-    )
-    whole = (added > 0) | solid
-    _, parts = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
-    kept = np.isin(parts, np.unique(np.asarray(parts)[solid]))
-    # What is decided is: the second look would take halves for borders.
-    found = np.where(whole, found, np.minimum(found, first))
-    return np.where(kept, np.clip(_FIRM * (found - 0.5) + 0.5, 0, 1), 0).astype(np.float32)
+    ratio = _colour_log_ratio(photo, inside, outside & free, height)
+    # Pixels that one cut-out misses are more often vehicle than not.
+    network = np.clip(0.25 * np.minimum(first, second) + 0.75 * np.maximum(first, second), 0.05, 0.95)
+    light = np.clip(photo.max(-1) / np.float32(255 * _DARK), 0, 1)
+    odds = light * ratio + _NETWORK_WEIGHT * np.log(network / (1 - network)) + _OUTLINE_WEIGHT * (covered - 0.25)
+    walked = _random_walk(photo, inside, undecided, 1 / (1 + np.exp(-odds)))
+    # Spikes along edges of the background are no part of the vehicle.
+    opened = cv2.morphologyEx(((walked >= 0.5) | solid).astype(np.uint8), cv2.MORPH_OPEN, _disc(_THIN * height))
+    whole = (opened > 0) | solid
+    _, components = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
+    connected = np.isin(components, np.unique(np.asarray(components)[solid]))
+    # Firm shares: the refinement would take halves for borders.
+    share = np.where(whole, walked, np.minimum(walked, first))
+    return np.where(connected, np.clip(_FIRM * (share - 0.5) + 0.5, 0, 1), 0).astype(np.float32)
 
 
 def _disc(radius: float) -> NDArray[np.uint8]:
-    """A disc of a radius, px, at least 1."""
+    """A disc of at least 1 px radius."""
     side = 2 * max(round(radius), 1) + 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
 
 
-def _depth(mask: Mask) -> Array:
-    """Distance (h, w), px, from the nearest pixel beside the mask; 0 there. The image's border is none."""
+def _distance_inside(mask: Mask) -> Array:
+    """Distance (h, w), px, from the nearest pixel outside the mask; the image's border does not count."""
     return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
-def _likelier(
-    photo: NDArray[np.uint8], inside: Mask, outside: Mask, high: float, settings: MaskExtensionSettings
-) -> Array:
-    """Log of how much likelier (h, w) a pixel's colour is on the vehicle near by than beside it near by."""
-    kinds = _kinds(photo, settings.colours)
-    side = 2 * max(round(settings.near * high), 1) + 1
+def _colour_log_ratio(photo: NDArray[np.uint8], inside: Mask, outside: Mask, height: float) -> Array:
+    """Log ratio (h, w) of the frequencies of a pixel's colour on the vehicle and outside it, nearby."""
+    clusters = _colour_clusters(photo)
+    side = 2 * max(round(_NEAR * height), 1) + 1
     shares = []
     for region in (inside, outside):
-        count = np.bincount(kinds[region], minlength=settings.colours).astype(np.float32)
-        known = (count + 1) / (count.sum() + settings.colours)
+        count = np.bincount(clusters[region], minlength=_CLUSTERS).astype(np.float32)
+        frequency = (count + 1) / (count.sum() + _CLUSTERS)
         around = cv2.boxFilter(region.astype(np.float32), -1, (side, side), normalize=False)
-        own = np.zeros(kinds.shape, np.float32)
-        for kind in range(settings.colours):
-            such = kinds == kind
+        own = np.zeros(clusters.shape, np.float32)
+        for cluster in range(_CLUSTERS):
+            such = clusters == cluster
             own[such] = cv2.boxFilter((such & region).astype(np.float32), -1, (side, side), normalize=False)[such]
-        shares.append(((own + settings.few * known[kinds]) / (around + settings.few), known[kinds]))
-    (here, anywhere), (beside, _) = shares
-    # Vehicles have the same paint everywhere; what is around them changes.
-    here = np.maximum(here, anywhere)
-    return np.clip(np.log(here / beside), -4, 4)
+        whole = frequency[clusters]
+        shares.append(((own + _PRIOR_PX * whole) / (around + _PRIOR_PX), whole))
+    (on_vehicle, anywhere), (off_vehicle, _) = shares
+    # Vehicles have the same paint everywhere; their surroundings vary.
+    return np.clip(np.log(np.maximum(on_vehicle, anywhere) / off_vehicle), -4, 4)
 
 
-def _kinds(photo: NDArray[np.uint8], count: int) -> NDArray[np.int64]:
-    """Which of `count` kinds of colours (h, w) each pixel has."""
+def _colour_clusters(photo: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Index (h, w) of each pixel's colour cluster."""
     colours = cv2.cvtColor(photo, cv2.COLOR_RGB2LAB).reshape(-1, 3).astype(np.float32)
-    colours[:, 1:] *= 2  # Shades of one paint differ by more than paints of one shade do.
+    colours[:, 1:] *= 2  # Shades of one paint differ more than paints of one shade.
     some = np.ascontiguousarray(colours[::_SAMPLE])
     rank = np.argsort(np.argsort(some @ np.array([1, 0.5, 0.25], np.float32), kind="stable"), kind="stable")
-    start = (rank * count // len(rank)).astype(np.int32)[:, None]
+    start = (rank * _CLUSTERS // len(rank)).astype(np.int32)[:, None]
     stop = (cv2.TERM_CRITERIA_MAX_ITER, 8, 0.0)
-    _, _, centres = cv2.kmeans(some, count, start, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)
-    apart = (centres * centres).sum(1) - 2 * colours @ centres.T
-    return np.asarray(apart.argmin(1), np.int64).reshape(photo.shape[:2])
+    _, _, centres = cv2.kmeans(some, _CLUSTERS, start, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+    distance = (centres * centres).sum(1) - 2 * colours @ centres.T
+    return np.asarray(distance.argmin(1), np.int64).reshape(photo.shape[:2])
 
 
-def _walked(
-    photo: NDArray[np.uint8], inside: Mask, open_: Mask, prior: Array, settings: MaskExtensionSettings
-) -> Array:
-    """Shares (h, w) that are smooth but across edges, 1 inside, near the prior where open, 0 elsewhere."""
+def _random_walk(photo: NDArray[np.uint8], inside: Mask, undecided: Mask, prior: Array) -> Array:
+    """Shares (h, w): 1 inside, 0 outside, and smooth except across edges and near the prior where undecided."""
     values = photo.astype(np.float32) / 255
     known = inside.astype(np.float32)
-    index = np.cumsum(open_.ravel()).reshape(open_.shape) - 1
-    count = int(open_.sum())
-    weight = np.full(count, settings.pull, np.float64)
-    target = settings.pull * prior[open_].astype(np.float64)
+    index = np.cumsum(undecided.ravel()).reshape(undecided.shape) - 1
+    count = int(undecided.sum())
+    weight = np.full(count, _PULL, np.float64)
+    target = _PULL * prior[undecided].astype(np.float64)
     rows, columns, links = [], [], []
     for a, b in (
         ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
         ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
     ):
         apart = ((values[a] - values[b]) ** 2).sum(-1)
-        link = np.exp(-apart / (2 * settings.contrast**2)).astype(np.float64) + 1e-3
+        link = np.exp(-apart / (2 * _CONTRAST**2)).astype(np.float64) + 1e-3
         for p, q in ((a, b), (b, a)):
-            mine = open_[p]
+            mine = undecided[p]
             np.add.at(weight, index[p][mine], link[mine])
-            np.add.at(target, index[p][mine], (link * known[q] * ~open_[q])[mine])
-            pair = mine & open_[q]
+            np.add.at(target, index[p][mine], (link * known[q] * ~undecided[q])[mine])
+            pair = mine & undecided[q]
             rows.append(index[p][pair])
             columns.append(index[q][pair])
             links.append(-link[pair])
     matrix = coo_array((np.concatenate(links), (np.concatenate(rows), np.concatenate(columns))), (count, count))
     matrix = (matrix + diags_array(weight)).tocsr()
-    solved, _ = cg(matrix, target, x0=prior[open_].astype(np.float64), rtol=1e-3, maxiter=60)
-    found = known.copy()
-    found[open_] = solved
-    return found
+    solved, _ = cg(matrix, target, x0=prior[undecided].astype(np.float64), rtol=1e-3, maxiter=60)
+    known[undecided] = solved
+    return known

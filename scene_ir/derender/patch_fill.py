@@ -1,9 +1,9 @@
-"""What stood behind the cars: holes filled by copying patches of the same photograph, coarse to fine.
+"""Fill holes with patches of the same photograph, from coarse to fine.
 
-The fill is Wexler's space-time completion (CVPR 2004) with the randomised nearest-neighbour search of PatchMatch
-(Barnes 2009). Copies prefer sources at the same height above or below the horizon, where a road's texture has the
-same scale, and where a guide says what is to be seen (`street.continued`), sources that look like it. Everything
-is numpy: the same input and seed give the same bytes.
+Wexler's space-time completion (CVPR 2004) with the randomised nearest-neighbour search of PatchMatch (Barnes
+2009). Sources at the same height relative to the horizon are preferred, where a road's texture has the same scale,
+and sources that resemble a guide (`street.continue_street`). Pure NumPy: the same input and seed give the same
+bytes.
 """
 
 from __future__ import annotations
@@ -20,42 +20,47 @@ Mask = NDArray[np.bool_]
 
 _STEPS = (-3, -1, 0, 1, 3)
 _PATTERN = np.array([(dy, dx) for dy in _STEPS for dx in _STEPS if abs(dy) + abs(dx) < 6], np.int64)
-"""Sample points of a 7x7 patch: 21 of 49 tell as much of it at less than half the price."""
+"""Sample points of a 7x7 patch: 21 of 49 are as good at less than half the cost."""
 _RADIUS = 3
 _SIDEWAYS = 0.4
-"""How much nearer than up and down a pixel to the side counts for the first guess."""
+"""Factor on sideways distances in the initial guess."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchFillSettings:
-    """coarsest_radius: px, pyramid levels are added until no hole is thicker than this; iterations: search rounds
-    at the coarsest and finest level; row_weight, column_weight: how much a copy from another height or from far
-    away costs against a colour error; confidence_px: how fast trust in a filled pixel falls away from the hole's
-    border; search_px: how far from the best source so far others are tried, at the coarsest level in px of the
-    full image, then in px of each level; ground_weight: cost of showing no ground where ground must be; guessed:
-    weight of a pixel in the hole against one outside, when patches are compared; guide_weight: cost of a source
-    whose surroundings, blurred by guide_px, have not the guide's colour; settle_px: over which distance the fill's
-    mean colour is brought to the guide's; grain_px: finer detail is each pixel's own source's; keep: a source that
-    was drawn by chance must cost less by this factor, so that neighbours keep copying neighbours.
-    """
+    """Options of the patch fill."""
 
     coarsest_radius: float = 4.0
+    """Pyramid levels are added until no hole is thicker than this, px."""
     max_levels: int = 6
+    """Largest number of levels."""
     iterations: tuple[int, int] = (8, 2)
+    """Search rounds at the coarsest and the finest level."""
     row_weight: float = 0.05
+    """Cost of copying from another height, against a colour error."""
     column_weight: float = 0.004
+    """Cost of copying from far away sideways."""
     search_px: tuple[float, float] = (160.0, 24.0)
+    """Range of random trials: at the coarsest level in px of the full image, then in px of each level."""
     ground_weight: float = 0.02
+    """Cost of showing no ground where there must be ground."""
     guessed: float = 0.3
+    """Weight of a pixel in the hole against one outside when patches are compared."""
     confidence_px: float = 12.0
+    """Distance from the hole's border over which confidence in filled pixels falls."""
     guide_weight: float = 3.0
+    """Cost of a source with blurred surroundings unlike the guide."""
     guide_px: float = 2.5
+    """That blur, px."""
     settle_px: float = 6.0
+    """Blur at which the fill's mean colour is adjusted to the guide's, px."""
     grain_px: float = 1.5
+    """Detail finer than this, px, is each pixel's own source's."""
     keep: float = 0.85
+    """A random source must cost less by this factor, so that neighbours keep copying neighbours."""
 
     def scaled_down(self, shrink: int) -> PatchFillSettings:
-        """For a photograph at one over `shrink` of its size: the same lengths of what is to be seen."""
+        """The settings for a photograph at one over `shrink` of its size."""
         coarse, fine = self.search_px
         return replace(
             self,
@@ -68,15 +73,15 @@ class PatchFillSettings:
 
 @dataclass(frozen=True, slots=True)
 class GroundMaps:
-    """wanted (H, W): pixels that see the ground once the cars are gone; like (H, W) in [0, 1]: how much each pixel
-    of the photograph looks like ground.
-    """
+    """Where ground must be, and where there is ground to copy."""
 
     wanted: Mask
+    """(H, W), pixels that show ground once the vehicles are removed."""
     share: NDArray[np.float32]
+    """(H, W) in [0, 1], share of ground in each pixel of the photograph."""
 
     def halved(self, size: tuple[int, int]) -> GroundMaps:
-        """At the next coarser level, of `size` (width, height)."""
+        """The maps at the next coarser level, of `size` (width, height)."""
         wanted = cv2.resize(self.wanted.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
         like = cv2.resize(self.share.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         return GroundMaps(wanted, np.asarray(like, np.float32))
@@ -92,11 +97,20 @@ def fill_patches(
     settings: PatchFillSettings | None = None,
     guide: Image | None = None,
 ) -> Image:
-    """The image with `hole` filled from pixels that are not `forbidden`.
+    """Fill a hole with patches of the image.
 
-    image (H, W, 3) RGB in [0, 1]; hole, forbidden (H, W), forbidden is taken to contain hole; horizon: its row,
-    px; ground: where ground is to be seen, and where it can be copied from; guide (H, W, 3): roughly what is to be
-    seen, smooth in the hole -> (H, W, 3) in [0, 1], equal to the image outside the hole.
+    Args:
+        image: (H, W, 3) RGB in [0, 1].
+        hole: Pixels (H, W) to fill.
+        forbidden: Pixels (H, W) not to copy, besides the hole.
+        horizon: Its row, px.
+        ground: Where ground must be, and where it can be copied from.
+        seed: Of the random search.
+        settings: Options of the fill.
+        guide: A smooth image (H, W, 3) that the fill should resemble.
+
+    Returns:
+        (H, W, 3) in [0, 1], equal to the image outside the hole.
     """
     settings = settings or PatchFillSettings()
     if not hole.any():
@@ -145,7 +159,7 @@ def fill_patches(
 def _with_grain(
     current: Image, image: Image, hole: Mask, forbidden: Mask, source: NDArray[np.int64], sigma: float
 ) -> Image:
-    """The fill with fine detail as it is at each pixel's own source: the mean of several sources has lost it."""
+    """The fill with each pixel's own source's fine detail, which the mean of several sources has lost."""
     detail = image - masked_blur(image, ~forbidden, sigma)
     smooth = masked_blur(current, np.ones_like(hole), sigma)
     rows, columns = source[hole].T
@@ -155,7 +169,16 @@ def _with_grain(
 
 
 def masked_blur(values: Image, mask: Mask, sigma: float) -> Image:
-    """Gaussian mean (H, W, 3), sigma px, of the values (H, W, 3) in the mask (H, W)."""
+    """Gaussian mean of the values inside a mask.
+
+    Args:
+        values: (H, W, 3).
+        mask: (H, W).
+        sigma: Standard deviation, px.
+
+    Returns:
+        (H, W, 3).
+    """
     weight = mask.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
     mean = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma) / np.maximum(total, 1e-3)[..., None]
@@ -163,11 +186,10 @@ def masked_blur(values: Image, mask: Mask, sigma: float) -> Image:
 
 
 def mirror_sources(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns (H, W) of a first guess: each unknown pixel copies what lies mirrored at the hole's nearest
-    end.
+    """Rows and columns (H, W) of each pixel mirrored at the nearest end of the unknown area (H, W).
 
-    unknown (H, W), not everywhere. Sideways counts as nearer than up and down, since streets run on sideways
-    behind a car: hedge, wall, kerb, road. Known pixels point to themselves.
+    Sideways counts as nearer, since a street continues sideways behind a car: hedge, wall, kerb, road. Known
+    pixels point to themselves. At least one pixel must be known.
     """
     height, width = unknown.shape
     nearest = np.asarray(
@@ -181,7 +203,7 @@ def mirror_sources(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def initial_sources(unknown: Mask, ground: GroundMaps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """`mirrored`, with ground from the nearest ground where ground must be."""
+    """`mirror_sources`, with ground from the nearest ground where there must be ground."""
     rows, columns = mirror_sources(unknown)
     other = unknown | (ground.share < 0.5)
     if other.all():
@@ -192,12 +214,12 @@ def initial_sources(unknown: Mask, ground: GroundMaps) -> tuple[NDArray[np.int64
 
 
 def _distance(mask: Mask) -> NDArray[np.float32]:
-    """Distance (H, W) px of each pixel in the mask to the nearest one outside."""
+    """Distance (H, W) px from each pixel in the mask to the nearest one outside."""
     return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
 def _halve(image: Image, hole: Mask, forbidden: Mask) -> tuple[Image, Mask, Mask]:
-    """The next coarser level: colours averaged over allowed pixels only, masks by maximum."""
+    """The next coarser level: colours averaged over allowed pixels, masks by maximum."""
     size = ((image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2)
     allowed = (~forbidden).astype(np.float32)
     weight = cv2.resize(allowed, size, interpolation=cv2.INTER_AREA)
@@ -209,7 +231,7 @@ def _halve(image: Image, hole: Mask, forbidden: Mask) -> tuple[Image, Mask, Mask
 
 
 class _Level:
-    """One pyramid level of the completion: the current image, its target pixels, and their search for sources."""
+    """One level of the pyramid: the current image, its target pixels, and the search for their sources."""
 
     def __init__(
         self,
@@ -245,7 +267,7 @@ class _Level:
         self.column_unit = 200.0 / scale
         self.confidence = np.exp(-_distance(hole)[target] * scale / settings.confidence_px).astype(np.float32)
         self.confidence = np.maximum(self.confidence, 1e-4)
-        # What the photograph shows at the hole's border weighs more than what is only guessed inside.
+        # Known pixels at the hole's border weigh more than guessed ones inside.
         certain = np.where(hole, settings.guessed, 1).astype(np.float32)
         certain = cv2.copyMakeBorder(certain, pad, pad, pad, pad, cv2.BORDER_REFLECT).reshape(-1)
         trust = certain[self._flat(self.rows, self.columns)[:, None] + self.offsets]
@@ -254,7 +276,7 @@ class _Level:
         self.blurred = image
 
     def follow(self, guide: Image) -> None:
-        """Prefer sources that look like the guide (H, W, 3) at the place that they are copied to."""
+        """Prefer sources that resemble the guide (H, W, 3) at their targets."""
         self.guide = guide[self.rows, self.columns]
         image = self.padded[self.pad : -self.pad, self.pad : -self.pad]
         self.blurred = masked_blur(image, self.allowed, max(self.settings.guide_px / self.scale, 0.7))
@@ -265,7 +287,7 @@ class _Level:
     def _patches(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
         index = self._flat(rows, columns)[:, None] + self.offsets
         values = self.padded.reshape(-1, 3).take(index, axis=0, mode="clip")
-        # Not -1: there may be no row.
+        # Not -1: there may be no rows.
         return values.reshape(rows.size, 3 * self.offsets.size)
 
     def _cost(
@@ -286,7 +308,7 @@ class _Level:
     def _try(
         self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64], gain: float = 1.0
     ) -> None:
-        """Take the proposed sources where their cost is below `gain` times the current one."""
+        """Accept proposed sources that cost less than `gain` times the current ones."""
         rows = np.clip(rows, 0, self.height - 1)
         columns = np.clip(columns, 0, self.width - 1)
         current = self.source[which]
@@ -299,7 +321,7 @@ class _Level:
         self.best[chosen] = cost[better]
 
     def _start(self, coarse: NDArray[np.int64] | None) -> None:
-        """First sources: mirrored ones, or the coarser level's where these are better."""
+        """Set the initial sources: mirrored ones, or the coarser level's where better."""
         everything = np.arange(self.rows.size)
         rows, columns = initial_sources(~self.allowed, self.ground)
         self.source = np.stack([rows[self.rows, self.columns], columns[self.rows, self.columns]], 1)
@@ -334,7 +356,7 @@ class _Level:
             radius /= 3
 
     def _vote(self) -> None:
-        """Each hole pixel becomes the trust-weighted mean of what the patches around it say."""
+        """Set each hole pixel to the confidence-weighted mean of the overlapping patches."""
         flat = self.padded.reshape(-1, 3)
         weight = self.confidence / (self.best + 0.002)
         total = np.zeros((len(flat), 4))
@@ -354,8 +376,16 @@ class _Level:
     def run(
         self, coarse: NDArray[np.int64] | None, rounds: int, rng: np.random.Generator
     ) -> tuple[Image, NDArray[np.int64]]:
-        """Alternate search and vote. -> the image (H, W, 3) and the sources (H, W, 2), -1 where nothing is
-        filled."""
+        """Alternate search and vote.
+
+        Args:
+            coarse: Sources (h, w, 2) of the coarser level, if there is one.
+            rounds: Number of rounds.
+            rng: Of the random trials.
+
+        Returns:
+            The image (H, W, 3), and the sources (H, W, 2), -1 where nothing is filled.
+        """
         everything = (self.rows, self.columns)
         self.target_patches = self._patches(*everything)
         self._start(coarse)
