@@ -6,19 +6,20 @@ from pathlib import Path
 
 from rich.table import Table
 
-from drivesem.config.commands import AttackConfig
+from drivesem.config.commands import AttackConfig, ReportConfig
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.failures.grades import Grade, Kind
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
-from drivesem.run.attack import attack_run
+from drivesem.run.attack import attack_dataset
 from drivesem.run.report.page import KINDS, NO_KIND
+from drivesem.run.report.runs import build_reports
 from drivesem.run.results import RunSummary
 
 
-def run(config: AttackConfig) -> int:
+def attack_command(config: AttackConfig) -> int:
     """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
-    summary = attack_run(config)
+    summary = attack_dataset(config)
     if config.json:
         print_json(summary.to_json())
     else:
@@ -40,7 +41,7 @@ def _print(summary: RunSummary, console: Console) -> None:
         "attacked, benign labels (paper)": summary.attacked_paper,
     }
     for name, scores in rows.items():
-        figures = scores.headline.shown
+        figures = scores.headline.columns
         table.add_row(name, *("-" if figure is None else f"{100 * figure:.1f}" for figure in figures))
     console.print(table)
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
@@ -77,3 +78,15 @@ def told_grades(summary: RunSummary) -> str:
         return f"no certain failure: {failures} by threshold, which chance may explain{told}{unknown}"
     held = f"{certain} certain, {grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared"
     return f"failures: {held}, of {failures} by threshold{told}{unknown}"
+
+
+def report_command(config: ReportConfig) -> int:
+    """Write the page; exit code 0. Raises UsageError or SceneError for bad input."""
+    data = build_reports(config)
+    if config.json:
+        print_json(data)
+        return 0
+    runs, frames = len(data["runs"]), len(data["frames"])
+    said = f"{format_count(runs, 'run')}, {format_count(frames, 'frame')}, {data['bytes'] / 1e6:.1f} MB: {data['out']}"
+    Console().print(said, soft_wrap=True)
+    return 0

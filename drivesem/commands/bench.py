@@ -15,8 +15,8 @@ from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, watched
 from drivesem.bench.tables import Section
 from drivesem.config.commands import BenchConfig
+from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
-from drivesem.config.values import numbers
 from drivesem.report.tables import format_count
 from drivesem.report.terminal import Console
 from drivesem.run.attack import select_frames
@@ -28,7 +28,7 @@ _SECONDS = {"step": (36.0, 240.0), "render": (22.0, 240.0), "verbs": (6.0, 30.0)
 """Seconds for measuring, with --quick and without; imports and scenes take some more."""
 
 
-def run(config: BenchConfig) -> int:
+def bench_command(config: BenchConfig) -> int:
     """Measure, print, write; exit code 0. Raises UsageError or SceneError for bad input."""
     cars, _ = _sizes(config)
     if max(cars) > MOST_CARS:
@@ -45,7 +45,7 @@ def _step(config: BenchConfig, console: Console) -> Measured:
     try:
         detector = load_detector(config.detector, config.device)
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if config.boxes is not None:
         return _boxes(config, Path(config.boxes), detector, console)
     sizes, beside = step.cases(*_sizes(config))
@@ -112,7 +112,7 @@ def _night(config: BenchConfig, console: Console) -> Measured:
 
 
 def _sizes(config: BenchConfig) -> tuple[list[int], list[int]]:
-    return numbers("--cars", config.cars), numbers("--triangles", config.triangles)
+    return parse_integers("--cars", config.cars), parse_integers("--triangles", config.triangles)
 
 
 def _seconds(name: str, config: BenchConfig) -> float:

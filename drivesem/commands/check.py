@@ -24,7 +24,7 @@ LEAST_SIDE = 64
 _STYLES = {"ok": "green", "failed": "bold red", "raised": "bold red", "not tried": "dim"}
 
 
-def run(config: CheckConfig) -> int:
+def check_command(config: CheckConfig) -> int:
     """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input, a
     detector whose code raises among it.
     """
@@ -33,11 +33,11 @@ def run(config: CheckConfig) -> int:
     try:
         detector = load_predictor(config.detector, config.device, config.tiles)
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     try:
         report = check_detector(detector, (height, width), seed=config.seed, device=config.device)
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if config.json:
         print_json({"detector_setting": config.detector, **asdict(report)})
     else:

@@ -21,12 +21,12 @@ from drivesem.report.tables import ReportTable, format_count, format_percent, pr
 from drivesem.report.terminal import Console
 from drivesem.run.driver import print_output_folder, publish_report
 from drivesem.run.folder import claim_folder, resolve_output_folder
-from drivesem.run.page import PAGE
+from drivesem.run.report.runs import PAGE
 
 _ASKED = {"explain": explain_run, "holes": holes_run, "gate": gate_run}
 
 
-def run(config: ClassifyConfig) -> int:
+def classify_command(config: ClassifyConfig) -> int:
     """Draw, train, attack, or ask about a run; exit code 0, and 1 where a gate is not passed.
     Raises UsageError or SceneError for bad input."""
     check_device(config.device)

@@ -11,7 +11,7 @@ from drivesem.run.derender import derender_frames
 from drivesem.scenes.sources import Photographs, SceneSource
 
 
-def run(config: DerenderConfig) -> int:
+def derender_command(config: DerenderConfig) -> int:
     """Take apart the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console(stderr=True)
     found = derender_frames(config, lambda source: _begin(source, config, console))

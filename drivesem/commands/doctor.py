@@ -13,7 +13,7 @@ from drivesem.report.terminal import Console, progress_bar
 _LOOKS = {"works": "green", "missing": "yellow", "broken": "red"}
 
 
-def run(config: DoctorConfig) -> int:
+def doctor_command(config: DoctorConfig) -> int:
     """Try all parts; exit code 0, or 1 where one does not work without which nothing does."""
     errors = Console(stderr=True)
     with progress_bar(errors, keep=False, show_elapsed=False, hidden=not errors.is_terminal) as bar:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivesem.analysis.evaluate.figures import evaluate_files
-from drivesem.analysis.evaluate.report import print_result
+from drivesem.analysis.evaluate.files import evaluate_files
+from drivesem.analysis.evaluate.report import print_evaluation
 from drivesem.config.commands import EvalConfig
 from drivesem.report.tables import print_json
 from drivesem.report.terminal import Console
@@ -12,21 +12,21 @@ _FILE_WIDTH = 120
 """Characters a line of the tables where they go to a file and not to a terminal."""
 
 
-def run(config: EvalConfig) -> int:
+def eval_command(config: EvalConfig) -> int:
     """Evaluate and report; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
     console = Console(stderr=True)
     if config.detector is not None:
-        from drivesem.analysis.evaluate.detector import evaluate_detector, print_figures
+        from drivesem.analysis.evaluate.detector import evaluate_detector, print_detector_metrics
         from drivesem.config.devices import check_device
 
         check_device(config.device)
         figures = evaluate_detector(config)
         if config.json:
             print_json(figures.data)
-        print_figures(figures, console)
+        print_detector_metrics(figures, console)
         return 0
     result = evaluate_files(config)
     if config.json:
         print_json(result.to_json())
-    print_result(result, console if console.is_terminal else Console(stderr=True, width=_FILE_WIDTH))
+    print_evaluation(result, console if console.is_terminal else Console(stderr=True, width=_FILE_WIDTH))
     return 0

@@ -16,7 +16,7 @@ from drivesem.failures.grades import Grade
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.finished import METRICS
-from drivesem.run.folder import CONFIG, FRAMES, attack_of, is_attack, settings_of
+from drivesem.run.folder import CONFIG, FRAMES, is_attack_run, load_attack_config, result_settings
 from drivesem.run.labels import list_frames
 from drivesem.run.lock import acquire_folder_lock, is_locked_elsewhere
 from drivesem.run.merge import merge_runs
@@ -29,7 +29,7 @@ _HOME = "runs"
 """Where `drivesem attack` puts runs without --out."""
 
 
-def run(config: RunsConfig) -> int:
+def runs_command(config: RunsConfig) -> int:
     """Tell, merge or prune; exit code 0. Raises UsageError or SceneError for bad input."""
     console = Console()
     does = {"list": _list, "show": _show, "merge": _merge, "prune": _prune}
@@ -69,11 +69,11 @@ def _runs_in(folder: Path) -> list[Path]:
     if (folder / CONFIG).is_file():
         return [folder]
     runs = (path.parent for path in folder.glob(f"*/{CONFIG}") if (path.parent / FRAMES).is_dir())
-    return sorted(run for run in runs if is_attack(run))
+    return sorted(run for run in runs if is_attack_run(run))
 
 
 def _row(folder: Path) -> dict[str, Any]:
-    attack, figures = attack_of(folder, _SETTING), _figures(folder)
+    attack, figures = load_attack_config(folder, _SETTING), _figures(folder)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return {
         "run": str(folder),
@@ -99,7 +99,7 @@ def _show(config: RunsConfig, console: Console) -> dict[str, Any]:
     told = []
     for folder in map(_place, config.folders):
         usual = {field.name: field.default for field in fields(AttackConfig)}
-        settings = settings_of(attack_of(folder, _SETTING))
+        settings = result_settings(load_attack_config(folder, _SETTING))
         asked = {key: value for key, value in settings.items() if value != usual[key]}
         told.append({**_row(folder), "settings": asked, "left": len(files.find_leftovers(folder))})
         console.print(
@@ -125,7 +125,7 @@ def _merge(config: RunsConfig, console: Console) -> dict[str, Any]:
 def _prune(config: RunsConfig, console: Console) -> dict[str, Any]:
     removed: list[str] = []
     for folder in map(Path, config.folders):
-        attack_of(folder, _SETTING)
+        load_attack_config(folder, _SETTING)
         acquire_folder_lock(folder)  # what another command is writing now is none of this
         for path in files.find_leftovers(folder):
             # A question to the run writes below it, and holds the folder of its own answers alone.

@@ -46,7 +46,7 @@ def order_of(config: SynthConfig) -> Order:
     )
 
 
-def run(config: SynthConfig) -> int:
+def synth_command(config: SynthConfig) -> int:
     """Write the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
     start = time.perf_counter()
     order = order_of(config)

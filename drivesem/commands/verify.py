@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from drivesem.analysis.verify.asking import WHOLE_RUN, verify_run
+from drivesem.analysis.verify.run import WHOLE_RUN, run_verify
 from drivesem.config.commands import VerifyConfig
 from drivesem.config.devices import check_device
 from drivesem.report.tables import ReportTable, format_count, print_json
@@ -22,12 +22,12 @@ _UNSEALED = (
 )
 
 
-def run(config: VerifyConfig) -> int:
+def verify_command(config: VerifyConfig) -> int:
     """Check, report; exit code 0, or 1 where something differs or a frame could not be read. Raises UsageError or
     SceneError for bad input.
     """
     check_device(config.device)
-    data, out = verify_run(config)
+    data, out = run_verify(config)
     console = Console(stderr=True)
     if config.json:
         print_json(data)

@@ -1,22 +1,38 @@
-"""One dataclass a command, of shared blocks and settings of its own. The command line wins over a preset
-(`--config FILE.yaml`), which wins over the defaults here.
+"""Settings of each command: one dataclass of shared blocks and fields of its own.
 
-This module is loaded by `drivesem --help`: it imports nothing heavy.
+A docstring below a field is the option's help. The command line wins over a preset (`--config NAME`), which wins
+over the defaults here. `drivesem --help` loads this module: it imports nothing heavy.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from drivesem.config.blocks import (
-    CERTIFYING_DRAWS,
+from drivesem.config.constraints import (
+    POSITIVE,
+    AllowsUrl,
+    ExistingFolder,
+    NumberRange,
+    OneOf,
+    OnlyWith,
+    ParsedBy,
+    Required,
+    at_least,
+    is_url,
+    parse_class_map,
+    parse_integers,
+    parse_part,
+)
+from drivesem.config.errors import refuse
+from drivesem.config.options import (
     DATASETS,
+    DEFAULT_FINDER,
     DEMO,
-    FINDER,
+    MIN_DRAWS,
     SCENES,
     BootstrapOption,
     CommandConfig,
@@ -40,238 +56,220 @@ from drivesem.config.blocks import (
     TrainingOptions,
     TrustOption,
     WorkerOptions,
-    option,
+    option_name,
 )
-from drivesem.config.constraints import (
-    POSITIVE,
-    AllowsUrl,
-    ExistingFolder,
-    ForMethods,
-    NumberRange,
-    OneOf,
-    Parsed,
-    Required,
-    at_least,
-)
-from drivesem.config.errors import refuse
-from drivesem.config.values import class_map, is_url, numbers, part_of
 
 COMBO_NUMBERS = (1, 2, 3, 4)
 DEFAULT_COMBO = 2
 DEFAULT_QUERIES = 64
 SYNTH = "synth"
-"""What --dataset takes for training: frames that the generator makes."""
-GRADIENT_FREE = ("random", "halton", "sobol", "cma-es")
-"""Attacks that ask a detector only what it finds."""
-LEAST_PASSES = 24
-"""Of --passes: with fewer, searches have nothing left after a look around."""
-COUNTED = (*GRADIENT_FREE, "scw", "subsets")
-"""Attacks that end after --queries."""
-RESTARTED = ("si-fgsm", "apgd", "fgsm", "sgd", "scw")
-"""Attacks that may begin elsewhere."""
-Search = Literal[
-    "si-fgsm", "apgd", "fgsm", "sgd", "scw", "subsets", "random", "halton", "sobol", "cma-es", "corners", "climb"
-]  # fmt: skip
-"""Attacks that look for failures; the placebo looks for none."""
+"""Value of --dataset of training: frames from the generator."""
+GRADIENT_FREE_METHODS = ("random", "halton", "cma-es")
+"""Search methods that use detections alone."""
+QUERY_METHODS = (*GRADIENT_FREE_METHODS, "scw")
+"""Search methods that end after --queries."""
+MIN_PASSES = 24
+"""The fewest --passes: with fewer, searches end with their first samples."""
+SearchMethod = Literal["si-fgsm", "apgd", "fgsm", "sgd", "scw", "random", "halton", "cma-es", "corners", "climb"]
+"""Methods that search for failures; a placebo does not."""
 
-_NETWORK = "squeezenet"
-"""The classifier that is attacked, or trained, where none is named."""
+_DEFAULT_NETWORK = "squeezenet"
+"""The classifier of `drivesem classify`."""
+_STEP_METHODS = ("si-fgsm", "apgd", "sgd", "scw")
+_CLASSIFY_RUN = ("confirm", "explain", "holes", "gate")
+"""What `drivesem classify` does with a finished run."""
 
 RunArguments = Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN...")]
 RunFolders = Annotated[RunArguments, Required("folders of drivesem attack", "RUN")]
-Fraction = Annotated[float, NumberRange(0, 1, "()", "a share between 0 and 1")]
+Combo = Annotated[int, NumberRange(1, 4, expected="1, 2, 3 or 4")]
+Fraction = Annotated[float, NumberRange(0, 1, "()", "a fraction between 0 and 1")]
+FractionOrEnds = Annotated[float, NumberRange(0, 1, expected="a fraction from 0 to 1")]
+NewFolder = Annotated[str | None, Required("a new or empty folder"), tyro.conf.arg(aliases=["-o"])]
+PictureFile = Annotated[str | None, tyro.conf.arg(aliases=["-o"])]
+SceneFolder = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+ClassMap = Annotated[str, ParsedBy(parse_class_map)]
+LabelFormat = Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone"]
+Stage = Literal["attacked", "attacked-paper", "rerendered", "benign"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandConfig):
-    """Find feasible changes of driving scenes that a detector gets wrong."""
+    """Search for feasible scene changes that make a detector fail."""
 
-    combo: Annotated[int, NumberRange(1, 4, expected="1, 2, 3 or 4")] | None = None
-    """The paper's combinations: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
+    basic: ClassVar[tuple[str, ...]] = (
+        *("detector", "dataset", "root", "limit", "combo", "params", "budget", "changes", "method", "passes"),
+        *("steps", "objective", "confirm", "second_detector", "out", "workers", "device", "seed", "json"),
+    )
+
+    combo: Combo | None = None
+    """Combination of the paper: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
-    """Any set instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh; size and
-    sun, with --budget street alone."""
-    method: Literal[Search, "placebo"] = "si-fgsm"
-    """si-fgsm, fgsm, sgd follow the gradient, apgd by steps that halve where the loss stops rising; scw
-    (Carlini-Wagner) also keeps the change small; subsets finds the fewest parameters that are enough; random
-    (uniform), halton, sobol (scrambled sequences) and cma-es ask only what the detector finds; climb lowers what
-    each object's margin is on average over draws of --nuisances, and finds failures that hold; corners is its
-    baseline, which tries corners of the bounds."""
-    passes: Annotated[Count, at_least(LEAST_PASSES, "which the search needs")] | None = None
-    """Passes of the detector that a frame may take, a gradient counted as 3: methods take as many steps or queries
-    as fit, whatever --steps says. By default only climb and corners count them, 90."""
-    queries: Annotated[Count, ForMethods(COUNTED)] | None = None
-    """Of scw: gradients; of methods without gradient: renders that are judged; of subsets: both. By default 64."""
-    step_form: Annotated[Literal["raw", "l2"], ForMethods(("sgd",))] = "l2"
-    """Of sgd: the gradient as it is, or its direction, each parameter's as long as a step of si-fgsm."""
+    """Parameters instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh, size, sun."""
+    method: Literal[SearchMethod, "placebo"] = "si-fgsm"
+    """Search method; climb and corners look for failures that hold; placebo makes one random edit (--like)."""
+    passes: Annotated[Count, at_least(MIN_PASSES, "which the search needs")] | None = None
+    """Detector passes per frame (a gradient counts as 3); climb and corners take 90 by default."""
+    queries: Annotated[Count, OnlyWith("method", QUERY_METHODS)] | None = None
+    """Query budget: gradients for scw, evaluated renders for gradient-free methods (default: 64)."""
+    step_form: Annotated[Literal["raw", "l2"], OnlyWith("method", ("sgd",))] = "l2"
+    """Step of sgd: the gradient itself (raw), or its direction in steps as long as si-fgsm's (l2)."""
     rate: Annotated[
-        float,
-        ForMethods(("si-fgsm", "apgd", "sgd", "scw")),
-        NumberRange(0, ends="()", expected="a number above 0"),
+        float, OnlyWith("method", _STEP_METHODS), NumberRange(0, ends="()", expected="a number above 0")
     ] = 1.0
-    """Of si-fgsm, apgd, sgd and scw: length of a (first) step in units of each parameter's own step."""
-    momentum: Annotated[float, ForMethods(("si-fgsm", "sgd")), NumberRange(0, 1)] = 0.0
-    """Of si-fgsm and sgd: what is left of earlier gradients after a step, 0 to 1 (MI-FGSM: 1)."""
-    norm: Annotated[Literal[1, 2], ForMethods(("scw",))] = 2
-    """Of scw: the norm of the change that is kept small."""
-    restarts: Annotated[NotNegative, ForMethods(RESTARTED)] = 0
-    """Of si-fgsm, apgd, fgsm, sgd and scw: how often to begin again at random near the photograph."""
-    scouts: Annotated[NotNegative, ForMethods(RESTARTED)] = 0
-    """Of the same: how many samples of all the bounds are judged first; the attack begins at the best."""
-    like: Annotated[str, ForMethods(("placebo",)), ExistingFolder("a run of drivesem attack")] | None = None
-    """Of placebo, one random edit of each frame: the run whose counterexamples are as large."""
+    """Length of a (first) step of si-fgsm, apgd, sgd and scw, in units of each parameter's own step."""
+    momentum: Annotated[float, OnlyWith("method", ("si-fgsm", "sgd")), NumberRange(0, 1)] = 0.0
+    """Weight of earlier gradients in si-fgsm and sgd, 0 to 1 (MI-FGSM: 1)."""
+    norm: Annotated[Literal[1, 2], OnlyWith("method", ("scw",))] = 2
+    """Norm of the change that scw keeps small."""
+    like: Annotated[str, OnlyWith("method", ("placebo",)), ExistingFolder("a run of drivesem attack")] | None = (
+        None
+    )
+    """Run whose counterexamples set the size of a placebo's edits."""
     range: Literal["bounds", "steps"] = "bounds"
-    """Of methods without gradient: search all of the parameters' bounds, or what --steps steps reach."""
+    """Region in which gradient-free methods sample: all of the bounds, or what --steps steps can reach."""
     early_stop: Flag = False
-    """Stop a frame at its first success instead of using all steps or queries."""
+    """Stop a frame at its first success."""
     grade: bool = True
-    """See how sure failures are; without, all are by threshold, and certificates take no time."""
-    changes: Annotated[str, ForMethods(("climb", "corners"))] | None = None
-    """Of climb and corners, with --budget street: what else may change, with commas: leave (a car is gone), park
-    (one more stands there), swap (another vehicle in its place), load (on its roof). Some are tried on what was
-    found, within the same passes; the best is kept."""
+    """Compute certificates; without them every failure has the grade threshold."""
+    changes: Annotated[str, OnlyWith("method", ("climb", "corners"))] | None = None
+    """Changes of vehicles with --budget street: leave, park, swap, load, with commas (climb and corners)."""
     mesh: str | None = None
-    """Of --changes: the vehicle that parks or comes in a car's place, a mesh (OBJ, GLB, PLY) in metres, y up; by
-    default templates.
-    """
+    """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY, metres, y up (default: the templates)."""
     target_objects: str | None = None
-    """Only these objects of each frame, such as 0,2: others may be lost, which is no success; nor are phantoms."""
+    """Objects that count as failures when lost, such as 0,2; phantoms do not count then."""
     target_classes: str | None = None
-    """Only objects and phantoms of these classes, such as Car,Pedestrian."""
+    """Classes whose lost objects and phantoms count as failures, such as Car,Pedestrian."""
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
 
     out: FolderOrUrl = None
-    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
-    part: Annotated[str | None, Parsed(part_of)] = None
-    """K/N, such as 2/4: the 2nd, 6th, 10th frame and so on, for one of four machines (drivesem runs merge)."""
+    """Folder or URL of the results; the same command resumes what it finds there."""
+    part: Annotated[str | None, ParsedBy(parse_part)] = None
+    """Part of the frames for one of several machines: K/N is every N-th, from the K-th (drivesem runs merge)."""
 
     def check(self) -> None:
         super().check()
-        beside = f"--combo {self.combo}"
-        refuse(self.combo is not None and self.params is not None, "--params", "no --combo beside it", beside)
-        free = self.method in GRADIENT_FREE
-        without = f"a method without gradient ({', '.join(GRADIENT_FREE)}) beside it"
-        refuse(self.range != "bounds" and not free, "--range", without, self.method)
-        none = f"float32 with {self.method}, which takes no gradient"
-        refuse(free and self.precision != "float32", "--precision", none, self.precision)
-        single = self.early_stop and self.method in ("fgsm", "placebo")
-        refuse(single, "--early-stop", "a method of several steps or queries", self.method)
-        both = self.passes is not None and self.queries is not None
-        refuse(both, "--queries", "no --passes beside it", f"--passes {self.passes}")
-        subsets = self.method == "subsets"
-        whole = self.early_stop and self.method in ("subsets", "corners", "climb")
-        refuse(whole, "--early-stop", "a method that may end at the first success", self.method)
+        method, gradient_free = self.method, self.method in GRADIENT_FREE_METHODS
+        refuse(None not in (self.combo, self.params), "--params", "no --combo", f"--combo {self.combo}")
+        free = f"--method {', '.join(GRADIENT_FREE_METHODS)}"
+        refuse(self.range != "bounds" and not gradient_free, "--range", free, f"--method {method}")
+        exact = f"float32 with {method}, which takes no gradient"
+        refuse(gradient_free and self.precision != "float32", "--precision", exact, self.precision)
+        whole = self.early_stop and method in ("fgsm", "placebo", "corners", "climb")
+        refuse(whole, "--early-stop", "a method that can end at its first success", f"--method {method}")
+        refuse(None not in (self.passes, self.queries), "--queries", "no --passes", f"--passes {self.passes}")
         street = self.budget.split(",")[0] == "street"
-        refuse(self.changes is not None and not street, "--changes", "--budget street beside it", self.budget)
-        refuse(self.mesh is not None and self.changes is None, "--mesh", "--changes beside it", self.mesh)
-        unlike = self.method == "placebo" and self.like is None
+        refuse(self.changes is not None and not street, "--changes", "--budget street", f"--budget {self.budget}")
+        refuse(self.mesh is not None and self.changes is None, "--mesh", "--changes", "none")
+        unlike = method == "placebo" and self.like is None
         refuse(unlike, "--like", "a run of drivesem attack, for --method placebo", "nothing")
-        refuse(subsets and self.queries == 1, "--queries", "at least 2 with subsets", self.queries)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveConfig(TileOption, SearchOptions, FrameCommandConfig):
-    """Attack a whole clip: one change of each car over its whole track, and how long the detector misses it."""
+    """Attack a video clip with one consistent change per vehicle."""
+
+    basic: ClassVar[tuple[str, ...]] = (
+        *("clip", "sequence", "limit", "detector", "combo", "params", "budget", "method", "steps", "queries"),
+        *("objective", "certify", "out", "workers", "device", "seed", "json"),
+    )
 
     clip: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="CLIP"), AllowsUrl()] = None
-    """A folder, or its URL: Virtual KITTI 1.3.1 or 2, KITTI's tracking benchmark, or what drivesem synth
-    --sequence wrote (kitti, vkitti2); by default an embedded drive, made by code."""
+    """Folder or URL of a Virtual KITTI or KITTI tracking data set (default: a generated drive)."""
     sequence: str | None = None
-    """Which clip of the folder, such as 0003, 0001/clone or Scene01/clone; by default the first."""
-    combo: Annotated[int, NumberRange(1, 4, expected="1, 2, 3 or 4")] | None = None
-    """The paper's combinations, as of drivesem attack, instead of --params."""
+    """Clip in the folder, such as 0003, 0001/clone or Scene01/clone (default: the first)."""
+    combo: Combo | None = None
+    """Combination of the paper instead of --params, as in drivesem attack."""
     params: str | None = None
-    """What may change, with commas, as of drivesem attack; by default color,translate,mesh. translate is a smooth
-    path aside; all else is the same in all frames."""
-    method: Literal["si-fgsm", "fgsm", "sgd", "random", "halton", "sobol", "cma-es"] = "si-fgsm"
-    """si-fgsm, fgsm, sgd follow the gradient; the others ask only what the detector finds in the whole clip."""
-    queries: Annotated[Count, ForMethods(COUNTED)] | None = None
-    """Of methods without gradient: whole clips that are judged, by default 64."""
+    """Parameters, with commas (default: color,translate,mesh); translate is a smooth path over time."""
+    method: Literal["si-fgsm", "fgsm", "sgd", "random", "halton", "cma-es"] = "si-fgsm"
+    """Search method: si-fgsm, fgsm and sgd use gradients; random, halton and cma-es do not."""
+    queries: Annotated[Count, OnlyWith("method", QUERY_METHODS)] | None = None
+    """Query budget of gradient-free methods, in evaluated clips (default: 64)."""
     bend: Annotated[int, NumberRange(0, 5, expected="0 to 5")] = 3
-    """Degree of the polynomial of a car's path over time; 0 sets it aside by the same in all frames."""
+    """Degree of the polynomial of a vehicle's path over time; 0: the same offset in all frames."""
     keys: Count = 8
-    """Frames that a gradient step looks at, evenly spread; each step looks at others, in turn."""
+    """Frames per gradient step, evenly spread and different in each step."""
     certify: NotNegative = 6
-    """Frames with new misses, evenly spread, that are looked at again in draws: are they missed for certain?"""
+    """Frames with new misses, evenly spread, whose failures get certificates."""
     fit: bool = True
-    """Fit each car's shape in the frame that shows it best (photographs only)."""
+    """Fit each vehicle's shape in the photograph that shows it best."""
     limit: Count | None = None
-    """Take the first N frames; of the embedded drive N, by default 30."""
+    """Number of frames, from the first (default for the generated drive: 30)."""
 
     def check(self) -> None:
         super().check()
-        both = self.combo is not None and self.params is not None
-        refuse(both, "--params", "no --combo beside it", f"--combo {self.combo}")
-        refuse(self.sequence is not None and self.clip is None, "--sequence", "a CLIP beside it", self.sequence)
+        refuse(None not in (self.combo, self.params), "--params", "no --combo", f"--combo {self.combo}")
+        refuse(self.sequence is not None and self.clip is None, "--sequence", "a CLIP", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DerenderConfig(SceneOptions, FrameCommandConfig):
-    """Take photographs apart into scenes: vehicles, their shadows, and what stood behind them."""
+    """Turn photographs into editable 3D scenes."""
+
+    basic: ClassVar[tuple[str, ...]] = (
+        *("photo", "dataset", "root", "split", "limit", "finder", "focal", "fast", "meshes", "segmenter"),
+        *("velodyne", "sheet", "out", "workers", "seed", "json"),
+    )
 
     out: FolderOrUrl = None
-    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
+    """Folder or URL of the scenes; the same command resumes what it finds there."""
     photo: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="PHOTO")] = None
-    """A photograph without labels, or a folder of them: vehicles are found by a detector and placed by a small
-    network."""
-    finder: Annotated[str, tyro.conf.arg(aliases=["--detector"])] = FINDER
-    """Of PHOTO, and of --dataset photographs: the detector that finds the vehicles, shipped or a file."""
+    """Photograph without labels, or a folder of them; a detector finds the vehicles, a network their poses."""
+    finder: Annotated[str, tyro.conf.arg(aliases=["--detector"])] = DEFAULT_FINDER
+    """Detector that finds vehicles in photographs without labels."""
     velodyne: Flag = False
-    """Read the laser's points too (KITTI, where a frame has them)."""
+    """Use the laser's points too (KITTI, where a frame has them)."""
     fit: bool = True
-    """Fit template, pose and shape to the photograph's silhouettes."""
+    """Fit template, pose and shape to the silhouettes in photographs."""
     fast: Flag = False
-    """No fit: templates stay where the labels put them. The same as --no-fit."""
+    """Skip the fit: templates stay where the labels put them; the same as --no-fit."""
     meshes: Annotated[str, ExistingFolder()] | None = None
-    """A folder of vehicle meshes (OBJ, GLB, PLY) to choose from beside the templates."""
+    """Folder of vehicle meshes (OBJ, GLB, PLY) to choose from, with the templates."""
     segmenter: str | None = None
-    """An ONNX file of a segmentation network that maps sky, foliage and road, instead of the shipped one."""
+    """ONNX network that segments sky, foliage and road (default: the shipped one)."""
     sheet: Flag = False
-    """Also draw sheet.jpg into each scene's folder: photograph, mattes, normals, depth, maps, shadows, background,
-    re-render and difference."""
+    """Write sheet.jpg to each scene: photograph, mattes, normals, depth, maps, re-render and difference."""
 
     def check(self) -> None:
         super().check()
-        alone, beside = self.photo is None, f"--dataset {self.dataset}"
-        demo = self.dataset == DEMO
-        refuse(not alone and not demo, "PHOTO", "no --dataset beside it", beside)
-        photographs = "a PHOTO or a --dataset of photographs beside it"
-        refuse(self.meshes is not None and alone and demo, "--meshes", photographs, beside)
-        refuse(self.segmenter is not None and alone and demo, "--segmenter", photographs, beside)
-        refuse(self.velodyne and self.dataset != "kitti", "--velodyne", "--dataset kitti beside it", beside)
+        data, labelled = f"--dataset {self.dataset}", self.photo is None
+        refuse(not labelled and self.dataset != DEMO, "PHOTO", "no --dataset", data)
+        for name in ("meshes", "segmenter"):
+            unused = getattr(self, name) is not None and labelled and self.dataset == DEMO
+            refuse(unused, f"--{name}", "a PHOTO or a --dataset of photographs", data)
+        refuse(self.velodyne and self.dataset != "kitti", "--velodyne", "--dataset kitti", data)
         refuse(self.device != "cpu", "--device", "cpu", self.device)
-        refuse(self.cache is not None, "--cache", "none: scenes are what is written", self.cache)
-        refuse(self.dataset == SCENES, "--dataset", "photographs to take apart", beside)
+        refuse(self.cache is not None, "--cache", "none: the scenes are the result", self.cache)
+        refuse(self.dataset == SCENES, "--dataset", "photographs", data)
 
-    def _check_photographs(self, beside: str) -> None:
+    def _check_photographs(self, data: str) -> None:
         if self.photo is None:
-            super()._check_photographs(beside)
+            super()._check_photographs(data)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TransferConfig(DetectionOptions, FrameCommandConfig):
-    """Show the counterexamples of finished runs to other detectors: whose failures are shared?"""
+    """Test counterexamples on other detectors."""
 
     run: RunFolder = None
     """Folder of a run of drivesem attack; several with commas."""
     detectors: Annotated[str | None, Required("detectors with commas")] = None
-    """Detectors to ask, with commas: shipped ones, files, or other projects' (docs/detectors.md)."""
+    """Detectors to test, with commas: shipped ones, weights files, or other projects'."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainConfig(TrustOption, InferenceOptions, BootstrapOption, RunOption, FrameCommandConfig):
-    """Say why the counterexamples of a finished run fail: which parameter, which car, and how little is enough."""
+    """Find which change causes each failure, and the smallest one that suffices."""
 
     frame: str | None = None
-    """Frames of the run by name, with commas; by default all that fail by moved labels."""
+    """Frames of the run, by name with commas (default: all that fail)."""
     least: Literal["fails", "lost"] = "fails"
-    """What the least change must still do: fail in any way, or lose an object where the counterexample does."""
+    """Effect that the smallest change must keep: any failure, or a lost object where one was lost."""
     points: Count = 16
-    """How many scales of a change are looked at before the smallest that fails is bisected."""
+    """Scales of the change to evaluate before the smallest failing one is bisected."""
     permutations: int = 32
-    """Walks through the cars, in random orders and back, where more than 6 moved; up to 6, all subsets are
-    judged."""
+    """Random orders of the vehicles for Shapley values; up to 6 vehicles, all subsets are evaluated."""
 
     def check(self) -> None:
         super().check()
@@ -281,667 +279,621 @@ class ExplainConfig(TrustOption, InferenceOptions, BootstrapOption, RunOption, F
 
 @dataclass(frozen=True, kw_only=True)
 class ConfirmConfig(TrustOption, RunOption, FrameCommandConfig):
-    """Draw a run's counterexamples again by a second renderer: which failures survive it?"""
+    """Re-test counterexamples with a second renderer."""
 
     run: RunFolder = None
-    """Folder of a run of drivesem attack. Generated frames are drawn by the generator, photographs by pyrender."""
+    """Folder of a run of drivesem attack; generated frames need the generator, photographs pyrender."""
     root: FolderOrUrl = None
-    """Folder of the run's data set, or its URL, where it is no longer where the run found it."""
+    """Folder or URL of the run's data set, if it has moved."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HolesConfig(TrustOption, FrameCommandConfig):
-    """Look around the certain failures of runs: where, and how often, does the detector lose such an object?"""
+    """Map failure regions around certain failures."""
 
     runs: RunFolders = ()
-    """Folders of drivesem attack."""
-    samples: Annotated[int, at_least(24, "of which a rule can be made")] = 96
-    """States around each failure, within what the run could change; each is seen once, with nuisances."""
+    """Folders of runs of drivesem attack."""
+    samples: Annotated[int, at_least(24, "which a rule needs")] = 96
+    """Samples around each failure, each evaluated once with nuisances."""
     fresh: Count = 32
-    """Further ones inside of the rule that was found, which it is held against."""
+    """New samples inside each rule, which estimate its failure rate."""
     contrast: NotNegative = 4
-    """States of every frame in which all objects change: they say where none is lost, for rules of many."""
+    """Samples per frame in which all objects change, as contrast for rules of several failures."""
     recheck: Count | None = None
-    """Then so many inside of each rule by seeds of their own, of a hole's stated probability: does it hold?"""
-    reach: Annotated[float, NumberRange(0, 1, ends="(]", expected="a share above 0, up to 1")] = 1.0
-    """How far from the counterexample, as a share of each bound's width, within the bounds."""
+    """Samples with other seeds inside each rule, which test its stated failure rate again."""
+    reach: Annotated[float, NumberRange(0, 1, ends="(]", expected="a fraction above 0, up to 1")] = 1.0
+    """Distance from the counterexample, as a fraction of each bound's width."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GateConfig(TrustOption, BootstrapOption, TileOption, FrameCommandConfig):
-    """Compare two detectors around certain failures of runs: exit code 1 where the new one fails more often."""
+    """Compare two detectors on a run's failure regions; for CI."""
 
     runs: RunFolders = ()
-    """Folders of drivesem attack."""
+    """Folders of runs of drivesem attack."""
     before: str | None = None
-    """The detector that stands: shipped, a file, or another project's; by default the runs' own."""
-    after: Annotated[str | None, Required("the detector that is to take the place of --before")] = None
-    """The one that is to take its place; it has to be named."""
-    tolerance: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.05
-    """By how much the share of lost objects may grow, of a hole, of a kind of failure, and of all."""
+    """Current detector: shipped, a weights file, or another project's (default: the runs' own)."""
+    after: Annotated[str | None, Required("the detector that replaces --before")] = None
+    """New detector; exit code 1 if it fails more often."""
+    tolerance: FractionOrEnds = 0.05
+    """Accepted increase of the rate of lost objects: per region, per kind of failure, and overall."""
     samples: Count = 32
-    """States around each failure, the same for both detectors."""
+    """Samples around each failure, the same for both detectors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig(CommandConfig):
-    """The page of a finished run, or of several beside each other: one HTML file with its pictures in it."""
+    """Build the HTML report of one or more runs."""
 
     runs: RunFolders = ()
-    """Folders of drivesem attack; a folder of drivesem study stands for its arms."""
-    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """HTML file to write; by default report.html in the one folder given, else where the command is called."""
+    """Folders of runs of drivesem attack, or of an experiment, whose arms are its runs."""
+    out: PictureFile = None
+    """HTML file to write (default: report.html in the run's folder, or here for several runs)."""
     frames: Count | None = None
-    """Frames whose pictures are shown, worst first; by default as many as hold 200 pictures: 100 of one run."""
+    """Frames to show, worst first (default: as many as 200 pictures hold, 100 of one run)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunsConfig(TrustOption, CommandConfig):
-    """Tell what runs there are, make one of several parts, and remove what was never finished."""
+    """List, merge and prune runs."""
 
     what: tyro.conf.Positional[Literal["list", "show", "merge", "prune"]] = "list"
-    """list: the runs in folders, by default in runs; show: what was asked for and found; merge: one run, --out, of
-    parts that were made with the same settings, on several machines for instance; prune: remove what commands left
-    that were killed."""
+    """list runs; show their settings and results; merge parts with equal settings; prune unfinished files."""
     folders: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FOLDER..."), AllowsUrl()] = ()
-    """Runs of drivesem attack, or their URLs; to list, folders that hold some."""
-    out: str | None = None
-    """Merge: the folder of the run that is made."""
-    dry: Flag = False
-    """Prune: only say what would be removed."""
+    """Runs of drivesem attack, or their URLs; for list, folders of runs (default: runs)."""
+    out: Annotated[str, OnlyWith("what", ("merge",))] | None = None
+    """Folder of the merged run."""
+    dry: Annotated[Flag, OnlyWith("what", ("prune",))] = False
+    """Print what prune would remove, and remove nothing."""
 
     def check(self) -> None:
         super().check()
         refuse(self.what != "list" and not self.folders, "FOLDER", f"runs to {self.what}", "nothing")
-        merges, given = self.what == "merge", self.out is not None
-        refuse(merges and not given, "--out", "the folder of the run that is made", "nothing")
-        refuse(given and not merges, "--out", "runs merge", f"runs {self.what}")
-        refuse(self.dry and self.what != "prune", "--dry", "runs prune", f"runs {self.what}")
-        elsewhere = next((folder for folder in self.folders if is_url(folder)), None)
-        here = elsewhere is None or self.what != "prune"
-        refuse(not here, "FOLDER", "a folder of this machine, to prune", elsewhere)
+        refuse(self.what == "merge" and self.out is None, "--out", "the folder of the merged run", "nothing")
+        url = next((folder for folder in self.folders if is_url(folder)), None)
+        refuse(self.what == "prune" and url is not None, "FOLDER", "a folder on this machine, to prune", url)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyConfig(TrustOption, DeviceOption, WorkerOptions, RunOption, CommandConfig):
-    """Is a finished run what it says it is? Every frame computed again from its files; exit code 1 where not."""
+    """Recompute a run from its files and compare. Exit code 1 on a mismatch."""
 
     out: str | None = None
-    """JSON file to write; by default verify.json in the run's folder."""
+    """JSON file to write (default: verify.json in the run's folder)."""
     limit: Count | None = None
-    """Check the first N frames."""
+    """Number of frames to check, from the first."""
     keep_going: Flag = False
-    """List a frame whose files are missing or damaged in the results, and go on with the rest."""
+    """List frames with missing or damaged files in the results and continue with the rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig(CommandConfig):
-    """Render a scene folder as it stands."""
+    """Render a scene."""
 
-    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
-    """The scene's folder, as `drivesem derender` writes it."""
-    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """PNG to write; by default render.png in the scene's folder."""
+    scene: SceneFolder
+    """Folder of a scene of drivesem derender."""
+    out: PictureFile = None
+    """PNG file to write (default: render.png in the scene's folder)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EditConfig(CommandConfig):
-    """Change a scene folder by physical units, and render it."""
+    """Change a scene by physical amounts."""
 
-    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
-    """The scene's folder, as `drivesem derender` writes it; objects are numbered by row, from 0."""
+    scene: SceneFolder
+    """Folder of a scene of drivesem derender; its objects are numbered from 0."""
     set: Repeated = ()
-    """A change, as often as needed: 'objects[2].translate=0.5m,0m' (along the heading, to the left),
-    'objects[2].rotate=10deg', 'objects[1].color=0.3,0,0,0,0', 'objects[all].rotate=2deg', weather=fog (or rain,
-    sunset, overcast, twilight), weather.rain=0.4, foliage.hue=0.5."""
+    """Change, repeatable: objects[2].translate=0.5m,0m, objects[all].rotate=2deg, weather=fog, foliage.hue=0.5."""
     remove: Repeated = ()
-    """Rows of vehicles to take out, with their shadows; or all."""
+    """Vehicles to remove with their shadows, by number with commas, or all."""
     photographed: Flag = False
-    """Begin with the scene as it was photographed, where the folder holds a counterexample or an edit: every
-    vehicle at its place, in its shape and paint, without weather. Vehicles that were removed, exchanged, added,
-    loaded or taken away stay so. A shape is then also given as a share of what it was bent to:
-    'objects[2].mesh=60%'."""
+    """Start from the scene as photographed, where it holds a counterexample or an edit."""
     edits: str | None = None
-    """A YAML file of changes; what --set says of the same thing wins."""
-    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
-    """PNG to write; by default edit.png in the scene's folder, or nothing where there is --save."""
+    """YAML file of changes; --set wins over it."""
+    out: PictureFile = None
+    """PNG file to write (default: edit.png in the scene's folder, or none with --save)."""
     save: str | None = None
-    """Folder to write the changed scene to."""
+    """Folder for the changed scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(TrustOption, ThresholdOption, TileOption, DeviceOption, CommandConfig):
-    """Open a page on which a scene or a counterexample moves as you move it, and the detector answers."""
+    """Explore a scene or run in the browser."""
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE|RUN")]
-    """A scene of drivesem derender, a folder of some, or a run of drivesem attack."""
+    """Scene of drivesem derender, a folder of scenes, or a run of drivesem attack."""
     frame: str | None = None
-    """The frame to begin with, by name; by default the first."""
+    """Frame to start with, by name (default: the first)."""
     detector: str | None = None
-    """A shipped detector, a file, or another project's (docs/detectors.md); by default the run's, else squeezedet.
-    """
+    """Detector: shipped, a weights file, or another project's (default: the run's, else squeezedet)."""
     budget: str = "street"
-    """How far sliders go: a preset, a YAML file, or NAME=VALUE with commas, as of drivesem attack."""
+    """Range of the sliders: a preset, a YAML file, or NAME=VALUE with commas, as in drivesem attack."""
     port: Annotated[int, NumberRange(0, 65535, expected="0 (any that is free) to 65535")] | None = None
-    """Port of 127.0.0.1 to serve the page at; by default 8321, or the next that is free."""
+    """Port of 127.0.0.1 (default: 8321, or the next that is free)."""
     browser: bool = True
     """Open the page in the browser."""
-    window: Flag = False
-    """Instead of the page, show the frame in 3D in a window of Open3D, which needs a display."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SynthConfig(FrameCommandConfig):
-    """Make driving frames with exact ground truth by code."""
+    """Generate street scenes with exact ground truth."""
 
     out: FolderOrUrl = None
-    """Folder for the results, or its URL (docs/scale.md); a second run with the same goes on where it stopped."""
+    """Folder or URL of the data set; the same command resumes what it finds there."""
     frames: Count = 10
-    """How many frames; each is made in every one of --variations."""
+    """Number of frames; each is made in every variation."""
     layout: Literal["kitti", "vkitti2", "vkitti1", "coco", "yolo"] = "kitti"
-    """Layout of the folder that is written: KITTI object, Virtual KITTI 2 or 1.3.1, COCO JSON, YOLO."""
+    """Layout of the data set: KITTI object, Virtual KITTI 2 or 1.3.1, COCO JSON, YOLO."""
     split: Literal["train", "heldout"] = "train"
-    """Pools of vehicle shapes and surroundings; the two share nothing."""
+    """Pool of vehicle shapes and surroundings; the two pools share nothing."""
     variations: str | None = None
-    """Virtual KITTI's, with commas, or all: clone, fog, morning, overcast, rain, sunset, 15-deg-left,
-    15-deg-right, 30-deg-left, 30-deg-right; or mixed: weather drawn for each street. By default clone for Virtual
-    KITTI's layouts, else mixed."""
+    """Variations of Virtual KITTI with commas, such as clone,fog,15-deg-left; all; or mixed weather."""
     sequence: Count | None = None
-    """Frames of one drive, ten a second, with moving cars and tracks; by default 10 for Virtual KITTI's layouts,
-    else 1: every frame a street of its own."""
+    """Frames per drive, at 10 per second, with tracks (default: 10 for Virtual KITTI, else 1)."""
     people: bool | None = None
-    """Pedestrians and cyclists too; by default in all layouts but Virtual KITTI's, which have no class for
-    them."""
+    """Add pedestrians and cyclists (default: in all layouts but Virtual KITTI's)."""
     cameras: Literal[1, 2] = 1
-    """2: Virtual KITTI 2's right camera too."""
-    validation: Annotated[float, NumberRange(0, 1, "[)", "a share in [0, 1)")] = 0.0
-    """Share of the frames that make up part val, from shapes that no frame of part train shows."""
+    """Number of cameras; 2 adds the right camera of Virtual KITTI 2."""
+    validation: Annotated[float, NumberRange(0, 1, "[)", "a fraction in [0, 1)")] = 0.0
+    """Fraction of the frames in part val, with shapes that part train does not contain."""
     edits: str | None = None
-    """A YAML file of changes to the scenes: vehicles moved, turned, bent, painted, removed; weather; foliage."""
+    """YAML file of changes to the scenes: vehicles, weather, foliage."""
     meshes: str | None = None
-    """A folder of vehicle meshes (OBJ, GLB, PLY) to use instead of the generated ones."""
+    """Folder of vehicle meshes (OBJ, GLB, PLY) instead of the generated ones."""
     assets: str | None = None
-    """A folder of the optional pack of vehicles and skies, made by tools/fetch_assets.py."""
+    """Folder of the optional vehicles and skies of tools/fetch_assets.py."""
     sheet: Flag = False
-    """Also draw sheet.jpg: frames with boxes, depth, classes, instances, as read back from the folder."""
+    """Write sheet.jpg: frames with boxes, depth, classes and instances, as read back."""
     compare: Flag = False
-    """Also write distributions.png and .md: sizes, distances, angles, occlusion beside KITTI's own."""
+    """Write distributions.png and .md: sizes, distances, angles and occlusion, compared with KITTI."""
 
     def check(self) -> None:
         super().check()
         refuse(self.cameras == 2 and self.layout != "vkitti2", "--cameras", "1, or --layout vkitti2", self.cameras)
-        unknown = f"False with --layout {self.layout}, which has no class for them"
-        refuse(bool(self.people) and self.layout.startswith("vkitti"), "--people", unknown, True)
+        no_people = f"False with --layout {self.layout}, which has no class for them"
+        refuse(bool(self.people) and self.layout.startswith("vkitti"), "--people", no_people, True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(InferenceOptions, SceneOptions, FrameCommandConfig):
-    """What benchmarks have in common."""
+    """Options that benchmarks share."""
 
     quick: Flag = False
     """Measure with fewer repetitions."""
-    cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
+    cars: Annotated[str, ParsedBy(parse_integers)] = "1,4,8,16"
     """Numbers of cars, 1 to 16, with commas."""
-    triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
-    """Triangles a car, with commas."""
+    triangles: Annotated[str, ParsedBy(partial(parse_integers, minimum=4))] = "2000,5000"
+    """Triangles per car, with commas."""
     threads: Count | None = None
-    """Threads of torch and of the kernels (default: as many as torch chooses)."""
+    """Threads of torch and of the kernels (default: torch's choice)."""
     detector: str = "squeezedet"
-    """Shipped detector, or a .safetensors file of one."""
+    """Detector: a shipped one, or a .safetensors file of one."""
     markdown: str | None = None
-    """Markdown file whose section on this benchmark is rewritten (docs/benchmarks.md)."""
+    """Markdown file whose section on this benchmark is rewritten."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchConfig(BenchOptions):
     """Measure attack steps, rendering and run time on this machine."""
 
+    basic: ClassVar[tuple[str, ...]] = (
+        *("what", "quick", "cars", "triangles", "boxes", "frames", "dataset", "root", "limit", "count", "attack"),
+        *("threads", "detector", "out", "markdown", "workers", "device", "seed", "json"),
+    )
+
     what: tyro.conf.Positional[Literal["step", "render", "night"]] = "step"
-    """step: a whole attack step, compared with the detector alone; render: the renderer, compared with its
-    reference; night: an estimate of how long an attack on all frames of --root takes."""
-    boxes: str | None = None
-    """Of step: a tar archive of KITTI's label_2 and calib, whose vehicles are measured."""
+    """step: an attack step and the detector alone; render: both renderers; night: hours for all of --root."""
+    boxes: Annotated[str, OnlyWith("what", ("step",))] | None = None
+    """Tar archive of KITTI's label_2 and calib, whose vehicles step measures."""
     frames: Count = 40
-    """Of step: frames of --boxes; a quarter of them with --quick."""
+    """Frames of --boxes; a quarter of them with --quick."""
     limit: Count | None = None
-    """Of night: frames to measure, evenly spread (default: 20)."""
+    """Frames that night measures, evenly spread (default: 20)."""
     count: Count | None = None
-    """Of night: frames to estimate for (default: all that have vehicles)."""
+    """Frames that night estimates for (default: all with vehicles)."""
     attack: str | None = None
-    """Of night: preset or YAML file of `drivesem attack` (default: its defaults; data, device and workers are
-    given here)."""
+    """Preset or YAML file of the attack that night measures (default: the default attack)."""
 
     def check(self) -> None:
         super().check()
-        refuse(self.what != "step" and self.boxes is not None, "--boxes", "bench step", f"bench {self.what}")
-        demo = self.what == "night" or self.dataset == DEMO
-        refuse(not demo, "--dataset", "--dataset demo, but for bench night", self.dataset)
+        data = self.what == "night" or self.dataset == DEMO
+        refuse(not data, "--dataset", "demo, except with night", self.dataset)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvalConfig(TileOption, WorkerOptions, CommandConfig):
-    """Figures of detections against labels, as COCO, KITTI or VOC define them; or of a detector on a data set."""
+    """Compute detection metrics (COCO, KITTI, VOC) for a detector or a prediction file."""
 
     gt: FolderOrUrl = None
-    """Labels: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of
-    drivesem attack."""
+    """Labels: a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of drivesem attack."""
     pred: FolderOrUrl = None
-    """Detections: a folder of KITTI result files (with scores), COCO results, YOLO text files, or a run."""
+    """Detections: KITTI result files with scores, COCO results, YOLO text files, or a run."""
     pred_b: FolderOrUrl = None
-    """A second set of detections of the same frames, compared with the first by a paired test."""
+    """Second detections of the same frames, compared with the first by a paired test."""
     protocol: Literal["coco", "kitti", "voc"] = "coco"
-    """Which benchmark's rules."""
+    """Evaluation protocol."""
     gt_format: Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"] = "auto"
-    """Layout of --gt; auto looks at what lies there."""
+    """Layout of --gt; auto detects it."""
     pred_format: Literal["auto", "kitti", "coco", "yolo", "run"] = "auto"
-    """Layout of --pred and --pred-b."""
+    """Layout of --pred and --pred-b; auto detects it."""
     small_detections: Literal["ignore", "count"] = "ignore"
-    """KITTI: detections below the minimum height are ignored (development kit of 2017) or counted (the older)."""
-    map: Annotated[str, Parsed(class_map)] | None = None
-    """Classes of the detections by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
-    map_gt: Annotated[str, Parsed(class_map)] | None = None
-    """The same for the labels."""
+    """KITTI detections below the minimum height: ignored (development kit of 2017) or counted (the older one)."""
+    map: ClassMap | None = None
+    """Class names of the detections, such as car=Car,person=Pedestrian; bus=- leaves a class out."""
+    map_gt: ClassMap | None = None
+    """Class names of the labels, in the same form."""
     classes: str | None = None
-    """Judge these classes only, with commas."""
+    """Classes to evaluate, with commas (default: all)."""
     frames: str | None = None
-    """A file with one identifier a line: judge these frames only."""
-    stage: Literal["attacked", "attacked-paper", "rerendered", "benign"] = "attacked"
-    """Of a run: detections after the attack, beside labels that moved or the benign ones; in the re-rendered
-    photograph; in the photograph."""
-    stage_b: Literal["attacked", "attacked-paper", "rerendered", "benign"] | None = None
-    """The same for --pred-b; by default --stage."""
+    """File of the frames to evaluate, one identifier per line (default: all)."""
+    stage: Stage = "attacked"
+    """Detections of a run: after the attack by moved or benign labels, re-rendered, or in the photograph."""
+    stage_b: Stage | None = None
+    """The same for --pred-b (default: --stage)."""
     bootstrap: NotNegative | None = None
-    """Draws of frames for confidence intervals and paired tests; 0 leaves them out. By default 200, and none of
-    more than 5,000 frames, whose figures hardly vary, unless two detectors are compared."""
+    """Bootstrap samples for intervals and paired tests (default: 200; 0 for over 5,000 frames of one detector)."""
     seed: int = 0
-    """Seed of the draws."""
+    """Seed of the bootstrap."""
     out: str | None = None
     """Folder for metrics.json, CSV, Markdown and PNG."""
     detector: str | None = None
-    """Instead of --gt and --pred: run this detector, a shipped one, a file, or another project's (see
-    docs/detectors.md)."""
+    """Detector to run instead of reading --pred: shipped, a weights file, or another project's."""
     dataset: Annotated[str, OneOf(DATASETS)] = "kitti"
-    """Of --detector: kitti, vkitti1, vkitti2, coco or yolo."""
+    """Data set for --detector: kitti, vkitti1, vkitti2, coco or yolo."""
     root: FolderOrUrl = None
-    """Of --detector: folder of the data set, or its URL."""
+    """Folder or URL of that data set."""
     limit: Count | None = None
-    """Of --detector: the first N frames."""
+    """Number of its frames, from the first."""
     device: str = "cpu"
-    """Of --detector: torch device."""
+    """torch device of --detector."""
     min_height: float = 25.0
-    """Of --detector: lower objects are neither missed nor a hit, px."""
+    """Smallest height of an object that counts with --detector, px."""
     max_occlusion: int = 1
-    """Of --detector: objects occluded more (KITTI's 0 to 3) are neither missed nor a hit."""
+    """Largest occlusion of an object that counts with --detector, KITTI's 0 to 3."""
     max_truncation: float = 1.0
-    """Of --detector: objects of which a larger share lies outside the image are neither missed nor a hit."""
+    """Largest truncated fraction of an object that counts with --detector."""
     pictures: NotNegative = 0
-    """Of --detector: draw hits, misses and false alarms of the N frames with most mistakes into --out."""
+    """Number of frames with most errors of --detector to draw into --out."""
 
     def check(self) -> None:
         super().check()
-        given, asked = self.gt is not None and self.pred is not None, self.detector is not None
-        which = "both" if self.gt else "neither"
-        refuse(given == asked, "--gt and --pred, or --detector", "one or the other", which)
-        refuse(asked and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
-        sharing = next((f.name for f in fields(WorkerOptions) if getattr(self, f.name) != f.default), None)
-        alone = sharing is not None and not asked
-        refuse(alone, option(sharing or ""), "--detector beside it", "none")
-        nowhere = self.pictures > 0 and (not asked or self.out is None)
+        files, detector = None not in (self.gt, self.pred), self.detector is not None
+        given = "both" if self.gt else "neither"
+        refuse(files == detector, "--gt and --pred, or --detector", "one or the other", given)
+        refuse(detector and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
+        changed = [field.name for field in fields(WorkerOptions) if getattr(self, field.name) != field.default]
+        refuse(bool(changed) and not detector, option_name("".join(changed[:1])), "--detector", "none")
+        nowhere = self.pictures > 0 and (not detector or self.out is None)
         refuse(nowhere, "--pictures", "--detector and --out", "one of them missing")
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnchorsConfig(CommandConfig):
-    """Anchor shapes for a data set, by k-means of its boxes with 1 - IoU as the distance."""
-
-    dataset: Annotated[str, OneOf(DATASETS)] = "kitti"
-    """kitti, vkitti1, vkitti2, coco or yolo."""
-    root: str
-    """Folder of the data set."""
-    count: Count = 9
-    """How many anchors."""
-    classes: str | None = None
-    """Boxes of these classes only, with commas, as the data set calls them; by default of all."""
-    min_height: float = 12.0
-    """Lower boxes are left out, px: nothing is trained on them."""
-    limit: Count | None = None
-    """The first N frames."""
-    seed: int = 0
-    """Seed of the starts; the best of several is kept."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class CheckConfig(TileOption, DeviceOption, CommandConfig):
-    """Does a detector keep its contract? Shapes, gradient, loss, decoding; exit code 1 where it does not."""
+    """Test a detector against the contract, and see what it detects. Exit code 1 if a promise is broken."""
 
     detector: str
-    """A shipped detector, a file, or another project's (docs/detectors.md)."""
+    """Detector: shipped, a weights file, or another project's."""
     size: str = "320x192"
-    """WIDTHxHEIGHT of the pictures it is tried on, px."""
+    """Size of the test pictures, WIDTHxHEIGHT, px."""
     seed: int = 0
-    """Seed of the pictures, and of the directions along which differences are taken."""
+    """Seed of the pictures and of the directions of finite differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertConfig(CommandConfig):
-    """Convert labels between KITTI, COCO, YOLO and Virtual KITTI, or to FiftyOne, and say what is lost."""
+    """Convert labels between formats."""
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
-    """What to convert: a folder of KITTI label files, a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or
-    the counterexamples of a run of drivesem attack."""
+    """Labels: a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of drivesem attack."""
     out: Annotated[str, tyro.conf.arg(aliases=["-o"])]
     """Folder to write, new or empty; or a .json file for COCO."""
-    to_format: Annotated[
-        Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone"], tyro.conf.arg(aliases=["--to"])
-    ]
-    """Layout to write."""
+    to_format: Annotated[LabelFormat, tyro.conf.arg(aliases=["--to"])]
+    """Format to write."""
     from_format: Annotated[
         Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"], tyro.conf.arg(aliases=["--from"])
     ] = "auto"
-    """Layout of SOURCE; auto looks at what lies there."""
+    """Format of SOURCE; auto detects it."""
     scores: Flag = False
-    """SOURCE holds detections with scores, not labels."""
+    """Read detections with scores, not labels."""
     images: str | None = None
-    """Folder of the images, for their sizes, which COCO and YOLO need; by default where SOURCE has them."""
+    """Folder of the images, whose sizes COCO and YOLO need (default: where SOURCE has them)."""
     image_size: str | None = None
-    """WIDTHxHEIGHT of all images, px, instead of looking at them."""
+    """Size of all images, WIDTHxHEIGHT, px, instead of reading it from the files."""
     copy_images: Flag = False
-    """Also copy the images into the new layout."""
-    map: Annotated[str, Parsed(class_map)] | None = None
-    """Classes by name, with commas: car=Car,person=Pedestrian; bus=- leaves a class out."""
+    """Copy the images to the output."""
+    map: ClassMap | None = None
+    """Class names, such as car=Car,person=Pedestrian; bus=- leaves a class out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(CommandConfig):
-    """Hand a run's counterexamples on: as training data with moved labels, as tables, or as 3D files."""
+    """Export counterexamples as training data, tables or 3D files."""
 
     run: RunFolder = None
-    """Folder of a run of drivesem attack; for gltf also a scene of drivesem derender, or a folder of some."""
-    out: Annotated[str | None, Required("a new or empty folder"), tyro.conf.arg(aliases=["-o"])] = None
+    """Folder of a run of drivesem attack; for gltf also a scene, or a folder of scenes."""
+    out: NewFolder = None
     """Folder to write, new or empty."""
-    to_format: Annotated[
-        Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone", "tables", "gltf"],
-        tyro.conf.arg(aliases=["--to"]),
-    ]
-    """kitti, coco, yolo, vkitti1, vkitti2, fiftyone: a data set with its images, and where each is from; coco also
-    holds what the detector found. tables: frames, failures and parameters as CSV, and as Parquet where pyarrow is
-    there. gltf: vehicles and surroundings in 3D, textured by the photograph."""
+    to_format: Annotated[Literal[LabelFormat, "tables", "gltf"], tyro.conf.arg(aliases=["--to"])]
+    """Format: a labelled data set; tables (CSV, and Parquet with pyarrow); gltf (textured 3D scenes)."""
     grade: Literal["all", "threshold", "certain", "confirmed", "shared"] = "threshold"
-    """Frames with a failure of at least this grade (docs/grades.md); all: also those that withstood."""
-    map: Annotated[str, Parsed(class_map)] | None = None
-    """Classes by name, with commas: Car=car,Truck=truck; Truck=- leaves a class out."""
+    """Lowest grade of the failures to export; all also exports frames without failures."""
+    map: ClassMap | None = None
+    """Class names, such as Car=car,Truck=truck; Truck=- leaves a class out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(TrainingOptions, FrameCommandConfig):
-    """Train a detector; killed or stopped, the same command goes on and ends with the same weights."""
+    """Train a detector."""
+
+    basic: ClassVar[tuple[str, ...]] = (
+        *("detector", "dataset", "root", "split", "held_out", "held_out_split", "validation", "frames", "weights"),
+        *("start", "anchors", "steps", "minutes", "batch", "rate", "semantic", "out", "device", "seed", "json"),
+    )
 
     detector: str = "squeezedet"
-    """Architecture: squeezedet, or another one of docs/training.md."""
+    """Architecture: squeezedet, or another one of the training guide."""
     dataset: Annotated[str, OneOf((*DATASETS, SYNTH))] = "kitti"
-    """kitti, vkitti1, vkitti2, coco or yolo; or synth: the generator makes frames in the run's folder first."""
+    """Data set: kitti, vkitti1, vkitti2, coco, yolo; or synth: frames that the generator makes first."""
     root: str | None = None
-    """Folder of the data set, or several with commas: their frames are joined."""
+    """Folder of the data set; several with commas are joined."""
     held_out: str | None = None
-    """Folder of the same layout to judge by: the best weights on it are kept, and t* is set on it."""
+    """Folder of frames that select the best weights and set t*, in the same layout."""
     split: str | None = None
-    """Frames of --root: 3d-sdn-train or 3d-sdn (of Virtual KITTI), random:0.75 or random:0.75:rest, or a file of
-    names (docs/derender.md)."""
+    """Frames of --root: 3d-sdn-train, 3d-sdn, random:FRACTION, random:FRACTION:rest, or a file of names."""
     held_out_split: str | None = None
-    """The same of --held-out; where that is not given, of --root."""
+    """Frames of --held-out, or of --root without it, in the same form."""
     validation: str | None = None
-    """Folder of the same layout that chooses the best weights and t* in the place of --held-out, which then only
-    judges them: its figures are of frames that had no say."""
+    """Folder of frames that select weights and t* instead of --held-out, which then only measures."""
     also: str | None = None
-    """Folder of further frames whose figures go into the model card, KITTI layout."""
+    """Folder of further frames whose metrics go into the model card, in KITTI's layout."""
     frames: Annotated[int, POSITIVE] = 1000
-    """Synth: how many frames to train on."""
+    """Frames to generate for training with --dataset synth."""
     held_out_frames: NotNegative = 100
-    """Synth: how many frames to judge by, of shapes and surroundings of their own; 0 is none."""
+    """Frames to generate for evaluation, with other shapes and surroundings; 0 for none."""
     weights: str | None = None
-    """File for the best weights, with their card beside; by default DETECTOR.safetensors in the run's folder."""
+    """File for the best weights and their model card (default: DETECTOR.safetensors in the run's folder)."""
     start: str = "auto"
-    """First weights: auto (the shipped ones of this architecture, or none), none, squeezenet (ImageNet backbone),
-    darknet:FILE.cfg,FILE.weights, or a .safetensors file: weights, a run's checkpoint, or a backbone."""
-    anchors: Literal["published", "kmeans"] = "published"
-    """SqueezeDet: as published, or as many by k-means of the data's boxes."""
+    """First weights: auto (shipped), none, squeezenet, darknet:FILE.cfg,FILE.weights, or a .safetensors file."""
+    anchors: Literal["published", "kmeans"] | int = "published"
+    """Anchors of SqueezeDet: published, or kmeans of the boxes; a number N prints N anchors and trains nothing."""
     steps: Annotated[int, POSITIVE] = 10000
-    """Length of the schedule in steps."""
+    """Training steps."""
     batch: Annotated[int, POSITIVE] = 16
-    """Views a step, over all processes."""
+    """Views per step, over all processes."""
     optimiser: Literal["adamw", "sgd"] = "adamw"
-    """sgd is with --momentum."""
+    """Optimiser; sgd uses --momentum."""
     momentum: Annotated[float, NumberRange(0, 1, "[)")] = 0.9
-    """Of sgd."""
+    """Momentum of sgd."""
     rate: Annotated[float, POSITIVE] = 1e-3
     """Peak learning rate."""
     backbone_rate: float = 0.3
-    """Rate of the layers that a backbone provides, relative to the others'."""
+    """Learning rate of a pretrained backbone, relative to the other layers'."""
     weight_decay: float = 1e-4
-    """Decay of the weights a step, relative to the rate."""
+    """Weight decay per step, relative to the learning rate."""
     warmup_power: float = 1.0
-    """The rate rises with this power of the steps (Darknet's burn-in: 4)."""
-    drops: Annotated[str, Parsed(numbers)] | None = None
-    """Steps, with commas, at which the rate is multiplied by --drop-factor; without, it falls in a half cosine."""
+    """Power of the steps with which the learning rate rises (Darknet's burn-in: 4)."""
+    drops: Annotated[str, ParsedBy(parse_integers)] | None = None
+    """Steps, with commas, at which the learning rate drops (default: a half cosine instead)."""
     drop_factor: float = 0.1
-    """Of --drops."""
+    """Factor of each drop of the learning rate."""
     clip: Annotated[float, POSITIVE] = 50.0
-    """Largest norm of a step's gradient."""
+    """Largest norm of a gradient."""
     average: Annotated[float, NumberRange(0, 1, "[)")] = 0.998
-    """Decay a step of the moving average of the weights, which is what is judged and kept."""
+    """Decay per step of the moving average of the weights, which is evaluated and saved."""
     dropout: Annotated[float, NumberRange(0, 1, "[)")] = 0.5
-    """Of detectors that have dropout."""
+    """Dropout rate, of detectors with dropout."""
     evaluate_every: NotNegative = 500
-    """Steps between evaluations on the held-out frames; 0 is at the end only."""
+    """Steps between evaluations; 0 evaluates at the end only."""
     thin: Annotated[int, POSITIVE] = 1
-    """Judge by every n-th held-out frame until the best weights are written."""
+    """Stride of the frames in evaluations before the last."""
     semantic: Annotated[float, NumberRange(0, 1, "[)")] = 0.0
-    """Share of the views that show a frame with its vehicles moved, turned, bent and painted at random, weather
-    and foliage changed, by the project's own renderer; data sets with 3D boxes."""
+    """Fraction of views with random scene changes, by the project's renderer; needs 3D boxes."""
     loaders: NotNegative = 0
-    """Threads that make views ready ahead (where a GPU trains); 0 makes them between the steps."""
+    """Threads that prepare views ahead (for GPUs); 0 prepares them between steps."""
     note: Annotated[str, AllowsUrl()] = ""
-    """A remark on this run for the model card."""
+    """Remark for the model card."""
 
     def check(self) -> None:
         super().check()
-        made, given = self.dataset == SYNTH, (self.root, self.held_out, self.validation) != (None,) * 3
-        refuse(not made and self.root is None, "--root", f"the folder of data set {self.dataset!r}", "nothing")
-        both = "--root, --held-out, --validation"
-        refuse(made and given, both, "none with --dataset synth, which makes what it needs", "one")
+        synth, root = self.dataset == SYNTH, self.root is not None
+        refuse(not synth and not root, "--root", f"the folder of data set {self.dataset!r}", "nothing")
+        given = root or (self.held_out, self.validation) != (None, None)
+        folders = "--root, --held-out, --validation"
+        refuse(synth and given, folders, "none with --dataset synth, which makes its own frames", "one")
         split = self.split or self.held_out_split
-        refuse(made and split is not None, "--split, --held-out-split", "none with --dataset synth", split)
-        alone = self.validation is not None and self.held_out is None
-        refuse(alone, "--held-out", "frames to judge by, beside --validation", "none")
+        refuse(synth and split is not None, "--split, --held-out-split", "none with --dataset synth", split)
+        unheld = self.validation is not None and self.held_out is None
+        refuse(unheld, "--held-out", "frames to measure on, with --validation", "none")
+        fitted = not isinstance(self.anchors, int) or (self.anchors > 0 and not synth)
+        refuse(not fitted, "--anchors", "a number above 0 and a data set with labels", self.anchors)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RetrainConfig(TrustOption, TrainingOptions, FrameCommandConfig):
-    """Train a detector on with a run's counterexamples, and attack it again. Defaults: the paper's protocol."""
+    """Fine-tune a detector on counterexamples and attack it again."""
+
+    basic: ClassVar[tuple[str, ...]] = (
+        *("run", "dataset", "root", "start", "fraction", "mix", "label_mode", "validation", "fresh", "steps"),
+        *("attack_steps", "minutes", "batch", "rate", "out", "workers", "device", "seed", "json"),
+    )
 
     run: str
-    """A run's folder, as drivesem attack writes it."""
+    """Folder of a run of drivesem attack."""
     dataset: Annotated[str, OneOf(DATASETS)] | None = None
-    """Benign frames to train on: kitti, vkitti1, vkitti2, coco or yolo; by default the run's own photographs."""
+    """Benign frames: kitti, vkitti1, vkitti2, coco or yolo (default: the run's photographs)."""
     root: str | None = None
     """Folder of that data set."""
     start: str | None = None
-    """First weights: a shipped detector or a .safetensors file; by default the detector that the run attacked."""
+    """First weights: a shipped detector or a .safetensors file (default: the detector of the run)."""
     fraction: Fraction = 0.25
-    """Share of the training set that are counterexamples."""
+    """Fraction of counterexamples in the training set."""
     mix: Literal["replace", "add"] = "replace"
-    """Counterexamples in the place of benign frames, drawn at random, or beside all of them."""
+    """Counterexamples replace random benign frames, or are added to them."""
     label_mode: Literal["paper", "moved"] = "paper"
-    """Labels of counterexamples in training: the benign ones as in the paper, or moved with the cars."""
-    ramp: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.0
-    """Share of the steps over which counterexamples come in little by little; 0: all from the first step."""
+    """Training labels of counterexamples: benign as in the paper, or moved with the vehicles."""
+    ramp: FractionOrEnds = 0.0
+    """Fraction of the steps over which counterexamples come in; 0: all from the first step."""
     validation: Fraction = 0.25
-    """Share of the run's frames that are never trained on: the table's figures are of these."""
+    """Fraction of the run's frames to evaluate on; they are never trained on."""
     fresh: NotNegative | None = None
-    """How many of those are attacked again, against the retrained detector; by default all, 0 is none."""
+    """Evaluation frames to attack again with the retrained detector (default: all)."""
     attack_steps: Count | None = None
-    """Steps of that attack; by default as many as the run's."""
+    """Steps of that attack (default: the run's)."""
     steps: Annotated[int, POSITIVE] = 6000
-    """Steps of training."""
+    """Training steps."""
     rate: Annotated[float, POSITIVE] = 3e-4
-    """Peak learning rate of AdamW; it falls in a half cosine."""
+    """Peak learning rate of AdamW, which falls in a half cosine."""
 
     def check(self) -> None:
         super().check()
-        one = (self.dataset is None) != (self.root is None)
-        refuse(one, "--dataset and --root", "both or none", "one of them")
+        single = (self.dataset is None) != (self.root is None)
+        refuse(single, "--dataset and --root", "both or none", "one of them")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassifyConfig(FrameCommandConfig):
-    """Image classifiers instead of detectors: objects whose shape, pose or light changes until a network errs."""
+    """Attack image classifiers instead of detectors."""
+
+    basic: ClassVar[tuple[str, ...]] = (
+        *("what", "folder", "network", "objects", "split", "params", "method", "steps", "queries", "grade"),
+        *(
+            "layers",
+            "epochs",
+            "batch",
+            "samples",
+            "tolerance",
+            "out",
+            "limit",
+            "workers",
+            "device",
+            "seed",
+            "json",
+        ),
+    )
 
     what: tyro.conf.Positional[Literal["data", "train", "attack", "confirm", "explain", "holes", "gate"]]
-    """data: pictures of all objects, by split and class; train: a network on these; attack: look for changes that
-    a network gets wrong. Of a run of attack, RUN: confirm draws its failures again by a second renderer; explain
-    says how little of each change is enough; holes, in which poses the object is misclassified;
-    gate, whether --network fails more often there: exit code 1."""
+    """data: render pictures; train or attack a network; confirm, explain, holes, gate: analyse a finished RUN."""
     folder: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="RUN")] = None
     """Folder of a run of drivesem classify attack."""
     renderer: Literal["auto", "mitsuba", "pyrender"] = "auto"
-    """Confirm: the second renderer; by default Mitsuba where it is installed, else pyrender."""
-    samples: Annotated[int, at_least(24, "of which a rule can be made")] = 64
-    """Holes, gate: poses around each failure, each seen once, with nuisances."""
+    """Second renderer of confirm (auto: Mitsuba if installed, else pyrender)."""
+    samples: Annotated[int, at_least(24, "which a rule needs")] = 64
+    """Poses around each failure that holes and gate evaluate, with nuisances."""
     fresh: Count = 32
-    """Holes: further ones inside of the rule that was found, of its stated probability."""
+    """New poses inside each rule of holes, which estimate its failure rate."""
     reach: Annotated[float, POSITIVE] = 0.6
-    """Holes, gate: how far pitch, yaw and roll go either way from the pose that was found, rad."""
-    tolerance: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.05
-    """Gate: by how much the share of misclassified poses may grow, of a failure, of a class, and of all."""
+    """Range of pitch, yaw and roll around a failure for holes and gate, rad either way."""
+    tolerance: FractionOrEnds = 0.05
+    """Accepted increase of the misclassification rate for gate: per failure, per class, and overall."""
     objects: str | None = None
-    """Where objects come from: ShapeNetCore v2's folder, or one of meshes by class; by default 12 classes that are
-    made by code."""
+    """Folder of ShapeNetCore v2, or of meshes by class (default: 12 generated classes)."""
     split: Literal["train", "val", "test"] = "test"
-    """Attack: whose objects."""
+    """Split whose objects are attacked."""
     views: str = "forward,top,left,right"
-    """From where each object is seen, with commas."""
+    """Camera views of each object, with commas."""
     backgrounds: Annotated[str, ExistingFolder("a folder of photographs")] | None = None
-    """Photographs to put behind objects; by default pictures that are made."""
+    """Folder of photographs as backgrounds (default: generated ones)."""
     network: str = ""
-    """Attack: squeezenet, weights that classify train wrote, or an ONNX file; train: squeezenet, vgg16,
-    vgg16-pooled, resnet50, torchvision:NAME or timm:NAME; by default squeezenet. Gate: the new one, as of attack;
-    it has to be named (docs/classify.md)."""
-    weights: str | None = None
-    """Train: what the network begins with, such as torchvision's file; squeezenet needs none, and with --layers
-    all others begin anew where none is named."""
-    data: Annotated[str, ExistingFolder("a folder of classify data")] | None = None
-    """Train: pictures that classify data wrote; by default they are made now."""
+    """Network: squeezenet, vgg16, resnet50, torchvision:NAME, timm:NAME, weights of classify train, or ONNX."""
+    weights: Annotated[str, OnlyWith("what", ("train",))] | None = None
+    """First weights of training, such as torchvision's file."""
+    data: Annotated[str, OnlyWith("what", ("train",)), ExistingFolder("a folder of classify data")] | None = None
+    """Pictures of classify data to train on (default: rendered now)."""
     layers: Literal["last", "all"] = "last"
-    """Train: the last layer, on features that are computed once, as in the paper; or the whole network."""
+    """Layers to train: the last, on features that are computed once as in the paper, or all."""
     epochs: Count = 20
-    """Train: how often each picture is shown."""
+    """Training epochs."""
     batch: Count = 32
-    """Train: pictures a step."""
+    """Pictures per training step."""
     rate: Annotated[float, POSITIVE] | None = None
-    """Train: learning rate of Adam; by default 0.003 for the last layer, 0.0001 for all."""
-    half: NotNegative = 0
-    """Train, --layers all: in the first N epochs pictures have half their size, a quarter of the work."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Train, --layers all: what the network computes in; bfloat16 is faster where the processor has it."""
+    """Learning rate of Adam (default: 0.003 for the last layer, 0.0001 for all)."""
+    half: Annotated[NotNegative, OnlyWith("what", ("train",))] = 0
+    """Epochs, from the first, with pictures of half the size, for --layers all."""
+    precision: Annotated[Literal["float32", "bfloat16"], OnlyWith("what", ("train",))] = "float32"
+    """Floating-point format of training with --layers all; bfloat16 where the CPU has it."""
     params: str | None = None
-    """Attack: what is changed, with commas: vertex, pose, lighting; by default pose,vertex, and pose alone for
-    random and halton."""
+    """Parameters to attack, with commas: vertex, pose, lighting (default: pose,vertex; pose without gradients)."""
     shape: Literal["each", "smooth"] = "each"
-    """Attack: whether vertices move each by itself, as in the paper, or with a 4x4x4 lattice around the object."""
+    """Motion of vertices: each by itself as in the paper, or with a 4x4x4 lattice around the object."""
     method: Literal["si-fgsm", "sgd", "scw", "random", "halton"] = "si-fgsm"
-    """Attack: by the gradient, after the paper, or samples of --within; of these the misclassified one with the
-    highest softmax of a wrong class is kept."""
+    """Search method: si-fgsm, sgd, scw use gradients as in the paper; random, halton sample --within-*."""
     steps: Count = 5
-    """Attack: steps along the gradient; an attack ends at the first that is misclassified."""
-    queries: Annotated[Count, ForMethods(("random", "halton"))] = 5
-    """Attack: samples of each picture."""
+    """Gradient steps; an attack ends at its first success."""
+    queries: Annotated[Count, OnlyWith("method", ("random", "halton"))] = 5
+    """Samples per picture of random and halton."""
     step_vertex: Annotated[float, POSITIVE] | None = None
-    """Attack: length of a step, in object sizes; by default the paper's for VGG-16, as are the next ones."""
+    """Step of a vertex, in object sizes (default: the paper's for VGG-16, as for all steps)."""
     step_pose: Annotated[float, POSITIVE] | None = None
-    """Attack: the same, in radians."""
+    """Step of the pose, rad."""
     step_lighting: Annotated[float, POSITIVE] | None = None
-    """Attack: the same, as a share of the light."""
+    """Step of the light, as a fraction of it."""
     within_vertex: Annotated[float, POSITIVE] | None = None
-    """Attack: how far a vertex may go along each axis."""
+    """Bound of a vertex along each axis, in object sizes."""
     within_pose: Annotated[float, POSITIVE] | None = None
-    """Attack: how far pitch, yaw and roll may go, rad; of random and halton by default 0.75."""
+    """Bound of pitch, yaw and roll, rad (default for random and halton: 0.75)."""
     within_lighting: Annotated[float, POSITIVE] | None = None
-    """Attack: how far the light may go."""
-    constant: Annotated[float, ForMethods(("scw",)), POSITIVE] = 0.1
-    """Attack: what a logit counts beside the size of the change."""
-    norm: Annotated[Literal[1, 2], ForMethods(("scw",))] = 2
-    """Attack: the norm of the change that is kept small."""
-    draws: Annotated[int, at_least(CERTIFYING_DRAWS, "which a certificate's rule needs")] = CERTIFYING_DRAWS
-    """Attack: draws before a change and after it, in which a failure must hold to be certain: right in 15 of 16,
-    then wrong in 12 of 16."""
+    """Bound of the light, as a fraction of it."""
+    constant: Annotated[float, OnlyWith("method", ("scw",)), POSITIVE] = 0.1
+    """Weight of a logit relative to the size of the change in scw."""
+    norm: Annotated[Literal[1, 2], OnlyWith("method", ("scw",))] = 2
+    """Norm of the change that scw keeps small."""
+    draws: Annotated[int, at_least(MIN_DRAWS, "which a certificate's rule needs")] = MIN_DRAWS
+    """Nuisance samples before and after the change, for each certificate."""
     grade: bool = True
-    """Attack: see whether failures are certain; without, all are by threshold."""
+    """Compute certificates; without them every failure has the grade threshold."""
     nuisances: str = "shift_px=3"
-    """Attack: what a draw changes of a picture (docs/grades.md)."""
+    """Nuisances of the samples: NAME=NUMBER with commas (docs/guide/ideas.md)."""
 
     def __post_init__(self) -> None:
-        # Beside a run there is no default: a network compared with itself passes every gate.
+        # gate has no default: a network compared with itself passes every gate.
         if not self.network and self.what != "gate":
-            object.__setattr__(self, "network", _NETWORK)
+            object.__setattr__(self, "network", _DEFAULT_NETWORK)
 
     def check(self) -> None:
         super().check()
-        whole = self.what == "train" and self.layers == "all"
-        refuse(self.half > 0 and not whole, "--half", "classify train --layers all", self.half)
+        last = f"--layers {self.layers}"
+        for name in ("half", "precision"):
+            changed = getattr(self, name) != getattr(ClassifyConfig, name) and self.layers == "last"
+            refuse(changed, f"--{name}", "--layers all", last)
         refuse(self.half > self.epochs, "--half", f"at most --epochs, {self.epochs}", self.half)
-        refuse(
-            self.precision != "float32" and not whole, "--precision", "classify train --layers all", self.precision
-        )
-        needless = self.weights is not None and self.what != "train"
-        refuse(needless, "--weights", "classify train (an attack takes --network FILE)", f"classify {self.what}")
-        refuse(self.data is not None and self.what != "train", "--data", "classify train", f"classify {self.what}")
-        of_run = self.what in ("confirm", "explain", "holes", "gate")
-        refuse(
-            of_run and not self.folder, "RUN", f"a folder of drivesem classify attack, to {self.what}", "nothing"
-        )
-        refuse(not of_run and self.folder is not None, "RUN", f"no folder, for classify {self.what}", self.folder)
-        refuse(not self.network, "--network", "the network that is to take the place of the run's", "nothing")
-        refuse(
-            self.what == "confirm" and self.out is not None, "--out", "none: confirm goes on in the run", self.out
-        )
+        of_run = self.what in _CLASSIFY_RUN
+        run = f"a folder of drivesem classify attack, to {self.what}"
+        refuse(of_run and not self.folder, "RUN", run, "nothing")
+        refuse(not of_run and self.folder is not None, "RUN", f"none with classify {self.what}", self.folder)
+        refuse(not self.network, "--network", "the network that replaces the run's", "nothing")
+        elsewhere = self.what == "confirm" and self.out is not None
+        refuse(elsewhere, "--out", "none with classify confirm, which writes to the run", self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorConfig(CommandConfig):
-    """Say what is installed, which optional parts work, what each missing one would give, and how to get it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PresetsConfig(CommandConfig):
-    """List the presets that --config takes by name."""
+    """Show what is installed and how to add what is missing."""
 
 
 COMMANDS: dict[str, type[CommandConfig]] = {
     "attack": AttackConfig,
     "drive": DriveConfig,
-    "transfer": TransferConfig,
-    "explain": ExplainConfig,
-    "confirm": ConfirmConfig,
-    "holes": HolesConfig,
-    "gate": GateConfig,
-    "report": ReportConfig,
-    "runs": RunsConfig,
+    "classify": ClassifyConfig,
     "verify": VerifyConfig,
+    "confirm": ConfirmConfig,
+    "explain": ExplainConfig,
+    "holes": HolesConfig,
+    "transfer": TransferConfig,
+    "gate": GateConfig,
+    "retrain": RetrainConfig,
+    "train": TrainConfig,
+    "eval": EvalConfig,
+    "export": ExportConfig,
+    "convert": ConvertConfig,
     "derender": DerenderConfig,
-    "render": RenderConfig,
     "edit": EditConfig,
+    "render": RenderConfig,
     "view": ViewConfig,
     "synth": SynthConfig,
-    "bench": BenchConfig,
-    "eval": EvalConfig,
-    "convert": ConvertConfig,
-    "export": ExportConfig,
     "check": CheckConfig,
-    "anchors": AnchorsConfig,
-    "train": TrainConfig,
-    "retrain": RetrainConfig,
-    "classify": ClassifyConfig,
     "doctor": DoctorConfig,
-    "presets": PresetsConfig,
+    "bench": BenchConfig,
+    "report": ReportConfig,
+    "runs": RunsConfig,
 }
-"""Commands by name."""
+"""Settings of each command, by name."""

@@ -34,10 +34,10 @@ from scene_ir.ffd import SYMMETRIC_DIM
 from scene_ir.types import TEXTURE_DIM
 
 ALL = "all"
-WEATHER_NAMES = ("fog", "rain", "time", "overcast")
-FOLIAGE_NAMES = ("hue", "lightness", "density")
-SUN_NAMES = ("azimuth", "elevation", "strength")
-WEATHERS: Mapping[str, Mapping[str, float]] = {
+WEATHER_CODES = ("fog", "rain", "time", "overcast")
+FOLIAGE_CODES = ("hue", "lightness", "density")
+SUN_CODES = ("azimuth", "elevation", "strength")
+WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "fog": {"fog": 0.6, "overcast": 0.4},
     "rain": {"rain": 0.8, "overcast": 0.6},
     "sunset": {"time": 0.5},
@@ -49,11 +49,11 @@ OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")
 FRAME_KEYS = ("objects", "weather", "foliage", "sun")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
-SHARE_UNITS = {"%": 0.01}
-MOST_GROWN = 0.5
+FRACTION_UNITS = {"%": 0.01}
+MAX_SIZE_CHANGE = 0.5
 """Share by which an edit may make a vehicle larger or smaller: beyond it is no vehicle of its kind."""
 _PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage|sun)\.(\w+)")
-_TRUTH = {"true": True, "false": False}
+_BOOLEANS = {"true": True, "false": False}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +70,17 @@ class ObjectEdit:
     mesh: tuple[float, ...] = ()
     size: float = 0.0
     remove: bool = False
-    mesh_share: float = 0.0
+    mesh_fraction: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
             raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
         if len(self.mesh) not in (0, SYMMETRIC_DIM):
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
-        if not abs(self.size) <= MOST_GROWN:
-            raise RangeError("edit size", f"a share of at most {MOST_GROWN:.0%} either way", self.size)
-        if not 0 <= self.mesh_share <= 1:
-            raise RangeError("edit mesh", "a share from 0% to 100%", self.mesh_share)
+        if not abs(self.size) <= MAX_SIZE_CHANGE:
+            raise RangeError("edit size", f"a share of at most {MAX_SIZE_CHANGE:.0%} either way", self.size)
+        if not 0 <= self.mesh_fraction <= 1:
+            raise RangeError("edit mesh", "a share from 0% to 100%", self.mesh_fraction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +90,9 @@ class FrameEdit:
     """
 
     objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
-    weather: tuple[float, ...] = (0.0,) * len(WEATHER_NAMES)
-    foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_NAMES)
-    sun: tuple[float, ...] = (0.0,) * len(SUN_NAMES)
+    weather: tuple[float, ...] = (0.0,) * len(WEATHER_CODES)
+    foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_CODES)
+    sun: tuple[float, ...] = (0.0,) * len(SUN_CODES)
 
 
 Edits = Mapping[int | str, FrameEdit]
@@ -104,19 +104,19 @@ def read_edits(path: Path) -> Edits:
 
     FormatError naming the file and the place in it.
     """
-    frames = mapping_of(f"{path}", files.read_yaml(path), ("frames",)).get("frames", {})
+    frames = require_mapping(f"{path}", files.read_yaml(path), ("frames",)).get("frames", {})
     found: dict[int | str, FrameEdit] = {}
-    for key, value in mapping_of(f"{path}: frames", frames).items():
+    for key, value in require_mapping(f"{path}: frames", frames).items():
         number = _number_or_all(f"{path}: frames", key)
-        found[number] = frame_edit(f"{path}: frame {number}", value)
+        found[number] = parse_frame_edit(f"{path}: frame {number}", value)
     return found
 
 
 def read_frame_edit(path: Path) -> dict[str, Any]:
     """The mappings of a YAML file of one frame's edit, checked. FormatError naming the file and the place."""
     loaded = files.read_yaml(path)
-    content = {} if loaded is None else mapping_of(str(path), loaded, FRAME_KEYS)
-    frame_edit(str(path), content)
+    content = {} if loaded is None else require_mapping(str(path), loaded, FRAME_KEYS)
+    parse_frame_edit(str(path), content)
     return content
 
 
@@ -141,18 +141,18 @@ def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
         found = {environment: {code: value}}
     else:
         number: int | str = int(row) if row.isascii() and row.isdigit() else row
-        found = {"objects": {number: {parameter: _listed(parameter, value)}}}
-    frame_edit(f"{setting} {text}", found)
+        found = {"objects": {number: {parameter: _split_value(parameter, value)}}}
+    parse_frame_edit(f"{setting} {text}", found)
     return found
 
 
-def _listed(parameter: str, value: str) -> Any:
+def _split_value(parameter: str, value: str) -> Any:
     if parameter in ("translate", "color") or (parameter == "mesh" and "%" not in value):
         return [part.strip() for part in value.split(",")]
-    return _TRUTH.get(value, value) if parameter == "remove" else value
+    return _BOOLEANS.get(value, value) if parameter == "remove" else value
 
 
-def merged(first: Mapping[Any, Any], second: Mapping[Any, Any]) -> dict[Any, Any]:
+def merge_edits(first: Mapping[Any, Any], second: Mapping[Any, Any]) -> dict[Any, Any]:
     """Two edits as mappings, one after the other: what the second says of the same thing counts."""
     found = dict(first)
     for key, value in second.items():
@@ -160,47 +160,47 @@ def merged(first: Mapping[Any, Any], second: Mapping[Any, Any]) -> dict[Any, Any
         if key == "weather":
             before, value = _weather(before), _weather(value)
         both = isinstance(before, Mapping) and isinstance(value, Mapping)
-        found[key] = merged(before, value) if both and before is not None else value
+        found[key] = merge_edits(before, value) if both and before is not None else value
     return found
 
 
 def _weather(value: Any) -> Any:
     """A weather's name as its codes; all codes, so that a name replaces what was there."""
-    if not isinstance(value, str) or value not in WEATHERS:
+    if not isinstance(value, str) or value not in WEATHER_PRESETS:
         return value
-    return {**dict.fromkeys(WEATHER_NAMES, 0.0), **WEATHERS[value]}
+    return {**dict.fromkeys(WEATHER_CODES, 0.0), **WEATHER_PRESETS[value]}
 
 
-def frame_edit(where: str, value: Any) -> FrameEdit:
+def parse_frame_edit(where: str, value: Any) -> FrameEdit:
     """The edit that nested mappings describe. FormatError: `where`, the place in them, expected, found."""
-    entry = mapping_of(where, value, FRAME_KEYS)
-    objects = mapping_of(f"{where}: objects", entry.get("objects") or {})
+    entry = require_mapping(where, value, FRAME_KEYS)
+    objects = require_mapping(f"{where}: objects", entry.get("objects") or {})
     weather = entry.get("weather")
-    if isinstance(weather, str) and weather not in WEATHERS:
-        raise FormatError(f"{where}: weather", f"codes, or one of {', '.join(WEATHERS)}", repr(weather))
+    if isinstance(weather, str) and weather not in WEATHER_PRESETS:
+        raise FormatError(f"{where}: weather", f"codes, or one of {', '.join(WEATHER_PRESETS)}", repr(weather))
     return FrameEdit(
         objects={
             _number_or_all(f"{where}: objects", key): _object_edit(f"{where}: object {key}", edit)
             for key, edit in objects.items()
         },
-        weather=_codes(f"{where}: weather", _weather(weather), WEATHER_NAMES, 0.0),
-        foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_NAMES, -1.0),
-        sun=_codes(f"{where}: sun", entry.get("sun"), SUN_NAMES, -1.0),
+        weather=_codes(f"{where}: weather", _weather(weather), WEATHER_CODES, 0.0),
+        foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_CODES, -1.0),
+        sun=_codes(f"{where}: sun", entry.get("sun"), SUN_CODES, -1.0),
     )
 
 
 def _object_edit(where: str, value: Any) -> ObjectEdit:
-    entry = mapping_of(where, value, OBJECT_KEYS)
+    entry = require_mapping(where, value, OBJECT_KEYS)
     own, metres = [0.0, 0.0], [0.0, 0.0]
     for i, item in enumerate(_list(f"{where}: translate", entry.get("translate", [0, 0]), 2)):
         if isinstance(item, str):
-            metres[i] = measure(f"{where}: translate", item, LENGTH_UNITS)
+            metres[i] = parse_measure(f"{where}: translate", item, LENGTH_UNITS)
         else:
-            own[i] = finite_number(f"{where}: translate", item)
+            own[i] = parse_finite_number(f"{where}: translate", item)
     mesh = entry.get("mesh")
     share = 0.0
     if isinstance(mesh, str):
-        mesh, share = None, measure(f"{where}: mesh", mesh, SHARE_UNITS)
+        mesh, share = None, parse_measure(f"{where}: mesh", mesh, FRACTION_UNITS)
     remove = entry.get("remove", False)
     if not isinstance(remove, bool):
         raise FormatError(f"{where}: remove", "true or false", repr(remove))
@@ -211,15 +211,15 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
             rotate=_angle(f"{where}: rotate", entry.get("rotate", 0)),
             color=_floats(f"{where}: color", entry.get("color", [0] * TEXTURE_DIM), TEXTURE_DIM),
             mesh=() if mesh in (None, []) else _floats(f"{where}: mesh", mesh, SYMMETRIC_DIM),
-            size=_share(f"{where}: size", entry.get("size", 0)),
+            size=_fraction(f"{where}: size", entry.get("size", 0)),
             remove=remove,
-            mesh_share=share,
+            mesh_fraction=share,
         )
     except RangeError as error:
         raise FormatError(where, error.expected, error.actual) from error
 
 
-def mapping_of(where: str, value: Any, known: Sequence[str] | None = None) -> dict[Any, Any]:
+def require_mapping(where: str, value: Any, known: Sequence[str] | None = None) -> dict[Any, Any]:
     """`value`, a mapping with keys among `known`. FormatError."""
     if not isinstance(value, dict):
         raise FormatError(where, "a mapping", type(value).__name__)
@@ -236,10 +236,10 @@ def _list(where: str, value: Any, length: int) -> Sequence[Any]:
 
 
 def _floats(where: str, value: Any, length: int) -> tuple[float, ...]:
-    return tuple(finite_number(where, item) for item in _list(where, value, length))
+    return tuple(parse_finite_number(where, item) for item in _list(where, value, length))
 
 
-def finite_number(where: str, value: Any) -> float:
+def parse_finite_number(where: str, value: Any) -> float:
     """`value` as a number. FormatError."""
     try:
         number = float(value)
@@ -251,19 +251,25 @@ def finite_number(where: str, value: Any) -> float:
 
 
 def _angle(where: str, value: Any) -> float:
-    return measure(where, value, ANGLE_UNITS) if isinstance(value, str) else finite_number(where, value)
+    return (
+        parse_measure(where, value, ANGLE_UNITS) if isinstance(value, str) else parse_finite_number(where, value)
+    )
 
 
-def _share(where: str, value: Any) -> float:
-    return measure(where, value, SHARE_UNITS) if isinstance(value, str) else finite_number(where, value)
+def _fraction(where: str, value: Any) -> float:
+    return (
+        parse_measure(where, value, FRACTION_UNITS)
+        if isinstance(value, str)
+        else parse_finite_number(where, value)
+    )
 
 
-def measure(where: str, text: str, units: Mapping[str, float]) -> float:
+def parse_measure(where: str, text: str, units: Mapping[str, float]) -> float:
     """Text with a unit, such as 10deg; 0 needs none. FormatError."""
     for unit, factor in units.items():
         if text.strip().endswith(unit):
-            return finite_number(where, text.strip().removesuffix(unit)) * factor
-    if finite_number(where, text) != 0:
+            return parse_finite_number(where, text.strip().removesuffix(unit)) * factor
+    if parse_finite_number(where, text) != 0:
         raise FormatError(where, f"a unit: {' or '.join(text.strip() + unit for unit in units)}", repr(text))
     return 0.0
 
@@ -275,8 +281,8 @@ def _number_or_all(where: str, key: Any) -> int | str:
 
 
 def _codes(where: str, value: Any, names: tuple[str, ...], low: float) -> tuple[float, ...]:
-    entry = mapping_of(where, {} if value is None else value, names)
-    codes = tuple(finite_number(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
+    entry = require_mapping(where, {} if value is None else value, names)
+    codes = tuple(parse_finite_number(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
     for name, code in zip(names, codes, strict=True):
         if not low <= code <= 1:
             raise FormatError(f"{where}.{name}", f"a code in [{low:g}, 1]", code)

@@ -1,4 +1,4 @@
-"""What is wrong with a setting, in one line."""
+"""Errors about what the user typed, each in one line."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import re
 
 from scene_ir.errors import make_printable
 
-_TOLD = re.compile(r"(?:(.+?): )?expected (.+?), found (.+)", re.DOTALL)
-"""How errors of `detectors` tell what is wrong: where, expected, found."""
-_ITSELF = (None, "detector")
-"""Where such an error is about what was named, not a file or a part of it."""
+_DETECTOR_ERROR = re.compile(r"(?:(.+?): )?expected (.+?), found (.+)", re.DOTALL)
+"""The form of errors of `detectors`: field, expected, found."""
+_WHOLE_DETECTOR = (None, "detector")
+"""Fields of such errors about the detector itself, not a file or a part of it."""
+
+
+class CommandLineError(ValueError):
+    """A command line that the parser does not understand, in its words."""
 
 
 class UsageError(ValueError):
-    """A setting that cannot be. The message is one line: setting, expected, found."""
+    """A bad value of an option, in one line: option, expected, found."""
 
     def __init__(self, field: str, expected: str, actual: object) -> None:
         self.field = field
@@ -24,24 +28,35 @@ class UsageError(ValueError):
         )
 
     @classmethod
-    def of(cls, field: str, expected: str, error: Exception) -> UsageError:
-        """A setting that names a detector that cannot be had, with one expected and one found: those of `error`,
-        which says why. expected: what the setting takes.
+    def from_detector_error(cls, field: str, expected: str, error: Exception) -> UsageError:
+        """An option that names a detector which cannot be loaded.
+
+        Args:
+            field: The option.
+            expected: What the option takes.
+            error: The reason; its own `expected` and `found` are kept.
         """
-        told = _TOLD.fullmatch(str(error))
-        if told is None:
+        match = _DETECTOR_ERROR.fullmatch(str(error))
+        if match is None:
             return cls(field, expected, error)
-        where, wanted, found = told.groups()
-        if where in _ITSELF:
-            return cls(field, f"{expected} ({wanted})", found)
-        return cls(f"{field}: {where}", wanted, found)
+        where, wanted, actual = match.groups()
+        if where in _WHOLE_DETECTOR:
+            return cls(field, f"{expected} ({wanted})", actual)
+        return cls(f"{field}: {where}", wanted, actual)
 
     def __reduce__(self) -> tuple[type[UsageError], tuple[str, str, str]]:
-        """As processes hand errors to one another."""
+        """Pickle the parts, for errors that cross processes."""
         return type(self), (self.field, self.expected, self.actual)
 
 
-def refuse(wrong: bool, setting: str, expected: str, found: object) -> None:
-    """Raise UsageError where something is wrong."""
+def refuse(wrong: bool, option: str, expected: str, actual: object) -> None:
+    """Raise UsageError if `wrong`.
+
+    Args:
+        wrong: Whether the value is wrong.
+        option: The option, as it is typed.
+        expected: What it takes.
+        actual: What was given.
+    """
     if wrong:
-        raise UsageError(setting, expected, found)
+        raise UsageError(option, expected, actual)

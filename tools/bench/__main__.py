@@ -1,6 +1,6 @@
 """Benchmarks for maintainers: `python -m tools.bench NAME [options]`, from the repository's root.
 
-Each prints its tables, with method, machine and versions, and writes its section of docs/benchmarks.md with
+Each prints its tables, with method, machine and versions, and writes its section of docs/research/benchmarks.md with
 `--markdown`, as `drivesem bench` does.
 """
 
@@ -13,20 +13,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector, load_predictor
+from drivesem import __version__
 from drivesem.attack.space import parse_params
 from drivesem.bench import render
 from drivesem.bench.scenes import MOST_CARS
 from drivesem.bench.session import Measured, conduct, targets_of, watched
 from drivesem.bench.tables import Section
-from drivesem.cli import run_program
-from drivesem.config.blocks import CommandConfig
+from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
-from drivesem.config.values import numbers
+from drivesem.config.options import CommandConfig
+from drivesem.program import Program
 from drivesem.report.tables import format_count
+from drivesem.report.terminal import Console
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from scene_ir.derender.derender import DerenderSettings
@@ -68,7 +68,8 @@ _PLANTED_FRAMES = 3
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one benchmark. Returns the exit code: 0 done, 1 a check failed, 2 bad input."""
-    return run_program(argv, BENCHMARKS, _PROGRAM, _load_benchmark)
+    summary = "Benchmarks for maintainers."
+    return Program(_PROGRAM, __version__, summary, BENCHMARKS, _load_benchmark).main(argv)
 
 
 def _load_benchmark(name: str) -> Callable[[Any], int]:
@@ -77,8 +78,8 @@ def _load_benchmark(name: str) -> Callable[[Any], int]:
 
 def _run(measure: Callable[[Any, Console], Measured], config: BenchTool | DetectorBenchConfig) -> int:
     """Measure, print, write; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
-    if max(numbers("--cars", config.cars)) > MOST_CARS:
-        raise UsageError("--cars", f"at most {MOST_CARS}", max(numbers("--cars", config.cars)))
+    if max(parse_integers("--cars", config.cars)) > MOST_CARS:
+        raise UsageError("--cars", f"at most {MOST_CARS}", max(parse_integers("--cars", config.cars)))
     return conduct(config, _PROGRAM, measure)
 
 
@@ -112,7 +113,7 @@ def _found(config: BenchTool, console: Console) -> Measured:
     try:
         frames = dict(watched(found.measure(config, sheets), found.count(config), console))
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     rows = [car for name in sorted(frames) for car in frames[name]]
     if sheets is not None:
         found.rank_sheets(rows, sheets)
@@ -125,7 +126,7 @@ def _redraw(config: BenchTool, console: Console) -> Measured:
     try:
         frames = dict(watched(redraw.measure(config, _sheets(config)), found.count(config), console))
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     rows = [frames[name] for name in sorted(frames)]
     fields = {"frames": len(rows), "rows": [asdict(row) for row in rows], "summary": redraw.summary(rows)}
     return _measured(redraw, fields)
@@ -138,7 +139,7 @@ def _weather(config: BenchTool, console: Console) -> Measured:
         measured = weather.measure(config, frames, _sheets(config))
         rows = [row for found in watched(measured, frames, console) for row in found]
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(weather, {"rows": [asdict(row) for row in rows], "summary": weather.summary(rows)})
 
 
@@ -173,7 +174,7 @@ def _moves(config: BenchTool, console: Console) -> Measured:
         measured = watched(moves.measure(config, frames, _sheets(config)), frames, console)
         rows = [row for found in measured for row in found]
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(moves, {"rows": [asdict(row) for row in rows], "summary": moves.summary(rows)})
 
 
@@ -187,7 +188,7 @@ def _synth(config: BenchTool, console: Console) -> Measured:
 
 
 def _rivals(config: BenchTool, console: Console) -> Measured:
-    sizes = render.sizes(numbers("--cars", config.cars), numbers("--triangles", config.triangles))
+    sizes = render.sizes(parse_integers("--cars", config.cars), parse_integers("--triangles", config.triangles))
     measured = rivals.measure(sizes, _RIVAL_SECONDS[0 if config.quick else 1], config.seed, config.device)
     return _measured(rivals, {"rows": [asdict(row) for row in watched(measured, 2 * len(sizes), console)]})
 
@@ -206,7 +207,7 @@ def _viewer(config: BenchTool, console: Console) -> Measured:
         detector = load_predictor(config.detector, config.device, config.tiles)
         rows = list(watched(viewer.measure(scene, detector, states, config.seed), 8, console))
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(viewer, {"rows": [asdict(row) for row in rows]})
 
 
@@ -232,7 +233,9 @@ def _memory(config: DetectorBenchConfig, console: Console) -> Measured:
         raise UsageError("bench memory", "a system with /proc", sys.platform)
     if config.device != "cpu":
         raise UsageError("--device", "cpu (the memory of a GPU is not measured)", config.device)
-    cases = memory.cases(numbers("--cars", config.cars), numbers("--triangles", config.triangles), config.quick)
+    cases = memory.cases(
+        parse_integers("--cars", config.cars), parse_integers("--triangles", config.triangles), config.quick
+    )
     rows = _dicts(watched(memory.measure(cases, config.seed, config.detector), len(cases), console))
     return Measured({"rows": rows, "method": memory.METHOD}, [Section(memory.TITLE, memory.COLUMNS, rows)])
 
@@ -244,7 +247,7 @@ def _detector(config: DetectorBenchConfig, console: Console) -> Measured:
     try:
         rows = _dicts(watched(measured, len(names) * len(detectors.SIZES_HW), console))
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector with gradients", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
     return Measured(
         {"rows": rows, "method": detectors.METHOD}, [Section(detectors.TITLE, detectors.COLUMNS, rows)]
     )
@@ -259,8 +262,8 @@ def _climb(config: DetectorBenchConfig, console: Console) -> Measured:
             for name, dtype in climb.PRECISIONS.items()
         }
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector with gradients", error) from error
-    cars, params = numbers("--cars", config.cars), parse_params(config.params)
+        raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
+    cars, params = parse_integers("--cars", config.cars), parse_params(config.params)
     measured = climb.measure(cars, params, config.passes, 4 if config.quick else 20, by_precision, config.seed)
     rows = _dicts(watched(measured, len(cars) * len(by_precision), console))
     return Measured({"rows": rows, "method": climb.METHOD}, [Section(climb.TITLE, climb.COLUMNS, rows)])

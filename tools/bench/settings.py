@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
-from drivesem.config.blocks import (
+from drivesem.config.commands import MIN_PASSES, BenchOptions
+from drivesem.config.constraints import NumberRange, OneOf, ParsedBy, at_least, parse_integers
+from drivesem.config.errors import refuse
+from drivesem.config.options import (
     DEMO,
     SOURCES,
     CommandName,
@@ -18,10 +21,6 @@ from drivesem.config.blocks import (
     SceneOptions,
     TileOption,
 )
-from drivesem.config.commands import LEAST_PASSES, BenchOptions
-from drivesem.config.constraints import NumberRange, OneOf, Parsed, at_least
-from drivesem.config.errors import refuse
-from drivesem.config.values import numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +40,9 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     seconds from a clone to the first report, and of each start."""
     quick: Flag = False
     """Fewer repetitions or frames."""
-    cars: Annotated[str, Parsed(numbers)] = "1,4,8,16"
+    cars: Annotated[str, ParsedBy(parse_integers)] = "1,4,8,16"
     """Of rivals: how many cars, 1 to 16, with commas."""
-    triangles: Annotated[str, Parsed(partial(numbers, least=4))] = "2000,5000"
+    triangles: Annotated[str, ParsedBy(partial(parse_integers, minimum=4))] = "2000,5000"
     """Of rivals: triangles a car, with commas."""
     frames: int | None = None
     """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
@@ -70,7 +69,7 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     """A folder of scenes that drivesem derender wrote. Of found and redraw: instead of a data set; of depth:
     besides one; of viewer: whose first is moved, by default an embedded one."""
     markdown: str | None = None
-    """A Markdown file whose section on this benchmark is written anew (docs/benchmarks.md)."""
+    """A Markdown file whose section on this benchmark is written anew (docs/research/benchmarks.md)."""
 
     def check(self) -> None:
         super().check()
@@ -89,11 +88,11 @@ class DetectorBenchConfig(BenchOptions):
     what: CommandName = ""
     """memory: peak memory above the detector's own; detector: forward, backward and decoding of each detector;
     climb: a search by climb, and the parts of its passes; planted: how many faults that were planted into the
-    detector each attack finds (docs/planted.md), minutes a frame; scale: frames shared by Ray beside frames shared
+    detector each attack finds (docs/research/planted.md), minutes a frame; scale: frames shared by Ray beside frames shared
     by processes of this machine."""
     methods: str = "climb,corners,si-fgsm,halton,cma-es"
     """Planted: attacks to judge, with commas (drivesem attack --method)."""
-    passes: Annotated[int, at_least(LEAST_PASSES)] = 90
+    passes: Annotated[int, at_least(MIN_PASSES)] = 90
     """Climb and planted: passes of the detector that each attack may take, a gradient counted as 3."""
     params: str = "color,weather,foliage,translate,rotate,mesh"
     """Climb and planted: what attacks may move, with commas."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from drivesem.cli import run_program
+from drivesem import __version__
 from drivesem.config.options import CommandConfig
+from drivesem.program import Program
 from tools.experiments.settings import (
     PlausibilityConfig,
     RealismConfig,
@@ -30,107 +32,41 @@ EXPERIMENTS: dict[str, type[CommandConfig]] = {
     "survey-results": SurveyResultsConfig,
 }
 """Settings of each experiment."""
+_RUNNERS = {
+    **dict.fromkeys(STUDIES, "detection.study:run_study"),
+    "classification": "classification.study:run_classification_study",
+    "plausibility": "plausibility.percentiles:run_plausibility",
+    "realism": "realism.report:run_realism",
+    "worth": "worth.run:run_worth",
+    "survey": "survey.page:run_survey",
+    "survey-results": "survey.results:run_survey_results",
+}
+"""The function of each experiment, which gives a report or an exit code."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one experiment. Returns the exit code: 0 done, 2 bad input."""
-    return run_program(argv, EXPERIMENTS, "python -m tools.experiments", _load_experiment)
+    summary = "Experiments behind the paper's tables."
+    return Program("python -m tools.experiments", __version__, summary, EXPERIMENTS, _load_experiment).main(argv)
 
 
 def _load_experiment(name: str) -> Callable[[Any], int]:
-    experiments: dict[str, Callable[[Any], int]] = {
-        "plausibility": _run_plausibility,
-        "realism": _run_realism,
-        "worth": _run_worth,
-        "survey": _run_survey,
-        "survey-results": _run_survey_results,
-    }
-    return experiments.get(name, _run_study)
+    module, _, function = _RUNNERS[name].partition(":")
 
+    def run(config: Any) -> int:
+        from drivesem.config.devices import check_device
+        from drivesem.run.driver import print_report, publish_report
 
-def _run_study(config: StudyConfig) -> int:
-    from drivesem.config.devices import check_device
-    from drivesem.run.driver import print_report, publish_report
+        if isinstance(config, StudyConfig):
+            check_device(config.device)
+        report = getattr(importlib.import_module(f"tools.experiments.{module}"), function)(config)
+        if isinstance(report, int):
+            return report
+        unwritten = isinstance(config, StudyConfig) and config.results is not None and config.out is None
+        (print_report if unwritten else publish_report)(report, config.json)
+        return 0
 
-    check_device(config.device)
-    if config.name == "classification":
-        from tools.experiments.classification.asking import study_run as run_study
-    else:
-        from tools.experiments.detection.study import run_study
-    report = run_study(config)
-    (print_report if config.results is not None and config.out is None else publish_report)(report, config.json)
-    return 0
-
-
-def _run_plausibility(config: PlausibilityConfig) -> int:
-    from drivesem.run.driver import publish_report
-    from tools.experiments.plausibility.asking import plausibility_run
-
-    publish_report(plausibility_run(config), config.json)
-    return 0
-
-
-def _run_realism(config: RealismConfig) -> int:
-    from drivesem.run.driver import publish_report
-    from tools.experiments.realism.asking import realism_run
-
-    publish_report(realism_run(config), config.json)
-    return 0
-
-
-def _run_worth(config: WorthConfig) -> int:
-    from drivesem.run.driver import publish_report
-    from tools.experiments.worth.asking import worth_run
-
-    publish_report(worth_run(config), config.json)
-    return 0
-
-
-def _run_survey(config: SurveyConfig) -> int:
-    from drivesem.report.tables import format_count, print_json
-    from drivesem.report.terminal import Console
-    from drivesem.run.finished import load_runs
-    from drivesem.run.folder import resolve_output_folder
-    from scene_ir import files
-    from tools.experiments.survey.page import (
-        CHANGED,
-        KEY,
-        PAGE,
-        UNCHANGED,
-        items_of,
-        render_page,
-        survey_name,
-        write_key,
-    )
-
-    runs = load_runs(config.runs, setting="RUN")
-    out = resolve_output_folder(config.out, runs[0].folder / "survey")
-    chosen = items_of(runs, config.items, config.controls, config.seed)
-    items = [item for item, _ in chosen]
-    page = render_page(chosen)
-    files.write_text(out / PAGE, page)
-    write_key(out / KEY, items, {"runs": [str(run.folder) for run in runs], "seed": config.seed})
-    counts = {kind: sum(item.kind == kind for item in items) for kind in (CHANGED, UNCHANGED)}
-    data = {"survey": survey_name(items), "page": str(out / PAGE), "key": str(out / KEY), **counts}
-    data["megabytes"] = round(len(page) / 1e6, 2)
-    console = Console(stderr=True)
-    if config.json:
-        print_json(data)
-    if counts[CHANGED] < config.items:
-        console.print(
-            f"only {counts[CHANGED]} of {format_count(config.items, 'picture')}: the runs have no more",
-            soft_wrap=True,
-        )
-    console.print(f"give people {out / PAGE}, keep {out / KEY}", soft_wrap=True, highlight=False)
-    return 0
-
-
-def _run_survey_results(config: SurveyResultsConfig) -> int:
-    from drivesem.run.driver import publish_report
-    from tools.experiments.survey.results import survey_results
-
-    publish_report(survey_results(config), config.json)
-    return 0
+    return run
 
 
 if __name__ == "__main__":  # workers load this file too, by another name

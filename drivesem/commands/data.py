@@ -8,15 +8,17 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from drivesem.config.commands import ConvertConfig
+from drivesem.config.commands import ConvertConfig, ExportConfig
+from drivesem.config.constraints import parse_class_map
 from drivesem.config.errors import UsageError
-from drivesem.config.values import class_map
 from drivesem.data.label_table import Written
 from drivesem.report.tables import format_count, print_json
-from drivesem.run.labels import Conversion, convert, detect_labels_layout
+from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
+from drivesem.run.finished import load_runs
+from drivesem.run.labels import ConversionSettings, convert_labels, detect_labels_layout
 
 
-def run(config: ConvertConfig) -> int:
+def convert_command(config: ConvertConfig) -> int:
     """Convert; exit code 0. Raises UsageError or SceneError for bad input."""
     out = Path(config.out)
     if out.suffix.lower() == ".json":
@@ -28,16 +30,16 @@ def run(config: ConvertConfig) -> int:
         raise UsageError("--out", "a new or empty folder", config.out)
     source = Path(config.source)
     layout = detect_labels_layout(source) if config.from_format == "auto" else config.from_format
-    conversion = Conversion(
+    conversion = ConversionSettings(
         to_format=config.to_format,
         from_format=layout,
         scores=config.scores,
         size_wh=_size(config.image_size),
         images=None if config.images is None else Path(config.images),
         copy_images=config.copy_images,
-        mapping=class_map("--map", config.map),
+        mapping=parse_class_map("--map", config.map),
     )
-    written = convert(source, out, conversion)
+    written = convert_labels(source, out, conversion)
     if config.json:
         print_json({"out": config.out, **asdict(written)})
     sys.stderr.write(f"{sentence(written)}\n")
@@ -64,3 +66,34 @@ def sentence(written: Written) -> str:
     parts = [f"lost: {listed(written.lost)}" if written.lost else "nothing lost"]
     parts += [f"assumed: {listed(written.assumed)}"] if written.assumed else []
     return f"{format_count(written.files, 'file')}; {'; '.join(parts)}"
+
+
+def export_command(config: ExportConfig) -> int:
+    """Export; exit code 0. Raises UsageError or SceneError for bad input."""
+    out = Path(config.out or "")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError("--out", "a new or empty folder", out)
+    if config.to_format == "gltf":
+        return _gltf(config, out)
+    (attack_run,) = load_runs([config.run or ""])
+    if config.to_format == "tables":
+        written = write_tables(build_tables(attack_run, select_frames_by_grade(attack_run, config.grade)), out)
+        if config.json:
+            print_json({"out": str(out), "files": written})
+        sys.stderr.write(f"{', '.join(written)} in {out}\n")
+        return 0
+    result = export_dataset(attack_run, out, config.to_format, config.grade, parse_class_map("--map", config.map))
+    if config.json:
+        print_json({"out": str(out), **asdict(result)})
+    sys.stderr.write(f"{sentence(result)}\n")
+    return 0
+
+
+def _gltf(config: ExportConfig, out: Path) -> int:
+    from drivesem.run.gltf import export_scenes
+
+    written = export_scenes(Path(config.run or ""), out)
+    if config.json:
+        print_json({"out": str(out), "files": written})
+    sys.stderr.write(f"{format_count(len(written), 'scene')} in {out}\n")
+    return 0

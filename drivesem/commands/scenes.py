@@ -1,0 +1,99 @@
+"""`drivesem edit` and `drivesem render`: a scene folder, changed by physical amounts or as it is, as a picture."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from drivesem.attack.scene_edits import REMOVED, apply_edit
+from drivesem.config.commands import EditConfig, RenderConfig
+from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting, read_frame_edit
+from drivesem.config.errors import UsageError
+from drivesem.report.tables import format_count, print_json
+from drivesem.report.terminal import Console
+from drivesem.scenes.scene import Scene, free_folder
+from scene_ir import files
+from scene_ir.exchange import CHANGE_KEY
+from scene_ir.io import load_scene, save_scene
+
+_CHANGED = "not the photograph: vehicles that were removed, exchanged, added or loaded remain so"
+
+
+def edit_command(config: EditConfig) -> int:
+    """`drivesem edit`: write the changed scene, its picture, or both."""
+    start = time.perf_counter()
+    folder = Path(config.scene)
+    out = None
+    if config.out is not None or config.save is None:
+        out = picture_path(config.out, folder / "edit.png")
+    save = None if config.save is None else _save_path(Path(config.save), folder)
+    edit = parse_frame_edit("edit", _changes(config))
+    scene = load_scene(folder)
+    result = apply_edit(scene.unperturbed(), edit, scene) if config.photographed else apply_edit(scene, edit)
+    changed = config.photographed and not {CHANGE_KEY, REMOVED}.isdisjoint(scene.provenance)
+    notes = (*([_CHANGED] if changed else []), *result.notes)
+    for note in notes:
+        sys.stderr.write(f"drivesem: {note}\n")
+    if save is not None:
+        save_scene(result.scene, save)
+    if out is not None:
+        files.write_png(out, Scene(result.scene).render())
+    seconds = round(time.perf_counter() - start, 3)
+    written = {name: str(path) for name, path in (("out", out), ("save", save)) if path is not None}
+    if config.json:
+        facts = {"objects": len(result.scene.objects), "notes": notes, "seconds": seconds}
+        print_json({"scene": config.scene, **written, **facts})
+    else:
+        vehicles = format_count(len(result.scene.objects), "vehicle")
+        vehicles += f", {len(result.removed)} removed" if result.removed else ""
+        Console().print(f"{' and '.join(written.values())}: {vehicles} ({seconds:.1f} s)", soft_wrap=True)
+    return 0
+
+
+def _changes(config: EditConfig) -> dict[Any, Any]:
+    """The edits of file and command line as one mapping. Raises FormatError or UsageError."""
+    changes: dict[Any, Any] = {} if config.edits is None else read_frame_edit(Path(config.edits))
+    for text in config.set:
+        changes = merge_edits(changes, parse_setting(text))
+    for text in config.remove:
+        for part in text.split(","):
+            row = part.strip()
+            if row != ALL and not (row.isascii() and row.isdigit()):
+                raise UsageError("--remove", "numbers from 0, or all", repr(text))
+            changes = merge_edits(changes, {"objects": {ALL if row == ALL else int(row): {"remove": True}}})
+    if not changes and not config.photographed:
+        raise UsageError("edit", "a change: --set, --remove, --edits or --photographed", "none")
+    return changes
+
+
+def _save_path(path: Path, scene: Path) -> Path:
+    """The folder of the changed scene. Raises UsageError if it would overwrite anything but a scene."""
+    if free_folder(path, "--save").resolve() in scene.resolve().parents:
+        raise UsageError("--save", "a folder that does not hold the scene", path)
+    return path
+
+
+def render_command(config: RenderConfig) -> int:
+    """`drivesem render`: write the picture of a scene."""
+    start = time.perf_counter()
+    out = picture_path(config.out, Path(config.scene) / "render.png")
+    scene = load_scene(Path(config.scene))
+    files.write_png(out, Scene(scene).render())
+    seconds = round(time.perf_counter() - start, 3)
+    if config.json:
+        print_json({"scene": config.scene, "out": str(out), "objects": len(scene.objects), "seconds": seconds})
+    else:
+        Console().print(f"{out}: {format_count(len(scene.objects), 'vehicle')} ({seconds:.1f} s)", soft_wrap=True)
+    return 0
+
+
+def picture_path(given: str | None, default: Path) -> Path:
+    """The path of a picture. Raises UsageError if it is not a PNG file."""
+    if given is None:
+        return default
+    path = Path(given)
+    if path.suffix.lower() != ".png" or path.is_dir():
+        raise UsageError("--out", "a .png file", given)
+    return path
