@@ -238,7 +238,7 @@ def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, f
     objects, whole = scene.objects, Compositor(scene.unperturbed())
     gains, lifts = [], []
     for i, (surface, samples) in enumerate(
-        zip(whole.object_surfaces.surfaces, whole.sample_photograph(), strict=True)
+        zip(whole.surfaces.templates, whole.sample_photograph(), strict=True)
     ):
         found = finish.estimate_exposure(surface, samples)
         if found is not None:

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
-# ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare what a loop changes, and evaluates
+# ruff: noqa: UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare what a loop changes, and evaluates
 # both sides of `and`, so that a cheap test first saves time only as an `if` of its own.
 """What is done to triangles one by one, as Warp kernels: cutting, smoothing, bending; leaves around a crown."""
 
@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from scene_ir.raster.lanes import OPTIONS
 from scene_ir.raster.launch import launch, start_warp
+from scene_ir.raster.simd import SIMD_OPTIONS
 from scene_ir.types import LATTICE, LATTICE_POINTS
 
 start_warp()
-wp.set_module_options(OPTIONS)
+wp.set_module_options(SIMD_OPTIONS)
 
 Floats = wp.array(dtype=wp.float32)
 Ints = wp.array(dtype=wp.int32)
@@ -348,7 +348,7 @@ def crown(
     inputs = [_vectors(v) for v in (centres, radii, frame)]
     inputs += [_indices(blob), _vectors(direction), wp.array(depth, dtype=wp.float32, copy=False, device="cpu")]
     outputs = [_vectors(points), _vectors(outward), wp.array(light, dtype=wp.float32, copy=False, device="cpu")]
-    launch(crown_kernel, [0, len(blob)], inputs, outputs)
+    launch(crown_kernel, [0, len(blob)], [*inputs, *outputs])
     kept = np.flatnonzero(light >= 0)
     return kept, points[kept], outward[kept], light[kept]
 
@@ -362,5 +362,5 @@ def leaves(
     corners, normals = np.empty((2, len(points), 3, 3), np.float32)
     reach = wp.array(np.ascontiguousarray(draws[2], np.float32), dtype=wp.float32, copy=False, device="cpu")
     inputs = [_vectors(v) for v in (points, outward, draws[0], draws[1])]
-    launch(leaf_kernel, [0, len(points)], [*inputs, reach], [_vectors(corners), _vectors(normals)])
+    launch(leaf_kernel, [0, len(points)], [*inputs, reach, _vectors(corners), _vectors(normals)])
     return corners, normals

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare a loop variable, and evaluates
+# ruff: noqa: UP018, RUF046, SIM102 - the line above; Warp needs int(0) to declare a loop variable, and evaluates
 # both sides of `and`, so that a cheap test first saves time only as a separate `if`.
 """The four verbs as Warp kernels: one source for CPU and CUDA, float32 tensors, no copies.
 
@@ -152,7 +152,7 @@ def _extend_by_edge(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
 
 
 @wp.func
-def _triangle_bounds(
+def _face_bounds(
     corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(dtype=wp.vec4i), near: wp.float64
 ):
     """First and last pixel (x, y, x, y) of the part of a triangle beyond the near plane."""
@@ -198,7 +198,7 @@ def _owns_pixel(e: wp.float64, n: wp.vec3d):
 
 
 @wp.func
-def _triangle_edges(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
+def _face_edges(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
     """Edge functions of a triangle; none for a culled back face."""
     c0 = wp.vec3d(clip[corner[0]])
     c1 = wp.vec3d(clip[corner[1]])
@@ -360,7 +360,7 @@ def _rasterize_kernel(
             f = order[face]
             if quarter > 0 and (face == begin + quarter or face == begin + 2 * quarter):
                 _update_tiles(part, x0, x1, row, row_end, origin, width, keys, tiles)
-        box = _triangle_bounds(faces[f], clip, boxes, near)
+        box = _face_bounds(faces[f], clip, boxes, near)
         box = wp.vec4i(
             wp.max(box[0], x0), wp.max(box[1], row), wp.min(box[2] + 1, x1), wp.min(box[3] + 1, row_end)
         )
@@ -368,7 +368,7 @@ def _rasterize_kernel(
         if sorted and some and quarter > 0 and face >= begin + quarter:
             some = not _is_hidden(faces[f], clip, part, x0, row, box, tiles)
         if some:
-            e = _triangle_edges(faces[f], clip, parts[part, CULL])
+            e = _face_edges(faces[f], clip, parts[part, CULL])
             if e.det > ZERO:
                 _fill_triangle(e, f, box, origin, width, near, lanes == 1, sorted, keys)
         face += lanes
@@ -376,10 +376,7 @@ def _rasterize_kernel(
 
 @wp.kernel
 def unpack_kernel(
-    start: int,
-    keys: wp.array(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    depth: wp.array(dtype=wp.float32),
+    start: int, keys: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), depth: wp.array(dtype=wp.float32)
 ):
     i = start + wp.tid()
     key = keys[i]
@@ -546,10 +543,7 @@ def _bicubic_weights(t: float):
 def _bicubic_slopes(t: float):
     """Derivatives of `_bicubic_weights`."""
     return wp.vec4f(
-        (-1.5 * t + 2.0) * t - 0.5,
-        (4.5 * t - 5.0) * t,
-        (-4.5 * t + 4.0) * t + 0.5,
-        (1.5 * t - 1.0) * t,
+        (-1.5 * t + 2.0) * t - 0.5, (4.5 * t - 5.0) * t, (-4.5 * t + 4.0) * t + 0.5, (1.5 * t - 1.0) * t
     )
 
 
@@ -601,14 +595,7 @@ class BicubicTaps:
 
 @wp.func
 def bicubic_taps(
-    uv: wp.vec2f,
-    x0: int,
-    y0: int,
-    width: int,
-    height: int,
-    start: int,
-    texel_stride: int,
-    clamp: bool,
+    uv: wp.vec2f, x0: int, y0: int, width: int, height: int, start: int, texel_stride: int, clamp: bool
 ):
     """Taps of a sample in one crop.
 
@@ -763,7 +750,7 @@ def _record_outline(
 
 
 @wp.func
-def _record_interval_end(
+def _record_end(
     keys: wp.array2d(dtype=wp.int64),
     face: wp.array(dtype=wp.int32),
     axis: int,
@@ -873,19 +860,19 @@ def _hit_kernel(
 
 
 @wp.kernel
-def _mark_boundaries_kernel(
+def _boundary_kernel(
     start: int,
     parts: wp.array2d(dtype=wp.int32),
     hits: wp.array(dtype=wp.uint64),
     boundary: wp.array(dtype=wp.uint64),
     right: wp.array(dtype=wp.uint64),
     below: wp.array(dtype=wp.uint64),
-    right_or_below: wp.array(dtype=wp.uint64),
+    either: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
     """For 64 packed pixels, mark where hit and empty pixels meet, and clear the pairs' keys.
 
-    `right`, `below`: this pixel and the next in the row or column differ; `right_or_below`: either; `boundary`:
+    `right`, `below`: this pixel and the next in the row or column differ; `either`: either; `boundary`:
     any of the four neighbours differs.
     """
     word = start + wp.tid()
@@ -924,7 +911,7 @@ def _mark_boundaries_kernel(
     boundary[word] = boundary_bits
     right[word] = right_bits
     below[word] = below_bits
-    right_or_below[word] = right_bits | below_bits
+    either[word] = right_bits | below_bits
     while right_bits != wp.uint64(0):
         keys[0, 64 * word + _lowest_bit(right_bits)] = wp.int64(-1)
         right_bits = right_bits & (right_bits - wp.uint64(1))
@@ -967,9 +954,9 @@ def _scan_line(
         low_edge = wp.int32(span[2])
         high_edge = wp.int32(span[3])
         if low_edge < 3:
-            _record_interval_end(keys, face, axis, span[0], low, high, origin, step, False, code + low_edge)
+            _record_end(keys, face, axis, span[0], low, high, origin, step, False, code + low_edge)
         if high_edge < 3:
-            _record_interval_end(keys, face, axis, span[1], low, high, origin, step, True, code + high_edge)
+            _record_end(keys, face, axis, span[1], low, high, origin, step, True, code + high_edge)
 
 
 @wp.kernel
@@ -984,7 +971,7 @@ def _outline_kernel(
     face: wp.array(dtype=wp.int32),
     right: wp.array(dtype=wp.uint64),
     below: wp.array(dtype=wp.uint64),
-    right_or_below: wp.array(dtype=wp.uint64),
+    either: wp.array(dtype=wp.uint64),
     keys: wp.array2d(dtype=wp.int64),
 ):
     """For each marked pair, find the triangle edge that reaches farthest from the hit to the empty pixel."""
@@ -1002,15 +989,15 @@ def _outline_kernel(
     if x1 <= x0 or row_end <= row:
         end = f
     while f < end:
-        box = _triangle_bounds(faces[f], clip, boxes, near)
+        box = _face_bounds(faces[f], clip, boxes, near)
         # A pair may begin one pixel before the first that the triangle touches.
         xa = wp.max(box[0] - 1, x0)
         ya = wp.max(box[1] - 1, row)
         xb = wp.min(box[2] + 1, x1)
         yb = wp.min(box[3] + 1, row_end)
         if xa < xb and ya < yb:
-            if _any_bit(right_or_below, xa, xb, ya, yb, origin, width):
-                e = _triangle_edges(faces[f], clip, parts[part, CULL])
+            if _any_bit(either, xa, xb, ya, yb, origin, width):
+                e = _face_edges(faces[f], clip, parts[part, CULL])
                 if e.det > ZERO:
                     for y in range(wp.max(box[1], row), yb):
                         if _any_bit(right, xa, xb, y, y + 1, origin, width):
@@ -1053,7 +1040,7 @@ class OutlineCrossing:
 
 
 @wp.func
-def _outline_crossing(
+def _find_crossing(
     axis: int,
     x: int,
     y: int,
@@ -1135,7 +1122,7 @@ def _coverage_kernel(
                     if key >= wp.int64(0):
                         code = wp.int32(key & wp.int64(0xFFFFFFFF))
                         first_is_hit = hit != (back == 1)
-                        c = _outline_crossing(
+                        c = _find_crossing(
                             axis, parts[part, X0] + x, parts[part, Y0] + y, first_is_hit, code, clip, faces
                         )
                         amount = wp.abs(HALF - c.t)
@@ -1181,7 +1168,7 @@ def _coverage_backward_kernel(
             x = parts[part, X0] + column - back * (1 - axis)
             y = parts[part, Y0] + row - back * axis
             hit = face[i] >= 0
-            c = _outline_crossing(axis, x, y, hit != (back == 1), code, clip, faces)
+            c = _find_crossing(axis, x, y, hit != (back == 1), code, clip, faces)
             # An empty pixel gets t - 1/2, a hit one keeps 1/2 + t: both grow with t = e_hit / (e_hit - e_empty), and
             # e = p . (a x b).
             length = c.e_hit - c.e_empty
@@ -1223,8 +1210,8 @@ def rasterize(
             array(tiles),
             array(keys),
         ]
-        launch(_rasterize_kernel, plan.cuts, inputs, (), clip.device)
-        launch(unpack_kernel, split_range(size), [array(keys), array(face), array(depth)], (), clip.device)
+        launch(_rasterize_kernel, plan.cuts, inputs, clip.device)
+        launch(unpack_kernel, split_range(size), [array(keys), array(face), array(depth)], clip.device)
     return face, depth, plan
 
 
@@ -1279,8 +1266,8 @@ class _Interpolate(torch.autograd.Function):
         ctx.layout = fragments.layout
         out = attributes.new_zeros(fragments.face.shape[0], attributes.shape[1])
         hits = [array(fragments.face), *_layout_arrays(fragments.layout)]
-        inputs = [*hits, *_mesh_arrays(clip, faces), _contiguous_array(attributes), array(out)]
-        launch(_interpolate_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
+        inputs = [*hits, *_mesh_arrays(clip, faces), _dense(attributes), array(out)]
+        launch(_interpolate_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, out.device)
         return out
 
     @staticmethod
@@ -1292,11 +1279,11 @@ class _Interpolate(torch.autograd.Function):
         grad_attributes = torch.zeros_like(attributes, memory_format=torch.contiguous_format)
         inputs = [
             *(array(face), *_layout_arrays(ctx.layout), *_mesh_arrays(clip, faces)),
-            *(_contiguous_array(attributes), _contiguous_array(grad_out), with_clip, with_attributes),
+            *(_dense(attributes), _dense(grad_out), with_clip, with_attributes),
             *(array(grad_clip, wp.vec3d), array(grad_attributes)),
         ]
         count = face.shape[0] if grad_out.numel() else 0
-        launch(_interpolate_backward_kernel, _single_thread(count), inputs, (), clip.device)
+        launch(_interpolate_backward_kernel, _single_thread(count), inputs, clip.device)
         to_clip = grad_clip.to(clip.dtype) if with_clip else None
         return None, to_clip, None, grad_attributes if with_attributes else None
 
@@ -1307,8 +1294,8 @@ class _Texture(torch.autograd.Function):
         ctx.save_for_backward(texels, *crops, offsets, uv)
         ctx.strides, ctx.clamp = strides, clamp
         out = uv.new_zeros(uv.shape[0], strides[0])
-        inputs = [*_sampling_inputs(texels, strides, crops, offsets, uv), clamp, array(out)]
-        launch(_texture_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, (), out.device)
+        inputs = [*_texel_arrays(texels, strides, crops, offsets, uv), clamp, array(out)]
+        launch(_texture_kernel, split_range(out.shape[0] if out.numel() else 0), inputs, out.device)
         return out
 
     @staticmethod
@@ -1319,13 +1306,13 @@ class _Texture(torch.autograd.Function):
         grad_uv = torch.zeros_like(uv, memory_format=torch.contiguous_format)
         grad_texels = torch.zeros_like(texels, memory_format=torch.contiguous_format)
         inputs = [
-            *_sampling_inputs(texels, ctx.strides, (crop_rects, crop_offsets), offsets, uv),
-            *(ctx.clamp, _contiguous_array(grad_out), with_uv, with_texels),
+            *_texel_arrays(texels, ctx.strides, (crop_rects, crop_offsets), offsets, uv),
+            *(ctx.clamp, _dense(grad_out), with_uv, with_texels),
             *(array(grad_uv, wp.vec2f), array(grad_texels.view(-1))),
         ]
         count = uv.shape[0] if grad_out.numel() else 0
         edges = _single_thread(count) if with_texels else split_range(count)
-        launch(_texture_backward_kernel, edges, inputs, (), uv.device)
+        launch(_texture_backward_kernel, edges, inputs, uv.device)
         return grad_texels if with_texels else None, None, None, None, grad_uv if with_uv else None, None
 
 
@@ -1338,20 +1325,16 @@ class _Antialias(torch.autograd.Function):
         size, like = fragments.face.shape[0], fragments.face
         coverage = torch.empty(size, dtype=clip.dtype, device=clip.device)
         count = (size + 63) // 64
-        marks = torch.empty((5, count + 1), dtype=torch.int64, device=clip.device)  # the last is read, never written
+        marks = torch.empty(
+            (5, count + 1), dtype=torch.int64, device=clip.device
+        )  # the last is read, never written
         keys, choice = like.new_empty((2, size), dtype=torch.int64), like.new_empty(size, dtype=torch.int64)
         if size:
             parts, mesh, face = array(plan.parts), _mesh_arrays(clip, faces), array(like)
-            hits, boundary, right, below, right_or_below = (array(m, wp.uint64) for m in marks)
+            hits, boundary, right, below, either = (array(m, wp.uint64) for m in marks)
             found, seen, edges = array(keys), array(coverage), _split_words(size)
-            launch(_hit_kernel, edges, [face, hits, seen], (), like.device)
-            launch(
-                _mark_boundaries_kernel,
-                edges,
-                [parts, hits, boundary, right, below, right_or_below, found],
-                (),
-                like.device,
-            )
+            launch(_hit_kernel, edges, [face, hits, seen], like.device)
+            launch(_boundary_kernel, edges, [parts, hits, boundary, right, below, either, found], like.device)
             inputs = [
                 plan.lanes,
                 parts,
@@ -1361,12 +1344,12 @@ class _Antialias(torch.autograd.Function):
                 face,
                 right,
                 below,
-                right_or_below,
+                either,
                 found,
             ]
-            launch(_outline_kernel, plan.outline_cuts, inputs, (), like.device)
+            launch(_outline_kernel, plan.outline_cuts, inputs, like.device)
             inputs = [parts, *mesh, face, boundary, right, below, found, array(choice), seen]
-            launch(_coverage_kernel, edges, inputs, (), like.device)
+            launch(_coverage_kernel, edges, inputs, like.device)
         ctx.save_for_backward(like, clip, faces, marks[1], choice)
         ctx.plan = plan
         return coverage
@@ -1380,9 +1363,9 @@ class _Antialias(torch.autograd.Function):
             inputs = [
                 *(array(ctx.plan.parts), *_mesh_arrays(clip, faces), array(face)),
                 *(array(boundary, wp.uint64), array(choice)),
-                *(_contiguous_array(grad_out), array(grad_clip, wp.vec3d)),
+                *(_dense(grad_out), array(grad_clip, wp.vec3d)),
             ]
-            launch(_coverage_backward_kernel, _single_thread(boundary.shape[0] - 1), inputs, (), face.device)
+            launch(_coverage_backward_kernel, _single_thread(boundary.shape[0] - 1), inputs, face.device)
         return None, grad_clip.to(clip.dtype), None
 
 
@@ -1409,7 +1392,7 @@ def _make_plan(
         cuts = outlines = [0, parts.shape[0] * lanes]
     boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
     inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
-    launch(_corner_kernel, split_range(clip.shape[0]), inputs, (), clip.device)
+    launch(_corner_kernel, split_range(clip.shape[0]), inputs, clip.device)
     return RasterPlan(parts, lanes, cuts, outlines, boxes, clip.detach(), tensor_version(clip))
 
 
@@ -1437,11 +1420,11 @@ def _layout_arrays(layout: PixelLayout) -> list[Any]:
     return [array(layout.rects.contiguous()), array(layout.offsets.contiguous())]
 
 
-def _contiguous_array(values: Tensor) -> Any:
+def _dense(values: Tensor) -> Any:
     return array(values.contiguous())
 
 
-def _sampling_inputs(texels: Tensor, strides, crops, offsets: Tensor, uv: Tensor) -> list:
+def _texel_arrays(texels: Tensor, strides, crops, offsets: Tensor, uv: Tensor) -> list:
     flat = array(texels.contiguous().view(-1))
     places = [array(t.contiguous()) for t in (*crops, offsets)]
     return [flat, *strides, *places, array(uv.contiguous(), wp.vec2f)]

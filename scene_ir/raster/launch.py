@@ -104,37 +104,31 @@ def run_in_threads(work: Callable[[int, int], None], edges: Sequence[int]) -> No
 
 
 def launch(
-    kernel: Any,
-    edges: Sequence[int],
-    inputs: Sequence[Any],
-    outputs: Sequence[Any] = (),
-    device: torch.device | None = None,
+    kernel: Any, edges: Sequence[int], arguments: Sequence[Any], device: torch.device | None = None
 ) -> None:
     """Run a kernel over ranges of indices: in torch's stream on a GPU, else in one thread per range.
 
     Args:
         kernel: Warp kernel; its first argument is the first index.
         edges: Ascending bounds of the ranges.
-        inputs: Arguments after the first index.
-        outputs: Further arguments.
+        arguments: Arguments after the first index.
         device: Device of the arrays; by default that of the first array.
     """
     if len(edges) < 2 or edges[-1] <= edges[0]:
         return
-    inputs = (*inputs, *outputs)
     if device is None:
-        device = torch.device(wp.device_to_torch(next(i.device for i in inputs if isinstance(i, wp.array))))
+        device = torch.device(wp.device_to_torch(next(i.device for i in arguments if isinstance(i, wp.array))))
     if device.type != "cpu":
         where, stream = wp.device_from_torch(device), wp.stream_from_torch(device)
-        _launch_range(kernel, edges[0], edges[-1] - edges[0], inputs, where, stream)
+        _launch_range(kernel, edges[0], edges[-1] - edges[0], arguments, where, stream)
         return
     if len(edges) > 2:
         load_kernel(kernel)
-    run_in_threads(lambda start, end: _launch_range(kernel, start, end - start, inputs, "cpu", None), edges)
+    run_in_threads(lambda start, end: _launch_range(kernel, start, end - start, arguments, "cpu", None), edges)
 
 
-def _launch_range(kernel: Any, start: int, count: int, inputs: Sequence[Any], device: Any, stream: Any) -> None:
-    wp.launch(kernel, dim=count, inputs=[start, *inputs], device=device, stream=stream)
+def _launch_range(kernel: Any, start: int, count: int, arguments: Sequence[Any], device: Any, stream: Any) -> None:
+    wp.launch(kernel, dim=count, inputs=[start, *arguments], device=device, stream=stream)
 
 
 def array(values: Tensor, dtype: Any = None) -> Any:

@@ -40,7 +40,11 @@ class _TensorCache(Generic[V]):
         if entry is not None and entry[0]() is tensor and entry[1] == tensor_version(tensor):
             return entry[2]
         value = self._compute(tensor)
-        self._entries[key] = (weakref.ref(tensor, lambda _: self._entries.pop(key, None)), tensor_version(tensor), value)
+        self._entries[key] = (
+            weakref.ref(tensor, lambda _: self._entries.pop(key, None)),
+            tensor_version(tensor),
+            value,
+        )
         return value
 
 

@@ -35,7 +35,7 @@ class Compositor(PreparedScene):
     @property
     def fixed_geometry(self) -> fast.FixedGeometry | None:
         """Input of the fast kernels, gathered on first use; None where they do not apply."""
-        if self._fixed_geometry is None and self.texels is not None and self.settings.backend == "warp":
+        if self._fixed_geometry is None and self.texels is not None and self.backend == "warp":
             with torch.no_grad():
                 self._fixed_geometry = fast.FixedGeometry.from_scene(self)
         return self._fixed_geometry
@@ -79,7 +79,7 @@ class Compositor(PreparedScene):
             objects: Its objects.
             layers: Their layers; None without objects.
         """
-        environment, backend = perturbed.environment, self.settings.backend
+        environment, backend = perturbed.environment, self.backend
         weather, foliage = is_active(environment.weather), is_active(environment.foliage)
         canvas = self.canvas if weather else self.canvas[:3]
         if foliage:

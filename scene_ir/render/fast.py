@@ -67,19 +67,15 @@ class FixedGeometry:
     @classmethod
     def from_scene(cls, prepared: PreparedScene) -> FixedGeometry:
         """The input for one scene."""
-        object_surfaces, base, count = (
-            prepared.object_surfaces,
-            prepared.base_geometry,
-            len(prepared.scene.objects),
-        )
+        meshes, base, count = (prepared.surfaces, prepared.base_geometry, len(prepared.scene.objects))
         assert prepared.texels is not None
         assert prepared.shadows is not None
         height, width = prepared.frame_hw
         return cls(
-            faces=object_surfaces.faces.to(torch.int32).contiguous(),
-            neighbours=object_surfaces.neighbours.to(torch.int32).contiguous(),
+            faces=meshes.faces.to(torch.int32).contiguous(),
+            neighbours=meshes.neighbours.to(torch.int32).contiguous(),
             base_clip=base.clip,
-            base_attributes=torch.stack([base.facing_cos, object_surfaces.paint, prepared.vertex_height], dim=1),
+            base_attributes=torch.stack([base.facing_cos, meshes.paint, prepared.vertex_height], dim=1),
             template=prepared.completion_attributes(
                 prepared.sharp_normals, torch.zeros_like(prepared.vertex_height)
             ),
@@ -134,10 +130,7 @@ class PaintCodes:
 
 
 def draw_photographed(
-    fixed: FixedGeometry,
-    drawn: VisibleSurfaces,
-    yaw: Tensor,
-    code: PaintCodes | None,
+    fixed: FixedGeometry, drawn: VisibleSurfaces, yaw: Tensor, code: PaintCodes | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Draw photographed objects and their shadows.
 

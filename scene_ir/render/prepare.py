@@ -183,7 +183,8 @@ class PreparedScene:
             whole_patches: Keep all ground that a vehicle may darken, not only what its source's shadow darkens.
         """
         self.settings = settings or RenderSettings()
-        if self.settings.backend == "warp":
+        self.backend = self.settings.backend
+        if self.backend == "warp":
             scene = convert_scene(scene, torch.float32)
         self.scene = scene
         self._whole_patches = whole_patches
@@ -208,9 +209,9 @@ class PreparedScene:
             heights = self._heights_px(base)
             meshes = [detail(mesh, height) for mesh, height in zip(meshes, heights, strict=True)]
         picked = [TemplateSurface.from_mesh(mesh, self.like.dtype) for mesh in meshes]
-        self.object_surfaces = ObjectSurfaces.from_surfaces(picked, self.like)
-        local = self.object_surfaces.local_vertices(base.ffd, base.size_lhw)
-        self.sharp_normals, self.smooth_normals = self.object_surfaces.normals(local)
+        self.surfaces = ObjectSurfaces.from_surfaces(picked, self.like)
+        local = self.surfaces.local_vertices(base.ffd, base.size_lhw)
+        self.sharp_normals, self.smooth_normals = self.surfaces.normals(local)
         inflation = self.like.new_tensor([s.inflation for s in objects.source] or [0.0] * len(objects))
         self.halo = inflation * self.scene.camera.matrix[0, 0].to(self.like)
         self.base_shadow_offset = surfaces.shadow_offset(self.scene.environment.sun, base.yaw, base.size_lhw[:, 1])
@@ -223,11 +224,11 @@ class PreparedScene:
         self.base_yaw = base.yaw
         self.sunlight = self.like.new_tensor([s.sunlight for s in objects.source] or [model.SUNLIGHT] * len(base))
         self.placement: VertexPlacement | None = None
-        if self.settings.backend == "warp" and len(base):
+        if self.backend == "warp" and len(base):
             follows = self.sunlight if objects.source else torch.zeros_like(self.sunlight)
             environment = self.scene.environment
             self.placement = VertexPlacement.from_objects(
-                self.object_surfaces, base, self.smooth_normals, self.scene.camera, environment.sun, follows
+                self.surfaces, base, self.smooth_normals, self.scene.camera, environment.sun, follows
             )
         self.base_size_lhw = base.size_lhw
         self._base_ffd, self._base_local = base.ffd, local
@@ -283,12 +284,12 @@ class PreparedScene:
     def _prepare_sources(self, objects: Objects, base: Objects, hidden: Sequence[Tensor] | None) -> None:
         drawn = self.find_visible(base)
         self._base_visible = drawn
-        mirrored = self.object_surfaces.place(
-            self.object_surfaces.local_vertices(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
+        mirrored = self.surfaces.place(
+            self.surfaces.local_vertices(base.ffd, base.size_lhw, mirrored=True), base.yaw, base.translation
         )
         self.mirror_clip = surfaces.project_vertices(mirrored, self.scene.camera)
         flipped = surfaces.rotate_y(
-            self.smooth_normals * self.like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.object_surfaces.owner]
+            self.smooth_normals * self.like.new_tensor([1.0, 1.0, -1.0]), base.yaw[self.surfaces.owner]
         )
         self.mirror_cos = surfaces.facing_cosine(mirrored, flipped, self.centre)
         order = blend.paint_order(base.size_lhw, base.yaw, base.translation, self.centre, self.footprints)
@@ -319,7 +320,7 @@ class PreparedScene:
     def finish(self) -> Tensor:
         """(V, 4) gains (3) and lift that match the templates' colours to the vehicles; computed on first use."""
         if self._finish is None:
-            parts = zip(self.object_surfaces.surfaces, self.sample_photograph(), strict=True)
+            parts = zip(self.surfaces.templates, self.sample_photograph(), strict=True)
             ground_points = [torch.from_numpy(finish.fit_finish(surface, samples)) for surface, samples in parts]
             self._finish = torch.cat(ground_points).to(self.like)
             self._base_visible = None
@@ -335,16 +336,16 @@ class PreparedScene:
 
     def _template_paint(self) -> Tensor:
         """Mean colour (N, 3) of the templates' paint."""
-        object_surfaces = self.object_surfaces
+        meshes = self.surfaces
         total = self.base_size_lhw.new_zeros(len(self.base_size_lhw), 3)
-        total = total.index_add(0, object_surfaces.owner, object_surfaces.colours * object_surfaces.paint[:, None])
-        count = total.new_zeros(len(total)).index_add(0, object_surfaces.owner, object_surfaces.paint)
+        total = total.index_add(0, meshes.owner, meshes.colours * meshes.paint[:, None])
+        count = total.new_zeros(len(total)).index_add(0, meshes.owner, meshes.paint)
         return total / count.clamp(min=1e-3)[:, None]
 
     def estimate_paint(self, samples: Sequence[finish.FinishSamples]) -> Tensor:
         """Paint (N, 3) of the objects in the photograph, by their samples; the templates' where it shows none."""
         paint = self._template_paint()
-        for i, (surface, own) in enumerate(zip(self.object_surfaces.surfaces, samples, strict=True)):
+        for i, (surface, own) in enumerate(zip(self.surfaces.templates, samples, strict=True)):
             ground_points = finish.estimate_paint(surface, own)
             if ground_points is not None:
                 paint[i] = ground_points.to(paint)
@@ -369,7 +370,7 @@ class PreparedScene:
         """Vertices (V, 3) m in their objects' frames."""
         shapes = ((objects.ffd, self._base_ffd), (objects.size_lhw, self.base_size_lhw))
         changed = any(now.requires_grad or not torch.equal(now, then) for now, then in shapes)
-        return self.object_surfaces.local_vertices(objects.ffd, objects.size_lhw) if changed else self._base_local
+        return self.surfaces.local_vertices(objects.ffd, objects.size_lhw) if changed else self._base_local
 
     def compute_brightening(self, objects: Objects, sun: PerturbedSun | None = None) -> Tensor:
         """Brightening (V,) of the surfaces since the photograph, by turns of objects and sun or its strength: see
@@ -377,10 +378,10 @@ class PreparedScene:
         """
         turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
         if not objects.source or not (turned or sun is not None):
-            return self.like.new_zeros(self.object_surfaces.owner.shape[0])
+            return self.like.new_zeros(self.surfaces.owner.shape[0])
         if self._base_sun_exposure is None:
             self._base_sun_exposure = self._sun_exposure(self.base_yaw)
-        sunlight = self.object_surfaces.per_vertex(self.sunlight)
+        sunlight = self.surfaces.per_vertex(self.sunlight)
         then = (
             model.AMBIENT[0]
             + model.AMBIENT[1] * (0.5 - 0.5 * self.smooth_normals[:, 1])
@@ -392,13 +393,13 @@ class PreparedScene:
             if sun is None
             else now - self._base_sun_exposure + (sun.strength - 1.0) * now
         )
-        return texture.limit_brightening(sunlight * more / then, self.object_surfaces.paint)
+        return texture.limit_brightening(sunlight * more / then, self.surfaces.paint)
 
     def _sun_exposure(self, yaw: Tensor, moved: PerturbedSun | None = None) -> Tensor:
         """How squarely (V,) the sun meets the surfaces of objects at yaw (N,)."""
         direction = self.scene.environment.sun.to(self.like) if moved is None else moved.direction
         sun = direction.expand(len(yaw), 3)
-        x, y, z = self.object_surfaces.per_vertex(surfaces.rotate_y(sun, -yaw)).unbind(-1)
+        x, y, z = self.surfaces.per_vertex(surfaces.rotate_y(sun, -yaw)).unbind(-1)
         # Written out: the last bit of a sum along an axis may depend on the number of rows.
         soft = self.smooth_normals[:, 0] * x + self.smooth_normals[:, 1] * y + self.smooth_normals[:, 2] * z
         return texture.sun_exposure(soft)
@@ -494,10 +495,8 @@ class PreparedScene:
 
     def template_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.PLAIN) appearance of the templates. normals (V, 3); depth (V,) m."""
-        shares = torch.stack(
-            [self.object_surfaces.paint, self.object_surfaces.glass, depth, self.vertex_height], dim=1
-        )
-        return torch.cat([self.object_surfaces.colours, normals, shares], dim=1)
+        shares = torch.stack([self.surfaces.paint, self.surfaces.glass, depth, self.vertex_height], dim=1)
+        return torch.cat([self.surfaces.colours, normals, shares], dim=1)
 
     def completion_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.OWN): `template_attributes`, and what completes a photographed vehicle."""
@@ -506,7 +505,7 @@ class PreparedScene:
 
     def rotated_normals(self, objects: Objects) -> Tensor:
         """Unit normals (V, 3) with sharp edges, in camera axes."""
-        return surfaces.rotate_y(self.sharp_normals, self.object_surfaces.per_vertex(objects.yaw))
+        return surfaces.rotate_y(self.sharp_normals, self.surfaces.per_vertex(objects.yaw))
 
     def object_lights(self, sun: PerturbedSun | None = None) -> Tensor:
         """(N, 4) direction and strength of the sun on each object."""
@@ -539,11 +538,7 @@ class PreparedScene:
         objects = at_photographed_pose(self.scene.objects)
         drawn = self.find_visible(objects)
         dense = verbs.interpolate(
-            drawn.mesh,
-            drawn.geometry.clip,
-            self.object_surfaces.faces,
-            self.object_surfaces.paint[:, None],
-            self.settings.backend,
+            drawn.mesh, drawn.geometry.clip, self.surfaces.faces, self.surfaces.paint[:, None], self.backend
         )
         out = []
         for i, (packed, size) in enumerate(drawn.mesh.layout.spans()):
@@ -574,7 +569,7 @@ class PreparedScene:
         owner, xy = layout.draw_index()[pixel], layout.pixel_xy()[pixel].to(self.like)
         assert self.texels is not None
         counts = torch.bincount(owner, minlength=2 * count)
-        seen = self.texels.sample(xy, counts, self.settings.backend, "clamp")
+        seen = self.texels.sample(xy, counts, self.backend, "clamp")
         weight = smoothstep(seen[:, channels.ALPHA], 0.9, 0.99)
         for part in (seen[:, channels.HIDDEN], texture.outline_share(seen[:, channels.INSET])):
             weight = weight * (1.0 - smoothstep(part, 0.0, 1.0))
@@ -584,7 +579,7 @@ class PreparedScene:
         place = torch.arange(len(plain), device=plain.device) - (size.cumsum(0) - size)[owner[plain]]
         chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MAX_SAMPLES / size.clamp(min=1))[owner[plain]]]
         pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
-        corner = self.object_surfaces.faces[drawn.mesh.face[pixel].long()]
+        corner = self.surfaces.faces[drawn.mesh.face[pixel].long()]
         share = surfaces.perspective_weights(drawn.geometry.clip[corner], xy).to(self.like)
         template_appearance = self.template_attributes(self.rotated_normals(objects), drawn.geometry.clip[:, 2])
         own = torch.cat([template_appearance, drawn.geometry.facing_cos[:, None]], dim=1)
@@ -596,7 +591,7 @@ class PreparedScene:
         sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
         columns = (corner, share, template, seen[:, : channels.ALPHA], sky, lit - sky, weight)
         out = []
-        for i, (start, _) in enumerate(self.object_surfaces.vertex_ranges.tolist()):
+        for i, (start, _) in enumerate(self.surfaces.vertex_ranges.tolist()):
             mine = (owner == i) & (weight > 0.0)
             vertex, *values = (c[mine].cpu().numpy() for c in columns)
             out.append(finish.FinishSamples(vertex - start, *(v.astype(np.float64) for v in values)))
@@ -608,7 +603,7 @@ class PreparedScene:
         assert drawn.patch_fragments is not None
         faces, _, _ = patch_faces(self.patch_corners.shape[0], clip.device)
         corners = self.patch_corners.reshape(-1, 2).contiguous()
-        local = verbs.interpolate(drawn.patch_fragments, clip, faces, corners, self.settings.backend)
+        local = verbs.interpolate(drawn.patch_fragments, clip, faces, corners, self.backend)
         owner = drawn.patch_layout.draw_index()
         density = surfaces.shadow_density(local, self.base_size_lhw[owner], self.base_shadow_offset[owner])
         return density * (drawn.patch_fragments.face >= 0)
@@ -622,16 +617,16 @@ class SceneBatch:
 
     def __init__(self, members: Sequence[PreparedScene]) -> None:
         self._members = tuple(members)
-        self._backend: verbs.Backend = members[0].settings.backend
+        self._backend: verbs.Backend = members[0].backend
         placements = [m.placement for m in members if m.placement is not None]
         self._placement = VertexPlacement.concat(placements) if placements else None
         self._faces, self._vertex_ranges, self._face_ranges = ObjectSurfaces.concat_faces(
-            [m.object_surfaces for m in members]
+            [m.surfaces for m in members]
         )
         self._face_range_tensor = torch.tensor(
             self._face_ranges, dtype=torch.int64, device=self._faces.device
         ).reshape(-1, 2)
-        closed = [s.closed for m in members for s in m.object_surfaces.surfaces]
+        closed = [s.closed for m in members for s in m.surfaces.templates]
         self._cull = torch.tensor(closed, dtype=torch.bool, device=self._faces.device)
         self.counts = [len(m.scene.objects) for m in members]
         cameras = [m.scene.camera for m in members]
@@ -658,7 +653,7 @@ class SceneBatch:
             ((m,), (o,), (sun,)) = self._members, objects, suns
             matrix = m.scene.camera.matrix.to(m.like)
             clip, cos = surfaces.place_vertices(
-                m.local_vertices(o), m.smooth_normals, m.object_surfaces.owner, o, matrix, m.centre
+                m.local_vertices(o), m.smooth_normals, m.surfaces.owner, o, matrix, m.centre
             )
             return PlacedGeometry(clip, cos, m.place_patches(o, sun), m.compute_brightening(o, sun))
         lit = list(zip(self._members, objects, suns, strict=True))

@@ -174,7 +174,7 @@ def _interpolate_attributes(
 ) -> Tensor:
     """Attributes (V, K) of the mesh at the mesh rows (Rm, K), extended over the outline."""
     dense = verbs.interpolate(
-        drawn.mesh, drawn.geometry.clip, prepared.object_surfaces.faces, attributes, prepared.settings.backend
+        drawn.mesh, drawn.geometry.clip, prepared.surfaces.faces, attributes, prepared.backend
     )
     return rows.outline.fill(dense.index_select(0, rows.pixel[: rows.mesh_rows]))
 
@@ -185,16 +185,16 @@ def _average_attributes(
     """`_interpolate_attributes`, averaged over the pixel at `model.SUBPIXELS`: parts thinner than a pixel would
     otherwise be rows of dots. A position that is not reached counts as the pixel's centre.
     """
-    object_surfaces, clip = prepared.object_surfaces, drawn.geometry.clip.double()
+    meshes, clip = prepared.surfaces, drawn.geometry.clip.double()
     face = drawn.mesh.face[rows.pixel[: rows.mesh_rows]].long()
     hit = (face >= 0).nonzero()[:, 0]
     centre, start = rows.xy[hit].double(), face[hit]
     total = clip.new_zeros(len(hit), attributes.shape[1])
     for place in model.SUBPIXELS:
         xy = centre + clip.new_tensor(place) / 16.0
-        found = _walk_mesh(start, xy, clip.detach(), object_surfaces.faces, object_surfaces.neighbours)
+        found = _walk_mesh(start, xy, clip.detach(), meshes.faces, meshes.neighbours)
         xy = torch.where(found[:, None] < 0, centre, xy)
-        corner = object_surfaces.faces[torch.where(found < 0, start, found)]
+        corner = meshes.faces[torch.where(found < 0, start, found)]
         share = surfaces.perspective_weights(clip[corner], xy)
         total = total + (share[..., None] * attributes.double()[corner]).sum(dim=1)
     mean = clip.new_zeros(len(face), attributes.shape[1]).index_copy(0, hit, total / len(model.SUBPIXELS))
@@ -225,17 +225,12 @@ def _shade_photographed(
     prepared: PreparedScene, objects: Objects, drawn: VisibleSurfaces, rows: _PixelRows, sun: PerturbedSun | None
 ) -> _ShadedRows:
     """All rows, coloured by the photograph, and completed where it did not see the mesh."""
-    geometry, base, object_surfaces, m = (
-        drawn.geometry,
-        prepared.base_geometry,
-        prepared.object_surfaces,
-        rows.mesh_rows,
-    )
+    geometry, base, meshes, m = (drawn.geometry, prepared.base_geometry, prepared.surfaces, rows.mesh_rows)
     turn = torch.stack(
         [
             geometry.facing_cos - base.facing_cos,
             base.facing_cos,
-            object_surfaces.paint,
+            meshes.paint,
             prepared.vertex_height,
             geometry.brightening,
         ],
@@ -243,9 +238,7 @@ def _shade_photographed(
     )
 
     attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
-    dense = verbs.interpolate(
-        drawn.mesh, geometry.clip, object_surfaces.faces, attributes, prepared.settings.backend
-    )
+    dense = verbs.interpolate(drawn.mesh, geometry.clip, meshes.faces, attributes, prepared.backend)
     mesh = rows.outline.fill(_photograph_lookup(dense.index_select(0, rows.pixel[:m]), rows.xy[:m]))
     lookup = torch.cat([mesh, mesh.index_select(0, rows.anchor)])
     move, rest = lookup.split([channels.W_THEN, channels.LOOKUP - channels.W_THEN], dim=1)
@@ -253,7 +246,7 @@ def _shade_photographed(
 
     assert prepared.texels is not None
     uv = rows.xy + move
-    texels = prepared.texels.sample(uv, rows.counts, prepared.settings.backend, "clamp")
+    texels = prepared.texels.sample(uv, rows.counts, prepared.backend, "clamp")
     rgb, rest = texels.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
     alpha, hidden, inset, z_seen, support = rest.unbind(1)
     rgb = texture.relight(rgb, brighter)
@@ -279,16 +272,16 @@ def _shade_photographed(
     gain = torch.cat([closed / alpha[:m].clamp(min=model.OPEN_ALPHA[0]), torch.zeros_like(alpha[m:])])
     fill = (1.0 - weight[:m]) * (1.0 - empty)
     colour, opacity = (weight + gain)[:, None] * rgb, (weight + gain) * alpha
-    unseen_rows = (fill != 0.0).nonzero()[:, 0]
-    if unseen_rows.numel():
-        filled = fill.index_select(0, unseen_rows)
-        completed = _complete_unseen(prepared, objects, drawn, rows, unseen_rows, cos_then[:m] + turned[:m], sun)
-        colour = colour.index_add(0, unseen_rows, filled[:, None] * completed)
-        opacity = opacity.index_add(0, unseen_rows, filled)
+    unseen = (fill != 0.0).nonzero()[:, 0]
+    if unseen.numel():
+        filled = fill.index_select(0, unseen)
+        completed = _complete_unseen(prepared, objects, drawn, rows, unseen, cos_then[:m] + turned[:m], sun)
+        colour = colour.index_add(0, unseen, filled[:, None] * completed)
+        opacity = opacity.index_add(0, unseen, filled)
     assert prepared.regions is not None
     if is_active(objects.texture_code) and bool(prepared.regions.known.any()):
         unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
-        found = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.settings.backend)[:, 0]
+        found = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.backend)[:, 0]
         paint = texture.paint_share(paint, found, unseen, prepared.regions.known[rows.owner])
     return _ShadedRows(colour, opacity, z_now, paint, height)
 
@@ -298,33 +291,33 @@ def _complete_unseen(
     objects: Objects,
     drawn: VisibleSurfaces,
     rows: _PixelRows,
-    unseen_rows: Tensor,
+    unseen: Tensor,
     cos_now: Tensor,
     sun: PerturbedSun | None,
 ) -> Tensor:
-    """Colours (K, 3) of mesh rows `unseen_rows` that the photograph did not see: the car's other side, or the template
+    """Colours (K, 3) of mesh rows `unseen` that the photograph did not see: the car's other side, or the template
     in the car's own finish. cos_now: (Rm,) towards the camera.
     """
     attributes = prepared.completion_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
-    own = _average_attributes(prepared, drawn, rows, attributes)[unseen_rows]
+    own = _average_attributes(prepared, drawn, rows, attributes)[unseen]
     gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
     colour = texture.apply_finish(
-        prepared.shade_template(rows.xy[unseen_rows], rows.owner[unseen_rows], own, sun), gain, lift
+        prepared.shade_template(rows.xy[unseen], rows.owner[unseen], own, sun), gain, lift
     )
     clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
     z = clip[:, 2]
     safe = z.clamp(min=model.NEAREST_MIRRORED_M)
     uv = clip[:, :2] / safe[:, None]
-    counts = torch.bincount(rows.owner[unseen_rows], minlength=rows.counts.shape[0])
+    counts = torch.bincount(rows.owner[unseen], minlength=rows.counts.shape[0])
     assert prepared.texels is not None
-    texels = prepared.texels.sample(uv, counts, prepared.settings.backend, "clamp")
+    texels = prepared.texels.sample(uv, counts, prepared.backend, "clamp")
     height, width = prepared.frame_hw
     weight = (
         texture.inside_weight(uv, height, width)
         * (1.0 - smoothstep(texels[:, channels.HIDDEN], 0.0, 1.0))
         * smoothstep(texels[:, channels.ALPHA], *model.SOLID_ALPHA)
         * (1.0 - smoothstep(z - texels[:, channels.DEPTH], *model.DEPTH_TOLERANCE_M))
-        * texture.facing_weight(cos_now[unseen_rows] - cos_then, cos_then, own[:, channels.OWN_PAINT])
+        * texture.facing_weight(cos_now[unseen] - cos_then, cos_then, own[:, channels.OWN_PAINT])
         * smoothstep(cos_then, *model.MIRRORED_COS)
         * (1.0 - smoothstep(texture.outline_share(texels[:, channels.INSET]), *model.MIRRORED_RIM))
     )
@@ -344,7 +337,7 @@ def _sample_shadows(prepared: PreparedScene, objects: Objects, drawn: VisibleSur
         return (1.0 - prepared.patch_density(drawn))[:, None].expand(-1, 3)
     base = prepared.base_geometry.patch_clip
     fixed = torch.cat([base - clip, base[:, 2:]], dim=1)
-    dense = verbs.interpolate(drawn.patch_fragments, clip, faces, fixed, prepared.settings.backend)
+    dense = verbs.interpolate(drawn.patch_fragments, clip, faces, fixed, prepared.backend)
     hit = (drawn.patch_fragments.face >= 0).nonzero()[:, 0]
     xy = layout.pixel_xy()[hit].to(prepared.like)
     wanted = xy + _photograph_lookup(dense.index_select(0, hit), xy)[:, :2]
@@ -357,7 +350,7 @@ def _sample_shadows(prepared: PreparedScene, objects: Objects, drawn: VisibleSur
     reached = ((uv > rect[:, :2] - 2) & (uv < rect[:, 2:] + 1)).all(dim=1).nonzero()[:, 0]
     hit, uv, wanted = hit[reached], uv.index_select(0, reached), wanted.index_select(0, reached)
     counts = torch.bincount(owner[reached], minlength=len(objects))
-    dark = prepared.shadows.sample(uv, counts, prepared.settings.backend, "zero")
+    dark = prepared.shadows.sample(uv, counts, prepared.backend, "zero")
     dark = dark * texture.inside_weight(wanted, height, width, model.SHADOW_EXTENDED_PX)[:, None]
     return dark.new_ones(layout.size, 3).index_add(0, hit, -dark)
 

@@ -226,7 +226,7 @@ def _estimate_lighting(
     whole = replace(scene, objects=replace(scene.objects, source=tuple(plain)), occluders=())
     compositor = Compositor(whole, RenderSettings(settings.backend), hidden=hidden)
     samples = compositor.sample_photograph()
-    seen = list(zip(compositor.object_surfaces.surfaces, samples, strict=True))
+    seen = list(zip(compositor.surfaces.templates, samples, strict=True))
     strength = finish.estimate_sunlight(seen, [_sunlight_from_shadow(s, scene.environment.sun) for s in shadows])
     paint = compositor.estimate_paint(samples)
     return [replace(s, paint=paint[i], sunlight=strength) for i, s in enumerate(blank)]
@@ -426,4 +426,4 @@ def _composite_object(alone: Compositor) -> Tensor:
     no_shadow = PixelLayout.from_rects(layers.shadow_layout.rects * 0)
     plan = blend.BlendPlan.from_layouts(layers.layout, no_shadow, range(len(objects)))
     what = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
-    return blend.composite(background, alone.scene.depth, what, plan, False, alone.settings.backend)[0]
+    return blend.composite(background, alone.scene.depth, what, plan, False, alone.backend)[0]

@@ -173,7 +173,7 @@ def offset_indices(numbers: Sequence[Tensor], counts: Sequence[int]) -> list[Ten
 class ObjectSurfaces:
     """The surfaces of N objects, concatenated."""
 
-    surfaces: tuple[TemplateSurface, ...]
+    templates: tuple[TemplateSurface, ...]
     """Surface of each object."""
     owner: Tensor
     """(V,) int64, object of each vertex."""
@@ -226,12 +226,12 @@ class ObjectSurfaces:
         vertex_ranges: list[list[int]] = []
         face_ranges: list[list[int]] = []
         faces, vertices, triangles = [], 0, 0
-        for object_surfaces in surface_sets:
-            faces.append(object_surfaces.faces + vertices)
-            vertex_ranges += [[vertices + a, vertices + b] for a, b in object_surfaces.vertex_ranges.tolist()]
-            face_ranges += [[triangles + a, triangles + b] for a, b in object_surfaces.face_ranges.tolist()]
-            vertices += object_surfaces.owner.shape[0]
-            triangles += object_surfaces.faces.shape[0]
+        for surfaces in surface_sets:
+            faces.append(surfaces.faces + vertices)
+            vertex_ranges += [[vertices + a, vertices + b] for a, b in surfaces.vertex_ranges.tolist()]
+            face_ranges += [[triangles + a, triangles + b] for a, b in surfaces.face_ranges.tolist()]
+            vertices += surfaces.owner.shape[0]
+            triangles += surfaces.faces.shape[0]
         return torch.cat(faces), vertex_ranges, face_ranges
 
     def local_vertices(self, ffd: Tensor, size_lhw: Tensor, mirrored: bool = False) -> Tensor:
@@ -243,7 +243,7 @@ class ObjectSurfaces:
             mirrored: Whether left and right are swapped.
         """
         parts = []
-        for i, surface in enumerate(self.surfaces):
+        for i, surface in enumerate(self.templates):
             if mirrored:
                 unit = surface.unit * surface.unit.new_tensor([1.0, 1.0, -1.0])
                 unit = unit + _LatticeBend.apply(ffd[i], surface.mirror_weights)
@@ -255,7 +255,7 @@ class ObjectSurfaces:
     def normals(self, local: Tensor) -> tuple[Tensor, Tensor]:
         """Unit normals (V, 3) twice: with sharp edges for shading, and welded ones."""
         sharp, smooth = [], []
-        for surface, (start, end) in zip(self.surfaces, self.vertex_ranges.tolist(), strict=True):
+        for surface, (start, end) in zip(self.templates, self.vertex_ranges.tolist(), strict=True):
             points = local[start:end]
             sharp.append(vertex_normals(points, surface.faces))
             count = int(surface.weld.max()) + 1
@@ -330,18 +330,12 @@ class VertexPlacement:
 
     @classmethod
     def from_objects(
-        cls,
-        object_surfaces: ObjectSurfaces,
-        base: Objects,
-        normal: Tensor,
-        camera: Camera,
-        sun: Tensor,
-        sunlight: Tensor,
+        cls, surfaces: ObjectSurfaces, base: Objects, normal: Tensor, camera: Camera, sun: Tensor, sunlight: Tensor
     ) -> VertexPlacement:
         """The input for one scene's photographed objects.
 
         Args:
-            object_surfaces: Surfaces of the objects.
+            surfaces: Surfaces of the objects.
             base: Objects at their photographed poses.
             normal: (V, 3) welded normals.
             camera: The camera.
@@ -350,18 +344,18 @@ class VertexPlacement:
         """
         count, like = len(base), normal
         placement = cls(
-            unit=torch.cat([s.unit for s in object_surfaces.surfaces]) if count else like,
-            weights=tuple(s.weights for s in object_surfaces.surfaces),
+            unit=torch.cat([s.unit for s in surfaces.templates]) if count else like,
+            weights=tuple(s.weights for s in surfaces.templates),
             normal=normal.contiguous(),
-            owner=object_surfaces.owner.to(torch.int32),
-            paint=object_surfaces.paint,
+            owner=surfaces.owner.to(torch.int32),
+            paint=surfaces.paint,
             base_ffd=base.ffd.new_full((), torch.nan),
             base_bend=torch.zeros_like(like.T),
             base_exposure=like.new_zeros(len(like)),
             sunlight=sunlight,
             matrix=camera.matrix.to(like).expand(count, 3, 4).contiguous(),
             centre=camera_centre(camera.matrix).to(like).expand(count, 3).contiguous(),
-            vertex_edges=[0, *object_surfaces.vertex_ranges[:, 1].tolist()],
+            vertex_edges=[0, *surfaces.vertex_ranges[:, 1].tolist()],
         )
         placement = replace(placement, base_bend=placement.bend_vertices(base.ffd), base_ffd=base.ffd)
         lights = torch.cat([sun.to(like).expand(count, 3), sunlight[:, None]], dim=1)

@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
-from drivesem.attack.budgets import budget_of
+from drivesem.attack.budgets import parse_budget
 from drivesem.cli import main
-from drivesem.viewer.stage import Stage
+from drivesem.viewer.scene import InteractiveScene
 from scene_ir.raster import launch
 from scene_ir.raster.kernels import unpack_kernel
 from tests.pretended_gpu import CPU, GPU, place, pretended
@@ -67,7 +67,7 @@ def test_the_pretended_one_refuses_what_a_real_one_does() -> None:
         with pytest.raises(TypeError, match="numpy"):
             there.numpy()
         with pytest.raises(RuntimeError, match="array lies on"):
-            launch.launch(unpack_kernel, [0, 3], [launch.array(here)] * 3, (), GPU)
+            launch.launch(unpack_kernel, [0, 3], [launch.array(here)] * 3, GPU)
 
 
 def test_gradients_come_back_to_where_their_tensors_lie() -> None:
@@ -127,10 +127,10 @@ def test_a_scene_is_shown(tmp_path: Path) -> None:
     run(["attack", "--combo", "1", "--steps", "1", "--no-grade", "--limit", "1"], tmp_path / "run", "cpu")
     (scene,) = (tmp_path / "run").glob("frames/*/scene")
     with pretended():
-        stage = Stage(scene, load_detector("squeezedet", "cuda"), budget_of("street"), None)
-        drawn = stage.drawn({})
-        assert all((stage.picture(drawn), stage.photograph(), stage.street()))
-        assert stage.seen({}, drawn)["cars"]
+        stage = InteractiveScene(scene, load_detector("squeezedet", "cuda"), parse_budget("street"), None)
+        drawn = stage.render_state({})
+        assert all((stage.encode_picture(drawn), stage.encode_photograph(), stage.encode_street()))
+        assert stage.detect({}, drawn)["cars"]
         assert 0 < stage.score({}, 0, drawn)["score"] <= 1
 
 

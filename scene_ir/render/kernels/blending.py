@@ -125,7 +125,7 @@ _LAY_CODE = (
 )
 _CLAMP_CODE = (
     """
-    wp::uint8* const flags = (wp::uint8*)((char*)clamp_flags.data + y * clamp_flags.strides[0]);
+    wp::uint8* const row_flags = (wp::uint8*)((char*)flags.data + y * flags.strides[0]);
     for (int channel = 0; channel < 3; ++channel) {
         float* const plane = (float*)((char*)image.data + y * image.strides[1] + channel * image.strides[0]);
     """
@@ -135,11 +135,11 @@ _CLAMP_CODE = (
             const float away = v > 0.5f ? v - 0.5f : 0.5f - v;
             const int bits = away > 0.5f + SATURATEDf ? 1 : (away >= 0.5f - SATURATEDf ? 8 : 0);
             const float clamped = v < 0.0f ? 0.0f : (v > 1.0f ? 1.0f : v);
-            plane[x] = flags[x] >= 64 ? v : clamped;
-            flags[x] |= (wp::uint8)(flags[x] >= 64 ? 0 : bits << channel);
+            plane[x] = row_flags[x] >= 64 ? v : clamped;
+            row_flags[x] |= (wp::uint8)(row_flags[x] >= 64 ? 0 : bits << channel);
         }
     }
-    for (int x = x0; x < x1; ++x) flags[x] |= 64;
+    for (int x = x0; x < x1; ++x) row_flags[x] |= 64;
 """
 )
 _START_CODE = (
@@ -147,14 +147,14 @@ _START_CODE = (
     for (int channel = 0; channel < grad.shape[0]; ++channel) {
         const char* const given = (const char*)grad_image.data + y * grad_image.strides[1] + channel * grad_image.strides[0];
         float* const plane = (float*)((char*)grad.data + y * grad.strides[1] + channel * grad.strides[0]);
-        const wp::uint8* const flags = (const wp::uint8*)((const char*)clamp_flags.data + y * clamp_flags.strides[0]);
+        const wp::uint8* const row_flags = (const wp::uint8*)((const char*)flags.data + y * flags.strides[0]);
         const int gone = channel < 3 ? 1 << channel : 0, half = channel < 3 ? 8 << channel : 0;
         const int step = grad_image.strides[2];
     """
     + _PIXEL_LOOP
     + """
             const float g = *(const float*)(given + x * step);
-            plane[x] = flags[x] & gone ? 0.0f : (flags[x] & half ? 0.5f * g : g);
+            plane[x] = row_flags[x] & gone ? 0.0f : (row_flags[x] & half ? 0.5f * g : g);
         }
     }
 """
@@ -243,9 +243,7 @@ def _lay_row(
 
 
 @wp.func_native(_CLAMP_CODE.replace("SATURATED", str(model.SATURATED)))
-def _clamp_row(
-    image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, clamp_flags: wp.array2d(dtype=wp.uint8)
-):
+def _clamp_row(image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, flags: wp.array2d(dtype=wp.uint8)):
     """Clamp to [0, 1] and record which channels had left it (bits 0 to 2) or reached a bound (3 to 5), and that it
     was done (6): rectangles overlap, and a clamped pixel stays as it is.
     """
@@ -257,7 +255,7 @@ def _start_row(
     y: int,
     x0: int,
     x1: int,
-    clamp_flags: wp.array2d(dtype=wp.uint8),
+    flags: wp.array2d(dtype=wp.uint8),
     grad: wp.array3d(dtype=wp.float32),
 ):
     """The gradient to pixels before clamping: see `blend.clamp_colour`."""
@@ -307,7 +305,7 @@ def _blend_kernel(
     number: wp.array2d(dtype=wp.int64),
     under_shadow: wp.array(dtype=wp.vec3f),
     under_layer: wp.array(dtype=wp.vec4f),
-    clamp_flags: wp.array2d(dtype=wp.uint8),
+    flags: wp.array2d(dtype=wp.uint8),
 ):
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
@@ -321,10 +319,10 @@ def _blend_kernel(
     if clamped:
         for k in range(shadows.order.shape[0]):
             s = _row_span(shadows, k, y)
-            _clamp_row(image, y, s.x0, s.x1, clamp_flags)
+            _clamp_row(image, y, s.x0, s.x1, flags)
         for k in range(layers.order.shape[0]):
             s = _row_span(layers, k, y)
-            _clamp_row(image, y, s.x0, s.x1, clamp_flags)
+            _clamp_row(image, y, s.x0, s.x1, flags)
 
 
 @wp.kernel
@@ -336,7 +334,7 @@ def _blend_backward_kernel(
     opacity: wp.array(dtype=wp.float32),
     under_shadow: wp.array(dtype=wp.vec3f),
     under_layer: wp.array(dtype=wp.vec4f),
-    clamp_flags: wp.array2d(dtype=wp.uint8),
+    flags: wp.array2d(dtype=wp.uint8),
     grad_image: wp.array3d(dtype=wp.float32),
     grad: wp.array3d(dtype=wp.float32),
     grad_factor: wp.array(dtype=wp.vec3f),
@@ -346,10 +344,10 @@ def _blend_backward_kernel(
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
         s = _row_span(shadows, k, y)
-        _start_row(grad_image, y, s.x0, s.x1, clamp_flags, grad)
+        _start_row(grad_image, y, s.x0, s.x1, flags, grad)
     for k in range(layers.order.shape[0]):
         s = _row_span(layers, k, y)
-        _start_row(grad_image, y, s.x0, s.x1, clamp_flags, grad)
+        _start_row(grad_image, y, s.x0, s.x1, flags, grad)
     for i in range(layers.order.shape[0]):
         s = _row_span(layers, layers.order.shape[0] - 1 - i, y)
         _lift_row(grad, y, s.x0, s.x1, s.origin, opacity, under_layer, grad_colour, grad_opacity)
@@ -376,7 +374,7 @@ class BlendLayers(torch.autograd.Function):
         nearest = background_depth.clone()
         height, width = nearest.shape
         number = torch.zeros(height, width, dtype=torch.int64, device=canvas.device)
-        clamp_flags = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
+        flags = torch.zeros(height, width, dtype=torch.uint8, device=canvas.device)
         under_shadow, under_layer = torch.empty_like(factor), torch.empty_like(colour)
         inputs = [
             *(
@@ -386,10 +384,10 @@ class BlendLayers(torch.autograd.Function):
                 array(colour, wp.vec4f),
             ),
             *(array(opacity), array(depth), clamped, array(image), array(nearest), array(number)),
-            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(clamp_flags)),
+            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(flags)),
         ]
         launch(_blend_kernel, edges, inputs, device=canvas.device)
-        ctx.save_for_backward(factor, opacity, under_shadow, under_layer, clamp_flags)
+        ctx.save_for_backward(factor, opacity, under_shadow, under_layer, flags)
         ctx.plan, ctx.channels = plan, canvas.shape[0]
         ctx.mark_non_differentiable(nearest, number)
         ctx.set_materialize_grads(False)
@@ -400,7 +398,7 @@ class BlendLayers(torch.autograd.Function):
     def backward(ctx: Any, grad_image: Tensor | None, *_: Tensor | None):
         if grad_image is None:
             return (None,) * 8
-        factor, opacity, under_shadow, under_layer, clamp_flags = ctx.saved_tensors
+        factor, opacity, under_shadow, under_layer, flags = ctx.saved_tensors
         shadows, layers, edges = ctx.plan
         with_canvas = ctx.needs_input_grad[0]
         contiguous = torch.contiguous_format
@@ -419,7 +417,7 @@ class BlendLayers(torch.autograd.Function):
                 array(factor, wp.vec3f),
                 array(opacity),
             ),
-            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(clamp_flags), array(grad_image)),
+            *(array(under_shadow, wp.vec3f), array(under_layer, wp.vec4f), array(flags), array(grad_image)),
             *(array(grad), array(grad_factor, wp.vec3f), array(grad_colour, wp.vec4f), array(grad_opacity)),
         ]
         launch(_blend_backward_kernel, edges, inputs, device=factor.device)

@@ -280,7 +280,7 @@ def _change_size(change: PaintChange):
 
 
 @wp.func
-def _paint_difference(rgb: wp.vec3f, change: PaintChange, base: wp.float32):
+def _difference(rgb: wp.vec3f, change: PaintChange, base: wp.float32):
     """Change of an opaque colour in [0, 1]; exactly 0 without change, for any rounding."""
     lab = rgb_to_lab(rgb)
     difference = _add_dust(lab_to_rgb(_repaint(lab, change, base)), change) - lab_to_rgb(
@@ -290,7 +290,7 @@ def _paint_difference(rgb: wp.vec3f, change: PaintChange, base: wp.float32):
 
 
 @wp.func
-def _paint_difference_adjoint(rgb: wp.vec3f, change: PaintChange, base: wp.float32, g: wp.vec3f):
+def _difference_adjoint(rgb: wp.vec3f, change: PaintChange, base: wp.float32, g: wp.vec3f):
     """The change itself; gradients to rgb, (shift, red, yellow), (gloss, dirt, grip), base."""
     lab = rgb_to_lab(rgb)
     now, g_lab, g_tint, g_finish, g_base = _repaint_adjoint(lab, change, base, g)
@@ -318,7 +318,7 @@ def _paint_kernel(
     alpha = load(opacity, i)
     own = load3(colour, 3 * i, 1)
     straight = clamp01((1.0 / wp.max(alpha, model.LEAST_ALPHA)) * own)
-    difference = _paint_difference(straight, _read_change(code, i, load(height, i)), load(base, i))
+    difference = _difference(straight, _read_change(code, i, load(height, i)), load(base, i))
     store3(out, 3 * i, 1, own + _paint_opacity(alpha, load(paint, i)) * difference)
 
 
@@ -347,7 +347,7 @@ def _paint_adjoint_kernel(
     share = load(paint, i)
     touched = wp.where(wp.min(alpha, share) > 0.0, 1.0, 0.0)
     change = _read_change(code, i, up)
-    difference, g_rgb, g_tint, g_finish, g_base = _paint_difference_adjoint(
+    difference, g_rgb, g_tint, g_finish, g_base = _difference_adjoint(
         rgb, change, load(base, i), _paint_opacity(alpha, share) * g
     )
     along = touched * wp.dot(g, difference)
@@ -381,7 +381,7 @@ class _Paint(torch.autograd.Function):
         rows = given[0].shape[0]
         grads = given[0].new_empty(12, rows)
         inputs = [*(flat_array(t) for t in (*given, grad)), rows]
-        launch(_paint_adjoint_kernel, split_range(rows), inputs, [flat_array(grads)])
+        launch(_paint_adjoint_kernel, split_range(rows), [*inputs, flat_array(grads)])
         return grads[9:].T, grads[0], grads[4:9].T, grads[1], grads[2], grads[3]
 
 

@@ -56,19 +56,7 @@ WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 
 _STRIP = 64
 """Columns that a CPU thread smears at a time; `_mirror_columns` and its adjoint have room for this many."""
-(
-    SETTING_OVERCAST,
-    SETTING_RAIN,
-    SETTING_FOG,
-    SETTING_COVER,
-    SETTING_GAIN,
-    SETTING_GAIN_SLOPE,
-    SETTING_AIR,
-    SETTING_AIR_BY_OVERCAST,
-    SETTING_AIR_BY_TIME,
-    SETTING_AIR_BY_HAZE,
-    SETTING_COUNT,
-) = (
+(OVERCAST, WET, MIST, COVER, GAIN, GAIN_SLOPE, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_HAZE, SETTINGS) = (
     *(0, 1, 2, 3, 4),
     *(7, 10, 13, 16, 19, 22),
 )
@@ -118,17 +106,17 @@ def _settings_kernel(
     paler = _luma + overcast * darker - plain
     misty = plain + greyed * paler
     if c == 0:
-        settings[SETTING_OVERCAST] = wp.float32(overcast)
-        settings[SETTING_RAIN] = code[1]
-        settings[SETTING_FOG] = code[0]
-        settings[SETTING_COVER] = wp.float32(wp.float64(COVER_AIR) * _luma + wp.float64(model.COVER_LIGHT))
-    settings[SETTING_GAIN + c] = wp.float32(gain)
-    settings[SETTING_GAIN_SLOPE + c] = wp.float32(slope)
-    settings[SETTING_AIR + c] = wp.float32(misty + gain * misty)
+        settings[OVERCAST] = wp.float32(overcast)
+        settings[WET] = code[1]
+        settings[MIST] = code[0]
+        settings[COVER] = wp.float32(wp.float64(COVER_AIR) * _luma + wp.float64(model.COVER_LIGHT))
+    settings[GAIN + c] = wp.float32(gain)
+    settings[GAIN_SLOPE + c] = wp.float32(slope)
+    settings[AIR + c] = wp.float32(misty + gain * misty)
     along = away + greyed * (darker - away)
-    settings[SETTING_AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
-    settings[SETTING_AIR_BY_TIME + c] = wp.float32(slope * misty)
-    settings[SETTING_AIR_BY_HAZE + c] = wp.float32(wp.float64(model.HAZE_GREY) * paler * (one + gain))
+    settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
+    settings[AIR_BY_TIME + c] = wp.float32(slope * misty)
+    settings[AIR_BY_HAZE + c] = wp.float32(wp.float64(model.HAZE_GREY) * paler * (one + gain))
 
 
 @wp.func
@@ -151,7 +139,7 @@ def _overcast_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.f
     """Change by full overcast."""
     y = _luma(x)
     flat = FLAT * x + _splat(FLAT_GREY * y + FLAT_LIGHT)
-    return (flat + sky * (_splat(load(settings, SETTING_COVER) + model.COVER_STRUCTURE * y) - flat)) - x
+    return (flat + sky * (_splat(load(settings, COVER) + model.COVER_STRUCTURE * y) - flat)) - x
 
 
 @wp.func
@@ -161,11 +149,11 @@ def _damp_change(x: wp.vec3f):
 
 
 @wp.func
-def _before_mirror(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _dampen(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after overcast, time of day and damp."""
-    covered = x + load(settings, SETTING_OVERCAST) * _overcast_change(x, sky, settings)
-    timed = _apply_gain(covered, load3(settings, SETTING_GAIN, 1))
-    return timed + (model.DAMP * load(settings, SETTING_RAIN)) * _damp_change(timed)
+    covered = x + load(settings, OVERCAST) * _overcast_change(x, sky, settings)
+    timed = _apply_gain(covered, load3(settings, GAIN, 1))
+    return timed + (model.DAMP * load(settings, WET)) * _damp_change(timed)
 
 
 @wp.func
@@ -211,17 +199,17 @@ def _apply_veil_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3
 @wp.func
 def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel after haze, streaks and fog."""
-    rain = load(settings, SETTING_RAIN)
-    air = load3(settings, SETTING_AIR, 1)
+    rain = load(settings, WET)
+    air = load3(settings, AIR, 1)
     far = _apply_veil(x, 1.0 - exp_(-RAIN * rain * depth), model.RAIN_AIR * air)
     streaked = far + (model.STREAKS * rain * streak) * (air - far)
-    return _apply_veil(streaked, 1.0 - exp_(-FOG * load(settings, SETTING_FOG) * depth), air)
+    return _apply_veil(streaked, 1.0 - exp_(-FOG * load(settings, MIST) * depth), air)
 
 
 @wp.func
 def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
     """A pixel with the share `wet` in [0, 1] of the road's sheen."""
-    return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, SETTING_AIR, 1) - x)
+    return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, AIR, 1) - x)
 
 
 @wp.kernel
@@ -236,7 +224,7 @@ def _dry_kernel(
     out: wp.array(dtype=wp.float32),
 ):
     i = start + wp.tid()
-    x = _before_mirror(load3(image, i, plane), load(sky, i), settings)
+    x = _dampen(load3(image, i, plane), load(sky, i), settings)
     store3(out, i, plane, _apply_haze(x, _haze_depth(load(inverse, i)), load(streaks, i), settings))
 
 
@@ -253,7 +241,7 @@ def _damp_kernel(
 ):
     """Pixels before the mirror; out: planes of `wet_pixels` numbers, from pixel `first` on."""
     i = start + wp.tid()
-    store3(out, i - first, wet_pixels, _before_mirror(load3(image, i, plane), load(sky, i), settings))
+    store3(out, i - first, wet_pixels, _dampen(load3(image, i, plane), load(sky, i), settings))
 
 
 @wp.kernel
@@ -272,22 +260,22 @@ def _wet_kernel(
 ):
     i = start + wp.tid()
     depth = _haze_depth(load(inverse, i))
-    share = load(settings, SETTING_RAIN) * (load(road, i) * _grazing_sheen(depth))
+    share = load(settings, WET) * (load(road, i) * _grazing_sheen(depth))
     x = _apply_sheen(load3(damp, i - first, wet_pixels), load3(mirrored, i - first, wet_pixels), share, settings)
     store3(out, i, plane, _apply_haze(x, depth, load(streaks, i), settings))
 
 
 @wp.func
-def _before_mirror_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
-    """Gradients of `_before_mirror` to x, to rain, time and overcast (3), and to sky."""
-    overcast = load(settings, SETTING_OVERCAST)
-    damping = model.DAMP * load(settings, SETTING_RAIN)
-    gain = load3(settings, SETTING_GAIN, 1)
+def _dampen_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
+    """Gradients of `_dampen` to x, to rain, time and overcast (3), and to sky."""
+    overcast = load(settings, OVERCAST)
+    damping = model.DAMP * load(settings, WET)
+    gain = load3(settings, GAIN, 1)
     change = _overcast_change(x, sky, settings)
     covered = x + overcast * change
     rain = model.DAMP * wp.dot(g, _damp_change(_apply_gain(covered, gain)))
     wetted = g + damping * ((DAMP * g + DAMP_GREY * sum3(g) * LUMA) - g)
-    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, SETTING_GAIN_SLOPE, 1))
+    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, GAIN_SLOPE, 1))
     timed = _apply_gain(wetted, gain)
     flat = (1.0 - sky) * timed
     grey_slope = FLAT_GREY * sum3(flat) + model.COVER_STRUCTURE * sky * sum3(timed)
@@ -297,7 +285,7 @@ def _before_mirror_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: 
 
 
 @wp.func
-def _after_mirror_adjoint(
+def _haze_adjoint(
     x: wp.vec3f,
     mirrored: wp.vec3f,
     road: wp.float32,
@@ -307,9 +295,9 @@ def _after_mirror_adjoint(
     settings: wp.array(dtype=wp.float32),
 ):
     """Gradients of `_apply_sheen` and `_apply_haze` to x, mirrored, (fog, rain, time, overcast), inverse, road."""
-    rain = load(settings, SETTING_RAIN)
-    fog = load(settings, SETTING_FOG)
-    air = load3(settings, SETTING_AIR, 1)
+    rain = load(settings, WET)
+    fog = load(settings, MIST)
+    air = load3(settings, AIR, 1)
     depth = _haze_depth(inverse)
     t = _sheen_share(depth)
     seen = road * _grazing_sheen(depth)
@@ -335,12 +323,12 @@ def _after_mirror_adjoint(
         + model.RAIN_AIR * g_haze_air
         + (model.SHEEN_AIR * wet) * g_wet
     )
-    g_grey = wp.dot(g_air, load3(settings, SETTING_AIR_BY_HAZE, 1))
+    g_grey = wp.dot(g_air, load3(settings, AIR_BY_HAZE, 1))
     code = wp.vec4f(
         g_fogged * depth + (1.0 - rain) * g_grey,
         g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen + (1.0 - fog) * g_grey,
-        wp.dot(g_air, load3(settings, SETTING_AIR_BY_TIME, 1)),
-        wp.dot(g_air, load3(settings, SETTING_AIR_BY_OVERCAST, 1)),
+        wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
+        wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
     )
     bend = (model.SHEEN_FAR * 6.0 / SHEEN_OVER) * (t - t * t)
     g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
@@ -370,11 +358,11 @@ def _dry_adjoint_kernel(
     i = start + wp.tid()
     colour = load3(image, i, plane)
     sky_share = load(sky, i)
-    x = _before_mirror(colour, sky_share, settings)
-    g, _mirrored, code, g_inverse, _road = _after_mirror_adjoint(
+    x = _dampen(colour, sky_share, settings)
+    g, _mirrored, code, g_inverse, _road = _haze_adjoint(
         x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
     )
-    g_colour, parts, g_sky = _before_mirror_adjoint(colour, sky_share, g, settings)
+    g_colour, parts, g_sky = _dampen_adjoint(colour, sky_share, g, settings)
     store3(grad_image, i, plane, g_colour)
     store(grad_inverse, i, g_inverse)
     store(code_parts, i, code[0])
@@ -405,8 +393,8 @@ def _wet_adjoint_kernel(
 ):
     """Back to the mirror: grad_image receives the gradient to the picture before it."""
     i = start + wp.tid()
-    x = _before_mirror(load3(image, i, plane), load(sky, i), settings)
-    g, g_mirrored, code, g_inverse, g_road = _after_mirror_adjoint(
+    x = _dampen(load3(image, i, plane), load(sky, i), settings)
+    g, g_mirrored, code, g_inverse, g_road = _haze_adjoint(
         x,
         load3(mirrored, i - first, wet_pixels),
         load(road, i),
@@ -440,7 +428,7 @@ def _damp_adjoint_kernel(
     """From before the mirror back to the picture; grad_damp comes through the mirror."""
     i = start + wp.tid()
     g = load3(grad_image, i, plane) + load3(grad_damp, i - first, wet_pixels)
-    g_colour, parts, g_sky = _before_mirror_adjoint(load3(image, i, plane), load(sky, i), g, settings)
+    g_colour, parts, g_sky = _dampen_adjoint(load3(image, i, plane), load(sky, i), g, settings)
     store3(grad_image, i, plane, g_colour)
     store3(code_parts, i + plane, plane, load3(code_parts, i + plane, plane) + parts)
     store(grad_maps, i, g_sky)
@@ -610,42 +598,20 @@ class _Weather(torch.autograd.Function):
         plane, wet = height * width, _WetRows.of(road)
         first, last = wet.top * width, wet.bottom * width
         wet_pixels = last - first
-        settings, out = (
-            image.new_empty(SETTING_COUNT),
-            torch.empty_like(image, memory_format=torch.contiguous_format),
-        )
+        settings, out = image.new_empty(SETTINGS), image.new_empty(image.shape)
         damp, mirrored = _scratch.planes(image, 3 * wet_pixels)[0], image.new_empty(3 * wet_pixels)
         saved_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
-        image_array, inverse_array, sky_array, road_array, streak_array = (flat_array(t) for t in saved_maps)
-        setting_array, out_array, damp_array, mirror_array = (
-            flat_array(settings),
-            flat_array(out),
-            flat_array(damp),
-            flat_array(mirrored),
-        )
-        launch(_settings_kernel, [0, 3], [flat_array(code), flat_array(air)], [setting_array])
+        image_in, inverse_in, sky_in, road_in, streaks_in = (flat_array(t) for t in saved_maps)
+        settings_in, out_array, damp_out, mirror_out = (flat_array(t) for t in (settings, out, damp, mirrored))
+        launch(_settings_kernel, [0, 3], [flat_array(code), flat_array(air), settings_in])
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
-            inputs = [setting_array, image_array, inverse_array, sky_array, streak_array, plane]
-            launch(_dry_kernel, _ranges(top * width, bottom * width), inputs, [out_array])
-        launch(
-            _damp_kernel,
-            _ranges(first, last),
-            [setting_array, image_array, sky_array, plane, first, wet_pixels],
-            [damp_array],
-        )
-        _launch_mirror(wet, width, damp_array, mirror_array, True)
-        inputs = [
-            setting_array,
-            damp_array,
-            mirror_array,
-            first,
-            wet_pixels,
-            inverse_array,
-            road_array,
-            streak_array,
-            plane,
-        ]
-        launch(_wet_kernel, _ranges(first, last), inputs, [out_array])
+            inputs = [settings_in, image_in, inverse_in, sky_in, streaks_in, plane]
+            launch(_dry_kernel, _ranges(top * width, bottom * width), [*inputs, out_array])
+        inputs = [settings_in, image_in, sky_in, plane, first, wet_pixels, damp_out]
+        launch(_damp_kernel, _ranges(first, last), inputs)
+        _launch_mirror(wet, width, damp_out, mirror_out, True)
+        inputs = [settings_in, damp_out, mirror_out, first, wet_pixels, inverse_in, road_in, streaks_in, plane]
+        launch(_wet_kernel, _ranges(first, last), [*inputs, out_array])
         ctx.save_for_backward(*saved_maps, settings, mirrored)
         ctx.wet = wet
         return out
@@ -655,7 +621,7 @@ class _Weather(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         wet: _WetRows = ctx.wet
         image, inverse, *_ = ctx.saved_tensors
-        image_array, inverse_array, sky_array, road_array, streak_array, setting_array, mirror_array = (
+        image_in, inverse_in, sky_in, road_in, streaks_in, settings_in, mirror_out = (
             flat_array(t) for t in ctx.saved_tensors
         )
         height, width = inverse.shape
@@ -664,15 +630,15 @@ class _Weather(torch.autograd.Function):
         grad_maps = image.new_empty(2, height, width)
         scratch = _scratch.planes(image, 4 * plane, 3 * (last - first), 3 * (last - first))
         parts, to_mirror, to_damp = (flat_array(t) for t in scratch)
-        inputs = [setting_array, image_array, inverse_array, sky_array, streak_array, plane, flat_array(grad)]
+        inputs = [settings_in, image_in, inverse_in, sky_in, streaks_in, plane, flat_array(grad)]
         outputs = [flat_array(grad_image), flat_array(grad_inverse), parts, flat_array(grad_maps)]
         for top, bottom in ((0, wet.top), (wet.bottom, height)):
-            launch(_dry_adjoint_kernel, _ranges(top * width, bottom * width), inputs, outputs)
-        through = [road_array, mirror_array, first, last - first, to_mirror]
-        launch(_wet_adjoint_kernel, _ranges(first, last), [*inputs, *through], outputs)
+            launch(_dry_adjoint_kernel, _ranges(top * width, bottom * width), [*inputs, *outputs])
+        through = [road_in, mirror_out, first, last - first, to_mirror]
+        launch(_wet_adjoint_kernel, _ranges(first, last), [*inputs, *through, *outputs])
         _launch_mirror(wet, width, to_mirror, to_damp, False)
-        inputs = [setting_array, image_array, sky_array, plane, to_damp, first, last - first]
-        launch(_damp_adjoint_kernel, _ranges(first, last), inputs, [outputs[0], *outputs[2:]])
+        inputs = [settings_in, image_in, sky_in, plane, to_damp, first, last - first]
+        launch(_damp_adjoint_kernel, _ranges(first, last), [*inputs, outputs[0], *outputs[2:]])
         grad_code = _sum_rows_first(scratch[0].view(4, height, width))
         return grad_image, grad_inverse, grad_code, None, *grad_maps, None
 
@@ -692,7 +658,7 @@ def _launch_mirror(wet: _WetRows, width: int, source: Any, out_array: Any, forwa
 
 
 ODDS, CHROMA, COS, SIN, RED, YELLOW, THICKER, THINNER, TURN_SLOPE, THICKER_SLOPE, THINNER_SLOPE = range(11)
-LEAF_SETTING_COUNT = 11
+LEAF_SETTINGS = 11
 """Indices of the settings, equal for all leaves, and their count: factor of the odds of lightness; of chroma;
 cosine and sine of the turn of hue; shift of a* and b*; thicker and thinner; slopes of the turn along hue, of
 thicker and thinner along density.
@@ -700,11 +666,7 @@ thicker and thinner along density.
 
 
 @wp.kernel
-def _leaf_settings_kernel(
-    start: int,
-    code: wp.array(dtype=wp.float32),
-    settings: wp.array(dtype=wp.float32),
-):
+def _leaf_settings_kernel(start: int, code: wp.array(dtype=wp.float32), settings: wp.array(dtype=wp.float32)):
     """Thread 0 for the code, thread 1 for no change."""
     t = start + wp.tid()
     on = wp.float64(1 - t)
@@ -716,7 +678,7 @@ def _leaf_settings_kernel(
     rate_slope = wp.float64(LEAF_TURN_SLOPE) * (one - bend * bend)
     thick = one / (one + wp.exp(wp.float64(-model.CROWN_BEND) * density))
     steep = wp.float64(model.CROWN_BEND) * density * thick * (one - thick)
-    first = t * LEAF_SETTING_COUNT
+    first = t * LEAF_SETTINGS
     settings[first + ODDS] = wp.float32(wp.exp(on * wp.float64(model.LEAF_LIGHTNESS) * wp.float64(code[1])))
     settings[first + CHROMA] = wp.float32(one + wp.float64(model.LEAF_CHROMA) * hue)
     settings[first + COS] = wp.float32(wp.cos(-rate * hue))
@@ -733,10 +695,10 @@ def _leaf_settings_kernel(
 @wp.func
 def _leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
     """The leaf model without density: L*a*b*."""
-    _before_mirror = lightness_level(lab[0])
+    _dampen = lightness_level(lab[0])
     odds = load(settings, at + ODDS)
-    level = scale_odds(_before_mirror, odds)
-    chroma = load(settings, at + CHROMA) * wp.sqrt(odds / (_before_mirror * odds + (1.0 - _before_mirror)))
+    level = scale_odds(_dampen, odds)
+    chroma = load(settings, at + CHROMA) * wp.sqrt(odds / (_dampen * odds + (1.0 - _dampen)))
     cos = load(settings, at + COS)
     sin = load(settings, at + SIN)
     room = 4.0 * level * (1.0 - level)
@@ -783,10 +745,10 @@ def _leaf_adjoint(lab: wp.vec3f, crown: CrownPixel, g: wp.vec3f, settings: wp.ar
     g_thick = -THICK * crown.thickened * wp.dot(g_dense, rgb)
     g_lab = lab_to_rgb_adjoint(changed, keep * g_dense)
 
-    _before_mirror = lightness_level(lab[0])
+    _dampen = lightness_level(lab[0])
     odds = load(settings, at + ODDS)
-    bottom = _before_mirror * odds + (1.0 - _before_mirror)
-    level = _before_mirror * odds / bottom
+    bottom = _dampen * odds + (1.0 - _dampen)
+    level = _dampen * odds / bottom
     root = wp.sqrt(odds / bottom)
     chroma = load(settings, at + CHROMA) * root
     cos = load(settings, at + COS)
@@ -833,9 +795,7 @@ def _foliage_kernel(
     crown = _read_crown(crowns, i, plane)
     lab = rgb_to_lab(clamp01(own))
     now = _apply_crown(lab_to_rgb(_leaf_lab(lab, settings, 0)), crown, settings, 0)
-    then = _apply_crown(
-        lab_to_rgb(_leaf_lab(lab, settings, LEAF_SETTING_COUNT)), crown, settings, LEAF_SETTING_COUNT
-    )
+    then = _apply_crown(lab_to_rgb(_leaf_lab(lab, settings, LEAF_SETTINGS)), crown, settings, LEAF_SETTINGS)
     size = wp.abs(load(code, 0)) + wp.abs(load(code, 1)) + wp.abs(load(code, 2))
     share = wp.where(size > 0.0, _leaf_share(load(amount, i)), 0.0)
     store3(out, i, plane, own + share * (now - then))
@@ -884,7 +844,7 @@ def _foliage_image_kernel(
     part = _leaf_share(load(amount, i)) * g
     crown = _read_crown(crowns, i, plane)
     now, _code = _leaf_adjoint(lab, crown, part, settings, 0)
-    then, _none = _leaf_adjoint(lab, crown, part, settings, LEAF_SETTING_COUNT)
+    then, _none = _leaf_adjoint(lab, crown, part, settings, LEAF_SETTINGS)
     store3(grad_image, i, plane, g + clamp01_adjoint(own, rgb_to_lab_adjoint(rgb, now - then)))
 
 
@@ -897,12 +857,12 @@ class _Foliage(torch.autograd.Function):
         plane = height * width
         top, bottom = (0, height) if image.is_cuda else _rows(amount, model.FEWEST_LEAVES)
         saved_maps = [t.detach().contiguous() for t in (image, amount, crowns)]
-        settings = image.new_empty(2 * LEAF_SETTING_COUNT)
+        settings = image.new_empty(2 * LEAF_SETTINGS)
         out = saved_maps[0].clone()
-        setting_array, own_code, maps = flat_array(settings), flat_array(code), [flat_array(t) for t in saved_maps]
-        launch(_leaf_settings_kernel, [0, 2], [own_code], [setting_array])
-        inputs = [setting_array, own_code, *maps, plane]
-        launch(_foliage_kernel, _ranges(top * width, bottom * width), inputs, [flat_array(out)])
+        settings_in, own_code, maps = flat_array(settings), flat_array(code), [flat_array(t) for t in saved_maps]
+        launch(_leaf_settings_kernel, [0, 2], [own_code, settings_in])
+        inputs = [settings_in, own_code, *maps, plane]
+        launch(_foliage_kernel, _ranges(top * width, bottom * width), [*inputs, flat_array(out)])
         ctx.save_for_backward(*saved_maps, settings)
         ctx.rows = (top, bottom)
         return out
@@ -924,15 +884,11 @@ class _Foliage(torch.autograd.Function):
         grad_image = grad_code = None
         if ctx.needs_input_grad[0]:
             grad_image = grad.clone()
-            launch(_foliage_image_kernel, _ranges(first, last), inputs, [flat_array(grad_image)])
+            launch(_foliage_image_kernel, _ranges(first, last), [*inputs, flat_array(grad_image)])
         if ctx.needs_input_grad[1]:
             (code_parts,) = _scratch.planes(image, 3 * (last - first))
-            launch(
-                _foliage_code_kernel,
-                _ranges(first, last),
-                [*inputs, first, last - first],
-                [flat_array(code_parts)],
-            )
+            inputs = [*inputs, first, last - first, flat_array(code_parts)]
+            launch(_foliage_code_kernel, _ranges(first, last), inputs)
             grad_code = _sum_rows_first(code_parts.view(3, bottom - top, width))
         return grad_image, grad_code, None, None
 

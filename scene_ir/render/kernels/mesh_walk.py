@@ -148,5 +148,5 @@ def trace_walks(
         *(array(here), array(goal), array(start, wp.vec3d), array(end, wp.vec3d)),
         *(array(face), array(share), array(edge), array(goes_on), array(plane, wp.vec3d), array(meets)),
     ]
-    launch(_walk_kernel, split_range(count), inputs, (), points.device)
+    launch(_walk_kernel, split_range(count), inputs, points.device)
     return face, share, edge, goes_on.bool(), plane, meets.bool()

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -55,15 +56,13 @@ def _pixel_to_patch(s: ShadingInputs) -> Tensor:
 class _ObjectRanges:
     """Objects [start, end) as ranges of packed pixels, which one thread draws from the first stage to the last."""
 
-    def __init__(self, s: ShadingInputs, code: Tensor | None) -> None:
+    def __init__(self, s: ShadingInputs) -> None:
         self.pixels = s.visible.mesh.layout.offsets.tolist()
         self.ground = s.visible.patch_layout.offsets.tolist()
         count = len(self.pixels) - 1
-        work = [
-            2.0 * (self.pixels[i + 1] - self.pixels[i]) + self.ground[i + 1] - self.ground[i] for i in range(count)
-        ]
+        work = (2 * np.diff(self.pixels) + np.diff(self.ground)).tolist()
         # A GPU and a painter process all objects at once.
-        whole = s.fixed.faces.device.type != "cpu" or code is not None
+        whole = s.fixed.faces.device.type != "cpu" or s.painter is not None
         self.edges = [0, count] if whole else split_by_work(list(range(count + 1)), work)
 
 
@@ -109,83 +108,53 @@ class PhotographedPixels(torch.autograd.Function):
             Premultiplied RGB and opacity / depth (T, 4), opacity (T,), depth (T,) m, inf where empty, and shadow
             factors (Ts, 3).
         """
-        size, device = coverage.shape[0], clip.device
-        clip, facing, brighter, coverage = (t.detach().contiguous() for t in (clip, facing, brighter, coverage))
-        parts = _ObjectRanges(s, code if s.painter is not None else None)
-        table, ground_table = (
-            torch.empty(layout.size, 4, dtype=torch.int32, device=device)
-            for layout in (s.visible.mesh.layout, s.visible.patch_layout)
+        size, device, fixed, visible = coverage.shape[0], clip.device, s.fixed, s.visible
+        clip, facing, brighter, coverage, then, sun = (
+            t.detach().contiguous() for t in (clip, facing, brighter, coverage, then, sun)
         )
+        parts, final = _ObjectRanges(s), s.painter is None
+        layouts = visible.mesh.layout, visible.patch_layout
+        table, ground_table = (torch.empty(o.size, 4, dtype=torch.int32, device=device) for o in layouts)
         nearest = torch.empty(size, dtype=torch.int64, device=device)
         turn = torch.stack([torch.cos(yaw), torch.sin(yaw)], dim=1).detach()
-        found, lookup = clip.new_empty(size, channels.LOOKUP), clip.new_empty(size, channels.LOOKUP)
-        mesh, halo, unseen = clip.new_empty(size, 4), clip.new_empty(size, 4), clip.new_empty(size)
-        colour, opacity, depth = clip.new_empty(size, 4), clip.new_empty(size), clip.new_empty(size)
-        shadow = clip.new_empty(s.visible.patch_layout.size, 3)
-        pixels = make_struct(
-            shading.PackedPixels, table, s.visible.mesh.layout.rects, s.visible.mesh.face, coverage, nearest
-        )
-        vertices = make_struct(
-            shading.MeshVertices,
-            s.fixed.faces,
-            s.fixed.neighbours,
-            clip,
-            facing,
-            brighter,
-            s.fixed.base_clip,
-            s.fixed.base_attributes,
-            s.fixed.template,
-        )
-        photograph = make_struct(
-            shading.PhotographArrays,
-            *s.fixed.texels,
-            s.fixed.frame_wh,
-            turn,
-            sun.detach().contiguous(),
-            s.fixed.unproject,
-        )
-        lookups = make_struct(shading.LookupArrays, found, lookup, mesh, halo, unseen)
-        layers = make_struct(shading.LayerArrays, colour, opacity, depth)
-        patches = make_struct(
-            shadows.ShadowArrays,
-            _pixel_to_patch(s),
-            then.detach().contiguous(),
-            *s.fixed.darkness,
-            s.fixed.frame_wh,
-        )
+        new = clip.new_empty
+        mesh, halo, lookup, unseen = new(size, 4), new(size, 4), new(size, channels.LOOKUP), new(size)
+        colour, opacity, depth, shadow = new(size, 4), new(size), new(size), new(layouts[1].size, 3)
+        pixels = make_struct(shading.PackedPixels, table, layouts[0].rects, visible.mesh.face, coverage, nearest)
+        templates = fixed.base_clip, fixed.base_attributes, fixed.template
+        vertices = make_struct(shading.Vertices, fixed.faces, fixed.neighbours, clip, facing, brighter, *templates)
+        photograph = make_struct(shading.Photographs, *fixed.texels, fixed.frame_wh, turn, sun, fixed.unproject)
+        lookups = make_struct(shading.Lookups, torch.empty_like(lookup), lookup, mesh, halo, unseen)
+        layers = make_struct(shading.MergedLayers, colour, opacity, depth)
+        patches = make_struct(shadows.ShadowArrays, _pixel_to_patch(s), then, *fixed.darkness, fixed.frame_wh)
         shadow_inputs = [array(ground_table, wp.vec4i), patches]
         tables = [
             [array(layout.rects), array(layout.offsets), array(out, wp.vec4i)]
-            for layout, out in ((s.visible.mesh.layout, table), (s.visible.patch_layout, ground_table))
+            for layout, out in zip(layouts, (table, ground_table), strict=True)
         ]
         darkened = array(shadow, wp.vec3f)
         unseen_pixels: dict[int, Tensor] = {}
         partial: dict[int, Tensor] = {}
-        final = s.painter is None
 
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
             for inputs in tables:
-                launch(shading.table_kernel, [start, end], inputs, (), device)
-            launch(
-                shadows.shadow_kernel,
-                [parts.ground[start], parts.ground[end]],
-                [*shadow_inputs, darkened],
-                (),
-                device,
-            )
+                launch(shading.table_kernel, [start, end], inputs, device)
+            ground = [parts.ground[start], parts.ground[end]]
+            launch(shadows.shadow_kernel, ground, [*shadow_inputs, darkened], device)
             if last == first:
                 return
-            surfaces.nearest_hits(s.visible.mesh, s.visible.reach_px, range(start, end), nearest)
-            launch(shading.lookup_kernel, [first, last], [pixels, vertices, lookups], (), device)
-            partial[start] = lean = _partly_covered(coverage[first:last]).add_(first)
-            launch(shading.save_lookups_kernel, [0, lean.shape[0]], [array(lean), lookups], (), device)
-            launch(shading.extend_lookups_kernel, [0, lean.shape[0]], [array(lean), pixels, lookups], (), device)
-            launch(shading.shade_kernel, [first, last], [pixels, photograph, lookups, final, layers], (), device)
+            surfaces.nearest_hits(visible.mesh, visible.reach_px, range(start, end), nearest)
+            launch(shading.lookup_kernel, [first, last], [pixels, vertices, lookups], device)
+            # Partly covered pixels: of what is hit, at least half is covered.
+            partial[start] = rim = coverage[first:last].frac().nonzero()[:, 0].add_(first)
+            launch(shading.save_kernel, [0, rim.shape[0]], [array(rim), lookups], device)
+            launch(shading.extend_kernel, [0, rim.shape[0]], [array(rim), pixels, lookups], device)
+            launch(shading.shade_kernel, [first, last], [pixels, photograph, lookups, final, layers], device)
             unseen_pixels[start] = need = unseen[first:last].nonzero()[:, 0] + first
             if need.numel():
                 inputs = [array(need), pixels, vertices, photograph, lookups, final, layers]
-                launch(shading.complete_kernel, [0, need.shape[0]], inputs, (), device)
+                launch(shading.complete_kernel, [0, need.shape[0]], inputs, device)
 
         for kernel in (shading.lookup_kernel, shadows.shadow_kernel):
             load_kernel(kernel)
@@ -199,7 +168,7 @@ class PhotographedPixels(torch.autograd.Function):
                 state.painted = leaves, s.painter(*leaves, table, nearest)
             for name, painted in zip(("mesh", "halo"), state.painted[1], strict=True):
                 lookups.set_array(name, painted.detach().contiguous())
-            launch(shading.combine_kernel, split_range(size), [pixels, lookups, layers], (), device)
+            launch(shading.combine_kernel, split_range(size), [pixels, lookups, layers], device)
         ctx.setting, ctx.state = s, state
         ctx.mark_non_differentiable(depth)
         return colour, opacity, depth, shadow
@@ -215,10 +184,8 @@ class PhotographedPixels(torch.autograd.Function):
         """
         s: ShadingInputs = ctx.setting
         state: _ForwardState = ctx.state
-        parts, pixels, vertices, photograph, lookups = (
-            *(state.parts, state.pixels, state.vertices),
-            *(state.photograph, state.lookups),
-        )
+        parts, pixels, vertices = state.parts, state.pixels, state.vertices
+        photograph, lookups = state.photograph, state.lookups
         grad_colour, grad_opacity = grad_colour.contiguous(), grad_opacity.contiguous()
         size, count, device = grad_opacity.shape[0], s.fixed.base_clip.shape[0], grad_colour.device
         new, zeros = grad_colour.new_empty, grad_colour.new_zeros
@@ -229,11 +196,10 @@ class PhotographedPixels(torch.autograd.Function):
         grad_then = torch.zeros_like(_pixel_to_patch(s))
         grad_turn = torch.zeros_like(state.turn, dtype=torch.float64)
         grad_sun = torch.zeros(len(state.turn), 4, dtype=torch.float64, device=device)
-        to_layers = make_struct(
-            shading.LayerArrays, grad_colour, grad_opacity, grad_opacity
-        )  # depth has no gradient
+        # The depth has no gradient.
+        to_layers = make_struct(shading.MergedLayers, grad_colour, grad_opacity, grad_opacity)
         grads = make_struct(
-            *(shading.ShadingGradients, grad_lookup, grad_moved, grad_mesh, grad_halo, grad_unseen, grad_coverage),
+            *(shading.PixelGradients, grad_lookup, grad_moved, grad_mesh, grad_halo, grad_unseen, grad_coverage),
             *(grad_clip, grad_facing, grad_brighter, grad_turn, grad_sun),
         )
         shadowed = [*state.shadow_inputs, array(grad_shadow.contiguous(), wp.vec3f), array(grad_then, wp.mat33d)]
@@ -243,7 +209,7 @@ class PhotographedPixels(torch.autograd.Function):
         def work(start: int, end: int) -> None:
             first, last = parts.pixels[start], parts.pixels[end]
             ranges = [parts.ground[start], parts.ground[end]]
-            launch(shadows.shadow_backward_kernel, ranges, shadowed, (), device)
+            launch(shadows.shadow_backward_kernel, ranges, shadowed, device)
             if last == first:
                 return
             grad_coverage[first:last].zero_()
@@ -253,25 +219,18 @@ class PhotographedPixels(torch.autograd.Function):
             need = state.unseen_pixels[start]
             if need.numel():
                 inputs = [array(need), pixels, vertices, photograph, lookups, final, to_layers, grads]
-                launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, (), device)
+                launch(shading.complete_backward_kernel, [0, need.shape[0]], inputs, device)
             inputs = [pixels, photograph, lookups, final, to_layers, grads]
-            launch(shading.shade_backward_kernel, [first, last], inputs, (), device)
-            lean = state.partial[start]
-            launch(shading.move_gradients_kernel, [0, lean.shape[0]], [array(lean), grads], (), device)
-            launch(
-                shading.extend_lookups_backward_kernel,
-                [0, lean.shape[0]],
-                [array(lean), pixels, lookups, grads],
-                (),
-                device,
-            )
-            launch(shading.lookup_backward_kernel, [first, last], [pixels, vertices, lookups, grads], (), device)
+            launch(shading.shade_backward_kernel, [first, last], inputs, device)
+            rim = state.partial[start]
+            launch(shading.move_gradients_kernel, [0, rim.shape[0]], [array(rim), grads], device)
+            launch(shading.extend_backward_kernel, [0, rim.shape[0]], [array(rim), pixels, lookups, grads], device)
+            launch(shading.lookup_backward_kernel, [first, last], [pixels, vertices, lookups, grads], device)
 
         grad_code = None
         if state.painted is not None:
-            launch(
-                shading.combine_backward_kernel, split_range(size), [pixels, lookups, to_layers, grads], (), device
-            )
+            inputs = [pixels, lookups, to_layers, grads]
+            launch(shading.combine_backward_kernel, split_range(size), inputs, device)
             leaves, painted = state.painted
             grad_mesh, grad_halo, more, to_unseen, grad_code = torch.autograd.grad(
                 painted, leaves, (grad_mesh, grad_halo), allow_unused=True
@@ -286,8 +245,3 @@ class PhotographedPixels(torch.autograd.Function):
         grad_yaw = (grad_turn[:, 1] * turn[:, 0] - grad_turn[:, 0] * turn[:, 1]).to(turn.dtype)
         to_place = grad_clip.to(grad_colour.dtype), grad_facing, grad_brighter
         return *to_place, grad_coverage, grad_yaw, grad_then, grad_code, grad_sun.to(grad_colour.dtype), None
-
-
-def _partly_covered(coverage: Tensor) -> Tensor:
-    """Pixels that `shading.is_partly_covered`: of what is hit, at least half is covered."""
-    return coverage.frac().nonzero()[:, 0]

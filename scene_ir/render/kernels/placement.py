@@ -190,9 +190,7 @@ def _place_backward_kernel(
         # d (turned vector) / d yaw is (z, 0, -x) of the turned vector
         angle = to_p[0] * r[2] - to_p[2] * r[0] + to_n[0] * n[2] - to_n[2] * n[0]
         wp.atomic_add(
-            to.pose,
-            o,
-            wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle)),
+            to.pose, o, wp.vec4d(wp.float64(to_p[0]), wp.float64(to_p[1]), wp.float64(to_p[2]), wp.float64(angle))
         )
         wp.atomic_add(to.size, o, wp.vec3d(wp.cw_mul(to_local, v)))
     to.bend[0, i] = to_bend[0]
@@ -229,7 +227,6 @@ class PlaceVertices(torch.autograd.Function):
             _place_kernel,
             split_range(count),
             [templates, poses, make_struct(PlacedVertices, clip, facing, lit, brighter)],
-            (),
             like.device,
         )
         ctx.saved, ctx.placement, ctx.bend = saved, placement, bend
@@ -261,7 +258,6 @@ class PlaceVertices(torch.autograd.Function):
             _place_backward_kernel,
             split_by_work(placement.vertex_edges),
             [*_inputs(placement, ctx.bend, *ctx.saved), places, to],
-            (),
             like.device,
         )
         small = [t.to(like.dtype) for t in (to_size, pose, to_lights)]

@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, RUF046, SIM102, RUF059 - the line above; Warp needs int(0) to declare a variable that a loop changes;
+# ruff: noqa: UP018, RUF046, SIM102, RUF059 - the line above; Warp needs int(0) to declare a variable that a loop changes;
 # `wp.grad` returns gradients to all arguments.
 """Pixels of photographed vehicles as Warp kernels: one pass per stage, forward and backward; float32.
 
@@ -35,11 +35,11 @@ wp.set_module_options({"fuse_fp": True, "fast_math": False, "max_unroll": ch.OWN
 
 DARKNESS = 4
 """Numbers per texel of a shadow: three, and one that completes what a CPU processes at once."""
-texel_type = wp.types.vector(length=ch.TEXEL, dtype=wp.float32)
+texel_t = wp.types.vector(length=ch.TEXEL, dtype=wp.float32)
 texel_samples = wp.types.matrix(shape=(3, ch.TEXEL), dtype=wp.float32)
 darkness_samples = wp.types.matrix(shape=(3, DARKNESS), dtype=wp.float32)
-lookup_type = wp.types.vector(length=ch.LOOKUP, dtype=wp.float32)
-attributes_type = wp.types.vector(length=ch.OWN, dtype=wp.float32)
+lookup_t = wp.types.vector(length=ch.LOOKUP, dtype=wp.float32)
+attributes_t = wp.types.vector(length=ch.OWN, dtype=wp.float32)
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 SUBPIXEL_COUNT = len(model.SUBPIXELS)
 SUBPIXELS = wp.constant(
@@ -57,7 +57,7 @@ DEPTH, STRETCH, OPEN_TURN, OPEN_ALPHA, RIM, OUTLINE_TURN, BORDER, EXTENDED = (
 )
 (
     OUTLINE_PX,
-    OUTER_OUTLINE,
+    RIM_INSET,
     MIRRORED_RIM,
     MIRRORED_COS,
     SOLID,
@@ -117,7 +117,7 @@ class PackedPixels:
 
 
 @wp.struct
-class MeshVertices:
+class Vertices:
     """Faces of the meshes and their neighbours, and the vertices: fields of `prepare.PlacedGeometry` and
     `fast.FixedGeometry`.
     """
@@ -129,11 +129,11 @@ class MeshVertices:
     brighter: wp.array(dtype=wp.float32)
     base_clip: wp.array(dtype=wp.vec3f)
     base: wp.array(dtype=wp.vec3f)
-    own: wp.array(dtype=attributes_type)
+    own: wp.array(dtype=attributes_t)
 
 
 @wp.struct
-class PhotographArrays:
+class Photographs:
     """The photograph of each object.
 
     Attributes:
@@ -144,7 +144,7 @@ class PhotographArrays:
         unproject: (N,) from a pixel to its ray.
     """
 
-    texels: wp.array(dtype=texel_type)
+    texels: wp.array(dtype=texel_t)
     rects: wp.array2d(dtype=wp.int64)
     offsets: wp.array(dtype=wp.int64)
     frame_wh: wp.array(dtype=wp.vec2f)
@@ -163,25 +163,25 @@ class PixelHit:
 
 
 @wp.struct
-class LookupArrays:
+class Lookups:
     """Values of packed pixels, stage by stage.
 
     Attributes:
-        found: Lookups of partly covered pixels before `extend_lookups_kernel`.
+        found: Lookups of partly covered pixels before `extend_kernel`.
         lookup: Lookups, extended over the outline.
         mesh, halo: Premultiplied RGB and opacity.
         unseen: Share of the mesh to complete.
     """
 
-    found: wp.array(dtype=lookup_type)
-    lookup: wp.array(dtype=lookup_type)
+    found: wp.array(dtype=lookup_t)
+    lookup: wp.array(dtype=lookup_t)
     mesh: wp.array(dtype=wp.vec4f)
     halo: wp.array(dtype=wp.vec4f)
     unseen: wp.array(dtype=wp.float32)
 
 
 @wp.struct
-class LayerArrays:
+class MergedLayers:
     """Mesh and halo merged: premultiplied RGB and opacity / depth, opacity, depth in m; or gradients to these."""
 
     colour: wp.array(dtype=wp.vec4f)
@@ -190,11 +190,11 @@ class LayerArrays:
 
 
 @wp.struct
-class ShadingGradients:
+class PixelGradients:
     """Gradients to the other structs; moved_lookup: see `move_gradients_kernel`."""
 
-    lookup: wp.array(dtype=lookup_type)
-    moved_lookup: wp.array(dtype=lookup_type)
+    lookup: wp.array(dtype=lookup_t)
+    moved_lookup: wp.array(dtype=lookup_t)
     mesh: wp.array(dtype=wp.vec4f)
     halo: wp.array(dtype=wp.vec4f)
     unseen: wp.array(dtype=wp.float32)
@@ -253,14 +253,14 @@ def table_kernel(
 
 
 @wp.func
-def _corner_values(vertices: MeshVertices, i: int):
+def _corner_values(vertices: Vertices, i: int):
     """A lookup before its division: clip then minus now (3) and w then instead of displacement and depths."""
     then = vertices.base_clip[i]
     delta = then - vertices.clip[i]
     fixed = vertices.base[i]
     turned = vertices.facing[i] - fixed[0]
     bright = vertices.brighter[i]
-    return lookup_type(delta[0], delta[1], delta[2], then[2], turned, fixed[0], fixed[1], fixed[2], bright)
+    return lookup_t(delta[0], delta[1], delta[2], then[2], turned, fixed[0], fixed[1], fixed[2], bright)
 
 
 @wp.func
@@ -270,7 +270,7 @@ def _scaled_pixel(hit: TriangleHit, x: wp.float64, y: wp.float64):
 
 
 @wp.func
-def _lookup_dot(a: lookup_type, b: lookup_type):
+def _lookup_dot(a: lookup_t, b: lookup_t):
     """In double precision: differences between corners matter, which are small compared to the values."""
     total = wp.float64(a[0]) * wp.float64(b[0])
     for k in range(1, ch.LOOKUP):
@@ -279,7 +279,7 @@ def _lookup_dot(a: lookup_type, b: lookup_type):
 
 
 @wp.func
-def _attributes_dot(a: attributes_type, b: attributes_type):
+def _attributes_dot(a: attributes_t, b: attributes_t):
     """See `_lookup_dot`."""
     total = wp.float64(a[0]) * wp.float64(b[0])
     for k in range(1, ch.OWN):
@@ -294,7 +294,7 @@ def is_partly_covered(pixels: PackedPixels, i: int):
 
 
 @wp.func
-def _saved_lookup(pixels: PackedPixels, lookups: LookupArrays, i: int):
+def _saved_lookup(pixels: PackedPixels, lookups: Lookups, i: int):
     """Lookup of a pixel before its extension over the outline."""
     found = lookups.lookup[i]
     if is_partly_covered(pixels, i):
@@ -303,14 +303,14 @@ def _saved_lookup(pixels: PackedPixels, lookups: LookupArrays, i: int):
 
 
 @wp.kernel(enable_backward=False)
-def lookup_kernel(start: int, pixels: PackedPixels, vertices: MeshVertices, lookups: LookupArrays):
+def lookup_kernel(start: int, pixels: PackedPixels, vertices: Vertices, lookups: Lookups):
     """Find where pixels look up the photograph.
 
     Args:
         start, pixels, vertices, lookups: See the module.
     """
     i = start + wp.tid()
-    value = lookup_type()
+    value = lookup_t()
     if pixels.face[i] >= 0:
         at = pixels.table[i]
         hit = triangle_hit(pixels.face[i], wp.float64(at[1]), wp.float64(at[2]), vertices.clip, vertices.faces)
@@ -332,7 +332,7 @@ def lookup_kernel(start: int, pixels: PackedPixels, vertices: MeshVertices, look
 
 @wp.kernel(enable_backward=False)
 def lookup_backward_kernel(
-    start: int, pixels: PackedPixels, vertices: MeshVertices, lookups: LookupArrays, grads: ShadingGradients
+    start: int, pixels: PackedPixels, vertices: Vertices, lookups: Lookups, grads: PixelGradients
 ):
     """Gradient of `lookup_kernel`.
 
@@ -426,8 +426,8 @@ def _outline_blend(pixels: PackedPixels, i: int):
 
 
 @wp.kernel(enable_backward=False)
-def save_lookups_kernel(start: int, partial: wp.array(dtype=wp.int64), lookups: LookupArrays):
-    """Save the lookups of partly covered pixels before `extend_lookups_kernel`.
+def save_kernel(start: int, partial: wp.array(dtype=wp.int64), lookups: Lookups):
+    """Save the lookups of partly covered pixels before `extend_kernel`.
 
     Args:
         start, partial, lookups: See the module.
@@ -437,9 +437,7 @@ def save_lookups_kernel(start: int, partial: wp.array(dtype=wp.int64), lookups: 
 
 
 @wp.kernel(enable_backward=False)
-def extend_lookups_kernel(
-    start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, lookups: LookupArrays
-):
+def extend_kernel(start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, lookups: Lookups):
     """Extend the lookups over the outline.
 
     Args:
@@ -459,20 +457,20 @@ def extend_lookups_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def move_gradients_kernel(start: int, partial: wp.array(dtype=wp.int64), grads: ShadingGradients):
-    """Move the gradients of partly covered pixels aside, for `extend_lookups_backward_kernel` to distribute.
+def move_gradients_kernel(start: int, partial: wp.array(dtype=wp.int64), grads: PixelGradients):
+    """Move the gradients of partly covered pixels aside, for `extend_backward_kernel` to distribute.
 
     Args:
         start, partial, grads: See the module.
     """
     i = wp.int32(partial[start + wp.tid()])
     grads.moved_lookup[i] = grads.lookup[i]
-    grads.lookup[i] = lookup_type()
+    grads.lookup[i] = lookup_t()
 
 
 @wp.func
 def _outline_to_coverage(
-    pixels: PackedPixels, i: int, f: OutlineBlend, to_own: float, to_weight: wp.vec4f, grads: ShadingGradients
+    pixels: PackedPixels, i: int, f: OutlineBlend, to_own: float, to_weight: wp.vec4f, grads: PixelGradients
 ):
     """Add gradients to a pixel's own weight and its neighbours' weights to their coverages."""
     shared = wp.dot(to_weight, f.weight)
@@ -485,14 +483,10 @@ def _outline_to_coverage(
 
 
 @wp.kernel(enable_backward=False)
-def extend_lookups_backward_kernel(
-    start: int,
-    partial: wp.array(dtype=wp.int64),
-    pixels: PackedPixels,
-    lookups: LookupArrays,
-    grads: ShadingGradients,
+def extend_backward_kernel(
+    start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, lookups: Lookups, grads: PixelGradients
 ):
-    """Gradient of `extend_lookups_kernel`.
+    """Gradient of `extend_kernel`.
 
     Args:
         start, partial, pixels, lookups, grads: See the module.
@@ -544,7 +538,7 @@ _SAMPLE = """
 
 @wp.func_native(_SAMPLE.replace("WIDTH", str(ch.TEXEL)))
 def sample_texels(
-    texels: wp.array(dtype=texel_type),
+    texels: wp.array(dtype=texel_t),
     rows: wp.vec4i,
     columns: wp.vec4i,
     wx: wp.vec4f,
@@ -582,18 +576,18 @@ def sample_darkness(
 class TexelSample:
     """A texel between texels, and its changes along u and v."""
 
-    value: texel_type
-    to_u: texel_type
-    to_v: texel_type
+    value: texel_t
+    to_u: texel_t
+    to_v: texel_t
 
 
 @wp.func
-def _sample(texels: wp.array(dtype=texel_type), t: BicubicTaps):
+def _sample(texels: wp.array(dtype=texel_t), t: BicubicTaps):
     return sample_texels(texels, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)[0]
 
 
 @wp.func
-def _sample_with_slopes(texels: wp.array(dtype=texel_type), t: BicubicTaps):
+def _sample_with_slopes(texels: wp.array(dtype=texel_t), t: BicubicTaps):
     sums = sample_texels(texels, t.rows, t.columns, t.wx, t.wy, t.sx, t.sy)
     out = TexelSample()
     out.value = sums[0]
@@ -621,9 +615,9 @@ def crop_taps(uv: wp.vec2f, rect: wp.vec4i, start: wp.int64, clamp: bool):
 
 
 @wp.func
-def _texel_at(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
+def _texel_at(photograph: Photographs, draw: int, uv: wp.vec2f):
     """The texel at a position of the frame; 0 in an empty crop."""
-    out = texel_type()
+    out = texel_t()
     rect = read_rect(photograph.rects, draw)
     if rect[2] > rect[0]:
         out = _sample(photograph.texels, crop_taps(uv, rect, photograph.offsets[draw], True))
@@ -631,7 +625,7 @@ def _texel_at(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
 
 
 @wp.func
-def _texel_with_slopes(photograph: PhotographArrays, draw: int, uv: wp.vec2f):
+def _texel_with_slopes(photograph: Photographs, draw: int, uv: wp.vec2f):
     """`_texel_at`, and its changes."""
     out = TexelSample()
     rect = read_rect(photograph.rects, draw)
@@ -673,13 +667,13 @@ def _pixel_xy(pixels: PackedPixels, i: int):
 
 
 @wp.func
-def _photograph_xy(lookup: lookup_type, xy: wp.vec2f):
+def _photograph_xy(lookup: lookup_t, xy: wp.vec2f):
     """Photograph position of a pixel, px."""
     return wp.vec2f(xy[0] + lookup[ch.DISPLACEMENT], xy[1] + lookup[ch.DISPLACEMENT + 1])
 
 
 @wp.func
-def _visible_weight(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
+def _visible_weight(lookup: lookup_t, texel: texel_t, xy: wp.vec2f, wh: wp.vec2f):
     """Share of the pixel that the photograph knows; and share that it sees there at all."""
     u = xy[0] + lookup[ch.DISPLACEMENT]
     v = xy[1] + lookup[ch.DISPLACEMENT + 1]
@@ -707,7 +701,7 @@ def _relight_slope(c: float, brighter: float):
 
 
 @wp.func
-def _mesh_colour(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f):
+def _mesh_colour(lookup: lookup_t, texel: texel_t, xy: wp.vec2f, wh: wp.vec2f):
     """Premultiplied RGB, opacity, and the share to complete."""
     seen = _visible_weight(lookup, texel, xy, wh)
     weight = seen[0]
@@ -727,7 +721,7 @@ def _mesh_colour(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.ve
 
 
 @wp.func
-def _is_plainly_visible(lookup: lookup_type, texel: texel_type, u: float, v: float, wh: wp.vec2f):
+def _is_plainly_visible(lookup: lookup_t, texel: texel_t, u: float, v: float, wh: wp.vec2f):
     """Whether all weights of `_mesh_colour` are constant at full: then it is the relit texel, and so is its
     gradient.
     """
@@ -748,24 +742,24 @@ def _is_plainly_visible(lookup: lookup_type, texel: texel_type, u: float, v: flo
 
 
 @wp.func
-def _mesh_loss(lookup: lookup_type, texel: texel_type, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_unseen: float):
+def _mesh_loss(lookup: lookup_t, texel: texel_t, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f, to_unseen: float):
     p = _mesh_colour(lookup, texel, xy, wh)
     return p[0] * g[0] + p[1] * g[1] + p[2] * g[2] + p[3] * g[3] + p[UNSEEN] * to_unseen
 
 
 @wp.func
-def _outline_share(texel: texel_type):
+def _outline_share(texel: texel_t):
     """`texture.outline_share`."""
     return 1.0 - _smoothstep(texel[ch.INSET], OUTLINE_PX)
 
 
 @wp.func
-def _halo_colour(lookup: lookup_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f):
+def _halo_colour(lookup: lookup_t, texel: texel_t, inset: float, xy: wp.vec2f, wh: wp.vec2f):
     """Premultiplied RGB and opacity. inset: of the mesh pixel with which this one moves."""
     seen = _visible_weight(lookup, texel, xy, wh)
     on_outline = 1.0 - _smoothstep(lookup[ch.TURNED] * lookup[ch.TURNED], OUTLINE_TURN)
     texel_weight = (
-        seen[0] * _smoothstep(_outline_share(texel), UNIT) * on_outline * (1.0 - _smoothstep(inset, OUTER_OUTLINE))
+        seen[0] * _smoothstep(_outline_share(texel), UNIT) * on_outline * (1.0 - _smoothstep(inset, RIM_INSET))
     )
     return wp.vec4f(
         texel_weight * _relight(texel[0], lookup[ch.BRIGHTER]),
@@ -776,7 +770,7 @@ def _halo_colour(lookup: lookup_type, texel: texel_type, inset: float, xy: wp.ve
 
 
 @wp.func
-def _halo_loss(lookup: lookup_type, texel: texel_type, inset: float, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
+def _halo_loss(lookup: lookup_t, texel: texel_t, inset: float, xy: wp.vec2f, wh: wp.vec2f, g: wp.vec4f):
     return wp.dot(_halo_colour(lookup, texel, inset, xy, wh), g)
 
 
@@ -794,9 +788,7 @@ def _in_halo(pixels: PackedPixels, i: int):
 
 
 @wp.func
-def _write_layer(
-    pixels: PackedPixels, lookups: LookupArrays, layers: LayerArrays, i: int, m: wp.vec4f, h: wp.vec4f
-):
+def _write_layer(pixels: PackedPixels, lookups: Lookups, layers: MergedLayers, i: int, m: wp.vec4f, h: wp.vec4f):
     """Merge a pixel's mesh m and halo h."""
     c = wp.vec3f(0.0, 0.0, 0.0)
     inverse = float(0.0)
@@ -824,7 +816,7 @@ def _write_layer(
 
 
 @wp.func
-def _layer_gradient(lookups: LookupArrays, to_layers: LayerArrays, i: int, j: int):
+def _layer_gradient(lookups: Lookups, to_layers: MergedLayers, i: int, j: int):
     """Gradient to the mesh or halo of pixel i, by the lookup of pixel j, before its share."""
     g = to_layers.colour[i]
     return wp.vec4f(g[0], g[1], g[2], to_layers.opacity[i] + g[3] / wp.max(lookups.lookup[j][ch.W_NOW], NEAR_M))
@@ -832,19 +824,19 @@ def _layer_gradient(lookups: LookupArrays, to_layers: LayerArrays, i: int, j: in
 
 @wp.func
 def _add_depth_gradient(
-    lookups: LookupArrays, to_layers: LayerArrays, i: int, j: int, solid: float, grads: ShadingGradients
+    lookups: Lookups, to_layers: MergedLayers, i: int, j: int, solid: float, grads: PixelGradients
 ):
     """Add the gradient to opacity / depth to that of the depth there. solid: opacity of the part."""
     inverse = to_layers.colour[i][3]
     z = lookups.lookup[j][ch.W_NOW]
     if inverse != 0.0 and z > NEAR_M:
-        to_z = lookup_type()
+        to_z = lookup_t()
         to_z[ch.W_NOW] = -inverse * solid / (z * z)
         wp.atomic_add(grads.lookup, j, to_z)
 
 
 @wp.kernel(enable_backward=False)
-def combine_kernel(start: int, pixels: PackedPixels, lookups: LookupArrays, layers: LayerArrays):
+def combine_kernel(start: int, pixels: PackedPixels, lookups: Lookups, layers: MergedLayers):
     """Merge mesh and halo.
 
     Args:
@@ -856,7 +848,7 @@ def combine_kernel(start: int, pixels: PackedPixels, lookups: LookupArrays, laye
 
 @wp.kernel(enable_backward=False)
 def combine_backward_kernel(
-    start: int, pixels: PackedPixels, lookups: LookupArrays, to_layers: LayerArrays, grads: ShadingGradients
+    start: int, pixels: PackedPixels, lookups: Lookups, to_layers: MergedLayers, grads: PixelGradients
 ):
     """Gradient of `combine_kernel` to mesh and halo.
 
@@ -877,12 +869,7 @@ def combine_backward_kernel(
 
 @wp.kernel(enable_backward=False)
 def shade_kernel(
-    start: int,
-    pixels: PackedPixels,
-    photograph: PhotographArrays,
-    lookups: LookupArrays,
-    final: bool,
-    layers: LayerArrays,
+    start: int, pixels: PackedPixels, photograph: Photographs, lookups: Lookups, final: bool, layers: MergedLayers
 ):
     """Colour mesh and halo by the photograph.
 
@@ -893,7 +880,7 @@ def shade_kernel(
     at = pixels.table[i]
     to_mesh = wp.vec4f(0.0, 0.0, 0.0, 0.0)
     to_halo = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-    unseen_share = float(0.0)
+    unseen = float(0.0)
     xy = _pixel_xy(pixels, i)
     wh = photograph.frame_wh[at[0]]
     if _in_mesh(pixels, i):
@@ -908,7 +895,7 @@ def shade_kernel(
         if not _is_plainly_visible(a, texel, uv[0], uv[1], wh):
             p = _mesh_colour(a, texel, xy, wh)
             to_mesh = wp.vec4f(p[0], p[1], p[2], p[3])
-            unseen_share = p[UNSEEN]
+            unseen = p[UNSEEN]
     if _in_halo(pixels, i):
         j = wp.int32(pixels.nearest[i])
         a = lookups.lookup[j]
@@ -918,7 +905,7 @@ def shade_kernel(
             to_halo = _halo_colour(a, texel, inset, xy, wh)
     lookups.mesh[i] = to_mesh
     lookups.halo[i] = to_halo
-    lookups.unseen[i] = unseen_share
+    lookups.unseen[i] = unseen
     if final:
         _write_layer(pixels, lookups, layers, i, to_mesh, to_halo)
 
@@ -927,11 +914,11 @@ def shade_kernel(
 def shade_backward_kernel(
     start: int,
     pixels: PackedPixels,
-    photograph: PhotographArrays,
-    lookups: LookupArrays,
+    photograph: Photographs,
+    lookups: Lookups,
     final: bool,
-    to_layers: LayerArrays,
-    grads: ShadingGradients,
+    to_layers: MergedLayers,
+    grads: PixelGradients,
 ):
     """Gradient of `shade_kernel`.
 
@@ -955,8 +942,8 @@ def shade_backward_kernel(
             g = grads.mesh[i]
         texel = _texel_with_slopes(photograph, at[0], uv)
         c = texel.value
-        to_lookup = lookup_type()
-        to_texel = texel_type()
+        to_lookup = lookup_t()
+        to_texel = texel_t()
         to_texel[ch.ALPHA] = g[3]
         for k in range(3):
             to_texel[k] = g[k] * _relight_slope(c[k], a[ch.BRIGHTER])
@@ -983,23 +970,17 @@ def shade_backward_kernel(
         halo_g = halo_g * (1.0 - pixels.coverage[i])
         if not final:
             halo_g = grads.halo[i]
-        halo_texel = _texel_with_slopes(photograph, at[0], _photograph_xy(b, xy))
+        outer = _texel_with_slopes(photograph, at[0], _photograph_xy(b, xy))
         if (
-            halo_texel.value[ch.ALPHA] != 0.0
-            or halo_texel.to_u[ch.ALPHA] != 0.0
-            or halo_texel.to_v[ch.ALPHA] != 0.0
+            outer.value[ch.ALPHA] != 0.0 or outer.to_u[ch.ALPHA] != 0.0 or outer.to_v[ch.ALPHA] != 0.0
         ):  # else its surroundings are empty
             anchor = _texel_with_slopes(photograph, at[0], _photograph_xy(b, _pixel_xy(pixels, j)))
-            to_halo_lookup, to_halo_texel, to_inset, _to_halo_xy, _to_halo_wh, _to_halo_g = wp.grad(_halo_loss)(
-                b, halo_texel.value, anchor.value[ch.INSET], xy, wh, halo_g
+            to_anchor, to_outer, to_inset, _to_halo_xy, _to_halo_wh, _to_halo_g = wp.grad(_halo_loss)(
+                b, outer.value, anchor.value[ch.INSET], xy, wh, halo_g
             )
-            to_halo_lookup[ch.DISPLACEMENT] += (
-                wp.dot(to_halo_texel, halo_texel.to_u) + to_inset * anchor.to_u[ch.INSET]
-            )
-            to_halo_lookup[ch.DISPLACEMENT + 1] += (
-                wp.dot(to_halo_texel, halo_texel.to_v) + to_inset * anchor.to_v[ch.INSET]
-            )
-            wp.atomic_add(grads.lookup, j, to_halo_lookup)
+            to_anchor[ch.DISPLACEMENT] += wp.dot(to_outer, outer.to_u) + to_inset * anchor.to_u[ch.INSET]
+            to_anchor[ch.DISPLACEMENT + 1] += wp.dot(to_outer, outer.to_v) + to_inset * anchor.to_v[ch.INSET]
+            wp.atomic_add(grads.lookup, j, to_anchor)
     wp.atomic_add(grads.coverage, i, to_share)
 
 
@@ -1007,7 +988,7 @@ def shade_backward_kernel(
 
 
 @wp.func
-def _centre_hit(pixels: PackedPixels, vertices: MeshVertices, i: int):
+def _centre_hit(pixels: PackedPixels, vertices: Vertices, i: int):
     """What a pixel's centre hits."""
     at = pixels.table[i]
     spot = PixelHit()
@@ -1018,7 +999,7 @@ def _centre_hit(pixels: PackedPixels, vertices: MeshVertices, i: int):
 
 
 @wp.func
-def _subpixel_hit(centre: PixelHit, face: int, k: int, vertices: MeshVertices):
+def _subpixel_hit(centre: PixelHit, face: int, k: int, vertices: Vertices):
     """`reference._walk_mesh` to the k-th position within a pixel, if its centre hits a face."""
     spot = PixelHit()
     spot.x = centre.x + SUBPIXELS[k, 0]
@@ -1049,9 +1030,9 @@ def _subpixel_hit(centre: PixelHit, face: int, k: int, vertices: MeshVertices):
 
 
 @wp.func
-def _average_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
+def _average_attributes(pixels: PackedPixels, vertices: Vertices, i: int):
     """Mesh attributes averaged over a pixel that it hits, else 0."""
-    value = attributes_type()
+    value = attributes_t()
     if pixels.face[i] >= 0:
         centre = _centre_hit(pixels, vertices, i)
         k = int(0)
@@ -1065,7 +1046,7 @@ def _average_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
 
 
 @wp.func
-def _blended_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
+def _blended_attributes(pixels: PackedPixels, vertices: Vertices, i: int):
     """`_average_attributes`, extended over the outline."""
     value = _average_attributes(pixels, vertices, i)
     if is_partly_covered(pixels, i):
@@ -1079,7 +1060,7 @@ def _blended_attributes(pixels: PackedPixels, vertices: MeshVertices, i: int):
 
 @wp.func
 def _attributes_to_clip(
-    pixels: PackedPixels, vertices: MeshVertices, i: int, g: attributes_type, share: float, grads: ShadingGradients
+    pixels: PackedPixels, vertices: Vertices, i: int, g: attributes_t, share: float, grads: PixelGradients
 ):
     """Add `share` of a gradient to `_average_attributes` to the corners; returns g . attributes."""
     centre = _centre_hit(pixels, vertices, i)
@@ -1102,9 +1083,7 @@ def _attributes_to_clip(
 
 
 @wp.func
-def _attributes_backward(
-    pixels: PackedPixels, vertices: MeshVertices, i: int, g: attributes_type, grads: ShadingGradients
-):
+def _attributes_backward(pixels: PackedPixels, vertices: Vertices, i: int, g: attributes_t, grads: PixelGradients):
     """Add a gradient to `_blended_attributes` to corners and coverages."""
     if is_partly_covered(pixels, i):
         f = _outline_blend(pixels, i)
@@ -1169,7 +1148,7 @@ def _shade(
 
 
 @wp.func
-def _mirrored_xy(own: attributes_type):
+def _mirrored_xy(own: attributes_t):
     """Photograph position of the car's other side, px."""
     safe = wp.max(own[ch.MIRROR + 2], model.NEAREST_MIRRORED_M)
     return wp.vec2f(own[ch.MIRROR] / safe, own[ch.MIRROR + 1] / safe)
@@ -1177,13 +1156,7 @@ def _mirrored_xy(own: attributes_type):
 
 @wp.func
 def _complete(
-    own: attributes_type,
-    facing: float,
-    texel: texel_type,
-    turn: wp.vec2f,
-    to_eye: wp.vec3f,
-    sun: wp.vec4f,
-    wh: wp.vec2f,
+    own: attributes_t, facing: float, texel: texel_t, turn: wp.vec2f, to_eye: wp.vec3f, sun: wp.vec4f, wh: wp.vec2f
 ):
     """`reference._complete_unseen`, one row. own: attributes with local normals; facing: cosine towards the camera
     now.
@@ -1219,9 +1192,9 @@ def _complete(
 
 @wp.func
 def _completion_loss(
-    own: attributes_type,
+    own: attributes_t,
     facing: float,
-    texel: texel_type,
+    texel: texel_t,
     turn: wp.vec2f,
     to_eye: wp.vec3f,
     sun: wp.vec4f,
@@ -1232,12 +1205,12 @@ def _completion_loss(
 
 
 @wp.func
-def _mirror_loss(own: attributes_type, g: wp.vec2f):
+def _mirror_loss(own: attributes_t, g: wp.vec2f):
     return wp.dot(_mirrored_xy(own), g)
 
 
 @wp.func
-def _to_eye(photograph: PhotographArrays, at: wp.vec4i):
+def _to_eye(photograph: Photographs, at: wp.vec4i):
     """Unit vector towards the camera at a pixel."""
     ray = photograph.unproject[at[0]] @ wp.vec3f(wp.float32(at[1]), wp.float32(at[2]), 1.0)
     return _unit(ray) * -1.0
@@ -1248,11 +1221,11 @@ def complete_kernel(
     start: int,
     need: wp.array(dtype=wp.int64),
     pixels: PackedPixels,
-    vertices: MeshVertices,
-    photograph: PhotographArrays,
-    lookups: LookupArrays,
+    vertices: Vertices,
+    photograph: Photographs,
+    lookups: Lookups,
     final: bool,
-    layers: LayerArrays,
+    layers: MergedLayers,
 ):
     """Complete what the photograph did not see.
 
@@ -1280,12 +1253,12 @@ def complete_backward_kernel(
     start: int,
     need: wp.array(dtype=wp.int64),
     pixels: PackedPixels,
-    vertices: MeshVertices,
-    photograph: PhotographArrays,
-    lookups: LookupArrays,
+    vertices: Vertices,
+    photograph: Photographs,
+    lookups: Lookups,
     final: bool,
-    to_layers: LayerArrays,
-    grads: ShadingGradients,
+    to_layers: MergedLayers,
+    grads: PixelGradients,
 ):
     """Gradient of `complete_kernel`.
 
@@ -1313,7 +1286,7 @@ def complete_backward_kernel(
     move = wp.vec2f(wp.dot(to_texel, texel.to_u), wp.dot(to_texel, texel.to_v))
     more, to_move = wp.grad(_mirror_loss)(v, move)
     _attributes_backward(pixels, vertices, i, to_own + more, grads)
-    to_lookup = lookup_type()
+    to_lookup = lookup_t()
     to_lookup[ch.TURNED] = to_facing
     to_lookup[ch.COS_THEN] = to_facing
     wp.atomic_add(grads.lookup, i, to_lookup)
@@ -1327,10 +1300,10 @@ def _adjoints_kernel(out: wp.array(dtype=wp.float32)):
     """Never run. Warp generates adjoints of what a differentiable kernel calls; with `wp.grad` alone, some
     functions further down may be missed (Warp 1.19), and their gradients are silently 0.
     """
-    a = texel_type()
+    a = texel_t()
     xy = wp.vec2f(0.0, 0.0)
     c = wp.vec3f(0.0, 0.0, 0.0)
     g = wp.vec4f(0.0, 0.0, 0.0, 0.0)
-    b = lookup_type()
+    b = lookup_t()
     out[0] = _mesh_loss(b, a, xy, xy, g, 0.0) + _halo_loss(b, a, 0.0, xy, xy, g)
-    out[1] = _completion_loss(attributes_type(), 0.0, a, xy, c, g, xy, c) + _mirror_loss(attributes_type(), xy)
+    out[1] = _completion_loss(attributes_t(), 0.0, a, xy, c, g, xy, c) + _mirror_loss(attributes_t(), xy)

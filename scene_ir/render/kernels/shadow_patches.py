@@ -265,7 +265,7 @@ class PlacePatches(torch.autograd.Function):
             make_struct(PatchPoses, *poses),
             make_struct(PatchOutputs, clip, patch, inside),
         ]
-        launch(_patch_kernel, [0, count], inputs, (), like.device)
+        launch(_patch_kernel, [0, count], inputs, like.device)
         ctx.saved = fixed, poses, clip, patch, inside
         ctx.mark_non_differentiable(patch, clip)
         return inside, patch, clip.view(-1, 3)
@@ -281,5 +281,5 @@ class PlacePatches(torch.autograd.Function):
             make_struct(PatchOutputs, clip, patch, inside),
         ]
         inputs = [*inputs, array(grad_inside.contiguous(), wp.mat33d), make_struct(PatchPoseGradients, *to)]
-        launch(_patch_backward_kernel, [0, len(poses[0])], inputs, (), grad_inside.device)
+        launch(_patch_backward_kernel, [0, len(poses[0])], inputs, grad_inside.device)
         return *(t.to(poses[0].dtype) for t in to), None

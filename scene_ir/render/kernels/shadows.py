@@ -1,5 +1,5 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportOptionalMemberAccess=false
-# ruff: noqa: E501, UP018, SIM102, RUF059 - the line above; Warp needs int(0) to declare a variable that a loop changes;
+# ruff: noqa: UP018, SIM102, RUF059 - the line above; Warp needs int(0) to declare a variable that a loop changes;
 # `wp.grad` returns gradients to all arguments.
 """Photographed shadows on the ground, as Warp kernels: what `reference` does in plain torch; float32.
 

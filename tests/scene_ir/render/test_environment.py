@@ -143,9 +143,7 @@ def test_autumn_is_redder_and_thin_crowns_show_the_air() -> None:
     assert float(thin.mean()) > float(thick.mean()) + 0.1
 
 
-def test_grass_is_no_crown_and_leaves_show_what_surrounds_them(
-    street: Callable[[torch.dtype], SceneIR],
-) -> None:
+def test_grass_is_no_crown_and_leaves_show_what_surrounds_them(street: Callable[[torch.dtype], SceneIR]) -> None:
     """Four patches of leaves: before a blue sky, on a red wall, one on level ground, one a hand above it."""
     scene = street(torch.float64)
     blue, red, grey = (

@@ -187,6 +187,6 @@ def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> N
 def test_level_of_detail_changes_triangles_not_the_photograph(photographed: SceneIR) -> None:
     scene = convert_scene(photographed, torch.float32)
     coarse, full = Compositor(scene), Compositor(scene, RenderSettings(lod=False))
-    assert coarse.object_surfaces.faces.shape[0] <= full.object_surfaces.faces.shape[0]
+    assert coarse.surfaces.faces.shape[0] <= full.surfaces.faces.shape[0]
     for compositor in (coarse, full):
         assert float((compositor.render(scene).image - scene.photograph).abs().max()) < 1e-6

@@ -21,7 +21,7 @@ def compositor(photographed: SceneIR) -> Compositor:
 
 
 def test_the_template_is_the_photograph_where_that_shows_it(compositor: Compositor) -> None:
-    for surface, samples in zip(compositor.object_surfaces.surfaces, compositor.sample_photograph(), strict=True):
+    for surface, samples in zip(compositor.surfaces.templates, compositor.sample_photograph(), strict=True):
         own = finish.fit_finish(surface, samples)
         gain, lift = (
             (samples.share[..., None] * own[samples.vertex][..., k]).sum(axis=1) for k in (slice(3), [3])
@@ -33,7 +33,7 @@ def test_the_template_is_the_photograph_where_that_shows_it(compositor: Composit
 
 
 def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> None:
-    surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
+    surface, samples = compositor.surfaces.templates[0], compositor.sample_photograph()[0]
     own = finish.fit_finish(surface, samples)[:, :3]
     paint = surface.part.numpy() == Part.PAINT
     seen = np.zeros(len(paint), bool)
@@ -47,7 +47,7 @@ def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
     none = finish.FinishSamples(
         np.zeros((0, 3), np.int64), *(np.zeros((0, n)) for n in (3, 3, 3)), *[np.zeros(0)] * 3
     )
-    surface = compositor.object_surfaces.surfaces[0]
+    surface = compositor.surfaces.templates[0]
     own = finish.fit_finish(surface, none)
     assert np.allclose(own, [1.0, 1.0, 1.0, 0.0])
     assert finish.estimate_paint(surface, none) is None
@@ -71,14 +71,14 @@ def _lit(samples: finish.FinishSamples, strength: float) -> finish.FinishSamples
 
 @pytest.mark.parametrize("strength", [0.0, 0.6, 1.4])
 def test_sunlight_is_read_off_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
-    surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
+    surface, samples = compositor.surfaces.templates[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, strength))]
     assert finish.estimate_sunlight(seen, [strength]) == pytest.approx(strength, abs=0.01)
     assert abs(finish.estimate_sunlight(seen, [strength + 0.4]) - strength) < 0.4
 
 
 def test_one_vehicle_in_the_shade_does_not_change_the_frames_sunlight(compositor: Compositor) -> None:
-    surface, samples = compositor.object_surfaces.surfaces[0], compositor.sample_photograph()[0]
+    surface, samples = compositor.surfaces.templates[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, s)) for s in (1.4, 1.4, 0.0)]
     assert finish.estimate_sunlight(seen, [1.4, 1.4, 0.0]) == pytest.approx(1.4, abs=0.01)
 
@@ -104,7 +104,7 @@ def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypat
 
 def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor) -> None:
     """Without samples on one side, its gains are pulled towards the other's."""
-    surface: TemplateSurface = compositor.object_surfaces.surfaces[1]
+    surface: TemplateSurface = compositor.surfaces.templates[1]
     samples = compositor.sample_photograph()[1]
     brighter = replace(samples, photograph=np.minimum(1.5 * samples.photograph, 0.9))
     plain, bright = (finish.fit_finish(surface, s)[:, 0] for s in (samples, brighter))
@@ -124,7 +124,7 @@ def test_a_car_that_turns_is_relit(photographed: SceneIR) -> None:
     # A side that turned to the sun is brighter.
     sun = photographed.environment.sun
     normal = compositor.smooth_normals
-    yaw = compositor.object_surfaces.per_vertex(objects.yaw)
+    yaw = compositor.surfaces.per_vertex(objects.yaw)
     gained = (_turned(normal, yaw + 0.3) - _turned(normal, yaw)) @ sun
     lit = (_turned(normal, yaw) @ sun > 0.1) & (gained.abs() > 0.02)
     assert bool((turned[lit].sign() == gained[lit].sign()).all())
