@@ -1,4 +1,4 @@
-"""What sheets are drawn with: texts, and pictures of depth and of objects. Pictures are (h, w, 3) uint8 RGB."""
+"""Text, labels, and colour maps of depth and objects, drawn into pictures (h, w, 3) uint8 RGB."""
 
 from __future__ import annotations
 
@@ -20,32 +20,38 @@ if TYPE_CHECKING:
 
 MARGIN_PX = 12
 TEXT_PX = 15
-PAPER = (250, 250, 250)
-INK = (30, 30, 30)
-UNKNOWN = (120, 120, 120)
-"""Sky in depth maps; pixels of no object."""
+PAPER_COLOUR = (250, 250, 250)
+TEXT_COLOUR = (30, 30, 30)
+UNKNOWN_COLOUR = (120, 120, 120)
+"""Sky in depth maps, and pixels of no object."""
 NEAR_M, FAR_M = 3.0, 200.0
-"""Ends of the depth scale, which is logarithmic."""
-_LINES_OFF = 4
-"""So many lines of text above or below its box a label may stand where all nearer places are taken."""
-_HIDDEN = 0.2
-"""Share of a box from which on a label hides it."""
+"""Ends of the logarithmic depth scale, m."""
+# Okabe and Ito's palette, which colour-blind people can tell apart.
+TRUE_COLOUR = (0, 158, 115)
+DETECTED_COLOUR = (240, 228, 66)
+LOST_COLOUR = (213, 94, 0)
+PHANTOM_COLOUR = (204, 121, 167)
+IGNORED_COLOUR = (150, 150, 150)
+_MAX_LINES_AWAY = 4
+"""Farthest a label may be above or below its box, in lines of text, when all nearer positions are taken."""
+_HIDDEN_SHARE = 0.2
+"""A label hides a box if it covers more than this share of it."""
 
-Spot = tuple[int, int, int, int]
-"""x0, y0, x1, y1 px; x1 and y1 are outside."""
+PixelRect = tuple[int, int, int, int]
+"""x0, y0, x1, y1 in px; x1 and y1 are exclusive."""
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write a picture (h, w, 3) uint8 RGB as PNG, or as JPEG where the name says so, atomically."""
+    """Write a picture (h, w, 3) uint8 RGB atomically, as JPEG if the suffix says so, otherwise as PNG."""
     if path.suffix.lower() not in (".jpg", ".jpeg"):
         files.write_png(path, picture)
         return
     files.write_bytes(path, _jpeg(picture, 92))
 
 
-def jpeg_address(picture: np.ndarray) -> str:
-    """A picture as JPEG in the address by which a page shows it. Its quality is high, or people who are asked how
-    real it looks would judge the compression.
+def encode_jpeg_data_url(picture: np.ndarray) -> str:
+    """Return a picture (h, w, 3) uint8 as a JPEG data URL, of high quality: people who rate how real a picture
+    looks must not rate its compression.
     """
     return f"data:image/jpeg;base64,{base64.b64encode(_jpeg(picture, 90)).decode('ascii')}"
 
@@ -54,16 +60,16 @@ def _jpeg(picture: np.ndarray, quality: int) -> bytes:
     return cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def depth_colours(depth_m: np.ndarray) -> np.ndarray:
-    """Depth in viridis, near is bright, on a logarithmic scale; the sky, and no depth, in grey."""
+def colourise_depth(depth_m: np.ndarray) -> np.ndarray:
+    """Colour depth (h, w) m with viridis on a logarithmic scale, near is bright; sky and unknown depth are grey."""
     known = np.isfinite(depth_m) & (depth_m > 0)
     level = np.log(np.clip(np.where(known, depth_m, FAR_M), NEAR_M, FAR_M) / NEAR_M) / np.log(FAR_M / NEAR_M)
     colours = cv2.applyColorMap((255 * (1 - level)).round().astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
-    return np.where(known[..., None], colours, np.array(UNKNOWN, np.uint8))
+    return np.where(known[..., None], colours, np.array(UNKNOWN_COLOUR, np.uint8))
 
 
-def palette(count: int) -> np.ndarray:
-    """Colours (count, 3) uint8 of objects 0, 1, ..., in hues that differ from number to number."""
+def object_palette(count: int) -> np.ndarray:
+    """Return a colour (count, 3) uint8 for each object; consecutive objects differ in hue."""
     numbers = np.arange(1, count + 1)
     hue = (numbers * 0.618034 % 1 * 180).astype(np.uint8)  # golden ratio: neighbours lie far apart
     value = np.where(numbers % 2, 235, 190).astype(np.uint8)
@@ -71,34 +77,34 @@ def palette(count: int) -> np.ndarray:
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if count else np.zeros((0, 3), np.uint8)
 
 
-def pale(image: np.ndarray) -> np.ndarray:
-    """A picture in pale grey, to draw on."""
+def fade_to_grey(image: np.ndarray) -> np.ndarray:
+    """Return a picture in pale grey, as a background to draw on."""
     return (128 + cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) // 4)[..., None].repeat(3, axis=2)
 
 
-def object_colours(instances: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Objects, instances (H, W) from 1, 0 is none, in their colours over the photograph in pale grey."""
-    colours = np.concatenate([np.zeros((1, 3), np.uint8), palette(int(instances.max(initial=0)))])
-    return np.where((instances > 0)[..., None], colours[instances], pale(image)).astype(np.uint8)
+def colourise_objects(instances: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Colour object instances (H, W), 0 is none, over the photograph (H, W, 3) in pale grey."""
+    colours = np.concatenate([np.zeros((1, 3), np.uint8), object_palette(int(instances.max(initial=0)))])
+    return np.where((instances > 0)[..., None], colours[instances], fade_to_grey(image)).astype(np.uint8)
 
 
 def paste(canvas: np.ndarray, corner: tuple[int, int], picture: np.ndarray) -> None:
-    """Lay a picture over `canvas`, its upper left corner at `corner`."""
+    """Copy a picture into `canvas` with its top left corner at `corner` (x, y) px."""
     x, y = corner
     canvas[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
 
 
 @lru_cache(maxsize=4)
 def _font(size_px: int) -> FreeTypeFont:
-    """DejaVu Sans, which matplotlib brings along."""
+    """DejaVu Sans, which ships with matplotlib."""
     import matplotlib
     from PIL import ImageFont
 
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size_px)
 
 
-def text_extent(text: str, size_px: int) -> tuple[int, int]:
-    """Width and height in px that a text takes, with a margin of 2 px at its sides."""
+def measure_text(text: str, size_px: int) -> tuple[int, int]:
+    """Return the width and height of a line of text in px, with 2 px of padding on either side."""
     return math.ceil(_font(size_px).getlength(text)) + 4, size_px + 3
 
 
@@ -106,14 +112,22 @@ def write_text(
     canvas: np.ndarray,
     corner: tuple[int, int],
     text: str,
-    colour: tuple[int, int, int] = INK,
+    colour: tuple[int, int, int] = TEXT_COLOUR,
     size_px: int = TEXT_PX,
 ) -> None:
-    """Write a line of text into `canvas`, its upper left corner at `corner`; what leaves the canvas is cut."""
+    """Draw a line of text into `canvas`; what does not fit is cut off.
+
+    Args:
+        canvas: Picture (h, w, 3) uint8, changed in place.
+        corner: Top left corner of the text (x, y), px.
+        text: The line.
+        colour: RGB of the text.
+        size_px: Font size.
+    """
     from PIL import Image, ImageDraw
 
     x, y = corner
-    wide, high = text_extent(text, size_px)
+    wide, high = measure_text(text, size_px)
     part = canvas[max(y, 0) : y + high + 3, max(x, 0) : x + wide]
     picture = Image.fromarray(np.ascontiguousarray(part))
     ImageDraw.Draw(picture).text((0, 0), text, colour, _font(size_px))
@@ -121,63 +135,79 @@ def write_text(
 
 
 @dataclass(frozen=True, slots=True)
-class Label:
-    """A line of text on a plate. colour: of the text; plate: behind it."""
+class TextLabel:
+    """One line of text on a filled background."""
 
     text: str
+    """The line."""
     colour: tuple[int, int, int]
-    plate: tuple[int, int, int] = (0, 0, 0)
+    """RGB of the text."""
+    background: tuple[int, int, int] = (0, 0, 0)
+    """RGB behind the text."""
     size_px: int = TEXT_PX - 3
+    """Font size."""
 
 
 @dataclass
-class Labels:
-    """Texts at the boxes of a picture of size_wh px, none of them over another where there is room.
+class LabelLayout:
+    """Labels of the boxes in a picture, placed without overlap while there is room.
 
-    The text that is added first has the best place: above its box; else below it, beside it, inside, or some lines
-    further off. Where all of these are taken, it stands where it hides the least of the others. seen: boxes
-    (x0, y0, x1, y1) px that no text should hide.
+    Labels added first get the best positions: above the box, then below, at its sides, inside, then some lines
+    away. If all are taken, a label goes where it hides the least of the others.
     """
 
     size_wh: tuple[int, int]
-    seen: Sequence[Sequence[float]] = ()
-    placed: list[tuple[Spot, Label]] = field(default_factory=list)
+    """Width and height of the picture, px."""
+    protected_boxes: Sequence[Sequence[float]] = ()
+    """Boxes xyxy, px, that no label should hide."""
+    placed: list[tuple[PixelRect, TextLabel]] = field(default_factory=list)
+    """Labels so far, with their positions."""
 
-    def add(self, xyxy: Sequence[float], label: Label, within: bool = False) -> None:
-        """Find a label's place at its box. within: the box's middle comes before all others."""
+    def add(self, xyxy: Sequence[float], label: TextLabel, within: bool = False) -> None:
+        """Place a label at its box.
 
-        def covers(spot: Spot) -> tuple[float, int]:
-            others = sum(_shared(spot, taken) for taken, _ in self.placed)
-            return others, sum(_shared(spot, box) > _HIDDEN * _shared(box, box) for box in self.seen)
+        Args:
+            xyxy: The box, px.
+            label: The label.
+            within: Prefer the middle of the box to all other positions.
+        """
 
-        extent = text_extent(label.text, label.size_px)
-        self.placed.append((min(_places(xyxy, extent, self.size_wh, within), key=covers), label))
+        def count_overlaps(spot: PixelRect) -> tuple[float, int]:
+            others = sum(_overlap_area(spot, taken) for taken, _ in self.placed)
+            return others, sum(
+                _overlap_area(spot, box) > _HIDDEN_SHARE * _overlap_area(box, box) for box in self.protected_boxes
+            )
+
+        extent = measure_text(label.text, label.size_px)
+        self.placed.append(
+            (min(_candidate_positions(xyxy, extent, self.size_wh, within), key=count_overlaps), label)
+        )
 
     def draw(self, canvas: np.ndarray) -> None:
-        """Write all of them into `canvas` (H, W, 3)."""
+        """Draw all labels into `canvas` (H, W, 3) uint8."""
         for (x0, y0, x1, y1), label in self.placed:
-            canvas[y0:y1, x0:x1] = label.plate
+            canvas[y0:y1, x0:x1] = label.background
             write_text(canvas, (x0 + 2, y0), label.text, label.colour, label.size_px)
 
 
-def _shared(a: Sequence[float], b: Sequence[float]) -> float:
-    """How many px two boxes share."""
+def _overlap_area(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the area that two boxes have in common, px²."""
     return max(min(a[2], b[2]) - max(a[0], b[0]), 0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0)
 
 
-def _places(
+def _candidate_positions(
     xyxy: Sequence[float], extent: tuple[int, int], size_wh: tuple[int, int], within: bool
-) -> Iterator[Spot]:
-    """Where a text of an extent may stand at a box, all inside of the picture, the best first."""
+) -> Iterator[PixelRect]:
+    """Yield positions of a label at its box, all inside the picture, the best first."""
     (wide, high), (x0, y0, x1, y1) = extent, (round(v) for v in xyxy)
     middle = (x0 + x1 - wide + 1) // 2
     corners = [(middle, (y0 + y1 - high + 1) // 2)] if within else []
     columns = (x0 - 1, x1 - wide + 2, middle)
     above, below = y0 - high - 1, y1 + 2
     corners += [(x, y) for y in (above, below) for x in columns]
-    corners += [(x, y) for x in (x1 + 3, x0 - wide - 2) for y in (y0 - 1, y1 - high + 2)]  # beside
+    corners += [(x, y) for x in (x1 + 3, x0 - wide - 2) for y in (y0 - 1, y1 - high + 2)]
     corners += [(x, y) for y in (y0 + 2, y1 - high - 1) for x in columns]
-    for line in range(1, _LINES_OFF + 1):
+    for line in range(1, _MAX_LINES_AWAY + 1):
         off = line * (high + 1)
         corners += [(x, y) for y in (above - off, below + off) for x in columns]
     for left, top in corners:

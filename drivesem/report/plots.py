@@ -1,4 +1,4 @@
-"""Curves and bars of an evaluation as PNG, in colours that people with colour-blindness tell apart."""
+"""Plots as PNG, in colours that colour-blind people can tell apart."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette (jfly.uni-koeln.de/color), the yellow left out: too pale on white."""
-LINES = ("-", "--", "-.", ":")
-"""A second sign beside colour, so that curves are told apart in grey too."""
+PLOT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's palette (jfly.uni-koeln.de/color) without yellow, which is too pale on white."""
+LINE_STYLES = ("-", "--", "-.", ":")
+"""Distinguish curves in greyscale, too."""
 _SIZE_IN = (6.4, 4.4)
 _DPI = 150
-STYLE: Mapping[str, Any] = {
+PLOT_STYLE: Mapping[str, Any] = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -33,14 +33,16 @@ STYLE: Mapping[str, Any] = {
 
 
 def write_curves(path: Path, title: str, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
-    """Precision over recall. curves: name -> recall and precision, fractions."""
-    figure, axes = _empty(title)
+    """Plot precision over recall. curves: recall and precision in [0, 1], by name."""
+    figure, axes = _create_axes(title)
     for i, (name, (recall, precision)) in enumerate(curves.items()):
         axes.plot(
             [100 * r for r in recall],
             [100 * p for p in precision],
-            LINES[i // len(COLOURS) % len(LINES)] if len(curves) > len(COLOURS) else LINES[i % len(LINES)],
-            color=COLOURS[i % len(COLOURS)],
+            LINE_STYLES[i // len(PLOT_COLOURS) % len(LINE_STYLES)]
+            if len(curves) > len(PLOT_COLOURS)
+            else LINE_STYLES[i % len(LINE_STYLES)],
+            color=PLOT_COLOURS[i % len(PLOT_COLOURS)],
             label=name,
             linewidth=1.8,
             marker="o",
@@ -49,20 +51,28 @@ def write_curves(path: Path, title: str, curves: Mapping[str, tuple[Sequence[flo
         )
     axes.set(xlabel="recall, %", ylabel="precision, %", xlim=(0, 100), ylim=(0, 102))
     if curves:
-        _legend(axes, len(curves))
-    _write(path, figure)
+        _add_legend(axes, len(curves))
+    write_figure(path, figure)
 
 
 def write_bars(
     path: Path, title: str, groups: Sequence[str], series: Mapping[str, Sequence[float | None]], x_label: str
 ) -> None:
-    """Recall of each series in each group. series: name -> a fraction a group, None where there is no object."""
-    figure, axes = _empty(title)
+    """Plot the recall of each series in each group as bars.
+
+    Args:
+        path: PNG file.
+        title: Title of the plot.
+        groups: Names of the groups.
+        series: A recall in [0, 1] per group, by name; None if the group has no object.
+        x_label: Label of the axis of groups.
+    """
+    figure, axes = _create_axes(title)
     width = 0.8 / max(len(series), 1)
     for i, (name, values) in enumerate(series.items()):
         places = [g + (i - (len(series) - 1) / 2) * width for g in range(len(groups))]
         heights = [0.0 if v is None else 100 * v for v in values]
-        axes.bar(places, heights, width * 0.92, color=COLOURS[i % len(COLOURS)], label=name)
+        axes.bar(places, heights, width * 0.92, color=PLOT_COLOURS[i % len(PLOT_COLOURS)], label=name)
         for place, value in zip(places, values, strict=True):
             text = "none" if value is None else f"{100 * value:.0f}"
             axes.annotate(
@@ -71,28 +81,28 @@ def write_bars(
     axes.set_xticks(range(len(groups)), groups)
     axes.set(xlabel=x_label, ylabel="recall, %", ylim=(0, 108))
     if len(series) > 1:
-        _legend(axes, len(series))
-    _write(path, figure)
+        _add_legend(axes, len(series))
+    write_figure(path, figure)
 
 
-def _legend(axes: Axes, entries: int) -> None:
-    """Below the axes, where it hides nothing."""
+def _add_legend(axes: Axes, entries: int) -> None:
+    """Put a legend below the axes, where it hides nothing."""
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(entries, 3), fontsize=9)
 
 
-def _empty(title: str) -> tuple[Figure, Axes]:
+def _create_axes(title: str) -> tuple[Figure, Axes]:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
+    with mpl.rc_context(dict(PLOT_STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         axes = figure.add_subplot()
     axes.set_title(title, loc="left", fontsize=11)
     return figure, axes
 
 
-def _write(path: Path, figure: Figure) -> None:
+def write_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG; equal figures give equal bytes."""
     buffer = io.BytesIO()
-    # no date and no version in the file: equal figures give equal bytes
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     files.write_bytes(path, buffer.getvalue())

@@ -1,130 +1,221 @@
-"""Tables for people, on a terminal and in Markdown."""
+"""Results of an analysis as JSON, CSV, Markdown, a picture, and tables on a terminal."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import json
+import sys
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from rich.cells import cell_len
-from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-_ROOMY = 10_000
-"""Characters in which any table has room."""
+from drivesem.report.terminal import Console
+from scene_ir import files
+
+_UNLIMITED_WIDTH = 10_000
+"""Characters; wide enough for any table."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sheet:
-    """One table: its title, its columns, and rows of text. looks: how a terminal shows it, as `table` takes it."""
+class ReportTable:
+    """A table of text for people."""
 
     title: str
+    """Heading."""
     columns: tuple[str, ...]
+    """Names of the columns."""
     rows: tuple[tuple[str, ...], ...]
-    looks: Mapping[str, Any] = field(default_factory=dict)
+    """A cell per column."""
+    rich_options: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of `fit_to_console` for this table."""
 
-    def markdown(self, words: Collection[str]) -> list[str]:
-        """Lines: a heading, and the table. words: columns of words; the others hold numbers."""
-        sides = ("---" if name in words else "---:" for name in self.columns)
+    def to_markdown(self, text_columns: Collection[str]) -> list[str]:
+        """Return a heading and the table as lines. Columns are right-aligned unless they are text columns."""
+        sides = ("---" if name in text_columns else "---:" for name in self.columns)
         lines = (self.columns, sides, *self.rows)
         cells = [[cell.replace("|", "\\|").replace("\n", ", ") for cell in line] for line in lines]
         return [f"## {self.title}", "", *(f"| {' | '.join(line)} |" for line in cells)]
 
-    def table(
+    def to_rich(
         self,
-        words: Collection[str],
+        text_columns: Collection[str],
         unbroken: Collection[str] = (),
         widths: Sequence[int] | None = None,
-        **looks: Any,
+        **rich_options: Any,
     ) -> Table:
-        """The same for a terminal. unbroken: columns that are never wrapped; widths: of the columns, characters,
-        by default as rich finds; looks: of its Table.
+        """Return the table for a terminal.
+
+        Args:
+            text_columns: Columns that are left-aligned.
+            unbroken: Columns that are never wrapped.
+            widths: Width of each column in characters; chosen by rich by default.
+            rich_options: Further arguments of `rich.table.Table`.
         """
-        table = Table(title=self.title, title_justify="left", **looks)
-        for place, name in enumerate(self.columns):
-            side, width = "left" if name in words else "right", None if widths is None else widths[place]
+        table = Table(title=self.title, title_justify="left", **rich_options)
+        for i, name in enumerate(self.columns):
+            side, width = "left" if name in text_columns else "right", None if widths is None else widths[i]
             table.add_column(name, justify=side, no_wrap=name in unbroken, overflow="fold", width=width)
         for row in self.rows:
             table.add_row(*row)
         return table
 
-    def tables(
-        self, console: Console, words: Collection[str], unbroken: Collection[str] = (), **looks: Any
+    def fit_to_console(
+        self, console: Console, text_columns: Collection[str], unbroken: Collection[str] = (), **rich_options: Any
     ) -> list[Table]:
-        """`table`, or, where that does not fit the terminal, one in which no word and no number is broken; or,
-        where there is no room for that, several of some columns each, all of which begin with the columns of words
-        that this one begins with.
+        """Return tables that fit the width of a console without breaking words or numbers.
+
+        This is `to_rich` if that fits, else the same with narrower columns, else several tables that all begin
+        with the leading text columns.
+
+        Args:
+            console: Where the tables will be printed.
+            text_columns: Columns that are left-aligned.
+            unbroken: Columns that are never wrapped.
+            rich_options: Further arguments of `rich.table.Table`.
         """
 
-        def size(table: Table) -> Measurement:
-            return Measurement.get(console, console.options.update(width=_ROOMY), table)
+        def measure(table: Table) -> Measurement:
+            return Measurement.get(console, console.options.update(width=_UNLIMITED_WIDTH), table)
 
-        def laid(places: Sequence[int], more: str = "") -> Table | None:
-            """Of some columns; None where there is no room."""
-            part = self._of(places, more)
-            least, most = zip(*(part._room(i, words, unbroken) for i in range(len(places))), strict=True)
-            spare = console.width - size(part.table(words, unbroken, least, **looks)).maximum
+        def fit_columns(indices: Sequence[int], title_suffix: str = "") -> Table | None:
+            part = self._select_columns(indices, title_suffix)
+            lows, highs = zip(
+                *(part._column_widths(i, text_columns, unbroken) for i in range(len(indices))), strict=True
+            )
+            spare = console.width - measure(part.to_rich(text_columns, unbroken, lows, **rich_options)).maximum
             if spare < 0:
                 return None
-            wanted = max(sum(most) - sum(least), 1)
-            widths = [a + min(b - a, spare * (b - a) // wanted) for a, b in zip(least, most, strict=True)]
-            return part.table(words, unbroken, widths, **looks)
+            wanted = max(sum(highs) - sum(lows), 1)
+            widths = [a + min(b - a, spare * (b - a) // wanted) for a, b in zip(lows, highs, strict=True)]
+            return part.to_rich(text_columns, unbroken, widths, **rich_options)
 
-        whole = self.table(words, unbroken, **looks)
-        if size(whole).maximum <= console.width or not self.columns:
+        whole = self.to_rich(text_columns, unbroken, **rich_options)
+        if measure(whole).maximum <= console.width or not self.columns:
             return [whole]
-        everything = [*range(len(self.columns))]
-        first = next((i for i in everything if self.columns[i] not in words), len(everything))
-        parts = [everything]
-        if laid(everything) is None:
-            parts = [[*range(first)]]
-            for place in everything[first:]:
-                if len(parts[-1]) > first and laid([*parts[-1], place]) is None:
-                    parts.append([*range(first)])
-                parts[-1].append(place)
-        found = [laid(part, ", further columns" if i else "") for i, part in enumerate(parts)]
-        known = [table for table in found if table is not None]
-        return known if len(known) == len(parts) else [whole]
+        every_column = [*range(len(self.columns))]
+        leading = next((i for i in every_column if self.columns[i] not in text_columns), len(every_column))
+        parts = [every_column]
+        if fit_columns(every_column) is None:
+            parts = [[*range(leading)]]
+            for i in every_column[leading:]:
+                if len(parts[-1]) > leading and fit_columns([*parts[-1], i]) is None:
+                    parts.append([*range(leading)])
+                parts[-1].append(i)
+        fitted = [fit_columns(part, ", further columns" if i else "") for i, part in enumerate(parts)]
+        tables = [table for table in fitted if table is not None]
+        return tables if len(tables) == len(parts) else [whole]
 
-    def _room(self, place: int, words: Collection[str], unbroken: Collection[str]) -> tuple[int, int]:
-        """Characters that a column takes at least, and in which none of its lines is wrapped. Columns of numbers
-        have them in one line, below a heading that may be wrapped.
+    def _column_widths(
+        self, column: int, text_columns: Collection[str], unbroken: Collection[str]
+    ) -> tuple[int, int]:
+        """Return the least width of a column, and the width that wraps none of its lines, in characters. Numbers
+        are never wrapped; their heading may be.
         """
-        name, cells = self.columns[place], [row[place] for row in self.rows]
-        longest, lines = _longest(name.split()), _longest(cells)
-        if name in words and name not in unbroken:
-            least = max(longest, _longest(word for cell in cells for word in cell.split()), 1)
-            return least, max(least, lines, _longest([name]))
+        name, cells = self.columns[column], [row[column] for row in self.rows]
+        longest_word, longest_line = _longest_line(name.split()), _longest_line(cells)
+        if name in text_columns and name not in unbroken:
+            least = max(longest_word, _longest_line(word for cell in cells for word in cell.split()), 1)
+            return least, max(least, longest_line, _longest_line([name]))
         if name in unbroken:
-            longest = _longest([name])
-        return max(longest, lines, 1), max(longest, lines, 1)
+            longest_word = _longest_line([name])
+        return max(longest_word, longest_line, 1), max(longest_word, longest_line, 1)
 
-    def _of(self, places: Sequence[int], more: str = "") -> Sheet:
-        columns = tuple(self.columns[i] for i in places)
+    def _select_columns(self, indices: Sequence[int], title_suffix: str = "") -> ReportTable:
         return replace(
             self,
-            title=self.title + more,
-            columns=columns,
-            rows=tuple(tuple(row[i] for i in places) for row in self.rows),
+            title=self.title + title_suffix,
+            columns=tuple(self.columns[i] for i in indices),
+            rows=tuple(tuple(row[i] for i in indices) for row in self.rows),
         )
 
 
-def _longest(texts: Iterable[str]) -> int:
-    """Of lines, in characters."""
+def _longest_line(texts: Iterable[str]) -> int:
+    """Length of the longest line, characters."""
     return max((cell_len(line) for text in texts for line in text.splitlines()), default=0)
 
 
-def csv_text(rows: Sequence[Mapping[str, Any]], line_end: str = "\n") -> str:
-    """Rows as CSV, with a heading of all columns that any of them has."""
+@dataclass(frozen=True, slots=True)
+class AnalysisReport:
+    """The result of one analysis, to be written to files and printed."""
+
+    out: Path
+    """Output folder."""
+    name: str
+    """Base name of the files, such as explain for explain.json."""
+    heading: str
+    """Title of the Markdown page."""
+    data: Mapping[str, Any]
+    """Contents of the JSON file, and what `--json` prints."""
+    csv_tables: Mapping[str, Sequence[Mapping[str, Any]]]
+    """CSV files by base name; a mapping per line."""
+    tables: Sequence[ReportTable]
+    """Tables of the Markdown page."""
+    notes: Sequence[str]
+    """Explanations below the tables."""
+    text_columns: Collection[str] = ()
+    """Columns that are left-aligned; by default the first of each table."""
+    printed_tables: Sequence[ReportTable] | None = None
+    """Tables on a terminal, if not `tables`."""
+    printed_text_columns: Collection[str] = ()
+    """Left-aligned columns on a terminal, if not `text_columns`."""
+    intro: Sequence[str] = ()
+    """Markdown lines below the title."""
+    appendix: Sequence[str] = ()
+    """Markdown lines at the end."""
+    picture: Callable[[Path], object] | None = None
+    """Draws the PNG file."""
+    failed: Mapping[str, str] = field(default_factory=dict)
+    """Reasons, by what was left out."""
+    failure_text: str = "could not be used"
+    """Verb phrase between a key of `failed` and its reason."""
+    json_only: bool = False
+    """Whether `--json` suppresses the tables."""
+
+    def write(self) -> None:
+        """Write all files into `out`."""
+        files.write_json(self.out / f"{self.name}.json", self.data)
+        for name, rows in self.csv_tables.items():
+            files.write_text(self.out / f"{name}.csv", rows_to_csv(rows))
+        files.write_text(self.out / f"{self.name}.md", self.to_markdown())
+        if self.picture is not None:
+            self.picture(self.out / f"{self.name}.png")
+
+    def to_markdown(self) -> str:
+        """Return the Markdown page."""
+        lines = [f"# {self.heading}", "", *self.intro]
+        lines += [f"![]({self.name}.png)", ""] if self.picture is not None else []
+        for table in self.tables:
+            lines += [*table.to_markdown(self.text_columns or table.columns[:1]), ""]
+        return "\n".join([*lines, *(f"{note}\n" for note in self.notes), *self.appendix])
+
+    def print(self, console: Console) -> None:
+        """Print the tables and notes."""
+        for table in self.tables if self.printed_tables is None else self.printed_tables:
+            text_columns = self.printed_text_columns or self.text_columns or table.columns[:1]
+            console.print(*table.fit_to_console(console, text_columns, **table.rich_options), sep="\n")
+        for note in self.notes:
+            console.print(note, soft_wrap=True)
+
+
+def print_json(data: Mapping[str, Any]) -> None:
+    """Print one line of JSON to standard output. Raises ValueError if a number is not finite."""
+    sys.stdout.write(json.dumps(data, allow_nan=False) + "\n")
+
+
+def rows_to_csv(rows: Sequence[Mapping[str, Any]], line_end: str = "\n") -> str:
+    """Return rows as CSV, with a heading of all columns that any row has."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    return csv_table(columns, ([row.get(name) for name in columns] for row in rows), line_end)
+    return cells_to_csv(columns, ([row.get(name) for name in columns] for row in rows), line_end)
 
 
-def csv_table(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end: str = "\n") -> str:
-    """Cells below a heading as CSV."""
+def cells_to_csv(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end: str = "\n") -> str:
+    """Return a heading and rows of cells as CSV."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator=line_end)
     writer.writerow(columns)
@@ -132,11 +223,11 @@ def csv_table(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end: s
     return buffer.getvalue()
 
 
-def number_of(number: int, word: str, words: str | None = None) -> str:
-    """How many there are of something: 1 frame, 2 frames. words: the plural, if it isn't the word with an s."""
-    return f"{number} {word if number == 1 else words or word + 's'}"
+def format_count(number: int, noun: str, plural: str | None = None) -> str:
+    """Format a number with its noun: 1 frame, 2 frames. The plural defaults to the noun with an s."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
-def percent(value: float | None) -> str:
-    """A fraction as a percentage; a dash where there is none (COCO's -1 too)."""
+def format_percent(value: float | None) -> str:
+    """Format a fraction as a percentage with two decimals; "-" if it is undefined (None, or COCO's -1)."""
     return "-" if value is None or value < 0 else f"{100 * value:.2f}"

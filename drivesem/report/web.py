@@ -1,4 +1,4 @@
-"""Pages of one file: what they share, and what they may do."""
+"""Self-contained HTML pages from Jinja templates, with a strict content security policy."""
 
 from __future__ import annotations
 
@@ -10,32 +10,36 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 
 
-def render(template: str, script: str | None = None, **values: Any) -> str:
-    """A page's text. template: `PACKAGE:FILE`, which extends `drivesem.report:base.html`; script: the same of the
-    one script that the page's content security policy lets run, by its hash. Values are escaped. Templates know
-    `number_of`.
+def render_page(template: str, script: str | None = None, **values: Any) -> str:
+    """Return the text of a page.
+
+    Args:
+        template: `PACKAGE:FILE` of a template that extends `drivesem.report:base.html`; it may call
+            `format_count`.
+        script: `PACKAGE:FILE` of the only script that the content security policy allows, by its hash.
+        values: Variables of the template; they are escaped.
     """
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, loader=jinja2.FunctionLoader(_part)
+        autoescape=True, undefined=jinja2.StrictUndefined, loader=jinja2.FunctionLoader(_read_resource)
     )
-    told = None if script is None else _part(script)
+    source = None if script is None else _read_resource(script)
     return environment.get_template(template).render(
-        number_of=number_of,
-        style=Markup(_part("drivesem.report:style.css")),
-        script=None if told is None else Markup(told),
-        script_hash=None if told is None else Markup(_hash(told)),
+        format_count=format_count,
+        style=Markup(_read_resource("drivesem.report:style.css")),
+        script=None if source is None else Markup(source),
+        script_hash=None if source is None else Markup(_hash_script(source)),
         **values,
     )
 
 
-def _part(name: str) -> str:
+def _read_resource(name: str) -> str:
     package, _, file = name.partition(":")
     return resources.files(package).joinpath(file).read_text(encoding="utf-8")
 
 
-def _hash(script: str) -> str:
-    """A script's source expression for `script-src`, of the text between the tags."""
+def _hash_script(script: str) -> str:
+    """Return the `script-src` source expression of a script."""
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode('ascii')}"

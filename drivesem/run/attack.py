@@ -1,313 +1,440 @@
-"""`drivesem attack`: every frame through the pipeline, then the figures and the page."""
+"""Attacks on frames: what one process needs for them, one scene, and a whole run with its report."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from detectors.base import Detector, DetectorError, Predictor
+from detectors.base import Detector, DetectorError, Predictor, detector_device
 from detectors.registry import load_detector, load_predictor
-from drivesem.attack.aims import Aim
-from drivesem.attack.budgets import budget_of, written
-from drivesem.attack.changes import Changes, parse_changes, vehicle_mesh
-from drivesem.attack.judging import HEADLINE, JudgedClasses, t_star_of
+from drivesem.attack.budgets import format_budget, parse_budget, resolve_parameters
+from drivesem.attack.changes import (
+    SAMPLES,
+    VehicleChangeSettings,
+    count_affordable_proposals,
+    load_vehicle_mesh,
+    parse_vehicle_changes,
+    proposal_passes,
+    propose_scenes,
+)
+from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.apgd import APGD
-from drivesem.attack.methods.base import GRADIENT_PASSES, LOOKED_AT
-from drivesem.attack.methods.base import Attack as AttackMethod
+from drivesem.attack.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
 from drivesem.attack.methods.climb import Climb
-from drivesem.attack.methods.cma_es import CMAES
-from drivesem.attack.methods.corners import Corners
 from drivesem.attack.methods.fgsm import FGSM
-from drivesem.attack.methods.placebo import Placebo
-from drivesem.attack.methods.restarts import Restarted
-from drivesem.attack.methods.sampling import Sampling
-from drivesem.attack.methods.scouted import Scouted
+from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
+from drivesem.attack.methods.gradient_free import CMAES, Sampling
+from drivesem.attack.methods.margin_search import FIRST_HELD_OUT_SAMPLE, Corners, MarginSearch, margin_objective
+from drivesem.attack.methods.placebo import FixedTheta, Placebo
 from drivesem.attack.methods.scw import SCW
-from drivesem.attack.methods.sgd import SGD
-from drivesem.attack.methods.si_fgsm import SiFGSM
-from drivesem.attack.methods.subsets import Subsets
-from drivesem.attack.objective import OF_DETECTIONS
-from drivesem.attack.space import SIX, Parameter, combo, parse_params
-from drivesem.config.blocks import FrameCommand, option
-from drivesem.config.commands import DEFAULT_COMBO, DEFAULT_QUERIES, GRADIENT_FREE, Attack
+from drivesem.attack.objective import GRADIENT_FREE_TERMS, Objective
+from drivesem.attack.space import Parameter
+from drivesem.attack.targets import HEADLINE, EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.config.commands import DEFAULT_QUERIES, GRADIENT_FREE_METHODS, AttackConfig
+from drivesem.config.constraints import parse_part
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.config.values import part_of
-from drivesem.failures.certificate import Rule
-from drivesem.failures.grading import Grader, witness_of
+from drivesem.config.options import FrameCommandConfig, option_name
+from drivesem.failures.certificate import CertificateRule
+from drivesem.failures.grading import Grader, make_reference_detector
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.second_renderer.choose import SecondRenderers
-from drivesem.report.tables import number_of
-from drivesem.run.ask import Bar, ask
+from drivesem.failures.second_renderer.selection import SecondRenderers
+from drivesem.report.tables import format_count
+from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS
-from drivesem.run.folder import FRAMES, claim, settings_of
-from drivesem.run.frame import RESULT, AttackedScene, FrameSettings, attack_scene, write_frame
-from drivesem.run.manifest import manifest_of
-from drivesem.run.page import write_run
+from drivesem.run.folder import FRAMES, claim_folder, result_settings
+from drivesem.run.frame import RESULT, AttackedScene, grade_failures, write_frame
+from drivesem.run.manifest import build_manifest
+from drivesem.run.report.runs import write_run_report
 from drivesem.run.results import FrameResult, RunSummary, load_frame
-from drivesem.run.tally import tally
+from drivesem.run.summary import summarise_frames
 from drivesem.scenes.sources import NoVehicleError, SceneSource, make_ready, open_source
 from scene_ir import files
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import SceneIR
+from scene_ir.types import SceneIR, convert_scene
 
-PEERS = ("yolov3-slim", "squeezedet")
-"""Shipped detectors of different architectures: what is confirmed of one is shown to another."""
-WITHOUT_GRADIENT = "climb"
-"""The method for detectors that have no gradient, where nobody asked for one: of those that need none, it finds
-most failures that hold."""
-_NEED_NO_GRADIENT = (*GRADIENT_FREE, "corners", WITHOUT_GRADIENT)
-"""All methods for such detectors."""
-_AROUND = 3
-"""Passes of a frame in which no method has a say."""
+SECOND_DETECTORS = ("yolov3-slim", "squeezedet")
+"""Shipped detectors of different architectures; the one not under attack re-tests confirmed failures."""
+GRADIENT_FREE_FALLBACK = "climb"
+"""Default method for detectors without a gradient: of methods without one, it finds most certain failures."""
+_METHODS_WITHOUT_GRADIENT = (*GRADIENT_FREE_METHODS, "corners", GRADIENT_FREE_FALLBACK)
+_FIXED_PASSES = 3
+"""Detector passes of a frame that no method controls."""
 WRITTEN = (METRICS, MANIFEST, "report.html", FRAMES)
 
 
-def attack_run(config: Attack) -> RunSummary:
-    """Run or continue an attack in the folder that the settings name, or in one under `runs`. Raises UsageError or
-    SceneError for bad input.
+def attack_dataset(config: AttackConfig) -> RunSummary:
+    """Run or continue an attack in its folder, by default one in `runs`. Raises UsageError or SceneError for bad
+    input.
     """
     start = time.perf_counter()
     _check_texts(config)
-    config = _settled(config)
-    aim_of(config)
+    config = _resolve_budget(config)
+    TargetSelection.from_options(config.target_objects, config.target_classes)
     check_device(config.device)
-    detector = named_detector(config)
-    suited = suited_to(config, detector)
-    worker = Worker.of(suited, detector)
-    if suited.method != config.method:
-        told = f"--method {suited.method} takes the place of {config.method}"
-        sys.stderr.write(f"{config.detector} has no gradient: {told}\n")
-    config = suited
-    out = Path(config.out) if config.out else Path("runs") / _name(config, worker.params)
-    claim(out, config, WRITTEN)
-    names, without, failed = select_frames(worker.source, config)
-    _check_any(config, names, without, failed)
-    return _attacked(worker, (_of_part(names, config.part), without, failed), out, start, must_find=True)
+    detector = load_named_detector(config)
+    usable_config = with_gradient_free_fallback(config, detector)
+    worker = AttackWorker.from_config(usable_config, detector)
+    if usable_config.method != config.method:
+        replacement = f"--method {usable_config.method} takes the place of {config.method}"
+        sys.stderr.write(f"{config.detector} has no gradient: {replacement}\n")
+    config = usable_config
+    out = Path(config.out) if config.out else Path("runs") / _run_name(config, worker.params)
+    claim_folder(out, config, WRITTEN)
+    names, without_vehicles, failed = select_frames(worker.source, config)
+    _check_any_frame(config, names, without_vehicles, failed)
+    names = _select_part(names, config.part)
+    jobs = run_frame_jobs(*_prepare_jobs(worker, names, out))
+    return _finish_run(worker, names, out, jobs, start, without_vehicles, failed, require_detections=True)
 
 
-def attack_frames(worker: Worker, names: Sequence[str], out: Path) -> RunSummary:
-    """Attack these frames, of all that the worker's source has, into the run folder `out`; those that are there
-    already stay. Raises as `run`.
+def attack_frames(worker: AttackWorker, names: Sequence[str], out: Path) -> RunSummary:
+    """Attack the frames `names` of the worker's source, into the run folder `out`; finished frames stay. Raises as
+    `attack_dataset`.
     """
     start = time.perf_counter()
-    claim(out, worker.config, WRITTEN)
-    return _attacked(worker, (list(names), 0, {}), out, start)
+    claim_folder(out, worker.config, WRITTEN)
+    jobs = run_frame_jobs(*_prepare_jobs(worker, names, out))
+    return _finish_run(worker, names, out, jobs, start)
 
 
-def _attacked(
-    worker: Worker,
-    selected: tuple[list[str], int, dict[str, str]],
-    out: Path,
-    start: float,
-    must_find: bool = False,
-) -> RunSummary:
-    """Attack what `select_frames` chose, as far as it is not done, and write what is said of all frames.
-
-    must_find: raise UsageError where the detector finds nothing in any photograph.
-    """
-    names, without_vehicles, failed = selected
+def _prepare_jobs(worker: AttackWorker, names: Sequence[str], out: Path) -> tuple[Any, ...]:
+    """The arguments of `run_frame_jobs`, for frames that are not finished."""
     config = worker.config
-    todo = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
-    if todo and config.backend == "warp" and config.device == "cpu":
+    pending = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
+    if pending and config.backend == "warp" and config.device == "cpu":
         make_ready(config)
-    work, build = partial(worker.attack, out=out), partial(_attacker, config, out)
-    answers = ask(todo, work, build, config, Bar("attacking frames", remaining=True))
-    failed = failed | answers.failed
-    empty = {name for name, usable in answers.results.items() if not usable}
+    progress = ProgressSettings("attacking frames", show_remaining=True)
+    return (
+        pending,
+        partial(worker.attack_frame, out=out),
+        partial(_make_frame_attack, config, out),
+        config,
+        progress,
+    )
+
+
+def _make_frame_attack(config: AttackConfig, out: Path) -> Callable[[str], bool]:
+    return partial(AttackWorker.from_config(config).attack_frame, out=out)
+
+
+def _finish_run(
+    worker: AttackWorker,
+    names: Sequence[str],
+    out: Path,
+    jobs: JobResults[str, bool],
+    start: float,
+    without_vehicles: int = 0,
+    failed: Mapping[str, str] | None = None,
+    require_detections: bool = False,
+) -> RunSummary:
+    """Summarise the frames of a run and write its files.
+
+    Args:
+        worker: attacked the frames.
+        names: the frames of the run.
+        out: the run folder.
+        jobs: outcomes by frame; False where no vehicle could be attacked.
+        start: time.perf_counter() at the start of the run.
+        without_vehicles: number of frames that were passed over.
+        failed: frames that could not be read, with the reason.
+        require_detections: raise UsageError where the detector finds nothing in any photograph.
+    """
+    config, failed = worker.config, {**(failed or {}), **jobs.failed}
+    empty = {name for name, attacked in jobs.results.items() if not attacked}
     done = [name for name in names if name not in failed and name not in empty]
-    if names and not done and config.part is None:
-        _check_any(config, done, without_vehicles + len(empty), failed)
+    if names and config.part is None:
+        _check_any_frame(config, done, without_vehicles + len(empty), failed)
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
-    if must_find:
-        _check_sight(worker, results)
+    if require_detections:
+        _check_detections(worker, results)
     summary = replace(
-        summary_of(config, worker.params, worker.detector, results),
+        summarise_run(config, worker.params, worker.detector, results),
         frames_without_vehicles=without_vehicles + len(empty),
         frames_failed=dict(sorted(failed.items())),
         seconds=round(time.perf_counter() - start, 3),
     )
-    return conclude(out, config, summary, results, empty)
+    return write_run_summary(out, config, summary, results, empty)
 
 
-def _check_texts(config: Attack) -> None:
-    """FormatError for a setting that no file of the run could hold: the first is written after all frames."""
-    for name, value in settings_of(config, presentation=()).items():
+def _check_texts(config: AttackConfig) -> None:
+    """Raise FormatError for a setting that cannot be written; the run's settings are written after all frames."""
+    for name, value in result_settings(config, presentation=()).items():
         if isinstance(value, str):
-            files.check_text(option(name), value)
+            files.check_utf8(option_name(name), value)
 
 
-def _check_any(config: Attack, names: Sequence[str], without: int, failed: Mapping[str, str]) -> None:
-    """UsageError where no frame can be attacked: figures of none would say nothing."""
+def _check_any_frame(
+    config: AttackConfig, names: Sequence[str], without_vehicles: int, failed: Mapping[str, str]
+) -> None:
+    """Raise UsageError where no frame can be attacked."""
     if names:
         return
-    found = [f"{number_of(without, 'frame')} without"] if without else []
+    reasons = [f"{format_count(without_vehicles, 'frame')} without"] if without_vehicles else []
     if failed:
-        found.append(f"{len(failed)} that cannot be used, such as {next(iter(failed.items()))[1]}")
+        reasons.append(f"{len(failed)} that cannot be used, such as {next(iter(failed.items()))[1]}")
     expected = "frames with cars, vans or trucks to attack (drivesem derender --sheet draws what it makes of one)"
-    raise UsageError(
-        f"--root {config.root}" if config.root else "--dataset", expected, "; ".join(found) or "no frame"
-    )
+    source = f"--root {config.root}" if config.root else "--dataset"
+    raise UsageError(source, expected, "; ".join(reasons) or "no frame")
 
 
-def conclude(
-    out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult], empty: Collection[str]
+def write_run_summary(
+    out: Path, config: AttackConfig, summary: RunSummary, results: Sequence[FrameResult], empty: Collection[str]
 ) -> RunSummary:
-    """Write into the folder of a run what is said of all of its frames. empty: those that have vehicles, of which
-    none could be taken apart.
+    """Write a run's metrics, manifest and report.
+
+    Args:
+        out: the run folder.
+        config: the settings.
+        summary: the run's metrics.
+        results: of all frames.
+        empty: frames with vehicles, none of which could be de-rendered.
+
+    Returns:
+        The summary with its folder.
     """
     summary = replace(summary, out=str(out))
     metrics = summary.to_json()
     files.write_json(out / METRICS, metrics)
     names = [result.identifier for result in results]
-    manifest = manifest_of(config, out, names, metrics) | {"empty": sorted(empty)}
+    manifest = build_manifest(config, out, names, metrics) | {"empty": sorted(empty)}
     files.write_json(out / MANIFEST, manifest)
-    write_run(out, config, summary, results)
+    write_run_report(out, config, summary, results)
     return summary
 
 
-def _check_sight(worker: Worker, results: Sequence[FrameResult]) -> None:
-    """UsageError for a detector that finds nothing in any photograph: it has nothing to lose, and figures of an
-    attack on it would say nothing. One frame in which nothing is found is no reason.
-    """
-    t_star = t_star_of(worker.detector, worker.config.t_star)
+def _check_detections(worker: AttackWorker, results: Sequence[FrameResult]) -> None:
+    """Raise UsageError for a detector that finds nothing in several photographs: it has nothing to lose."""
+    t_star = resolve_t_star(worker.detector, worker.config.t_star)
     scores = [box.score or 0 for result in results for box in result.detections_benign]
     if len(results) > 1 and max(scores, default=0) < t_star:
         best = f"the best score is {max(scores):.3g}" if scores else "no detection at all"
-        found = f"{best} in {len(results)} photographs (is its input prepared as in training? drivesem eval)"
-        raise UsageError("--detector", f"one that finds something, with a score of {t_star:.3g} or more", found)
+        actual = f"{best} in {len(results)} photographs (is its input prepared as in training? drivesem eval)"
+        raise UsageError("--detector", f"one that finds something, with a score of {t_star:.3g} or more", actual)
 
 
-def params_of(config: Attack) -> tuple[Parameter, ...]:
-    """What is to move. Raises FormatError where the budget holds it."""
-    params = _named_params(config)
-    budget_of(config.budget).check(params, config.parametrisation)
-    return params
+def _resolve_budget(config: AttackConfig) -> AttackConfig:
+    """The settings with the budget's numbers instead of its file, so that a run can be repeated without it."""
+    return replace(config, budget=format_budget(parse_budget(config.budget)))
 
 
-def _named_params(config: Attack) -> tuple[Parameter, ...]:
-    if config.params is not None:
-        return parse_params(config.params)
-    if config.method == "subsets" and config.combo is None:
-        return SIX
-    return combo(config.combo or DEFAULT_COMBO)
+@dataclass(frozen=True, slots=True)
+class AttackInstance:
+    """One scene as a problem for an attack."""
 
+    margin_oracle: NuisanceMarginOracle
+    """Margins of the scene's objects; holds the objective."""
+    feasible: FeasibleSet
+    """The feasible set of theta."""
+    problem: Problem
+    """What the attack sees."""
 
-def _settled(config: Attack) -> Attack:
-    """The configuration with the budget's numbers in place of its file, so that a run can be repeated without."""
-    return replace(config, budget=written(budget_of(config.budget)))
+    @classmethod
+    def from_scene(
+        cls, identifier: str, scene: SceneIR, detector: Predictor, config: AttackConfig, nuisances: Nuisances
+    ) -> AttackInstance:
+        """The problem that an attack's settings pose on a scene.
+
+        Args:
+            identifier: name of the frame, which seeds its nuisance samples.
+            scene: on the detector's device.
+            detector: the detector under attack.
+            config: the settings.
+            nuisances: nuisances of the margins.
+        """
+        objective = Objective.from_config(scene, detector, config)
+        oracle = NuisanceMarginOracle.for_objective(objective, nuisances, f"search:{identifier}:{config.seed}")
+        feasible = objective.feasible_set(only_bounds=config.project == "bounds")
+        return cls(oracle, feasible, objective.problem(feasible, config.keep == "last", oracle))
+
+    @property
+    def objective(self) -> Objective:
+        """The objective of the scene."""
+        return self.margin_oracle.objective
+
+    def held_out_margin(self, theta: Tensor) -> float:
+        """Mean margin at theta (D,) over held-out nuisance samples, as a margin search measures it."""
+        oracle = self.margin_oracle
+        samples = (oracle.margins(theta, FIRST_HELD_OUT_SAMPLE + sample) for sample in range(SAMPLES))
+        return sum(margin_objective(margins, oracle.counted_objects) for margins in samples)
 
 
 @dataclass(frozen=True)
-class Worker:
-    """What one process needs: built once, used for many frames."""
+class AttackWorker:
+    """Per-process state of an attack, built once and reused for all frames."""
 
-    config: Attack
+    config: AttackConfig
+    """The settings, their budget resolved."""
     params: tuple[Parameter, ...]
-    method: AttackMethod
+    """What the attack moves."""
+    method: Attack
+    """The algorithm."""
     source: SceneSource
+    """Where scenes come from."""
     detector: Predictor
+    """The detector under attack."""
     grader: Grader
-    changes: Changes | None = None
+    """Grades failures."""
+    changes: VehicleChangeSettings | None = None
+    """Vehicle changes to propose besides theta."""
 
     @classmethod
-    def of(cls, config: Attack, detector: Predictor | None = None) -> Worker:
-        """detector: by default the one that the settings name. Raises UsageError for a detector that cannot be
-        used, SceneError for a source that cannot be read.
+    def from_config(cls, config: AttackConfig, detector: Predictor | None = None) -> AttackWorker:
+        """Build the state; `detector`: by default the one that the settings name. Raises UsageError for a detector
+        that cannot be used, SceneError for a source that cannot be read.
         """
-        config = _settled(config)
-        params, source, method = params_of(config), open_source(config), attack_method(config)
-        detector = named_detector(config) if detector is None else detector
+        config = _resolve_budget(config)
+        params, source, method = resolve_parameters(config), open_source(config), build_attack(config)
+        detector = load_named_detector(config) if detector is None else detector
         _check_detector(config, detector, method.needs_gradient)
-        grader, changes = grader_of(config, detector), changes_of(config)
+        grader, changes = build_grader(config, detector), _parse_changes(config)
         return cls(config, params, method, source, detector, grader, changes)
 
-    def beside(self, config: Attack) -> Worker:
-        """For another attack on the same source and detector, which are shared."""
-        config = _settled(config)
-        return replace(self, config=config, params=params_of(config), method=attack_method(config))
+    def with_config(self, config: AttackConfig) -> AttackWorker:
+        """The same source and detector with other settings."""
+        config = _resolve_budget(config)
+        return replace(self, config=config, params=resolve_parameters(config), method=build_attack(config))
 
-    def attack(self, identifier: str, out: Path) -> bool:
-        """One frame, from the source to its folder; False where it has no vehicle to attack. The result, a quarter
-        of a megabyte, is in the folder alone: a night has thousands.
+    def attack_frame(self, identifier: str, out: Path) -> bool:
+        """Attack a frame of the source and write its folder; False where it has no vehicle to attack. The result
+        stays on disk: a run has thousands of a quarter megabyte each.
         """
         try:
-            self.attack_scene(identifier, self.source.scene(identifier), out)
+            attacked = self.attack_scene(identifier, self.source.scene(identifier))
         except NoVehicleError:
             return False
+        write_frame(attacked, out / FRAMES / identifier)
         return True
 
-    def attack_scene(self, identifier: str, scene: SceneIR, out: Path) -> FrameResult:
-        """One frame that has been taken apart, to its folder. Raises NoVehicleError where it has no vehicle."""
-        return write_frame(self.search(identifier, scene), out / FRAMES / identifier)
+    def attack_scene(self, identifier: str, scene: SceneIR) -> AttackedScene:
+        """Attack a scene in memory.
 
-    def search(self, identifier: str, scene: SceneIR) -> AttackedScene:
-        """One frame that has been taken apart, in memory. Raises NoVehicleError where it has no vehicle."""
-        if len(scene.objects) == 0:
-            raise NoVehicleError(f"frame {identifier}", "a vehicle that can be taken apart", "none")
+        Raises:
+            NoVehicleError: the scene has no vehicle, or not all targeted ones.
+            SceneError: the scene cannot be used, or a loss or gradient is not finite.
+        """
+        start = time.perf_counter()
+        self._check_vehicles(identifier, scene)
         config = self.config
-        aim = aim_of(config)
-        if aim.objects is not None and aim.objects[-1] >= len(scene.objects):
-            count = f"{len(scene.objects)} of them"
-            raise NoVehicleError(f"frame {identifier}", f"objects up to the {aim.objects[-1]}th from 0", count)
-        settings = FrameSettings(
-            attack=self.method if config.like is None else _placebo(Path(config.like), identifier),
-            params=self.params,
-            label_mode=config.objective_labels,
-            term=config.objective,
-            render=RenderSettings(backend=config.backend),
-            seed=config.seed,
-            t_star=config.t_star,
-            budget=budget_of(config.budget),
-            aim=aim,
-            grader=self.grader if config.grade else None,
-            keep_last=config.keep == "last",
-            only_bounds=config.project == "bounds",
-            parametrisation=config.parametrisation,
-            whole=config.whole,
-            keep_mb=config.keep_mb,
-            changes=self.changes,
-        )
+        scene = convert_scene(scene, None, detector_device(self.detector))
+        method = self.method if config.like is None else _load_placebo(Path(config.like), identifier)
         try:
-            return attack_scene(identifier, scene, self.detector, settings)
+            instance, other_passes = self._pose(identifier, scene), 0
+            if self.changes is None:
+                result = method(instance.problem, instance.objective.space.theta0, config.seed)
+            else:
+                instance, result, other_passes = self._search_with_changes(
+                    identifier, scene, instance, self.changes
+                )
+            instance.margin_oracle.clear_cache()
+            objective = instance.objective
+            evaluation = objective.evaluate(result.theta)
+            benign = objective.detect(scene.photograph)
+            passes = objective.passes + 1 + other_passes
+            search_end = time.perf_counter()
+            failures, notes = grade_failures(
+                identifier,
+                objective,
+                instance.feasible,
+                result,
+                self.grader if config.grade else None,
+                config.seed,
+            )
         except (RangeError, ShapeError) as error:
-            # A loss or gradient that is no number says where in the scene, and not in which.
+            # The error of a loss or gradient that is not finite names the coordinate, but not the frame.
             raise type(error)(f"frame {identifier}: {error.field}", error.expected, error.actual) from error
+        objective.release_layers()
+        end = time.perf_counter()
+        return AttackedScene(
+            identifier=identifier,
+            objective=objective,
+            search=result,
+            rendered=evaluation,
+            benign=benign,
+            violated_at_start=instance.feasible.violated_at_start,
+            failures=failures,
+            grade_notes=notes,
+            passes=passes,
+            seconds=end - start,
+            grading_seconds=end - search_end,
+        )
+
+    def _check_vehicles(self, identifier: str, scene: SceneIR) -> None:
+        count, rows = len(scene.objects), TargetSelection.from_options(self.config.target_objects, None).objects
+        if count == 0:
+            raise NoVehicleError(f"frame {identifier}", "a vehicle that can be de-rendered", "none")
+        if rows is not None and rows[-1] >= count:
+            raise NoVehicleError(
+                f"frame {identifier}", f"objects up to the {rows[-1]}th from 0", f"{count} of them"
+            )
+
+    def _pose(self, identifier: str, scene: SceneIR) -> AttackInstance:
+        nuisances = self.grader.nuisances if self.config.grade else Nuisances()
+        return AttackInstance.from_scene(identifier, scene, self.detector, self.config, nuisances)
+
+    def _search_with_changes(
+        self, identifier: str, scene: SceneIR, unchanged: AttackInstance, changes: VehicleChangeSettings
+    ) -> tuple[AttackInstance, AttackResult, int]:
+        """Search theta with a part of the passes, and try vehicle changes at the result with the rest.
+
+        Returns:
+            The scene with the lowest margins, the result on it, and the passes that the other scenes took.
+        """
+        config, attack = self.config, self.method
+        assert isinstance(attack, MarginSearch)
+        count = count_affordable_proposals(attack.passes)
+        attack = replace(attack, passes=attack.passes - proposal_passes(count))
+        result = attack(unchanged.problem, unchanged.objective.space.theta0, config.seed)
+        scenes = propose_scenes(scene, changes, count, config.seed, RenderSettings(backend=config.backend))
+        proposals = (self._pose(identifier, changed) for changed in scenes)
+        return _choose_change(unchanged, result, proposals, config.seed)
 
 
-def changes_of(config: Attack) -> Changes | None:
-    """What the settings let a search propose; None for nothing. Raises FormatError for what is no change, or no
-    mesh of a vehicle.
-    """
+def _choose_change(
+    unchanged: AttackInstance, result: AttackResult, proposals: Iterable[AttackInstance], seed: int
+) -> tuple[AttackInstance, AttackResult, int]:
+    """The scene with the lowest margins at the theta found; returns what `_search_with_changes` does."""
+    best, least, theta = unchanged, unchanged.held_out_margin(result.theta), result.theta
+    all_passes = best_passes = unchanged.margin_oracle.passes
+    for proposal in proposals:
+        space, oracle = proposal.objective.space, proposal.margin_oracle
+        same_theta = space.convert_theta(unchanged.objective.space, result.theta)
+        proposal_theta = proposal.problem.project(same_theta).theta
+        margin = proposal.held_out_margin(proposal_theta)
+        oracle.clear_cache()
+        all_passes += oracle.passes
+        if margin < least:
+            best, least, theta, best_passes = proposal, margin, proposal_theta, oracle.passes
+    if best is not unchanged:
+        on_change = FixedTheta(theta)(best.problem, best.objective.space.theta0, seed)
+        if torch.equal(on_change.theta, theta):  # else its render is not feasible
+            trace = (*result.loss_trace, *on_change.loss_trace)
+            return best, replace(on_change, queries=result.queries, loss_trace=trace), all_passes - best_passes
+    return unchanged, result, all_passes - unchanged.margin_oracle.passes
+
+
+def _parse_changes(config: AttackConfig) -> VehicleChangeSettings | None:
+    """The vehicle changes that the settings allow. Raises FormatError for an unknown change or a bad mesh."""
     if config.changes is None:
         return None
-    return Changes(parse_changes(config.changes), None if config.mesh is None else vehicle_mesh(config.mesh))
+    mesh = None if config.mesh is None else load_vehicle_mesh(config.mesh)
+    return VehicleChangeSettings(parse_vehicle_changes(config.changes), mesh)
 
 
-def aim_of(config: Attack) -> Aim:
-    """What the settings ask the attack to be after. Raises UsageError."""
-    return Aim.of(config.target_objects, config.target_classes)
-
-
-def attack_method(config: Attack) -> AttackMethod:
-    """The algorithm that the settings ask for."""
-    attack = _from_theta0(config)
-    if config.restarts:
-        attack = Restarted(attack, config.restarts, config.steps, config.early_stop)
-    return Scouted(attack, config.scouts, early_stop=config.early_stop) if config.scouts else attack
-
-
-def _from_theta0(config: Attack) -> AttackMethod:
-    early_stop = config.early_stop
-    steps, queries = _afforded(config)
+def build_attack(config: AttackConfig) -> Attack:
+    """The algorithm that the settings name."""
+    early_stop, box_steps = config.early_stop, config.steps if config.range == "steps" else None
+    steps, queries = _steps_for_pass_budget(config)
     match config.method:
         case "si-fgsm":
             return SiFGSM(steps, early_stop, config.momentum, config.rate)
@@ -325,117 +452,107 @@ def _from_theta0(config: Attack) -> AttackMethod:
             return Corners(config.passes or Corners().passes)
         case "placebo":
             return Placebo()
-        case "subsets":
-            return Subsets(queries, steps)
         case "cma-es":
-            return CMAES(queries, _reach(config), early_stop)
-        case "random" | "halton" | "sobol":
-            return Sampling(queries, _reach(config), early_stop, config.method)
+            return CMAES(queries, box_steps, early_stop)
+        case "random" | "halton":
+            return Sampling(queries, box_steps, early_stop, config.method)
 
 
-def _afforded(config: Attack) -> tuple[int, int]:
-    """Steps, and queries, as many as --passes allows where it is given. Beside them a frame takes a few passes:
-    the photograph, its re-render, and the re-scoring of what was found. Methods that count both as queries may
-    take a gradient and a render for each.
+def _steps_for_pass_budget(config: AttackConfig) -> tuple[int, int]:
+    """Steps and queries, as many as --passes allows if given.
+
+    A frame takes a few more passes: the photograph, its re-render, and the re-scoring of proposals. Methods that
+    count both gradients and renders as queries may need one of each per query.
     """
     if config.passes is None:
         return config.steps, config.queries or DEFAULT_QUERIES
-    if config.method in GRADIENT_FREE:
-        return config.steps, max(config.passes - _AROUND, 1)
-    a_step = GRADIENT_PASSES + (config.early_stop or config.method in ("scw", "subsets"))
-    left = config.passes - _AROUND - config.scouts - (LOOKED_AT + 1) * (config.restarts + 1)
-    afforded = max(left // (a_step * (config.restarts + 1)), 2)
-    return afforded, afforded
+    if config.method in GRADIENT_FREE_METHODS:
+        return config.steps, max(config.passes - _FIXED_PASSES, 1)
+    step_passes = GRADIENT_PASSES + (config.early_stop or config.method == "scw")
+    steps = max((config.passes - _FIXED_PASSES - (MAX_RESCORED + 1)) // step_passes, 2)
+    return steps, steps
 
 
-def grader_of(config: Attack, detector: Predictor) -> Grader:
-    """What grades the failures of a run with these settings. Raises UsageError for settings that cannot be."""
+def build_grader(config: AttackConfig, detector: Predictor) -> Grader:
+    """The grader of a run's failures. Raises UsageError for invalid settings."""
     return Grader(
         detector=detector,
-        t_star=t_star_of(detector, config.t_star),
-        nuisances=Nuisances.of(config.nuisances),
-        rule=Rule(config.draws),
+        t_star=resolve_t_star(detector, config.t_star),
+        nuisances=Nuisances.parse(config.nuisances),
+        rule=CertificateRule(config.draws),
         seed=config.seed,
-        second=SecondRenderers(config.dataset, config.root).of if config.confirm else None,
-        peer=_peer(config),
-        witness=None if config.witness is None else _witness(config, config.witness),
+        make_second_renderer=SecondRenderers(config.dataset, config.root).renderer_for if config.confirm else None,
+        load_second_detector=_second_detector_loader(config),
+        reference_detector=None
+        if config.reference_detector is None
+        else _load_reference(config, config.reference_detector),
     )
 
 
-def _peer(config: Attack) -> Callable[[], Predictor] | None:
-    """What loads the detector of another architecture; None where nobody is to be asked."""
-    if config.peer == "off" or not config.confirm:
+def _second_detector_loader(config: AttackConfig) -> Callable[[], Predictor] | None:
+    """Loads the detector of another architecture; None without one."""
+    if config.second_detector == "off" or not config.confirm:
         return None
-    others = [name for name in PEERS if name != config.detector]
-    name = others[0] if config.peer == "auto" else config.peer
-    if config.peer == "auto":
+    if config.second_detector == "auto":
+        name = next(name for name in SECOND_DETECTORS if name != config.detector)
         return cache(partial(load_predictor, name, config.device, config.tiles))
     try:
-        peer = load_predictor(name, config.device, config.tiles)
-        JudgedClasses.of(peer)
+        detector = load_predictor(config.second_detector, config.device, config.tiles)
+        EvaluatedClasses.from_detector(detector)
     except DetectorError as error:
-        raise UsageError.of("--peer", "auto, off, or a detector", error) from error
-    return lambda: peer
+        raise UsageError.from_detector_error("--second-detector", "auto, off, or a detector", error) from error
+    return lambda: detector
 
 
-def _witness(config: Attack, name: str) -> Callable[[Tensor], Tensor]:
+def _load_reference(config: AttackConfig, name: str) -> Callable[[Tensor], Tensor]:
     try:
-        return witness_of(load_predictor(name, config.device, config.tiles))
+        return make_reference_detector(load_predictor(name, config.device, config.tiles))
     except DetectorError as error:
-        raise UsageError.of("--witness", "a detector", error) from error
+        raise UsageError.from_detector_error("--reference-detector", "a detector", error) from error
 
 
-def _placebo(run: Path, identifier: str) -> Placebo:
-    """An edit as large as what a run did to the frame. Raises FormatError where the run has no such frame."""
+def _load_placebo(run: Path, identifier: str) -> Placebo:
+    """An edit as large as a run's change of the frame. Raises FormatError where the run has no such frame."""
     return Placebo(tuple(c.value for c in load_frame(run / FRAMES / identifier / RESULT).theta))
 
 
-def _reach(config: Attack) -> int | None:
-    """Steps around theta0 within which a search without gradient looks; None for all of the bounds."""
-    return config.steps if config.range == "steps" else None
-
-
-def named_detector(config: Attack) -> Predictor:
-    """The detector under attack. Raises UsageError where it is none."""
+def load_named_detector(config: AttackConfig) -> Predictor:
+    """Load the detector under attack. Raises UsageError for an unknown one."""
     try:
         if config.precision == "float32":
             return load_predictor(config.detector, config.device, config.tiles)
         return load_detector(config.detector, config.device, getattr(torch, config.precision))
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
 
 
-def suited_to(config: Attack, detector: Predictor) -> Attack:
-    """The settings with a method that needs no gradient, where the detector has none and nobody asked for one."""
-    if isinstance(detector, Detector) or config.method != Attack().method:
+def with_gradient_free_fallback(config: AttackConfig, detector: Predictor) -> AttackConfig:
+    """The settings, with GRADIENT_FREE_FALLBACK for the default method where the detector has no gradient."""
+    if isinstance(detector, Detector) or config.method != AttackConfig().method:
         return config
-    suited = replace(config, method=WITHOUT_GRADIENT)
-    suited.check()
-    return suited
+    fallback = replace(config, method=GRADIENT_FREE_FALLBACK)
+    fallback.check()
+    return fallback
 
 
-def _check_detector(config: Attack, detector: Predictor, needs_gradient: bool) -> None:
-    """Raises UsageError where the detector knows no cars, or lacks a gradient that the settings need."""
+def _check_detector(config: AttackConfig, detector: Predictor, needs_gradient: bool) -> None:
+    """Raise UsageError for a detector that knows no cars, or lacks a gradient that the settings need."""
     try:
-        JudgedClasses.of(detector)
+        EvaluatedClasses.from_detector(detector)
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if isinstance(detector, Detector):
         return
     if needs_gradient:
-        expected = f"one of {', '.join(_NEED_NO_GRADIENT)} for {config.detector}, which has no gradient"
+        expected = f"one of {', '.join(_METHODS_WITHOUT_GRADIENT)} for {config.detector}, which has no gradient"
         raise UsageError("--method", expected, config.method)
-    if config.objective not in OF_DETECTIONS:
-        expected = f"one of {', '.join(OF_DETECTIONS)} for {config.detector}, which has no gradient"
+    if config.objective not in GRADIENT_FREE_TERMS:
+        expected = f"one of {', '.join(GRADIENT_FREE_TERMS)} for {config.detector}, which has no gradient"
         raise UsageError("--objective", expected, config.objective)
 
 
-def _attacker(config: Attack, out: Path) -> Callable[[str], bool]:
-    return partial(Worker.of(config).attack, out=out)
-
-
-def select_frames(source: SceneSource, config: FrameCommand) -> tuple[list[str], int, dict[str, str]]:
-    """The frames to attack, how many without vehicles were passed over, and those that cannot be read."""
+def select_frames(source: SceneSource, config: FrameCommandConfig) -> tuple[list[str], int, dict[str, str]]:
+    """The frames to attack, the number passed over without vehicles, and the unreadable ones with the reason."""
     names: list[str] = []
     failed: dict[str, str] = {}
     without = 0
@@ -456,24 +573,24 @@ def select_frames(source: SceneSource, config: FrameCommand) -> tuple[list[str],
     return names, without, failed
 
 
-def _of_part(names: list[str], part: str | None) -> list[str]:
-    """Every N-th of the frames, from the K-th on, so that all parts take about as long."""
+def _select_part(names: list[str], part: str | None) -> list[str]:
+    """Every N-th frame from the K-th on, so that all parts take about as long."""
     if part is None:
         return names
-    number, count = part_of("--part", part)
+    number, count = parse_part("--part", part)
     return names[number - 1 :: count]
 
 
-def _name(config: Attack, params: tuple[Parameter, ...]) -> str:
-    method = "" if config.method == Attack().method else f"-{config.method}"
+def _run_name(config: AttackConfig, params: tuple[Parameter, ...]) -> str:
+    method = "" if config.method == AttackConfig().method else f"-{config.method}"
     return f"{config.dataset}-{'-'.join(params)}{method}-seed{config.seed}"
 
 
-def summary_of(
-    config: Attack, params: tuple[Parameter, ...], detector: Predictor, results: Sequence[FrameResult]
+def summarise_run(
+    config: AttackConfig, params: tuple[Parameter, ...], detector: Predictor, results: Sequence[FrameResult]
 ) -> RunSummary:
-    """The figures of a run, as far as they follow from its settings and its frames."""
-    t_star = t_star_of(detector, config.t_star)
+    """The metrics of a run, as far as they follow from its settings and frames."""
+    t_star = resolve_t_star(detector, config.t_star)
     return RunSummary(
         out="",
         dataset=config.dataset,
@@ -484,5 +601,5 @@ def summary_of(
         frames_without_vehicles=0,
         frames_failed={},
         seconds=0.0,
-        **tally(results, JudgedClasses.of(detector), t_star, HEADLINE),
+        **summarise_frames(results, EvaluatedClasses.from_detector(detector), t_star, HEADLINE),
     )

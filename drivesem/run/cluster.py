@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from drivesem.config.blocks import Sharing
 from drivesem.config.errors import UsageError
+from drivesem.config.options import WorkerOptions
 from drivesem.run.jobs import Start, begin, do, ended
 
 if TYPE_CHECKING:
@@ -62,7 +62,9 @@ class _InHand:
     gone: float | None = None
 
 
-def on_ray(start: Start, jobs: Sequence[J], config: Sharing) -> Iterator[tuple[J, Callable[[], Any]]]:
+def run_jobs_on_ray(
+    start: Start, jobs: Sequence[J], config: WorkerOptions
+) -> Iterator[tuple[J, Callable[[], Any]]]:
     """Each job with a call that gives its result or raises what went wrong, as they are done.
 
     By `--workers` processes on the machines of the cluster, by default one for each CPU. Raises UsageError where

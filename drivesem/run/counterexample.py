@@ -26,16 +26,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from detectors.base import Predictor, device_of
-from drivesem.config.commands import Attack, Search
+from detectors.base import Predictor, detector_device
+from drivesem.config.commands import AttackConfig, SearchMethod
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import number_of
-from drivesem.run.attack import Worker, named_detector, suited_to
+from drivesem.report.tables import format_count
+from drivesem.run.attack import AttackWorker, load_named_detector, with_gradient_free_fallback
 from drivesem.run.frame import AttackedScene, frame_result, write_frame
-from drivesem.run.report import grading, pictures
+from drivesem.run.report import page as grading
+from drivesem.run.report import pictures
 from drivesem.run.results import Failure, FrameResult
-from drivesem.run.tally import graded
+from drivesem.run.summary import count_grades
 from drivesem.scenes.scene import Scene, png
 from scene_ir.io import to_uint8
 from scene_ir.types import SceneIR
@@ -46,7 +47,7 @@ class AttackOptions(TypedDict, total=False):
 
     combo: int
     params: str
-    method: Search
+    method: SearchMethod
     steps: int
     queries: int
     passes: int
@@ -117,8 +118,8 @@ class Counterexample:
 
     @property
     def grades(self) -> dict[str, int]:
-        """How many failures are of at least each grade: threshold, certain, confirmed, shared (docs/grades.md)."""
-        return graded([self.result])["grades"]
+        """How many failures are of at least each grade: threshold, certain, confirmed, shared (docs/guide/ideas.md)."""
+        return count_grades([self.result])["grades"]
 
     @property
     def success(self) -> bool:
@@ -136,7 +137,7 @@ class Counterexample:
 
     def failure_rows(self) -> list[dict[str, Any]]:
         """Failures as flat dicts, for `pandas.DataFrame`: kind, grade, draws, second opinions, box."""
-        return [failure.flat() for failure in self.failures]
+        return [failure.to_row() for failure in self.failures]
 
     def save(self, folder: str | Path) -> None:
         """Write the folder that `drivesem attack` writes of a frame; in place of an earlier one."""
@@ -147,10 +148,12 @@ class Counterexample:
 
     def _repr_html_(self) -> str:
         result, t_star = self.result, self.attacked.objective.t_star
-        marked = pictures.overlay(
+        marked = pictures.draw_overlay(
             self.picture, result.targets_moved, result.detections_attacked, result.failures, t_star
         )
-        before = pictures.overlay(self.photograph, result.targets_benign, result.detections_benign, (), t_star)
+        before = pictures.draw_overlay(
+            self.photograph, result.targets_benign, result.detections_benign, (), t_star
+        )
         shown = "".join(
             f'<figure style="margin:0;flex:1"><img alt="{name}" style="width:100%" src="data:image/png;base64,'
             f'{base64.b64encode(png(picture)).decode("ascii")}"/><figcaption>{name}</figcaption></figure>'
@@ -160,7 +163,7 @@ class Counterexample:
         lines = lines or "<li>nothing fails</li>"
         feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
         grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count) or "no failure"
-        head = f"{self.scene.name}: {grades}; {feasible}, {number_of(result.queries, 'query', 'queries')}"
+        head = f"{self.scene.name}: {grades}; {feasible}, {format_count(result.queries, 'query', 'queries')}"
         return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{shown}</div><ul>{lines}</ul></div>'
 
 
@@ -169,14 +172,14 @@ def _told(failure: Failure) -> str:
     place = ", ".join(f"{value:.0f}" for value in failure.xyxy)
     which = "" if failure.index is None else f", objects[{failure.index}]"
     score = "" if failure.score is None else f"score {failure.score:.2f}"
-    opinions = (grading.says(failure, agreement) for agreement in (failure.second, failure.peer))
-    said = [words for words in (score, grading.draws(failure), *opinions) if words]
+    opinions = (grading.format_second_opinion(failure, agreement) for agreement in (failure.second, failure.peer))
+    said = [words for words in (score, grading.format_draws(failure), *opinions) if words]
     return f"{failure.grade}: {grading.what(failure)}{which} at {place} px" + "".join(
         f"; {words}" for words in said
     )
 
 
-def attack(
+def run_attack(
     scene: Scene | SceneIR, detector: str | Predictor = "squeezedet", **options: Unpack[AttackOptions]
 ) -> Counterexample:
     """Change a scene, within what is feasible, until a detector gets it wrong.
@@ -194,13 +197,13 @@ def attack(
     named = detector if isinstance(detector, str) else detector.name
     held = scene if isinstance(scene, Scene) else Scene(scene)
     try:
-        config = Attack(detector=named, **options)
+        config = AttackConfig(detector=named, **options)
         config.check()
         check_device(config.device)
         if not isinstance(detector, str):
             _check_beside(detector, options)
-        loaded = named_detector(config) if isinstance(detector, str) else detector
-        worker = Worker.of(suited_to(config, loaded), loaded)
+        loaded = load_named_detector(config) if isinstance(detector, str) else detector
+        worker = AttackWorker.from_config(with_gradient_free_fallback(config, loaded), loaded)
     except UsageError as error:
         raise UsageError(_argument(error.field), _argument(error.expected), error.actual) from error
     attacked = worker.search(held.name, held.ir)
@@ -226,7 +229,7 @@ def _check_beside(detector: Predictor, options: Mapping[str, Any]) -> None:
     for name in ("precision", "tiles"):
         if name in options:
             raise UsageError(name, "none beside a detector that is loaded", repr(options[name]))
-    own = device_of(detector)
+    own = detector_device(detector)
     asked = torch.device(options.get("device", own))
     if asked.type != own.type or asked.index not in (None, own.index):
         raise UsageError("device", f"that of the detector, which is loaded: {own}", repr(options["device"]))

@@ -9,9 +9,9 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from drivesem.config.commands import Derender
-from drivesem.run.ask import Bar, ask
-from drivesem.run.folder import PRESENTATION, claim
+from drivesem.config.commands import DerenderConfig
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
+from drivesem.run.folder import PRESENTATION, claim_folder
 from drivesem.scenes.sheet import write_scene_sheet
 from drivesem.scenes.sources import SceneSource, make_ready, open_source
 from scene_ir.io import count_objects, load_scene, save_scene
@@ -20,7 +20,7 @@ RECORD, SHEET = "scene.json", "sheet.jpg"
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class DerenderSummary:
     """One frame taken apart. objects: vehicles in its scene; seconds: to take it apart and write it, None where an
     earlier run did.
     """
@@ -30,23 +30,23 @@ class Taken:
 
 
 @dataclass(frozen=True, slots=True)
-class Derendered:
+class DerenderRunResult:
     """All frames: in order those that were taken apart, and why others could not be."""
 
     out: Path
-    frames: dict[str, Taken]
+    frames: dict[str, DerenderSummary]
     failed: dict[str, str]
     seconds: float
 
 
-class DerenderWorker:
+class FrameDerenderer:
     """What one process needs: built once, used for many frames."""
 
-    def __init__(self, config: Derender, out: Path) -> None:
+    def __init__(self, config: DerenderConfig, out: Path) -> None:
         self.config, self.out = config, out
         self.source: SceneSource = open_source(config)
 
-    def __call__(self, identifier: str) -> Taken:
+    def __call__(self, identifier: str) -> DerenderSummary:
         """One frame, from the source to its folder. Raises SceneError for a frame that cannot be used."""
         start = time.perf_counter()
         folder = self.out / identifier
@@ -58,31 +58,35 @@ class DerenderWorker:
             seconds = round(time.perf_counter() - start, 3)
         if self.config.sheet and not (folder / SHEET).is_file():
             write_scene_sheet(folder / SHEET, scene, identifier)
-        return Taken(len(scene.objects), seconds)
+        return DerenderSummary(len(scene.objects), seconds)
 
 
-def derender_run(config: Derender, begin: Callable[[SceneSource], None]) -> Derendered:
+def derender_frames(config: DerenderConfig, begin: Callable[[SceneSource], None]) -> DerenderRunResult:
     """Take apart the frames that are not there yet. begin: is told the source, before the first frame. Raises
     UsageError or SceneError for bad input.
     """
     start = time.perf_counter()
     config = replace(config, fit=config.fit and not config.fast, fast=False)
     out = Path(config.out or f"scenes/{config.dataset if config.photo is None else Path(config.photo).stem}")
-    build = partial(DerenderWorker, config, out)
+    build = partial(FrameDerenderer, config, out)
     worker = build()
     scenes = (name for name in worker.source.identifiers() if (out / name / RECORD).is_file())
-    claim(out, config, scenes, (*PRESENTATION, "sheet"))
+    claim_folder(out, config, scenes, (*PRESENTATION, "sheet"))
     names = list(islice(worker.source.identifiers(), config.limit))
-    done: dict[str, Taken] = {}
+    done: dict[str, DerenderSummary] = {}
     for name in names:
         whole = config.resume and (out / name / RECORD).is_file()
         if whole and (not config.sheet or (out / name / SHEET).is_file()):
-            done[name] = Taken(count_objects(out / name), None)
+            done[name] = DerenderSummary(count_objects(out / name), None)
     begin(worker.source)
     todo = [name for name in names if name not in done]
     if todo:
         make_ready(config)
-    answers = ask(todo, worker, build, config, Bar("taking frames apart", remaining=True))
+    answers = run_frame_jobs(
+        todo, worker, build, config, ProgressSettings("taking frames apart", show_remaining=True)
+    )
     done |= answers.results
     frames = {name: done[name] for name in names if name in done}
-    return Derendered(out, frames, dict(sorted(answers.failed.items())), round(time.perf_counter() - start, 3))
+    return DerenderRunResult(
+        out, frames, dict(sorted(answers.failed.items())), round(time.perf_counter() - start, 3)
+    )

@@ -1,60 +1,67 @@
-"""Counterexamples of a run as others take them: data sets with their origin, tables, and scenes in 3D."""
+"""Exports counterexamples of a run as data sets with provenance, and as tables."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drivesem.config.errors import UsageError
 from drivesem.data.label_table import Written, to_coco
 from drivesem.failures.grades import Grade
-from drivesem.report.tables import csv_text
-from drivesem.run.conversion import Conversion, convert
-from drivesem.run.finished import Run
-from drivesem.run.results import Failure, FrameResult
-from drivesem.run.training_data import told_of
+from drivesem.report.tables import rows_to_csv
+from drivesem.run.finished import AttackRun
+from drivesem.run.labels import ConversionSettings, convert_labels, provenance
+from drivesem.run.results import FrameResult
+from drivesem.run.summary import has_grade
 from scene_ir import files
 
 PROVENANCE = "provenance.json"
-"""In the folder of an exported data set: what each picture is."""
+"""File of an exported data set that describes each picture."""
 DETECTIONS = "detections.json"
-"""Beside COCO's annotations: what the attacked detector found, as COCO's results."""
+"""The attacked detector's detections as COCO results."""
 
 
-def chosen(run: Run, grade: str) -> list[FrameResult]:
-    """The frames with a failure of at least this grade, or "all". UsageError where there is none."""
-    rising = list(Grade)
-
-    def reaches(failure: Failure) -> bool:
-        return rising.index(Grade(failure.grade or Grade.THRESHOLD)) >= rising.index(Grade(grade))
-
+def select_frames_by_grade(run: AttackRun, grade: str) -> list[FrameResult]:
+    """Return the frames with a failure of at least this grade ("all": every frame). Raises UsageError for none."""
     results = [frame.result for frame in run.frames]
-    found = [result for result in results if grade == "all" or any(map(reaches, result.failures))]
-    if not found:
-        expected = "frames that fail so surely (--grade all takes those that withstood, too)"
+    selected = results if grade == "all" else [r for r in results if any(map(has_grade(Grade(grade)), r.failures))]
+    if not selected:
+        expected = "a failure of this grade (--grade all also takes frames without failures)"
         raise UsageError(f"--grade {grade}", expected, f"none of {len(run.frames)}")
-    return found
+    return selected
 
 
 def export_dataset(
-    run: Run, out: Path, layout: str, grade: str, mapping: Mapping[str, str | None] | None = None
+    run: AttackRun, out: Path, layout: str, grade: str, mapping: Mapping[str, str | None] | None = None
 ) -> Written:
-    """Write the counterexamples of a run as a data set: pictures, moved labels, and `PROVENANCE`. mapping: classes
-    by name. Raises UsageError or FormatError for what cannot be.
+    """Write the counterexamples of a run as a data set: pictures, moved labels, and `PROVENANCE`.
+
+    Args:
+        run: The run.
+        out: Folder of the data set.
+        layout: Label layout.
+        grade: Lowest grade of a frame's failures, or "all".
+        mapping: New names of classes; None drops a class.
+
+    Raises:
+        UsageError: No frame has the grade, or a class is unknown.
+        FormatError: A file of the run is damaged.
     """
-    results = chosen(run, grade)
+    results = select_frames_by_grade(run, grade)
     names = [result.identifier for result in results]
-    how = Conversion(layout, "run", copy_images=True, mapping=mapping or {}, frames=names)
-    written = convert(run.folder, out, how)
+    settings = ConversionSettings(layout, "run", copy_images=True, mapping=mapping or {}, frames=names)
+    written = convert_labels(run.folder, out, settings)
     frames = [
         {
             "number": i,
-            **told_of(run.folder, result),
+            **provenance(run.folder, result),
             "change": result.change,
-            "failed": [failure.flat() for failure in result.failures],
+            "failed": [failure.to_row() for failure in result.failures],
         }
         for i, result in enumerate(results)
     ]
@@ -68,17 +75,15 @@ def export_dataset(
 
 
 def _write_detections(out: Path, results: Sequence[FrameResult]) -> None:
-    """COCO's results of the exported pictures, by the ids of the annotations; classes that these do not have are
-    left out.
-    """
-    told = files.read_json(out / "annotations" / "instances_all.json")
-    categories = {row["name"]: row["id"] for row in told["categories"]}
-    images = {row["drivesem"]["frame"]: row["id"] for row in told["images"]}
+    """Write COCO results with the annotations' ids, without classes that the annotations lack."""
+    annotations = files.read_json(out / "annotations" / "instances_all.json")
+    categories = {row["name"]: row["id"] for row in annotations["categories"]}
+    images = {row["drivesem"]["frame"]: row["id"] for row in annotations["images"]}
     rows = [
         {
             "image_id": images[result.identifier],
             "category_id": categories[box.label],
-            "bbox": to_coco(_array(box.xyxy)).tolist(),
+            "bbox": to_coco(np.array(box.xyxy, np.float64)).tolist(),
             "score": box.score,
         }
         for result in results
@@ -88,48 +93,32 @@ def _write_detections(out: Path, results: Sequence[FrameResult]) -> None:
     files.write_json(out / DETECTIONS, rows)
 
 
-def _array(values: Sequence[float]) -> Any:
-    import numpy as np
-
-    return np.array(values, np.float64)
-
-
-@dataclass(frozen=True, slots=True)
-class Tables:
-    """Flat rows by the name of their table."""
-
-    rows: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, run: Run, results: Sequence[FrameResult]) -> Tables:
-        """frames: one a frame; failures: one a failure; theta: one a parameter; each names its frame."""
-        names = {result.identifier for result in results}
-        theta = [
-            {"frame": result.identifier, **asdict(coordinate)} for result in results for coordinate in result.theta
-        ]
-        return cls(
-            {
-                "frames": [row for row in run.rows() if row["frame"] in names],
-                "failures": [row for row in run.failure_rows() if row["frame"] in names],
-                "theta": theta,
-            }
-        )
-
-    def write(self, out: Path) -> list[str]:
-        """Write each that has rows as CSV, and as Parquet where pyarrow is there; the names of the files."""
-        written: list[str] = []
-        for name, rows in self.rows.items():
-            if not rows:
-                continue
-            files.write_text(out / f"{name}.csv", csv_text(rows))
-            written.append(f"{name}.csv")
-            if find_spec("pyarrow") is not None:
-                files.write_bytes(out / f"{name}.parquet", _parquet(rows))
-                written.append(f"{name}.parquet")
-        return written
+def build_tables(run: AttackRun, results: Sequence[FrameResult]) -> dict[str, list[dict[str, Any]]]:
+    """Return flat rows by table: frames, failures, and theta (a row per coordinate). Each row names its frame."""
+    names = {result.identifier for result in results}
+    theta = [{"frame": result.identifier, **asdict(one)} for result in results for one in result.theta]
+    return {
+        "frames": [row for row in run.rows() if row["frame"] in names],
+        "failures": [row for row in run.failure_rows() if row["frame"] in names],
+        "theta": theta,
+    }
 
 
-def _parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
+def write_tables(tables: Mapping[str, Sequence[Mapping[str, Any]]], out: Path) -> list[str]:
+    """Write each table that has rows as CSV, and as Parquet if pyarrow is installed. Returns the file names."""
+    written: list[str] = []
+    for name, rows in tables.items():
+        if not rows:
+            continue
+        files.write_text(out / f"{name}.csv", rows_to_csv(rows))
+        written.append(f"{name}.csv")
+        if find_spec("pyarrow") is not None:
+            files.write_bytes(out / f"{name}.parquet", _rows_to_parquet(rows))
+            written.append(f"{name}.parquet")
+    return written
+
+
+def _rows_to_parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
     import pyarrow  # pyright: ignore[reportMissingImports]
     import pyarrow.parquet  # pyright: ignore[reportMissingImports]
 

@@ -1,65 +1,90 @@
-"""A finished run of `drivesem attack`, as transfer needs it."""
+"""Loads finished runs of `drivesem attack`, and rebuilds the objectives of their frames."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from drivesem.config.commands import Attack
+import torch
+from torch import Tensor
+
+from detectors.base import Predictor, detector_device
+from drivesem.attack.budgets import parse_budget
+from drivesem.attack.feasible.constraints import FeasibilityLimits
+from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.labels import Difficulty
+from drivesem.attack.objective import Objective
+from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attack.targets import TargetSelection
+from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
+from drivesem.failures.neighbourhood import Neighbourhood
+from drivesem.failures.nuisances import Nuisances
 from drivesem.run.folder import CONFIG
-from drivesem.run.labels import MANIFEST, RESULT, names_in
-from drivesem.run.lock import held_elsewhere
+from drivesem.run.labels import MANIFEST, RESULT, list_manifest_frames
+from drivesem.run.lock import is_locked_elsewhere
 from drivesem.run.records import from_json
-from drivesem.run.results import FrameResult, load_frame
-from drivesem.run.tally import graded
+from drivesem.run.results import SCHEMA, Failure, FrameResult, load_frame
+from drivesem.run.summary import certain_losses, count_grades
 from scene_ir import files
 from scene_ir.errors import FormatError
+from scene_ir.io import load_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import convert_scene
 
 METRICS = "metrics.json"
 PICTURES = {"benign": "benign.png", "rerendered": "rerender.png", "attacked": "counterexample.png"}
-"""A frame's photograph, the same rendered again without any change, and the picture that was found: all lossless,
-as the source was judged on them."""
+"""Lossless pictures of a frame: the photograph, its re-render without a change, and the counterexample."""
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """One frame of a run: its folder, what came of it, and its pictures by name (PICTURES)."""
+class RunFrame:
+    """One frame of a finished run."""
 
     folder: Path
+    """Folder of the frame."""
     result: FrameResult
+    """Contents of its result.json."""
     pictures: dict[str, Path]
+    """Paths by the names of `PICTURES`."""
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """name: of the folder; detector, method, params: of the attack; frames: in the order of their names."""
+class AttackRun:
+    """A finished run of `drivesem attack`."""
 
     name: str
+    """Name of the folder, or its path if several runs have that name."""
     folder: Path
+    """Folder of the run."""
     detector: str
+    """The attacked detector, as named in the settings."""
     method: str
+    """Search method."""
     params: str
-    frames: tuple[Frame, ...]
+    """Attacked parameters, separated by commas."""
+    frames: tuple[RunFrame, ...]
+    """Frames in the order of their names."""
 
     def rows(self) -> list[dict[str, Any]]:
-        """One flat dict a frame, for `pandas.DataFrame`."""
-        return [_row(frame) for frame in self.frames]
+        """Return a flat dict per frame, for `pandas.DataFrame`."""
+        return [_frame_row(frame) for frame in self.frames]
 
     def failure_rows(self) -> list[dict[str, Any]]:
-        """One flat dict a failure: its frame, kind, grade, draws, second opinions, box."""
+        """Return a flat dict per failure: frame, kind, grade, draws, second opinions, and box."""
         return [
-            {"frame": frame.result.identifier, **failure.flat()}
+            {"frame": frame.result.identifier, **failure.to_row()}
             for frame in self.frames
             for failure in frame.result.failures
         ]
 
     def _repr_html_(self) -> str:
-        """A table of the frames, for a notebook."""
+        """Return an HTML table of the frames, for notebooks."""
         rows = self.rows()
         lines = [list(rows[0]), *(["" if v is None else str(v) for v in row.values()] for row in rows)]
         head, *body = ("".join(f"<td>{escape(cell)}</td>" for cell in line) for line in lines)
@@ -68,7 +93,7 @@ class Run:
         return f"<table><caption>{caption}</caption><tbody>{table}</tbody></table>"
 
 
-def _row(frame: Frame) -> dict[str, Any]:
+def _frame_row(frame: RunFrame) -> dict[str, Any]:
     result = frame.result
     kinds = [failure.kind for failure in result.failures]
     return {
@@ -78,7 +103,7 @@ def _row(frame: Frame) -> dict[str, Any]:
         "success_paper": result.success_paper,
         "lost": kinds.count("lost"),
         "phantoms": kinds.count("phantom"),
-        **_grades(result),
+        **_count_frame_grades(result),
         "passes": result.passes,
         "feasible": result.feasible,
         "queries": result.queries,
@@ -90,22 +115,21 @@ def _row(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _grades(result: FrameResult) -> dict[str, int | None]:
-    """Failures of at least each grade from certain on, and by kind; None where they are unknown."""
-    told = graded([result])
-    counts = {grade: count for grade, count in told["grades"].items() if grade != Grade.THRESHOLD}
-    counts |= told["kinds"]
+def _count_frame_grades(result: FrameResult) -> dict[str, int | None]:
+    """Count failures by lowest grade from certain on, and by kind; None if the failures are not graded."""
+    summary = count_grades([result])
+    counts = {grade: count for grade, count in summary["grades"].items() if grade != Grade.THRESHOLD}
+    counts |= summary["kinds"]
     return counts if result.graded else dict.fromkeys(counts)
 
 
-def load_run(folder: str | Path, limit: int | None = None) -> Run:
-    """A finished run of `drivesem attack`; limit: its first frames only.
+def load_run(folder: str | Path, limit: int | None = None) -> AttackRun:
+    """Load a finished run of `drivesem attack`, or its first `limit` frames.
 
         run = ds.load_run("runs/a")
         pandas.DataFrame(run.rows())
 
-    Raises UsageError for a folder that holds no finished run and a limit below 1, FormatError naming a file that
-    is damaged.
+    Raises UsageError if the folder holds no finished run or the limit is below 1, FormatError for a damaged file.
     """
     if limit is not None and limit < 1:
         raise UsageError("limit", "at least 1", limit)
@@ -114,60 +138,157 @@ def load_run(folder: str | Path, limit: int | None = None) -> Run:
 
 def load_runs(
     folders: Sequence[str], limit: int | None = None, setting: str = "--run", may_be_empty: bool = False
-) -> list[Run]:
-    """Runs by folder; limit: the first frames of each; setting: what names them on the command line. may_be_empty:
-    also runs without frames, as a part may be. Raises UsageError for a folder that holds no finished run,
-    FormatError naming a file that is not as `drivesem attack` writes it.
+) -> list[AttackRun]:
+    """Load finished runs.
+
+    Args:
+        folders: Their folders.
+        limit: Number of frames to load of each run; all by default.
+        setting: Option or argument that named the folders.
+        may_be_empty: Accept runs without frames.
+
+    Raises:
+        UsageError: A folder holds no finished run of this version, or is given twice.
+        FormatError: A file is damaged.
     """
     paths = [Path(folder) for folder in folders]
-    doubled = sorted({str(path) for path in paths if sum(p.resolve() == path.resolve() for p in paths) > 1})
-    if doubled:
-        raise UsageError(setting, "each run once", doubled[0])
-    # Runs of the same name in different folders are told apart by their whole paths.
-    plain = [path.resolve().name for path in paths]
-    names = [name if plain.count(name) == 1 else str(path) for name, path in zip(plain, paths, strict=True)]
-    runs = [_load(path, name, limit, setting) for path, name in zip(paths, names, strict=True)]
+    repeated = sorted({str(path) for path in paths if sum(p.resolve() == path.resolve() for p in paths) > 1})
+    if repeated:
+        raise UsageError(setting, "each run once", repeated[0])
+    base_names = [path.resolve().name for path in paths]
+    names = [n if base_names.count(n) == 1 else str(path) for n, path in zip(base_names, paths, strict=True)]
+    runs = [_load_run(path, name, limit, setting) for path, name in zip(paths, names, strict=True)]
     for run in runs:
         if not run.frames and not may_be_empty:
             raise UsageError(setting, "a run with frames", f"{run.folder}, which has none")
     return runs
 
 
-def _load(folder: Path, name: str, limit: int | None, setting: str) -> Run:
+def _load_run(folder: Path, name: str, limit: int | None, setting: str) -> AttackRun:
     for file in (CONFIG, METRICS, MANIFEST):
-        files.below(folder, file)
+        files.resolve_inside(folder, file)
     if not (folder / CONFIG).is_file():
         raise UsageError(setting, "a folder of drivesem attack", folder)
     settings = files.read_yaml(folder / CONFIG)
-    if not isinstance(settings, dict) or not {"detector", "dataset", "params", "combo"} <= settings.keys():
+    if (
+        not isinstance(settings, dict)
+        or not {"detector", "dataset", "params", "combo", "method"} <= settings.keys()
+    ):
         raise UsageError(setting, "a folder of drivesem attack", f"{folder}, a run of another command")
     if not (folder / METRICS).is_file() or not (folder / MANIFEST).is_file():
-        if held_elsewhere(folder):
+        if is_locked_elsewhere(folder):
             raise UsageError(setting, "a finished run", f"{folder}, into which an attack is still writing")
         raise UsageError(
             setting, "a finished run (the same command finishes it)", f"{folder}, which stopped early"
         )
-    identifiers, metrics = names_in(folder), files.read_json(folder / METRICS)
+    identifiers, metrics = list_manifest_frames(folder), files.read_json(folder / METRICS)
+    if not isinstance(metrics, dict) or metrics.get("schema") != SCHEMA:
+        version = files.read_json(folder / MANIFEST).get("versions", {}).get("drivesem", "of another version")
+        raise UsageError(setting, "a run of this version", f"{folder}, made by an earlier drivesem {version}")
     try:
         params = ",".join(metrics["params"])
     except (KeyError, TypeError) as error:
         raise FormatError(str(folder / METRICS), "params of a run", error) from error
     from_json(float | None, metrics.get("t_star"), f"{folder / METRICS}: t_star")
-    return Run(
+    return AttackRun(
         name=name,
         folder=folder,
         detector=from_json(str, settings["detector"], f"{folder / CONFIG}: detector"),
-        # Runs from before there was a choice followed the default.
-        method=str(settings.get("method", Attack().method)),
+        method=str(settings["method"]),
         params=params,
-        frames=tuple(_frame(folder / "frames" / identifier) for identifier in identifiers[:limit]),
+        frames=tuple(_load_run_frame(folder / "frames" / identifier) for identifier in identifiers[:limit]),
     )
 
 
-def _frame(folder: Path) -> Frame:
+def _load_run_frame(folder: Path) -> RunFrame:
     files.check_links(folder)
     pictures = {name: folder / file for name, file in PICTURES.items()}
     for path in pictures.values():
         if not path.is_file():
             raise FormatError(str(path), "a picture of the run", "none")
-    return Frame(folder, load_frame(folder / RESULT), pictures)
+    return RunFrame(folder, load_frame(folder / RESULT), pictures)
+
+
+def rebuild_objective(
+    result: FrameResult,
+    folder: Path,
+    attack: AttackConfig,
+    params: Sequence[Parameter],
+    detector: Predictor,
+) -> tuple[Objective, Tensor]:
+    """Rebuild the objective of a frame from the saved scene, without the data set.
+
+    Args:
+        result: The frame's result.
+        folder: The frame's folder in the run.
+        attack: The run's settings.
+        params: The run's parameters.
+        detector: The detector to evaluate.
+
+    Returns:
+        The objective, and the theta (D,) of the run.
+
+    Raises:
+        FormatError: The scene or theta is damaged.
+    """
+    scene = convert_scene(load_scene(folder / "scene").unperturbed(), None, detector_device(detector))
+    space = ParameterSpace(scene, params, parse_budget(attack.budget), parametrisation=attack.parametrisation)
+    if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
+        raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
+    theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
+    compositor = Compositor(scene, RenderSettings(backend=attack.backend))
+    labels, term = attack.objective_labels, attack.objective
+    aim = TargetSelection.from_options(attack.target_objects, attack.target_classes)
+    difficulty = Difficulty(min_contrast=result.min_contrast)
+    return Objective(
+        compositor, space, detector, labels, term, difficulty, attack.t_star, aim, attack.whole, attack.keep_mb
+    ), theta
+
+
+@dataclass(frozen=True)
+class RebuiltFrame:
+    """A frame of a finished run, ready to be rendered and evaluated in other states."""
+
+    result: FrameResult
+    """Contents of its result.json."""
+    objective: Objective
+    """The objective that was attacked."""
+    feasible: FeasibleSet
+    """Feasible thetas."""
+    theta: Tensor
+    """Theta of the counterexample (D,)."""
+    nuisances: Nuisances
+    """Distribution of the draws."""
+
+    @classmethod
+    def load(
+        cls, folder: Path, attack: AttackConfig, params: Sequence[Parameter], detector: Predictor
+    ) -> RebuiltFrame:
+        """Rebuild a frame from its folder.
+
+        Args:
+            folder: The frame's folder in the run.
+            attack: The run's settings.
+            params: The run's parameters.
+            detector: The detector to evaluate.
+
+        Raises:
+            FormatError: A file is damaged.
+        """
+        result = load_frame(folder / RESULT)
+        objective, theta = rebuild_objective(result, folder, attack, params, detector)
+        limits = FeasibilityLimits(joint_weather=result.joint_weather)
+        feasible = objective.feasible_set(limits, attack.project == "bounds")
+        return cls(result, objective, feasible, theta, Nuisances.parse(attack.nuisances))
+
+    def neighbourhoods(self, stream: str, reach: float = 1.0) -> Iterator[tuple[Failure, Neighbourhood]]:
+        """Yield each certain failure of an object, and its neighbourhood. `stream` selects the random draws."""
+        for failure in certain_losses(self.result):
+            assert failure.index is not None
+            name = f"{self.result.identifier}:{failure.index}:{stream}"
+            yield (
+                failure,
+                Neighbourhood(
+                    self.objective, self.feasible, self.theta, failure.index, self.nuisances, name, reach
+                ),
+            )

@@ -10,19 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from detectors.base import DetectorError, Predictor
-from detectors.registry import code_of, load_predictor
-from drivesem.attack.judging import JudgedClasses
-from drivesem.config.blocks import Output
-from drivesem.config.commands import Attack
+from detectors.registry import find_code_to_run, load_predictor
+from drivesem.attack.targets import EvaluatedClasses
+from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
-from drivesem.config.text import to_yaml
-from drivesem.run.lock import LOCK, hold
+from drivesem.config.options import OutputOptions, to_yaml
+from drivesem.run.lock import LOCK, acquire_folder_lock
 from drivesem.run.records import from_json
 from scene_ir import files
 
 CONFIG = "config.yaml"
 """The resolved settings, in the run's folder."""
-NAMED = "files.json"
+REFERENCED_FILES = "files.json"
 """Digests of the files that these name."""
 FRAMES = "frames"
 """Folder of the frames in a run's folder, and of what a question keeps of each."""
@@ -46,9 +45,9 @@ PRESENTATION = (
 """Settings that change no frame's result: a run may be continued with others."""
 
 
-def claim(
+def claim_folder(
     out: Path,
-    config: Output,
+    config: OutputOptions,
     written: Iterable[str],
     presentation: Collection[str] = PRESENTATION,
     renews: bool = False,
@@ -61,10 +60,10 @@ def claim(
     another process is writing.
     """
     path = out / CONFIG
-    folder_of(None, out)
+    resolve_output_folder(None, out)
     if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
         raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
-    hold(out)
+    acquire_folder_lock(out)
     named = _named(config, presentation)
     if path.exists():
         if config.resume:
@@ -72,34 +71,36 @@ def claim(
         other = _others(out, named) if config.resume else []
         if other and not renews:
             expected = "the files of this run (else another --out, or --no-resume)"
-            raise UsageError(str(out / NAMED), expected, f"another content of {', '.join(other)}")
+            raise UsageError(str(out / REFERENCED_FILES), expected, f"another content of {', '.join(other)}")
         if other or not config.resume:
             _remove(out / name for name in written)
     files.write_text(path, to_yaml(config))
     if named:
-        files.write_json(out / NAMED, named)
+        files.write_json(out / REFERENCED_FILES, named)
 
 
-def _named(config: Output, presentation: Collection[str]) -> dict[str, str]:
+def _named(config: OutputOptions, presentation: Collection[str]) -> dict[str, str]:
     """Digests of the files that settings name, such as weights, by how they name them."""
-    values = [value for value in settings_of(config, presentation).values() if isinstance(value, str)]
+    values = [value for value in result_settings(config, presentation).values() if isinstance(value, str)]
     words = {word for value in values for word in (value, *re.split("[,:]", value)) if word}
-    return {word: files.digest(Path(word)) for word in sorted(words) if Path(word).is_file()}
+    return {word: files.sha256_digest(Path(word)) for word in sorted(words) if Path(word).is_file()}
 
 
 def _others(folder: Path, named: Mapping[str, str]) -> list[str]:
     """Which of the files hold something else than when the folder was claimed."""
-    path = folder / NAMED
+    path = folder / REFERENCED_FILES
     before = files.read_json(path) if path.is_file() else {}
     known = before if isinstance(before, dict) else {}
     return [word for word, digest in named.items() if known.get(word, digest) != digest]
 
 
-def check_files(run: Path, config: Output) -> None:
+def check_referenced_files(run: Path, config: OutputOptions) -> None:
     """UsageError where a file that a run's settings name is no longer the one that the run was made with."""
     other = _others(run, _named(config, PRESENTATION))
     if other:
-        raise UsageError(str(run / NAMED), "the files that this run was made with", f"another {', '.join(other)}")
+        raise UsageError(
+            str(run / REFERENCED_FILES), "the files that this run was made with", f"another {', '.join(other)}"
+        )
 
 
 def _remove(paths: Iterable[Path]) -> None:
@@ -110,7 +111,7 @@ def _remove(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
 
 
-def folder_of(given: str | None, default: Path) -> Path:
+def resolve_output_folder(given: str | None, default: Path) -> Path:
     """The folder that --out names, or the default. Raises UsageError for a file."""
     out = Path(given) if given else default
     if out.exists() and not out.is_dir():
@@ -118,22 +119,22 @@ def folder_of(given: str | None, default: Path) -> Path:
     return out
 
 
-def is_attack(run: Path) -> bool:
+def is_attack_run(run: Path) -> bool:
     """Whether the settings of a run are those of `drivesem attack`, and not of another command."""
     loaded = files.read_yaml(run / CONFIG)
-    return isinstance(loaded, dict) and set(loaded) <= {field.name for field in fields(Attack)}
+    return isinstance(loaded, dict) and set(loaded) <= {field.name for field in fields(AttackConfig)}
 
 
-def attack_of(run: Path, setting: str = "--run") -> Attack:
+def load_attack_config(run: Path, setting: str = "--run") -> AttackConfig:
     """The configuration of a run of `drivesem attack`. setting: what names it on the command line. Raises
     UsageError where the folder is none.
     """
     path = run / CONFIG
     if not path.is_file():
         raise UsageError(setting, "a run's folder, with its config.yaml", run)
-    if not is_attack(run):
+    if not is_attack_run(run):
         raise UsageError(setting, "a run of drivesem attack", run)
-    attack: Attack = from_json(Attack, files.read_yaml(path), str(path))
+    attack: AttackConfig = from_json(AttackConfig, files.read_yaml(path), str(path))
     try:
         # The run that a placebo was like may be gone.
         replace(attack, like=attack.like and str(run)).check()
@@ -142,44 +143,44 @@ def attack_of(run: Path, setting: str = "--run") -> Attack:
     return attack
 
 
-def trusted_attack(run: Path, trust: bool, setting: str = "--run") -> Attack:
+def load_trusted_config(run: Path, trust: bool, setting: str = "--run") -> AttackConfig:
     """The same, to load its detectors: a run comes from anywhere, and so would code that its settings name.
     trust: whether that may run. Raises UsageError as `attack_of`, and where it may not.
     """
-    attack = attack_of(run, setting)
+    attack = load_attack_config(run, setting)
     for setting in ("detector", "peer", "witness"):
-        code = code_of(getattr(attack, setting) or "")
+        code = find_code_to_run(getattr(attack, setting) or "")
         if code is not None and not trust:
             expected = f"a detector that is data alone, or --trust, which lets this run the code in {code}"
             raise UsageError(f"{run / CONFIG}: {setting}", expected, getattr(attack, setting))
-    check_files(run, attack)
+    check_referenced_files(run, attack)
     return attack
 
 
-def detector_of(attack: Attack, device: str, setting: str = "--run") -> Predictor:
+def load_run_detector(attack: AttackConfig, device: str, setting: str = "--run") -> Predictor:
     """The run's detector, in float32, in which a run judges too whatever it took its gradients in.
 
     setting: what names the run on the command line. Raises UsageError where it cannot be had, or knows no cars.
     """
     try:
         detector = load_predictor(attack.detector, device, attack.tiles)
-        JudgedClasses.of(detector)
+        EvaluatedClasses.from_detector(detector)
     except DetectorError as error:
-        raise UsageError.of(setting, "a run whose detector can be had", error) from error
+        raise UsageError.from_detector_error(setting, "a run whose detector can be had", error) from error
     return detector
 
 
-def settings_of(config: Output, presentation: Collection[str] = PRESENTATION) -> dict[str, Any]:
+def result_settings(config: OutputOptions, presentation: Collection[str] = PRESENTATION) -> dict[str, Any]:
     """The settings that may change a frame's result, by name."""
     return {key: value for key, value in asdict(config).items() if key not in presentation}
 
 
-def _check_settings(path: Path, config: Output, presentation: Collection[str]) -> None:
+def _check_settings(path: Path, config: OutputOptions, presentation: Collection[str]) -> None:
     before = files.read_yaml(path)
     # A setting that came with a later version had its default before.
     defaults = {f.name: f.default for f in fields(config) if f.default is not MISSING}
     known = defaults | before if isinstance(before, dict) else {}
-    wanted = settings_of(config, presentation)
+    wanted = result_settings(config, presentation)
     if {key: value for key, value in known.items() if key not in presentation} != wanted:
         changed = [key for key, value in wanted.items() if known.get(key) != value]
         raise UsageError(

@@ -1,10 +1,10 @@
-"""One frame: de-render -> perturb -> project -> re-render -> detect -> judge, and its folder on disk."""
+"""The outcome of an attack on one scene: graded failures, records of boxes, and the frame's folder on disk."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,208 +12,67 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from detectors.base import Predictor, device_of
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.aims import EVERYTHING, Aim
-from drivesem.attack.budgets import reach_of
-from drivesem.attack.changes import DRAWS, Changes, affordable, passes_of, proposals
-from drivesem.attack.feasibility_check import Reach, check_scene, judge_at_hand
+from drivesem.attack.budgets import change_limits
+from drivesem.attack.feasibility_check import available_check_method, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.judging import JudgedClasses
-from drivesem.attack.labels import LabelMode, MovedLabels, shown_boxes, to_kitti_labels
-from drivesem.attack.methods.base import Attack as AttackMethod
-from drivesem.attack.methods.base import AttackResult, Problem
-from drivesem.attack.methods.given import Given
-from drivesem.attack.methods.margin_search import FRESH, OfMargins, value_of
+from drivesem.attack.labels import SceneLabels, to_kitti_labels, visible_boxes
+from drivesem.attack.methods.base import AttackResult
 from drivesem.attack.methods.placebo import Placebo
-from drivesem.attack.objective import Objective, Rendered
-from drivesem.attack.space import Budget, Parameter, ParameterSpace, Parametrisation
-from drivesem.config.blocks import KEEP_MB
+from drivesem.attack.objective import Objective, RenderEvaluation
+from drivesem.attack.targets import EvaluatedClasses
 from drivesem.data import kitti
-from drivesem.evaluation.failures import Failures
-from drivesem.failures.certificate import with_regions
+from drivesem.evaluation.failures import FrameFailures
+from drivesem.failures.certificate import CompositorRenderer, pad_visible_boxes
 from drivesem.failures.grades import Grade
-from drivesem.failures.grading import Case, Graded, Grader, Grades
-from drivesem.failures.kinds import View
-from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.second_renderer.compositor import CompositorDraw
-from drivesem.failures.views import DrawnViews
+from drivesem.failures.grading import FrameGrades, GradedFault, Grader, GradingInput
+from drivesem.failures.kinds import LabelledDetections
 from drivesem.run.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.exchange import CHANGE
+from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene, save_scene, to_uint8
-from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Render, SceneIR, scene_to
+from scene_ir.types import Render, SceneIR
 
 RESULT = "result.json"
 """The file that marks a frame as done."""
 
 
 @dataclass(frozen=True, slots=True)
-class FrameSettings:
-    """What is done to every frame. attack: the algorithm; params: what it may move; term: of the detector's loss,
-    to be raised; seed: of its randomness; t_star: score from which a detection counts, by default the detector's;
-    budget: how far theta may go, by default as far as the paper's; aim: what the attack is after; grader: says
-    how sure its failures are, None to leave them ungraded. keep_last, only_bounds: as the paper's protocol has it,
-    see `Problem` and `FeasibleSet`. parametrisation: of translate. whole, keep_mb: see `Objective`. changes: what
-    is proposed after a search on margins, None for nothing.
-    """
-
-    attack: AttackMethod
-    params: tuple[Parameter, ...]
-    label_mode: LabelMode
-    term: str
-    render: RenderSettings
-    seed: int
-    t_star: float | None = None
-    budget: Budget | None = None
-    aim: Aim = EVERYTHING
-    grader: Grader | None = None
-    keep_last: bool = False
-    only_bounds: bool = False
-    parametrisation: Parametrisation = "ground"
-    whole: bool = False
-    keep_mb: float = KEEP_MB
-    changes: Changes | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class AttackedScene:
-    """What an attack on one scene found, in memory. search: what the attack handed back; rendered: the scene at
-    its theta, judged; benign: detections on the photograph; failures: of `rendered`, graded; seconds: it all took,
-    grading_seconds: and of these, what came after the search.
-    """
+    """The outcome of an attack on one scene, in memory."""
 
     identifier: str
+    """Name of the frame."""
     objective: Objective
+    """The objective of the scene."""
     search: AttackResult
-    rendered: Rendered
+    """The attack's result."""
+    rendered: RenderEvaluation
+    """The scene at its theta, evaluated."""
     benign: Detections
+    """Detections on the photograph."""
     violated_at_start: tuple[str, ...]
+    """Constraints that the photographed scene violates."""
     failures: tuple[Failure, ...]
+    """Graded failures of `rendered`."""
     grade_notes: tuple[str, ...]
+    """Why a grade could not be reached."""
     passes: int
+    """Detector passes, a gradient counted as 3."""
     seconds: float
+    """Total time."""
     grading_seconds: float
-
-
-def attack_scene(identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> AttackedScene:
-    """Attack one scene, where the detector is. Nothing is written.
-
-    Raises SceneError where the scene cannot be used, or a loss or gradient is not finite; DetectorError where the
-    detector knows no cars.
-    """
-    start = time.perf_counter()
-    scene = scene_to(scene, None, device_of(detector))
-    posed, attack = _Posed.of(identifier, scene, detector, settings), settings.attack
-    aside = 0
-    if settings.changes is not None and isinstance(attack, OfMargins):
-        count = affordable(attack.passes)
-        attack = replace(attack, passes=attack.passes - passes_of(count))
-        search = posed.searched(attack)
-        offered = proposals(scene, settings.changes, count, settings.seed, settings.render)
-        others = (_Posed.of(identifier, changed, detector, settings) for changed in offered)
-        posed, search, aside = _best_change(posed, search, others)
-    else:
-        search = posed.searched(attack)
-    posed.views.forget()
-    objective, feasible = posed.views.objective, posed.feasible
-    rendered = objective.evaluate(search.theta)
-    benign = objective.detect(scene.photograph)
-    passes = objective.passes + 1 + aside
-    searched = time.perf_counter()
-    failures, notes = _graded(identifier, objective, feasible, search, rendered, settings)
-    objective.forget()
-    end = time.perf_counter()
-    return AttackedScene(
-        identifier=identifier,
-        objective=objective,
-        search=search,
-        rendered=rendered,
-        benign=benign,
-        violated_at_start=feasible.violated_at_start,
-        failures=failures,
-        grade_notes=notes,
-        passes=passes,
-        seconds=end - start,
-        grading_seconds=end - searched,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Posed:
-    """A scene and what is asked of it, in draws of its frame's name."""
-
-    views: DrawnViews
-    feasible: FeasibleSet
-    problem: Problem
-    seed: int
-
-    @classmethod
-    def of(cls, identifier: str, scene: SceneIR, detector: Predictor, settings: FrameSettings) -> _Posed:
-        objective = Objective(
-            Compositor(scene, settings.render),
-            ParameterSpace(scene, settings.params, settings.budget, parametrisation=settings.parametrisation),
-            detector,
-            settings.label_mode,
-            settings.term,
-            t_star=settings.t_star,
-            aim=settings.aim,
-            whole=settings.whole,
-            keep_mb=settings.keep_mb,
-        )
-        nuisances = Nuisances() if settings.grader is None else settings.grader.nuisances
-        views = DrawnViews.of(objective, nuisances, f"search:{identifier}:{settings.seed}")
-        feasible = objective.feasible_set(only_bounds=settings.only_bounds)
-        return cls(views, feasible, objective.problem(feasible, settings.keep_last, views), settings.seed)
-
-    @property
-    def space(self) -> ParameterSpace:
-        """Of theta."""
-        return self.views.objective.space
-
-    def searched(self, attack: AttackMethod) -> AttackResult:
-        """What an attack finds."""
-        return attack(self.problem, self.space.theta0, self.seed)
-
-    def value(self, theta: Tensor) -> float:
-        """What a search on margins lowers, at theta (D,), in draws that no search looks at."""
-        seen = (self.views.margins(theta, FRESH + number) for number in range(DRAWS))
-        return sum(value_of(margins, self.views.judged) for margins in seen)
-
-
-def _best_change(
-    still: _Posed, search: AttackResult, changed: Iterable[_Posed]
-) -> tuple[_Posed, AttackResult, int]:
-    """Of a scene at the theta that was found, and what changes made of it at the same theta, that with the lowest
-    margins; and the passes that the others took.
-    """
-    best, least, theta = still, still.value(search.theta), search.theta
-    all_passes = kept_passes = still.views.passes
-    for posed in changed:
-        here = posed.problem.project(posed.space.carried(still.space, search.theta)).theta
-        value = posed.value(here)
-        posed.views.forget()
-        all_passes += posed.views.passes
-        if value < least:
-            best, least, theta, kept_passes = posed, value, here, posed.views.passes
-    if best is not still:
-        found = best.searched(Given(theta))
-        if torch.equal(found.theta, theta):  # else its render showed that it cannot be
-            trace = (*search.loss_trace, *found.loss_trace)
-            return best, replace(found, queries=search.queries, loss_trace=trace), all_passes - kept_passes
-    return still, search, all_passes - still.views.passes
+    """Time after the search."""
 
 
 def write_frame(attacked: AttackedScene, folder: Path) -> FrameResult:
-    """Write a frame's folder, whole or not at all. Returns what `folder / RESULT` holds: the independent check
-    reads the scene back from disk.
+    """Write a frame's folder, completely or not at all. Returns the content of `folder / RESULT`; the independent
+    feasibility check reads the scene back from disk.
     """
     start = time.perf_counter()
-    with files.whole_folder(folder) as part:
+    with files.atomic_folder(folder) as part:
         save_scene(attacked.rendered.scene, part / "scene")
         result = frame_result(attacked, load_scene(part / "scene"))
         result = replace(result, seconds=round(attacked.seconds + time.perf_counter() - start, 3))
@@ -222,9 +81,9 @@ def write_frame(attacked: AttackedScene, folder: Path) -> FrameResult:
 
 
 def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
-    """The record of an attacked scene. perturbed: the counterexample as the independent check is to see it."""
+    """The record of an attacked scene; `perturbed`: the scene that the independent feasibility check tests."""
     objective, search, rendered = attacked.objective, attacked.search, attacked.rendered
-    names = objective.judged.names
+    names = objective.classes.names
     scene = objective.space.scene
     moved = rendered.moved.targets
     return FrameResult(
@@ -237,7 +96,13 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
             for name, facts in objective.space.theta_by_name(search.theta).items()
         ),
         active_constraints=search.active_constraints,
-        violations=tuple(check_scene(perturbed.at_rest(), perturbed, reach=_reach(objective.space))),
+        violations=tuple(
+            check_scene(
+                perturbed.unperturbed(),
+                perturbed,
+                reach=change_limits(objective.space.budget, objective.space.parametrisation),
+            )
+        ),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
         targets_moved=target_records(moved, CLASSES, len(scene.objects)),
         detections_benign=detection_records(attacked.benign, names),
@@ -250,17 +115,13 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         identity_psnr_db=psnr_in_boxes(objective.benign.scene, objective.benign.render.image),
         seconds=round(attacked.seconds, 3),
         violated_at_start=attacked.violated_at_start,
-        checked_by=judge_at_hand(),
+        checked_by=available_check_method(),
         passes=attacked.passes,
         grade_notes=attacked.grade_notes,
         min_contrast=objective.difficulty.min_contrast,
         joint_weather=True,
-        change=scene.provenance.get(CHANGE, "") if scene.before is not None else "",
+        change=scene.provenance.get(CHANGE_KEY, "") if scene.before is not None else "",
     )
-
-
-def _reach(space: ParameterSpace) -> Reach:
-    return reach_of(space.budget, space.parametrisation)
 
 
 def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
@@ -270,11 +131,11 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
     files.write_png(part / "benign.png", before)
     files.write_png(part / "rerender.png", to_uint8(objective.benign.render.image))
     files.write_png(part / "counterexample.png", after)
-    marked = pictures.overlay(
+    marked = pictures.draw_overlay(
         after, result.targets_moved, result.detections_attacked, result.failures, objective.t_star
     )
     files.write_png(part / "overlay.png", marked)
-    files.write_png(part / "difference.png", pictures.difference(before, after))
+    files.write_png(part / "difference.png", pictures.draw_difference(before, after))
     for labels in (rendered.paper, rendered.moved):
         as_kitti = to_kitti_labels(labels, objective.benign.scene, rendered.scene)
         kitti.write_labels(part / f"labels_{labels.mode}.txt", as_kitti)
@@ -288,101 +149,136 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
     files.write_text(part / RESULT, dump_frame(result))
 
 
-def _graded(
+def grade_failures(
     identifier: str,
     objective: Objective,
     feasible: FeasibleSet,
     search: AttackResult,
-    rendered: Rendered,
-    settings: FrameSettings,
+    grader: Grader | None,
+    seed: int,
 ) -> tuple[tuple[Failure, ...], tuple[str, ...]]:
-    """What the detector gets wrong in `rendered`, as graded records; and why a grade could not be reached."""
-    failures = objective.failures(rendered, "moved")
-    if settings.grader is None or not failures.success:
-        return failure_records(objective.judged, rendered.moved.targets, rendered.detections, failures), ()
+    """Failures at the theta that an attack found, as graded records.
+
+    Args:
+        identifier: name of the frame.
+        objective: the objective of the scene.
+        feasible: its feasible set, for the placebo.
+        search: the attack's result.
+        grader: grades the failures; None leaves them ungraded.
+        seed: seed of the placebo.
+
+    Returns:
+        The records, and the reasons why a grade could not be reached.
+    """
+    evaluation = objective.evaluate(search.theta)
+    failures, moved = objective.failures(evaluation, "moved"), evaluation.moved.targets
+    if grader is None or not failures.success:
+        return build_failure_records(objective.classes, moved, evaluation.detections, failures), ()
 
     def placebo() -> SceneIR:
-        edit = Placebo(tuple(search.theta.tolist()))(
-            objective.problem(feasible), objective.space.theta0, settings.seed
-        )
+        edit = Placebo(tuple(search.theta.tolist()))(objective.problem(feasible), objective.space.theta0, seed)
         return objective.space.apply(objective.space.scene, edit.theta)
 
-    case = case_of(
+    benign = objective.benign
+    grading_input = build_grading_input(
         identifier,
-        CompositorDraw(objective.compositor, objective.labeller),
-        objective.judged,
-        State(
-            objective.benign.scene, objective.benign.render, objective.benign.paper, objective.benign.detections
-        ),
-        State(rendered.scene, rendered.render, rendered.moved, rendered.detections),
+        CompositorRenderer(objective.compositor, objective.labeller),
+        objective.classes,
+        EvaluatedScene(benign.scene, benign.render, benign.paper, benign.detections),
+        EvaluatedScene(evaluation.scene, evaluation.render, evaluation.moved, evaluation.detections),
         placebo,
     )
-    grades = settings.grader.grade(case, failures)
-    records = failure_records(objective.judged, rendered.moved.targets, rendered.detections, failures, grades)
+    grades = grader.grade(grading_input, failures)
+    records = build_failure_records(objective.classes, moved, evaluation.detections, failures, grades)
     return records, grades.notes
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """A scene as it was judged: rendered, labelled, looked at. detections: labels among the judged classes."""
+class EvaluatedScene:
+    """A state of a scene, rendered, labelled and detected."""
 
     scene: SceneIR
+    """The scene."""
     render: Render
-    labels: MovedLabels
+    """Its render."""
+    labels: SceneLabels
+    """Its labels."""
     detections: Detections
+    """Detections; labels are indices into the evaluated classes."""
 
 
-def case_of(
+def build_grading_input(
     identifier: str,
-    renderer: CompositorDraw,
-    judged: JudgedClasses,
-    benign: State,
-    now: State,
+    renderer: CompositorRenderer,
+    classes: EvaluatedClasses,
+    benign: EvaluatedScene,
+    attacked: EvaluatedScene,
     placebo: Callable[[], SceneIR] | None = None,
-) -> Case:
-    """What a grader is to look at. placebo: as of `Case`."""
+) -> GradingInput:
+    """The input of a grader.
 
-    def view(state: State) -> View:
-        targets = judged.targets(state.labels.targets)
-        return View(targets, with_regions(shown_boxes(state.render), targets), state.detections)
+    Args:
+        identifier: name of the frame.
+        renderer: renders states of the scene.
+        classes: the evaluated classes.
+        benign: the scene before the change.
+        attacked: the scene after the change.
+        placebo: makes a random change of the same size; see `GradingInput`.
+    """
 
-    return Case(identifier, benign.scene, now.scene, renderer, view(benign), view(now), placebo)
+    def label_detections(state: EvaluatedScene) -> LabelledDetections:
+        targets = classes.map_targets(state.labels.targets)
+        boxes = pad_visible_boxes(visible_boxes(state.render), targets)
+        return LabelledDetections(targets, boxes, state.detections)
+
+    before, after = label_detections(benign), label_detections(attacked)
+    return GradingInput(identifier, benign.scene, attacked.scene, renderer, before, after, placebo)
 
 
-def failure_records(
-    judged: JudgedClasses,
+def build_failure_records(
+    classes: EvaluatedClasses,
     moved: Targets,
     detections: Detections,
-    failures: Failures,
-    grades: Grades | None = None,
+    failures: FrameFailures,
+    grades: FrameGrades | None = None,
 ) -> tuple[Failure, ...]:
-    """Failures as records: lost objects, then phantoms. moved: labels among CLASSES; detections: among the judged
-    classes; grades: of these failures, None where nobody asked.
+    """Failures as records: lost objects, then phantoms.
+
+    Args:
+        classes: the evaluated classes, which the detections' labels index.
+        moved: targets with labels among CLASSES.
+        detections: detections after the change.
+        failures: the failures.
+        grades: of these failures; None leaves them ungraded.
     """
     lost = [
         Failure(
-            "lost", CLASSES[int(moved.labels[i])], _xyxy(moved.boxes_xyxy[i]), index=i, **_of(grades, "lost", i)
+            "lost",
+            CLASSES[int(moved.labels[i])],
+            _xyxy(moved.boxes_xyxy[i]),
+            index=i,
+            **_grade_fields(grades, "lost", i),
         )
         for i in failures.lost
     ]
     phantoms = [
         Failure(
             "phantom",
-            judged.names[int(detections.labels[i])],
+            classes.names[int(detections.labels[i])],
             _xyxy(detections.boxes_xyxy[i]),
             score=float(detections.scores[i]),
-            **_of(grades, "phantoms", i),
+            **_grade_fields(grades, "phantoms", i),
         )
         for i in failures.phantoms
     ]
     return (*lost, *phantoms)
 
 
-def _of(grades: Grades | None, which: Literal["lost", "phantoms"], index: int) -> dict[str, Any]:
-    """The fields of a failure's record that say what it is and how sure."""
+def _grade_fields(grades: FrameGrades | None, which: Literal["lost", "phantoms"], index: int) -> dict[str, Any]:
+    """The fields of a failure's record that hold its kind and grade."""
     if grades is None:
         return {}
-    graded: Graded | None = getattr(grades, which).get(index)
+    graded: GradedFault | None = getattr(grades, which).get(index)
     if graded is None:
         return {"grade": str(Grade.THRESHOLD)}
     fields = {"error": str(graded.fault.kind), "grade": str(graded.grade), "count": graded.count}
@@ -404,7 +300,7 @@ def detection_records(detections: Detections, names: tuple[str, ...]) -> tuple[B
     return tuple(BoxRecord(_xyxy(box), names[label], score=score) for box, label, score in rows)
 
 
-def as_targets(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Targets:
+def targets_from_records(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Targets:
     """The inverse of `target_records`."""
     return Targets(
         boxes_xyxy=torch.tensor([r.xyxy for r in records], dtype=torch.float32).reshape(-1, 4),
@@ -413,7 +309,7 @@ def as_targets(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Target
     )
 
 
-def as_detections(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Detections:
+def detections_from_records(records: tuple[BoxRecord, ...], names: tuple[str, ...]) -> Detections:
     """The inverse of `detection_records`."""
     return Detections(
         boxes_xyxy=torch.tensor([r.xyxy for r in records], dtype=torch.float32).reshape(-1, 4),

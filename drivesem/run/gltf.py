@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.failures.second_renderer.photograph import PhotographRedraw
-from drivesem.failures.second_renderer.placing import Lens
+from drivesem.failures.second_renderer.geometry import PictureCamera
+from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.scenes.sources import scene_folders
 from scene_ir import files
 from scene_ir.io import load_scene, to_uint8
@@ -35,17 +35,17 @@ def export_scenes(source: Path, out: Path) -> list[str]:
     """
     written: list[str] = []
     for name, folder in scene_folders(source).items():
-        files.write_bytes(out / f"{name}.glb", glb_of(name, load_scene(folder)))
+        files.write_bytes(out / f"{name}.glb", scene_to_glb(name, load_scene(folder)))
         written.append(f"{name}.glb")
     return written
 
 
-def glb_of(name: str, scene: SceneIR) -> bytes:
+def scene_to_glb(name: str, scene: SceneIR) -> bytes:
     """A scene as a GLB file: meshes "vehicle-0" and so on, and "surroundings"."""
     import trimesh
 
     whole = trimesh.Scene()
-    for i, (corners, skin) in enumerate(PhotographRedraw(name, scene).skinned(scene)):
+    for i, (corners, skin) in enumerate(PhotographRenderer(name, scene).textured_vehicles(scene)):
         faces = np.arange(corners.shape[0] * 3).reshape(-1, 3)
         points = corners.reshape(-1, 3) * _TO_GLTF
         whole.add_geometry(_textured(points, faces, skin.uv, skin.texture), geom_name=f"vehicle-{i}")
@@ -74,7 +74,7 @@ def _textured(points: NDArray[Any], faces: NDArray[Any], uv: NDArray[Any], pictu
 
 def _relief(scene: SceneIR) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """The background as a surface: points (N, 3) m in the camera's own axes, faces (M, 3), uv (N, 2) upwards."""
-    lens = Lens.of(scene.camera)
+    lens = PictureCamera.from_camera(scene.camera)
     depth = np.minimum(scene.origin.depth.cpu().numpy().astype(np.float32), FARTHEST_M)
     rows = np.unique(np.append(np.arange(0, lens.height, STEP_PX), lens.height - 1))
     columns = np.unique(np.append(np.arange(0, lens.width, STEP_PX), lens.width - 1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -13,11 +14,10 @@ from typing import Any, NoReturn, TypeVar
 
 import torch
 
-from detectors.adapters.module import RAISES_NOTHING, blamed
+from detectors.adapters.module import RAISES_NOTHING, describe_user_error
 from detectors.base import DetectorError
 from drivesem import store
 from drivesem.config.errors import UsageError
-from drivesem.run.allocation import keep_freed
 from scene_ir.errors import SceneError, WriteError
 
 J = TypeVar("J")
@@ -45,7 +45,7 @@ class Start:
 def begin(start: Start) -> None:
     """Once in a process, before its first job."""
     global _work
-    keep_freed()
+    keep_freed_memory()
     torch.set_num_threads(start.threads)
     store.write_to(start.elsewhere)
     _work = partial(attempt, start.build(), start.keep_going)
@@ -75,7 +75,7 @@ def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:
         raise
     except Exception as error:
         if not keep_going:
-            if (told := blamed(error)) is not None:
+            if (told := describe_user_error(error)) is not None:
                 raise UsageError("--detector", RAISES_NOTHING, told) from error
             raise
         last = traceback.extract_tb(error.__traceback__)[-1]
@@ -106,3 +106,25 @@ def ended() -> NoReturn:
     raise UnforeseenError(
         "drivesem", "a process that lasts", "one that was ended twice, for want of memory perhaps"
     )
+
+
+_LARGEST_MB, _KEPT_MB = 32, 256
+"""Blocks of a layer or a picture are smaller than the first, the most that glibc takes; of what is free, so much
+stays."""
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
+"""Source: glibc's malloc.h."""
+
+
+def keep_freed_memory() -> None:
+    """Freed memory stays with the process, up to a limit. By default glibc gives large blocks back to the system,
+    which clears each page of them when the next pass asks for them: a tenth of what a detector's pass takes.
+
+    Where there is another allocator, or the environment says how glibc's is to behave, all stays as it is.
+    """
+    told = any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ)
+    if told or not sys.platform.startswith("linux"):
+        return
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        set_option(_MMAP_THRESHOLD, _LARGEST_MB << 20)
+        set_option(_TRIM_THRESHOLD, _KEPT_MB << 20)

@@ -18,7 +18,7 @@ _held: dict[Path, BaseFileLock] = {}
 """Of this process, by file."""
 
 
-def hold(folder: Path) -> None:
+def acquire_folder_lock(folder: Path) -> None:
     """Make `folder`, and keep other processes that ask from writing into it, until `let_go` or this process' end.
 
     This process may ask again. Raises UsageError where another one holds the folder,
@@ -26,13 +26,13 @@ def hold(folder: Path) -> None:
     """
     from filelock import FileLock, Timeout  # when needed: `drivesem --help` starts without
 
-    from scene_ir.files import writing
+    from scene_ir.files import name_write_errors
 
     path = folder.resolve() / LOCK
     if path in _held:
         return
     lock = FileLock(path)
-    with writing(folder):
+    with name_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire(blocking=False)
@@ -41,7 +41,7 @@ def hold(folder: Path) -> None:
     _held[path] = lock
 
 
-def held_elsewhere(folder: Path) -> bool:
+def is_locked_elsewhere(folder: Path) -> bool:
     """Whether another process writes into the folder now."""
     from filelock import FileLock, Timeout
 
@@ -58,7 +58,7 @@ def held_elsewhere(folder: Path) -> bool:
 
 
 @contextmanager
-def let_go() -> Iterator[None]:
+def release_folder_locks() -> Iterator[None]:
     """What is held inside is free at the end."""
     before = set(_held)
     try:

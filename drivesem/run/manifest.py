@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from detectors.registry import ONNX
-from drivesem.config.commands import Attack
-from drivesem.run.folder import FRAMES, settings_of
+from drivesem.config.commands import AttackConfig
+from drivesem.run.folder import FRAMES, result_settings
 from drivesem.run.frame import RESULT
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-OF_PLACE_AND_TIME = ("out", "seconds")
+VOLATILE_KEYS = ("out", "seconds")
 """Keys of metrics.json and result.json that differ between two runs with the same settings: in no hash."""
-OF_RUN = ("frames_without_vehicles", "frames_failed")
-OF_FRAME = (
+HASHED_RUN_FIELDS = ("frames_without_vehicles", "frames_failed")
+HASHED_FRAME_FIELDS = (
     *("loss_trace", "queries", "passes", "active_constraints", "violated_at_start", "became_ignored"),
     *("failures", "grade_notes", "checked_by", "change"),
 )
@@ -39,7 +39,9 @@ _PACKAGES = (
 )
 
 
-def manifest_of(config: Attack, out: Path, names: Sequence[str], metrics: Mapping[str, Any]) -> dict[str, Any]:
+def build_manifest(
+    config: AttackConfig, out: Path, names: Sequence[str], metrics: Mapping[str, Any]
+) -> dict[str, Any]:
     """The manifest of the run in `out`. names: of its frames; metrics: as metrics.json has them."""
     packages = [*_PACKAGES]
     packages += ["cma"] if config.method == "cma-es" else []
@@ -47,19 +49,20 @@ def manifest_of(config: Attack, out: Path, names: Sequence[str], metrics: Mappin
     return {
         "versions": {package: importlib.metadata.version(package) for package in packages},
         "seed": config.seed,
-        "settings": settings_of(config),
-        "metrics": digest_of(metrics),
-        "frames": {name: frame_hashes(out / FRAMES / name) for name in names},
+        "settings": result_settings(config),
+        "metrics": hash_json(metrics),
+        "frames": {name: hash_frame_files(out / FRAMES / name) for name in names},
         "fields": {
-            "run": field_hashes(metrics, OF_RUN),
+            "run": hash_fields(metrics, HASHED_RUN_FIELDS),
             "frames": {
-                name: field_hashes(files.read_json(out / FRAMES / name / RESULT), OF_FRAME) for name in names
+                name: hash_fields(files.read_json(out / FRAMES / name / RESULT), HASHED_FRAME_FIELDS)
+                for name in names
             },
         },
     }
 
 
-def frame_hashes(folder: Path) -> dict[str, str]:
+def hash_frame_files(folder: Path) -> dict[str, str]:
     """SHA-256 of every file of a frame's folder, by its path in there; of result.json without its times. Raises
     FormatError for a file that cannot be read.
     """
@@ -68,19 +71,19 @@ def frame_hashes(folder: Path) -> dict[str, str]:
 
 
 def _hash(path: Path, folder: Path) -> str:
-    return digest_of(files.read_json(path)) if path == folder / RESULT else files.digest(path)
+    return hash_json(files.read_json(path)) if path == folder / RESULT else files.sha256_digest(path)
 
 
-def field_hashes(data: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
+def hash_fields(data: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
     """The first digits of the SHA-256 of single values of a JSON object, null for those that it lacks."""
     return {name: _sha(data.get(name))[:_DIGITS] for name in names}
 
 
-def digest_of(data: Any) -> str:
+def hash_json(data: Any) -> str:
     """SHA-256 of a JSON object without OF_PLACE_AND_TIME. Raises FormatError where it is none."""
     if not isinstance(data, Mapping):
         raise FormatError("a run's figures", "an object", type(data).__name__)
-    told = {key: value for key, value in data.items() if key not in OF_PLACE_AND_TIME}
+    told = {key: value for key, value in data.items() if key not in VOLATILE_KEYS}
     return _sha(told)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from drivesem.report.tables import csv_table
+from drivesem.report.tables import cells_to_csv
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -82,7 +82,7 @@ def load_record(path: Path, kind: type[T], schema: int) -> T:
 def dump_rows(kind: type[Any], rows: Iterable[Any]) -> str:
     """Dataclasses of plain fields as CSV, a column a field: nothing for None, and true or false."""
     columns = list(_hints(kind))
-    return csv_table(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
+    return cells_to_csv(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
 
 
 def _cell(value: Any) -> Any:

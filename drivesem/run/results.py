@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from drivesem.evaluation.coco import Scores
-from drivesem.failures.grades import Agreement, Count
+from drivesem.evaluation.coco import CocoScores
+from drivesem.failures.grades import Certificate, SecondOpinion
 from drivesem.run.records import from_json
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -62,16 +62,16 @@ class Failure:
     score: float | None = None
     error: str | None = None
     grade: str | None = None
-    count: Count | None = None
-    second: Agreement | None = None
-    peer: Agreement | None = None
+    count: Certificate | None = None
+    second: SecondOpinion | None = None
+    peer: SecondOpinion | None = None
 
-    def flat(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """A flat dict: kind (as `truth.kinds`), grade, draws and second opinions; boxes in px; None where unknown.
 
         by_threshold is lost or phantom; right_before, wrong_after are draws, of draws_before, draws_after.
         """
-        count, (x0, y0, x1, y1) = self.count or Count(), self.xyxy
+        count, (x0, y0, x1, y1) = self.count or Certificate(), self.xyxy
         row: dict[str, Any] = {"kind": self.error, "grade": self.grade, "by_threshold": self.kind}
         row |= {"label": self.label, "object": self.index, "score": self.score}
         row |= {"right_before": count.before, "draws_before": count.before_draws}
@@ -144,10 +144,10 @@ class RunSummary:
     frames_without_vehicles: int
     frames_failed: dict[str, str]
     objects: int
-    benign: Scores
-    rerendered: Scores
-    attacked_paper: Scores
-    attacked_moved: Scores
+    benign: CocoScores
+    rerendered: CocoScores
+    attacked_paper: CocoScores
+    attacked_moved: CocoScores
     lost_objects: dict[str, int]
     phantoms: dict[str, int]
     successes_paper: int

@@ -20,20 +20,20 @@ import cv2
 import torch
 
 from drivesem import store
-from drivesem.config.blocks import Sharing
-from drivesem.run.cluster import on_ray
+from drivesem.config.options import WorkerOptions
+from drivesem.run.cluster import run_jobs_on_ray
 from drivesem.run.jobs import Start, attempt, begin, do, ended
 
 J = TypeVar("J")
 R = TypeVar("R")
 
 
-def outcomes(
-    work: Callable[[J], R],
-    build: Callable[[], Callable[[J], R]],
+def run_jobs(
+    worker: Callable[[J], R],
+    make_worker: Callable[[], Callable[[J], R]],
     jobs: Sequence[J],
-    config: Sharing,
-    apart: bool = False,
+    config: WorkerOptions,
+    in_subprocess: bool = False,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     """Each job with a call that gives its result or raises what went wrong, as they are done.
 
@@ -44,7 +44,7 @@ def outcomes(
     is not there.
     """
     elsewhere = store.current()
-    for job, outcome in _outcomes(work, build, jobs, config, apart):
+    for job, outcome in _outcomes(worker, make_worker, jobs, config, in_subprocess):
         yield job, outcome
         if elsewhere is not None:
             elsewhere.keep()
@@ -56,11 +56,11 @@ def _outcomes(
     work: Callable[[J], R],
     build: Callable[[], Callable[[J], R]],
     jobs: Sequence[J],
-    config: Sharing,
+    config: WorkerOptions,
     apart: bool,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     if config.engine == "ray":
-        yield from on_ray(Start(build, 1, config.keep_going, store.current()), jobs, config)
+        yield from run_jobs_on_ray(Start(build, 1, config.keep_going, store.current()), jobs, config)
         return
     # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
     # No more than torch would take by itself: OMP_NUM_THREADS says what is left beside other work.
@@ -78,11 +78,13 @@ def _outcomes(
         torch.set_num_threads(before)  # what follows, such as training, is alone again
 
 
-def mapping(config: Sharing, apart: bool = False) -> Callable[[Callable[[J], R], Sequence[J]], Iterator[R]]:
+def make_parallel_map(
+    config: WorkerOptions, in_subprocess: bool = False
+) -> Callable[[Callable[[J], R], Sequence[J]], Iterator[R]]:
     """What does jobs that nothing has to be made for, and gives their results as they are done; see `outcomes`."""
 
     def over(work: Callable[[J], R], jobs: Sequence[J]) -> Iterator[R]:
-        for _, outcome in outcomes(work, partial(_as_it_is, work), jobs, config, apart):
+        for _, outcome in run_jobs(work, partial(_as_it_is, work), jobs, config, in_subprocess):
             yield outcome()
 
     return over

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from drivesem.evaluation.coco import STATS
-from drivesem.evaluation.results import Result
+from drivesem.evaluation.results import EvaluationMetrics
 from drivesem.report.plots import write_bars, write_curves
-from drivesem.report.tables import Sheet, csv_table, number_of, percent
+from drivesem.report.tables import ReportTable, cells_to_csv, format_count, format_percent
 from drivesem.report.terminal import Console
 from scene_ir import files
 
@@ -26,27 +26,27 @@ def _signed(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:+.2f}"
 
 
-def sheets(result: Result, wide: bool = False) -> list[Sheet]:
+def build_evaluation_tables(result: EvaluationMetrics, wide: bool = False) -> list[ReportTable]:
     """The tables of an evaluation, the protocol's own figures first. wide: parts by class beside one another."""
-    found: list[Sheet] = []
+    found: list[ReportTable] = []
     if result.stats is not None:
-        rows = zip(STATS, _COCO_WORDS, map(percent, result.stats), strict=True)
-        found.append(Sheet("COCO, all classes, %", ("figure", "what", "%"), tuple(rows)))
+        rows = zip(STATS, _COCO_WORDS, map(format_percent, result.stats), strict=True)
+        found.append(ReportTable("COCO, all classes, %", ("figure", "what", "%"), tuple(rows)))
     if result.rows:
         kit = result.facts["small_detections"]
         found.append(
-            Sheet(
+            ReportTable(
                 f"KITTI 2D, %; small detections: {kit}",
                 ("class", "difficulty", "R40", "R11", "objects"),
                 tuple(
-                    (r.name, r.difficulty, percent(r.r40), percent(r.r11), str(r.ground_truth))
+                    (r.name, r.difficulty, format_percent(r.r40), format_percent(r.r11), str(r.ground_truth))
                     for r in result.rows
                 ),
             )
         )
     further = list(dict.fromkeys(key for row in result.classes for key in row.further))
     found.append(
-        Sheet(
+        ReportTable(
             "Classes, %; t*: score of best F1",
             (
                 "class",
@@ -62,9 +62,18 @@ def sheets(result: Result, wide: bool = False) -> list[Sheet]:
             ),
             tuple(
                 (
-                    *(c.name, f"{c.overlap:g}", percent(c.ap), *(percent(c.further.get(k)) for k in further)),
-                    *(percent(c.recall), "-" if c.t_star is None else f"{c.t_star:.3f}", percent(c.f1)),
-                    *(percent(c.precision_at_t_star), percent(c.recall_at_t_star), str(c.objects)),
+                    *(
+                        c.name,
+                        f"{c.overlap:g}",
+                        format_percent(c.ap),
+                        *(format_percent(c.further.get(k)) for k in further),
+                    ),
+                    *(
+                        format_percent(c.recall),
+                        "-" if c.t_star is None else f"{c.t_star:.3f}",
+                        format_percent(c.f1),
+                    ),
+                    *(format_percent(c.precision_at_t_star), format_percent(c.recall_at_t_star), str(c.objects)),
                 )
                 for c in result.classes
             ),
@@ -75,20 +84,23 @@ def sheets(result: Result, wide: bool = False) -> list[Sheet]:
     if result.intervals:
         draws, frames = result.facts["bootstrap"], result.facts["frames"]
         found.append(
-            Sheet(
-                f"95 % intervals, %; {number_of(draws, 'bootstrap draw')} of {number_of(frames, 'frame')}",
+            ReportTable(
+                f"95 % intervals, %; {format_count(draws, 'bootstrap draw')} of {format_count(frames, 'frame')}",
                 ("figure", "value", "low", "high"),
-                tuple((i.name, percent(i.value), percent(i.low), percent(i.high)) for i in result.intervals),
+                tuple(
+                    (i.name, format_percent(i.value), format_percent(i.low), format_percent(i.high))
+                    for i in result.intervals
+                ),
             )
         )
     if result.comparison:
         found.append(
-            Sheet(
+            ReportTable(
                 "Second minus first, percentage points; paired over frames",
                 ("figure", "first", "second", "difference", "low", "high", "p"),
                 tuple(
                     (
-                        *(d.name, percent(d.first), percent(d.second), _signed(d.difference)),
+                        *(d.name, format_percent(d.first), format_percent(d.second), _signed(d.difference)),
                         *(_signed(d.low), _signed(d.high), "-" if d.p is None else f"{d.p:.4f}"),
                     )
                     for d in result.comparison
@@ -98,42 +110,47 @@ def sheets(result: Result, wide: bool = False) -> list[Sheet]:
     return found
 
 
-def _parts(result: Result) -> Sheet:
-    rows = ((p.name, p.by, p.part, percent(p.ap), percent(p.recall), str(p.objects)) for p in result.parts)
+def _parts(result: EvaluationMetrics) -> ReportTable:
+    rows = (
+        (p.name, p.by, p.part, format_percent(p.ap), format_percent(p.recall), str(p.objects))
+        for p in result.parts
+    )
     title = "Parts, %; objects elsewhere are ignored, false positives count everywhere"
-    return Sheet(title, ("class", "by", "part", "AP", "recall", "objects"), tuple(rows))
+    return ReportTable(title, ("class", "by", "part", "AP", "recall", "objects"), tuple(rows))
 
 
-def _wide_parts(result: Result) -> Sheet:
+def _wide_parts(result: EvaluationMetrics) -> ReportTable:
     names = tuple(row.name for row in result.classes if any(p.name == row.name for p in result.parts))
-    cells = {(p.by, p.part, p.name): f"{percent(p.recall)} of {p.objects}" for p in result.parts}
+    cells = {(p.by, p.part, p.name): f"{format_percent(p.recall)} of {p.objects}" for p in result.parts}
     places = dict.fromkeys((p.by, p.part) for p in result.parts)
     rows = ((*place, *(cells.get((*place, name), "-") for name in names)) for place in places)
-    return Sheet("Recall by part, %, and objects", ("by", "part", *names), tuple(rows))
+    return ReportTable("Recall by part, %, and objects", ("by", "part", *names), tuple(rows))
 
 
-def print_result(result: Result, console: Console) -> None:
+def print_evaluation(result: EvaluationMetrics, console: Console) -> None:
     """The tables, and what a reader must know."""
-    for sheet in sheets(result, wide=True):
-        console.print(*sheet.tables(console, _WORDS, min_width=min(len(sheet.title) + 4, console.width)), sep="\n")
+    for sheet in build_evaluation_tables(result, wide=True):
+        console.print(
+            *sheet.fit_to_console(console, _WORDS, min_width=min(len(sheet.title) + 4, console.width)), sep="\n"
+        )
     facts = result.facts
     counted = f", counted by {facts['engine']}" if "engine" in facts else ""
     console.print(
-        f"{number_of(facts['frames'], 'frame')}, {number_of(facts['objects'], 'object')}, "
-        f"{number_of(facts['detections'], 'detection')}{counted}"
+        f"{format_count(facts['frames'], 'frame')}, {format_count(facts['objects'], 'object')}, "
+        f"{format_count(facts['detections'], 'detection')}{counted}"
     )
     for note in result.notes:
         console.print(note, soft_wrap=True)
 
 
-def write_report(out: Path, result: Result) -> None:
+def write_evaluation(out: Path, result: EvaluationMetrics) -> None:
     """metrics.json, one CSV a table, curves.csv, report.md and PNGs in `out`."""
     files.write_json(out / "metrics.json", result.to_json())
-    for sheet in sheets(result):
+    for sheet in build_evaluation_tables(result):
         cells = [["" if cell == "-" else cell for cell in row] for row in sheet.rows]
-        files.write_text(out / f"{_file_name(sheet.title)}.csv", csv_table(sheet.columns, cells))
+        files.write_text(out / f"{_file_name(sheet.title)}.csv", cells_to_csv(sheet.columns, cells))
     rows = [(name, *(f"{value:.6f}" for value in row)) for name, curve in result.curves.items() for row in curve]
-    files.write_text(out / "curves.csv", csv_table(("class", "recall", "precision", "score"), rows))
+    files.write_text(out / "curves.csv", cells_to_csv(("class", "recall", "precision", "score"), rows))
     pictures = _pictures(out, result)
     files.write_text(out / "report.md", _markdown(result, pictures))
 
@@ -143,7 +160,7 @@ def _file_name(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", re.split(r"[,;]", title)[0].lower()).strip("-")
 
 
-def _pictures(out: Path, result: Result) -> dict[str, str]:
+def _pictures(out: Path, result: EvaluationMetrics) -> dict[str, str]:
     """File name -> what it shows."""
     found: dict[str, str] = {}
     overlaps = {row.name: row.overlap for row in result.classes}
@@ -157,7 +174,7 @@ def _pictures(out: Path, result: Result) -> dict[str, str]:
         write_curves(out / "precision-recall.png", "Precision over recall", curves)
     for name in dict.fromkeys(row.name for row in result.rows if row.r40 is not None):
         official = {
-            f"{row.difficulty}, R40 {percent(row.r40)} %": _reached(row.precision)
+            f"{row.difficulty}, R40 {format_percent(row.r40)} %": _reached(row.precision)
             for row in result.rows
             if row.name == name and row.r40 is not None
         }
@@ -184,13 +201,13 @@ def _reached(precision: Sequence[float]) -> tuple[list[float], list[float]]:
     return [k / (len(precision) - 1) for k in range(count)], list(precision[:count])
 
 
-def _markdown(result: Result, pictures: Mapping[str, str]) -> str:
+def _markdown(result: EvaluationMetrics, pictures: Mapping[str, str]) -> str:
     facts = result.facts
     lines = [f"# Evaluation, protocol {result.protocol}", ""]
     lines += [f"- {key}: {value}" for key, value in facts.items()]
     lines += [f"- {note}" for note in result.notes]
-    for sheet in sheets(result):
-        lines += ["", *sheet.markdown(_WORDS)]
+    for sheet in build_evaluation_tables(result):
+        lines += ["", *sheet.to_markdown(_WORDS)]
     for file, text in pictures.items():
         lines += ["", f"![{text}]({file})"]
     return "\n".join(lines) + "\n"

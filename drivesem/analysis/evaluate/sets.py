@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from drivesem.config.commands import Eval
+from drivesem.config.commands import EvalConfig
+from drivesem.config.constraints import parse_class_map
 from drivesem.config.errors import UsageError
-from drivesem.config.values import class_map
 from drivesem.data.kitti_labels import TYPES
 from drivesem.data.label_table import REGION, LabelTable
 from drivesem.evaluation import kitti
-from drivesem.evaluation.instances import Found, Truths, from_xywh, from_xyxy
-from drivesem.report.tables import number_of
-from drivesem.run.labels import layout_of, read
+from drivesem.evaluation.instances import DetectionTable, GroundTruthTable, boxes_from_xywh, boxes_from_xyxy
+from drivesem.report.tables import format_count
+from drivesem.run.labels import detect_labels_layout, read_labels
 from drivesem.store import place
 from scene_ir import files
 
@@ -25,21 +25,21 @@ _KITTI_TYPES = tuple(kind for kind in TYPES if kind != "DontCare")
 
 
 @dataclass(frozen=True, slots=True)
-class EvalSet:
+class EvaluationData:
     """Labels and one or two sets of detections. classes: labels are indices into it. truth_ids (M,): as the file
     numbers the labels, where it does. weather (F,): of the frames. notes: what a reader of the figures must know.
     """
 
     frames: tuple[str, ...]
     classes: tuple[str, ...]
-    truths: Truths
-    found: list[Found]
+    truths: GroundTruthTable
+    found: list[DetectionTable]
     truth_ids: np.ndarray | None
     weather: tuple[str | None, ...]
     notes: tuple[str, ...] = ()
 
 
-def open_sets(config: Eval) -> EvalSet:
+def load_evaluation_data(config: EvalConfig) -> EvaluationData:
     """Read, map and align what the configuration names.
 
     UsageError or FormatError, one line: ids that do not match, a class that nobody mapped, a score that is no
@@ -47,15 +47,15 @@ def open_sets(config: Eval) -> EvalSet:
     """
     gt_path = place(config.gt or "", "--gt")
     paths = [place(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
-    gt_layout = layout_of(gt_path) if config.gt_format == "auto" else config.gt_format
-    truth = read(gt_path, gt_layout, stage=config.stage)
+    gt_layout = detect_labels_layout(gt_path) if config.gt_format == "auto" else config.gt_format
+    truth = read_labels(gt_path, gt_layout, stage=config.stage)
     wanted = _wanted(config, truth)
     gt_known = _known(gt_layout, truth)
     stages = (config.stage, config.stage_b or config.stage)
     tables: list[LabelTable] = []
     for path, stage in zip(paths, stages, strict=False):
-        layout = layout_of(path) if config.pred_format == "auto" else config.pred_format
-        table = read(path, layout, scored=True, stage=stage, truth=truth)
+        layout = detect_labels_layout(path) if config.pred_format == "auto" else config.pred_format
+        table = read_labels(path, layout, scored=True, stage=stage, truth=truth)
         # KITTI and runs have a file for every frame; in other layouts a frame without detections has none
         needed = (wanted or truth.frames) if layout in ("kitti", "run") else ()
         table = _aligned(table, truth, path, needed)
@@ -67,16 +67,17 @@ def open_sets(config: Eval) -> EvalSet:
     classes = _classes(config, truth, tables, gt_known)
     chosen = _chosen(config, classes)
     truths, ids = _truths(
-        _renamed(truth, class_map("--map-gt", config.map_gt), classes, gt_path, "--map-gt"), chosen
+        _renamed(truth, parse_class_map("--map-gt", config.map_gt), classes, gt_path, "--map-gt"), chosen
     )
     found = [
         _found(
-            _renamed(table, class_map("--map", config.map), classes, path, "--map").in_edges(truth.edges), chosen
+            _renamed(table, parse_class_map("--map", config.map), classes, path, "--map").in_edges(truth.edges),
+            chosen,
         )
         for table, path in zip(tables, paths, strict=True)
     ]
     judged = tuple(classes) if chosen is None else tuple(chosen)
-    return EvalSet(truth.frames, judged, truths, found, ids, tuple(truth.weather()), _notes(config, truths))
+    return EvaluationData(truth.frames, judged, truths, found, ids, tuple(truth.weather()), _notes(config, truths))
 
 
 def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
@@ -89,7 +90,7 @@ def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*fixed, *truth.kinds)))
 
 
-def _wanted(config: Eval, truth: LabelTable) -> tuple[str, ...] | None:
+def _wanted(config: EvalConfig, truth: LabelTable) -> tuple[str, ...] | None:
     if config.frames is None:
         return None
     names = [line.strip() for line in files.read_text(Path(config.frames)).splitlines() if line.strip()]
@@ -120,15 +121,15 @@ def _aligned(table: LabelTable, truth: LabelTable, path: Path, needed: Sequence[
 
 
 def _classes(
-    config: Eval, truth: LabelTable, tables: Sequence[LabelTable], known: Sequence[str]
+    config: EvalConfig, truth: LabelTable, tables: Sequence[LabelTable], known: Sequence[str]
 ) -> tuple[str, ...]:
     """All class names after mapping. For KITTI its types; else those of the labels, and of detections by them."""
     if config.protocol == "kitti":
         return _KITTI_TYPES
-    mapping = class_map("--map-gt", config.map_gt)
+    mapping = parse_class_map("--map-gt", config.map_gt)
     names = [mapping.get(kind, kind) for kind in truth.kinds]
     allowed = {mapping.get(kind, kind) for kind in known} | set(names)
-    own = class_map("--map", config.map)
+    own = parse_class_map("--map", config.map)
     detected = {own.get(kind, kind) for table in tables for kind in _used(table)}
     extra = sorted(name for name in detected if name is not None and name in allowed and name not in names)
     return tuple(dict.fromkeys(name for name in (*names, *extra) if name is not None))
@@ -139,10 +140,10 @@ def _used(table: LabelTable) -> list[str]:
     return [table.kinds[i] for i in np.unique(table.kind[table.kind >= 0]).tolist()]
 
 
-def _chosen(config: Eval, classes: Sequence[str]) -> tuple[str, ...] | None:
+def _chosen(config: EvalConfig, classes: Sequence[str]) -> tuple[str, ...] | None:
     if config.classes is None:
         return None
-    names = chosen_classes(config.classes)
+    names = parse_class_list(config.classes)
     for name in names:
         if name not in classes:
             raise UsageError("--classes", f"some of {', '.join(classes)}", repr(name))
@@ -150,7 +151,7 @@ def _chosen(config: Eval, classes: Sequence[str]) -> tuple[str, ...] | None:
     return None if config.protocol == "kitti" else names
 
 
-def chosen_classes(text: str) -> tuple[str, ...]:
+def parse_class_list(text: str) -> tuple[str, ...]:
     """The names of "Car,Van", each once."""
     return tuple(dict.fromkeys(word.strip() for word in text.split(",")))
 
@@ -181,7 +182,7 @@ def _renamed(
                 raise UsageError(
                     f"{path}: class {kind!r}",
                     expected,
-                    f"{number_of(int((table.kind == i).sum()), 'box', 'boxes')} of it",
+                    f"{format_count(int((table.kind == i).sum()), 'box', 'boxes')} of it",
                 )
         places[i] = place
     kind = places[table.kind]  # REGION, -1, is the last place
@@ -203,10 +204,10 @@ def _selection(
     return labels != len(chosen), labels
 
 
-def _truths(table: LabelTable, chosen: Sequence[str] | None) -> tuple[Truths, np.ndarray | None]:
+def _truths(table: LabelTable, chosen: Sequence[str] | None) -> tuple[GroundTruthTable, np.ndarray | None]:
     keep, labels = _selection(table.kind, table.kinds, chosen)
-    boxes = from_xywh(table.boxes) if table.edges == "xywh" else from_xyxy(table.boxes)
-    truths = Truths(
+    boxes = boxes_from_xywh(table.boxes) if table.edges == "xywh" else boxes_from_xyxy(table.boxes)
+    truths = GroundTruthTable(
         frames=len(table.frames),
         frame=table.frame,
         label=labels,
@@ -218,23 +219,23 @@ def _truths(table: LabelTable, chosen: Sequence[str] | None) -> tuple[Truths, np
         area=np.where(np.isnan(table.area), boxes[:, 4] * boxes[:, 5], table.area),
     )
     ids = table.box_ids
-    return (truths, ids) if keep.all() else (truths.rows(keep), None if ids is None else ids[keep])
+    return (truths, ids) if keep.all() else (truths.select(keep), None if ids is None else ids[keep])
 
 
-def _found(table: LabelTable, chosen: Sequence[str] | None) -> Found:
+def _found(table: LabelTable, chosen: Sequence[str] | None) -> DetectionTable:
     keep, labels = _selection(table.kind, table.kinds, chosen)
-    boxes = from_xywh(table.boxes) if table.edges == "xywh" else from_xyxy(table.boxes)
-    return Found(table.frame, labels, boxes, table.score).rows(keep & (labels >= 0))
+    boxes = boxes_from_xywh(table.boxes) if table.edges == "xywh" else boxes_from_xyxy(table.boxes)
+    return DetectionTable(table.frame, labels, boxes, table.score).select(keep & (labels >= 0))
 
 
-def _notes(config: Eval, truths: Truths) -> tuple[str, ...]:
+def _notes(config: EvalConfig, truths: GroundTruthTable) -> tuple[str, ...]:
     """What a reader of the figures must know."""
     notes: list[str] = []
     if config.protocol == "kitti":
         unknown = int(((truths.occlusion < 0) & ~truths.ignore & (truths.label >= 0)).sum())
         if unknown:
             notes.append(
-                number_of(
+                format_count(
                     unknown,
                     "object without occlusion counts as visible",
                     "objects without occlusion count as visible",
@@ -243,7 +244,7 @@ def _notes(config: Eval, truths: Truths) -> tuple[str, ...]:
         unknown = int(((truths.truncation < 0) & ~truths.ignore & (truths.label >= 0)).sum())
         if unknown:
             notes.append(
-                number_of(
+                format_count(
                     unknown,
                     "object without truncation counts as whole",
                     "objects without truncation count as whole",

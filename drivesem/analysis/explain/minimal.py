@@ -1,9 +1,8 @@
-"""The least of a change that still fails: shortened, stripped of what is not needed, shortened again.
+"""Finds the smallest part of a change that still fails: shortens it, drops blocks, and shortens it again.
 
-A change theta is taken back along s * theta, s from 1 to 0, and every point is projected onto the feasible set.
-Failing need not be monotone in s: cars are lost and found again on the way. So scales are looked at on a grid
-first, and the smallest one that fails is bisected against its neighbour, which does not. What fails only between
-two neighbours of the grid is not seen.
+The change theta is scaled by s from 1 to 0, and every point is projected onto the feasible set. Failing need not
+be monotone in s, as objects are lost and found again. So scales are evaluated on a grid first, and the smallest
+that fails is bisected against its neighbour, which does not. Failures between two neighbours are missed.
 """
 
 from __future__ import annotations
@@ -17,64 +16,80 @@ from torch import Tensor
 from scene_ir.errors import RangeError
 
 _HALVINGS = 5
-"""Bisection steps between two neighbours of the grid: with 16 of them a scale is found to 1/512."""
+"""Bisection steps between two neighbours of the grid; a grid of 16 points resolves a scale to 1/512."""
 _ROUNDING = 1e-5
-"""Of norms in float32, relative."""
+"""Relative rounding error of norms in float32."""
 
 
 @dataclass(frozen=True, slots=True)
 class ThetaBlock:
-    """Coordinates that are dropped together. mask (D,) bool."""
+    """Coordinates that are dropped together."""
 
     name: str
+    """Name of the block."""
     mask: Tensor
+    """Its coordinates (D,) bool."""
 
 
 @dataclass(frozen=True, slots=True)
-class LeastSearch:
-    """What the search knows of thetas (D,). project: onto the feasible set. fails: of what was projected. size:
-    the norm that shall be small. points: of the grid of scales, without 0.
-    """
+class MinimalChangeSearch:
+    """Functions of theta (D,) that define the search."""
 
     project: Callable[[Tensor], Tensor]
+    """Projects onto the feasible set."""
     fails: Callable[[Tensor], bool]
+    """Whether the detector fails at a feasible theta."""
     size: Callable[[Tensor], float]
+    """The norm to minimise."""
     points: int
+    """Points of the grid of scales, without 0."""
 
 
 @dataclass(frozen=True, slots=True)
-class Minimal:
-    """theta (D,): the least change that was found, feasible and failing; scale: of what is left of the change.
-
-    scan: whether the whole change fails at each scale of the grid, 0 and 1 included. shortened (D,): after the
-    first bisection; shortened_scale: its scale. dropped: names of blocks, in the order in which they went.
-    """
+class ShortenedChange:
+    """Result of the search."""
 
     theta: Tensor
+    """Smallest change found (D,), feasible and failing."""
     scale: float
+    """Its scale relative to the remaining blocks, in [0, 1]."""
     scan: tuple[bool, ...]
+    """Whether the whole change fails at each scale of the grid, 0 and 1 included."""
     shortened: Tensor
+    """The whole change (D,) after the first bisection."""
     shortened_scale: float
+    """Its scale, in [0, 1]."""
     dropped: tuple[str, ...]
+    """Names of the dropped blocks, in order."""
 
     @property
     def sign_changes(self) -> int:
-        """How often failing begins or ends between neighbours of the grid: 1 where it is monotone."""
+        """Changes between failing and not failing along the grid; 1 if monotone."""
         return sum(a != b for a, b in zip(self.scan, self.scan[1:], strict=False))
 
 
-def minimal(theta: Tensor, blocks: Sequence[ThetaBlock], search: LeastSearch) -> Minimal:
-    """The least of theta (D,) that fails. blocks: what to try to drop, in this order, until nothing more goes.
+def find_minimal_change(
+    theta: Tensor, blocks: Sequence[ThetaBlock], search: MinimalChangeSearch
+) -> ShortenedChange:
+    """Find the smallest part of a change that fails.
 
-    A block goes where the rest, at some scale, still fails and is no larger than what there was. Raises RangeError
-    where theta does not fail.
+    A block is dropped if the rest, at some scale, still fails and is no larger than before. This is repeated until
+    no block can be dropped.
+
+    Args:
+        theta: The change (D,).
+        blocks: Blocks to drop, in this order.
+        search: Functions that define the search.
+
+    Raises:
+        RangeError: The change does not fail, or no change is needed.
     """
     scan = tuple(_fails_at(theta, k / search.points, search) for k in range(search.points + 1))
     if not scan[-1] or scan[0]:
-        found = "one that does not" if not scan[-1] else "a failure without any change"
-        raise RangeError("theta", "a change that fails", found)
+        actual = "one that does not" if not scan[-1] else "a failure without any change"
+        raise RangeError("theta", "a change that fails", actual)
     first = scan.index(True)
-    scale = _bisected(theta, (first - 1) / search.points, first / search.points, search)
+    scale = _bisect(theta, (first - 1) / search.points, first / search.points, search)
     shortened, shortened_scale = search.project(theta * scale), scale
     direction, dropped = theta, []
     again = True
@@ -84,42 +99,44 @@ def minimal(theta: Tensor, blocks: Sequence[ThetaBlock], search: LeastSearch) ->
             rest = torch.where(block.mask, torch.zeros_like(direction), direction)
             if torch.equal(rest, direction) or not bool(rest.any()):
                 continue
-            found = _smallest(rest, search.size(search.project(direction * scale)), search)
-            if found is not None:
-                direction, scale, again = rest, found, True
+            rest_scale = _failing_scale_within(rest, search.size(search.project(direction * scale)), search)
+            if rest_scale is not None:
+                direction, scale, again = rest, rest_scale, True
                 dropped.append(block.name)
     if dropped:
-        scale = _shortest(direction, scale, search)
-    return Minimal(search.project(direction * scale), scale, scan, shortened, shortened_scale, tuple(dropped))
+        scale = _smallest_failing_scale(direction, scale, search)
+    return ShortenedChange(
+        search.project(direction * scale), scale, scan, shortened, shortened_scale, tuple(dropped)
+    )
 
 
-def _fails_at(direction: Tensor, scale: float, search: LeastSearch) -> bool:
+def _fails_at(direction: Tensor, scale: float, search: MinimalChangeSearch) -> bool:
     return search.fails(search.project(direction * scale))
 
 
-def _smallest(direction: Tensor, most: float, search: LeastSearch) -> float | None:
-    """A scale up to 1 that fails and is no larger than `most`; the smallest on half the grid, None without one."""
-    limit = min(1.0, most / search.size(direction))
+def _failing_scale_within(direction: Tensor, max_size: float, search: MinimalChangeSearch) -> float | None:
+    """Return the smallest failing scale on half the grid with a change not larger than `max_size`, or None."""
+    limit = min(1.0, max_size / search.size(direction))
     points = max(search.points // 2, 1)
     for k in range(1, points + 1):
         scale = limit * k / points
         theta = search.project(direction * scale)
-        # Projected, a change may be longer than its scale says: what is feasible need not be star-shaped.
-        if search.size(theta) <= most * (1 + _ROUNDING) and search.fails(theta):
+        # projected, a change may be longer than its scale implies: the feasible set need not be star-shaped
+        if search.size(theta) <= max_size * (1 + _ROUNDING) and search.fails(theta):
             return scale
     return None
 
 
-def _shortest(direction: Tensor, scale: float, search: LeastSearch) -> float:
-    """The smallest failing scale up to `scale`, which fails, as `minimal` says."""
+def _smallest_failing_scale(direction: Tensor, scale: float, search: MinimalChangeSearch) -> float:
+    """Return the smallest failing scale up to `scale`, which fails, by grid and bisection."""
     for k in range(1, search.points):
         if _fails_at(direction, scale * k / search.points, search):
-            return _bisected(direction, scale * (k - 1) / search.points, scale * k / search.points, search)
-    return _bisected(direction, scale * (search.points - 1) / search.points, scale, search)
+            return _bisect(direction, scale * (k - 1) / search.points, scale * k / search.points, search)
+    return _bisect(direction, scale * (search.points - 1) / search.points, scale, search)
 
 
-def _bisected(direction: Tensor, low: float, high: float, search: LeastSearch) -> float:
-    """The failing end of an interval whose lower end does not fail, halved."""
+def _bisect(direction: Tensor, low: float, high: float, search: MinimalChangeSearch) -> float:
+    """Bisect an interval of scales; its upper end fails, its lower end does not. Return its failing end."""
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         if _fails_at(direction, middle, search):

@@ -1,4 +1,4 @@
-"""What is said of all frames: tables on the terminal and in Markdown, CSV, JSON, a plot of means."""
+"""Reports explanations over all frames: tables, JSON, CSV, Markdown, and plots of contributions."""
 
 from __future__ import annotations
 
@@ -7,46 +7,51 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
 
-from drivesem.analysis.explain.players import Size
-from drivesem.analysis.explain.plots import write_means
+from drivesem.analysis.explain.attribution import ChangeSize
 from drivesem.analysis.explain.results import Contribution, Explanation, PartOutcome
-from drivesem.evaluation.curves import Tally
-from drivesem.evaluation.resampling import Figure, Interval, Recalled, intervals
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.evaluation.curves import ClassMatches
+from drivesem.evaluation.resampling import Interval, NamedMetric, WeightedRecall, bootstrap_intervals
+from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
+from drivesem.report.tables import AnalysisReport, ReportTable
 
 _NEEDED = "needs"
-_WORDS = ("parameter", "frame", _NEEDED)
-"""Columns of words; the others hold numbers."""
-_LOOKS: dict[str, Any] = {"unbroken": _WORDS, "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
+_TEXT_COLUMNS = ("parameter", "frame", _NEEDED)
+"""Columns of text; the others hold numbers."""
+_RICH_OPTIONS: dict[str, Any] = {"unbroken": _TEXT_COLUMNS, "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
 
 
 @dataclass(frozen=True, slots=True)
-class Mean:
-    """One parameter over all frames. loss, fails: mean Shapley values, with bootstrap intervals over frames.
-    gradient_share: mean, None without a gradient. alone, without: frames that fail by it alone, and without it;
-    needed: frames whose least change has it. found, least: medians over frames of how far the car goes that goes
-    farthest, in `unit`, in the counterexample and, where it is needed, in the least change.
-    """
+class ParameterSummary:
+    """One parameter over all frames."""
 
     name: str
+    """The parameter."""
     loss: Interval
+    """Mean Shapley value of the loss, with a bootstrap interval over frames."""
     fails: Interval
+    """Mean Shapley value of failing, with a bootstrap interval over frames."""
     gradient_share: float | None
+    """Mean share of the gradient; None without a gradient."""
     alone: int
+    """Frames that fail by this parameter alone."""
     without: int
+    """Frames that fail without it."""
     needed: int
+    """Frames in which the minimal change contains it."""
     found: float
+    """Median over frames of the largest change of an object, in `unit`."""
     least: float | None
+    """The same in the minimal changes that contain it; None if none does."""
     unit: str
+    """m, deg or code."""
 
     def to_json(self) -> dict[str, Any]:
-        """Flat, numbers by name."""
+        """Return a flat JSON object."""
         data = asdict(self)
         for name in ("loss", "fails"):
             one: Interval = getattr(self, name)
@@ -54,130 +59,156 @@ class Mean:
         return data
 
 
-def means(explanations: Sequence[Explanation], draws: int, seed: int) -> list[Mean]:
-    """Each parameter that any of the frames moves, in the order in which theta holds them."""
+def summarise_parameters(explanations: Sequence[Explanation], draws: int, seed: int) -> list[ParameterSummary]:
+    """Summarise each parameter that any frame changes, in the order of theta.
+
+    Args:
+        explanations: Explanations of all frames.
+        draws: Bootstrap draws.
+        seed: Seed of the bootstrap.
+    """
     names = list(dict.fromkeys(c.name for e in explanations for c in e.of_kind("parameter")))
     tables = [{c.name: c for c in e.of_kind("parameter")} for e in explanations]
-    loss = _intervals(names, [[_value(t, n, "loss") for t in tables] for n in names], draws, seed)
-    fails = _intervals(names, [[_value(t, n, "fails") for t in tables] for n in names], draws, seed)
-    return [_mean(name, loss[i], fails[i], tables, explanations) for i, name in enumerate(names)]
+    loss = _mean_intervals(names, [[_shapley_value(t, n, "loss") for t in tables] for n in names], draws, seed)
+    fails = _mean_intervals(names, [[_shapley_value(t, n, "fails") for t in tables] for n in names], draws, seed)
+    return [_summarise_parameter(name, loss[i], fails[i], tables, explanations) for i, name in enumerate(names)]
 
 
-def sheets(explanations: Sequence[Explanation], rows: Sequence[Mean]) -> list[Sheet]:
-    """Parameters over all frames; then frame by frame, how little is enough."""
+def build_explain_tables(
+    explanations: Sequence[Explanation], rows: Sequence[ParameterSummary]
+) -> list[ReportTable]:
+    """Build the table of parameters over all frames, and that of minimal changes by frame."""
     by_parameter = tuple(
         (
             row.name,
-            _bounded(row.loss, 1, 2),
-            _bounded(row.fails, 100, 0),
+            _format_interval(row.loss, 1, 2),
+            _format_interval(row.fails, 100, 0),
             "-" if row.gradient_share is None else f"{100 * row.gradient_share:.0f}",
             str(row.alone),
             str(row.without),
             str(row.needed),
-            _measure(row.found, row.unit),
-            "-" if row.least is None else _measure(row.least, row.unit),
+            _format_size(row.found, row.unit),
+            "-" if row.least is None else _format_size(row.least, row.unit),
         )
         for row in rows
     )
     by_frame = tuple(_frame_row(e) for e in explanations)
     return [
-        Sheet(
+        ReportTable(
             f"by parameter, frames: {len(explanations)}",
             (
                 *("parameter", "adds to loss", "of failing, %", "of gradient, %", "fail by it alone"),
-                *("fail without it", "need it", "car moved by", "enough"),
+                *("fail without it", "need it", "largest change", "sufficient"),
             ),
             by_parameter,
-            _LOOKS,
+            _RICH_OPTIONS,
         ),
-        Sheet(
-            "how little is enough",
+        ReportTable(
+            "minimal change",
             (
-                *("frame", "loss", "failures", "flips on the way", "size, steps", "enough, steps", "enough, %"),
-                *(_NEEDED, "cars", "still", "most loss by"),
+                *("frame", "loss", "failures", "flips", "size, steps", "minimal, steps", "minimal, %"),
+                *(_NEEDED, "objects", "failures left", "most loss by"),
             ),
             by_frame,
-            _LOOKS,
+            _RICH_OPTIONS,
         ),
     ]
 
 
-def what_if(explanation: Explanation) -> Sheet:
-    """One frame: each parameter and car, what it adds, and what comes of it alone and of all but it."""
+def build_frame_table(explanation: Explanation) -> ReportTable:
+    """Build the table of one frame: each part's contribution, and the results of it alone and of all others."""
     rows: list[tuple[str, ...]] = [
-        ("nothing", "", "", "", *_told(explanation.benign), "", ""),
-        ("everything", "", "", "", *_told(explanation.found), "", ""),
+        ("no change", "", "", "", *_format_outcome(explanation.benign), "", ""),
+        ("whole change", "", "", "", *_format_outcome(explanation.found), "", ""),
     ]
     for one in explanation.contributions:
         loss, fails = f"{one.loss:+.2f}", f"{100 * one.fails:+.0f}"
         if one.loss_error is not None and one.fails_error is not None:
             loss, fails = f"{loss} ± {one.loss_error:.2f}", f"{fails} ± {100 * one.fails_error:.0f}"
         share = "-" if one.gradient_share is None else f"{100 * one.gradient_share:.0f}"
-        rows.append((one.name, loss, fails, share, *_told(one.alone), *_told(one.without)))
+        rows.append((one.name, loss, fails, share, *_format_outcome(one.alone), *_format_outcome(one.without)))
     columns = (
         *("part", "adds to loss", "of failing, %", "of gradient, %"),
         *("alone: loss", "alone: failures", "without: loss", "without: failures"),
     )
-    return Sheet(explanation.identifier, columns, tuple(rows))
+    return ReportTable(explanation.identifier, columns, tuple(rows))
 
 
-def notes(draws: int) -> list[str]:
-    """What the columns mean."""
-    spread = f"; in brackets: 95 % of {draws} draws of frames" if draws else ""
+def build_explain_notes(draws: int) -> list[str]:
+    """Explain the columns. draws: bootstrap draws."""
+    interval = f"; in brackets: 95 % interval of {draws} bootstrap draws of frames" if draws else ""
     return [
-        "Adds to loss, of failing: mean Shapley values, which add up to the rise of the loss and to 100 %"
-        f"{spread}. Of gradient: share of |gradient x change|, taken at the photograph. Fail by it alone, without "
-        "it: frames that fail by this parameter's part of the change only, and by all but it. Need it: frames "
-        "whose least failing change has it. Car moved by, enough: how far the car goes that goes farthest, in the "
-        "counterexample and in the least change where it is needed; medians over frames.",
-        "Failures: lost objects + phantoms. Flips on the way: how often failing begins or ends between photograph "
-        "and counterexample. Size: of the change in sign steps; enough: of the least that still fails, and its "
-        "share; "
-        f"{_NEEDED}, cars: what it moves; still: how it fails. Most loss by: the car with most of the loss.",
+        f"Adds to loss, of failing: mean Shapley values, which add up to the rise of the loss and to 100 "
+        f"%{interval}. "
+        "Of gradient: share of |gradient x change| at the photograph. Fail by it alone, without it: frames that "
+        "fail by this parameter's part of the change only, and by all other parts. Need it: frames in which the "
+        "minimal change contains it. Largest change, sufficient: largest change of an object in the "
+        "counterexample, and in the minimal change if it contains the parameter; medians over frames.",
+        "Failures: lost objects + phantoms. Flips: how often failing starts or stops between photograph and "
+        "counterexample. Size: of the change, in sign steps; minimal: of the smallest change found that still "
+        "fails, "
+        f"and its share; {_NEEDED}, objects: what it changes; failures left: its failures. Most loss by: the "
+        f"object "
+        "with the largest contribution to the loss.",
     ]
 
 
 def exchange_note(names: Sequence[str]) -> str:
-    """What is said of frames that are left out. names: theirs."""
-    return f"left out, as the exchange of vehicles alone makes them fail: {', '.join(names)}"
+    """Explain why frames are left out."""
+    return f"left out because they fail by the exchange of vehicles alone: {', '.join(names)}"
 
 
-def answer_of(
-    out: Path, explanations: Sequence[Explanation], rows: Sequence[Mean], draws: int, facts: Mapping[str, Any]
-) -> Answer:
-    """explain.json (with `facts` in front), explain.md, explain.csv and explain.png."""
+def build_explain_report(
+    out: Path,
+    explanations: Sequence[Explanation],
+    rows: Sequence[ParameterSummary],
+    draws: int,
+    facts: Mapping[str, Any],
+) -> AnalysisReport:
+    """Build the report.
+
+    Args:
+        out: Output folder.
+        explanations: Explanations of all frames.
+        rows: Summary of each parameter.
+        draws: Bootstrap draws.
+        facts: First entries of the JSON.
+    """
     appendix: list[str] = []
     for e in explanations:
-        sheet = what_if(e)
-        appendix += [*sheet.markdown(sheet.columns), ""]
+        table = build_frame_table(e)
+        appendix += [*table.to_markdown(table.columns), ""]
         pictures = ("shapley", *(("sensitivity",) if e.sensitivity else ()), "minimal_overlay")
         appendix += [f"![](frames/{e.identifier}/{name}.png)\n" for name in pictures]
-    tables = sheets(explanations, rows)
+    tables = build_explain_tables(explanations, rows)
     left_out: Sequence[str] = facts["frames_by_exchange"]
-    return Answer(
+    return AnalysisReport(
         out=out,
         name="explain",
-        heading="Why it fails",
-        data={**facts, "rows": [row.to_json() for row in rows], "explained": [_brief(e) for e in explanations]},
-        tables={"explain": [line for e in explanations for line in _flat(e)]},
-        sheets=tables,
-        notes=[*notes(draws), *([f"Frames {exchange_note(left_out)}."] if left_out else [])],
-        words=[name for sheet in tables for name in sheet.columns],
-        printed_words=_WORDS,
+        heading="Explanations",
+        data={**facts, "rows": [row.to_json() for row in rows], "explained": [_json_row(e) for e in explanations]},
+        csv_tables={"explain": [line for e in explanations for line in _csv_rows(e)]},
+        tables=tables,
+        notes=[
+            *build_explain_notes(draws),
+            *([f"Frames {exchange_note(left_out)}."] if left_out else []),
+        ],
+        text_columns=[name for table in tables for name in table.columns],
+        printed_text_columns=_TEXT_COLUMNS,
         appendix=appendix,
         picture=partial(
-            write_means,
+            plot_means,
             loss=[row.loss for row in rows],
             fails=[row.fails for row in rows],
             frames=len(explanations),
         ),
         failed={f"frame {name}": reason for name, reason in facts["frames_failed"].items()},
-        failure="could not be explained",
+        failure_text="could not be explained",
     )
 
 
-def _brief(explanation: Explanation) -> dict[str, Any]:
-    """A frame in the summary; the rest is in its own folder."""
+def _json_row(explanation: Explanation) -> dict[str, Any]:
+    """Summarise a frame; its own folder has the rest."""
     least = explanation.least
     return {
         "frame": explanation.identifier,
@@ -194,12 +225,12 @@ def _brief(explanation: Explanation) -> dict[str, Any]:
     }
 
 
-def _flat(explanation: Explanation) -> list[dict[str, Any]]:
-    """A row for each parameter and each object: numbers by name."""
+def _csv_rows(explanation: Explanation) -> list[dict[str, Any]]:
+    """Return a row per parameter and per object."""
     rows: list[dict[str, Any]] = []
     for one in explanation.contributions:
-        before, after = _sizes_of(one, explanation.sizes), _sizes_of(one, explanation.least.sizes)
-        # Metres and degrees cannot be added up: a car's size is told in steps only.
+        before, after = _part_sizes(one, explanation.sizes), _part_sizes(one, explanation.least.sizes)
+        # an object's change has no single unit: metres and degrees do not add up
         physical = one.kind == "parameter"
         rows.append(
             {
@@ -222,30 +253,30 @@ def _flat(explanation: Explanation) -> list[dict[str, Any]]:
     return rows
 
 
-def _sizes_of(one: Contribution, sizes: Sequence[Size]) -> list[Size]:
-    """Of a parameter's cells, or of a car's."""
+def _part_sizes(one: Contribution, sizes: Sequence[ChangeSize]) -> list[ChangeSize]:
+    """Select the sizes that belong to a parameter or an object."""
     return [size for size in sizes if one.name in (size.parameter, size.owner)]
 
 
-def _mean(
+def _summarise_parameter(
     name: str,
     loss: Interval,
     fails: Interval,
     tables: Sequence[dict[str, Contribution]],
     explanations: Sequence[Explanation],
-) -> Mean:
+) -> ParameterSummary:
     known = [table[name] for table in tables if name in table]
     shares = [c.gradient_share for c in known if c.gradient_share is not None]
-    found = [_farthest(name, e.sizes) for e in explanations]
-    least = [_farthest(name, e.least.sizes) for e in explanations]
+    found = [_largest_size(name, e.sizes) for e in explanations]
+    least = [_largest_size(name, e.least.sizes) for e in explanations]
     moved, needed = [s for s in found if s is not None], [s for s in least if s is not None]
-    return Mean(
+    return ParameterSummary(
         name=name,
         loss=loss,
         fails=fails,
         gradient_share=fmean(shares) if shares else None,
         alone=sum(c.alone.success for c in known),
-        # A frame that does not move it fails without it.
+        # a frame that does not change it fails without it
         without=sum(c.without.success for c in known) + len(tables) - len(known),
         needed=len(needed),
         found=median(s.value for s in moved),
@@ -254,31 +285,33 @@ def _mean(
     )
 
 
-def _farthest(name: str, sizes: Sequence[Size]) -> Size | None:
+def _largest_size(name: str, sizes: Sequence[ChangeSize]) -> ChangeSize | None:
     own = [size for size in sizes if size.parameter == name]
     return max(own, key=lambda size: size.value) if own else None
 
 
-def _value(table: dict[str, Contribution], name: str, field: str) -> float:
+def _shapley_value(table: dict[str, Contribution], name: str, field: str) -> float:
     return float(getattr(table[name], field)) if name in table else 0.0
 
 
-def _intervals(names: Sequence[str], values: Sequence[Sequence[float]], draws: int, seed: int) -> list[Interval]:
-    """Means over frames as the bootstrap takes them: sums of values over sums of ones."""
+def _mean_intervals(
+    names: Sequence[str], values: Sequence[Sequence[float]], draws: int, seed: int
+) -> list[Interval]:
+    """Return means over frames with bootstrap intervals. values: per name and frame."""
     frames = len(values[0])
     ones, order = np.ones(frames), np.arange(frames)
-    figures = [
-        Figure(name, (Recalled(Tally(ones, order, np.asarray(row), np.zeros(frames), ones)),))
+    metrics = [
+        NamedMetric(name, (WeightedRecall(ClassMatches(ones, order, np.asarray(row), np.zeros(frames), ones)),))
         for name, row in zip(names, values, strict=True)
     ]
-    return intervals(figures, frames, draws, np.random.default_rng(seed))
+    return bootstrap_intervals(metrics, frames, draws, np.random.default_rng(seed))
 
 
 def _frame_row(explanation: Explanation) -> tuple[str, ...]:
     least = explanation.least
     most = max(explanation.of_kind("object"), key=lambda c: c.loss)
-    benign_loss, _ = _told(explanation.benign)
-    found_loss, fails = _told(explanation.found)
+    benign_loss, _ = _format_outcome(explanation.benign)
+    found_loss, fails = _format_outcome(explanation.found)
     return (
         explanation.identifier,
         f"{benign_loss} to {found_loss}",
@@ -289,17 +322,17 @@ def _frame_row(explanation: Explanation) -> tuple[str, ...]:
         f"{100 * least.left:.1f}",
         ", ".join(least.parameters),
         f"{', '.join(map(str, least.objects)) or 'none'} of {explanation.objects}",
-        _told(least.outcome)[1],
+        _format_outcome(least.outcome)[1],
         f"{most.name.removeprefix('objects')} {most.loss:+.2f}",
     )
 
 
-def _told(outcome: PartOutcome) -> tuple[str, str]:
-    """Loss; lost objects and phantoms."""
+def _format_outcome(outcome: PartOutcome) -> tuple[str, str]:
+    """Format the loss, and lost objects + phantoms."""
     return f"{outcome.loss:.2f}", f"{outcome.lost} + {outcome.phantoms}"
 
 
-def _bounded(one: Interval, factor: float, digits: int) -> str:
+def _format_interval(one: Interval, factor: float, digits: int) -> str:
     if one.value is None:
         return "-"
     text = f"{factor * one.value:+.{digits}f}"
@@ -308,5 +341,102 @@ def _bounded(one: Interval, factor: float, digits: int) -> str:
     return f"{text} [{factor * one.low:+.{digits}f}, {factor * one.high:+.{digits}f}]"
 
 
-def _measure(value: float, unit: str) -> str:
+def _format_size(value: float, unit: str) -> str:
     return f"{value:.3g}" if unit == "code" else f"{value:.3g} {unit}"
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_BAR_IN = 0.32
+_MARGIN_IN = 1.5
+_WIDTH_IN = 10.5
+_UP, _DOWN, _TOTAL = PLOT_COLOURS[1], PLOT_COLOURS[0], "#777777"
+_TITLES = {"parameter": "by parameter", "object": "by object"}
+
+
+def plot_waterfalls(path: Path, explanation: Explanation) -> None:
+    """Plot the contributions of parameters and of objects as waterfalls from the photograph's loss to the
+    counterexample's, the largest first, with the contribution to failing, %.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    rows = [max(len(explanation.of_kind(kind)), 1) + 2 for kind in _TITLES]
+    height = _MARGIN_IN * len(rows) + _BAR_IN * sum(rows)
+    with mpl.rc_context({**PLOT_STYLE, "axes.grid.axis": "x"}):  # pyright: ignore[reportArgumentType]
+        figure = Figure(figsize=(_WIDTH_IN, height), layout="constrained")
+        panels = figure.subplots(len(rows), 1, height_ratios=rows, squeeze=False)[:, 0]
+        for axes, (kind, title) in zip(panels, _TITLES.items(), strict=True):
+            _plot_waterfall(axes, explanation, explanation.of_kind(kind))
+            axes.set_title(f"{explanation.identifier}, {title}", loc="left", fontsize=11)
+    write_figure(path, figure)
+
+
+def plot_means(path: Path, loss: Sequence[Interval], fails: Sequence[Interval], frames: int) -> None:
+    """Plot the mean contribution of each parameter to the loss and to failing as bars with intervals.
+
+    Args:
+        path: PNG file.
+        loss: Contributions to the loss.
+        fails: Contributions to failing, fractions.
+        frames: Number of frames.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    height = _MARGIN_IN + _BAR_IN * (len(loss) + 1)
+    with mpl.rc_context({**PLOT_STYLE, "axes.grid.axis": "x"}):  # pyright: ignore[reportArgumentType]
+        figure = Figure(figsize=(_WIDTH_IN, height), layout="constrained")
+        panels = figure.subplots(1, 2, squeeze=False)[0]
+        _plot_bars(panels[0], loss, 1, "added to the loss")
+        _plot_bars(panels[1], fails, 100, "added to failing, %")
+        figure.suptitle(f"Shapley values, mean over frames ({frames})", x=0.01, ha="left", fontsize=11)
+    write_figure(path, figure)
+
+
+def _plot_waterfall(axes: Axes, explanation: Explanation, contributions: Sequence[Contribution]) -> None:
+    ordered = sorted(contributions, key=lambda c: -c.loss)
+    start, end = explanation.benign.loss, explanation.found.loss
+    names = ["benign", *(c.name for c in ordered), "counterexample"]
+    places = list(range(len(names)))
+    axes.barh([0, places[-1]], [start, end], color=_TOTAL, height=0.62)
+    level, tops = start, [start]
+    for place, one in enumerate(ordered, start=1):
+        colour = _UP if one.loss >= 0 else _DOWN
+        error = None if one.loss_error is None else [one.loss_error]
+        axes.barh([place], [one.loss], left=[level], color=colour, height=0.62)
+        if error is not None:
+            axes.errorbar([level + one.loss], [place], xerr=error, color="black", linewidth=1, capsize=2)
+        axes.plot([level, level], [place - 1, place], color="#999999", linewidth=0.8)
+        tops.append(max(level, level + one.loss) + (one.loss_error or 0.0))
+        level += one.loss
+    axes.plot([level, level], [places[-1] - 1, places[-1]], color="#999999", linewidth=0.8)
+    tops.append(end)
+    texts = [f"{start:.2f}", *(_format_contribution(c) for c in ordered), f"{end:.2f}"]
+    for place, top, text in zip(places, tops, texts, strict=True):
+        axes.annotate(text, (top, place), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set_yticks(places, names)
+    axes.invert_yaxis()
+    axes.set_xlim(right=1.25 * max(tops))
+    axes.set_xlabel("loss")
+
+
+def _format_contribution(one: Contribution) -> str:
+    return f"{one.loss:+.2f}   (failing {100 * one.fails:+.0f} %)"
+
+
+def _plot_bars(axes: Axes, intervals: Sequence[Interval], factor: float, label: str) -> None:
+    for place, one in enumerate(intervals):
+        if one.value is None:
+            continue
+        value = factor * one.value
+        axes.barh([place], [value], color=_UP if value >= 0 else _DOWN, height=0.62)
+        if one.low is not None and one.high is not None:
+            # if all frames are equal, a mean may lie a rounding error outside its interval
+            spread = [[max(value - factor * one.low, 0)], [max(factor * one.high - value, 0)]]
+            axes.errorbar([value], [place], xerr=spread, color="black", linewidth=1, capsize=3)
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.set_yticks(range(len(intervals)), [one.name for one in intervals])
+    axes.invert_yaxis()
+    axes.set_xlabel(label)

@@ -1,138 +1,152 @@
-"""What is said of one frame, as plain dataclasses: written as JSON, read by the report and a resumed command."""
+"""Explanation of one counterexample, as plain dataclasses that are stored as JSON."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
-from drivesem.analysis.explain.players import Size
-from drivesem.run.records import load_record
+from drivesem.analysis.explain.attribution import ChangeSize
 from drivesem.run.results import Coordinate, Failure
-from scene_ir import files
 
 SCHEMA = 1
 EXPLANATION = "explain.json"
-"""The file that marks a frame as done."""
+"""File of a frame's explanation."""
 
 
 @dataclass(frozen=True, slots=True)
 class PartOutcome:
-    """What the detector makes of one theta, by `moved` labels. loss: the attack's objective; held_back: the
-    projection onto the feasible set changed the theta.
-    """
+    """The detector's result at one theta, with moved labels."""
 
     loss: float
+    """The attack's objective."""
     lost: int
+    """Number of lost objects."""
     phantoms: int
+    """Number of phantoms."""
     success: bool
+    """Whether the detector fails."""
     held_back: bool
+    """Whether the projection onto the feasible set changed theta."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """What one player adds. loss, fails: Shapley values of the loss and of failing (1) or not (0); loss_error,
-    fails_error: their standard errors where orders were drawn. gradient: gradient at theta0 times theta, added up;
-    gradient_share: the same with every coordinate's sign left out, as a share of all players'; None without a
-    gradient. alone: this player's part of the change only; without: all but it.
-    """
+    """Contribution of one part of the change: a parameter or an object."""
 
     kind: str
+    """"parameter" or "object"."""
     name: str
+    """Name of the part."""
     loss: float
+    """Shapley value of the loss."""
     loss_error: float | None
+    """Its standard error, if orders were sampled."""
     fails: float
+    """Shapley value of failing (1) or not (0)."""
     fails_error: float | None
+    """Its standard error, if orders were sampled."""
     gradient: float | None
+    """Sum of gradient at theta0 times theta; None without a gradient."""
     gradient_share: float | None
+    """Share of the sum of |gradient times theta| over all parts; None without a gradient."""
     alone: PartOutcome
+    """Result of this part only."""
     without: PartOutcome
+    """Result of all other parts."""
 
 
 @dataclass(frozen=True, slots=True)
-class Least:
-    """The least change that was found. scan: whether the change fails at each scale of the grid, 0 and 1 included;
-    sign_changes: among them; scale_whole: the smallest failing scale of the whole change; scale: of what is left
-    of it after `dropped` went. norm_found, norm_whole, norm: sizes in steps, of the counterexample, of the whole
-    change shortened, and of what is left. violations: of the second feasibility check. sizes, failures, theta (its
-    coordinates that are not 0): of what is left.
-    """
+class MinimalChange:
+    """The smallest change found that still fails."""
 
     scan: tuple[bool, ...]
+    """Whether the whole change fails at each scale of the grid, 0 and 1 included."""
     sign_changes: int
+    """Changes between failing and not failing along the grid."""
     scale_whole: float
+    """Smallest failing scale of the whole change, in [0, 1]."""
     scale: float
+    """Smallest failing scale after dropping parts, in [0, 1]."""
     dropped: tuple[str, ...]
+    """Names of the dropped parts, in order."""
     norm_found: float
+    """Size of the counterexample, steps."""
     norm_whole: float
+    """Size of the whole change at `scale_whole`, steps."""
     norm: float
+    """Size of the minimal change, steps."""
     outcome: PartOutcome
+    """The detector's result at the minimal change."""
     violations: tuple[str, ...]
-    sizes: tuple[Size, ...]
+    """Violations found by the independent feasibility check."""
+    sizes: tuple[ChangeSize, ...]
+    """Size of each parameter of each object."""
     failures: tuple[Failure, ...]
+    """Failures at the minimal change."""
     theta: tuple[Coordinate, ...]
+    """Coordinates of the minimal change that are not 0."""
 
     @property
     def left(self) -> float:
-        """Share of the counterexample's size that is left."""
+        """Size relative to the counterexample's."""
         return self.norm / self.norm_found
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Those that are left."""
+        """Parameters of the minimal change."""
         return tuple(dict.fromkeys(size.parameter for size in self.sizes))
 
     @property
     def objects(self) -> tuple[int, ...]:
-        """Those that are left."""
+        """Objects that the minimal change moves."""
         return tuple(sorted({size.object for size in self.sizes if size.object is not None}))
 
 
 @dataclass(frozen=True, slots=True)
-class Sensitivity:
-    """Share of |d loss / d pixel| on each object, and on the background, of one picture."""
+class PixelSensitivity:
+    """Distribution of |d loss / d pixel| over one picture."""
 
     objects: tuple[float, ...]
+    """Share on each object, in [0, 1]."""
     background: float
+    """Share on the background, in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """One frame. source: digest of the result that is explained. benign, found: the scene at theta0 and the
-    counterexample; contributions: parameters first, then objects; exact: kinds of players whose Shapley values are
-    of all coalitions; sizes: of the counterexample. sensitivity: by picture, `benign` and `counterexample`, empty
-    without a gradient. renders: thetas judged.
-    """
+    """Explanation of one counterexample."""
 
     identifier: str
+    """The frame."""
     source: str
+    """Digest of the run's result.json."""
     objects: int
+    """Number of objects in the scene."""
     benign: PartOutcome
+    """The detector's result at theta0."""
     found: PartOutcome
+    """Its result at the counterexample."""
     contributions: tuple[Contribution, ...]
+    """Contributions of parameters, then of objects."""
     exact: tuple[str, ...]
-    sizes: tuple[Size, ...]
-    least: Least
-    sensitivity: dict[str, Sensitivity]
+    """Kinds of parts with exact Shapley values."""
+    sizes: tuple[ChangeSize, ...]
+    """Size of each parameter of each object."""
+    least: MinimalChange
+    """The minimal change."""
+    sensitivity: dict[str, PixelSensitivity]
+    """Pixel gradients of `benign` and `counterexample`; empty without a gradient."""
     renders: int
+    """Number of thetas evaluated."""
     seconds: float
+    """Run time; the only field that may differ between two calls."""
 
     @property
     def by_exchange(self) -> bool:
-        """Whether the scene fails at theta0 already, by its exchange of vehicles alone: no part of theta is
-        weighed then, and the least change is none.
+        """Whether the scene fails at theta0 already, by the exchange of vehicles alone; there are no contributions
+        then, and the minimal change is empty.
         """
         return self.least.scan[0]
 
     def of_kind(self, kind: str) -> tuple[Contribution, ...]:
-        """Contributions of `parameter` or `object`."""
+        """Return the contributions of one kind, `parameter` or `object`."""
         return tuple(c for c in self.contributions if c.kind == kind)
-
-
-def write_explanation(path: Path, explanation: Explanation) -> None:
-    """As JSON, exact and in a fixed order."""
-    files.write_json(path, {"schema": SCHEMA, **asdict(explanation)})
-
-
-def read_explanation(path: Path) -> Explanation:
-    """What `write_explanation` wrote. Raises FormatError naming the file and the field."""
-    return load_record(path, Explanation, SCHEMA)

@@ -1,4 +1,4 @@
-"""Holes for people and programs: a table, JSON, CSV, Markdown and a plot."""
+"""Reports holes as a table, JSON, CSV, Markdown and a plot."""
 
 from __future__ import annotations
 
@@ -7,94 +7,129 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.analysis.holes.merged import Hole, Recheck
-from drivesem.analysis.holes.plots import write_holes
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
+from drivesem.analysis.holes.rules import Hole, RuleRecheck
+from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 
-_NONE = "No certain failure of an object in these runs: nothing to look around."
+_NO_FAILURES = "These runs have no certain failure of an object: nothing to sample around."
 _NOTES = (
-    "Lost: share of fresh samples inside of the rule in which the object is not found, with Wilson's 95 % "
-    "interval. Elsewhere: the same of samples outside of it. Size: share of the whole neighbourhood, of what "
-    "the run could change, in which the object is lost, inside of the rule or not, with a 95 % interval; by "
-    "subset simulation where that is rare. The neighbourhood is that of one object with all others as found.",
-    "Features: height_px, aspect (width by height), across (0 left, 1 right) of the label's box; lightness and "
-    "contrast of the picture in it; distance_m; yaw_deg; codes of paint, weather and foliage. A rule names what "
-    "tells failures best from the rest; what goes along with it may be the reason.",
+    "Lost: share of fresh samples inside the rule in which the object is missed, with its 95 % Wilson interval. "
+    "Elsewhere: the same for samples outside the rule. Size: share of the whole neighbourhood, that is of what "
+    "the run could change, in which the object is lost, inside the rule or not, with a 95 % interval; by subset "
+    "simulation if losses are rare. In the neighbourhood of an object, all others stay as found.",
+    "Features: height_px, aspect (width over height) and across (0 left, 1 right) of the labelled box; lightness "
+    "and contrast of the picture inside it; distance_m; yaw_deg; codes of paint, weather and foliage. A rule "
+    "names what separates failures best; the cause may be something that goes along with it.",
 )
-
-
-_CHECKED = (
-    "Again: the same share in draws by seeds that neither the rule nor its probability knew. A hole holds where "
-    "chance alone may explain the difference of the two shares: its 95 % interval, of both Wilson intervals after "
-    "Newcombe, has 0 in it. One in twenty does not hold though its probability is right. {hold} of {count} hold."
+_RECHECK_NOTE = (
+    "Again: the same share among draws with new seeds, independent of the rule and its failure rate. A hole holds "
+    "if chance alone may explain the difference of the two shares: its 95 % Newcombe interval contains 0. One in "
+    "twenty does not hold although its rate is right. {hold} of {count} hold."
 )
+_MAX_PLOTTED = 12
+"""Holes in the plot; the table has all."""
 
 
-def answer_of(out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed: Mapping[str, str]) -> Answer:
-    """What is said of all frames. facts: what stands before the holes in the JSON."""
-    checks = [hole.recheck for hole in holes if hole.recheck is not None]
+def build_holes_report(
+    out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed: Mapping[str, str]
+) -> AnalysisReport:
+    """Build the report of all frames.
+
+    Args:
+        out: Output folder.
+        holes: The holes.
+        facts: First entries of the JSON.
+        failed: Reasons by frame without samples.
+    """
+    rechecks = [hole.recheck for hole in holes if hole.recheck is not None]
     lines = tuple(
         (
-            hole.words,
+            hole.rule_text,
             hole.label,
-            "-"
-            if hole.probability is None
-            else f"{100 * hole.probability:.0f} [{_percent(hole.low)}, {_percent(hole.high)}]",
+            "-" if hole.probability is None else _format_rate(hole.probability, hole.low, hole.high),
             "-" if hole.outside is None else f"{100 * hole.outside:.0f}",
             f"{100 * hole.lost.probability:.2g} [{100 * hole.lost.low:.2g}, {100 * hole.lost.high:.2g}]",
             str(len(hole.failures)),
             str(len(hole.frames)),
-            *((_again(hole.recheck),) if checks else ()),
+            *((_format_recheck(hole.recheck),) if rechecks else ()),
         )
         for hole in holes
     )
     columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures", "frames")
-    columns += ("again, %",) if checks else ()
-    hold = sum(check.holds for check in checks)
-    told = (_CHECKED.format(hold=hold, count=len(checks)),) if checks else ()
+    columns += ("again, %",) if rechecks else ()
+    hold = sum(recheck.holds for recheck in rechecks)
+    recheck_notes = (_RECHECK_NOTE.format(hold=hold, count=len(rechecks)),) if rechecks else ()
     title = f"Holes of {facts['detector']}, within {facts['params']}"
-    return Answer(
+    return AnalysisReport(
         out=out,
         name="holes",
         heading="Holes",
-        data={**facts, "rechecked": len(checks), "hold": hold, "holes": [hole.to_json() for hole in holes]},
-        tables={"holes": [_flat(hole) for hole in holes]} if holes else {},
-        sheets=[Sheet(title, columns, lines)],
-        notes=(*_NOTES, *told) if holes else (_NONE,),
-        words=("where", "class"),
-        picture=partial(write_holes, holes=holes) if holes else None,
+        data={**facts, "rechecked": len(rechecks), "hold": hold, "holes": [hole.to_json() for hole in holes]},
+        csv_tables={"holes": [_csv_row(hole) for hole in holes]} if holes else {},
+        tables=[ReportTable(title, columns, lines)],
+        notes=(*_NOTES, *recheck_notes) if holes else (_NO_FAILURES,),
+        text_columns=("where", "class"),
+        picture=partial(plot_holes, holes=holes) if holes else None,
         failed=failed,
     )
 
 
-def _again(check: Recheck | None) -> str:
-    if check is None:
+def _format_rate(rate: float, low: float | None, high: float | None) -> str:
+    ends = ("-" if value is None else f"{100 * value:.0f}" for value in (low, high))
+    return f"{100 * rate:.0f} [{', '.join(ends)}]"
+
+
+def _format_recheck(recheck: RuleRecheck | None) -> str:
+    if recheck is None:
         return "-"
-    low, high = check.interval
-    share = f"{100 * check.probability:.0f} [{_percent(low)}, {_percent(high)}]"
-    return f"{share} {'holds' if check.holds else 'does not hold'}"
+    verdict = "holds" if recheck.holds else "does not hold"
+    return f"{_format_rate(recheck.probability, *recheck.interval)} {verdict}"
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.0f}"
-
-
-def _flat(hole: Hole) -> dict[str, Any]:
-    check = hole.recheck
+def _csv_row(hole: Hole) -> dict[str, Any]:
+    recheck = hole.recheck
     return {
-        "where": hole.words,
+        "where": hole.rule_text,
         "class": hole.label,
         "probability": hole.probability,
         "low": hole.low,
         "high": hole.high,
         "samples": hole.count,
-        "again": None if check is None else check.probability,
-        "again_draws": None if check is None else check.again[1],
-        "holds": None if check is None else check.holds,
+        "again": None if recheck is None else recheck.probability,
+        "again_draws": None if recheck is None else recheck.again[1],
+        "holds": None if recheck is None else recheck.holds,
         "outside": hole.outside,
         "size": hole.lost.probability,
         "size_low": hole.lost.low,
         "size_high": hole.lost.high,
         "failures": "; ".join(hole.failures),
     }
+
+
+def plot_holes(path: Path, holes: Sequence[Hole]) -> None:
+    """Plot the failure rates of the largest holes as bars with intervals, and marks for the rates elsewhere."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    plotted = holes[:_MAX_PLOTTED]
+    with mpl.rc_context(dict(PLOT_STYLE)):  # pyright: ignore[reportArgumentType]
+        figure = Figure(figsize=(8.0, 1.9 + 0.5 * len(plotted)), layout="constrained")
+        axes = figure.add_subplot()
+        inside, elsewhere = "fresh samples inside the rule, 95 % interval", "elsewhere in the neighbourhood"
+        for i, hole in enumerate(plotted):
+            if hole.probability is not None:
+                axes.barh([i], [100 * hole.probability], color=PLOT_COLOURS[1], height=0.6, label=inside)
+                inside = None  # one entry in the legend
+                ends = [100 * (hole.low or 0), 100 * (hole.high or 0)]
+                axes.plot(ends, [i] * 2, color="black", linewidth=1.2)
+            if hole.outside is not None:
+                rate = 100 * hole.outside
+                axes.plot([rate], [i], "D", color=PLOT_COLOURS[0], markersize=6, label=elsewhere, zorder=3)
+                elsewhere = None
+        labels = [f"{hole.rule_text}\n{format_count(len(hole.failures), 'failure')}" for hole in plotted]
+        axes.set_yticks(range(len(plotted)), labels)
+        axes.invert_yaxis()
+        axes.set(xlim=(0, 102), xlabel="lost, %")
+        axes.set_title("Holes, largest first", loc="left", fontsize=11)
+        figure.legend(loc="outside lower center", fontsize=9)
+        write_figure(path, figure)

@@ -1,4 +1,4 @@
-"""One frame of a run, computed again from its folder: pictures, detections, labels, success."""
+"""Recomputes one frame of a run from its folder, and compares pictures, detections, labels, success and grades."""
 
 from __future__ import annotations
 
@@ -13,31 +13,28 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.verify.change import check_change, check_feasibility
-from drivesem.analysis.verify.differences import CheckLog, Disagreement
-from drivesem.attack.aims import Aim
-from drivesem.attack.budgets import reach_of
-from drivesem.attack.judging import JudgedClasses
-from drivesem.attack.labels import Difficulty, Labeller, MovedLabels, to_kitti_labels
+from drivesem.analysis.verify.checks import CheckLog, Mismatch, check_change, check_feasibility
+from drivesem.attack.budgets import change_limits
+from drivesem.attack.labels import Difficulty, Labeller, SceneLabels, to_kitti_labels
 from drivesem.attack.space import Budget, Parameter, Parametrisation
+from drivesem.attack.targets import EvaluatedClasses, TargetSelection
 from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
-from drivesem.failures.certificate import Rule
-from drivesem.failures.grades import Count, Grade
+from drivesem.failures.certificate import CertificateRule, CompositorRenderer
+from drivesem.failures.grades import Certificate, Grade
 from drivesem.failures.grading import Grader
-from drivesem.failures.second_renderer.compositor import CompositorDraw
+from drivesem.run.detection_cache import detect_objects, image_to_tensor
 from drivesem.run.frame import (
     RESULT,
-    State,
-    as_targets,
-    case_of,
+    EvaluatedScene,
+    build_failure_records,
+    build_grading_input,
     detection_records,
-    failure_records,
     psnr_in_boxes,
     target_records,
+    targets_from_records,
 )
-from drivesem.run.looking import as_picture, detections_in
-from drivesem.run.manifest import OF_FRAME, field_hashes, frame_hashes
+from drivesem.run.manifest import HASHED_FRAME_FIELDS, hash_fields, hash_frame_files
 from drivesem.run.results import BoxRecord, Failure, FrameResult, load_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -48,200 +45,228 @@ from scene_ir.types import Labels, Render, SceneIR
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"
 LEVELS = 1
-"""Levels of 255 by which the same picture may differ from one processor to another."""
+"""Tolerance of pictures in levels of 255: results vary slightly between CPU models."""
 BOX_PX, SCORE = 0.05, 1e-3
-"""By how much a detection may differ: another number of threads adds up in another order."""
+"""Tolerance of detections: the number of threads changes the order of sums."""
 LABEL = 1e-3
-"""Of numbers in label files, which have three decimals, and of recorded targets, in the label's units."""
+"""Tolerance of label files, which have three decimals, and of recorded targets, in the label's units."""
 IDENTITY_DB = 0.1
-"""Of the PSNR of a re-render."""
+"""Tolerance of the PSNR of a re-render."""
 _EXACT_DB = 120.0
-"""A PSNR from which on, or without one, a re-render is the photograph."""
+"""A re-render with at least this PSNR, or none, is the photograph."""
 _NO_FILE = "no file"
 DRAWS = 1
-"""By how many draws a certificate may differ, whose scores lie that near to t*."""
+"""Tolerance of a certificate in draws, as some scores lie close to t*."""
 _DETECTIONS = {
     BENIGN: "detections_benign",
     RERENDER: "detections_rerendered",
     COUNTEREXAMPLE: "detections_attacked",
 }
-"""The result's field of what was found in each picture."""
+"""The result's field with the detections in each picture."""
 _LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "size_lhw", "yaw")
 
 
 @dataclass(frozen=True)
-class Given:
-    """What the run's settings say. hashes: of files in frames' folders, by frame and name, as the manifest has
-    them; field_hashes: of values in their result.json; sealed: whether hashes are of all their files; t_star:
-    score from which a detection counts; grader: of certificates alone.
-    """
+class RecordedSettings:
+    """The run's settings, detector and manifest."""
 
     detector: Predictor
+    """The attacked detector."""
     device: str
+    """Its device."""
     backend: str
+    """Renderer backend."""
     params: tuple[Parameter, ...]
+    """Attacked parameters."""
     budget: Budget
+    """Limits of the change."""
     parametrisation: Parametrisation
-    aim: Aim
+    """Parametrisation of theta."""
+    aim: TargetSelection
+    """Attacked objects and classes."""
     t_star: float
+    """Score from which detections count."""
     hashes: Mapping[str, Mapping[str, str]]
+    """Hashes of files by frame and name."""
     field_hashes: Mapping[str, Mapping[str, str]]
-    sealed: bool
+    """Hashes of values in result.json by frame and name."""
     grader: Grader
+    """Repeats certificates, without second opinions."""
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
-    """How far a picture is from the one on disk: the largest difference in levels of 255, and the share of pixels
-    that differ at all.
-    """
+class PixelDifference:
+    """Difference between a re-rendered picture and the one on disk."""
 
     largest: int
+    """Largest difference, levels of 255."""
     share: float
+    """Share of pixels that differ."""
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """One frame. compared: how often, by check; levels: of the three pictures, by file name."""
+class FrameCheck:
+    """Result of verifying one frame."""
 
     identifier: str
+    """The frame."""
     compared: dict[str, int]
-    differences: tuple[Disagreement, ...]
-    levels: dict[str, Level]
+    """Number of comparisons by check."""
+    differences: tuple[Mismatch, ...]
+    """Values that differ."""
+    levels: dict[str, PixelDifference]
+    """Differences of the three pictures, by file name."""
 
 
-def check_frame(identifier: str, folder: Path, given: Given) -> Checked:
-    """Compare one frame's folder with itself: everything follows from `scene/` and the pictures, and must be what
-    the other files say.
+def check_frame(identifier: str, folder: Path, settings: RecordedSettings) -> FrameCheck:
+    """Recompute a frame from `scene/` and the pictures, and compare with its other files.
 
-    No label file says that an object is ignored. Success is therefore judged twice: by boxes, classes and regions
-    of `labels_moved.txt` and `labels_paper.txt` with the flags that result.json records, and by the targets that
-    it records; the flags themselves are compared with those of the saved scene. Raises SceneError for files that
-    are missing or damaged.
+    Label files lack the ignore flags of objects. So success is evaluated twice: by the boxes, classes and regions
+    of `labels_moved.txt` and `labels_paper.txt` with the flags in result.json, and by the targets in result.json;
+    the flags are compared with those of the saved scene.
+
+    Args:
+        identifier: The frame.
+        folder: Its folder.
+        settings: The run's settings, detector and manifest.
+
+    Raises:
+        SceneError: A file is missing or damaged.
     """
     result = load_frame(folder / RESULT)
     perturbed = load_scene(folder / "scene")
-    base, rest = perturbed.as_photographed(), perturbed.at_rest()
+    base, rest = perturbed.as_photographed(), perturbed.unperturbed()
     log = CheckLog()
-    known, found = given.hashes.get(identifier, {}), frame_hashes(folder)
-    for name in sorted(known.keys() | found.keys()) if given.sealed else known:
-        log.same("files", name, known.get(name, _NO_FILE), found.get(name, _NO_FILE))
-    values = field_hashes(files.read_json(folder / RESULT), OF_FRAME)
-    log.each("files", RESULT, given.field_hashes.get(identifier, {}), values)
-    check_change(log, folder, result, rest, perturbed, given.params, given.budget, given.parametrisation)
-    check_feasibility(log, result, rest, perturbed, reach_of(given.budget, given.parametrisation))
+    expected, found = settings.hashes.get(identifier, {}), hash_frame_files(folder)
+    for name in sorted(expected.keys() | found.keys()):
+        log.compare("files", name, expected.get(name, _NO_FILE), found.get(name, _NO_FILE))
+    values = hash_fields(files.read_json(folder / RESULT), HASHED_FRAME_FIELDS)
+    log.compare_values("files", RESULT, settings.field_hashes.get(identifier, {}), values)
+    check_change(log, folder, result, rest, perturbed, settings.params, settings.budget, settings.parametrisation)
+    check_feasibility(log, result, rest, perturbed, change_limits(settings.budget, settings.parametrisation))
     size = (base.camera.height, base.camera.width)
     pictures = {name: files.read_image(folder / name, size) for name in _DETECTIONS}
     with torch.no_grad():
         difficulty = Difficulty(min_contrast=result.min_contrast)
-        drawn = _render(log, pictures, _Scenes(base, perturbed), difficulty, given.backend)
-        _identity(log, result, base, drawn.before)
-        seen = {
-            name: detections_in(given.detector, as_picture(image, given.device))
+        rerender = _rerender(log, pictures, _SceneChange(base, perturbed), difficulty, settings.backend)
+        _check_identity(log, result, base, rerender.before)
+        detections = {
+            name: detect_objects(settings.detector, image_to_tensor(image, settings.device))
             for name, image in pictures.items()
         }
-    names = JudgedClasses.of(given.detector).names
+    names = EvaluatedClasses.from_detector(settings.detector).names
     for name, field in _DETECTIONS.items():
-        _compare_boxes(log, "detections", field, getattr(result, field), detection_records(seen[name], names))
-    _judge(log, folder, result, drawn.labels, _Scenes(base, perturbed), seen, given)
-    if result.graded:
-        _grades(log, result, drawn, _Scenes(base, perturbed), seen, given)
-    return Checked(identifier, log.compared, tuple(log.differences), drawn.levels)
+        _compare_boxes(
+            log, "detections", field, getattr(result, field), detection_records(detections[name], names)
+        )
+    _check_success(log, folder, result, rerender.labels, _SceneChange(base, perturbed), detections, settings)
+    _check_grades(log, result, rerender, _SceneChange(base, perturbed), detections, settings)
+    return FrameCheck(identifier, log.compared, tuple(log.differences), rerender.levels)
 
 
 @dataclass(frozen=True, slots=True)
-class _Scenes:
+class _SceneChange:
     """A scene before and after the change."""
 
     base: SceneIR
+    """Before."""
     perturbed: SceneIR
+    """After."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Drawn:
-    """The scene before and after the change, rendered again. labels: by mode; levels: as of `Checked`."""
+class _Rerender:
+    """The scene, rendered again before and after the change."""
 
-    renderer: CompositorDraw
+    renderer: CompositorRenderer
+    """The renderer."""
     before: Render
+    """Before the change."""
     after: Render
-    labels: dict[str, MovedLabels]
-    levels: dict[str, Level]
+    """After the change."""
+    labels: dict[str, SceneLabels]
+    """Labels after the change, by label mode."""
+    levels: dict[str, PixelDifference]
+    """Differences from the three pictures on disk, by file name."""
 
 
-def _render(
-    log: CheckLog, pictures: Mapping[str, np.ndarray], scenes: _Scenes, difficulty: Difficulty, backend: str
-) -> _Drawn:
-    """The three pictures against the scene; labels of the scene by mode, and contrasts by the pictures."""
-    compositor = Compositor(scenes.perturbed.at_rest(), RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
+def _rerender(
+    log: CheckLog, pictures: Mapping[str, np.ndarray], scenes: _SceneChange, difficulty: Difficulty, backend: str
+) -> _Rerender:
+    """Compare the three pictures with re-renders, and compute labels, with contrasts from the pictures."""
+    compositor = Compositor(scenes.perturbed.unperturbed(), RenderSettings(backend=backend))  # pyright: ignore[reportArgumentType]
     before, after = compositor.render(scenes.base), compositor.render(scenes.perturbed)
-    drawn = {BENIGN: scenes.base.photograph, RERENDER: before.image, COUNTEREXAMPLE: after.image}
-    levels: dict[str, Level] = {}
-    for name, image in drawn.items():
-        apart = np.abs(pictures[name].astype(np.int16) - to_uint8(image)).max(axis=2)
-        levels[name] = Level(int(apart.max()), float((apart > 0).mean()))
+    images = {BENIGN: scenes.base.photograph, RERENDER: before.image, COUNTEREXAMPLE: after.image}
+    levels: dict[str, PixelDifference] = {}
+    for name, image in images.items():
+        difference = np.abs(pictures[name].astype(np.int16) - to_uint8(image)).max(axis=2)
+        levels[name] = PixelDifference(int(difference.max()), float((difference > 0).mean()))
         found = f"up to {levels[name].largest} levels off, in {100 * levels[name].share:.3g} % of the pixels"
-        log.told("pictures", name, "the scene's", found, agrees=levels[name].largest <= LEVELS)
-    shown = [
-        replace(render, image=as_picture(pictures[name], "cpu"))
+        log.record("pictures", name, "as the scene renders", found, agrees=levels[name].largest <= LEVELS)
+    renders = [
+        replace(render, image=image_to_tensor(pictures[name], "cpu"))
         for render, name in ((before, RERENDER), (after, COUNTEREXAMPLE))
     ]
-    labeller = Labeller(scenes.base, shown[0], difficulty)
-    labels = {"paper": labeller.paper(), "moved": labeller.moved(scenes.perturbed, shown[1])}
-    return _Drawn(CompositorDraw(compositor, labeller), before, after, labels, levels)
+    labeller = Labeller(scenes.base, renders[0], difficulty)
+    labels = {"paper": labeller.paper(), "moved": labeller.moved(scenes.perturbed, renders[1])}
+    return _Rerender(CompositorRenderer(compositor, labeller), before, after, labels, levels)
 
 
-def _identity(log: CheckLog, result: FrameResult, base: SceneIR, before: Render) -> None:
-    """The PSNR of the re-render, in the boxes of the vehicles."""
+def _check_identity(log: CheckLog, result: FrameResult, base: SceneIR, before: Render) -> None:
+    """Compare the PSNR of the re-render in the boxes of the vehicles."""
     pair = [result.identity_psnr_db, psnr_in_boxes(base, before.image)]
-    told, found = (_EXACT_DB if value is None else min(value, _EXACT_DB) for value in pair)
-    log.told("pictures", "identity_psnr_db", *pair, agrees=abs(told - found) <= IDENTITY_DB)
+    expected, found = (_EXACT_DB if value is None else min(value, _EXACT_DB) for value in pair)
+    log.record("pictures", "identity_psnr_db", *pair, agrees=abs(expected - found) <= IDENTITY_DB)
 
 
-def _grades(
+def _check_grades(
     log: CheckLog,
     result: FrameResult,
-    drawn: _Drawn,
-    scenes: _Scenes,
-    seen: Mapping[str, Detections],
-    given: Given,
+    rerender: _Rerender,
+    scenes: _SceneChange,
+    detections: Mapping[str, Detections],
+    settings: RecordedSettings,
 ) -> None:
-    """Kinds and certificates of the recorded failures against draws that are taken again, and grades against what
-    they rest on.
-    """
-    judged = JudgedClasses.of(given.detector)
-    benign = State(scenes.base, drawn.before, drawn.labels["paper"], seen[RERENDER])
-    now = State(scenes.perturbed, drawn.after, drawn.labels["moved"], seen[COUNTEREXAMPLE])
-    case = case_of(result.identifier, drawn.renderer, judged, benign, now)
+    """Compare kinds and certificates of the failures with new draws, and grades with their evidence."""
+    judged = EvaluatedClasses.from_detector(settings.detector)
+    benign = EvaluatedScene(scenes.base, rerender.before, rerender.labels["paper"], detections[RERENDER])
+    now = EvaluatedScene(scenes.perturbed, rerender.after, rerender.labels["moved"], detections[COUNTEREXAMPLE])
+    case = build_grading_input(result.identifier, rerender.renderer, judged, benign, now)
     moved = now.labels.targets
-    found = failures.find(
-        judged.targets(benign.labels.targets),
+    found = failures.find_failures(
+        judged.map_targets(benign.labels.targets),
         benign.detections,
-        judged.targets(moved),
+        judged.map_targets(moved),
         now.detections,
-        given.t_star,
+        settings.t_star,
     )
-    found = given.aim.failures(found, moved, now.detections, judged.names)
-    again = failure_records(judged, moved, now.detections, found, given.grader.grade(case, found))
+    found = settings.aim.failures(found, moved, now.detections, judged.names)
+    again = build_failure_records(judged, moved, now.detections, found, settings.grader.grade(case, found))
     if len(again) != len(result.failures):
-        log.told("grades", "failures", len(result.failures), len(again), agrees=False)
+        log.record("grades", "failures", len(result.failures), len(again), agrees=False)
         return
     for i, (recorded, failure) in enumerate(zip(result.failures, again, strict=True)):
-        log.same("grades", f"failures[{i}].error", recorded.error, failure.error)
-        log.same("grades", f"failures[{i}].index", recorded.index, failure.index)
-        ours, theirs = _draws(recorded), _draws(failure)
-        near = all(abs(a - b) <= DRAWS for a, b in zip(ours, theirs, strict=True))
-        log.told("grades", f"failures[{i}].count", ours, theirs, agrees=near)
-        log.same("grades", f"failures[{i}].grade", recorded.grade, str(_follows(recorded, given.grader.rule)))
+        log.compare("grades", f"failures[{i}].error", recorded.error, failure.error)
+        log.compare("grades", f"failures[{i}].index", recorded.index, failure.index)
+        expected, counted = _count_contrary_draws(recorded), _count_contrary_draws(failure)
+        near = all(abs(a - b) <= DRAWS for a, b in zip(expected, counted, strict=True))
+        log.record("grades", f"failures[{i}].count", expected, counted, agrees=near)
+        log.compare(
+            "grades",
+            f"failures[{i}].grade",
+            recorded.grade,
+            str(_grade_from_evidence(recorded, settings.grader.rule)),
+        )
 
 
-def _draws(failure: Failure) -> tuple[int, int]:
-    """Draws that count, before and after; of those that were not all taken as few as speak against it."""
-    count = failure.count or Count()
+def _count_contrary_draws(failure: Failure) -> tuple[int, int]:
+    """Count the draws, before and after, that contradict the failure; sampling may have stopped early."""
+    count = failure.count or Certificate()
     return count.before_draws - count.before, count.after_draws - count.after
 
 
-def _follows(failure: Failure, rule: Rule) -> Grade:
-    """The grade that the recorded draws give."""
+def _grade_from_evidence(failure: Failure, rule: CertificateRule) -> Grade:
+    """Return the grade that follows from the recorded draws and second opinions."""
     if failure.count is None or not rule.holds(failure.count):
         return Grade.THRESHOLD
     if failure.second is None or not failure.second.agrees:
@@ -249,111 +274,119 @@ def _follows(failure: Failure, rule: Rule) -> Grade:
     return Grade.SHARED if failure.peer is not None and failure.peer.agrees else Grade.CONFIRMED
 
 
-def _judge(
+def _check_success(
     log: CheckLog,
     folder: Path,
     result: FrameResult,
-    labels: Mapping[str, MovedLabels],
-    scenes: _Scenes,
-    seen: Mapping[str, Detections],
-    given: Given,
+    labels: Mapping[str, SceneLabels],
+    scenes: _SceneChange,
+    detections: Mapping[str, Detections],
+    settings: RecordedSettings,
 ) -> None:
-    """Labels against the scene, and success by them."""
+    """Compare labels with the scene, and success with labels and detections."""
     recorded = {"paper": result.targets_benign, "moved": result.targets_moved}
     count = len(scenes.base.objects)
     for mode, own in labels.items():
         _compare_targets(log, f"targets_{mode}", recorded[mode], target_records(own.targets, CLASSES, count))
-    log.same(
+    log.compare(
         "labels",
         "became_ignored",
         list(result.became_ignored),
         labels["moved"].became_ignored.nonzero()[:, 0].tolist(),
     )
-    judged = {mode: {"": as_targets(records, CLASSES)} for mode, records in recorded.items()}
+    targets_by_mode = {mode: {"": targets_from_records(records, CLASSES)} for mode, records in recorded.items()}
     for mode, own in labels.items():
         name = f"labels_{mode}.txt"
         written = read_labels(folder / name)
         if _compare_labels(log, name, written, to_kitti_labels(own, scenes.base, scenes.perturbed)):
-            judged[mode][f" by {name}"] = _targets_of(written, own, judged[mode][""].ignore)
-    sizes = {len(targets) for kinds in judged.values() for targets in kinds.values()}
+            ignore = targets_by_mode[mode][""].ignore
+            targets_by_mode[mode][f" by {name}"] = _targets_from_labels(written, own, ignore)
+    sizes = {len(targets) for by_source in targets_by_mode.values() for targets in by_source.values()}
     if len(sizes) > 1:
-        log.told("success", "targets", "as many of either label mode", sorted(sizes), agrees=False)
+        log.record("success", "targets", "as many of either label mode", sorted(sizes), agrees=False)
         return
-    for mode, kinds in judged.items():
-        for by, targets in kinds.items():
-            _compare_success(log, result, mode, by, _failures(judged["paper"][""], targets, seen, given))
+    for mode, by_source in targets_by_mode.items():
+        for source, targets in by_source.items():
+            found = _find_failures(targets_by_mode["paper"][""], targets, detections, settings)
+            _compare_success(log, result, mode, source, found)
 
 
-def _failures(
-    benign: Targets, targets: Targets, seen: Mapping[str, Detections], given: Given
+def _find_failures(
+    benign: Targets, targets: Targets, detections: Mapping[str, Detections], settings: RecordedSettings
 ) -> tuple[tuple[int, ...], tuple[BoxRecord, ...]]:
-    """Objects that are lost, and phantoms."""
-    judged = JudgedClasses.of(given.detector)
-    after = seen[COUNTEREXAMPLE]
+    """Return lost objects and phantoms."""
+    judged = EvaluatedClasses.from_detector(settings.detector)
+    after = detections[COUNTEREXAMPLE]
     try:
-        found = failures.find(judged.targets(benign), seen[RERENDER], judged.targets(targets), after, given.t_star)
+        found = failures.find_failures(
+            judged.map_targets(benign), detections[RERENDER], judged.map_targets(targets), after, settings.t_star
+        )
     except ValueError as error:
         raise FormatError("targets_moved", "the objects of targets_benign", "others") from error
-    found = given.aim.failures(found, targets, after, judged.names)
+    found = settings.aim.failures(found, targets, after, judged.names)
     records = detection_records(after, judged.names)
     return found.lost, tuple(records[i] for i in found.phantoms)
 
 
 def _compare_success(
-    log: CheckLog, result: FrameResult, mode: str, by: str, found: tuple[tuple[int, ...], tuple[BoxRecord, ...]]
+    log: CheckLog,
+    result: FrameResult,
+    mode: str,
+    source: str,
+    found: tuple[tuple[int, ...], tuple[BoxRecord, ...]],
 ) -> None:
     lost, phantoms = found
     expected = result.success_moved if mode == "moved" else result.success_paper
-    log.same("success", f"success_{mode}{by}", expected, bool(lost or phantoms))
+    log.compare("success", f"success_{mode}{source}", expected, bool(lost or phantoms))
     if mode == "moved":
         known = [f.index for f in result.failures if f.kind == "lost"]
-        log.same("success", f"lost{by}", [f"objects[{i}]" for i in known], [f"objects[{i}]" for i in lost])
+        log.compare("success", f"lost{source}", [f"objects[{i}]" for i in known], [f"objects[{i}]" for i in lost])
         boxes = [BoxRecord(f.xyxy, f.label, f.score) for f in result.failures if f.kind == "phantom"]
-        _compare_boxes(log, "success", f"phantoms{by}", boxes, phantoms)
+        _compare_boxes(log, "success", f"phantoms{source}", boxes, phantoms)
 
 
 def _compare_boxes(
     log: CheckLog, check: str, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]
 ) -> None:
-    """Detections, each with the first that is like it; order and what lies within the tolerance do not matter."""
-    left = list(found)
+    """Compare detections within the tolerance, in any order."""
+    unmatched = list(found)
     for record in expected:
-        like = next((other for other in left if _alike(record, other)), None)
-        if like is None:
-            log.told(check, name, _said(record), "none like it", agrees=False)
+        match = next((other for other in unmatched if _is_close(record, other)), None)
+        if match is None:
+            log.record(check, name, _describe_box(record), "no match", agrees=False)
         else:
-            left.remove(like)
-            log.told(check, name, "", "", agrees=True)
-    for record in left:
-        log.told(check, name, "none like it", _said(record), agrees=False)
+            unmatched.remove(match)
+            log.record(check, name, "", "", agrees=True)
+    for record in unmatched:
+        log.record(check, name, "no match", _describe_box(record), agrees=False)
 
 
-def _alike(one: BoxRecord, other: BoxRecord) -> bool:
+def _is_close(one: BoxRecord, other: BoxRecord) -> bool:
     apart = max(abs(a - b) for a, b in zip(one.xyxy, other.xyxy, strict=True))
     return one.label == other.label and apart <= BOX_PX and abs((one.score or 0) - (other.score or 0)) <= SCORE
 
 
-def _said(record: BoxRecord) -> str:
+def _describe_box(record: BoxRecord) -> str:
     corners = " ".join(f"{value:.1f}" for value in record.xyxy)
     score = "" if record.score is None else f" {record.score:.3f}"
     return f"{record.label}{score} at {corners}"
 
 
 def _compare_targets(log: CheckLog, name: str, expected: Sequence[BoxRecord], found: Sequence[BoxRecord]) -> None:
-    """Recorded targets against those of the saved scene."""
-    log.same("labels", f"{name}, how many", len(expected), len(found))
+    """Compare recorded targets with those of the saved scene."""
+    log.compare("labels", f"{name}, how many", len(expected), len(found))
     for i, (one, other) in enumerate(zip(expected, found, strict=False)):
         apart = max(abs(a - b) for a, b in zip(one.xyxy, other.xyxy, strict=True))
         same = (one.label, one.ignore, one.index) == (other.label, other.ignore, other.index)
-        told = [_said(r) + (", ignored" if r.ignore else "") for r in (one, other)]
-        log.told("labels", f"{name}[{i}]", *told, agrees=same and apart <= LABEL)
+        texts = [_describe_box(r) + (", ignored" if r.ignore else "") for r in (one, other)]
+        log.record("labels", f"{name}[{i}]", *texts, agrees=same and apart <= LABEL)
 
 
 def _compare_labels(log: CheckLog, name: str, written: Labels, own: Labels) -> bool:
-    """A label file against the saved scene. Returns whether both have the same objects and as many regions."""
-    log.same("labels", f"{name}: type", list(written.kind), list(own.kind))
+    """Compare a label file with the saved scene. Returns whether both have the same objects and number of regions."""
+    log.compare("labels", f"{name}: type", list(written.kind), list(own.kind))
     regions = len(written.ignore_xyxy), len(own.ignore_xyxy)
-    log.same("labels", f"{name}: DontCare", *regions)
+    log.compare("labels", f"{name}: DontCare", *regions)
     if written.kind != own.kind or regions[0] != regions[1]:
         return False
     for field in _LABEL_FIELDS:
@@ -363,20 +396,20 @@ def _compare_labels(log: CheckLog, name: str, written: Labels, own: Labels) -> b
 
 
 def _compare_rows(log: CheckLog, name: str, written: Tensor, own: Tensor) -> None:
-    """Rows of numbers; name: with a place for the row's."""
+    """Compare rows of numbers. name: a format string for the number of the row."""
     for i, (one, other) in enumerate(zip(written.tolist(), own.tolist(), strict=True)):
         pair = [side if isinstance(side, list) else [side] for side in (one, other)]
-        ways = [a - b for a, b in zip(*pair, strict=True)]
+        differences = [a - b for a, b in zip(*pair, strict=True)]
         if name.endswith(".yaw"):
-            ways = [math.remainder(way, 2 * math.pi) for way in ways]
-        apart = max(map(abs, ways))
-        told = [" ".join(f"{value:.3f}" for value in side) for side in pair]
-        log.told("labels", name.format(i), *told, agrees=apart <= LABEL)
+            differences = [math.remainder(difference, 2 * math.pi) for difference in differences]
+        largest = max(map(abs, differences))
+        texts = [" ".join(f"{value:.3f}" for value in side) for side in pair]
+        log.record("labels", name.format(i), *texts, agrees=largest <= LABEL)
 
 
-def _targets_of(written: Labels, own: MovedLabels, ignore: Tensor) -> Targets:
-    """What a label file holds as targets, with the recorded flags (M,) of what is ignored."""
-    placed = own.boxes_xyxy.clone()
-    placed[own.in_view] = written.boxes_xyxy
-    boxes = replace(own, boxes_xyxy=placed, regions_xyxy=written.ignore_xyxy).targets
+def _targets_from_labels(written: Labels, own: SceneLabels, ignore: Tensor) -> Targets:
+    """Return the targets of a label file, with the recorded ignore flags (M,)."""
+    boxes_xyxy = own.boxes_xyxy.clone()
+    boxes_xyxy[own.in_view] = written.boxes_xyxy
+    boxes = replace(own, boxes_xyxy=boxes_xyxy, regions_xyxy=written.ignore_xyxy).targets
     return Targets(boxes.boxes_xyxy, boxes.labels, ignore if len(ignore) == len(boxes) else boxes.ignore)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup, escape
 
-from drivesem.run.report.page import Chart, Line, Point
+from drivesem.run.report.page import ChartLine, Point, ReportChart
 
 SERIES = 7
 """Colours in the style sheet; more lines repeat them with other dashes."""
@@ -24,7 +24,7 @@ _ROW_PX, _NAME_LEFT, _BAR_LEFT, _BAR_RIGHT = 46, 6, 60, 60
 
 
 @dataclass(frozen=True, slots=True)
-class Fall:
+class MetricDrop:
     """A figure before and after, in percent. theirs: the paper's, not ours."""
 
     name: str
@@ -59,9 +59,9 @@ class _Axes:
         return [self.low + (self.high - self.low) * k / 5 for k in range(6)]
 
 
-def curve_chart(chart: Chart) -> Markup:
+def curve_chart(chart: ReportChart) -> Markup:
     """The chart as `<svg>`, with a text for those who do not see it."""
-    axes = _Axes(*chart.x_range, chart.doubling)
+    axes = _Axes(*chart.x_range, chart.log2_x)
     parts = [_frame(chart, axes)]
     parts += [_line(line, place, axes) for place, line in reversed(list(enumerate(chart.lines)))]
     told = f"{chart.title}: {chart.y_label} over {chart.x_label}. {_told(chart.lines)}"
@@ -71,7 +71,7 @@ def curve_chart(chart: Chart) -> Markup:
     )
 
 
-def key_of(place: int) -> Markup:
+def legend_key(place: int) -> Markup:
     """The sign of the i-th line, for a legend."""
     return Markup(
         f'<svg class="sign" viewBox="0 0 34 10" aria-hidden="true"><path class="line s{place % SERIES}"'
@@ -79,7 +79,7 @@ def key_of(place: int) -> Markup:
     )
 
 
-def fall_chart(falls: Sequence[Fall], label: str) -> Markup:
+def drop_chart(falls: Sequence[MetricDrop], label: str) -> Markup:
     """Rows that lead from before to after on one scale of percent; `label` names the figure."""
     height = _ROW_PX * len(falls) + 34
     lowest = min([100.0, *(min(f.before, f.after) for f in falls)])
@@ -123,7 +123,7 @@ def fall_chart(falls: Sequence[Fall], label: str) -> Markup:
     )
 
 
-def trace(values: Sequence[float], width: int = 180, height: int = 40) -> Markup:
+def loss_trace_chart(values: Sequence[float], width: int = 180, height: int = 40) -> Markup:
     """A frame's loss by query, from its least to its greatest value."""
     low, high = min(values), max(values)
     places = " ".join(
@@ -138,7 +138,7 @@ def trace(values: Sequence[float], width: int = 180, height: int = 40) -> Markup
     )
 
 
-def _frame(chart: Chart, axes: _Axes) -> str:
+def _frame(chart: ReportChart, axes: _Axes) -> str:
     """Grid, ticks and the names of the axes."""
     bottom, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
     parts = []
@@ -163,7 +163,7 @@ def _frame(chart: Chart, axes: _Axes) -> str:
     return "".join(parts)
 
 
-def _line(line: Line, place: int, axes: _Axes) -> str:
+def _line(line: ChartLine, place: int, axes: _Axes) -> str:
     colour = f"s{place % SERIES}"
     parts = []
     if line.band:
@@ -194,7 +194,7 @@ def _dash(place: int) -> str:
     return f' stroke-dasharray="{dash}"' if dash else ""
 
 
-def _told(lines: Sequence[Line]) -> str:
+def _told(lines: Sequence[ChartLine]) -> str:
     ends = (
         f"{line.name} ends at {line.points[-1][0]:.0f}, {line.points[-1][1]:.0f}" for line in lines if line.points
     )

@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from drivesem.report.tables import number_of
-from drivesem.run.report import grading
-from drivesem.run.report.page import ShownRun
+from drivesem.report.tables import format_count
+from drivesem.run.report import page as grading
+from drivesem.run.report.page import ReportedRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -61,7 +61,7 @@ _NEAR = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class BoxMark:
     """A box to be drawn. kind: true, ignored, found, lost or phantom; x, y, width, height: px; left, top, bottom:
     percent of the picture; text: of its label; unsure: a failure that chance may explain.
     """
@@ -106,12 +106,12 @@ class CloseUp:
     view: tuple[float, float, float, float]
     before: str
     after: str
-    marks_before: tuple[Mark, ...]
-    marks_after: tuple[Mark, ...]
+    marks_before: tuple[BoxMark, ...]
+    marks_after: tuple[BoxMark, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class OwnerChange:
     """What happened to one owner (`object 2`, `scene`): parts such as ("along", "+0.14 m")."""
 
     owner: str
@@ -132,12 +132,12 @@ class FailureRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class FrameOutcome:
     """A frame in one run. size: the greatest share of its bound that a coordinate takes, percent; params: those
     that changed; furthest, turned: the greatest move and turn, as text; risen: the loss, last less first.
     """
 
-    run: ShownRun
+    run: ReportedRun
     result: FrameResult
     lost: int
     phantoms: int
@@ -146,7 +146,7 @@ class Outcome:
     furthest: str
     turned: str
     risen: float
-    changes: tuple[Change, ...]
+    changes: tuple[OwnerChange, ...]
     rows: tuple[FailureRow, ...]
 
     @property
@@ -157,46 +157,46 @@ class Outcome:
     @property
     def rank(self) -> int:
         """Of its surest failure, as of `grading.rank`."""
-        return max(map(grading.rank, self.result.failures), default=0)
+        return max(map(grading.grade_rank, self.result.failures), default=0)
 
     @property
     def surest(self) -> int:
         """Failures of the highest grade."""
-        return sum(grading.rank(f) == self.rank for f in self.result.failures) if self.rank else 0
+        return sum(grading.grade_rank(f) == self.rank for f in self.result.failures) if self.rank else 0
 
     @property
     def sure(self) -> int:
         """Failures that are certain, or more than that."""
-        return sum(map(grading.is_sure, self.result.failures))
+        return sum(map(grading.is_certain, self.result.failures))
 
     @property
     def grade(self) -> str:
         """The highest; "" without a failure, or where nobody asked."""
-        ranks = {grading.rank(f): f.grade or "" for f in self.result.failures}
+        ranks = {grading.grade_rank(f): f.grade or "" for f in self.result.failures}
         return ranks[max(ranks)] if ranks else ""
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class PictureLayer:
     """A picture with its boxes. sets: the boxes by run, each with the places of the runs that share them."""
 
     title: str
     alt: str
     source: str
-    sets: tuple[tuple[tuple[int, ...], tuple[Mark, ...]], ...]
+    sets: tuple[tuple[tuple[int, ...], tuple[BoxMark, ...]], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class FrameCard:
     """A frame in all runs; layers (the photograph, then one a run) and close-ups where it is in the gallery."""
 
     identifier: str
     anchor: str
     weather: str | None
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[FrameOutcome, ...]
     width: int = 0
     height: int = 0
-    layers: tuple[Layer, ...] = ()
+    layers: tuple[PictureLayer, ...] = ()
     close_ups: tuple[tuple[CloseUp, ...], ...] = ()
 
     @property
@@ -248,12 +248,12 @@ class Card:
         return tuple(p for p in _PARAMETERS.values() if any(p in one.params for one in self.outcomes))
 
 
-def cards_of(runs: Sequence[ShownRun], gallery: int) -> list[Card]:
+def build_cards(runs: Sequence[ReportedRun], gallery: int) -> list[FrameCard]:
     """All frames, worst first: by the highest grade, then most failures of it, then most of any, then the smallest
     change that was enough; pictures for the first `gallery`. Raises FormatError where a picture is missing.
     """
     plain = [
-        Card(
+        FrameCard(
             identifier=results[0].identifier,
             anchor=f"frame-{place}",
             weather=runs[0].weathers[place],
@@ -267,11 +267,11 @@ def cards_of(runs: Sequence[ShownRun], gallery: int) -> list[Card]:
         return [*pool.map(_with_pictures, plain[:gallery]), *plain[gallery:]]
 
 
-def _outcome(run: ShownRun, result: FrameResult) -> Outcome:
+def _outcome(run: ReportedRun, result: FrameResult) -> FrameOutcome:
     kinds = [failure.kind for failure in result.failures]
     changed = [c for c in result.theta if c.value != 0]
     trace = result.loss_trace
-    return Outcome(
+    return FrameOutcome(
         run=run,
         result=result,
         lost=kinds.count("lost"),
@@ -287,23 +287,23 @@ def _outcome(run: ShownRun, result: FrameResult) -> Outcome:
 
 
 def _surest_first(failures: Sequence[Failure]) -> list[Failure]:
-    return sorted(failures, key=lambda failure: -grading.rank(failure))
+    return sorted(failures, key=lambda failure: -grading.grade_rank(failure))
 
 
 def _row(result: FrameResult, failure: Failure) -> FailureRow:
     return FailureRow(
         text=_named(failure),
         grade=failure.grade or "",
-        draws=grading.draws(failure),
-        margin=grading.margins(failure.count),
-        second=grading.says(failure, failure.second),
-        peer=grading.says(failure, failure.peer),
+        draws=grading.format_draws(failure),
+        margin=grading.format_margins(failure.count),
+        second=grading.format_second_opinion(failure, failure.second),
+        peer=grading.format_second_opinion(failure, failure.peer),
         score=_scores(result, failure, _before_it_moved(result, failure)),
     )
 
 
 def _named(failure: Failure) -> str:
-    return grading.what(failure) + ("" if failure.index is None else f", object {failure.index}")
+    return grading.describe_failure(failure) + ("" if failure.index is None else f", object {failure.index}")
 
 
 def _parameter(coordinate: Coordinate) -> str:
@@ -332,7 +332,7 @@ def _greatest(changed: Sequence[Coordinate], parameter: str) -> str:
     return max(mine, key=_amount, default="")
 
 
-def _changes(changed: Sequence[Coordinate]) -> tuple[Change, ...]:
+def _changes(changed: Sequence[Coordinate]) -> tuple[OwnerChange, ...]:
     """By owner, in their order; the many offsets of a mesh as one."""
     owners: dict[str, list[Coordinate]] = {}
     for c in changed:
@@ -345,7 +345,7 @@ def _changes(changed: Sequence[Coordinate]) -> tuple[Change, ...]:
         offsets = [c.display.lstrip("-") for c in mine if _parameter(c) == "mesh"]
         if offsets:
             parts.append(("mesh", f"{len(offsets)} offsets, up to {max(offsets, key=_amount)}"))
-        found.append(Change(owner, tuple(parts)))
+        found.append(OwnerChange(owner, tuple(parts)))
     return tuple(found)
 
 
@@ -361,18 +361,18 @@ def _signed(display: str) -> str:
     return f"−{text[1:]}" if text.startswith("-") else f"+{text}"
 
 
-def in_units(display: str) -> str:
+def format_size(display: str) -> str:
     """A size for people: `1.6°`, `0.14 m`, or a dash."""
     return _signed(display)[1:] if display else "–"
 
 
-def _with_pictures(card: Card) -> Card:
+def _with_pictures(card: FrameCard) -> FrameCard:
     first = card.outcomes[0]
     photograph = _opened(first, "benign.png")
     width, height = photograph.size
     pictures = [_opened(one, "counterexample.png") for one in card.outcomes]
     encoded, quality = _small(_reduced(photograph, LARGEST_PX))
-    before = Layer(
+    before = PictureLayer(
         title="before",
         alt=f"Frame {card.identifier} before the change: {_told_before(first)}",
         source=_address(encoded),
@@ -380,7 +380,7 @@ def _with_pictures(card: Card) -> Card:
     )
     several = len(card.outcomes) > 1
     after = [
-        Layer(
+        PictureLayer(
             title=one.run.name if several else "after",
             alt=f"Frame {card.identifier} after the change{f' by {one.run.name}' if several else ''}: {told(one)}",
             source=_address(_encoded(_reduced(picture, LARGEST_PX), quality)),
@@ -395,7 +395,7 @@ def _with_pictures(card: Card) -> Card:
         )
         for one, picture in zip(card.outcomes, pictures, strict=True)
     )
-    return Card(
+    return FrameCard(
         identifier=card.identifier,
         anchor=card.anchor,
         weather=card.weather,
@@ -407,40 +407,40 @@ def _with_pictures(card: Card) -> Card:
     )
 
 
-def told(one: Outcome) -> str:
+def describe_outcome(one: FrameOutcome) -> str:
     """`1 certain of 1 lost, 2 phantoms`."""
     parts = [f"{one.lost} lost"] if one.lost else []
     if one.phantoms:
-        parts.append(number_of(one.phantoms, "phantom"))
+        parts.append(format_count(one.phantoms, "phantom"))
     if not parts:
         return "withstood"
     sure = f"{one.surest} {one.grade} of " if one.sure else ""
     return sure + ", ".join(parts)
 
 
-def _told_before(one: Outcome) -> str:
-    return number_of(one.result.objects, "vehicle")
+def _told_before(one: FrameOutcome) -> str:
+    return format_count(one.result.objects, "vehicle")
 
 
-def _shared(sets: Sequence[tuple[Mark, ...]]) -> tuple[tuple[tuple[int, ...], tuple[Mark, ...]], ...]:
+def _shared(sets: Sequence[tuple[BoxMark, ...]]) -> tuple[tuple[tuple[int, ...], tuple[BoxMark, ...]], ...]:
     """Equal sets once, with the places that have them."""
-    places: dict[tuple[Mark, ...], list[int]] = {}
+    places: dict[tuple[BoxMark, ...], list[int]] = {}
     for place, marks in enumerate(sets):
         places.setdefault(marks, []).append(place)
     return tuple((tuple(mine), marks) for marks, mine in places.items())
 
 
-def _before(one: Outcome, size: tuple[int, int]) -> tuple[Mark, ...]:
+def _before(one: FrameOutcome, size: tuple[int, int]) -> tuple[BoxMark, ...]:
     result, threshold = one.result, one.run.summary.t_star
     return (*_true(result.targets_benign, size), *_found(result.detections_benign, threshold, size))
 
 
-def _after(one: Outcome, size: tuple[int, int]) -> tuple[Mark, ...]:
+def _after(one: FrameOutcome, size: tuple[int, int]) -> tuple[BoxMark, ...]:
     result, threshold = one.result, one.run.summary.t_star
     failures = tuple(
         replace(
             _mark(f.kind, f.xyxy, f"{grading.what(f)}{f': {f.grade}' if grading.is_sure(f) else ''}", size),
-            unsure=f.grade is not None and not grading.is_sure(f),
+            unsure=f.grade is not None and not grading.is_certain(f),
         )
         # What is surest is drawn last, over the others.
         for f in reversed(_surest_first(result.failures))
@@ -452,14 +452,14 @@ def _after(one: Outcome, size: tuple[int, int]) -> tuple[Mark, ...]:
     )
 
 
-def _true(boxes: Sequence[BoxRecord], size: tuple[int, int]) -> list[Mark]:
+def _true(boxes: Sequence[BoxRecord], size: tuple[int, int]) -> list[BoxMark]:
     """A region that is ignored for several classes is drawn once."""
     marks = [_mark("ignored" if b.ignore else "true", b.xyxy, b.label, size) for b in boxes]
     seen = {mark.kind + str((mark.x, mark.y, mark.width, mark.height)): mark for mark in marks}
     return list(seen.values())
 
 
-def _found(boxes: Sequence[BoxRecord], threshold: float, size: tuple[int, int]) -> list[Mark]:
+def _found(boxes: Sequence[BoxRecord], threshold: float, size: tuple[int, int]) -> list[BoxMark]:
     return [
         _mark("found", b.xyxy, f"{b.label} {b.score:.2f}", size)
         for b in boxes
@@ -467,11 +467,11 @@ def _found(boxes: Sequence[BoxRecord], threshold: float, size: tuple[int, int]) 
     ]
 
 
-def _mark(kind: str, xyxy: tuple[float, float, float, float], text: str, size: tuple[int, int]) -> Mark:
+def _mark(kind: str, xyxy: tuple[float, float, float, float], text: str, size: tuple[int, int]) -> BoxMark:
     """Cut off at the picture's edge, so that every side can be seen."""
     x0, x1 = (min(max(v, 1.0), size[0] - 1.0) for v in xyxy[0::2])
     y0, y1 = (min(max(v, 1.0), size[1] - 1.0) for v in xyxy[1::2])
-    return Mark(
+    return BoxMark(
         kind=kind,
         x=round(x0, 1),
         y=round(y0, 1),
@@ -484,7 +484,7 @@ def _mark(kind: str, xyxy: tuple[float, float, float, float], text: str, size: t
     )
 
 
-def _close_up(one: Outcome, failure: Failure, photograph: Image, picture: Image) -> CloseUp:
+def _close_up(one: FrameOutcome, failure: Failure, photograph: Image, picture: Image) -> CloseUp:
     size = photograph.size
     before = _before_it_moved(one.result, failure)
     view = _view(_hull(before, failure.xyxy), size)
@@ -493,7 +493,7 @@ def _close_up(one: Outcome, failure: Failure, photograph: Image, picture: Image)
         kind=failure.kind,
         text=row.text,
         grade=row.grade,
-        rank=grading.rank(failure),
+        rank=grading.grade_rank(failure),
         evidence=tuple(words for words in (row.draws, row.second, row.peer) if words),
         scores=row.score,
         view=view,
@@ -555,18 +555,18 @@ def _view(xyxy: tuple[float, float, float, float], size: tuple[int, int]) -> tup
     return x, y, width, height
 
 
-def _near(xyxy: tuple[float, float, float, float], marks: Sequence[Mark]) -> tuple[Mark, ...]:
+def _near(xyxy: tuple[float, float, float, float], marks: Sequence[BoxMark]) -> tuple[BoxMark, ...]:
     """Those that lie on a failure, but for what is ignored."""
     return tuple(
         m for m in marks if m.kind != "ignored" and _iou(xyxy, (m.x, m.y, m.x + m.width, m.y + m.height)) >= _NEAR
     )
 
 
-def _opened(one: Outcome, name: str) -> Image:
+def _opened(one: FrameOutcome, name: str) -> Image:
     path = one.run.folder / "frames" / one.result.identifier / name
     if not path.is_file():
         raise FormatError(str(path), "a picture of the run", "none")
-    with files.opened_image(path) as picture:
+    with files.open_image(path) as picture:
         return picture.convert("RGB")
 
 

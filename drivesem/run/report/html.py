@@ -14,11 +14,11 @@ from markupsafe import Markup
 
 from drivesem.failures.grades import Grade
 from drivesem.report import web
-from drivesem.report.tables import number_of
-from drivesem.run.report import grading
-from drivesem.run.report.charts import Fall, curve_chart, fall_chart, key_of, trace
-from drivesem.run.report.frames import Card, CloseUp, cards_of, in_units, told
-from drivesem.run.report.page import Page, ShownRun
+from drivesem.report.tables import format_count
+from drivesem.run.report import page as grading
+from drivesem.run.report.charts import MetricDrop, curve_chart, drop_chart, legend_key, loss_trace_chart
+from drivesem.run.report.frames import FrameCard, CloseUp, build_cards, format_size, describe_outcome
+from drivesem.run.report.page import ReportedRun, ReportPage
 from drivesem.run.results import RunSummary
 
 _COLUMNS = {
@@ -50,22 +50,22 @@ class _Tile:
     more: str
 
 
-def render_report(page: Page, at: Path) -> str:
+def render_report(page: ReportPage, at: Path) -> str:
     """The page's text. at: the file it will be, from which its links lead to the runs' folders.
 
     Raises FormatError where a picture of the gallery is missing.
     """
     runs, several = page.runs, len(page.runs) > 1
-    cards = cards_of(runs, page.gallery)
+    cards = build_cards(runs, page.gallery)
     first = runs[0]
-    return web.render(
+    return web.render_page(
         "drivesem.run.report:template.html",
         "drivesem.run.report:page.js",
         link_to=lambda folder, frame=None: _link(at, folder, frame),
         scene_of=lambda folder, frame: shlex.quote((folder / "frames" / frame / "scene").as_posix()),
-        told=told,
-        in_units=in_units,
-        trace=trace,
+        told=describe_outcome,
+        in_units=format_size,
+        trace=loss_trace_chart,
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
         several=several,
@@ -83,7 +83,7 @@ def render_report(page: Page, at: Path) -> str:
             {
                 "title": chart.title,
                 "picture": curve_chart(chart),
-                "legend": [(key_of(place), line.name) for place, line in enumerate(chart.lines)],
+                "legend": [(legend_key(place), line.name) for place, line in enumerate(chart.lines)],
                 "note": chart.note,
             }
             for chart in page.charts
@@ -92,9 +92,9 @@ def render_report(page: Page, at: Path) -> str:
         glance_title=_glance_title([shot for _, _, shot in glance]),
         graded=[run for run in runs if grading.is_known(run.summary, run.frames)],
         failures=any(result.failures for run in runs for result in run.frames),
-        kinds=[] if several else grading.table(first.frames),
+        kinds=[] if several else grading.tabulate_kinds(first.frames),
         grades=[str(grade) for grade in reversed(Grade)],
-        rules=grading.rules(first.asked),
+        rules=grading.build_grade_rules(first.grade_requirements),
         unknown=grading.UNKNOWN,
         grade_notes=_notes(runs),
         cards=cards,
@@ -124,26 +124,26 @@ def _totals(summary: RunSummary) -> tuple[int, int]:
     return sum(summary.lost_objects.values()), sum(summary.phantoms.values())
 
 
-def _verdict(run: ShownRun) -> str:
+def _verdict(run: ReportedRun) -> str:
     summary = run.summary
     lost, phantoms = _totals(summary)
     if not lost and not phantoms:
-        return f"{summary.detector} withstood in all of {number_of(summary.frames, 'frame')}"
+        return f"{summary.detector} withstood in all of {format_count(summary.frames, 'frame')}"
     if grading.is_known(summary, run.frames):
-        grade = grading.highest(summary)
+        grade = grading.highest_grade(summary)
         if grade is None:
-            return f"No certain failure: {number_of(lost + phantoms, 'failure')} by threshold, {grading.CHANCE}"
+            return f"No certain failure: {format_count(lost + phantoms, 'failure')} by threshold, {grading.CHANCE}"
         frames = sum(any(f.grade == grade for f in r.failures) for r in run.frames)
-        failures = number_of(summary.grades[str(grade)], f"{grade} failure")
-        return f"{failures} of {summary.detector}, in {frames} of {number_of(summary.frames, 'frame')}"
-    parts = [f"loses {number_of(lost, 'object')}"] if lost else []
+        failures = format_count(summary.grades[str(grade)], f"{grade} failure")
+        return f"{failures} of {summary.detector}, in {frames} of {format_count(summary.frames, 'frame')}"
+    parts = [f"loses {format_count(lost, 'object')}"] if lost else []
     if phantoms:
-        parts.append(f"makes up {phantoms if lost else number_of(phantoms, 'object')}")
-    frames = f"{summary.successes_moved} of {number_of(summary.frames, 'frame')}"
+        parts.append(f"makes up {phantoms if lost else format_count(phantoms, 'object')}")
+    frames = f"{summary.successes_moved} of {format_count(summary.frames, 'frame')}"
     return f"{summary.detector} {' and '.join(parts)}, in {frames}"
 
 
-def _how_sure(run: ShownRun) -> str:
+def _how_sure(run: ReportedRun) -> str:
     """Failures by highest grade and kind, in a sentence each; "" without any."""
     failures = [failure for result in run.frames for failure in result.failures]
     if not failures:
@@ -152,21 +152,21 @@ def _how_sure(run: ShownRun) -> str:
         return (
             f"{grading.UNKNOWN[0].upper()}{grading.UNKNOWN[1:]}. They are failures by threshold, {grading.CHANCE}."
         )
-    told = []
+    describe_outcome = []
     for grade in reversed(Grade):
         mine = [failure for failure in failures if failure.grade == grade]
         if mine and grade is Grade.THRESHOLD:
-            others = "More by threshold only" if told else "By threshold only"
-            told.append(f"{others}: {grading.summed(mine)}.")
+            others = "More by threshold only" if describe_outcome else "By threshold only"
+            describe_outcome.append(f"{others}: {grading.summed(mine)}.")
         elif mine:
-            word = f"only {grade}" if told else str(grade)
-            told.append(f"{word[0].upper()}{word[1:]}: {grading.summed(mine)}.")
+            word = f"only {grade}" if describe_outcome else str(grade)
+            describe_outcome.append(f"{word[0].upper()}{word[1:]}: {grading.summed(mine)}.")
     unknown = sum(failure.grade is None for failure in failures)
-    return " ".join([*told, *([f"{unknown} of unknown grade."] if unknown else [])])
+    return " ".join([*describe_outcome, *([f"{unknown} of unknown grade."] if unknown else [])])
 
 
-def _comparison(runs: Sequence[ShownRun]) -> str:
-    frames = number_of(runs[0].summary.frames, "frame")
+def _comparison(runs: Sequence[ReportedRun]) -> str:
+    frames = format_count(runs[0].summary.frames, "frame")
     head = f"{len(runs)} runs on {frames}"
     if all(grading.is_known(run.summary, run.frames) for run in runs):
         surest = max(runs, key=lambda run: tuple(run.summary.grades[str(g)] for g in _FROM_CERTAIN))
@@ -185,7 +185,7 @@ def _comparison(runs: Sequence[ShownRun]) -> str:
     return f"{head}: {most.name} breaks most by threshold, {most.summary.successes_moved}"
 
 
-def _tie(runs: Sequence[ShownRun], counts: Sequence[int], what: str) -> str:
+def _tie(runs: Sequence[ReportedRun], counts: Sequence[int], what: str) -> str:
     """Who shares the first place, in words; nothing where one run has it alone."""
     most = max(counts)
     names = [run.name for run, count in zip(runs, counts, strict=True) if count == most]
@@ -196,21 +196,19 @@ def _tie(runs: Sequence[ShownRun], counts: Sequence[int], what: str) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]} have most {what}, {most} each"
 
 
-def _notes(runs: Sequence[ShownRun]) -> list[str]:
+def _notes(runs: Sequence[ReportedRun]) -> list[str]:
     """Why grades could not be reached."""
     several = len(runs) > 1
     return [
-        f"{f'{run.name}: ' if several else ''}{note} ({number_of(frames, 'frame')})"
+        f"{f'{run.name}: ' if several else ''}{note} ({format_count(frames, 'frame')})"
         for run in runs
         for note, frames in run.summary.grade_notes.items()
     ]
 
 
-def _lead(runs: Sequence[ShownRun]) -> str:
+def _lead(runs: Sequence[ReportedRun]) -> str:
     summary = runs[0].summary
-    data = (
-        f"{number_of(summary.frames, 'frame')} of {summary.dataset} with {number_of(summary.objects, 'vehicle')}"
-    )
+    data = f"{format_count(summary.frames, 'frame')} of {summary.dataset} with {format_count(summary.objects, 'vehicle')}"
     if len(runs) > 1:
         return f"The same {data}, each run beside the others."
     changed = " + ".join(summary.params)
@@ -220,7 +218,7 @@ def _lead(runs: Sequence[ShownRun]) -> str:
     )
 
 
-def _tiles(run: ShownRun) -> list[_Tile]:
+def _tiles(run: ReportedRun) -> list[_Tile]:
     summary = run.summary
     before, moved, stay = (
         s.headline.ap50 for s in (summary.benign, summary.attacked_moved, summary.attacked_paper)
@@ -241,12 +239,12 @@ def _tiles(run: ShownRun) -> list[_Tile]:
         _Tile(
             "feasible, %",
             _percent(summary.feasible_fraction),
-            f"by the independent check; {number_of(summary.queries, 'query', 'queries')}",
+            f"by the independent check; {format_count(summary.queries, 'query', 'queries')}",
         ),
     ]
 
 
-def _graded_tile(run: ShownRun) -> list[_Tile]:
+def _graded_tile(run: ReportedRun) -> list[_Tile]:
     grades, failures = run.summary.grades, sum(_totals(run.summary))
     if not failures:
         return []
@@ -264,7 +262,7 @@ def _by_class(summary: RunSummary) -> str:
     return "; ".join(parts) or "nothing"
 
 
-def _figure_rows(run: ShownRun) -> list[_Row]:
+def _figure_rows(run: ReportedRun) -> list[_Row]:
     summary = run.summary
     rows = [
         ("before: photographs", summary.benign),
@@ -285,7 +283,7 @@ def _figure_rows(run: ShownRun) -> list[_Row]:
     return found
 
 
-def _run_row(run: ShownRun, papers: bool) -> _Row:
+def _run_row(run: ReportedRun, papers: bool) -> _Row:
     """papers: whether there is a column of the paper's figures."""
     summary = run.summary
     before, moved = summary.benign.headline, summary.attacked_moved.headline
@@ -310,36 +308,36 @@ def _run_row(run: ShownRun, papers: bool) -> _Row:
     )
 
 
-def _graded_cells(run: ShownRun) -> tuple[str, ...]:
+def _graded_cells(run: ReportedRun) -> tuple[str, ...]:
     """Failures of each grade and above, from certain on."""
     if not grading.is_known(run.summary, run.frames):
         return (_NONE,) * len(_FROM_CERTAIN)
     return tuple(str(run.summary.grades[str(grade)]) for grade in _FROM_CERTAIN)
 
 
-def _falls(runs: Sequence[ShownRun]) -> Markup | None:
+def _falls(runs: Sequence[ReportedRun]) -> Markup | None:
     """Rows from before to after; None without objects to find."""
-    found: list[Fall] = []
+    found: list[MetricDrop] = []
     for run in runs:
         summary, several = run.summary, len(runs) > 1
         before, moved = summary.benign.headline.ap50, summary.attacked_moved.headline.ap50
         stay = summary.attacked_paper.headline.ap50
         if before is None or moved is None or stay is None:
             continue
-        found.append(Fall(run.name if several else "moved labels", 100 * before, 100 * moved))
+        found.append(MetricDrop(run.name if several else "moved labels", 100 * before, 100 * moved))
         if not several:
-            found.append(Fall("benign labels, as in the paper", 100 * before, 100 * stay))
+            found.append(MetricDrop("benign labels, as in the paper", 100 * before, 100 * stay))
     papers = dict.fromkeys((run.summary.params, run.paper) for run in runs if run.paper is not None)
     found += [
-        Fall(f"the paper: {' + '.join(params)}", 100 * paper.before, 100 * paper.after, theirs=True)
+        MetricDrop(f"the paper: {' + '.join(params)}", 100 * paper.before, 100 * paper.after, theirs=True)
         for params, paper in papers
         if paper is not None
     ]
     headline = runs[0].summary.headline
-    return fall_chart(found, f"AP50 of {headline}") if found else None
+    return drop_chart(found, f"AP50 of {headline}") if found else None
 
 
-def _glance(cards: Sequence[Card]) -> Iterator[tuple[Card, str, CloseUp]]:
+def _glance(cards: Sequence[FrameCard]) -> Iterator[tuple[FrameCard, str, CloseUp]]:
     """Close-ups of the worst frames, surest first; of a grade the first of each frame, then the second, ..."""
     shots = [
         [
@@ -359,6 +357,6 @@ def _glance_title(shots: Sequence[CloseUp]) -> str:
     if not shots or not any(shot.grade for shot in shots):
         return "What went wrong, close up"
     surest = max(shots, key=lambda shot: shot.rank)
-    if surest.rank > grading.rank_of(Grade.THRESHOLD):
+    if surest.rank > grading.rank_of_grade(Grade.THRESHOLD):
         return "What went wrong, close up, surest first"
     return "What went wrong by threshold, close up: none of it is certain"

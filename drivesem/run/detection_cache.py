@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
 from detectors.types import Detections
-from drivesem.attack.judging import JudgedClasses
-from drivesem.config.blocks import Sharing
-from drivesem.run.ask import Bar, ask
-from drivesem.run.frame import as_detections, detection_records
+from drivesem.attack.targets import EvaluatedClasses
+from drivesem.config.options import WorkerOptions
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
+from drivesem.run.frame import detection_records, detections_from_records
 from drivesem.run.results import BoxRecord
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -32,7 +32,7 @@ _FINGERPRINT = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class DetectorSpec:
     """How to look: a detector by name or file, its device, tiles or not. folder: of what is remembered."""
 
     detector: str
@@ -45,49 +45,49 @@ class Order:
         return load_predictor(self.detector, self.device, self.tiles)
 
 
-def as_picture(image: np.ndarray, device: str) -> Tensor:
+def image_to_tensor(image: np.ndarray, device: str) -> Tensor:
     """An image (H, W, 3) uint8 as (3, H, W) in [0, 1]."""
     return torch.from_numpy(image).permute(2, 0, 1).to(device) / 255
 
 
-def detections_in(predictor: Predictor, picture: Tensor) -> Detections:
+def detect_objects(predictor: Predictor, picture: Tensor) -> Detections:
     """What is found in a picture (3, H, W) in [0, 1]: labels among the judged classes, on the CPU."""
-    found = JudgedClasses.of(predictor).detections(predict(predictor, picture[None])[0])
+    found = EvaluatedClasses.from_detector(predictor).map_detections(predict(predictor, picture[None])[0])
     return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
 
 
-class Memory:
+class DetectionCache:
     """One detector's detections, a file for each picture. Pictures with the same bytes share one."""
 
-    def __init__(self, order: Order, predictor: Predictor) -> None:
-        self._folder = order.folder / fingerprint(order, predictor)
-        self._judged = JudgedClasses.of(predictor)
+    def __init__(self, order: DetectorSpec, predictor: Predictor) -> None:
+        self._folder = order.folder / detector_fingerprint(order, predictor)
+        self._judged = EvaluatedClasses.from_detector(predictor)
 
-    def has(self, picture: Path) -> bool:
+    def contains(self, picture: Path) -> bool:
         """Whether a picture was looked at."""
-        return self.place(picture).is_file()
+        return self.path_for(picture).is_file()
 
-    def keep(self, picture: Path, found: Detections) -> None:
+    def store(self, picture: Path, found: Detections) -> None:
         """Remember detections whose labels are indices into the judged classes."""
         records = [asdict(record) for record in detection_records(found, self._judged.names)]
-        files.write_json(self.place(picture), {"schema": _SCHEMA, "detections": records})
+        files.write_json(self.path_for(picture), {"schema": _SCHEMA, "detections": records})
 
-    def recall(self, picture: Path) -> Detections:
+    def load(self, picture: Path) -> Detections:
         """What was found in a picture. Raises FormatError where the file is damaged."""
-        path = self.place(picture)
+        path = self.path_for(picture)
         data = files.read_json(path)
         try:
             records = tuple(BoxRecord(**record) for record in data["detections"])
-            return as_detections(records, self._judged.names)
+            return detections_from_records(records, self._judged.names)
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(str(path), "detections as drivesem transfer writes them", error) from error
 
-    def place(self, picture: Path) -> Path:
+    def path_for(self, picture: Path) -> Path:
         """The file of a picture's detections: that of its bytes."""
-        return self._folder / f"{files.digest(picture)}.json"
+        return self._folder / f"{files.sha256_digest(picture)}.json"
 
 
-def fingerprint(order: Order, predictor: Predictor) -> str:
+def detector_fingerprint(order: DetectorSpec, predictor: Predictor) -> str:
     """Differs where anything may that decides what is found: weights or files, classes, tiles, device, version."""
     known = hashlib.sha256()
     facts = [importlib.metadata.version("drivesem"), order.detector, order.tiles, order.device, *predictor.classes]
@@ -111,23 +111,25 @@ def weights_digest(module: nn.Module) -> str:
     return known.hexdigest()
 
 
-def look(
-    order: Order, predictor: Predictor, pictures: Sequence[Path], config: Sharing, title: str
+def cache_detections(
+    order: DetectorSpec, predictor: Predictor, pictures: Sequence[Path], config: WorkerOptions, title: str
 ) -> dict[str, str]:
     """Look at each picture that is not known yet. Returns which could not be used, and why, where the settings
     keep going; else the first ends it. Pictures with the same bytes are looked at once. title: of the bar.
     """
-    memory = Memory(order, predictor)
-    unknown = {memory.place(picture): picture for picture in reversed(pictures) if not memory.has(picture)}
+    memory = DetectionCache(order, predictor)
+    unknown = {memory.path_for(picture): picture for picture in reversed(pictures) if not memory.contains(picture)}
     todo = list(reversed(unknown.values()))
     work = partial(_look, predictor=predictor, memory=memory, device=order.device)
-    return ask(todo, work, partial(_in_process, order), config, Bar(title, stays=False)).failed
+    return run_frame_jobs(
+        todo, work, partial(_in_process, order), config, ProgressSettings(title, keep=False)
+    ).failed
 
 
-def _look(picture: Path, predictor: Predictor, memory: Memory, device: str) -> None:
-    memory.keep(picture, detections_in(predictor, as_picture(files.read_image(picture), device)))
+def _look(picture: Path, predictor: Predictor, memory: DetectionCache, device: str) -> None:
+    memory.store(picture, detect_objects(predictor, image_to_tensor(files.read_image(picture), device)))
 
 
-def _in_process(order: Order) -> Callable[[Path], None]:
+def _in_process(order: DetectorSpec) -> Callable[[Path], None]:
     predictor = order.load()
-    return partial(_look, predictor=predictor, memory=Memory(order, predictor), device=order.device)
+    return partial(_look, predictor=predictor, memory=DetectionCache(order, predictor), device=order.device)

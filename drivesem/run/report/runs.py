@@ -9,25 +9,30 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.attack.judging import JudgedClasses
-from drivesem.attack.space import combo
-from drivesem.config.commands import COMBO_NUMBERS, Attack, Report
+from drivesem.attack.space import combo_parameters
+from drivesem.attack.targets import EvaluatedClasses
+from drivesem.config.commands import COMBO_NUMBERS, AttackConfig, ReportConfig
 from drivesem.config.errors import UsageError
-from drivesem.config.text import command_line
+from drivesem.config.options import format_command_line
 from drivesem.data.label_table import WEATHERS
 from drivesem.evaluation.curves import sampled_curve
-from drivesem.evaluation.outcome import Outcome
-from drivesem.failures.certificate import Rule
-from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE
+from drivesem.evaluation.matched_class import MatchedClass
+from drivesem.failures.certificate import CertificateRule
 from drivesem.run.finished import METRICS, load_runs
-from drivesem.run.folder import CONFIG, attack_of
-from drivesem.run.protocol import follows_paper
+from drivesem.run.folder import CONFIG, load_attack_config
+from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, PAPER_SINGLE, follows_paper
 from drivesem.run.records import from_json
-from drivesem.run.report.grading import GradesAsked
 from drivesem.run.report.html import render_report
-from drivesem.run.report.page import Chart, Line, Page, PaperFigure, ShownRun
+from drivesem.run.report.page import (
+    ChartLine,
+    GradeRequirements,
+    PaperFigure,
+    ReportChart,
+    ReportedRun,
+    ReportPage,
+)
 from drivesem.run.results import FrameResult, RunSummary
-from drivesem.run.tally import boxes_of, graded, tally
+from drivesem.run.summary import count_grades, summarise_frames, targets_and_detections
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -41,12 +46,12 @@ _MOST_LINES = 7
 """Of a chart: as many as there are colours."""
 
 
-def report_runs(config: Report) -> dict[str, Any]:
+def build_reports(config: ReportConfig) -> dict[str, Any]:
     """Write the page of runs, or of the finished arms of studies: the JSON's form. Raises UsageError or SceneError
     for bad input.
     """
     folders: list[str] = []
-    charts: list[Chart] = []
+    charts: list[ReportChart] = []
     for given in config.runs:
         folders += [str(folder) for folder in _runs_of(Path(given))]
         if (Path(given) / _STUDY).is_file():
@@ -55,7 +60,7 @@ def report_runs(config: Report) -> dict[str, Any]:
     out = Path(config.out or (Path(config.runs[0]) / PAGE if len(config.runs) == 1 else PAGE))
     if out.is_dir():
         raise UsageError("--out", "an HTML file", f"the folder {out}")
-    shown, left_out = load_shown(folders)
+    shown, left_out = load_reported_runs(folders)
     size = write_report(out, shown, config.frames, left_out, charts)
     return _data(out, size, shown, left_out)
 
@@ -74,7 +79,7 @@ def _runs_of(folder: Path) -> list[Path]:
     return arms
 
 
-def _data(out: Path, size: int, shown: list[ShownRun], left_out: int) -> dict[str, Any]:
+def _data(out: Path, size: int, shown: list[ReportedRun], left_out: int) -> dict[str, Any]:
     """What `--json` prints: fractions of 1."""
     rows = []
     for one in shown:
@@ -107,29 +112,29 @@ def _data(out: Path, size: int, shown: list[ShownRun], left_out: int) -> dict[st
     return {"out": str(out), "bytes": size, "frames_left_out": left_out, "runs": rows, "frames": frames}
 
 
-def write_run(out: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]) -> None:
+def write_run_report(out: Path, config: AttackConfig, summary: RunSummary, results: Sequence[FrameResult]) -> None:
     """`report.html` of one run in its folder."""
     write_report(out / PAGE, [_shown(out.name, out, config, summary, results)])
 
 
 def write_report(
     path: Path,
-    runs: Sequence[ShownRun],
+    runs: Sequence[ReportedRun],
     frames: int | None = None,
     left_out: int = 0,
-    charts: Sequence[Chart] = (),
+    charts: Sequence[ReportChart] = (),
 ) -> int:
     """Write the page of runs on the same frames; how many bytes it has. frames: whose pictures are shown, worst
     first, by default as many as PICTURES allow. charts: beside precision over recall.
     """
     shown = frames or max(PICTURES // (1 + len(runs)), 1)
-    page = Page(runs, [*precision_recall(runs), *charts], min(shown, len(runs[0].frames)), left_out)
+    page = ReportPage(runs, [*precision_recall(runs), *charts], min(shown, len(runs[0].frames)), left_out)
     text = render_report(page, path).encode("utf-8")
     files.write_bytes(path, text)
     return len(text)
 
 
-def load_shown(folders: Sequence[str]) -> tuple[list[ShownRun], int]:
+def load_reported_runs(folders: Sequence[str]) -> tuple[list[ReportedRun], int]:
     """Finished runs, as far as their frames are in all of them, and how many frames are not. Figures are those of
     `metrics.json` where all runs have the same frames, else computed again.
 
@@ -147,19 +152,19 @@ def load_shown(folders: Sequence[str]) -> tuple[list[ShownRun], int]:
         summary = _summary(run.folder / METRICS)
         if len(shared) < len(every):
             summary = _again(summary, results)
-        shown.append(_shown(run.name, run.folder, attack_of(run.folder, "RUN"), summary, results))
+        shown.append(_shown(run.name, run.folder, load_attack_config(run.folder, "RUN"), summary, results))
     _check_photographs(shown)
     return shown, len(every) - len(shared)
 
 
-def precision_recall(runs: Sequence[ShownRun]) -> list[Chart]:
+def precision_recall(runs: Sequence[ReportedRun]) -> list[ReportChart]:
     """Precision over recall of the headline's class at IoU 0.5; nothing where there is no object to find.
 
     Of one run by both label modes, of several by labels that moved.
     """
     several = len(runs) > 1
-    before: dict[str, Line | None] = {}
-    after: list[Line | None] = []
+    before: dict[str, ChartLine | None] = {}
+    after: list[ChartLine | None] = []
     for run in runs:
         detector = run.summary.detector
         if detector not in before:
@@ -179,10 +184,10 @@ def precision_recall(runs: Sequence[ShownRun]) -> list[Chart]:
     lines = [*told[:room], *unchanged] if several else [*unchanged, *told]
     headline = runs[0].summary.headline
     title = f"Precision over recall: {headline}, IoU 0.5"
-    return [Chart(title, "recall, %", "precision, %", lines, note)]
+    return [ReportChart(title, "recall, %", "precision, %", lines, note)]
 
 
-def query_curves(study: Path) -> list[Chart]:
+def query_curves(study: Path) -> list[ReportChart]:
     """Frames broken after so many queries, where a study has these curves. Raises FormatError."""
     found = files.read_json(study / _STUDY)
     points = found.get("curves", []) if isinstance(found, dict) else []
@@ -201,23 +206,23 @@ def query_curves(study: Path) -> list[Chart]:
     if len(lines) > _MOST_LINES:
         note += f" The first {_MOST_LINES} of {len(lines)} arms."
     return [
-        Chart(
+        ReportChart(
             title="Frames broken after so many queries",
             x_label="queries",
             y_label="frames broken, %",
             lines=lines[:_MOST_LINES],
             note=note,
             x_range=(1.0, float(max(most, 2))),
-            doubling=True,
+            log2_x=True,
         )
     ]
 
 
-def _queries(name: str, points: Sequence[dict[str, Any]]) -> Line:
+def _queries(name: str, points: Sequence[dict[str, Any]]) -> ChartLine:
     mine = [p for p in points if p["name"] == name and p["share"] is not None]
     first = name == points[0]["name"]
     bounded = [p for p in mine if first and p["low"] is not None and p["high"] is not None]
-    return Line(
+    return ChartLine(
         name=name,
         points=tuple((float(p["queries"]), 100 * float(p["share"])) for p in mine),
         mark=(float(mine[-1]["queries"]), 100 * float(mine[-1]["share"])) if mine else None,
@@ -227,32 +232,32 @@ def _queries(name: str, points: Sequence[dict[str, Any]]) -> Line:
 
 
 def _shown(
-    name: str, folder: Path, config: Attack, summary: RunSummary, results: Sequence[FrameResult]
-) -> ShownRun:
-    return ShownRun(
+    name: str, folder: Path, config: AttackConfig, summary: RunSummary, results: Sequence[FrameResult]
+) -> ReportedRun:
+    return ReportedRun(
         name=name,
         folder=folder,
         summary=summary,
         frames=tuple(sorted(results, key=lambda r: r.identifier)),
         method=config.method,
-        command=command_line("attack", config, _NOT_TOLD),
+        command=format_command_line("attack", config, _NOT_TOLD),
         weathers=tuple(_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
-        asked=_asked(config),
+        grade_requirements=_asked(config),
         paper=_paper(summary.params) if follows_paper(config) else None,
     )
 
 
-def _asked(config: Attack) -> GradesAsked:
-    rule = Rule(config.draws)
-    return GradesAsked(
-        rule.draws, rule.before, rule.after, config.confirm, config.confirm and config.peer != "off"
+def _asked(config: AttackConfig) -> GradeRequirements:
+    rule = CertificateRule(config.draws)
+    return GradeRequirements(
+        rule.draws, rule.before, rule.after, config.confirm, config.confirm and config.second_detector != "off"
     )
 
 
 def _paper(params: tuple[str, ...]) -> PaperFigure | None:
     """The paper's mAP for the same parameters, alone or as one of its combinations."""
     known = {(str(one),): after for one, after in PAPER_SINGLE.items()}
-    known |= {tuple(str(p) for p in combo(number)): PAPER_COMBOS[number] for number in COMBO_NUMBERS}
+    known |= {tuple(str(p) for p in combo_parameters(number)): PAPER_COMBOS[number] for number in COMBO_NUMBERS}
     return PaperFigure(PAPER_BENIGN, known[params]) if params in known else None
 
 
@@ -261,30 +266,30 @@ def _weather(identifier: str) -> str | None:
     return next((word for word in identifier.replace("_", "/").split("/") if word in WEATHERS), None)
 
 
-def _curve(run: ShownRun, labels: str, seen: str, name: str) -> Line | None:
+def _curve(run: ReportedRun, labels: str, seen: str, name: str) -> ChartLine | None:
     summary = run.summary
     judged = _judged(summary)
     if summary.headline not in judged.names or not run.frames:
         return None
-    targets, found = boxes_of(run.frames, judged, labels, seen)
-    outcome = Outcome.of(targets, found, judged.names.index(summary.headline))
-    samples = sampled_curve(outcome.candidates.tally(outcome.match, 0))
+    targets, found = targets_and_detections(run.frames, judged, labels, seen)
+    outcome = MatchedClass.from_frames(targets, found, judged.names.index(summary.headline))
+    samples = sampled_curve(outcome.candidates.class_matches(outcome.match, 0))
     if not samples:
         return None
     points = tuple((100 * recall, 100 * precision) for recall, precision, _ in samples)
     above = [i for i, (_, _, score) in enumerate(samples) if score >= summary.t_star]
-    return Line(name, points, points[above[-1]] if above else None)
+    return ChartLine(name, points, points[above[-1]] if above else None)
 
 
-def _judged(summary: RunSummary) -> JudgedClasses:
+def _judged(summary: RunSummary) -> EvaluatedClasses:
     """Without the detector: a run's results hold none but judged classes."""
     names = tuple(summary.benign.per_class)
-    return JudgedClasses(names, names)
+    return EvaluatedClasses(names, names)
 
 
 def _again(summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
     """The figures of some of a run's frames."""
-    return replace(summary, **tally(results, _judged(summary), summary.t_star, summary.headline))
+    return replace(summary, **summarise_frames(results, _judged(summary), summary.t_star, summary.headline))
 
 
 def _summary(path: Path) -> RunSummary:
@@ -313,8 +318,8 @@ def _grades(data: dict[str, Any]) -> dict[str, Any]:
     """How sure the failures of a run are; of one that was written before anybody asked, that nobody knows."""
     if "grades" in data:
         return {name: data[name] for name in ("passes", "grades", "kinds", "frames_ungraded", "grade_notes")}
-    return graded([]) | {
-        "grades": {**graded([])["grades"], "threshold": data["lost_objects"] + data["phantoms"]},
+    return count_grades([]) | {
+        "grades": {**count_grades([])["grades"], "threshold": data["lost_objects"] + data["phantoms"]},
         "frames_ungraded": data["frames"],
     }
 
@@ -325,7 +330,7 @@ def _scores(data: dict[str, Any]) -> dict[str, Any]:
     return {"headline": {name: one for name, one in data.items() if name not in beside}} | beside
 
 
-def _check_photographs(runs: Sequence[ShownRun]) -> None:
+def _check_photographs(runs: Sequence[ReportedRun]) -> None:
     """Frames of the same name must be the same photograph."""
     first, *others = runs
     for result in first.frames:
@@ -336,5 +341,5 @@ def _check_photographs(runs: Sequence[ShownRun]) -> None:
                 raise UsageError("RUN", "runs on the same photographs", found)
 
 
-def _photograph(run: ShownRun, identifier: str) -> np.ndarray:
+def _photograph(run: ReportedRun, identifier: str) -> np.ndarray:
     return np.frombuffer(files.read_bytes(run.folder / "frames" / identifier / "benign.png"), np.uint8)

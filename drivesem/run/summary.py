@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.judging import JudgedClasses
+from drivesem.attack.targets import EvaluatedClasses
 from drivesem.evaluation import coco
 from drivesem.failures.grades import Grade, Kind
-from drivesem.failures.kinds import OF_OBJECTS
-from drivesem.run.frame import as_detections, as_targets
+from drivesem.failures.kinds import OBJECT_KINDS
+from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult
 
 
-class Graded(Protocol):
+class GradedFailure(Protocol):
     """A failure, as `results.Failure`, or what is counted of one."""
 
     @property
@@ -26,54 +26,58 @@ class Graded(Protocol):
     def grade(self) -> str | None: ...
 
 
-F = TypeVar("F", bound=Graded)
-F_co = TypeVar("F_co", bound=Graded, covariant=True)
+F = TypeVar("F", bound=GradedFailure)
+F_co = TypeVar("F_co", bound=GradedFailure, covariant=True)
 
 
-class Failing(Protocol[F_co]):
+class FrameWithFailures(Protocol[F_co]):
     """A frame with failures."""
 
     @property
     def failures(self) -> Sequence[F_co]: ...
 
 
-def boxes_of(
-    results: Sequence[FrameResult], judged: JudgedClasses, labels: str, seen: str
+def targets_and_detections(
+    results: Sequence[FrameResult], judged: EvaluatedClasses, labels: str, seen: str
 ) -> tuple[list[Targets], list[Detections]]:
     """Targets and detections of each frame. labels: benign or moved; seen: benign, rerendered or attacked."""
-    targets = [judged.targets(as_targets(getattr(r, f"targets_{labels}"), CLASSES)) for r in results]
-    return targets, [as_detections(getattr(r, f"detections_{seen}"), judged.names) for r in results]
+    targets = [judged.map_targets(targets_from_records(getattr(r, f"targets_{labels}"), CLASSES)) for r in results]
+    return targets, [detections_from_records(getattr(r, f"detections_{seen}"), judged.names) for r in results]
 
 
-def at_least(grade: Grade) -> Callable[[Graded], bool]:
+def has_grade(grade: Grade) -> Callable[[GradedFailure], bool]:
     """Whether a failure has that grade or a higher one; every failure has that of the threshold."""
     higher = list(Grade)[list(Grade).index(grade) :]
     return lambda failure: failure.grade in higher or grade is Grade.THRESHOLD
 
 
-def certain_losses(result: Failing[F]) -> list[F]:
+def certain_losses(result: FrameWithFailures[F]) -> list[F]:
     """Certain failures of objects; a phantom has no object whose states could be looked through."""
-    certain = at_least(Grade.CERTAIN)
-    return [f for f in result.failures if f.index is not None and f.error in OF_OBJECTS and certain(f)]
+    certain = has_grade(Grade.CERTAIN)
+    return [f for f in result.failures if f.index is not None and f.error in OBJECT_KINDS and certain(f)]
 
 
-def graded(results: Sequence[FrameResult]) -> dict[str, Any]:
+def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
     """Those of the fields that say how sure the failures are, and what the search cost."""
     failures = [failure for r in results for failure in r.failures]
     return {
         "passes": sum(r.passes or 0 for r in results),
-        "grades": {str(grade): sum(map(at_least(grade), failures)) for grade in Grade},
+        "grades": {str(grade): sum(map(has_grade(grade), failures)) for grade in Grade},
         "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
         "frames_ungraded": sum(not r.graded for r in results),
         "grade_notes": dict(Counter(note for r in results for note in r.grade_notes)),
     }
 
 
-def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, headline: str) -> dict[str, Any]:
+def summarise_frames(
+    results: Sequence[FrameResult], judged: EvaluatedClasses, t_star: float, headline: str
+) -> dict[str, Any]:
     """Those fields of `RunSummary` that follow from its frames, by name."""
 
-    def scores(labels: str, seen: str) -> coco.Scores:
-        return coco.evaluate(*boxes_of(results, judged, labels, seen), judged.names, t_star, headline)
+    def scores(labels: str, seen: str) -> coco.CocoScores:
+        return coco.evaluate(
+            *targets_and_detections(results, judged, labels, seen), judged.names, t_star, headline
+        )
 
     def count(kind: str) -> dict[str, int]:
         labels = [failure.label for r in results for failure in r.failures if failure.kind == kind]
@@ -92,5 +96,5 @@ def tally(results: Sequence[FrameResult], judged: JudgedClasses, t_star: float, 
         "successes_moved": sum(r.success_moved for r in results),
         "feasible_fraction": sum(r.feasible for r in results) / len(results) if results else None,
         "queries": sum(r.queries for r in results),
-        **graded(results),
+        **count_grades(results),
     }

@@ -11,25 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.analysis.evaluate.report import write_report
-from drivesem.analysis.evaluate.sets import EvalSet, chosen_classes, open_sets
-from drivesem.config.commands import Eval
+from drivesem.analysis.evaluate.report import write_evaluation
+from drivesem.analysis.evaluate.sets import EvaluationData, load_evaluation_data, parse_class_list
+from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError, refuse
-from drivesem.evaluation import breakdown, coco, kitti
-from drivesem.evaluation.curves import Rule, Tally, average_precision, sampled_curve
-from drivesem.evaluation.instances import EVERY_CLASS, Found, Truths
-from drivesem.evaluation.matching import Candidates, Match, mean_of
+from drivesem.evaluation import coco, kitti
+from drivesem.evaluation import results as breakdown
+from drivesem.evaluation.curves import ClassMatches, InterpolationRule, average_precision, sampled_curve
+from drivesem.evaluation.instances import EVERY_CLASS, DetectionTable, GroundTruthTable
+from drivesem.evaluation.matching import CandidatePairs, MatchResult, mean_of_known
 from drivesem.evaluation.resampling import (
     DRAWS,
-    Averaged,
-    Difference,
-    Figure,
     Interval,
-    Sampled,
-    differences,
-    intervals,
+    NamedMetric,
+    PairedDifference,
+    WeightedAveragePrecision,
+    WeightedKittiPrecision,
+    bootstrap_intervals,
+    paired_differences,
 )
-from drivesem.evaluation.results import ClassRow, KittiRow, Result
+from drivesem.evaluation.results import ClassRow, EvaluationMetrics, KittiRow
 
 VOC_OVERLAP = 0.5
 """At least so much must overlap (VOC)."""
@@ -37,14 +38,14 @@ MANY_FRAMES = 5000
 """From so many frames on there are no bootstrap draws by default."""
 
 
-def evaluate_files(config: Eval) -> Result:
+def evaluate_files(config: EvalConfig) -> EvaluationMetrics:
     """Read what the configuration names, count, and write what it asks for. Raises UsageError or SceneError for
     bad input.
     """
     with _no_garbage_collection():
-        result = evaluate(config, open_sets(config))
+        result = evaluate(config, load_evaluation_data(config))
     if config.out is not None:
-        write_report(Path(config.out), result)
+        write_evaluation(Path(config.out), result)
     return result
 
 
@@ -60,24 +61,24 @@ def _no_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-def evaluate(config: Eval, sets: EvalSet) -> Result:
+def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
     """All figures that the configuration asks for."""
     judge = _Judge(config, sets)
     first = judge.looked_at(sets.found[0])
     generator = np.random.default_rng(config.seed)
-    compared: list[Difference] = []
+    compared: list[PairedDifference] = []
     spread: list[Interval] = []
     draws = config.bootstrap
     if draws is None:
         draws = 0 if sets.truths.frames > MANY_FRAMES and len(sets.found) == 1 else DRAWS
     if draws:
-        spread = intervals(first.figures, sets.truths.frames, draws, generator)
+        spread = bootstrap_intervals(first.figures, sets.truths.frames, draws, generator)
     if len(sets.found) > 1:
         second = judge.looked_at(sets.found[1])
-        compared = differences(first.figures, second.figures, sets.truths.frames, draws, generator)
+        compared = paired_differences(first.figures, second.figures, sets.truths.frames, draws, generator)
     stats, facts = judge.stats(sets.found[0])
     counted = sets.truths.label[~sets.truths.ignore]
-    return Result(
+    return EvaluationMetrics(
         protocol=config.protocol,
         facts={
             "gt": config.gt,
@@ -91,8 +92,8 @@ def evaluate(config: Eval, sets: EvalSet) -> Result:
         },
         classes=first.classes,
         curves=first.curves,
-        parts=tuple(breakdown.rows(first.candidates, first.matches, judge.names, judge.rule, sets.weather)),
-        figures={figure.name: figure.value() for figure in first.figures},
+        parts=tuple(breakdown.score_parts(first.candidates, first.matches, judge.names, judge.rule, sets.weather)),
+        metrics={figure.name: figure.value() for figure in first.figures},
         stats=stats,
         rows=first.rows,
         intervals=tuple(spread),
@@ -105,11 +106,11 @@ def evaluate(config: Eval, sets: EvalSet) -> Result:
 class _Looked:
     """One set of detections, matched and counted. matches: one a class, at its overlap."""
 
-    candidates: Candidates
-    matches: tuple[Match, ...]
+    candidates: CandidatePairs
+    matches: tuple[MatchResult, ...]
     classes: tuple[ClassRow, ...]
     curves: dict[str, list[list[float]]]
-    figures: tuple[Figure, ...]
+    figures: tuple[NamedMetric, ...]
     rows: tuple[KittiRow, ...] = ()
 
 
@@ -120,20 +121,20 @@ _MOST_DETECTIONS = 2000
 class _Judge:
     """One protocol's rules. names: the classes with figures, in the order of their labels after `_own`."""
 
-    def __init__(self, config: Eval, sets: EvalSet) -> None:
+    def __init__(self, config: EvalConfig, sets: EvaluationData) -> None:
         self.config, self.sets = config, sets
         self.names: tuple[str, ...] = sets.classes
         self.truths, self.relabel = sets.truths, np.arange(len(sets.classes) + 1)
-        self.rule: Rule = "coco" if config.protocol == "coco" else "voc"
+        self.rule: InterpolationRule = "coco" if config.protocol == "coco" else "voc"
         if config.protocol == "kitti":
             self.rule = "kitti"
-            wanted = chosen_classes(config.classes) if config.classes is not None else kitti.CLASSES
+            wanted = parse_class_list(config.classes) if config.classes is not None else kitti.CLASSES
             self.names = tuple(name for name in kitti.CLASSES if name in wanted)
             if not self.names:
                 raise UsageError("--classes", f"some of {', '.join(kitti.CLASSES)}", config.classes)
             self.relabel, self.truths = _without_others(sets, self.names)
 
-    def stats(self, found: Found) -> tuple[list[float] | None, dict[str, Any]]:
+    def stats(self, found: DetectionTable) -> tuple[list[float] | None, dict[str, Any]]:
         """COCO's twelve numbers, and who counted."""
         if self.config.protocol == "kitti":
             return None, {"small_detections": self.config.small_detections}
@@ -141,15 +142,15 @@ class _Judge:
             return None, {"overlap": VOC_OVERLAP}
         ids = self.sets.truth_ids
         engine = coco.fastest_engine(ids)
-        return coco.twelve_numbers(self.truths, found, len(self.names), engine, ids), {"engine": engine}
+        return coco.coco_stats(self.truths, found, len(self.names), engine, ids), {"engine": engine}
 
     def overlap(self, name: str) -> float:
         """The overlap at which a class is looked at."""
         return kitti.CLASSES[name] if self.config.protocol == "kitti" else VOC_OVERLAP
 
-    def looked_at(self, found: Found) -> _Looked:
+    def looked_at(self, found: DetectionTable) -> _Looked:
         """Match one set of detections and count."""
-        curves: list[kitti.Curve] = []
+        curves: list[kitti.KittiCurve] = []
         if self.config.protocol == "kitti":
             small = self.config.small_detections
             of_frame_and_class = np.bincount(found.frame * len(self.sets.classes) + found.label)
@@ -159,12 +160,12 @@ class _Judge:
             curves = kitti.evaluate(self.sets.truths, found, self.sets.classes, small)
             curves = [curve for curve in curves if curve.name in self.names]
             labels = self.relabel[found.label]
-            found = Found(found.frame, labels, found.boxes, found.score).rows(labels >= 0)
+            found = DetectionTable(found.frame, labels, found.boxes, found.score).select(labels >= 0)
         limit = coco.MAX_DETECTIONS if self.config.protocol == "coco" else None
-        candidates = Candidates.of(self.truths, found, VOC_OVERLAP, limit)
+        candidates = CandidatePairs.from_tables(self.truths, found, VOC_OVERLAP, limit)
         by_overlap = {o: self._match(candidates, o) for o in {self.overlap(name) for name in self.names}}
         matches = tuple(by_overlap[self.overlap(name)] for name in self.names)
-        tallies = [candidates.tally(match, k) for k, match in enumerate(matches)]
+        tallies = [candidates.class_matches(match, k) for k, match in enumerate(matches)]
         further, figures = self._figures(candidates, tallies, curves)
         return _Looked(
             candidates,
@@ -173,21 +174,23 @@ class _Judge:
             {name: sampled_curve(tally) for name, tally in zip(self.names, tallies, strict=True)},
             figures,
             tuple(
-                KittiRow(c.name, c.difficulty, c.r11(), c.r40(), c.ground_truth, c.precision().tolist())
+                KittiRow(c.name, c.difficulty, c.r11(), c.r40(), c.object_count, c.precision().tolist())
                 for c in curves
             ),
         )
 
-    def _match(self, candidates: Candidates, overlap: float) -> Match:
-        return candidates.voc(overlap) if self.config.protocol == "voc" else candidates.coco(overlap)
+    def _match(self, candidates: CandidatePairs, overlap: float) -> MatchResult:
+        return candidates.match_voc(overlap) if self.config.protocol == "voc" else candidates.match_coco(overlap)
 
-    def _row(self, label: int, tally: Tally, found: Found, further: dict[str, float | None]) -> ClassRow:
+    def _row(
+        self, label: int, tally: ClassMatches, found: DetectionTable, further: dict[str, float | None]
+    ) -> ClassRow:
         best = tally.best_f1()
         f1, t_star, precision, recall = best if best is not None else (None, None, None, None)
         return ClassRow(
             name=self.names[label],
             overlap=self.overlap(self.names[label]),
-            objects=int(tally.count()),
+            objects=int(tally.object_count()),
             detections=int((found.label == label).sum()),
             ap=further.pop("ap", average_precision(tally, self.rule)),
             recall=tally.recall(),
@@ -199,34 +202,42 @@ class _Judge:
         )
 
     def _figures(
-        self, candidates: Candidates, tallies: Sequence[Tally], curves: Sequence[kitti.Curve]
-    ) -> tuple[list[dict[str, float | None]], tuple[Figure, ...]]:
+        self, candidates: CandidatePairs, tallies: Sequence[ClassMatches], curves: Sequence[kitti.KittiCurve]
+    ) -> tuple[list[dict[str, float | None]], tuple[NamedMetric, ...]]:
         """Further figures of each class, and those that intervals are given for."""
         if self.config.protocol == "kitti":
             names = [f"{c.name} {c.difficulty} R40" for c in curves]
             return [{} for _ in tallies], tuple(
-                Figure(name, (Sampled(c),)) for name, c in zip(names, curves, strict=True)
+                NamedMetric(name, (WeightedKittiPrecision(c),)) for name, c in zip(names, curves, strict=True)
             )
         if self.config.protocol == "voc":
             old = [{"ap07": average_precision(tally, "voc07")} for tally in tallies]
-            parts = tuple(Averaged(tally, "voc") for tally in tallies)
-            return old, (Figure("mAP", parts), Figure("mAP07", tuple(Averaged(t, "voc07") for t in tallies)))
-        averaged: list[list[Averaged]] = []
+            parts = tuple(WeightedAveragePrecision(tally, "voc") for tally in tallies)
+            return old, (
+                NamedMetric("mAP", parts),
+                NamedMetric("mAP07", tuple(WeightedAveragePrecision(t, "voc07") for t in tallies)),
+            )
+        averaged: list[list[WeightedAveragePrecision]] = []
         for threshold in coco.IOU_THRESHOLDS.tolist():
-            match = candidates.coco(threshold)
-            averaged.append([Averaged(candidates.tally(match, k), "coco") for k in range(len(self.names))])
+            match = candidates.match_coco(threshold)
+            averaged.append(
+                [
+                    WeightedAveragePrecision(candidates.class_matches(match, k), "coco")
+                    for k in range(len(self.names))
+                ]
+            )
         further: list[dict[str, float | None]] = []
         for k in range(len(self.names)):
             values = [row[k].value(None) for row in averaged]
-            further.append({"ap50": values[0], "ap75": values[5], "ap": mean_of(values)})
+            further.append({"ap50": values[0], "ap75": values[5], "ap": mean_of_known(values)})
         return further, (
-            Figure("AP", tuple(part for row in averaged for part in row)),
-            Figure("AP50", tuple(averaged[0])),
-            Figure("AP75", tuple(averaged[5])),
+            NamedMetric("AP", tuple(part for row in averaged for part in row)),
+            NamedMetric("AP50", tuple(averaged[0])),
+            NamedMetric("AP75", tuple(averaged[5])),
         )
 
 
-def _without_others(sets: EvalSet, names: Sequence[str]) -> tuple[np.ndarray, Truths]:
+def _without_others(sets: EvaluationData, names: Sequence[str]) -> tuple[np.ndarray, GroundTruthTable]:
     """Labels among `names` by label (-1: another class, or every one), and the truths of `names`; neighbours are
     ignored there.
     """
@@ -240,11 +251,11 @@ def _without_others(sets: EvalSet, names: Sequence[str]) -> tuple[np.ndarray, Tr
             relabel[i], neighbour[i] = names.index(near), True
     truths = sets.truths
     labels = relabel[truths.label]
-    kept = truths.rows((labels >= 0) | (truths.label == EVERY_CLASS))
+    kept = truths.select((labels >= 0) | (truths.label == EVERY_CLASS))
     label = relabel[kept.label]
     ignore = kept.ignore | neighbour[kept.label] | (label < 0)
     own = np.where(neighbour, -1, relabel)
-    return own, Truths(
+    return own, GroundTruthTable(
         kept.frames,
         kept.frame,
         label,

@@ -9,36 +9,36 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivesem.attack.space import parse_params
-from drivesem.config.commands import Attack
+from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
-from drivesem.run.attack import WRITTEN, conclude, summary_of
-from drivesem.run.finished import MANIFEST, METRICS, Run, load_runs
-from drivesem.run.folder import FRAMES, claim, detector_of, settings_of, trusted_attack
+from drivesem.run.attack import WRITTEN, summarise_run, write_run_summary
+from drivesem.run.finished import MANIFEST, METRICS, AttackRun, load_runs
+from drivesem.run.folder import FRAMES, claim_folder, load_run_detector, load_trusted_config, result_settings
 from drivesem.run.frame import RESULT
-from drivesem.run.manifest import digest_of
+from drivesem.run.manifest import hash_json
 from drivesem.run.records import from_json
 from drivesem.run.results import RunSummary
 from scene_ir import files
 from scene_ir.errors import FormatError
 
 
-def merge(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
+def merge_runs(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
     """Make one run in the folder `out` of the frames of several finished ones with the same settings, or go on
     with it. Frames that are the same in two of them count once. `out` may be one of them. trust: see
     `trusted_attack`.
 
     Raises UsageError for runs that are no parts of one, FormatError naming a file that is damaged.
     """
-    files.check_text("--out", str(out))
+    files.check_utf8("--out", str(out))
     parts = load_runs(folders, setting="FOLDER", may_be_empty=True)
     if not any(part.frames for part in parts):
         raise UsageError("FOLDER", "runs with frames", f"none in {', '.join(folders)}")
-    attacks = [trusted_attack(part.folder, trust, "FOLDER") for part in parts]
+    attacks = [load_trusted_config(part.folder, trust, "FOLDER") for part in parts]
     for part, attack in zip(parts, attacks, strict=True):
         _check_alike(parts[0], attacks[0], part, attack)
     # Whatever the first was told of frames that are there: those of `out` stay, which may be a part's own.
     config = replace(attacks[0], out=str(out), part=None, limit=None, resume=True)
-    claim(out, config, WRITTEN)
+    claim_folder(out, config, WRITTEN)
     results = {}
     for part in parts:
         for frame in part.frames:
@@ -49,7 +49,7 @@ def merge(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
                     raise UsageError("FOLDER", "runs in which a frame is the same", f"two results of frame {name}")
                 raise UsageError("--out", "a new folder, or one of the same frames", f"another {name} in {out}")
             if not there:
-                with files.whole_folder(out / FRAMES / name) as whole:
+                with files.atomic_folder(out / FRAMES / name) as whole:
                     shutil.copytree(frame.folder, whole, dirs_exist_ok=True, copy_function=_link_or_copy)
             results[name] = frame.result
     ordered = [results[name] for name in sorted(results)]
@@ -64,16 +64,16 @@ def merge(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise FormatError(METRICS, "frames_failed, frames_without_vehicles and seconds", error) from error
     failed = {name: why for name, why in sorted(failed.items()) if name not in results}
-    detector = detector_of(config, config.device, "FOLDER")
-    summary = summary_of(config, parse_params(parts[0].params), detector, ordered)
+    detector = load_run_detector(config, config.device, "FOLDER")
+    summary = summarise_run(config, parse_params(parts[0].params), detector, ordered)
     empty = set().union(*emptied)
     without = passed_over + len(empty)
     summary = replace(summary, frames_failed=failed, frames_without_vehicles=without, seconds=seconds)
-    return conclude(out, config, summary, ordered, empty)
+    return write_run_summary(out, config, summary, ordered, empty)
 
 
-def _check_alike(first: Run, wanted: Attack, part: Run, attack: Attack) -> None:
-    one, other = settings_of(wanted), settings_of(attack)
+def _check_alike(first: AttackRun, wanted: AttackConfig, part: AttackRun, attack: AttackConfig) -> None:
+    one, other = result_settings(wanted), result_settings(attack)
     if one != other:
         changed = ", ".join(key for key, value in one.items() if other[key] != value)
         raise UsageError(
@@ -88,7 +88,7 @@ def _emptied(run: Path) -> set[str]:
 
 
 def _told(frame: Path) -> str:
-    return digest_of(files.read_json(frame / RESULT))
+    return hash_json(files.read_json(frame / RESULT))
 
 
 def _link_or_copy(source: str, target: str) -> None:

@@ -1,0 +1,399 @@
+"""Explains counterexamples of a run: which parameters and objects cause the failure, and how little suffices."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from detectors.base import Detector
+from detectors.types import CLASSES
+from drivesem.analysis.explain import sensitivity
+from drivesem.analysis.explain.attribution import (
+    MOST_EXACT,
+    Flags,
+    Floats,
+    ThetaPart,
+    list_object_parameters,
+    measure_change,
+    shapley_values,
+    split_by_object,
+    split_by_parameter,
+)
+from drivesem.analysis.explain.minimal import MinimalChangeSearch, ShortenedChange, ThetaBlock, find_minimal_change
+from drivesem.analysis.explain.report import (
+    build_explain_report,
+    exchange_note,
+    plot_waterfalls,
+    summarise_parameters,
+)
+from drivesem.analysis.explain.results import (
+    EXPLANATION,
+    SCHEMA,
+    Contribution,
+    Explanation,
+    MinimalChange,
+    PartOutcome,
+    PixelSensitivity,
+)
+from drivesem.attack.budgets import change_limits
+from drivesem.attack.feasibility_check import check_scene
+from drivesem.attack.methods.base import Problem, Score
+from drivesem.attack.objective import Objective, RenderEvaluation
+from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.config.commands import ExplainConfig
+from drivesem.config.errors import UsageError
+from drivesem.evaluation.resampling import DRAWS
+from drivesem.report.tables import AnalysisReport, format_count
+from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames
+from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
+from drivesem.run.folder import FRAMES, PRESENTATION, claim_folder, load_run_detector, load_trusted_config
+from drivesem.run.frame import build_failure_records, detection_records, target_records
+from drivesem.run.report import pictures
+from drivesem.run.results import Coordinate
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.io import to_uint8
+
+_WRITTEN = ("explain.json", "explain.md", "explain.csv", "explain.png", FRAMES)
+_FREE = (*PRESENTATION, "run", "frame", "bootstrap")
+"""Settings that do not affect a frame's explanation."""
+
+
+def run_explain(config: ExplainConfig) -> AnalysisReport:
+    """Explain a run's counterexamples, or resume, and write the report.
+
+    Raises UsageError or SceneError for bad input.
+    """
+    (run,) = load_runs([config.run or ""])
+    names = _choose_frames(run, config)
+    out = Path(config.out) if config.out else run.folder / "explain"
+    make_analyser = partial(ExplainAnalyser, config, run, out)
+    analyser = make_analyser()
+    claim_folder(out, config, _WRITTEN, _FREE)
+    results, failed = analyse_frames(names, analyser, make_analyser, config, ProgressSettings("explaining frames"))
+    explanations = [one for one in results if not one.by_exchange]
+    by_exchange = [one.identifier for one in results if one.by_exchange]
+    if not explanations:
+        reasons = "; ".join([*failed.values(), *([exchange_note(by_exchange)] if by_exchange else [])])
+        raise UsageError("--run", "a run with frames that can be explained", reasons)
+    draws = DRAWS if config.bootstrap is None else config.bootstrap
+    facts = {
+        "out": str(out),
+        "run": str(run.folder),
+        "detector": run.detector,
+        "params": run.params,
+        "frames": len(explanations),
+        "frames_of_run": len(run.frames),
+        "frames_failed": failed,
+        "frames_by_exchange": by_exchange,
+        "bootstrap": draws,
+    }
+    parameters = summarise_parameters(explanations, draws, config.seed)
+    report = build_explain_report(out, explanations, parameters, draws, facts)
+    report.write()
+    return report
+
+
+def _choose_frames(run: AttackRun, config: ExplainConfig) -> list[str]:
+    """Return the frames that fail with moved labels, or those of --frame. Raises UsageError if there are none."""
+    fails = {frame.result.identifier: frame.result.success_moved for frame in run.frames}
+    requested = [part.strip() for part in (config.frame or "").split(",") if part.strip()]
+    for name in requested:
+        if name not in fails:
+            raise UsageError("--frame", f"a frame of {run.folder}", name)
+        if not fails[name]:
+            raise UsageError("--frame", "frames that fail, by moved labels", f"{name}, which does not")
+    names = [name for name in fails if fails[name] and (not requested or name in requested)]
+    if not names:
+        raise UsageError(
+            "--run", "a run with counterexamples, by moved labels", f"none in {format_count(len(fails), 'frame')}"
+        )
+    return names[: config.limit]
+
+
+@dataclass(frozen=True, slots=True)
+class ExplainBudget:
+    """Effort spent on one counterexample."""
+
+    points: int
+    """Points of the grid of scales."""
+    permutations: int
+    """Sampled orders of more than MOST_EXACT parts; an even number."""
+    seed: int
+    """Seed of the orders."""
+    keep_lost: bool = False
+    """The minimal change of a counterexample that loses objects must lose one, too."""
+
+
+class PartialChangeEvaluator:
+    """Evaluates the detector on parts of a change."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._evaluated: set[bytes] = set()
+
+    @property
+    def renders(self) -> int:
+        """Number of different thetas evaluated."""
+        return len(self._evaluated)
+
+    def outcome(self, theta: Tensor, mask: Tensor) -> PartOutcome:
+        """Evaluate theta (D,) with the coordinates outside `mask` (D,) bool reset and the rest projected."""
+        masked = torch.where(mask, theta, 0)
+        part = self.project(masked)
+        score = self._score(part)
+        return PartOutcome(score.loss, score.lost, score.phantoms, score.success, not torch.equal(part, masked))
+
+    def project(self, theta: Tensor) -> Tensor:
+        """Project theta (D,) onto the feasible set."""
+        return self._problem.project(theta).theta
+
+    def size(self, theta: Tensor) -> float:
+        """Return the size of theta (D,) in steps (`Problem.size`)."""
+        return float(self._problem.size(theta))
+
+    def make_search(self, points: int, keep_lost: bool) -> MinimalChangeSearch:
+        """Make the search for the smallest change that fails or, with `keep_lost`, that loses an object."""
+
+        def fails(theta: Tensor) -> bool:
+            score = self._score(theta)
+            return score.lost > 0 if keep_lost else score.success
+
+        return MinimalChangeSearch(self.project, fails, self.size, points)
+
+    def _score(self, theta: Tensor) -> Score:
+        self._evaluated.add(theta.cpu().numpy().tobytes())
+        return self._problem.score(theta)
+
+
+class ExplainAnalyser(FrameAnalyser[Explanation]):
+    """Explains counterexamples of a run."""
+
+    file, kind, schema = EXPLANATION, Explanation, SCHEMA
+
+    def __init__(self, config: ExplainConfig, run: AttackRun, out: Path) -> None:
+        super().__init__(run.folder, out)
+        attack = load_trusted_config(run.folder, config.trust)
+        whole = config.resolve_whole(attack.whole)
+        self.attack = replace(attack, whole=whole, incremental=False, keep_mb=config.keep_mb)
+        self.params, self.detector = parse_params(run.params), load_run_detector(attack, config.device)
+        keep_lost = config.least == "lost"
+        self.budget = ExplainBudget(config.points, config.permutations, config.seed, keep_lost)
+
+    def analyse(self, name: str, source: str, folder: Path) -> Explanation:
+        """See `FrameAnalyser`. A scene that fails by the exchange of its vehicles alone has no contributions.
+
+        Raises FormatError if the detector does not fail on this machine, RangeError for a gradient that is not
+        finite.
+        """
+        start = time.perf_counter()
+        frame_folder, budget = self.run_folder / FRAMES / name, self.budget
+        frame = RebuiltFrame.load(frame_folder, self.attack, self.params, self.detector)
+        objective, theta, space = frame.objective, frame.theta, frame.objective.space
+        evaluator = PartialChangeEvaluator(objective.problem(frame.feasible))
+        everything = torch.ones_like(theta, dtype=torch.bool)
+        found = evaluator.outcome(theta, everything)
+        if not found.success:
+            raise FormatError(
+                str(frame_folder), "a counterexample that fails", "one that the detector gets right here"
+            )
+        parts = {"parameter": split_by_parameter(space, theta), "object": split_by_object(space, theta)}
+        slope = objective.loss_and_grad(space.theta0)[1] * theta if isinstance(self.detector, Detector) else None
+        generator = np.random.default_rng([budget.seed, zlib.crc32(name.encode())])
+        search = evaluator.make_search(budget.points, budget.keep_lost and found.lost > 0)
+        contributions: list[Contribution] = []
+        if search.fails(space.theta0):
+            shortened = ShortenedChange(space.theta0, 0.0, (True, True), space.theta0, 0.0, ())
+        else:
+            for own in parts.values():
+                contributions += compute_contributions(
+                    own, theta, evaluator, slope, budget.permutations, generator
+                )
+            blocks = _order_blocks(space, theta, [*parts["parameter"], *parts["object"]], contributions, evaluator)
+            shortened = find_minimal_change(theta, blocks, search)
+        minimal = objective.evaluate(shortened.theta)
+        gradients = _pixel_gradients(objective, theta)
+        explanation = Explanation(
+            identifier=name,
+            source=source,
+            objects=frame.result.objects,
+            benign=evaluator.outcome(theta, ~everything),
+            found=found,
+            contributions=tuple(contributions),
+            exact=tuple(kind for kind, own in parts.items() if len(own) <= MOST_EXACT),
+            sizes=tuple(measure_change(space, theta)),
+            least=_describe_minimal_change(frame, evaluator, shortened, minimal),
+            sensitivity={view: _sensitivity_shares(*pair) for view, pair in gradients.items()},
+            renders=evaluator.renders,
+            seconds=round(time.perf_counter() - start, 3),
+        )
+        _write_pictures(folder, explanation, objective, minimal, gradients)
+        return explanation
+
+
+def compute_contributions(
+    parts: Sequence[ThetaPart],
+    theta: Tensor,
+    evaluator: PartialChangeEvaluator,
+    slope: Tensor | None,
+    permutations: int,
+    generator: np.random.Generator,
+) -> list[Contribution]:
+    """Compute the Shapley value of each part of a change.
+
+    Args:
+        parts: Parts that together cover theta.
+        theta: The change (D,).
+        evaluator: Evaluates the detector.
+        slope: Gradient at theta0 times theta (D,), if the detector has a gradient.
+        permutations: Sampled orders of more than MOST_EXACT parts.
+        generator: Draws the orders.
+    """
+    masks = torch.stack([part.mask for part in parts])
+    outcomes: dict[bytes, PartOutcome] = {}
+
+    def outcome(members: Flags) -> PartOutcome:
+        key = members.tobytes()
+        if key not in outcomes:
+            outcomes[key] = evaluator.outcome(theta, masks[torch.from_numpy(members)].any(dim=0))
+        return outcomes[key]
+
+    def game(members: Flags) -> Floats:
+        one = outcome(members)
+        return np.array([one.loss, one.success], dtype=np.float64)
+
+    values = shapley_values(game, len(parts), permutations, generator)
+    total_slope = None if slope is None else float(slope.abs().sum())
+    contributions: list[Contribution] = []
+    for i, part in enumerate(parts):
+        alone = np.arange(len(parts)) == i
+        errors = (None, None) if values.errors is None else tuple(values.errors[i].tolist())
+        own_slope = None if slope is None else slope[part.mask]
+        share = float(own_slope.abs().sum()) / total_slope if own_slope is not None and total_slope else None
+        contributions.append(
+            Contribution(
+                kind=part.kind,
+                name=part.name,
+                loss=float(values.contributions[i, 0]),
+                loss_error=errors[0],
+                fails=float(values.contributions[i, 1]),
+                fails_error=errors[1],
+                gradient=None if own_slope is None else float(own_slope.sum()),
+                gradient_share=share,
+                alone=outcome(alone),
+                without=outcome(~alone),
+            )
+        )
+    return contributions
+
+
+def _order_blocks(
+    space: ParameterSpace,
+    theta: Tensor,
+    parts: Sequence[ThetaPart],
+    contributions: Sequence[Contribution],
+    evaluator: PartialChangeEvaluator,
+) -> list[ThetaBlock]:
+    """Order the blocks to drop: parameters and objects by their contribution to the loss, the least first; then
+    single parameters of single objects, the smallest first.
+    """
+    loss = {c.name: c.loss for c in contributions}
+    blocks = [ThetaBlock(part.name, part.mask) for part in sorted(parts, key=lambda part: loss[part.name])]
+    single: list[tuple[float, ThetaBlock]] = []
+    for cell in list_object_parameters(space):
+        mask = torch.zeros_like(theta, dtype=torch.bool)
+        mask[cell.where] = True
+        single.append((evaluator.size(torch.where(mask, theta, 0)), ThetaBlock(cell.name, mask)))
+    return blocks + [block for size, block in sorted(single, key=lambda pair: pair[0]) if size > 0]
+
+
+def _describe_minimal_change(
+    frame: RebuiltFrame, evaluator: PartialChangeEvaluator, shortened: ShortenedChange, rendered: RenderEvaluation
+) -> MinimalChange:
+    objective, space, minimal = frame.objective, frame.objective.space, shortened.theta
+    violations = check_scene(
+        space.scene,
+        rendered.scene,
+        joint_weather=frame.result.joint_weather,
+        reach=change_limits(space.budget, space.parametrisation),
+    )
+    return MinimalChange(
+        scan=shortened.scan,
+        sign_changes=shortened.sign_changes,
+        scale_whole=shortened.shortened_scale,
+        scale=shortened.scale,
+        dropped=shortened.dropped,
+        norm_found=evaluator.size(frame.theta),
+        norm_whole=evaluator.size(shortened.shortened),
+        norm=evaluator.size(minimal),
+        outcome=evaluator.outcome(minimal, torch.ones_like(minimal, dtype=torch.bool)),
+        violations=tuple(violations),
+        sizes=tuple(measure_change(space, minimal)),
+        failures=build_failure_records(
+            objective.classes, rendered.moved.targets, rendered.detections, objective.failures(rendered, "moved")
+        ),
+        theta=tuple(
+            Coordinate(name=name, **facts)  # pyright: ignore[reportArgumentType]
+            for name, facts in space.theta_by_name(minimal).items()
+            if facts["value"] != 0
+        ),
+    )
+
+
+def _pixel_gradients(
+    objective: Objective, theta: Tensor
+) -> dict[str, tuple[RenderEvaluation, sensitivity.Floats]]:
+    """Return the benign re-render and the counterexample with the gradient (H, W) of the loss to their pixels;
+    nothing if the detector has no gradient.
+    """
+    if not isinstance(objective.detector, Detector):
+        return {}
+    pair = {"benign": objective.benign, "counterexample": objective.evaluate(theta)}
+    return {name: (one, sensitivity.pixel_gradient(objective, one)) for name, one in pair.items()}
+
+
+def _sensitivity_shares(rendered: RenderEvaluation, gradient: sensitivity.Floats) -> PixelSensitivity:
+    ids = rendered.render.object_id.cpu().numpy()
+    *objects, background = sensitivity.gradient_shares(gradient, ids, len(rendered.scene.objects))
+    return PixelSensitivity(tuple(objects), background)
+
+
+def _write_pictures(
+    folder: Path,
+    explanation: Explanation,
+    objective: Objective,
+    minimal: RenderEvaluation,
+    gradients: Mapping[str, tuple[RenderEvaluation, sensitivity.Floats]],
+) -> None:
+    image = to_uint8(minimal.render.image)
+    files.write_png(folder / "minimal.png", image)
+    overlay = pictures.draw_overlay(
+        image,
+        target_records(minimal.moved.targets, CLASSES, explanation.objects),
+        detection_records(minimal.detections, objective.classes.names),
+        explanation.least.failures,
+        objective.t_star,
+        sensitivity.place_object_numbers((image.shape[1], image.shape[0]), _object_boxes(minimal)),
+    )
+    files.write_png(folder / "minimal_overlay.png", overlay)
+    if gradients:
+        rows = [
+            (name, to_uint8(one.render.image), _object_boxes(one), gradient)
+            for name, (one, gradient) in gradients.items()
+        ]
+        files.write_png(folder / "sensitivity.png", sensitivity.draw_sensitivity_sheet(rows))
+    if explanation.contributions:
+        plot_waterfalls(folder / "shapley.png", explanation)
+
+
+def _object_boxes(rendered: RenderEvaluation) -> sensitivity.Floats:
+    """Boxes of the objects (N, 4) xyxy, px."""
+    return rendered.moved.boxes_xyxy.cpu().numpy()

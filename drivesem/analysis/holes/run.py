@@ -1,0 +1,343 @@
+"""Samples the neighbourhoods of runs' certain failures, and reports the holes that they lie in."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from detectors.types import CLASSES
+from drivesem.analysis.holes.report import build_holes_report
+from drivesem.analysis.holes.rules import (
+    ContrastSamples,
+    FailureKey,
+    FailureRule,
+    FailureSamples,
+    FailureWithRule,
+    FeatureSamples,
+    FrameHoles,
+    FrameRuleSamples,
+    fit_rules,
+    join_samples,
+    merge_holes,
+)
+from drivesem.attack.space import parse_params
+from drivesem.config.commands import HolesConfig
+from drivesem.failures.failure_probability import UnitCubePoint, estimate_failure_probability
+from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood, ObjectSample, SceneSampler
+from drivesem.failures.rules import Floats, Intervals, contains
+from drivesem.report.tables import AnalysisReport, format_count
+from drivesem.report.terminal import Console
+from drivesem.run.driver import FrameAnalyser, K, analyse_runs
+from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
+from drivesem.run.folder import (
+    FRAMES,
+    PRESENTATION,
+    claim_folder,
+    load_run_detector,
+    load_trusted_config,
+    resolve_output_folder,
+)
+from drivesem.run.results import Failure
+from drivesem.run.summary import certain_losses
+
+_WRITTEN = ("holes.json", "holes.md", "holes.csv", "holes.png", "runs", "fresh", "rechecks")
+_FREE = (*PRESENTATION, "runs", "recheck")
+_TRIES = 6
+"""States tried for each fresh sample inside a rule."""
+_RECHECK_TRIES = 20
+"""The same for a recheck: a rule may contain as little as a twentieth of the samples it was fitted to."""
+
+Rules = dict[str, dict[int, Intervals]]
+"""Rules of a run's failures, by frame and object."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExtraSamples:
+    """Which further samples to draw inside each rule."""
+
+    count: int
+    """Number of samples."""
+    numbers: range
+    """Numbers of the states to try."""
+    stream: str
+    """Suffix of the seed."""
+    file: str
+    """File of a frame's samples."""
+
+    @classmethod
+    def fresh(cls, fitted: int, count: int) -> ExtraSamples:
+        """Return the samples that test a rule, which was fitted to the first `fitted` samples."""
+        return cls(count, range(fitted, fitted + _TRIES * count), "", "fresh.json")
+
+    @classmethod
+    def recheck(cls, count: int) -> ExtraSamples:
+        """Return the samples that test a rule's failure rate, by new seeds."""
+        return cls(count, range(_RECHECK_TRIES * count), ":recheck", "recheck.json")
+
+
+def run_holes(config: HolesConfig) -> AnalysisReport:
+    """Sample around the certain failures of runs, or resume, and write the report.
+
+    Raises UsageError or SceneError for bad input.
+    """
+    runs = load_runs(config.runs, config.limit, "RUN")
+    out = resolve_output_folder(config.out, runs[0].folder / "holes")
+    for run in runs:
+        load_trusted_config(run.folder, config.trust, "RUN")  # before anything is written
+    claim_folder(out, config, _WRITTEN, _FREE)
+    _print_workload(runs, config)
+    chosen = [(run, _choose_frames(run, config)) for run in runs]
+    title = "sampling around failures of"
+    frames, failed = analyse_runs(chosen, partial(HolesAnalyser, config), out / "runs", config, title)
+    failures = {(name, one.index): one for name, frame in frames.items() for one in frame.around}
+    rules = fit_rules(frames)
+    passes = sum(frame.passes for frame in frames.values())
+    stages = {"fresh": ExtraSamples.fresh(config.samples, config.fresh)}
+    if config.recheck is not None:
+        stages["rechecks"] = ExtraSamples.recheck(config.recheck)
+    samples_by_stage: dict[str, dict[FailureKey, FeatureSamples]] = {}
+    for stage, extra in stages.items():
+        prefixes = {run.name: f"{run.name}/" if len(runs) > 1 else "" for run in runs}
+        rules_by_run = {run.name: _select_rules(run, prefixes[run.name], rules, failures) for run in runs}
+        make = partial(_make_rule_analyser, config, rules_by_run, extra)
+        folder = out / stage if stage == "fresh" else out / stage / str(config.recheck)
+        chosen = [(run, list(rules_by_run[run.name])) for run in runs]
+        results, errors = analyse_runs(chosen, make, folder, config, "testing rules of")
+        samples_by_stage[stage] = {
+            (name, index): samples
+            for name, result in results.items()
+            for index, samples in zip(result.indices, result.inside, strict=True)
+        }
+        passes += sum(result.passes for result in results.values())
+        failed |= errors
+    facts = {
+        "out": str(out),
+        "runs": [str(run.folder) for run in runs],
+        "detector": runs[0].detector,
+        "params": runs[0].params,
+        "frames": sum(len(run.frames) for run in runs),
+        "failures": len(rules),
+        "passes": passes,
+        "frames_failed": failed,
+    }
+    no_samples = FeatureSamples((), (), ())
+    explained = {
+        key: FailureWithRule(failure, rules[key], samples_by_stage["fresh"].get(key, no_samples))
+        for key, failure in failures.items()
+    }
+    report = build_holes_report(out, merge_holes(explained, samples_by_stage.get("rechecks")), facts, failed)
+    report.write()
+    return report
+
+
+class _NeighbourhoodAnalyser(FrameAnalyser[K]):
+    """Samples around the certain failures of a run's frames."""
+
+    def __init__(self, config: HolesConfig, run: AttackRun, out: Path) -> None:
+        super().__init__(run.folder, out)
+        self.config = config
+        self.attack, self.params = load_trusted_config(run.folder, config.trust, "RUN"), parse_params(run.params)
+        self.detector = load_run_detector(self.attack, config.device, "RUN")
+
+    def load_frame(self, name: str) -> RebuiltFrame:
+        """Rebuild a frame of the run."""
+        return RebuiltFrame.load(self.run_folder / FRAMES / name, self.attack, self.params, self.detector)
+
+
+class HolesAnalyser(_NeighbourhoodAnalyser[FrameHoles]):
+    """Draws the samples that rules are fitted to."""
+
+    file, kind, schema = "holes.json", FrameHoles, 3
+
+    def analyse(self, name: str, source: str, folder: Path) -> FrameHoles:
+        """See `FrameAnalyser`."""
+        start = time.perf_counter()
+        config, frame = self.config, self.load_frame(name)
+        around = tuple(
+            _sample_failure(failure, neighbourhood, config.samples, config.seed)
+            for failure, neighbourhood in frame.neighbourhoods(str(config.seed), config.reach)
+        )
+        passes = sum(len(one.all_samples().margins) + one.lost.extra_samples for one in around)
+        contrast, contrast_passes = _sample_all_objects(frame, config.contrast, config.seed)
+        seconds = round(time.perf_counter() - start, 3)
+        return FrameHoles(name, source, around, contrast, passes + contrast_passes, seconds)
+
+
+class RuleRegionAnalyser(_NeighbourhoodAnalyser[FrameRuleSamples]):
+    """Draws further samples inside the rules of a run's failures."""
+
+    kind, schema = FrameRuleSamples, 3
+
+    def __init__(self, config: HolesConfig, run: AttackRun, rules: Rules, extra: ExtraSamples, out: Path) -> None:
+        super().__init__(config, run, out)
+        self.rules, self.extra, self.file = rules, extra, extra.file
+
+    def analyse(self, name: str, source: str, folder: Path) -> FrameRuleSamples:
+        """See `FrameAnalyser`."""
+        start = time.perf_counter()
+        config, extra, rules = self.config, self.extra, self.rules[name]
+        inside = {
+            neighbourhood.index: _draw_samples(
+                neighbourhood, extra.numbers, extra.count, rules[neighbourhood.index]
+            )[0]
+            for _, neighbourhood in self.load_frame(name).neighbourhoods(
+                f"{config.seed}{extra.stream}", config.reach
+            )
+            if neighbourhood.index in rules
+        }
+        return FrameRuleSamples(
+            identifier=name,
+            source=source,
+            indices=tuple(inside),
+            inside=tuple(inside.values()),
+            passes=sum(len(samples.margins) for samples in inside.values()),
+            seconds=round(time.perf_counter() - start, 3),
+        )
+
+
+def _make_rule_analyser(
+    config: HolesConfig, rules_by_run: Mapping[str, Rules], extra: ExtraSamples, run: AttackRun, out: Path
+) -> RuleRegionAnalyser:
+    """Make the analyser of a run. Its folder is named after the rules, as results of other rules do not apply."""
+    rules = rules_by_run[run.name]
+    digest = hashlib.sha256(repr(sorted(rules.items())).encode()).hexdigest()[:12]
+    return RuleRegionAnalyser(config, run, rules, extra, out / digest)
+
+
+def _choose_frames(run: AttackRun, config: HolesConfig) -> list[str]:
+    """Return the frames with certain failures, or all frames if contrast is wanted and any frame has one."""
+    with_failures = [f.result.identifier for f in run.frames if certain_losses(f.result)]
+    return [f.result.identifier for f in run.frames] if with_failures and config.contrast else with_failures
+
+
+def _select_rules(
+    run: AttackRun,
+    prefix: str,
+    rules: Mapping[FailureKey, FailureRule],
+    failures: Mapping[FailureKey, FailureSamples],
+) -> Rules:
+    """Select the rules of a run's failures that have samples. prefix: of its frames' names in `rules`."""
+    selected: Rules = {}
+    names = {prefix + frame.result.identifier: frame.result.identifier for frame in run.frames}
+    for key, failure in failures.items():
+        if key[0] in names and failure.samples.margins:
+            selected.setdefault(names[key[0]], {})[key[1]] = rules[key].where
+    return selected
+
+
+def _print_workload(runs: Sequence[AttackRun], config: HolesConfig) -> None:
+    """Print the number of passes, and the time at the pace of the runs, which is an upper limit: their seconds
+    include more than passes.
+    """
+    count = sum(len(certain_losses(frame.result)) for run in runs for frame in run.frames)
+    results = [frame.result for run in runs for frame in run.frames if frame.result.passes]
+    seconds, passes = sum(r.seconds for r in results), sum(r.passes or 0 for r in results)
+    needed = count * (config.samples + config.fresh + (config.recheck or 0))
+    needed += config.contrast * sum(len(run.frames) for run in runs) if count else 0
+    pace = ""
+    if passes and count:
+        pace = f", at most {max(needed * seconds / passes / 60, 0.1):.1f} min in one process"
+    text = f"{format_count(count, 'certain failure')}, about {format_count(needed, 'pass', 'passes')}{pace}; "
+    Console(stderr=True).print(text + "more if losses are rare or rules narrow", soft_wrap=True)
+
+
+def draw_samples_around(neighbourhood: Neighbourhood, count: int) -> FeatureSamples:
+    """Draw samples around a failure, half of them in the whole neighbourhood, half close to the failure."""
+    samples, near, _ = _draw_both_halves(neighbourhood, count)
+    return join_samples((samples, near))
+
+
+def _sample_failure(failure: Failure, neighbourhood: Neighbourhood, count: int, seed: int) -> FailureSamples:
+    samples, near, states = _draw_both_halves(neighbourhood, count)
+
+    def margin_at(place: Floats, draw: int) -> float | None:
+        sample = neighbourhood.sample_at(place, draw)
+        return None if sample is None else neighbourhood.margin(sample)
+
+    rng = np.random.default_rng([seed, neighbourhood.index])
+    return FailureSamples(
+        index=neighbourhood.index,
+        label=failure.label,
+        error=failure.error or "",
+        grade=failure.grade or "",
+        samples=samples,
+        near=near,
+        lost=estimate_failure_probability(states, margin_at, rng),
+    )
+
+
+def _draw_both_halves(
+    neighbourhood: Neighbourhood, count: int
+) -> tuple[FeatureSamples, FeatureSamples, list[UnitCubePoint]]:
+    """Draw samples in the whole neighbourhood, samples close to the failure, and the points of the former."""
+    half = count // 2
+    samples, states = _draw_samples(neighbourhood, range(half), half, {})
+    near, _ = _draw_samples(neighbourhood, range(half, count), count - half, {}, NEAR_REACH)
+    return samples, near, states
+
+
+def _draw_samples(
+    neighbourhood: Neighbourhood, numbers: Iterable[int], count: int, where: Intervals, reach: float = 1.0
+) -> tuple[FeatureSamples, list[UnitCubePoint]]:
+    """Draw samples inside a rule in which the object counts, and evaluate the detector on them.
+
+    Args:
+        neighbourhood: Neighbourhood of the failure.
+        numbers: Numbers of the states to try.
+        count: Largest number of samples.
+        where: The rule.
+        reach: Share of the neighbourhood's reach.
+
+    Returns:
+        The samples, and their points in the unit cube.
+    """
+    features: list[dict[str, float]] = []
+    states: list[UnitCubePoint] = []
+    for number in numbers:
+        if len(features) == count:
+            break
+        sample = neighbourhood.sample(number, reach)
+        if sample is None:
+            continue
+        if contains(where, {name: np.array([value]) for name, value in sample.features.items()}, 1)[0]:
+            features.append(sample.features)
+            margin = neighbourhood.margin(sample)
+            states.append(UnitCubePoint(neighbourhood.unit_point(number), number, margin))
+    return _tabulate_samples(features, [state.margin for state in states]), states
+
+
+def _sample_all_objects(frame: RebuiltFrame, count: int, seed: int) -> tuple[tuple[ContrastSamples, ...], int]:
+    """Draw samples of all objects of a frame. Returns them by class, and the passes that they took."""
+    if not count:
+        return (), 0
+    name = f"{frame.result.identifier}:{seed}"
+    sampler = SceneSampler(frame.objective, frame.feasible, frame.nuisances, name)
+    rows: dict[str, list[tuple[int, ObjectSample, float]]] = {}
+    passes = 0
+    for number in range(count):
+        samples = sampler.sample(number)
+        passes += bool(samples)
+        for index, margin in sampler.margins(samples).items():
+            label = CLASSES[int(samples[index].image.targets.labels[index])]
+            rows.setdefault(label, []).append((index, samples[index], margin))
+    contrast = tuple(
+        ContrastSamples(
+            label,
+            tuple(index for index, _, _ in own),
+            _tabulate_samples([sample.features for _, sample, _ in own], [margin for _, _, margin in own]),
+        )
+        for label, own in rows.items()
+    )
+    return contrast, passes
+
+
+def _tabulate_samples(features: Sequence[Mapping[str, float]], margins: Sequence[float]) -> FeatureSamples:
+    names = tuple(features[0]) if features else ()
+    values = tuple(tuple(round(v, 6) for v in row.values()) for row in features)
+    return FeatureSamples(names, values, tuple(round(margin, 6) for margin in margins))
