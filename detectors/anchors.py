@@ -1,7 +1,7 @@
-"""Anchor shapes for a data set: k-means of its boxes' sizes, with 1 - IoU as the distance (as YOLO9000 has it).
+"""Fits anchor shapes to a data set: k-means of box sizes with 1 - IoU as the distance, as in YOLO9000.
 
-IoU is that of two boxes around one centre. A cluster's anchor is the mean of its sizes. Plain k-means libraries
-measure Euclidean distance, by which large boxes would get nearly all anchors.
+IoU is that of two boxes with one centre; a cluster's anchor is the mean of its sizes. k-means libraries use
+Euclidean distance, which would give large boxes nearly all anchors.
 """
 
 from __future__ import annotations
@@ -13,64 +13,70 @@ import numpy as np
 from detectors.types import Targets
 
 STARTS = 8
-"""Runs from different first anchors, of which the best is kept: a single one ends in a local optimum."""
+"""Runs from different initial anchors, of which the best is used: a single one may end in a local optimum."""
 
-_MOST_ROUNDS = 300
-"""Of one run: means under this distance may in theory go round in circles."""
+_MAX_ITERATIONS = 300
+"""Iterations per run: k-means with this distance need not converge."""
 
 _ROUNDING = 1e-12
-"""Distance of a size from itself, in floating-point numbers."""
+"""Rounding error of a size's distance from itself."""
 
 
 @dataclass(frozen=True, slots=True)
-class Anchors:
-    """sizes_wh: width and height of each anchor in px, smallest area first. mean_iou: what `mean_best_iou` says of
-    the sizes they were made from.
-    """
+class AnchorFit:
+    """Anchors and how well they fit."""
 
     sizes_wh: tuple[tuple[float, float], ...]
+    """Width and height of each anchor, px, smallest area first."""
     mean_iou: float
+    """`mean_best_iou` over the fitted sizes, in (0, 1]."""
 
 
-def fit_anchors(sizes_wh: np.ndarray, count: int, seed: int = 0, starts: int = STARTS) -> Anchors:
-    """`count` anchors for boxes of sizes (N, 2): width and height, px. The same seed gives the same anchors.
+def fit_anchors(sizes_wh: np.ndarray, count: int, seed: int = 0, starts: int = STARTS) -> AnchorFit:
+    """Fit anchors to box sizes, initialised as in k-means++. The same seed gives the same anchors.
 
-    Each start draws its first anchors as k-means++ does, by the square of the distance. Raises ValueError where
-    sizes are no positive numbers, or fewer of them differ than there are to be anchors.
+    Args:
+        sizes_wh: (N, 2) width and height, px.
+        count: Number of anchors.
+        seed: Seed of the initial anchors.
+        starts: Number of runs.
+
+    Raises:
+        ValueError: Sizes are not positive numbers, or fewer of them are distinct than there are anchors.
     """
-    sizes = _checked(sizes_wh)
-    different = len(np.unique(sizes, axis=0))
-    if not 1 <= count <= different:
-        raise ValueError(f"count: expected 1 to {different}, the number of different sizes, found {count}")
+    sizes = _validate_sizes(sizes_wh)
+    distinct = len(np.unique(sizes, axis=0))
+    if not 1 <= count <= distinct:
+        raise ValueError(f"count: expected 1 to {distinct}, the number of different sizes, found {count}")
     if starts < 1:
         raise ValueError(f"starts: expected at least 1, found {starts}")
     generator = np.random.default_rng(seed)
-    runs = [_settle(sizes, _first(sizes, count, generator)) for _ in range(starts)]
+    runs = [_run_k_means(sizes, _draw_initial_anchors(sizes, count, generator)) for _ in range(starts)]
     best = max(runs, key=lambda anchors: mean_best_iou(sizes, anchors))
     best = best[np.lexsort((best[:, 0], best.prod(1)))]
-    return Anchors(tuple((float(w), float(h)) for w, h in best), mean_best_iou(sizes, best))
+    return AnchorFit(tuple((float(w), float(h)) for w, h in best), mean_best_iou(sizes, best))
 
 
 def mean_best_iou(sizes_wh: np.ndarray, anchors_wh: np.ndarray) -> float:
-    """The mean over sizes (N, 2) of the highest IoU with one of the anchors (K, 2), in (0, 1]."""
+    """Mean over sizes (N, 2) of the highest IoU with any anchor (K, 2), in (0, 1]."""
     return float(size_iou(sizes_wh, anchors_wh).max(1).mean())
 
 
 def size_iou(sizes_wh: np.ndarray, anchors_wh: np.ndarray) -> np.ndarray:
-    """IoU (N, K) of boxes of sizes (N, 2) with anchors (K, 2) around the same centre."""
+    """IoU (N, K) of boxes of sizes (N, 2) and anchors (K, 2) with one centre."""
     sizes, anchors = np.asarray(sizes_wh, np.float64), np.asarray(anchors_wh, np.float64)
     shared = np.minimum(sizes[:, None], anchors[None]).prod(2)
     return shared / (sizes.prod(1)[:, None] + anchors.prod(1)[None] - shared)
 
 
 def target_sizes(targets: Targets) -> np.ndarray:
-    """Sizes (N, 2) in px, float64, of the objects of one image that are not ignored and have an area."""
-    kept = targets.boxes_xyxy[~targets.ignore].double().cpu().numpy()
-    sizes = kept[:, 2:] - kept[:, :2]
+    """Sizes (M, 2) px, float64, of an image's objects that are not ignored and have an area."""
+    objects = targets.boxes_xyxy[~targets.ignore].double().cpu().numpy()
+    sizes = objects[:, 2:] - objects[:, :2]
     return sizes[(sizes > 0).all(1)]
 
 
-def _checked(sizes_wh: np.ndarray) -> np.ndarray:
+def _validate_sizes(sizes_wh: np.ndarray) -> np.ndarray:
     sizes = np.asarray(sizes_wh, np.float64)
     if sizes.ndim != 2 or sizes.shape[1] != 2 or len(sizes) == 0:
         raise ValueError(f"sizes: expected shape (N, 2) with N of at least 1, found {sizes.shape}")
@@ -79,30 +85,32 @@ def _checked(sizes_wh: np.ndarray) -> np.ndarray:
     return sizes
 
 
-def _first(sizes: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """(count, 2) different sizes, each drawn by the square of its distance from those before it (k-means++)."""
-    chosen = [sizes[generator.integers(len(sizes))]]
+def _draw_initial_anchors(sizes: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """(count, 2) distinct sizes, each drawn with probability proportional to the squared distance from the
+    previous ones.
+    """
+    initial = [sizes[generator.integers(len(sizes))]]
     for _ in range(count - 1):
-        distance = 1 - size_iou(sizes, np.stack(chosen)).max(1)
+        distance = 1 - size_iou(sizes, np.stack(initial)).max(1)
         weight = np.where(distance > _ROUNDING, distance, 0.0) ** 2
-        if weight.sum() == 0:  # what is left differs by rounding only: any will do
+        if weight.sum() == 0:  # the rest differs by rounding only: any will do
             weight = np.ones(len(sizes))
-        chosen.append(sizes[generator.choice(len(sizes), p=weight / weight.sum())])
-    return np.stack(chosen)
+        initial.append(sizes[generator.choice(len(sizes), p=weight / weight.sum())])
+    return np.stack(initial)
 
 
-def _settle(sizes: np.ndarray, anchors: np.ndarray) -> np.ndarray:
-    """Means of clusters and clusters of means, until no size changes its cluster."""
-    before = np.full(len(sizes), -1)
-    for _ in range(_MOST_ROUNDS):
+def _run_k_means(sizes: np.ndarray, anchors: np.ndarray) -> np.ndarray:
+    """Alternate between clusters and means until no size changes its cluster."""
+    previous = np.full(len(sizes), -1)
+    for _ in range(_MAX_ITERATIONS):
         overlap = size_iou(sizes, anchors)
         cluster = overlap.argmax(1)
         counts = np.bincount(cluster, minlength=len(anchors))
-        if (cluster == before).all():
+        if (cluster == previous).all():
             break
-        # An anchor that no size is nearest to starts anew where the present ones fit worst.
+        # An empty cluster restarts at the size that fits worst.
         worst = iter(sizes[np.argsort(overlap.max(1), kind="stable")])
         sums = np.stack([np.bincount(cluster, sizes[:, axis], len(anchors)) for axis in (0, 1)], 1)
         anchors = np.stack([total / n if n else next(worst) for total, n in zip(sums, counts, strict=True)])
-        before = cluster
+        previous = cluster
     return anchors

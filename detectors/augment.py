@@ -1,7 +1,7 @@
-"""Views of a training frame: windows at half to native scale, mirrored, with other colours, blur, noise, JPEG.
+"""Augments training frames: windows at half to native scale, mirrored, with other colours, blur, noise and JPEG.
 
-kornia changes the pixels. Everything is drawn from the generator that comes in, so a view is a function of (frame,
-generator) alone, and a run that was stopped goes on to the same bytes.
+Everything is drawn from the given generator, so an augmented frame is a function of (frame, generator) alone, and
+an interrupted run resumes to the same bytes.
 """
 
 from __future__ import annotations
@@ -18,87 +18,120 @@ from detectors import boxes
 from detectors.types import Targets
 
 CUT_VISIBLE = 0.3
-"""A box of which the window shows less than this fraction becomes an ignored one."""
+"""A box becomes an ignored one if the window shows less than this share of it."""
 
 FILL_RGB = (124, 117, 104)
-"""Outside the frame: the mean colour of ImageNet, which backbones take for nothing."""
+"""Colour outside the frame: ImageNet's mean, which backbones see as neutral."""
 
 
 @dataclass(frozen=True, slots=True)
 class AugmentSettings:
-    """How far views may depart from their frame."""
+    """Limits of the augmentation."""
 
     window_hw: tuple[int, int] = (224, 640)
-    """Size of the view in pixels; frames smaller than it are padded by their border."""
+    """Size of the window, px; smaller frames are padded."""
     scale: tuple[float, float] = (0.5, 1.35)
     """Range of the zoom, drawn uniformly in its logarithm."""
     scale_probability: float = 0.8
+    """Probability of a zoom other than 1."""
     object_probability: float = 0.9
-    """How often the window is placed around an object instead of anywhere."""
+    """Probability that the window is placed around an object instead of anywhere."""
     flip_probability: float = 0.5
+    """Probability of a horizontal flip."""
     brightness: float = 0.15
-    """Largest shift, in units of the whole range; the following three are relative."""
+    """Largest shift, in units of the whole range."""
     contrast: float = 0.35
+    """Largest relative change, in the logarithm."""
     gamma: float = 0.35
+    """Largest relative change of the exponent, in the logarithm."""
     channel_gain: float = 0.12
+    """Largest relative change per channel, in the logarithm."""
     saturation: float = 0.6
+    """Largest relative change."""
     hue_rad: float = 0.35
+    """Largest shift, rad."""
     hue_probability: float = 0.25
-    """Of a change of hue, by far the slowest of all."""
+    """Probability of a hue change, by far the slowest operation."""
     blur_probability: float = 0.15
+    """Probability of a Gaussian blur."""
     noise_probability: float = 0.2
+    """Probability of Gaussian noise."""
     jpeg_probability: float = 0.15
+    """Probability of JPEG compression."""
     minimum_height_px: float = 11.0
-    """Objects lower than this in the view are ignored: the coarsest thing a 16 px grid can be asked for."""
+    """Objects lower than this in the window are ignored: a 16 px grid resolves nothing smaller."""
 
 
-def view(
+def augment(
     image: np.ndarray, targets: Targets, settings: AugmentSettings, generator: np.random.Generator
 ) -> tuple[Tensor, Targets]:
-    """One view (3, h, w) float32 in [0, 1] with its targets, of a frame (H, W, 3) uint8 RGB with its targets."""
+    """Augment one frame.
+
+    Args:
+        image: (H, W, 3) uint8 RGB.
+        targets: Its targets.
+        settings: Limits of the augmentation.
+        generator: Source of all random numbers.
+
+    Returns:
+        The window (3, h, w) float32 in [0, 1] and its targets.
+    """
     scale = 1.0
     if generator.random() < settings.scale_probability:
         scale = float(np.exp(generator.uniform(*np.log(settings.scale))))
     height, width = (round(side / scale) for side in settings.window_hw)
-    x0, y0 = _place(image.shape[:2], (height, width), targets, settings, generator)
-    pixels = torch.from_numpy(_cut(image, x0, y0, height, width)).permute(2, 0, 1).float() / 255
+    x0, y0 = _draw_window(image.shape[:2], (height, width), targets, settings, generator)
+    pixels = torch.from_numpy(_crop(image, x0, y0, height, width)).permute(2, 0, 1).float() / 255
     if (height, width) != settings.window_hw:
         pixels = transform.resize(pixels, settings.window_hw, "bilinear", align_corners=False, antialias=scale < 1)
     zoom_xy = (settings.window_hw[1] / width, settings.window_hw[0] / height)
-    moved = cut_targets(targets, (x0, y0), zoom_xy, settings)
+    window_targets = crop_targets(targets, (x0, y0), zoom_xy, settings)
     if generator.random() < settings.flip_probability:
-        pixels, moved = transform.hflip(pixels), mirror(moved, settings.window_hw[1])
-    return degrade(recolour(pixels, settings, generator), settings, generator), moved
+        pixels, window_targets = transform.hflip(pixels), flip_targets(window_targets, settings.window_hw[1])
+    return degrade(jitter_colour(pixels, settings, generator), settings, generator), window_targets
 
 
-def cut_targets(
+def crop_targets(
     targets: Targets, origin_xy: tuple[int, int], zoom_xy: tuple[float, float], settings: AugmentSettings
 ) -> Targets:
-    """Targets in the window that starts at pixel origin_xy of the frame and was zoomed to settings.window_hw.
+    """Targets in a window of the frame.
 
-    Boxes are cut at the window; those outside go, those cut to less than CUT_VISIBLE or too low become ignored.
+    Boxes are clipped to the window. Those outside are dropped; those cut to less than CUT_VISIBLE or too low are
+    ignored.
+
+    Args:
+        targets: Targets of the frame.
+        origin_xy: First pixel of the window.
+        zoom_xy: Scale from the frame to the window of settings.window_hw.
+        settings: Window size and least height.
     """
     zoom = torch.tensor([*zoom_xy, *zoom_xy])
     origin = torch.tensor([*origin_xy, *origin_xy])
-    # Pixel centres are integers, so edges are what scales: x + 0.5.
-    whole = (targets.boxes_xyxy.float() - origin + 0.5) * zoom - 0.5
-    cut = boxes.clip(whole, *settings.window_hw)
-    shown = boxes.area(cut) / boxes.area(whole).clamp_min(1e-6)
+    # Pixel centres are integers, so edges lie at x + 0.5 and scale.
+    uncut = (targets.boxes_xyxy.float() - origin + 0.5) * zoom - 0.5
+    cut = boxes.clip(uncut, *settings.window_hw)
+    visible = boxes.area(cut) / boxes.area(uncut).clamp_min(1e-6)
     low = (cut[:, 3] - cut[:, 1]) < settings.minimum_height_px
-    there = boxes.area(cut) > 0
-    ignore = targets.ignore | (shown < CUT_VISIBLE) | low
-    return Targets(cut[there], targets.labels[there], ignore[there])
+    inside = boxes.area(cut) > 0
+    ignore = targets.ignore | (visible < CUT_VISIBLE) | low
+    return Targets(cut[inside], targets.labels[inside], ignore[inside])
 
 
-def mirror(targets: Targets, width: int) -> Targets:
-    """Targets in an image (of that width in px) that was flipped left to right."""
+def flip_targets(targets: Targets, width: int) -> Targets:
+    """Targets after a horizontal flip of an image of that width, px."""
     left, top, right, bottom = targets.boxes_xyxy.unbind(-1)
     boxes_xyxy = torch.stack((width - 1 - right, top, width - 1 - left, bottom), -1)
     return Targets(boxes_xyxy, targets.labels, targets.ignore)
 
 
-def recolour(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
-    """The image (3, H, W) in [0, 1] in other light: brightness, contrast, saturation, hue, channel gain, gamma."""
+def jitter_colour(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
+    """Change brightness, contrast, saturation, hue, channel gain and gamma.
+
+    Args:
+        image: (3, H, W) in [0, 1].
+        settings: Limits of the augmentation.
+        generator: Source of all random numbers.
+    """
     gain = np.exp(generator.uniform(-settings.channel_gain, settings.channel_gain, 3)).astype(np.float32)
     contrast = float(np.exp(generator.uniform(-settings.contrast, settings.contrast)))
     brightness = float(generator.uniform(-settings.brightness, settings.brightness))
@@ -115,7 +148,13 @@ def recolour(image: Tensor, settings: AugmentSettings, generator: np.random.Gene
 
 
 def degrade(image: Tensor, settings: AugmentSettings, generator: np.random.Generator) -> Tensor:
-    """The image (3, H, W) in [0, 1], now and then blurred, noisy, or through JPEG."""
+    """Blur, add noise or compress as JPEG, each with its probability.
+
+    Args:
+        image: (3, H, W) in [0, 1].
+        settings: Probabilities.
+        generator: Source of all random numbers.
+    """
     if generator.random() < settings.blur_probability:
         sigma = float(generator.uniform(0.4, 1.3))
         image = filters.gaussian_blur2d(image[None], (7, 7), (sigma, sigma), "replicate")[0]
@@ -128,18 +167,18 @@ def degrade(image: Tensor, settings: AugmentSettings, generator: np.random.Gener
     return image
 
 
-def _place(
+def _draw_window(
     image_hw: tuple[int, ...],
     size_hw: tuple[int, int],
     targets: Targets,
     settings: AugmentSettings,
     generator: np.random.Generator,
 ) -> tuple[int, int]:
-    """First pixel (x0, y0) of a window of that size; inside the frame where it fits."""
+    """First pixel (x0, y0) of a window of that size; inside the frame if it fits."""
     chosen = torch.nonzero(~targets.ignore)[:, 0]
     focus = generator.uniform(0, 1, 2) * (image_hw[1], image_hw[0])
     if len(chosen) and generator.random() < settings.object_probability:
-        # A class first, then one of its objects: the rare classes are seen more often than they occur.
+        # Draw a class, then one of its objects: this oversamples rare classes.
         present = torch.unique(targets.labels[chosen])
         chosen = chosen[targets.labels[chosen] == present[generator.integers(len(present))]]
         left, top, right, bottom = targets.boxes_xyxy[chosen[generator.integers(len(chosen))]].tolist()
@@ -150,7 +189,7 @@ def _place(
     return x0, y0
 
 
-def _cut(image: np.ndarray, x0: int, y0: int, height: int, width: int) -> np.ndarray:
+def _crop(image: np.ndarray, x0: int, y0: int, height: int, width: int) -> np.ndarray:
     """Pixels (height, width, 3) from (x0, y0) on; FILL_RGB outside the frame."""
     inside_y = slice(max(y0, 0), min(y0 + height, image.shape[0]))
     inside_x = slice(max(x0, 0), min(x0 + width, image.shape[1]))

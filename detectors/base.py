@@ -1,10 +1,11 @@
-"""The contract of detectors: images to raw predictions, to detections; with gradients, also to a loss.
+"""The detector contract: images to raw predictions to detections and, with gradients, to a loss.
 
-`detectors.check.check_detector` tests an implementation; docs/detectors.md says what it must do and shows one.
+`detectors.check.check_detector` tests an implementation; docs/reference/detectors.md describes it with an example.
 """
 
 from __future__ import annotations
 
+import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -17,82 +18,84 @@ from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from detectors.memory import in_halves
 from detectors.types import Detections, Targets
 
 N = TypeVar("N", bound=nn.Module)
+R = TypeVar("R")
 
 
 class DetectorError(ValueError):
-    """A detector that cannot be had: no such name or file, or weights that belong to another one."""
+    """A detector that cannot be loaded: unknown name, missing file, or weights of another detector."""
 
 
-def raised(error: Exception) -> str:
-    """What a user's code raised, and where: `ValueError: why (mine.py:12, in forward)`. The place is the innermost
-    outside of installed libraries and of this package.
+def describe_error(error: Exception) -> str:
+    """An error of user code with its location: `ValueError: why (mine.py:12, in forward)`.
+
+    The location is the innermost frame outside installed libraries and this package.
     """
-    if isinstance(error, SyntaxError) and error.filename:  # no line of it was run
+    if isinstance(error, SyntaxError) and error.filename:  # the file was never run
         return f"{type(error).__name__}: {error.msg} ({Path(error.filename).name}:{error.lineno})"
-    place = (outside(error) or traceback.extract_tb(error.__traceback__))[-1]
-    said = " ".join(str(error).split())[:300]
-    return f"{type(error).__name__}: {said} ({Path(place.filename).name}:{place.lineno}, in {place.name})"
+    frame = (user_code_frames(error) or traceback.extract_tb(error.__traceback__))[-1]
+    message = " ".join(str(error).split())[:300]
+    return f"{type(error).__name__}: {message} ({Path(frame.filename).name}:{frame.lineno}, in {frame.name})"
 
 
-def outside(error: Exception) -> list[traceback.FrameSummary]:
-    """The places that an error came through outside of installed libraries and of this package: a user's code."""
+def user_code_frames(error: Exception) -> list[traceback.FrameSummary]:
+    """Frames of an error's traceback outside installed libraries and this package."""
     frames = traceback.extract_tb(error.__traceback__)
-    home = str(Path(__file__).parent)
-    return [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(home)]
+    package = str(Path(__file__).parent)
+    return [f for f in frames if "site-packages" not in f.filename and not f.filename.startswith(package)]
 
 
 @runtime_checkable
-class Raw(Protocol):
-    """What any detector with gradients says about a batch of images: its own affair, but for these two."""
+class RawPredictions(Protocol):
+    """The output of `Detector.forward` for a batch. Only these two methods are prescribed."""
 
     def __len__(self) -> int:
-        """Images of the batch."""
+        """Number of images."""
         ...
 
-    def one(self, index: int) -> Raw:
-        """What is said about one image of the batch, as a batch of one."""
-        ...
-
-
-@runtime_checkable
-class Plantable(Protocol):
-    """Raw predictions into which a test can put one of its own."""
-
-    def planted(self, box_xyxy: Tensor, label: int) -> Any:
-        """The same, but silent about all images except for one certain prediction in each: a box (4,) px."""
+    def select(self, index: int) -> RawPredictions:
+        """The predictions of one image, as a batch of one."""
         ...
 
 
 @runtime_checkable
-class Lowerable(Protocol):
-    """Raw predictions whose scores of one class can be lowered: what faults are planted into."""
+class InjectablePredictions(Protocol):
+    """Raw predictions into which a test can inject a prediction."""
 
-    def lowered(self, label: int, by: Tensor) -> Any:
-        """The same, scores of that class lowered by logits (B, A), row by row of the candidates."""
+    def inject(self, box_xyxy: Tensor, label: int) -> Any:
+        """A copy with this box (4,) px as the only confident prediction in each image."""
+        ...
+
+
+@runtime_checkable
+class SuppressiblePredictions(Protocol):
+    """Raw predictions that support lowering the scores of one class, as planted faults do."""
+
+    def suppress(self, label: int, by: Tensor) -> Any:
+        """A copy with the class's logits lowered by `by` (B, A), one value per candidate."""
         ...
 
 
 CERTAIN = 20.0
-"""A logit that is as good as certain: its sigmoid differs from 1 by 2e-9."""
+"""Logit of a certain prediction: its sigmoid differs from 1 by 2e-9."""
 
 
 @dataclass(frozen=True, slots=True)
-class RawPredictions:
-    """What the network says about each of its A anchors, before any choice is made; differentiable.
-
-    boxes_xyxy (B, A, 4) px of the input image, not clipped; deltas (B, A, 4), the box head's own numbers;
-    class_logits (B, A, C); confidence_logits (B, A); image_hw, size of the input image in pixels.
-    """
+class AnchorPredictions:
+    """Output of an anchor-based network before any selection; differentiable."""
 
     boxes_xyxy: Tensor
+    """(B, A, 4) px of the input image, not clipped."""
     deltas: Tensor
+    """(B, A, 4) raw outputs of the box head."""
     class_logits: Tensor
+    """(B, A, C)."""
     confidence_logits: Tensor
+    """(B, A)."""
     image_hw: tuple[int, int]
+    """Size of the input image, px."""
 
     def __post_init__(self) -> None:
         b, a = self.confidence_logits.shape
@@ -105,19 +108,13 @@ class RawPredictions:
     def __len__(self) -> int:
         return int(self.confidence_logits.shape[0])
 
-    def one(self, index: int) -> RawPredictions:
-        """What is said about one image of the batch, as a batch of one."""
-        rows = slice(index, index + 1)
-        return RawPredictions(
-            self.boxes_xyxy[rows],
-            self.deltas[rows],
-            self.class_logits[rows],
-            self.confidence_logits[rows],
-            self.image_hw,
-        )
+    def select(self, index: int) -> AnchorPredictions:
+        """The predictions of one image, as a batch of one."""
+        names = ("boxes_xyxy", "deltas", "class_logits", "confidence_logits")
+        return replace(self, **{name: getattr(self, name)[index : index + 1] for name in names})
 
-    def planted(self, box_xyxy: Tensor, label: int) -> RawPredictions:
-        """The same, but for a certain prediction by each image's first anchor, and silence of all others."""
+    def inject(self, box_xyxy: Tensor, label: int) -> AnchorPredictions:
+        """A copy with this box as the only confident prediction in each image, at the first anchor."""
         boxes, classes = self.boxes_xyxy.clone(), torch.full_like(self.class_logits, -CERTAIN)
         confidence = torch.full_like(self.confidence_logits, -CERTAIN)
         boxes[:, 0] = box_xyxy.to(boxes)
@@ -125,27 +122,25 @@ class RawPredictions:
         confidence[:, 0] = CERTAIN
         return replace(self, boxes_xyxy=boxes, class_logits=classes, confidence_logits=confidence)
 
-    def lowered(self, label: int, by: Tensor) -> RawPredictions:
-        """The same, but less confident where `label` is the likeliest class; see `Lowerable`."""
+    def suppress(self, label: int, by: Tensor) -> AnchorPredictions:
+        """A copy with confidence logits lowered by `by` (B, A) where `label` is the likeliest class."""
         likeliest = self.class_logits.argmax(-1) == label
         return replace(self, confidence_logits=self.confidence_logits - torch.where(likeliest, by, 0.0))
 
 
-def lowered_probability(probability: Tensor, by: Tensor) -> Tensor:
-    """Probabilities (...) whose logits are lowered by so much (...); exact near 0 and 1."""
+def lower_probability(probability: Tensor, by: Tensor) -> Tensor:
+    """Probabilities (...) after lowering their logits by `by` (...); exact near 0 and 1."""
     return probability * torch.exp(-by) / (1 + probability * torch.expm1(-by))
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """What a detector would choose from in one image, before suppression; differentiable.
-
-    boxes_xyxy (A, K, 4) px, not clipped: K is 1, or C where each class has a box of its own; log_scores (A, C):
-    logarithms of the scores that `decode` gives, class by class.
-    """
+    """Scored boxes of one image before suppression; differentiable."""
 
     boxes_xyxy: Tensor
+    """(A, K, 4) px, not clipped: K is 1, or C where each class has its own box."""
     log_scores: Tensor
+    """(A, C) logarithms of the scores that `decode` gives, per class."""
 
     def __post_init__(self) -> None:
         a, c = self.log_scores.shape
@@ -153,152 +148,212 @@ class Candidates:
         if found not in ((a, 1, 4), (a, c, 4)):
             raise ValueError(f"candidates: expected boxes of shape {(a, 1, 4)} or {(a, c, 4)}, found {found}")
 
-    def boxes_of(self, label: int) -> Tensor:
-        """Boxes (A, 4) px for one class."""
+    def boxes_for_class(self, label: int) -> Tensor:
+        """Boxes (A, 4) px of one class."""
         return self.boxes_xyxy[:, label if self.boxes_xyxy.shape[1] > 1 else 0]
 
 
 @dataclass(frozen=True, slots=True)
-class Trunk:
-    """A detector taken apart, for images of one size: what is around the image, the network, how its outputs are
-    read. On it `detectors.incremental` builds.
-
-    network: takes a padded image (1, 3, H, W), RGB in [0, 1] less `mean`, and gives one tensor or several; in eval
-    mode, and torch.fx can trace it. fill: the padding's RGB; padding: its rows above and below, columns left and
-    right; interpret: of the network's outputs and of the image's height and width what `Detector.forward` gives.
-    """
+class DetectorStages:
+    """A detector split into padding, network and decoding for one image size; used by `detectors.incremental`."""
 
     network: nn.Module
+    """Maps a padded image (1, 3, H, W), RGB in [0, 1] minus `mean`, to one or several tensors; in eval mode and
+    traceable by torch.fx."""
     mean: tuple[float, float, float]
+    """RGB subtracted from the image."""
     fill: tuple[float, float, float]
+    """RGB of the padding."""
     padding: tuple[int, int, int, int]
-    interpret: Callable[[Sequence[Tensor], tuple[int, int]], RawPredictions]
+    """Rows above and below, columns left and right."""
+    interpret: Callable[[Sequence[Tensor], tuple[int, int]], AnchorPredictions]
+    """Maps the network's outputs and the image's (height, width) to the output of `Detector.forward`."""
 
     @property
-    def at(self) -> tuple[int, int]:
-        """Row and column of the padded image at which the image begins."""
+    def image_origin(self) -> tuple[int, int]:
+        """Row and column of the image's first pixel in the padded image."""
         return self.padding[0], self.padding[2]
 
-    def padded(self, image: Tensor) -> Tensor:
-        """What the network takes for an image (1, 3, h, w)."""
+    def pad_image(self, image: Tensor) -> Tensor:
+        """The network's input for an image (1, 3, h, w)."""
         top, bottom, left, right = self.padding
         height, width = int(image.shape[2]), int(image.shape[3])
-        mean, around = (image.new_tensor(level).view(1, 3, 1, 1) for level in (self.mean, self.fill))
-        whole = (around - mean).repeat(1, 1, top + height + bottom, left + width + right)
-        whole[:, :, top : top + height, left : left + width] = image - mean
-        return whole.contiguous(memory_format=torch.channels_last)
+        mean, fill = (image.new_tensor(level).view(1, 3, 1, 1) for level in (self.mean, self.fill))
+        padded = (fill - mean).repeat(1, 1, top + height + bottom, left + width + right)
+        padded[:, :, top : top + height, left : left + width] = image - mean
+        return padded.contiguous(memory_format=torch.channels_last)
 
 
 class Predictor(Protocol):
-    """A detector that need have no gradient: what `Detector` is, less loss and t*; detectors of other projects.
-
-    name; classes: labels are indices into it, "Car" among them where it knows cars. What `forward` gives is its
-    own affair, `decode` takes it.
-    """
+    """A detector without a gradient: `Detector` without loss and t*. `decode` takes the output of `forward`."""
 
     name: str
+    """Shown in reports."""
     classes: tuple[str, ...]
+    """Class names that labels index; with "Car" if the detector knows cars."""
 
     def forward(self, images: Tensor) -> Any:
         """images (B, 3, H, W), RGB in [0, 1], any size."""
         ...
 
     def decode(self, raw: Any) -> list[Detections]:
-        """One Detections for each image, best first, boxes inside the image; carries no gradient."""
+        """One Detections per image, best first, boxes inside the image; no gradient."""
         ...
 
 
-def device_of(predictor: Predictor) -> torch.device:
-    """Where a detector's weights lie, and its images must; the processor, where it has none that are known."""
-    known = chain(predictor.parameters(), predictor.buffers()) if isinstance(predictor, nn.Module) else ()
-    first = next(iter(known), None)
+def detector_device(predictor: Predictor) -> torch.device:
+    """The device of a detector's weights; the CPU if it has no visible weights."""
+    tensors = chain(predictor.parameters(), predictor.buffers()) if isinstance(predictor, nn.Module) else ()
+    first = next(iter(tensors), None)
     return torch.device("cpu") if first is None else first.device
 
 
-def compute_exactly(device: str | torch.device) -> None:
-    """Have a GPU convolve in float32; cuDNN's own choice is TF32, of ten bits."""
+def disable_tf32(device: str | torch.device) -> None:
+    """Make a GPU convolve in float32: cuDNN defaults to TF32 with its 10-bit mantissa."""
     if torch.device(device).type == "cuda":
         torch.backends.cudnn.allow_tf32 = False
 
 
-def ready(network: N, device: str | torch.device = "cpu") -> N:
-    """Frozen, in eval mode, channels-last."""
-    compute_exactly(device)
+def prepare_for_inference(network: N, device: str | torch.device = "cpu") -> N:
+    """The network on a device, frozen, in eval mode and channels-last."""
+    disable_tf32(device)
     network.requires_grad_(False)
     return network.to(device=device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
 @torch.no_grad()
 def predict(predictor: Predictor, images: Tensor) -> list[Detections]:
-    """What is found in images (B, 3, H, W), RGB in [0, 1]: one Detections for each. Images that are too many
-    for the device's memory are looked at in halves.
+    """One Detections per image (B, 3, H, W), RGB in [0, 1]; in halves when device memory runs out."""
+    return run_in_halves(lambda part: predictor.decode(predictor.forward(part)), images, "images")
+
+
+def run_in_halves(work: Callable[[Any], list[R]], items: Any, what: str) -> list[R]:
+    """Process all items at once; when device memory runs out, each half on its own, recursively.
+
+    Args:
+        work: Maps items to one result each.
+        items: A sequence or a tensor.
+        what: Plural noun for the items, used in the line on standard error.
+
+    Returns:
+        One result per item.
+
+    Raises:
+        torch.OutOfMemoryError: A single item does not fit.
     """
-    return in_halves(lambda part: predictor.decode(predictor.forward(part)), images, "images")
+    try:
+        return work(items)
+    except torch.OutOfMemoryError:
+        if len(items) < 2:
+            raise
+    # After the except block: the error holds on to the tensors that filled the memory.
+    half = -(-len(items) // 2)
+    free_device_memory(f"{len(items)} {what} at once exceed the device's memory: trying {half}")
+    return [*run_in_halves(work, items[:half], what), *run_in_halves(work, items[half:], what)]
+
+
+def free_device_memory(line: str) -> None:
+    """Empty the GPU's cache and write the reason to standard error."""
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+    sys.stderr.write(f"drivesem: {line}\n")
 
 
 class Detector(nn.Module, ABC):
-    """A detector: `name`, `classes` (labels are indices into it), `t_star` (score of best F1 on benign frames).
+    """A differentiable detector.
 
-    It takes images as they are: what normalises, pads or resizes them is part of `forward`, and boxes are px of
-    the image that was given. With all weights frozen (`requires_grad_(False)`) it is in eval mode, and `train()`
-    does not take it out: neither dropout nor the statistics of a normalisation change while it is attacked.
+    It takes images as they are: normalisation, padding and resizing are part of `forward`, and boxes are px of the
+    given image. Once all weights are frozen (`requires_grad_(False)`) it stays in eval mode, also after `train()`,
+    so that neither dropout nor normalisation statistics change during an attack.
     """
 
     name: str
+    """Shown in reports."""
     classes: tuple[str, ...]
+    """Class names that labels index."""
     t_star: float
+    """Score of best F1 on benign frames, in [0, 1]."""
     fresh_layers: tuple[str, ...] = ()
-    """Beginnings of the names of those parameters that no pretrained backbone provides."""
+    """Name prefixes of the parameters that no pretrained backbone provides."""
 
     @abstractmethod
     def forward(self, images: Tensor) -> Any:
-        """images (B, 3, H, W), RGB in [0, 1], any size, to what `Raw` is; differentiable to the images."""
+        """Images (B, 3, H, W), RGB in [0, 1], any size, to `RawPredictions`; differentiable to the images."""
 
     @abstractmethod
     def loss(self, raw: Any, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """Scalars by name, of what `forward` gave and one Targets for each image. Two of them all detectors have:
+        """Scalar loss terms by name, from the output of `forward` and one Targets per image.
 
-        "total", what training lowers, the sum of the detector's own terms (SqueezeDet: "confidence", "box",
-        "class"); and "objectness", which falls as the objects' confidences rise to 1 and those elsewhere fall to
-        0: attacks raise it. Ignored targets are neither objects nor elsewhere.
+        Two are required. "total" is the training loss, the sum of the detector's terms (SqueezeDet: "confidence",
+        "box", "class"). "objectness" falls as confidences of objects approach 1 and all others approach 0; attacks
+        raise it. Ignored targets count as neither.
 
-        Raises ValueError where targets and images differ in number, or a label is no class of this detector.
+        Raises:
+            ValueError: Targets and images differ in number, or a label is not one of the classes.
         """
 
     @abstractmethod
     def decode(self, raw: Any) -> list[Detections]:
-        """One Detections for each image, best first, boxes inside the image; carries no gradient."""
+        """One Detections per image, best first, boxes inside the image; no gradient."""
 
     def candidates(self, raw: Any) -> Candidates:
-        """What `decode` chooses from, of a batch of one image, for the objectives of drivesem/attack/goals.py.
+        """The candidates of `decode` for a batch of one image; used by the attack objectives.
 
-        Raises DetectorError where a detector does not tell.
+        Raises:
+            DetectorError: The detector does not provide candidates.
         """
-        raise DetectorError(f"detector {self.name}: expected one that tells its candidates")
+        raise DetectorError(f"detector {self.name}: expected one that provides its candidates")
 
     @torch.no_grad()
-    def glance(self, images: Tensor) -> Any:
-        """What `forward` gives, without a gradient, for searches, which judge nothing: in the precision of
-        gradients, where that is another.
-        """
+    def forward_for_search(self, images: Tensor) -> Any:
+        """`forward` without a gradient, for proposals that are evaluated again; may use the lower precision."""
         return self(images)
 
-    def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
-        """The detector taken apart for images (height, width), as its weights are; None where it cannot be."""
+    def stages(self, image_hw: tuple[int, int]) -> DetectorStages | None:
+        """The detector's stages for images (height, width) with the present weights; None if it has none."""
         return None
 
     @contextmanager
-    def holding(self, raw: Any) -> Iterator[None]:
-        """Inside, `forward` makes those choices that its gradient takes as constant as it made them for `raw`.
-        So differences can be held against the gradient. Most detectors make none.
+    def freeze_choices(self, raw: Any) -> Iterator[None]:
+        """Make `forward` repeat the choices made for `raw` that its gradient treats as constant.
+
+        This makes finite differences comparable with the gradient. Most detectors make no such choices.
         """
         yield
 
     def train(self, mode: bool = True) -> Self:
-        """Training mode, where there is something to train: with all weights frozen it stays in eval mode."""
+        """Set training mode, unless all weights are frozen."""
         return super().train(mode and any(parameter.requires_grad for parameter in self.parameters()))
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """Of all weights. Without gradients there is nothing to train, and the detector goes into eval mode."""
+        """Set `requires_grad` of all weights; freezing also sets eval mode."""
         super().requires_grad_(requires_grad)
         return self if requires_grad else self.eval()
+
+
+class DetectorWrapper(Detector):
+    """A detector that delegates to `inner`; subclasses override `forward`."""
+
+    def __init__(self, inner: Detector) -> None:
+        super().__init__()
+        self.inner = inner
+        self.name, self.classes, self.t_star = inner.name, inner.classes, inner.t_star
+        self.fresh_layers = tuple(f"inner.{prefix}" for prefix in inner.fresh_layers)
+
+    def loss(self, raw: Any, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """The inner detector's loss."""
+        return self.inner.loss(raw, targets)
+
+    def decode(self, raw: Any) -> list[Detections]:
+        """The inner detector's detections."""
+        return self.inner.decode(raw)
+
+    def candidates(self, raw: Any) -> Candidates:
+        """The inner detector's candidates."""
+        return self.inner.candidates(raw)
+
+    @contextmanager
+    def freeze_choices(self, raw: Any) -> Iterator[None]:
+        """The inner detector's `freeze_choices`."""
+        with self.inner.freeze_choices(raw):
+            yield

@@ -1,7 +1,7 @@
-"""Several detectors as one, to attack together: what all of them get wrong, others may get wrong too.
+"""Several detectors as one, to be attacked together.
 
-An object is found where any member finds it, and a phantom is any member's. So that their scores compare, each
-member's logits are shifted by what takes its t* to the ensemble's.
+An object is detected if any member detects it, and a false positive of any member is one of the ensemble. Each
+member's logits are shifted so that its t* becomes the ensemble's, which makes scores comparable.
 """
 
 from __future__ import annotations
@@ -16,102 +16,114 @@ import torch
 from torch import Tensor, nn
 
 from detectors import boxes
-from detectors.base import Candidates, Detector, DetectorError, lowered_probability
+from detectors.base import Candidates, Detector, DetectorError, lower_probability
 from detectors.types import Detections, Targets
 
 PREFIX = "ensemble:"
-"""Before detectors with + between: ensemble:squeezedet+yolov3-slim."""
+"""Before detector names joined by +: ensemble:squeezedet+yolov3-slim."""
 T_STAR = 0.5
 NMS_IOU = 0.5
-"""Detections of one class that overlap as much are one object's: the most certain member's stands."""
+"""IoU above which the best of several detections of one class is used."""
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
-    """What each member says of a batch."""
+class EnsemblePredictions:
+    """Raw predictions of all members for a batch."""
 
     members: tuple[Any, ...]
+    """One per member."""
 
     def __len__(self) -> int:
         return len(self.members[0])
 
-    def one(self, index: int) -> Said:
-        """Of one image of the batch, as a batch of one."""
-        return Said(tuple(raw.one(index) for raw in self.members))
+    def select(self, index: int) -> EnsemblePredictions:
+        """The predictions of one image, as a batch of one."""
+        return EnsemblePredictions(tuple(raw.select(index) for raw in self.members))
 
 
 class Ensemble(Detector):
-    """Detectors with the same classes. DetectorError for fewer than two, other classes, or a t* of 0 or 1, which
-    no shift takes to another.
+    """Detectors with the same classes.
+
+    Raises:
+        DetectorError: Fewer than two members, different classes, or a t* of 0 or 1, which no shift can change.
     """
 
     def __init__(self, members: Sequence[Detector]) -> None:
         super().__init__()
         if len(members) < 2:
-            raise DetectorError(f"{PREFIX} expected at least two detectors with + between, found {len(members)}")
+            raise DetectorError(f"{PREFIX} expected at least two detectors joined by +, found {len(members)}")
         first, *others = members
-        for one in others:
-            if one.classes != first.classes:
-                theirs, own = (", ".join(names) for names in (first.classes, one.classes))
-                raise DetectorError(f"{PREFIX} {one.name}: expected {first.name}'s classes, {theirs}, found {own}")
-        for one in members:
-            if not 0 < one.t_star < 1:
+        for member in others:
+            if member.classes != first.classes:
+                theirs, own = (", ".join(names) for names in (first.classes, member.classes))
                 raise DetectorError(
-                    f"{PREFIX} {one.name}: expected a t* above 0 and below 1, found {one.t_star:g}"
+                    f"{PREFIX} {member.name}: expected {first.name}'s classes, {theirs}, found {own}"
+                )
+        for member in members:
+            if not 0 < member.t_star < 1:
+                raise DetectorError(
+                    f"{PREFIX} {member.name}: expected a t* above 0 and below 1, found {member.t_star:g}"
                 )
         self.members = nn.ModuleList(members)
         self.name = PREFIX + "+".join(one.name for one in members)
         self.classes, self.t_star = first.classes, T_STAR
 
-    def _each(self) -> list[Detector]:
-        return [one for one in self.members if isinstance(one, Detector)]
+    def _with_predictions(self, raw: EnsemblePredictions) -> list[tuple[Detector, Any]]:
+        return list(zip(self._detectors(), raw.members, strict=True))
 
-    def forward(self, images: Tensor) -> Said:
+    def _detectors(self) -> list[Detector]:
+        return [member for member in self.members if isinstance(member, Detector)]
+
+    def forward(self, images: Tensor) -> EnsemblePredictions:
         """images (B, 3, H, W), RGB in [0, 1], any size."""
-        return Said(tuple(one(images) for one in self._each()))
+        return EnsemblePredictions(tuple(member(images) for member in self._detectors()))
 
-    def loss(self, raw: Said, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """ "total" and "objectness": means of the members'."""
-        terms = [one.loss(said, targets) for one, said in zip(self._each(), raw.members, strict=True)]
-        return {name: torch.stack([own[name] for own in terms]).mean() for name in ("total", "objectness")}
+    def loss(self, raw: EnsemblePredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """Means of the members' "total" and "objectness"."""
+        losses = [member.loss(predictions, targets) for member, predictions in self._with_predictions(raw)]
+        return {name: torch.stack([terms[name] for terms in losses]).mean() for name in ("total", "objectness")}
 
-    def candidates(self, raw: Said) -> Candidates:
-        """All of the members'."""
-        found = [one.candidates(said) for one, said in zip(self._each(), raw.members, strict=True)]
-        placed = [c.boxes_xyxy.expand(-1, len(self.classes), -1) for c in found]
-        logs = [_shifted(c.log_scores, _shift(one.t_star)) for c, one in zip(found, self._each(), strict=True)]
-        return Candidates(torch.cat(placed), torch.cat(logs))
+    def candidates(self, raw: EnsemblePredictions) -> Candidates:
+        """The members' candidates, with shifted scores."""
+        boxes_xyxy, log_scores = [], []
+        for member, predictions in self._with_predictions(raw):
+            candidates = member.candidates(predictions)
+            boxes_xyxy.append(candidates.boxes_xyxy.expand(-1, len(self.classes), -1))
+            log_scores.append(_lower_log_scores(candidates.log_scores, _shift(member.t_star)))
+        return Candidates(torch.cat(boxes_xyxy), torch.cat(log_scores))
 
     @torch.no_grad()
-    def decode(self, raw: Said) -> list[Detections]:
-        """What any member finds, each object once."""
-        every = [one.decode(said) for one, said in zip(self._each(), raw.members, strict=True)]
-        return [self._joined([found[image] for found in every]) for image in range(len(raw))]
+    def decode(self, raw: EnsemblePredictions) -> list[Detections]:
+        """The members' detections after suppression across members."""
+        per_member = [member.decode(predictions) for member, predictions in self._with_predictions(raw)]
+        return [self._merge([detections[image] for detections in per_member]) for image in range(len(raw))]
 
-    def _joined(self, found: Sequence[Detections]) -> Detections:
-        placed = torch.cat([one.boxes_xyxy for one in found])
-        labels = torch.cat([one.labels for one in found])
-        scores = torch.cat(
-            [
-                lowered_probability(one.scores, one.scores.new_tensor(_shift(member.t_star)))
-                for one, member in zip(found, self._each(), strict=True)
-            ]
-        )
+    def _merge(self, per_member: Sequence[Detections]) -> Detections:
+        boxes_xyxy = torch.cat([detections.boxes_xyxy for detections in per_member])
+        labels = torch.cat([detections.labels for detections in per_member])
+        shifts = [
+            d.scores.new_tensor(_shift(m.t_star)) for m, d in zip(self._detectors(), per_member, strict=True)
+        ]
+        scores = torch.cat([lower_probability(d.scores, by) for d, by in zip(per_member, shifts, strict=True)])
         order = torch.sort(scores, descending=True, stable=True).indices
-        kept = order[boxes.nms(placed[order], scores[order], NMS_IOU, labels[order])]
-        return Detections(placed[kept], labels[kept], scores[kept])
+        selected = order[boxes.nms(boxes_xyxy[order], scores[order], NMS_IOU, labels[order])]
+        return Detections(boxes_xyxy[selected], labels[selected], scores[selected])
 
     @contextmanager
-    def holding(self, raw: Said) -> Iterator[None]:
-        """The members'."""
+    def freeze_choices(self, raw: EnsemblePredictions) -> Iterator[None]:
+        """`freeze_choices` of all members."""
         with ExitStack() as stack:
-            for one, said in zip(self._each(), raw.members, strict=True):
-                stack.enter_context(one.holding(said))
+            for member, predictions in self._with_predictions(raw):
+                stack.enter_context(member.freeze_choices(predictions))
             yield
 
 
-def names_of(spec: str) -> list[str]:
-    """The detectors of "ensemble:a+b". DetectorError where they are not two or more."""
+def parse_member_names(spec: str) -> list[str]:
+    """The detectors of "ensemble:a+b".
+
+    Raises:
+        DetectorError: Fewer than two names.
+    """
     names = [part.strip() for part in spec.removeprefix(PREFIX).split("+")]
     if len(names) < 2 or not all(names):
         raise DetectorError(f"{spec}: expected {PREFIX}A+B, at least two detectors, found {len(names)}")
@@ -123,8 +135,8 @@ def _shift(t_star: float) -> float:
     return _logit(t_star) - _logit(T_STAR)
 
 
-def _shifted(log_score: Tensor, by: float) -> Tensor:
-    """log(s') of log(s), where the logit of s' is that of s less `by`; exact near 0."""
+def _lower_log_scores(log_score: Tensor, by: float) -> Tensor:
+    """Logarithms of scores after lowering their logits by `by`; exact near 0."""
     return log_score - by - torch.log1p(log_score.exp() * math.expm1(-by))
 
 

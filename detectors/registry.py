@@ -1,4 +1,4 @@
-"""Detectors by name or weights file, ready to be attacked: frozen, in eval mode, channels-last."""
+"""Loads detectors by name or weights file, ready to be attacked: frozen, in eval mode, channels-last."""
 
 from __future__ import annotations
 
@@ -14,60 +14,70 @@ from safetensors.torch import save
 from torch import nn
 
 from detectors import ensemble, planted
-from detectors.adapters import choose
-from detectors.base import Detector, DetectorError, Predictor, compute_exactly, ready
-from detectors.reading import read_file, read_text
+from detectors.base import Detector, DetectorError, Predictor, disable_tf32, prepare_for_inference
+from detectors.files import read_file, read_text, write_atomically
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
-from detectors.whole import write_whole
 from detectors.yolov3 import cfg
 from detectors.yolov3.yolov3 import YoloV3, YoloV3Slim, YoloV3Tiny
 
-_KINDS = (SqueezeDet, SqueezeDetPlus, YoloV3, YoloV3Tiny, YoloV3Slim)
-ARCHITECTURES: dict[str, type[SqueezeDet] | type[YoloV3]] = {kind.name: kind for kind in _KINDS}
-"""Name of an architecture, as weights files carry it in their metadata, and its class."""
+_ARCHITECTURES = (SqueezeDet, SqueezeDetPlus, YoloV3, YoloV3Tiny, YoloV3Slim)
+ARCHITECTURES: dict[str, type[SqueezeDet] | type[YoloV3]] = {kind.name: kind for kind in _ARCHITECTURES}
+"""Classes by architecture name, as in the metadata of weights files."""
 
 SHIPPED = {
     name: Path(__file__).parent / "weights" / f"{name}.safetensors" for name in (SqueezeDet.name, YoloV3Slim.name)
 }
-"""Detectors that come with the package."""
-
+"""Weights of the detectors that come with the package."""
 
 ONNX = "onnx:"
-"""Before the path of an ONNX graph: onnx:FILE."""
-
+"""Prefix of an ONNX graph: onnx:FILE."""
 DARKNET = "darknet:"
-"""Before Darknet's files: darknet:FILE.cfg,FILE.weights, or the former alone where the latter has its name."""
-_MOST_CLASSES = 10_000
-_MOST_ANCHORS = 1000
-"""Of a cell: each is a candidate at every place of the picture."""
+"""Prefix of Darknet files: darknet:FILE.cfg,FILE.weights; the second may be omitted if it has the same name."""
+KINDS = ("onnx", "torchvision", "ultralytics", "torchscript", "export", "module")
+"""Prefixes of detectors from elsewhere: KIND:WHAT[,MORE][,SPEC.yaml]."""
+RUNS_CODE = ("ultralytics", "torchscript", "export", "module")
+"""Kinds that run code from their files when loaded."""
+_SPEC_SUFFIXES = (".yaml", ".yml")
+_MAX_CLASSES = 10_000
+_MAX_ANCHORS = 1000
+"""Anchors per cell: each is a candidate at every place of the image."""
 
 
-def code_of(name_or_path: str | Path) -> str | None:
-    """The module or file whose code loading a detector of that name would run; None where there is only data."""
+def find_code_to_run(name_or_path: str | Path) -> str | None:
+    """The module or file of code that loading this detector would run; None if there is only data."""
     name = str(name_or_path)
     if name.startswith(planted.PREFIX):
-        return code_of(planted.parts_of(name)[1])
+        return find_code_to_run(planted.parse_planted_name(name)[1])
     if name.startswith(ensemble.PREFIX):
-        return next(filter(None, map(code_of, ensemble.names_of(name))), None)
-    return name.partition(":")[2] if choose.kind_of(name) in choose.RUNS_CODE else None
+        return next(filter(None, map(find_code_to_run, ensemble.parse_member_names(name))), None)
+    kind, colon, rest = name.partition(":")
+    return rest if colon and kind in RUNS_CODE else None
 
 
 def load_predictor(
     name_or_path: str | Path, device: str | torch.device = "cpu", tiling: str = "auto"
 ) -> Predictor:
-    """A detector that is only asked what it finds: `onnx:FILE[,SPEC.yaml]`, or what `load_detector` takes.
+    """Load a detector for prediction only.
 
-    device: of the latter; graphs run on the CPU. tiling: of a graph, "auto" or "off" (see
-    `detectors.adapters.onnx`). Raises DetectorError as `load_detector` does, and for a file that is no graph, a
-    graph of no known kind, or where ONNX Runtime is missing.
+    Args:
+        name_or_path: `onnx:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts.
+        device: Device of the weights; ONNX graphs run on the CPU.
+        tiling: Of an ONNX graph, "auto" or "off" (see `detectors.adapters.onnx`).
+
+    Raises:
+        DetectorError: As `load_detector`; or an ONNX graph of unknown format, or no ONNX Runtime.
     """
-    if str(name_or_path).startswith(planted.PREFIX):
-        fault, inner = planted.parts_of(str(name_or_path))
-        return planted.with_fault(load_predictor(inner, device, tiling), fault)
-    if str(name_or_path).startswith(ONNX):
-        return choose.open_predictor(str(name_or_path), tiling)
-    return load_detector(name_or_path, device)
+    name = str(name_or_path)
+    if name.startswith(planted.PREFIX):
+        fault, inner = planted.parse_planted_name(name)
+        return planted.plant_fault(load_predictor(inner, device, tiling), fault)
+    if not name.startswith(ONNX):
+        return load_detector(name_or_path, device)
+    from detectors.adapters.onnx import OnnxPredictor
+
+    (file,), spec = _split_arguments("onnx", name.removeprefix(ONNX))
+    return OnnxPredictor(Path(file), tiling, spec)
 
 
 def load_detector(
@@ -75,48 +85,89 @@ def load_detector(
     device: str | torch.device = "cpu",
     gradient_precision: torch.dtype | None = None,
 ) -> Detector:
-    """The shipped detector of that name, or the one in a `.safetensors` file, or `darknet:FILE.cfg,FILE.weights`;
-    frozen, eval mode, channels-last. Or one from elsewhere (see `detectors.adapters.choose`), always in float32;
-    any of these with a fault that is known, `planted:FAULT@DETECTOR` (see `detectors.planted`); or several with
-    the same classes as one, `ensemble:A+B` (see `detectors.ensemble`).
+    """Load a differentiable detector, frozen, in eval mode and channels-last.
 
-    gradient_precision: torch.bfloat16 or, on GPUs, torch.float16, for passes that a gradient follows; without it,
-    all compute in float32. Detections and losses that are judged always do.
+    Args:
+        name_or_path: A shipped detector's name, a `.safetensors` file, `darknet:FILE.cfg,FILE.weights`, a detector
+            from elsewhere (`KINDS`; always float32), `planted:FAULT@DETECTOR` (see `detectors.planted`), or
+            `ensemble:A+B` (see `detectors.ensemble`).
+        device: Device of the weights.
+        gradient_precision: torch.bfloat16 or, on GPUs, torch.float16 for passes with a gradient; reported
+            detections and losses are always float32.
 
-    Raises DetectorError for a name that is not known, a file that is missing or damaged, and weights that belong
-    to another architecture; the message names the file, what was expected and what was found.
+    Raises:
+        DetectorError: Unknown name, missing or damaged file, or weights of another architecture.
     """
-    compute_exactly(device)
-    if str(name_or_path).startswith(planted.PREFIX):
-        fault, inner = planted.parts_of(str(name_or_path))
-        return planted.PlantedDetector(load_detector(inner, device, gradient_precision), fault).requires_grad_(
-            False
-        )
-    if str(name_or_path).startswith(ensemble.PREFIX):
-        names = ensemble.names_of(str(name_or_path))
-        members = [load_detector(name, device, gradient_precision) for name in names]
+    disable_tf32(device)
+    name = str(name_or_path)
+    kind, colon, rest = name.partition(":")
+    if name.startswith(planted.PREFIX):
+        fault, inner = planted.parse_planted_name(name)
+        detector = planted.PlantedDetector(load_detector(inner, device, gradient_precision), fault)
+        return detector.requires_grad_(False)
+    if name.startswith(ensemble.PREFIX):
+        members = [load_detector(m, device, gradient_precision) for m in ensemble.parse_member_names(name)]
         return ensemble.Ensemble(members).requires_grad_(False)
-    if choose.kind_of(str(name_or_path)) is not None:
+    if colon and kind in KINDS:
         if gradient_precision is not None:
-            raise DetectorError(f"{name_or_path}: expected float32 for its gradients, found {gradient_precision}")
-        return choose.open_detector(str(name_or_path)).to(device)
-    if str(name_or_path).startswith(DARKNET):
+            raise DetectorError(f"{name}: expected float32 for its gradients, found {gradient_precision}")
+        return _load_adapted(kind, rest).requires_grad_(False).to(device)
+    if name.startswith(DARKNET):
         from detectors.yolov3 import darknet
 
-        files = [Path(part) for part in str(name_or_path).removeprefix(DARKNET).split(",", 1)]
-        return _ready(darknet.load(*files), device, gradient_precision)
-    path = SHIPPED.get(str(name_or_path), Path(name_or_path))
-    if str(name_or_path) not in SHIPPED and path.suffix != ".safetensors":
+        network = darknet.load(*(Path(part) for part in rest.split(",", 1)))
+    elif name in SHIPPED:
+        _check_card(SHIPPED[name])
+        network = _load_weights_file(SHIPPED[name])
+    elif Path(name_or_path).suffix == ".safetensors":
+        network = _load_weights_file(Path(name_or_path))
+    else:
         known = ", ".join(sorted(SHIPPED))
-        kinds = ", ".join([DARKNET, *(f"{kind}:" for kind in choose.KINDS), ensemble.PREFIX])
+        prefixes = ", ".join([DARKNET, *(f"{kind}:" for kind in KINDS), ensemble.PREFIX])
         raise DetectorError(
-            f"detector: expected {known}, a path.safetensors, or what begins with {kinds} or "
-            f"{planted.PREFIX}, found {str(name_or_path)!r}"
+            f"detector: expected {known}, a path.safetensors, or a name with prefix {prefixes} or "
+            f"{planted.PREFIX}, found {name!r}"
         )
+    network.gradient_precision = gradient_precision
+    return prepare_for_inference(network, device)
+
+
+def _load_adapted(kind: str, rest: str) -> Detector:
+    """A detector from elsewhere, on the CPU."""
+    if kind == "onnx":
+        raise DetectorError(f"detector: expected one with gradients, found {f'{kind}:{rest}'!r}, which has none")
+    arguments, spec = _split_arguments(kind, rest)
+    if kind == "torchvision":
+        from detectors.adapters.torchvision_models import load_torchvision
+
+        return load_torchvision(*arguments, spec=spec)
+    if kind == "module":
+        from detectors.adapters.module import load_user_detector
+
+        return load_user_detector(arguments[0], spec)
+    from detectors.adapters import network
+
+    loaders = {
+        "ultralytics": network.load_ultralytics,
+        "torchscript": network.load_torchscript,
+        "export": network.load_exported,
+    }
+    return loaders[kind](Path(arguments[0]), spec)
+
+
+def _split_arguments(kind: str, rest: str) -> tuple[list[str], Path | None]:
+    """The comma-separated arguments after a prefix, and the YAML file if the last one is one."""
+    words = [word.strip() for word in rest.split(",")]
+    spec = Path(words.pop()) if len(words) > 1 and words[-1].endswith(_SPEC_SUFFIXES) else None
+    most, more = (2, "[,WEIGHTS]") if kind == "torchvision" else (1, "")
+    if not 1 <= len(words) <= most or not all(words):
+        raise DetectorError(f"detector: expected {kind}:WHAT{more}[,SPEC.yaml], found {f'{kind}:{rest}'!r}")
+    return words, spec
+
+
+def _load_weights_file(path: Path) -> SqueezeDet | YoloV3:
     if not path.is_file():
         raise DetectorError(f"{path}: expected a weights file, found none")
-    if str(name_or_path) in SHIPPED:
-        _check_card(path)
     metadata, tensors = read_weights(path)
     architecture = metadata.get("architecture", "squeezedet")
     if architecture not in ARCHITECTURES:
@@ -124,18 +175,18 @@ def load_detector(
         raise DetectorError(f"{path}: expected architecture {known}, found {architecture!r}")
     try:
         settings: dict[str, Any] = {
-            "classes": class_names(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
+            "classes": parse_class_names(json.loads(metadata.get("classes", json.dumps(CLASSES)))),
             "t_star": float(metadata.get("t_star", "0.5")),
         }
         if not 0 < settings["t_star"] <= 1:
             raise ValueError(f"t_star: expected a score in (0, 1], found {metadata['t_star']}")
         if "anchors" in metadata:
             settings["anchors"] = json.loads(metadata["anchors"])
-            if len(settings["anchors"]) > _MOST_ANCHORS:
-                raise ValueError(f"anchors: expected at most {_MOST_ANCHORS}, found {len(settings['anchors'])}")
+            if len(settings["anchors"]) > _MAX_ANCHORS:
+                raise ValueError(f"anchors: expected at most {_MAX_ANCHORS}, found {len(settings['anchors'])}")
         if "cfg" in metadata:
             settings["cfg"] = cfg.parse(metadata["cfg"])
-        with torch.device("meta"):  # without memory, until it is known that the file fills it
+        with torch.device("meta"):  # allocates nothing until the file is known to fill the tensors
             _check_tensors(ARCHITECTURES[architecture](**settings), tensors, path)
         detector = ARCHITECTURES[architecture](**settings)
     except DetectorError:
@@ -145,18 +196,17 @@ def load_detector(
             f"{path}: expected metadata classes (list), t_star (number) and anchors (pairs, px): {error}"
         ) from None
     detector.load_state_dict(tensors)
-    return _ready(detector, device, gradient_precision)
-
-
-def _ready(
-    detector: SqueezeDet | YoloV3, device: str | torch.device, gradient_precision: torch.dtype | None
-) -> Detector:
-    detector.gradient_precision = gradient_precision
-    return ready(detector, device)
+    return detector
 
 
 def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None = None) -> None:
-    """Write weights as float16 with name, classes, t_star, anchors and further facts as metadata; atomic."""
+    """Write a weights file atomically: float16, with name, classes, t* and anchors as metadata.
+
+    Args:
+        detector: The detector.
+        path: The `.safetensors` file.
+        facts: Further metadata.
+    """
     metadata = {
         "architecture": detector.name,
         "classes": json.dumps(list(detector.classes)),
@@ -165,13 +215,13 @@ def save_detector(detector: Detector, path: Path, facts: dict[str, str] | None =
         **({"cfg": cfg.write(detector.cfg)} if isinstance(detector, YoloV3) else {}),
         **(facts or {}),
     }
-    write_weights(path, metadata, halved(detector))
+    write_weights(path, metadata, half_precision_state(detector))
 
 
-def halved(network: nn.Module) -> dict[str, torch.Tensor]:
-    """A network's state, what was learned as float16."""
+def half_precision_state(network: nn.Module) -> dict[str, torch.Tensor]:
+    """A network's state with its parameters as float16."""
     learned = {name for name, _ in network.named_parameters()}
-    # What was counted or measured in training need not lie in float16's range.
+    # Buffers, such as running statistics, may exceed float16's range.
     return {
         k: v.detach().cpu().contiguous().to(torch.float16 if k in learned else v.dtype)
         for k, v in network.state_dict().items()
@@ -179,7 +229,11 @@ def halved(network: nn.Module) -> dict[str, torch.Tensor]:
 
 
 def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    """Metadata and tensors of a safetensors file; DetectorError where it is none."""
+    """Metadata and tensors of a safetensors file.
+
+    Raises:
+        DetectorError: The file is not one.
+    """
     try:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
@@ -188,12 +242,18 @@ def read_weights(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
 
 
 def write_weights(path: Path, metadata: dict[str, str], tensors: dict[str, torch.Tensor]) -> None:
-    """Write a safetensors file, as `write_whole` does. The same content gives the same bytes."""
-    write_whole(path, _in_order(save(tensors, metadata)))
+    """Write a safetensors file atomically. The same content gives the same bytes.
+
+    Args:
+        path: The file.
+        metadata: Strings by name.
+        tensors: Tensors by name.
+    """
+    write_atomically(path, _sort_metadata(save(tensors, metadata)))
 
 
-def _in_order(data: bytes) -> bytes:
-    """A safetensors file with its metadata sorted by name: the library writes them in an order of chance."""
+def _sort_metadata(data: bytes) -> bytes:
+    """A safetensors file with its metadata sorted by name: the library's order is random."""
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start])
     if "__metadata__" in header:
@@ -204,26 +264,30 @@ def _in_order(data: bytes) -> bytes:
 
 
 def _check_card(path: Path) -> None:
-    """DetectorError for shipped weights that are not those of their model card."""
+    """Raise DetectorError if shipped weights differ from those of their model card."""
     card = path.with_suffix(".md")
-    said = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card, "a model card", 1 << 20))
+    stated = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card, "a model card", 1 << 20))
     found = hashlib.sha256(read_file(path, "a weights file", 1 << 30)).hexdigest()
-    if said is None or said[1] != found:
-        expected = f"the SHA-256 of {card.name}, {said[1] if said else 'which names none'}"
+    if stated is None or stated[1] != found:
+        expected = f"the SHA-256 of {card.name}, {stated[1] if stated else 'which the card lacks'}"
         raise DetectorError(f"{path}: expected {expected}, found {found}")
 
 
-def class_names(told: Any) -> tuple[str, ...]:
-    """Classes of metadata. ValueError where they are none."""
-    if not isinstance(told, list) or not all(isinstance(name, str) for name in told):
+def parse_class_names(names: Any) -> tuple[str, ...]:
+    """Class names from a file's metadata.
+
+    Raises:
+        ValueError: They are not 1 to 10,000 strings.
+    """
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("classes: expected a list of names, found something else")
-    if not 1 <= len(told) <= _MOST_CLASSES:
-        raise ValueError(f"classes: expected 1 to {_MOST_CLASSES}, found {len(told)}")
-    return tuple(told)
+    if not 1 <= len(names) <= _MAX_CLASSES:
+        raise ValueError(f"classes: expected 1 to {_MAX_CLASSES}, found {len(names)}")
+    return tuple(names)
 
 
 def _check_tensors(detector: Detector, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """DetectorError where tensors are not those of a detector, which may be without memory."""
+    """Raise DetectorError if tensors do not fit a detector, which may be on the meta device."""
     expected = detector.state_dict()
     missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or unexpected:

@@ -1,1 +1,1 @@
-"""Detectors that were trained elsewhere, behind `detectors.base.Predictor`; each loads its library where used."""
+"""Detectors trained elsewhere as `detectors.base.Predictor` or `Detector`; libraries are imported when used."""

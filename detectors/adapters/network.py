@@ -1,7 +1,7 @@
-"""A network that gives boxes and scores as a detector with gradients: TorchScript and torch.export files, modules.
+"""Networks as differentiable detectors: torch modules, TorchScript and torch.export files, Ultralytics models.
 
-It sees one image at a time: traced and exported graphs are made for one size of batch, and networks that suppress
-give each image another number of boxes.
+A network gets one image at a time: traced and exported graphs have a fixed batch size, and networks with built-in
+suppression return another number of boxes for each image.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors.adapters import coco
 from detectors.adapters.dense import LEAST_SCORE, NMS_IOU, T_STAR, DenseDetector, DensePredictions
-from detectors.adapters.formats import Reading, flat, reading
-from detectors.adapters.spec import Spec, fit, prepare, settings_of
+from detectors.adapters.formats import OutputDecoder, flatten_outputs, make_decoder
+from detectors.adapters.spec import (
+    NetworkSpec,
+    fit_images,
+    load_settings,
+    normalise_images,
+    with_project_names,
+)
 from detectors.base import DetectorError
 
 PROBE_HW = (128, 256)
-"""Size of the first image that a network of any size is shown, to see what it gives: a multiple of all strides."""
+"""Size of the first image for a network of any size, px: a multiple of all strides."""
 _ULTRALYTICS_FACTS = "config.txt"
-"""Name of the part of a TorchScript file in which Ultralytics' export keeps what it knows."""
+"""Name of the metadata file in a TorchScript file from Ultralytics."""
 
 
 class NetworkDetector(DenseDetector):
-    """A network, its settings, and `dense.DenseDetector`'s loss and decoding.
-
-    network: a module, or any callable of images. settings: of a `Spec`; they win over what the format usually
-    has. names: of classes, as the file has them. Raises DetectorError, beginning with `where`, where the network
-    takes no such image, or gives what no format reads.
-    """
+    """A network with `DenseDetector`'s loss and decoding."""
 
     def __init__(
         self,
@@ -45,43 +45,56 @@ class NetworkDetector(DenseDetector):
         names: tuple[str, ...] | None = None,
         where: str = "detector",
     ) -> None:
+        """Run the network once to recognise its outputs.
+
+        Args:
+            name: The detector's name.
+            network: A module, or any callable of images.
+            settings: Settings of a `NetworkSpec` that override the format's.
+            names: Class names from the network's file.
+            where: Beginning of error messages.
+
+        Raises:
+            DetectorError: The network does not take such an image, or its outputs have no known format.
+        """
         super().__init__(name, (), T_STAR)
         if isinstance(network, nn.Module) and not isinstance(network, torch.fx.GraphModule):
             self.network = network
         elif isinstance(network, nn.Module):
             network.requires_grad_(False)
-        # An exported module refuses train() and eval(): it is held where nn.Module does not look.
+        # An exported module refuses train() and eval(), so it is hidden from nn.Module in a tuple.
         self._call = (network,)
-        self._reading: Reading | None = None
+        self._decoder: OutputDecoder | None = None
         self._settings = dict(settings)
         self._probe(names, where)
 
     def predict(self, images: Tensor) -> DensePredictions:
-        """Each image fitted, shown to the network, and its boxes brought back."""
-        form = self._reading
-        assert form is not None
-        found = [self._of_one(image[None], form) for image in images]
-        counts = tuple(int(scores.shape[1]) for _, scores in found)
+        """Fit each image to the network's input, run it, and map its boxes back."""
+        decoder = self._decoder
+        assert decoder is not None
+        predictions = [self._predict_one(image[None], decoder) for image in images]
+        counts = tuple(int(scores.shape[1]) for _, scores in predictions)
         most = max(counts)
-        # Filled up with boxes of no size and no probability, so that images share one tensor.
-        boxes = torch.cat([F.pad(b, (0, 0, 0, most - b.shape[1])) for b, _ in found])
-        scores = torch.cat([F.pad(s, (0, 0, 0, most - s.shape[1])) for _, s in found])
+        # Padded with boxes of no size and no probability, so that images share one tensor.
+        boxes = torch.cat([F.pad(b, (0, 0, 0, most - b.shape[1])) for b, _ in predictions])
+        scores = torch.cat([F.pad(s, (0, 0, 0, most - s.shape[1])) for _, s in predictions])
         image_hw = int(images.shape[2]), int(images.shape[3])
         return DensePredictions(boxes[:, :, None], scores, image_hw, counts=counts)
 
-    def _of_one(self, image: Tensor, form: Reading) -> tuple[Tensor, Tensor]:
-        fed, fitted = fit(image, form.spec)
-        boxes, scores = form.read(self._outputs(fed, form.spec), (int(fed.shape[2]), int(fed.shape[3])))
-        return fitted.back(boxes), scores
+    def _predict_one(self, image: Tensor, decoder: OutputDecoder) -> tuple[Tensor, Tensor]:
+        network_input, placement = fit_images(image, decoder.spec)
+        input_hw = int(network_input.shape[2]), int(network_input.shape[3])
+        boxes, scores = decoder.decode(self._outputs(network_input, decoder.spec), input_hw)
+        return placement.to_image(boxes), scores
 
-    def _outputs(self, fed: Tensor, spec: Spec) -> list[Tensor]:
-        given: Any = prepare(fed, spec)
+    def _outputs(self, network_input: Tensor, spec: NetworkSpec) -> list[Tensor]:
+        given: Any = normalise_images(network_input, spec)
         if spec.input != "batch":
             given = given[0] if spec.input == "image" else [given[0]]
-        return flat(self._call[0](given))
+        return flatten_outputs(self._call[0](given))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """What moves and converts a module, for the one that it does not see too."""
+        """Move or convert the hidden exported module too."""
         network = self._call[0]
         if isinstance(network, torch.fx.GraphModule):
             network._apply(fn, recurse)
@@ -89,56 +102,58 @@ class NetworkDetector(DenseDetector):
 
     @torch.no_grad()
     def _probe(self, names: tuple[str, ...] | None, where: str) -> None:
-        """See what the network gives for a grey image, and settle how it is read."""
-        asked = replace(Spec(), **self._settings)
-        size = asked.size or PROBE_HW
+        """Run the network on a grey image and settle how its outputs are decoded."""
+        initial = replace(NetworkSpec(), **self._settings)
+        size = initial.size or PROBE_HW
         try:
-            outputs = self._outputs(torch.full((1, 3, *size), 0.5), asked)
+            outputs = self._outputs(torch.full((1, 3, *size), 0.5), initial)
         except (RuntimeError, TypeError, ValueError, AssertionError) as error:
             raise DetectorError(
-                f"{where}: expected a network that takes an image of {size[0]} x {size[1]} px (`size` and `input` "
-                f"in a YAML file say otherwise), found {_last_line(error)}"
+                f"{where}: expected a network that takes an image of {size[0]} x {size[1]} px (set `size` and "
+                f"`input` in a YAML file), found {_last_line(error)}"
             ) from error
         shapes = [tuple(output.shape) for output in outputs]
-        found = reading(shapes, size, self._settings, names, where)
+        found = make_decoder(shapes, size, self._settings, names, where)
         spec = found.spec
-        self._reading = found
+        self._decoder = found
         self.classes = found.classes
         self.t_star = T_STAR if spec.t_star is None else spec.t_star
         self.nms_iou = NMS_IOU if spec.nms_iou is None else spec.nms_iou
         self.least_score = LEAST_SCORE if spec.least_score is None else spec.least_score
 
 
-def torchscript(path: Path, spec: Path | None = None) -> NetworkDetector:
-    """A TorchScript file as a detector. Loading one runs what is in it: see docs/detectors.md.
+def load_torchscript(path: Path, spec: Path | None = None) -> NetworkDetector:
+    """A TorchScript file as a detector. Loading runs the file's code.
 
-    Raises DetectorError where it is none.
+    Raises:
+        DetectorError: The file is not one.
     """
     settings = _settings(path, spec, "a TorchScript file")
     facts = {_ULTRALYTICS_FACTS: ""}
     try:
         with warnings.catch_warnings():
-            # torch has a successor for new files; these are there.
+            # TorchScript is deprecated, but such files exist.
             for kind in (DeprecationWarning, FutureWarning):
                 warnings.simplefilter("ignore", kind)
             network = torch.jit.load(str(path), map_location="cpu", _extra_files=facts).eval()
     except (RuntimeError, ValueError) as error:
         raise DetectorError(f"{path}: expected a TorchScript file, found {_last_line(error)}") from None
-    names, size = _ultralytics(facts[_ULTRALYTICS_FACTS])
+    names, size = _parse_ultralytics_facts(facts[_ULTRALYTICS_FACTS])
     if size is not None:
         settings.setdefault("size", size)
     return NetworkDetector(path.stem, network, settings, names, where=str(path))
 
 
-def exported(path: Path, spec: Path | None = None) -> NetworkDetector:
-    """A program of `torch.export.save` as a detector, of its own input size where that is fixed.
+def load_exported(path: Path, spec: Path | None = None) -> NetworkDetector:
+    """A program from `torch.export.save` as a detector, with the program's input size if that is fixed.
 
-    Raises DetectorError where it is none.
+    Raises:
+        DetectorError: The file is not one.
     """
     settings = _settings(path, spec, "a program of torch.export")
     try:
         program = torch.export.load(str(path))
-    except Exception as error:  # its reader raises whatever its parts do: zip, JSON, schema
+    except Exception as error:  # the reader raises errors of zip, JSON and the schema
         raise DetectorError(f"{path}: expected a program of torch.export, found {_last_line(error)}") from None
     size = _exported_size(program)
     if size is not None:
@@ -149,11 +164,11 @@ def exported(path: Path, spec: Path | None = None) -> NetworkDetector:
 def _settings(path: Path, spec: Path | None, what: str) -> dict[str, Any]:
     if not path.is_file():
         raise DetectorError(f"{path}: expected {what}, found none")
-    return settings_of(path, spec)
+    return load_settings(path, spec)
 
 
 def _exported_size(program: torch.export.ExportedProgram) -> tuple[int, int] | None:
-    """Height and width px of the image that a program takes, where they are fixed."""
+    """Height and width of a program's image, px, if they are fixed."""
     for node in program.graph.nodes:
         if node.op == "placeholder" and node.name in program.graph_signature.user_inputs:
             shape = node.meta["val"].shape
@@ -162,11 +177,11 @@ def _exported_size(program: torch.export.ExportedProgram) -> tuple[int, int] | N
     return None
 
 
-def _ultralytics(text: str) -> tuple[tuple[str, ...] | None, tuple[int, int] | None]:
-    """Classes and input size (height, width) px as Ultralytics' export writes them into a TorchScript file."""
+def _parse_ultralytics_facts(text: str) -> tuple[tuple[str, ...] | None, tuple[int, int] | None]:
+    """Classes and input size (height, width) px from the metadata of a TorchScript file from Ultralytics."""
     try:
         facts = json.loads(text)
-        names = coco.ours(str(facts["names"][str(i)]) for i in range(len(facts["names"])))
+        names = with_project_names(str(facts["names"][str(i)]) for i in range(len(facts["names"])))
         high, wide = facts["imgsz"]
         return names, (int(high), int(wide))
     except (ValueError, TypeError, KeyError):
@@ -174,6 +189,50 @@ def _ultralytics(text: str) -> tuple[tuple[str, ...] | None, tuple[int, int] | N
 
 
 def _last_line(error: Exception) -> str:
-    """The end of a message of torch: what went wrong stands there."""
+    """The last line of an error of torch, which states the cause."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else type(error).__name__
+
+
+_ULTRALYTICS_STRIDE = 32
+"""Ultralytics models get images padded to a multiple of this, px, without resizing."""
+
+
+class _FirstOutput(nn.Module):
+    """A model reduced to its first output, the predictions; the others serve its training."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, images: Tensor) -> Tensor:
+        given = self.model(images)
+        return given if isinstance(given, Tensor) else given[0]
+
+
+def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
+    """A model file of Ultralytics (YOLOv8, YOLO11, ...; AGPL-3.0) as a detector. The file is a pickle of a whole
+    module, so loading runs the code in it; torch's `weights_only` is not possible.
+
+    Raises:
+        DetectorError: The file is not one, or Ultralytics is missing.
+    """
+    try:
+        from ultralytics import YOLO  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise DetectorError(f"{path}: needs Ultralytics: pip install 'drivesem[ultralytics]'") from None
+    if path.suffix != ".pt" or not path.is_file():
+        raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found none")
+    try:
+        model: Any = YOLO(str(path)).model
+        head = model.model[-1]
+        names = with_project_names(str(model.names[i]) for i in range(len(model.names)))
+    except Exception as error:  # the reader and the pickle may raise anything
+        raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found {error}") from None
+    if not type(head).__name__.endswith("Detect"):
+        raise DetectorError(f"{path}: expected a detector, found one that ends in {type(head).__name__}")
+    # End-to-end heads give no gradient to boxes they drop.
+    if getattr(head, "end2end", False):
+        head.end2end = False
+    settings = {"multiple": _ULTRALYTICS_STRIDE, "format": "yolov8"} | load_settings(path, spec)
+    return NetworkDetector(path.stem, _FirstOutput(model.float().eval()), settings, names, where=str(path))

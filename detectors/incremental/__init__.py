@@ -1,1 +1,1 @@
-"""A detector on a picture of which a few regions have changed: only those are computed again."""
+"""Incremental inference: a detector on an image with few changed regions, computing only what can differ."""

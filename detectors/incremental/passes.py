@@ -1,4 +1,4 @@
-"""A pass over the rectangles of a plan, and its way back to the picture, as one function of autograd."""
+"""Forward and backward pass over the rectangles of a plan, as one autograd function."""
 
 from __future__ import annotations
 
@@ -11,302 +11,367 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from detectors.convolving import convolve, convolve_onto, empty, mask, rectified
+from detectors.convolution import convolve, convolve_add, empty_channels_last, mask_gradient, rectify
 from detectors.incremental.graph import (
-    Convolved,
-    Each,
-    Enlarged,
-    Graph,
-    Kernel,
-    Layer,
-    Picture,
-    Pooled,
-    Rectified,
-    Scaled,
-    Sliding,
+    ChannelAffine,
+    Convolution,
+    ConvolutionWeights,
+    InputLayer,
+    LayerGraph,
+    MaxPool,
+    NetworkLayer,
+    PointwiseOp,
+    Rectifier,
+    Upsample,
+    WindowOp,
 )
-from detectors.incremental.plan import Gathered, Plan, Reading, Step
+from detectors.incremental.plan import GradientGather, LayerWindow, PlanStep, RecomputePlan
 from detectors.incremental.regions import Rect
 
-_BACK_POOL = torch.ops.aten.max_pool2d_with_indices_backward
+_MAX_POOL_BACKWARD = torch.ops.aten.max_pool2d_with_indices_backward
 
 
 @dataclass(frozen=True, slots=True)
-class Picturing:
-    """An image (1, 3, H, W). at: row and column of the padded picture at which it begins; mean: what is subtracted
-    from its channels.
-    """
+class ImageInput:
+    """An image inside the padded network input."""
 
     image: Tensor
-    at: tuple[int, int] = (0, 0)
+    """(1, 3, H, W)."""
+    origin: tuple[int, int] = (0, 0)
+    """Row and column of its first pixel in the padded image."""
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Subtracted from its channels."""
 
     def view(self, rect: Rect) -> Tensor:
-        """The image in a rectangle of the padded picture, in which it lies."""
-        top, left = rect.top - self.at[0], rect.left - self.at[1]
+        """The image in a rectangle of the padded image, which must lie inside the image."""
+        top, left = rect.top - self.origin[0], rect.left - self.origin[1]
         return self.image[:, :, top : top + rect.hw[0], left : left + rect.hw[1]]
 
-    def part(self, rect: Rect) -> Tensor:
-        """What the network takes there."""
+    def network_input(self, rect: Rect) -> Tensor:
+        """The network's input there."""
         view = self.view(rect)
         return view - view.new_tensor(self.mean).view(1, 3, 1, 1) if any(self.mean) else view
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
-    """A gradient to a rectangle of a layer, that waits to be added. own: whether nobody else has this tensor."""
+class PendingGradient:
+    """A gradient of a rectangle of a layer that is still to be added."""
 
     rect: Rect
+    """The rectangle."""
     gradient: Tensor
-    own: bool
+    """(1, C, h, w)."""
+    exclusive: bool
+    """Whether nothing else refers to the tensor."""
 
 
 @dataclass(slots=True)
-class Traces:
-    """What the way back needs of a step, rectangle by rectangle. given: what came out, where a rectifier ended it;
-    taken: what went in, where a function of places wants it; indices: of maxima.
-    """
+class SavedForBackward:
+    """What the backward pass needs of a step, per rectangle."""
 
-    given: list[Tensor] = field(default_factory=list)
-    taken: list[tuple[Tensor, ...]] = field(default_factory=list)
+    outputs: list[Tensor] = field(default_factory=list)
+    """Outputs of layers that end in a rectifier."""
+    inputs: list[tuple[Tensor, ...]] = field(default_factory=list)
+    """Inputs of pointwise functions."""
     indices: list[Tensor] = field(default_factory=list)
+    """Of maxima."""
 
 
 def forward(
-    graph: Graph, plan: Plan, picture: Picturing, kept: Mapping[Layer, Tensor], keep: Collection[Layer]
-) -> tuple[dict[Layer, list[Tensor]], list[Traces]]:
-    """What layers `keep` give in their rectangles, and what the way back needs. kept: the reference's layers."""
-    fresh: dict[Layer, list[Tensor]] = {}
-    found: dict[Layer, list[Tensor]] = {}
-    traces: list[Traces] = []
+    graph: LayerGraph,
+    plan: RecomputePlan,
+    image_input: ImageInput,
+    stored: Mapping[NetworkLayer, Tensor],
+    returned_layers: Collection[NetworkLayer],
+) -> tuple[dict[NetworkLayer, list[Tensor]], list[SavedForBackward]]:
+    """Compute a plan's rectangles.
+
+    Args:
+        graph: The network.
+        plan: What to compute.
+        image_input: The image.
+        stored: Stored activations of the reference.
+        returned_layers: Layers to return.
+
+    Returns:
+        The rectangles of the returned layers, and what the backward pass needs.
+    """
+    computed: dict[NetworkLayer, list[Tensor]] = {}
+    returned: dict[NetworkLayer, list[Tensor]] = {}
+    saved: list[SavedForBackward] = []
     for step in plan.steps:
-        trace = Traces()
-        fresh[step.layer] = [
-            _given(graph, step, k, _inputs(step, k, fresh, kept), picture, trace) for k in range(len(step.rects))
+        saved_step = SavedForBackward()
+        computed[step.layer] = [
+            _compute(graph, step, k, _inputs(step, k, computed, stored), image_input, saved_step)
+            for k in range(len(step.rects))
         ]
-        traces.append(trace)
-        if step.layer in keep:
-            found[step.layer] = fresh[step.layer]
-        for layer in step.done:
-            del fresh[layer]
-    return found, traces
+        saved.append(saved_step)
+        if step.layer in returned_layers:
+            returned[step.layer] = computed[step.layer]
+        for layer in step.last_used:
+            del computed[layer]
+    return returned, saved
 
 
 def backward(
-    graph: Graph, plan: Plan, traces: Sequence[Traces], gradients: Mapping[Layer, Tensor]
+    graph: LayerGraph,
+    plan: RecomputePlan,
+    saved: Sequence[SavedForBackward],
+    gradients: Mapping[NetworkLayer, Tensor],
 ) -> list[tuple[Rect, Tensor]]:
-    """The gradient to each of the picture's rectangles.
+    """The gradient of each rectangle of the image.
 
-    gradients: of a function of the outputs to each of them (1, C, h, w).
+    Args:
+        graph: The network.
+        plan: The plan of the forward pass.
+        saved: Saved by the forward pass.
+        gradients: (1, C, h, w) of each output.
     """
     like = next(iter(gradients.values()))
-    told: dict[Layer, list[Tensor]] = {}
-    waiting: dict[Layer, list[Placed]] = {}
+    convolution_gradients: dict[NetworkLayer, list[Tensor]] = {}
+    pending: dict[NetworkLayer, list[PendingGradient]] = {}
     for layer, gradient in gradients.items():
-        waiting[layer] = [Placed(Rect(0, gradient.shape[2], 0, gradient.shape[3]), gradient, False)]
-    for step, trace in zip(reversed(plan.steps), reversed(traces), strict=True):
+        pending[layer] = [PendingGradient(Rect(0, gradient.shape[2], 0, gradient.shape[3]), gradient, False)]
+    for step, saved_step in zip(reversed(plan.steps), reversed(saved), strict=True):
         layer = step.layer
-        placed = waiting.pop(layer, [])
-        totals = [_total(graph, step, k, told, placed, like) for k in range(len(step.rects))]
-        if isinstance(layer, Picture):
+        placed = pending.pop(layer, [])
+        totals = [_total(graph, step, k, convolution_gradients, placed, like) for k in range(len(step.rects))]
+        if isinstance(layer, InputLayer):
             return list(zip(step.rects, totals, strict=True))
-        slope = layer.slope if isinstance(layer, (Sliding, Rectified)) else None
+        slope = layer.slope if isinstance(layer, (WindowOp, Rectifier)) else None
         if slope is not None:
-            for total, given in zip(totals, trace.given, strict=True):
-                mask(total, given, slope)
-        if isinstance(layer, Convolved) and layer.plain:
-            told[layer] = totals
+            for total, output in zip(totals, saved_step.outputs, strict=True):
+                mask_gradient(total, output, slope)
+        if isinstance(layer, Convolution) and layer.uses_onednn:
+            convolution_gradients[layer] = totals
             continue
         for k, total in enumerate(totals):
-            for rows, columns in step.twice[k]:
+            for rows, columns in step.overlaps[k]:
                 total[:, :, rows, columns] = 0
-            for source, gradient in zip(layer.sources, _back(graph, step, k, total, trace), strict=True):
+            for source, gradient in zip(
+                layer.sources, _backpropagate(graph, step, k, total, saved_step), strict=True
+            ):
                 own = len(layer.sources) == 1
-                waiting.setdefault(source, []).append(Placed(step.windows[k], gradient, own))
-    raise AssertionError("a plan begins with the picture")
+                pending.setdefault(source, []).append(PendingGradient(step.windows[k], gradient, own))
+    raise AssertionError("a plan begins with the image")
 
 
 def _inputs(
-    step: Step, k: int, fresh: Mapping[Layer, Sequence[Tensor]], kept: Mapping[Layer, Tensor]
+    step: PlanStep,
+    k: int,
+    computed: Mapping[NetworkLayer, Sequence[Tensor]],
+    stored: Mapping[NetworkLayer, Tensor],
 ) -> list[Tensor]:
-    """What the layer takes for its k-th rectangle."""
-    fill = -torch.inf if isinstance(step.layer, Pooled) else 0.0
+    """The layer's inputs for its k-th rectangle."""
+    fill = -torch.inf if isinstance(step.layer, MaxPool) else 0.0
     return [
-        _read(reading, fresh[source], kept.get(source), fill)
-        for reading, source in zip(step.reads[k], step.layer.sources, strict=True)
+        _read(window, computed[source], stored.get(source), fill)
+        for window, source in zip(step.reads[k], step.layer.sources, strict=True)
     ]
 
 
-def _read(reading: Reading, fresh: Sequence[Tensor], kept: Tensor | None, fill: float) -> Tensor:
-    if reading.only:
-        number, (rows, columns), _ = reading.pieces[0]
-        return fresh[number][:, :, rows, columns]
-    like = fresh[0] if kept is None else kept
-    window = empty((1, like.shape[1], *reading.hw), like.dtype, like.device)
-    if reading.beyond:
-        window.fill_(fill)
-    if reading.kept is not None and kept is not None:
-        (rows, columns), (to_rows, to_columns) = reading.kept
-        window[:, :, to_rows, to_columns] = kept[:, :, rows, columns]
-    for number, (rows, columns), (to_rows, to_columns) in reading.pieces:
-        window[:, :, to_rows, to_columns] = fresh[number][:, :, rows, columns]
-    return window
+def _read(window: LayerWindow, computed: Sequence[Tensor], stored: Tensor | None, fill: float) -> Tensor:
+    if window.is_slice:
+        number, (rows, columns), _ = window.from_rects[0]
+        return computed[number][:, :, rows, columns]
+    like = computed[0] if stored is None else stored
+    values = empty_channels_last((1, like.shape[1], *window.hw), like.dtype, like.device)
+    if window.needs_fill:
+        values.fill_(fill)
+    if window.from_reference is not None and stored is not None:
+        (rows, columns), (to_rows, to_columns) = window.from_reference
+        values[:, :, to_rows, to_columns] = stored[:, :, rows, columns]
+    for number, (rows, columns), (to_rows, to_columns) in window.from_rects:
+        values[:, :, to_rows, to_columns] = computed[number][:, :, rows, columns]
+    return values
 
 
-def _given(
-    graph: Graph, step: Step, k: int, inputs: Sequence[Tensor], picture: Picturing, trace: Traces
+def _compute(
+    graph: LayerGraph,
+    step: PlanStep,
+    k: int,
+    inputs: Sequence[Tensor],
+    image_input: ImageInput,
+    saved_step: SavedForBackward,
 ) -> Tensor:
-    """What the layer gives in its k-th rectangle."""
+    """The layer's output in its k-th rectangle."""
     layer, rect = step.layer, step.rects[k]
     match layer:
-        case Picture():
-            return picture.part(rect)
-        case Convolved():
-            result = _convolved(layer, graph.kernels[layer], inputs)
-        case Pooled():
+        case InputLayer():
+            return image_input.network_input(rect)
+        case Convolution():
+            result = _convolve(layer, graph.weights[layer], inputs)
+        case MaxPool():
             result, indices = F.max_pool2d_with_indices(
-                inputs[0], layer.kernel, layer.stride, (0, 0), layer.dilation, ceil_mode=layer.ceil
+                inputs[0], layer.kernel, layer.stride, (0, 0), layer.dilation, ceil_mode=layer.ceil_mode
             )
-            trace.indices.append(indices)
+            saved_step.indices.append(indices)
             if layer.slope is not None:
-                result = rectified(result, layer.slope)
-        case Rectified():
+                result = rectify(result, layer.slope)
+        case Rectifier():
             result = F.leaky_relu(inputs[0], layer.slope)
-        case Scaled():
+        case ChannelAffine():
             result = inputs[0] * layer.scale[:, None, None] + layer.shift[:, None, None]
-        case Each():
+        case PointwiseOp():
             result = layer.call(*inputs)
-            trace.taken.append(() if layer.sum else tuple(inputs))
-        case Enlarged():
-            result = _enlarged(layer, rect, step.windows[k], inputs[0])
+            saved_step.inputs.append(() if layer.is_sum else tuple(inputs))
+        case Upsample():
+            result = _upsample(layer, rect, step.windows[k], inputs[0])
         case _:
             raise AssertionError(type(layer).__name__)
-    if isinstance(layer, (Sliding, Rectified)) and layer.slope is not None:
-        trace.given.append(result)
+    if isinstance(layer, (WindowOp, Rectifier)) and layer.slope is not None:
+        saved_step.outputs.append(result)
     return result
 
 
-def _convolved(layer: Convolved, kernel: Kernel, inputs: Sequence[Tensor]) -> Tensor:
-    if not layer.plain:
+def _convolve(layer: Convolution, kernel: ConvolutionWeights, inputs: Sequence[Tensor]) -> Tensor:
+    if not layer.uses_onednn:
         joined = inputs[0] if len(inputs) == 1 else torch.cat(list(inputs), 1)
         weight = layer.weight.to(joined)
         result = F.conv2d(joined, weight, kernel.bias, layer.stride, 0, layer.dilation, layer.groups)
-        return rectified(result, layer.slope)
+        return rectify(result, layer.slope)
     stride, final = layer.stride[0], len(inputs) - 1
-    result = convolve(inputs[0], kernel.weights[0], kernel.bias, stride, slope=None if final else layer.slope)
+    result = convolve(inputs[0], kernel.forward[0], kernel.bias, stride, slope=None if final else layer.slope)
     for i in range(1, len(inputs)):
         slope = layer.slope if i == final else None
-        result = convolve_onto(result, inputs[i], kernel.weights[i], stride, slope=slope)
+        result = convolve_add(result, inputs[i], kernel.forward[i], stride, slope=slope)
     return result
 
 
-def _enlarged(layer: Enlarged, rect: Rect, window: Rect, x: Tensor) -> Tensor:
+def _upsample(layer: Upsample, rect: Rect, window: Rect, x: Tensor) -> Tensor:
     align = None if layer.mode == "nearest" else False
-    large = F.interpolate(x, scale_factor=float(layer.factor), mode=layer.mode, align_corners=align)
-    top, left = rect.top - layer.factor * window.top, rect.left - layer.factor * window.left
+    large = F.interpolate(x, scale_factor=float(layer.scale_factor), mode=layer.mode, align_corners=align)
+    top, left = rect.top - layer.scale_factor * window.top, rect.left - layer.scale_factor * window.left
     return large[:, :, top : top + rect.hw[0], left : left + rect.hw[1]]
 
 
 def _total(
-    graph: Graph,
-    step: Step,
+    graph: LayerGraph,
+    step: PlanStep,
     k: int,
-    told: Mapping[Layer, Sequence[Tensor]],
-    waiting: Sequence[Placed],
+    convolution_gradients: Mapping[NetworkLayer, Sequence[Tensor]],
+    pending: Sequence[PendingGradient],
     like: Tensor,
 ) -> Tensor:
-    """The gradient to what the layer gives in its k-th rectangle, from all that take it. Nobody else has this
-    tensor, and where rectangles overlap, each has all of it.
+    """The gradient of the layer's output in its k-th rectangle, from all consumers; a tensor of its own.
+
+    Where rectangles overlap, each has the whole gradient.
     """
     rect, total = step.rects[k], None
-    for gathered in step.gathered[k]:
-        total = _gather(graph, gathered, told[gathered.layer], total)
-    meeting = [(placed, shared) for placed in waiting if (shared := placed.rect.meet(rect)).area]
-    if total is None and len(meeting) == 1 and meeting[0][0].own and meeting[0][0].rect == rect:
-        return meeting[0][0].gradient
+    for gathered in step.gathers[k]:
+        total = _gather(graph, gathered, convolution_gradients[gathered.layer], total)
+    overlapping = [(placed, shared) for placed in pending if (shared := placed.rect.intersect(rect)).area]
+    if total is None and len(overlapping) == 1 and overlapping[0][0].exclusive and overlapping[0][0].rect == rect:
+        return overlapping[0][0].gradient
     if total is None:
         total = _zeros(step.layer.channels, rect.hw, like)
-    for placed, shared in meeting:
-        rows, columns = shared.inside(rect)
-        of_rows, of_columns = shared.inside(placed.rect)
+    for placed, shared in overlapping:
+        rows, columns = shared.slices_in(rect)
+        of_rows, of_columns = shared.slices_in(placed.rect)
         total[:, :, rows, columns] += placed.gradient[:, :, of_rows, of_columns]
     return total
 
 
 def _zeros(channels: int, hw: tuple[int, int], like: Tensor) -> Tensor:
-    return empty((1, channels, *hw), like.dtype, like.device).zero_()
+    return empty_channels_last((1, channels, *hw), like.dtype, like.device).zero_()
 
 
-def _gather(graph: Graph, gathered: Gathered, told: Sequence[Tensor], total: Tensor | None) -> Tensor:
-    """`total`, plus the gradient by way of one convolution."""
-    weight, stride = graph.kernels[gathered.layer].back[gathered.number], gathered.layer.stride[0]
-    seen = _read(gathered.reading, told, None, 0.0)
+def _gather(
+    graph: LayerGraph, gathered: GradientGather, convolution_gradients: Sequence[Tensor], total: Tensor | None
+) -> Tensor:
+    """`total` plus the gradient through one convolution."""
+    weight, stride = graph.weights[gathered.layer].backward[gathered.source_index], gathered.layer.stride[0]
+    seen = _read(gathered.window, convolution_gradients, None, 0.0)
     if stride == 1:
-        return convolve(seen, weight) if total is None else convolve_onto(total, seen, weight)
+        return convolve(seen, weight) if total is None else convolve_add(total, seen, weight)
     # (1, rows, columns, s * s * I) -> (1, I, s * rows, s * columns)
     places = convolve(seen, weight).permute(0, 2, 3, 1).unflatten(3, (stride, stride, -1))
     large = places.transpose(2, 3).flatten(1, 2).flatten(2, 3).permute(0, 3, 1, 2)
-    rows, columns = gathered.cut
+    rows, columns = gathered.crop
     part = large[:, :, rows, columns]
     return part.contiguous(memory_format=torch.channels_last) if total is None else total.add_(part)
 
 
-def _back(graph: Graph, step: Step, k: int, total: Tensor, trace: Traces) -> list[Tensor]:
-    """The gradients to the k-th window of each source."""
+def _backpropagate(
+    graph: LayerGraph, step: PlanStep, k: int, total: Tensor, saved_step: SavedForBackward
+) -> list[Tensor]:
+    """The gradients of the k-th window of each source."""
     layer = step.layer
     match layer:
-        case Pooled():
-            before = empty((1, layer.channels, *step.reads[k][0].hw), total.dtype, total.device)
-            into: Tensor = _BACK_POOL(
-                total, before, layer.kernel, layer.stride, [0, 0], layer.dilation, layer.ceil, trace.indices[k]
+        case MaxPool():
+            before = empty_channels_last((1, layer.channels, *step.reads[k][0].hw), total.dtype, total.device)
+            into: Tensor = _MAX_POOL_BACKWARD(
+                total,
+                before,
+                layer.kernel,
+                layer.stride,
+                [0, 0],
+                layer.dilation,
+                layer.ceil_mode,
+                saved_step.indices[k],
             )
             return [into]
-        case Convolved():
+        case Convolution():
             window = F.conv_transpose2d(
                 total, layer.weight.to(total), None, layer.stride, groups=layer.groups, dilation=layer.dilation
             )
             return list(window.split([source.channels for source in layer.sources], 1))
-        case Rectified():
+        case Rectifier():
             return [total]
-        case Scaled():
+        case ChannelAffine():
             return [total * layer.scale[:, None, None]]
-        case Each() if layer.sum:
+        case PointwiseOp() if layer.is_sum:
             return [total] * len(layer.sources)
-        case Each():
-            return _slopes(layer.call, trace.taken[k], total)
-        case Enlarged():
+        case PointwiseOp():
+            return _autograd(layer.call, saved_step.inputs[k], total)
+        case Upsample():
             window, rect = step.windows[k], step.rects[k]
             like = total.new_empty((1, layer.channels, *window.hw))
-            return _slopes(lambda x: _enlarged(layer, rect, window, x), (like,), total)
+            return _autograd(lambda x: _upsample(layer, rect, window, x), (like,), total)
         case _:
             raise AssertionError(type(layer).__name__)
 
 
-def _slopes(call: Any, inputs: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
-    """By autograd."""
+def _autograd(call: Any, inputs: Sequence[Tensor], gradient: Tensor) -> list[Tensor]:
+    """Gradients by autograd."""
     with torch.enable_grad():
         leaves = [x.detach().requires_grad_(True) for x in inputs]
         return list(torch.autograd.grad(call(*leaves), leaves, gradient))
 
 
-class Changed(torch.autograd.Function):
-    """A plan's outputs, each a whole tensor, as a function of the picture's image."""
+class ChangedOutputs(torch.autograd.Function):
+    """A plan's outputs, as whole tensors, as a function of the image."""
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, picture: Picturing, graph: Graph, plan: Plan, kept: Mapping[Layer, Tensor]
+        ctx: Any,
+        image: Tensor,
+        image_input: ImageInput,
+        graph: LayerGraph,
+        plan: RecomputePlan,
+        stored: Mapping[NetworkLayer, Tensor],
     ) -> tuple[Tensor, ...]:
-        found, traces = forward(graph, plan, picture, kept, graph.outputs)
+        """Run the plan; arguments as `forward`.
+
+        Args:
+            ctx: Autograd's context.
+            image: (1, 3, H, W), the differentiable argument.
+            image_input: The same image.
+            graph: The network.
+            plan: What to compute.
+            stored: Stored activations of the reference.
+        """
+        returned, saved = forward(graph, plan, image_input, stored, graph.outputs)
         rects = {step.layer: step.rects for step in plan.steps}
         outputs = []
         for layer in graph.outputs:
-            whole = kept[layer].clone()
-            for rect, part in zip(rects[layer], found[layer], strict=True):
+            whole = stored[layer].clone()
+            for rect, part in zip(rects[layer], returned[layer], strict=True):
                 whole[:, :, rect.top : rect.bottom, rect.left : rect.right] = part
             outputs.append(whole)
         if ctx.needs_input_grad[0]:
-            ctx.graph, ctx.plan, ctx.traces = graph, plan, traces
-            ctx.at, ctx.shape = picture.at, image.shape
+            ctx.graph, ctx.plan, ctx.traces = graph, plan, saved
+            ctx.at, ctx.shape = image_input.origin, image.shape
         return tuple(outputs)
 
     @staticmethod
@@ -314,9 +379,9 @@ class Changed(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor, None, None, None, None]:
-        graph: Graph = ctx.graph
-        given = dict(zip(graph.outputs, gradients, strict=True))
+        graph: LayerGraph = ctx.graph
+        output_gradients = dict(zip(graph.outputs, gradients, strict=True))
         image = gradients[0].new_zeros(ctx.shape)
-        for rect, part in backward(graph, ctx.plan, ctx.traces, given):
-            Picturing(image, ctx.at).view(rect).copy_(part)
+        for rect, part in backward(graph, ctx.plan, ctx.traces, output_gradients):
+            ImageInput(image, ctx.at).view(rect).copy_(part)
         return image, None, None, None, None

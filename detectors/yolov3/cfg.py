@@ -1,7 +1,7 @@
-"""Darknet's `.cfg` files of the YOLOv3 family: read, checked, written.
+"""Reads, checks and writes Darknet `.cfg` files of the YOLOv3 family.
 
-A file is a list of sections. The first, [net], says how to train and how large the input is; each of the others is
-a layer, and layers are numbered from 0 after it.
+A file is a list of sections: first [net], with training settings and the input size, then one per layer, numbered
+from 0.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from detectors.base import DetectorError
 
 ACTIVATIONS = ("leaky", "linear")
 NO_MATCH = 1.0
-"""Default of a head's `iou_thresh`: only the best anchor answers for an object."""
-_MOST_WHOLE = 1 << 20
-_NUMBERS_A_BOX = 5
+"""Default `iou_thresh` of a head: only the best anchor predicts an object."""
+_MAX_INTEGER = 1 << 20
+_VALUES_PER_BOX = 5
 """x, y, width, height, objectness; the classes follow."""
 
 _READ = {
@@ -31,7 +31,7 @@ _READ = {
     "yolo": ("mask", "anchors", "classes", "num", "ignore_thresh", "iou_thresh"),
 }
 """Keys of a section that are read."""
-_OF_ANY = (
+_WITHOUT_EFFECT_ANYWHERE = (
     *("learning_rate", "stopbackward", "onlyforward", "dont_update", "burnin_update", "train_only_bn", "clip"),
     *("stream", "wait_stream"),
 )
@@ -47,9 +47,10 @@ _WITHOUT_EFFECT = {
         *("dets_for_track", "dets_for_show", "track_ciou_norm"),
     ),
 }
-"""Further keys that change no box, of any section and of one: of Darknet's training, its suppression, tracking and
-display, and of a GPU's streams (src/parser.c of https://github.com/AlexeyAB/darknet)."""
-_NEUTRAL_OF_ANY = {"dontload": "0", "dontloadscales": "0"}
+"""Keys that change no box, in any section and per section: of Darknet's training, suppression, tracking and
+display, and of GPU streams (src/parser.c of https://github.com/AlexeyAB/darknet).
+"""
+_NEUTRAL_ANYWHERE = {"dontload": "0", "dontloadscales": "0"}
 _NEUTRAL = {
     "convolutional": {
         **dict.fromkeys(("antialiasing", "binary", "xnor", "bin_output", "cbn", "flipped", "reverse"), "0"),
@@ -62,154 +63,186 @@ _NEUTRAL = {
     "upsample": {"scale": "1"},
     "yolo": {"scale_x_y": "1", "new_coords": "0"},
 }
-"""Further keys that change what a layer gives, or which weights it has, and the value with which they do not; of
-any section and of one."""
+"""Keys that can change a layer's output or weights, and the value with which they do not; in any section and per
+section.
+"""
 
-_MOST_LAYERS = 1000
+_MAX_LAYERS = 1000
 """YOLOv3 has 107."""
-_MOST_ANCHORS = 1000
-_MOST_SIDE = 63
-"""px of a kernel or a window; 13 in networks that are known."""
-_MOST_STRIDE = 1024
-"""px of the input, whose sides are padded to multiples of it; 64 at most in networks that are known."""
-_MOST_NUMBERS = 256, 4096
-"""That a layer, and all of them, may give for a pixel of the input: YOLOv3's give 32 and 329."""
+_MAX_ANCHORS = 1000
+_MAX_SIDE = 63
+"""Largest kernel or window, px; known networks use up to 13."""
+_MAX_STRIDE = 1024
+"""Largest stride of the input, px, to multiples of which its sides are padded; known networks use up to 64."""
+_MAX_VALUES_PER_PIXEL = 256, 4096
+"""Output values per input pixel, of one layer and of all: YOLOv3 has 32 and 329."""
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
-    """[kind] and its `key=value` lines, in their order; line: where it stands in its file; 0 is nowhere."""
+class CfgSection:
+    """[kind] and its `key=value` lines, in order."""
 
     kind: str
+    """Name of the section."""
     options: Mapping[str, str] = field(default_factory=dict)
+    """Values by key."""
     line: int = field(default=0, compare=False)
+    """Line in the file; 0 if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Convolution:
-    """filters: output channels; padding: px on each side; normalised: by its batch, then without a bias."""
+class ConvolutionLayer:
+    """A [convolutional] section."""
 
     filters: int
+    """Output channels."""
     size: int
+    """Side of the kernel."""
     stride: int
+    """In both directions."""
     padding: int
+    """px on each side."""
     normalised: bool
+    """Whether batch normalisation replaces the bias."""
     leaky: bool
+    """Whether a leaky rectifier follows."""
 
 
 @dataclass(frozen=True, slots=True)
-class MaxPool:
+class MaxPoolLayer:
+    """A [maxpool] section."""
+
     size: int
+    """Side of the window."""
     stride: int
+    """In both directions."""
 
 
 @dataclass(frozen=True, slots=True)
-class Route:
-    """The outputs of these layers (absolute numbers), one behind the other along the channels."""
+class RouteLayer:
+    """Concatenation of earlier outputs along the channels."""
 
     layers: tuple[int, ...]
+    """Absolute numbers."""
 
 
 @dataclass(frozen=True, slots=True)
-class Shortcut:
-    """The output of the layer before plus that of this layer (absolute number)."""
+class ShortcutLayer:
+    """Sum of the previous output and an earlier one."""
 
     layer: int
+    """Absolute number."""
 
 
 @dataclass(frozen=True, slots=True)
-class Upsample:
+class UpsampleLayer:
     """Each value repeated `factor` times in both directions."""
 
     factor: int
+    """Repetitions."""
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
-    """A [yolo] section. anchors_wh: of all heads, px of the input; mask: which of them this one has.
-
-    ignore_threshold: an anchor whose box overlaps an object more than this need not be silent; match_threshold:
-    further anchors whose shape overlaps an object's more than this answer for it too.
-    """
+class YoloHead:
+    """A [yolo] section."""
 
     anchors_wh: tuple[tuple[float, float], ...]
+    """Anchors of all heads, px of the input."""
     mask: tuple[int, ...]
+    """Indices of this head's anchors."""
     classes: int
+    """Number of classes."""
     ignore_threshold: float
+    """Anchors with a predicted box of higher IoU with an object need not be silent."""
     match_threshold: float
+    """Further anchors with a shape of higher IoU with an object's also predict it."""
 
 
-Layer = Convolution | MaxPool | Route | Shortcut | Upsample | Head
+Layer = ConvolutionLayer | MaxPoolLayer | RouteLayer | ShortcutLayer | UpsampleLayer | YoloHead
 
 
 @dataclass(frozen=True, slots=True)
-class Cfg:
-    """A network's description. layers, channels, strides: a layer's kind, how many channels it gives, and how many
-    px of the input one of its cells is wide; sections: what it was read from, [net] first.
-    """
+class DarknetCfg:
+    """A network's description."""
 
-    sections: tuple[Section, ...]
+    sections: tuple[CfgSection, ...]
+    """The sections it was read from, [net] first."""
     layers: tuple[Layer, ...]
+    """One per further section."""
     channels: tuple[int, ...]
+    """Output channels of each layer."""
     strides: tuple[int, ...]
+    """Input pixels per cell of each layer's output."""
 
     @property
-    def heads(self) -> tuple[tuple[int, Head], ...]:
+    def heads(self) -> tuple[tuple[int, YoloHead], ...]:
         """(layer number, head) of each [yolo] section."""
-        return tuple((i, layer) for i, layer in enumerate(self.layers) if isinstance(layer, Head))
+        return tuple((i, layer) for i, layer in enumerate(self.layers) if isinstance(layer, YoloHead))
 
     @property
     def classes(self) -> int:
+        """Number of classes."""
         return self.heads[0][1].classes
 
     @property
     def stride(self) -> int:
-        """What the sides of an input are multiples of."""
+        """Input sides must be multiples of this, px."""
         return math.lcm(*self.strides)
 
 
-def parse(text: str, source: str = "cfg") -> Cfg:
-    """Read the text of a `.cfg`. Raises DetectorError, with `source` and the line, for a section or a value that
-    this family does not have, and for layers that do not fit each other.
+def parse(text: str, source: str = "cfg") -> DarknetCfg:
+    """Parse the text of a `.cfg`.
+
+    Raises:
+        DetectorError: An unknown section or value, or layers that do not fit together; names `source` and the
+            line.
     """
     return build(_sections(text, source), source)
 
 
-def build(sections: Sequence[Section], source: str = "cfg") -> Cfg:
-    """The network that sections describe; errors as `parse`."""
+def build(sections: Sequence[CfgSection], source: str = "cfg") -> DarknetCfg:
+    """The network described by sections.
+
+    Raises:
+        DetectorError: As `parse`.
+    """
     if not sections or sections[0].kind not in ("net", "network"):
         line = sections[0].line if sections else 1
         raise DetectorError(f"{source}:{line}: expected [net] first, found {_kind(sections)}")
-    if len(sections) > _MOST_LAYERS:
-        raise DetectorError(f"{source}: expected at most {_MOST_LAYERS} sections, found {len(sections)}")
+    if len(sections) > _MAX_LAYERS:
+        raise DetectorError(f"{source}: expected at most {_MAX_LAYERS} sections, found {len(sections)}")
     layers: list[Layer] = []
     channels: list[int] = []
     strides: list[int] = []
     numbers: list[float] = []
-    width = _Reader(sections[0], source).integer("channels", 3)
+    width = _SectionReader(sections[0], source).integer("channels", 3)
     if width != 3:
         raise DetectorError(f"{source}:{sections[0].line}: channels: expected 3, found {width}")
     for section in sections[1:]:
-        reader = _Reader(section, source)
-        before = (channels[-1], strides[-1]) if layers else (width, 1)
+        reader = _SectionReader(section, source)
+        previous = (channels[-1], strides[-1]) if layers else (width, 1)
         if section.kind not in _LAYERS:
             known = ", ".join(f"[{name}]" for name in _LAYERS)
             raise DetectorError(f"{source}:{section.line}: expected one of {known}, found [{section.kind}]")
         _check_keys(reader)
         layer = _LAYERS[section.kind](reader, len(layers))
-        channel, stride = _output(layer, before, (channels, strides), reader)
+        channel, stride = _output(layer, previous, (channels, strides), reader)
         layers.append(layer)
         channels.append(channel)
         strides.append(stride)
         numbers.append(channel / stride**2)
-        if stride > _MOST_STRIDE or numbers[-1] > _MOST_NUMBERS[0] or sum(numbers) > _MOST_NUMBERS[1]:
-            most, in_all = _MOST_NUMBERS
-            expected = f"a stride up to {_MOST_STRIDE}, numbers a pixel up to {most}, {in_all} in all"
+        if (
+            stride > _MAX_STRIDE
+            or numbers[-1] > _MAX_VALUES_PER_PIXEL[0]
+            or sum(numbers) > _MAX_VALUES_PER_PIXEL[1]
+        ):
+            most, in_all = _MAX_VALUES_PER_PIXEL
+            expected = f"a stride up to {_MAX_STRIDE}, numbers a pixel up to {most}, {in_all} in all"
             raise reader.fail("filters, stride", expected, f"{stride}, {numbers[-1]:g}, {sum(numbers):g}")
-    cfg = Cfg(tuple(sections), tuple(layers), tuple(channels), tuple(strides))
-    if cfg.stride > _MOST_STRIDE:
+    cfg = DarknetCfg(tuple(sections), tuple(layers), tuple(channels), tuple(strides))
+    if cfg.stride > _MAX_STRIDE:
         raise DetectorError(
-            f"{source}: expected strides with a multiple of at most {_MOST_STRIDE}, found {cfg.stride}"
+            f"{source}: expected strides with a multiple of at most {_MAX_STRIDE}, found {cfg.stride}"
         )
     counts = {head.classes for _, head in cfg.heads}
     if len(counts) != 1:
@@ -218,8 +251,8 @@ def build(sections: Sequence[Section], source: str = "cfg") -> Cfg:
     return cfg
 
 
-def write(cfg: Cfg) -> str:
-    """The text of a `.cfg`; `parse` reads the same sections from it."""
+def write(cfg: DarknetCfg) -> str:
+    """The text of a `.cfg`, from which `parse` reads the same sections."""
     parts = []
     for section in cfg.sections:
         lines = [f"[{section.kind}]", *(f"{key}={value}" for key, value in section.options.items())]
@@ -227,31 +260,31 @@ def write(cfg: Cfg) -> str:
     return "\n".join(parts)
 
 
-def _sections(text: str, source: str) -> list[Section]:
-    found: list[tuple[str, dict[str, str], int]] = []
+def _sections(text: str, source: str) -> list[CfgSection]:
+    sections: list[tuple[str, dict[str, str], int]] = []
     for number, raw in enumerate(text.splitlines(), 1):
         line = raw.partition("#")[0].partition(";")[0].strip()
         if not line:
             continue
         if line.startswith("[") and line.endswith("]"):
-            found.append((line[1:-1].strip(), {}, number))
-        elif "=" in line and found:
+            sections.append((line[1:-1].strip(), {}, number))
+        elif "=" in line and sections:
             key, _, value = line.partition("=")
-            found[-1][1][key.strip()] = value.strip()
+            sections[-1][1][key.strip()] = value.strip()
         else:
             raise DetectorError(f"{source}:{number}: expected [section] or key=value, found {line!r}")
-    return [Section(*parts) for parts in found]
+    return [CfgSection(*parts) for parts in sections]
 
 
-def _kind(sections: Sequence[Section]) -> str:
+def _kind(sections: Sequence[CfgSection]) -> str:
     return f"[{sections[0].kind}]" if sections else "no section"
 
 
 @dataclass(frozen=True, slots=True)
-class _Reader:
-    """Values of a section; whatever cannot be read is a DetectorError with file and line."""
+class _SectionReader:
+    """Reads values of a section; errors name file and line."""
 
-    section: Section
+    section: CfgSection
     source: str
 
     def fail(self, key: str, expected: str, found: object) -> DetectorError:
@@ -259,7 +292,7 @@ class _Reader:
             f"{self.source}:{self.section.line}: [{self.section.kind}] {key}: expected {expected}, found {found}"
         )
 
-    def integer(self, key: str, default: int | None = None, least: int = 1, most: int = _MOST_WHOLE) -> int:
+    def integer(self, key: str, default: int | None = None, least: int = 1, most: int = _MAX_INTEGER) -> int:
         text = self.section.options.get(key)
         if text is None:
             if default is None:
@@ -297,18 +330,18 @@ class _Reader:
         return value
 
     def layer(self, key: str, index: int, here: int) -> int:
-        """The absolute number of a layer that is named relative to this one, where negative."""
+        """The absolute number of a layer; negative indices are relative."""
         absolute = here + index if index < 0 else index
         if not 0 <= absolute < here:
             raise self.fail(key, f"a layer before this one, number {here}", index)
         return absolute
 
 
-def _check_keys(reader: _Reader) -> None:
-    """DetectorError for a key that would make another network than the one that is built."""
+def _check_keys(reader: _SectionReader) -> None:
+    """Raise DetectorError for a key that would describe another network than the one built."""
     kind = reader.section.kind
-    passed = {*_READ[kind], *_OF_ANY, *_WITHOUT_EFFECT.get(kind, ())}
-    neutral = _NEUTRAL_OF_ANY | _NEUTRAL[kind]
+    passed = {*_READ[kind], *_WITHOUT_EFFECT_ANYWHERE, *_WITHOUT_EFFECT.get(kind, ())}
+    neutral = _NEUTRAL_ANYWHERE | _NEUTRAL[kind]
     for key, value in reader.section.options.items():
         if key in passed:
             continue
@@ -318,35 +351,35 @@ def _check_keys(reader: _Reader) -> None:
             raise reader.fail(key, neutral[key], value)
 
 
-def _is_number(text: str, wanted: str) -> bool:
-    """Whether a text is a number written otherwise."""
+def _is_number(text: str, expected: str) -> bool:
+    """Whether a text is a number in another notation."""
     try:
-        return float(text) == float(wanted)
+        return float(text) == float(expected)
     except ValueError:
         return False
 
 
-def _stride(reader: _Reader, most: int = _MOST_WHOLE) -> int:
-    """px, of both directions."""
+def _stride(reader: _SectionReader, most: int = _MAX_INTEGER) -> int:
+    """The stride of both directions, px."""
     stride = reader.integer("stride", 1, most=most)
     for key in ("stride_x", "stride_y"):
-        found = reader.integer(key, stride)
-        if found != stride:
-            raise reader.fail(key, f"{stride}, the stride", found)
+        other = reader.integer(key, stride)
+        if other != stride:
+            raise reader.fail(key, f"{stride}, the stride", other)
     return stride
 
 
-def _convolution(reader: _Reader, _here: int) -> Convolution:
+def _convolution(reader: _SectionReader, _here: int) -> ConvolutionLayer:
     activation = reader.section.options.get("activation", "logistic")
     if activation not in ACTIVATIONS:
         raise reader.fail("activation", " or ".join(ACTIVATIONS), activation)
     if reader.integer("groups", 1) != 1:
         raise reader.fail("groups", "1", reader.section.options["groups"])
-    size = reader.integer("size", 1, most=_MOST_SIDE)
+    size = reader.integer("size", 1, most=_MAX_SIDE)
     padding = size // 2 if reader.integer("pad", 0, 0) else reader.integer("padding", 0, 0)
     if 2 * padding != size - 1:
         raise reader.fail("pad", f"{(size - 1) / 2:g} px for a size of {size}", padding)
-    return Convolution(
+    return ConvolutionLayer(
         filters=reader.integer("filters"),
         size=size,
         stride=_stride(reader),
@@ -356,33 +389,33 @@ def _convolution(reader: _Reader, _here: int) -> Convolution:
     )
 
 
-def _max_pool(reader: _Reader, _here: int) -> MaxPool:
-    stride = _stride(reader, _MOST_SIDE)
-    size = reader.integer("size", stride, most=_MOST_SIDE)
+def _max_pool(reader: _SectionReader, _here: int) -> MaxPoolLayer:
+    stride = _stride(reader, _MAX_SIDE)
+    size = reader.integer("size", stride, most=_MAX_SIDE)
     if reader.integer("padding", size - 1, 0) != size - 1:
         raise reader.fail("padding", str(size - 1), reader.section.options["padding"])
-    return MaxPool(size, stride)
+    return MaxPoolLayer(size, stride)
 
 
-def _route(reader: _Reader, here: int) -> Route:
-    return Route(tuple(reader.layer("layers", index, here) for index in reader.integers("layers")))
+def _route(reader: _SectionReader, here: int) -> RouteLayer:
+    return RouteLayer(tuple(reader.layer("layers", index, here) for index in reader.integers("layers")))
 
 
-def _shortcut(reader: _Reader, here: int) -> Shortcut:
+def _shortcut(reader: _SectionReader, here: int) -> ShortcutLayer:
     activation = reader.section.options.get("activation", "linear")
     if activation != "linear":
         raise reader.fail("activation", "linear", activation)
     indices = reader.integers("from")
     if len(indices) != 1:
         raise reader.fail("from", "one layer", len(indices))
-    return Shortcut(reader.layer("from", indices[0], here))
+    return ShortcutLayer(reader.layer("from", indices[0], here))
 
 
-def _upsample(reader: _Reader, _here: int) -> Upsample:
-    return Upsample(reader.integer("stride", 2))
+def _upsample(reader: _SectionReader, _here: int) -> UpsampleLayer:
+    return UpsampleLayer(reader.integer("stride", 2))
 
 
-def _head(reader: _Reader, _here: int) -> Head:
+def _head(reader: _SectionReader, _here: int) -> YoloHead:
     text = reader.section.options.get("anchors", "")
     try:
         numbers = [float(part) for part in text.split(",") if part.strip()]
@@ -391,14 +424,14 @@ def _head(reader: _Reader, _here: int) -> Head:
     if not numbers or len(numbers) % 2 or not all(0 < n < math.inf for n in numbers):
         raise reader.fail("anchors", "pairs of positive numbers", repr(text))
     anchors = tuple(zip(numbers[::2], numbers[1::2], strict=True))
-    if len(anchors) > _MOST_ANCHORS:
-        raise reader.fail("anchors", f"at most {_MOST_ANCHORS}", len(anchors))
+    if len(anchors) > _MAX_ANCHORS:
+        raise reader.fail("anchors", f"at most {_MAX_ANCHORS}", len(anchors))
     if reader.integer("num", len(anchors)) != len(anchors):
         raise reader.fail("num", f"{len(anchors)}, as many as anchors", reader.section.options["num"])
     mask = reader.integers("mask") if "mask" in reader.section.options else list(range(len(anchors)))
     if not all(0 <= index < len(anchors) for index in mask):
         raise reader.fail("mask", f"indices of {len(anchors)} anchors", mask)
-    return Head(
+    return YoloHead(
         anchors_wh=anchors,
         mask=tuple(mask),
         classes=reader.integer("classes", 20),
@@ -418,33 +451,43 @@ _LAYERS = {
 
 
 def _output(
-    layer: Layer, before: tuple[int, int], given: tuple[Sequence[int], Sequence[int]], reader: _Reader
+    layer: Layer,
+    previous: tuple[int, int],
+    all_outputs: tuple[Sequence[int], Sequence[int]],
+    reader: _SectionReader,
 ) -> tuple[int, int]:
-    """Channels and stride of a layer. before: of the one before it; given: of all so far."""
-    channels, strides = given
-    channel, stride = before
+    """Output channels and stride of a layer.
+
+    Args:
+        layer: The layer.
+        before: Of the previous layer.
+        given: Of all layers so far.
+        reader: Reader of its section, for errors.
+    """
+    channels, strides = all_outputs
+    channel, stride = previous
     match layer:
-        case Convolution():
+        case ConvolutionLayer():
             return layer.filters, stride * layer.stride
-        case MaxPool():
+        case MaxPoolLayer():
             return channel, stride * layer.stride
-        case Route():
-            found = sorted({strides[i] for i in layer.layers})
-            if len(found) != 1:
-                raise reader.fail("layers", "layers of one stride", f"strides {found}")
-            return sum(channels[i] for i in layer.layers), found[0]
-        case Shortcut():
+        case RouteLayer():
+            route_strides = sorted({strides[i] for i in layer.layers})
+            if len(route_strides) != 1:
+                raise reader.fail("layers", "layers of one stride", f"strides {route_strides}")
+            return sum(channels[i] for i in layer.layers), route_strides[0]
+        case ShortcutLayer():
             other = channels[layer.layer], strides[layer.layer]
-            if other != before:
-                wanted = f"{channel} channels at stride {stride}"
-                raise reader.fail("from", wanted, f"{other[0]} at {other[1]}")
-            return before
-        case Upsample():
+            if other != previous:
+                expected = f"{channel} channels at stride {stride}"
+                raise reader.fail("from", expected, f"{other[0]} at {other[1]}")
+            return previous
+        case UpsampleLayer():
             if stride % layer.factor:
                 raise reader.fail("stride", f"a divisor of {stride}", layer.factor)
             return channel, stride // layer.factor
-        case Head():
-            wanted = len(layer.mask) * (_NUMBERS_A_BOX + layer.classes)
-            if channel != wanted:
-                raise reader.fail("mask, classes", f"{channel} numbers a cell from the layer before", wanted)
-            return before
+        case YoloHead():
+            expected = len(layer.mask) * (_VALUES_PER_BOX + layer.classes)
+            if channel != expected:
+                raise reader.fail("mask, classes", f"{channel} numbers a cell from the layer before", expected)
+            return previous

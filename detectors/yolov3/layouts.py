@@ -1,10 +1,10 @@
-"""The published networks, and a slim one, as `.cfg` descriptions for any number of classes."""
+"""The published networks and a slim one as `.cfg` descriptions, for any number of classes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from detectors.yolov3.cfg import Cfg, Section, build
+from detectors.yolov3.cfg import CfgSection, DarknetCfg, build
 
 Anchors = Sequence[tuple[float, float]]
 """Widths and heights, px of the input, smallest first."""
@@ -15,9 +15,9 @@ ANCHORS: Anchors = (
     *((30, 61), (62, 45), (59, 119)),
     *((116, 90), (156, 198), (373, 326)),
 )
-"""Of COCO at 416 px: section 2.3 of the paper."""
+"""For COCO at 416 px: section 2.3 of the paper."""
 TINY_ANCHORS: Anchors = ((10, 14), (23, 27), (37, 58), (81, 82), (135, 169), (344, 319))
-"""Of yolov3-tiny.cfg."""
+"""From yolov3-tiny.cfg."""
 
 SLIM_CLASSES = 4
 SLIM_ANCHORS: Anchors = (
@@ -25,32 +25,34 @@ SLIM_ANCHORS: Anchors = (
     *((33, 79), (92, 51), (70, 149)),
     *((151, 79), (228, 134), (390, 223)),
 )
-"""`detectors.anchors.fit_anchors` of the sizes in 3,000 generated frames (objects from 12 px on), zoomed as
-training zooms them; mean IoU 0.67."""
+"""`detectors.anchors.fit_anchors` for the sizes in 3,000 generated frames (objects from 12 px on), zoomed as in
+training; mean IoU 0.67.
+"""
 
 _BLOCKS = ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4))
-"""Darknet-53: channels of a stage, and its residual blocks (table 1 of the paper)."""
+"""Darknet-53: channels of each stage, and its residual blocks (table 1 of the paper)."""
 _SLIM_BLOCKS = ((48, 1), (96, 2), (192, 3), (384, 2))
-"""A stage of Darknet-53 less, at three eighths of the width. The first convolution strides too: at full size its
-channels would cost more than all the rest."""
+"""One stage fewer than Darknet-53, at three eighths of its width. The first convolution is strided too: at full
+size its channels would cost more than all the rest.
+"""
 _IGNORE = 0.7
-"""`ignore_thresh` of the published files; the paper says 0.5."""
+"""`ignore_thresh` of the published files; the paper states 0.5."""
 _SLIM_MATCH = 0.35
-"""`iou_thresh`: some three anchors answer for an object. One alone learns slower."""
+"""`iou_thresh`: about three anchors predict an object, which speeds up learning."""
 
 
-class _Layers:
-    """Sections in the making. ValueError where there are not as many anchors as the layout has places for."""
+class _CfgBuilder:
+    """Collects sections. ValueError if the number of anchors does not fit the layout."""
 
-    def __init__(self, size_hw: tuple[int, int], anchors: Anchors, places: int) -> None:
-        if len(anchors) != places:
-            raise ValueError(f"anchors: expected {places}, found {len(anchors)}")
+    def __init__(self, size_hw: tuple[int, int], anchors: Anchors, anchor_count: int) -> None:
+        if len(anchors) != anchor_count:
+            raise ValueError(f"anchors: expected {anchor_count}, found {len(anchors)}")
         net = {"height": str(size_hw[0]), "width": str(size_hw[1]), "channels": "3"}
-        self.sections = [Section("net", net)]
+        self.sections = [CfgSection("net", net)]
 
     def add(self, kind: str, **options: object) -> int:
-        """Append a layer; its number."""
-        self.sections.append(Section(kind, {key: str(value) for key, value in options.items()}))
+        """Append a layer and return its number."""
+        self.sections.append(CfgSection(kind, {key: str(value) for key, value in options.items()}))
         return len(self.sections) - 2
 
     def convolve(self, filters: int, size: int, stride: int = 1) -> int:
@@ -75,9 +77,9 @@ class _Layers:
         )
 
 
-def yolov3(classes: int = COCO_CLASSES, anchors: Anchors = ANCHORS) -> Cfg:
+def yolov3(classes: int = COCO_CLASSES, anchors: Anchors = ANCHORS) -> DarknetCfg:
     """Darknet-53 and three heads at strides 32, 16 and 8; nine anchors."""
-    layers = _Layers((416, 416), anchors, len(ANCHORS))
+    layers = _CfgBuilder((416, 416), anchors, len(ANCHORS))
     layers.convolve(32, 3)
     ends = []
     for channels, blocks in _BLOCKS:
@@ -97,9 +99,9 @@ def yolov3(classes: int = COCO_CLASSES, anchors: Anchors = ANCHORS) -> Cfg:
     return build(layers.sections, "yolov3")
 
 
-def yolov3_tiny(classes: int = COCO_CLASSES, anchors: Anchors = TINY_ANCHORS) -> Cfg:
-    """Seven convolutions with poolings between, and two heads at strides 32 and 16; six anchors."""
-    layers = _Layers((416, 416), anchors, len(TINY_ANCHORS))
+def yolov3_tiny(classes: int = COCO_CLASSES, anchors: Anchors = TINY_ANCHORS) -> DarknetCfg:
+    """Seven convolutions with poolings, and two heads at strides 32 and 16; six anchors."""
+    layers = _CfgBuilder((416, 416), anchors, len(TINY_ANCHORS))
     for channels in (16, 32, 64, 128):
         layers.convolve(channels, 3)
         layers.add("maxpool", size=2, stride=2)
@@ -120,9 +122,9 @@ def yolov3_tiny(classes: int = COCO_CLASSES, anchors: Anchors = TINY_ANCHORS) ->
     return build(layers.sections, "yolov3-tiny")
 
 
-def yolov3_slim(classes: int = SLIM_CLASSES, anchors: Anchors = SLIM_ANCHORS) -> Cfg:
+def yolov3_slim(classes: int = SLIM_CLASSES, anchors: Anchors = SLIM_ANCHORS) -> DarknetCfg:
     """A Darknet of eight narrow residual blocks, and three heads with short necks at strides 32, 16 and 8."""
-    layers = _Layers((384, 1248), anchors, len(SLIM_ANCHORS))
+    layers = _CfgBuilder((384, 1248), anchors, len(SLIM_ANCHORS))
     layers.convolve(24, 3, 2)
     ends = []
     for channels, blocks in _SLIM_BLOCKS:

@@ -1,8 +1,8 @@
 """YOLOv3 (Redmon and Farhadi, 2018, arXiv:1804.02767) for images of any size.
 
-Departures from the published code: images are padded right and below to a multiple of 32 px, with its grey, and
-never resized; an object whose best anchor is taken in its cell gets the next best one; sums of the loss are
-divided by the objects of the batch.
+Departures from the published code: images are padded right and below with its grey to a multiple of 32 px and
+never resized; an object gets the next best anchor if the best one in its cell is taken; loss sums are divided by
+the number of objects in the batch.
 """
 
 from __future__ import annotations
@@ -17,89 +17,99 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from detectors import boxes
-from detectors.base import Candidates, Detector, RawPredictions, Trunk
+from detectors.base import AnchorPredictions, Candidates, Detector, DetectorStages
 from detectors.types import CLASSES, Detections, Targets
 from detectors.yolov3 import layouts
-from detectors.yolov3.cfg import Cfg
-from detectors.yolov3.network import Folded, Network
+from detectors.yolov3.cfg import DarknetCfg
+from detectors.yolov3.network import DarknetNetwork, FoldedNetwork
 
 GREY = 0.5
-"""What Darknet fills with where there is no image."""
-LARGEST_LOG = 6.0
-"""Boxes are at most e^6 = 400 times their anchor: an untrained one cannot overflow."""
+"""Darknet's padding."""
+MAX_LOG_SIZE = 6.0
+"""Boxes are at most e^6 = 400 times their anchor: untrained ones cannot overflow."""
 MEETING_IOU = 0.5
-"""Overlap from which a predicted box meets an object, as in the evaluation."""
+"""IoU at which a predicted box matches an object, as in the evaluation."""
 IGNORE_OVERLAP = 0.5
-"""An anchor that lies in an ignored region by more than this need not be silent."""
+"""An anchor covered by an ignored region by more than this share need not be silent."""
 SCORE_MINIMUM = 0.005
 NMS_IOU = 0.45
 """Decoding for evaluation (published code: `validate_detector`)."""
 TOP_CANDIDATES = 200
-"""Boxes of a class each that suppression begins with; of more, the best."""
-KNOWN_SIZES = 16
-"""Of images, whose anchors' places are kept."""
+"""Maximum number of scored boxes per image before suppression."""
+MAX_CACHED_SIZES = 16
+"""Image sizes with cached anchors."""
 PRIOR = 0.01
-"""Objectness before training: almost all anchors see nothing."""
+"""Objectness before training: almost no anchor has an object."""
 _HALF = (torch.bfloat16, torch.float16)
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
-    """Where the A anchors of an image are: heads in the file's order, cells row by row, a cell's anchors together.
-
-    cells_xy (A, 2): px of the cell's corner; strides (A,) px; anchors_wh (A, 2) px.
-    """
+class AnchorPlacement:
+    """Positions of an image's A anchors: by head in the file's order, cell row by row, and anchor."""
 
     cells_xy: Tensor
+    """(A, 2) px, corner of the cell."""
     strides: Tensor
+    """(A,) px."""
     anchors_wh: Tensor
+    """(A, 2) px."""
 
 
 @dataclass(frozen=True, slots=True)
-class Assignment:
-    """Which anchors answer for which objects; holds no gradient. K pairs of both; M objects that are not ignored.
-
-    image, anchor (K,) int64; deltas (K, 4), what the box head should say: x and y as places in the cell in (0, 1),
-    logarithms of width and height in anchors; scales (K,), 2 less the object's share of the image; labels (K,)
-    int64; negative (B, A) bool: the anchors that must be silent. found_image, found_by (M,) int64: an object's
-    image, and the most confident of the anchors whose predicted boxes meet it (IoU of at least 0.5); found (M,)
-    bool: whether there is any; alarm (B, A) bool: negatives that meet no object.
-    """
+class YoloAssignment:
+    """Which anchors predict which objects, in K pairs, for the M objects that are not ignored; no gradient."""
 
     image: Tensor
+    """(K,) int64."""
     anchor: Tensor
+    """(K,) int64."""
     deltas: Tensor
+    """(K, 4) targets of the box head: x and y in the cell, in (0, 1); logarithms of width and height in anchors.
+    """
     scales: Tensor
+    """(K,) 2 minus the object's share of the image."""
     labels: Tensor
+    """(K,) int64."""
     negative: Tensor
+    """(B, A) bool: anchors that should be silent."""
     found_image: Tensor
+    """(M,) int64: image of each object."""
     found_by: Tensor
+    """(M,) int64: the most confident anchor with a predicted box that matches the object."""
     found: Tensor
+    """(M,) bool: whether there is one."""
     alarm: Tensor
+    """(B, A) bool: negatives that match no object."""
 
 
 class YoloV3(Detector):
     """The network of a `.cfg` with its loss and decoding.
 
-    In eval mode with all weights frozen, normalisation is folded into the convolutions. gradient_precision: what
-    passes compute in that a gradient to the images may follow, and `glance`; the others, which judge, use the
-    weights' own.
+    In eval mode with all weights frozen, normalisation is folded into the convolutions.
     """
 
     name = "yolov3"
     fresh_layers = ("network.",)
-    layout: ClassVar[Callable[..., Cfg]] = staticmethod(layouts.yolov3)
-    """The network without a `.cfg`: of the number of classes, and anchors."""
+    layout: ClassVar[Callable[..., DarknetCfg]] = staticmethod(layouts.yolov3)
+    """Builds the default network from the number of classes, and anchors."""
 
     def __init__(
         self,
         classes: tuple[str, ...] = CLASSES,
         t_star: float = 0.5,
         anchors: layouts.Anchors | None = None,
-        cfg: Cfg | None = None,
+        cfg: DarknetCfg | None = None,
     ) -> None:
-        """cfg: by default `layout` with these anchors, or those that it has. Raises ValueError where classes are
-        not as many as the file's, and for a number of anchors that the layout does not have.
+        """Build the network without initialising it.
+
+        Args:
+            classes: Class names.
+            t_star: Score of best F1, in [0, 1].
+            anchors: Width and height of each anchor, px; by default the layout's.
+            cfg: The network; by default `layout`.
+
+        Raises:
+            ValueError: The number of classes or anchors does not fit the network.
         """
         super().__init__()
         if cfg is None:
@@ -109,19 +119,19 @@ class YoloV3(Detector):
         self.cfg = cfg
         self.classes = tuple(classes)
         self.t_star = t_star
-        self.network = Network(cfg)
+        self.network = DarknetNetwork(cfg)
         self.gradient_precision: torch.dtype | None = None
-        self._nets: dict[torch.dtype, tuple[object, Folded]] = {}
-        self._known_places: dict[object, Places] = {}
+        self._nets: dict[torch.dtype, tuple[object, FoldedNetwork]] = {}
+        self._cached_places: dict[object, AnchorPlacement] = {}
 
     @property
     def anchors(self) -> layouts.Anchors:
-        """Widths and heights in px of all heads' anchors."""
+        """Widths and heights of all heads' anchors, px."""
         return self.cfg.heads[0][1].anchors_wh
 
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw all weights anew: He for the backbone, near zero for the heads, anchors silent."""
+        """Draw all weights: He for the backbone, near zero for the heads, low objectness everywhere."""
         for block in self.network.blocks.values():
             std = (2 / block.conv.weight[0].numel()) ** 0.5
             block.conv.weight.normal_(0.0, 1e-2 if block.norm is None else std, generator=generator)
@@ -134,7 +144,7 @@ class YoloV3(Detector):
                 bias.zero_()
                 bias.view(len(head.mask), -1)[:, 4] = prior
 
-    def forward(self, images: Tensor) -> RawPredictions:
+    def forward(self, images: Tensor) -> AnchorPredictions:
         """images (B, 3, H, W), RGB in [0, 1]; A: see `places`."""
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
@@ -142,55 +152,57 @@ class YoloV3(Detector):
         stride = self.cfg.stride
         if not self._is_frozen():
             return self._interpret(self.network(_padded(images, stride)), (height, width))
-        return self._passed(images, torch.is_grad_enabled() and images.requires_grad)
+        return self._forward_frozen(images, torch.is_grad_enabled() and images.requires_grad)
 
     @torch.no_grad()
-    def glance(self, images: Tensor) -> RawPredictions:
-        """See `Detector`."""
-        return self._passed(images, coarse=True) if self._is_frozen() else self(images)
+    def forward_for_search(self, images: Tensor) -> AnchorPredictions:
+        """As `Detector.forward_for_search`, in `gradient_precision`."""
+        return self._forward_frozen(images, coarse=True) if self._is_frozen() else self(images)
 
     def _is_frozen(self) -> bool:
         return not self.training and not any(p.requires_grad for p in self.network.parameters())
 
-    def _passed(self, images: Tensor, coarse: bool) -> RawPredictions:
-        """By folded convolutions; coarse: in the precision of gradients."""
+    def _forward_frozen(self, images: Tensor, coarse: bool) -> AnchorPredictions:
+        """With folded convolutions. coarse: in the precision of gradients."""
         dtype = next(self.network.parameters()).dtype
         if coarse and self.gradient_precision is not None:
             dtype = self.gradient_precision
-        scaled = _Scale()
+        gradient_scale = _GradientScale()
         x = images
         if dtype in _HALF:
-            x = _ToHalf.apply(images, dtype, scaled)  # pyright: ignore[reportAssignmentType]
+            x = _ToHalf.apply(images, dtype, gradient_scale)  # pyright: ignore[reportAssignmentType]
         with torch.autocast(images.device.type, enabled=False):
-            outputs = self._folded(dtype)(_padded(x, self.cfg.stride))
-        return self._interpret(outputs, (int(images.shape[2]), int(images.shape[3])), scaled)
+            outputs = self._folded_network(dtype)(_padded(x, self.cfg.stride))
+        return self._interpret(outputs, (int(images.shape[2]), int(images.shape[3])), gradient_scale)
 
-    def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
+    def stages(self, image_hw: tuple[int, int]) -> DetectorStages | None:
         """The whole network; None with another precision for gradients."""
         if self.gradient_precision is not None:
             return None
         bottom, right = (-side % self.cfg.stride for side in image_hw)
-        return Trunk(self.network, (0.0, 0.0, 0.0), (GREY, GREY, GREY), (0, bottom, 0, right), self._interpret)
+        return DetectorStages(
+            self.network, (0.0, 0.0, 0.0), (GREY, GREY, GREY), (0, bottom, 0, right), self._interpret
+        )
 
-    def _folded(self, dtype: torch.dtype) -> Folded:
-        """The network as attacks run it, made anew where the weights have changed since."""
+    def _folded_network(self, dtype: torch.dtype) -> FoldedNetwork:
+        """The folded network, rebuilt after a change of weights."""
         tensors = [*self.network.parameters(), *self.network.buffers()]
         state = [(t.data_ptr(), t._version, t.dtype, t.device) for t in tensors]
         known = self._nets.get(dtype)
         if known is None or known[0] != state:
-            known = self._nets[dtype] = (state, self.network.folded(dtype))
+            known = self._nets[dtype] = (state, self.network.fold(dtype))
         return known[1]
 
-    def places(self, image_hw: tuple[int, int], like: Tensor) -> Places:
-        """Where the anchors of an image are, in the dtype and on the device of `like`."""
+    def places(self, image_hw: tuple[int, int], like: Tensor) -> AnchorPlacement:
+        """An image's anchors, in the dtype and on the device of `like`."""
         key = (image_hw, like.dtype, like.device)
-        if key not in self._known_places:
-            if len(self._known_places) >= KNOWN_SIZES:
-                self._known_places.clear()
-            self._known_places[key] = self._places(image_hw, like)
-        return self._known_places[key]
+        if key not in self._cached_places:
+            if len(self._cached_places) >= MAX_CACHED_SIZES:
+                self._cached_places.clear()
+            self._cached_places[key] = self._places(image_hw, like)
+        return self._cached_places[key]
 
-    def _places(self, image_hw: tuple[int, int], like: Tensor) -> Places:
+    def _places(self, image_hw: tuple[int, int], like: Tensor) -> AnchorPlacement:
         sides = [side + -side % self.cfg.stride for side in image_hw]
         cells, strides, anchors = [], [], []
         for i, head in self.cfg.heads:
@@ -201,23 +213,23 @@ class YoloV3(Detector):
             cells.append(corners.repeat_interleave(count, 0))
             anchors.append(shapes.repeat(len(corners), 1))
             strides.append(like.new_full((len(corners) * count,), stride))
-        return Places(torch.cat(cells), torch.cat(strides), torch.cat(anchors))
+        return AnchorPlacement(torch.cat(cells), torch.cat(strides), torch.cat(anchors))
 
     def _interpret(
-        self, outputs: Sequence[Tensor], image_hw: tuple[int, int], scaled: _Scale | None = None
-    ) -> RawPredictions:
-        """Heads' channels are, anchor by anchor: x, y, width, height, objectness, classes."""
+        self, outputs: Sequence[Tensor], image_hw: tuple[int, int], gradient_scale: _GradientScale | None = None
+    ) -> AnchorPredictions:
+        """Decode the heads' channels, per anchor: x, y, width, height, objectness, classes."""
         numbers = 5 + len(self.classes)
         flat = [out.permute(0, 2, 3, 1).reshape(len(out), -1, numbers) for out in outputs]
         cells = torch.cat(flat, 1)
         if cells.dtype in _HALF:  # boxes need more than their 8 or 11 bits
-            cells = cells.float() if scaled is None else _FromHalf.apply(cells, scaled)
+            cells = cells.float() if gradient_scale is None else _FromHalf.apply(cells, gradient_scale)
         deltas, confidence, class_logits = cells.split((4, 1, len(self.classes)), -1)
         places = self.places(image_hw, cells)
-        # A cell's edge lies half a pixel before the centre of its first pixel, which is a whole number here.
+        # A cell's edge lies half a pixel before its first pixel's centre, which is an integer.
         centre = places.cells_xy + torch.sigmoid(deltas[..., :2]) * places.strides[:, None] - 0.5
-        half = places.anchors_wh * torch.exp(deltas[..., 2:].clamp_max(LARGEST_LOG)) / 2
-        return RawPredictions(
+        half = places.anchors_wh * torch.exp(deltas[..., 2:].clamp_max(MAX_LOG_SIZE)) / 2
+        return AnchorPredictions(
             boxes_xyxy=torch.cat((centre - half, centre + half), -1),
             deltas=deltas,
             class_logits=class_logits,
@@ -225,35 +237,36 @@ class YoloV3(Detector):
             image_hw=image_hw,
         )
 
-    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
-        """The paper's loss; what it aims at (`assign`) is taken as constant, as in the published code."""
+    def loss(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+        """The paper's loss; its targets (`assign`) are constant in the gradient, as in the published code."""
         return self.loss_terms(raw, self.assign(raw, targets))
 
     @torch.no_grad()
-    def assign(self, raw: RawPredictions, targets: Sequence[Targets]) -> Assignment:
-        """Give each object, in the cell of its centre, the anchor of all heads whose shape fits it best, and those
-        others that overlap its shape by more than their head's match_threshold.
+    def assign(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> YoloAssignment:
+        """Assign each object, in the cell of its centre, the anchor of all heads with the best shape, and those
+        others with an IoU above their head's match_threshold.
 
-        Raises ValueError where targets and images differ in number, or a label is no class of this detector.
+        Raises:
+            ValueError: Targets and images differ in number, or a label is not one of the classes.
         """
         if len(targets) != len(raw):
             raise ValueError(f"targets: expected {len(raw)}, one for each image, found {len(targets)}")
         like = raw.boxes_xyxy
         places = self.places(raw.image_hw, like)
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
-        meets_any = ~negative
-        image, anchor, truth, label, meeting, found_image = [], [], [], [], [], []
+        matches_any = ~negative
+        image, anchor, truth, label, matches, found_image = [], [], [], [], [], []
         thresholds = _ignore_thresholds(self.cfg, raw.image_hw, like)
         for b, target in enumerate(targets):
             ignore = target.ignore.to(like.device)
             wanted = target.boxes_xyxy.to(like)[~ignore]
             labels = target.labels.to(like.device)[~ignore]
-            # Regions are named once for each class.
+            # Ignored regions are listed once per class.
             regions = torch.unique(target.boxes_xyxy.to(like)[ignore], dim=0)
             overlap = boxes.iou_matrix(wanted, raw.boxes_xyxy[b])
             if len(wanted):
                 negative[b] = overlap.max(0).values <= thresholds
-                meets_any[b] = (overlap >= MEETING_IOU).any(0)
+                matches_any[b] = (overlap >= MEETING_IOU).any(0)
             if len(regions):
                 negative[b] &= ~(_covered(_anchor_boxes(places), regions) | _covered(raw.boxes_xyxy[b], regions))
             rows, columns = self._matches(wanted, raw.image_hw, places)
@@ -263,7 +276,7 @@ class YoloV3(Detector):
             label.append(labels[rows])
             found_image += [b] * len(wanted)
             logits = raw.confidence_logits[b].expand_as(overlap)
-            meeting.append(logits.masked_fill(overlap < MEETING_IOU, -torch.inf).max(1))
+            matches.append(logits.masked_fill(overlap < MEETING_IOU, -torch.inf).max(1))
         image = torch.tensor(image, dtype=torch.int64, device=like.device)
         anchor = torch.tensor(anchor, dtype=torch.int64, device=like.device)
         truth_xyxy, label = torch.cat(truth), torch.cat(label)
@@ -273,7 +286,7 @@ class YoloV3(Detector):
         centre, size = _centre_and_size(truth_xyxy)
         place = (centre - places.cells_xy[anchor]) / places.strides[anchor, None]
         share = size.prod(1) / (raw.image_hw[0] * raw.image_hw[1])
-        return Assignment(
+        return YoloAssignment(
             image=image,
             anchor=anchor,
             deltas=torch.cat((place.clamp(0, 1), torch.log(size / places.anchors_wh[anchor])), 1),
@@ -281,15 +294,15 @@ class YoloV3(Detector):
             labels=label,
             negative=negative,
             found_image=torch.tensor(found_image, dtype=torch.int64, device=like.device),
-            found_by=torch.cat([m.indices for m in meeting]),
-            found=torch.cat([m.values for m in meeting]) > -torch.inf,
-            alarm=negative & ~meets_any,
+            found_by=torch.cat([m.indices for m in matches]),
+            found=torch.cat([m.values for m in matches]) > -torch.inf,
+            alarm=negative & ~matches_any,
         )
 
     def _matches(
-        self, wanted_xyxy: Tensor, image_hw: tuple[int, int], places: Places
+        self, objects_xyxy: Tensor, image_hw: tuple[int, int], places: AnchorPlacement
     ) -> tuple[list[int], list[int]]:
-        """Rows of `wanted_xyxy` (N, 4), and the anchor of each; a row as often as anchors answer for it."""
+        """Rows of the objects (N, 4) and the anchor of each; an object's row occurs once per anchor."""
         shapes, offsets, strides, thresholds = [], [], [], []
         start = 0
         sides = [side + -side % self.cfg.stride for side in image_hw]
@@ -301,8 +314,8 @@ class YoloV3(Detector):
                 strides.append(stride)
                 thresholds.append(head.match_threshold)
             start += count * (sides[0] // stride) * (sides[1] // stride)
-        centre, size = _centre_and_size(wanted_xyxy)
-        overlaps = _shape_iou(size, wanted_xyxy.new_tensor(shapes)).tolist()
+        centre, size = _centre_and_size(objects_xyxy)
+        overlaps = _shape_iou(size, objects_xyxy.new_tensor(shapes)).tolist()
         taken: set[int] = set()
         rows, columns = [], []
         further: list[tuple[int, int]] = []
@@ -327,17 +340,16 @@ class YoloV3(Detector):
                 columns.append(index)
         return rows, columns
 
-    def loss_terms(self, raw: RawPredictions, assignment: Assignment) -> dict[str, Tensor]:
+    def loss_terms(self, raw: AnchorPredictions, assignment: YoloAssignment) -> dict[str, Tensor]:
         """Sums over the batch, divided by its objects (1 where there is none); their sum, and what attacks raise.
 
-        Box: binary cross entropy of x and y in their cell, less what it is where they are right, and half the
-        squared error of the logarithms of width and height, both times `scales`; confidence: binary cross entropy
-        of objectness over anchors that answer for an object or must be silent; class: binary cross entropy of each
-        class. Their gradients are those of the published code, whose squared errors of sigmoids leave out the
-        sigmoid's own slope.
+        Box: binary cross entropy of x and y in their cell, minus its minimum, and half the squared error of the
+        logarithms of width and height, both times `scales`; confidence: binary cross entropy of objectness over
+        anchors that predict an object or must be silent; class: binary cross entropy per class. Their gradients are
+        those of the published code, which uses squared errors of sigmoids and omits the sigmoid's slope.
 
-        "objectness" is a squared error, so that no object outweighs all others: 1 less the confidence of the most
-        confident anchor whose box meets the object, and the confidences of anchors that meet none.
+        "objectness" is a squared error, so that no object dominates: 1 minus the confidence of the most
+        confident matching anchor, and the confidences of anchors that match none.
         """
         image, anchor = assignment.image, assignment.anchor
         objects = max(len(assignment.found), 1)
@@ -364,17 +376,17 @@ class YoloV3(Detector):
             "objectness": (unseen + false) / objects,
         }
 
-    def candidates(self, raw: RawPredictions) -> Candidates:
+    def candidates(self, raw: AnchorPredictions) -> Candidates:
         """Every anchor; score = objectness x class probability."""
         logs = F.logsigmoid(raw.confidence_logits[0])[:, None] + F.logsigmoid(raw.class_logits[0])
         return Candidates(raw.boxes_xyxy[0][:, None], logs)
 
     @torch.no_grad()
-    def decode(self, raw: RawPredictions) -> list[Detections]:
-        """Score = objectness x class probability, each class by itself; NMS at 0.45 in it, score >= 0.005."""
+    def decode(self, raw: AnchorPredictions) -> list[Detections]:
+        """Score = objectness x class probability, per class; NMS at IoU 0.45 per class, score >= 0.005."""
         found = []
         for b, confidence in enumerate(torch.sigmoid(raw.confidence_logits)):
-            # No score exceeds its confidence, and few of the anchors have any.
+            # A score never exceeds its confidence, and few anchors are confident.
             (likely,) = torch.nonzero(confidence >= SCORE_MINIMUM, as_tuple=True)
             scores = confidence[likely, None] * torch.sigmoid(raw.class_logits[b, likely])
             flat = scores.flatten()
@@ -388,32 +400,32 @@ class YoloV3(Detector):
 
 
 class YoloV3Tiny(YoloV3):
-    """The published small one: poolings instead of residual blocks, two heads."""
+    """The published small variant: poolings instead of residual blocks, two heads."""
 
     name = "yolov3-tiny"
     layout = staticmethod(layouts.yolov3_tiny)
 
 
 class YoloV3Slim(YoloV3):
-    """A narrow Darknet with three heads, for processors without a GPU."""
+    """A narrow Darknet with three heads, for CPUs."""
 
     name = "yolov3-slim"
     layout = staticmethod(layouts.yolov3_slim)
 
 
-class _Scale:
-    """What a gradient was multiplied by on its way through half precision."""
+class _GradientScale:
+    """The factor of a gradient in half precision."""
 
     def __init__(self) -> None:
         self.factor: Tensor | None = None
 
 
 class _ToHalf(torch.autograd.Function):
-    """Images into half precision; back, the gradient loses the factor that `_FromHalf` gave it."""
+    """Convert images to half precision; backward, undo the factor of `_FromHalf`."""
 
     @staticmethod
-    def forward(ctx: Any, images: Tensor, dtype: torch.dtype, scaled: _Scale) -> Tensor:
-        ctx.dtype, ctx.scaled = images.dtype, scaled
+    def forward(ctx: Any, images: Tensor, dtype: torch.dtype, gradient_scale: _GradientScale) -> Tensor:
+        ctx.dtype, ctx.scaled = images.dtype, gradient_scale
         return images.to(dtype)
 
     @staticmethod
@@ -425,13 +437,13 @@ class _ToHalf(torch.autograd.Function):
 
 
 class _FromHalf(torch.autograd.Function):
-    """Half precision to float32. Float16's smallest number is 6e-8, and gradients of one confidence are smaller:
-    back, they are carried relative to the largest.
+    """Convert to float32; backward, scale the gradient relative to its maximum, because gradients of one
+    confidence lie below float16's smallest number, 6e-8.
     """
 
     @staticmethod
-    def forward(ctx: Any, cells: Tensor, scaled: _Scale) -> Tensor:
-        ctx.dtype, ctx.scaled = cells.dtype, scaled
+    def forward(ctx: Any, cells: Tensor, gradient_scale: _GradientScale) -> Tensor:
+        ctx.dtype, ctx.scaled = cells.dtype, gradient_scale
         return cells.float()
 
     @staticmethod
@@ -450,8 +462,8 @@ def _padded(images: Tensor, stride: int) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last)
 
 
-def _ignore_thresholds(cfg: Cfg, image_hw: tuple[int, int], like: Tensor) -> Tensor:
-    """(A,) the overlap with an object beyond which an anchor need not be silent."""
+def _ignore_thresholds(cfg: DarknetCfg, image_hw: tuple[int, int], like: Tensor) -> Tensor:
+    """(A,) IoU with an object beyond which an anchor need not be silent."""
     sides = [side + -side % cfg.stride for side in image_hw]
     parts = []
     for i, head in cfg.heads:
@@ -460,26 +472,26 @@ def _ignore_thresholds(cfg: Cfg, image_hw: tuple[int, int], like: Tensor) -> Ten
     return torch.cat(parts)
 
 
-def _anchor_boxes(places: Places) -> Tensor:
+def _anchor_boxes(places: AnchorPlacement) -> Tensor:
     """Anchors (A, 4) px around the middle of their cells."""
     centre = places.cells_xy + places.strides[:, None] / 2 - 0.5
     return torch.cat((centre - places.anchors_wh / 2, centre + places.anchors_wh / 2), -1)
 
 
 def _covered(candidates_xyxy: Tensor, regions_xyxy: Tensor) -> Tensor:
-    """Candidates (N,) of which a region covers more than IGNORE_OVERLAP."""
+    """(N,) bool: whether a region covers more than IGNORE_OVERLAP of a candidate."""
     shared = boxes.intersection_matrix(regions_xyxy, candidates_xyxy)
     return (shared > IGNORE_OVERLAP * boxes.area(candidates_xyxy)).any(0)
 
 
 def _centre_and_size(boxes_xyxy: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres (N, 2) px from the image's edge, half a pixel before the centre of its first one; sizes (N, 2)."""
+    """Centres (N, 2) px from the image's edge, half a pixel before the first pixel's centre; sizes (N, 2)."""
     top_left, bottom_right = boxes_xyxy[:, :2], boxes_xyxy[:, 2:]
     return (top_left + bottom_right) / 2 + 0.5, (bottom_right - top_left).clamp_min(1e-3)
 
 
 def _shape_iou(first_wh: Tensor, second_wh: Tensor) -> Tensor:
-    """IoU (N, M) of shapes (N, 2) and (M, 2) that have one centre."""
+    """IoU (N, M) of shapes (N, 2) and (M, 2) with one centre."""
     shared = torch.minimum(first_wh[:, None], second_wh[None]).prod(-1)
     return shared / (first_wh.prod(-1)[:, None] + second_wh.prod(-1)[None] - shared)
 

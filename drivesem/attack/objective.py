@@ -1,70 +1,66 @@
-"""theta -> loss: the one place where scene, renderer, labels and detector meet."""
+"""The loss of theta: an attack's objective on one scene, from renderer, labels and detector."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from detectors.base import Detector, Predictor, RawPredictions, predict
-from detectors.incremental.reference import LIMIT_MB, Reference
+from detectors.base import AnchorPredictions, Detector, Predictor, predict, run_in_halves
+from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
-from detectors.memory import in_halves
 from detectors.types import Detections, Targets
-from drivesem.attack import detection_loss, goals
-from drivesem.attack.aims import EVERYTHING, Aim
-from drivesem.attack.fading import Fading
-from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack import losses
+from drivesem.attack.budgets import parse_budget, resolve_parameters
+from drivesem.attack.feasible.constraints import FeasibilityLimits
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.judging import JudgedClasses, t_star_of
-from drivesem.attack.labels import Difficulty, Labeller, LabelMode, MovedLabels
-from drivesem.attack.methods.base import GRADIENT_PASSES, Group, Problem, Score, Views
+from drivesem.attack.labels import Difficulty, Labeller, LabelMode, SceneLabels
+from drivesem.attack.methods.base import GRADIENT_PASSES, MarginOracle, ParameterGroup, Problem, Score
 from drivesem.attack.space import Parameter, ParameterSpace
-from drivesem.config.blocks import KEEP_MB
+from drivesem.attack.targets import ALL_TARGETS, EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attack.visibility import VisibilityUnderWeather
+from drivesem.config.commands import AttackConfig
+from drivesem.config.options import DEFAULT_KEEP_MB
 from drivesem.evaluation import failures
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.io import as_written
+from scene_ir.io import round_to_8bit
 from scene_ir.render.compositor import Compositor, render_batch
+from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Render, SceneIR
 
-OF_DETECTIONS = ("objectness", *goals.GOALS)
-"""Terms that need no more than detections."""
-_REMEMBERED = 3
-"""Evaluated thetas kept: what an attack scores at its end, so that its choice need not be rendered once more."""
+GRADIENT_FREE_TERMS = ("objectness", *losses.GOALS)
+"""Terms that need detections only."""
+_RECENT = 3
+"""Number of cached evaluations: an attack's last scores, so that its result need not be rendered again."""
 
 
 @dataclass(frozen=True, slots=True)
-class Rendered:
-    """One theta, rendered, detected and labelled; carries no gradient. detections: labels are indices into the
-    judged classes. loss: the objective, by its own labels.
-    """
+class RenderEvaluation:
+    """One state of the scene, rendered, detected and labelled, without gradients."""
 
     scene: SceneIR
+    """The scene at theta."""
     render: Render
+    """Its render, rounded to 8 bits."""
     detections: Detections
-    paper: MovedLabels
-    moved: MovedLabels
+    """Detections; labels are indices into the evaluated classes."""
+    paper: SceneLabels
+    """The benign labels."""
+    moved: SceneLabels
+    """Labels that follow the vehicles."""
     loss: float
+    """The objective."""
 
 
 class Objective:
-    """What an attack raises, as a function of theta (D,).
+    """The loss that an attack raises, as a function of theta (D,).
 
-    label_mode: the labels the loss aims at, `moved` or, as in the paper, the benign ones, which reward drifting
-    away from the label. They are constant in the gradient. term: one of `goals.GOALS`, or a key of
-    `Detector.loss`; a detector without a gradient has OF_DETECTIONS only. difficulty: what is judged. t_star:
-    score from which a detection counts; by default the detector's own. aim: what counts as a failure, and is
-    raised; by default everything. whole: the detector always sees whole pictures; else only what vehicles change
-    of the benign one is computed again, where the detector's layers are known (`detectors.incremental`). keep_mb:
-    of layers of pictures that are kept for that, those of `truth.views` included.
-    Raises DetectorError where the detector knows no cars, or does not tell the candidates that a goal needs,
-    RangeError where it has no such term.
-
-    passes: of the detector so far, a gradient counted as GRADIENT_PASSES; the benign picture's is the first.
+    `passes` counts detector passes so far, a gradient as GRADIENT_PASSES; the benign picture's is the first.
     """
 
     def __init__(
@@ -76,17 +72,38 @@ class Objective:
         term: str = "objectness",
         difficulty: Difficulty | None = None,
         t_star: float | None = None,
-        aim: Aim = EVERYTHING,
+        aim: TargetSelection = ALL_TARGETS,
         whole: bool = False,
-        keep_mb: float = KEEP_MB,
+        keep_mb: float = DEFAULT_KEEP_MB,
     ) -> None:
+        """Render and evaluate the benign scene.
+
+        Args:
+            compositor: renders the scene.
+            space: the parameter space of the scene.
+            detector: the detector under attack.
+            label_mode: labels of the loss, constant in its gradient: `moved`, or `paper`, the benign labels, which
+                reward drifting away from the label.
+            term: one of `losses.GOALS`, or a term of `Detector.loss`; a detector without a gradient has
+                GRADIENT_FREE_TERMS only.
+            difficulty: which objects are evaluated.
+            t_star: score from which a detection counts; None: the detector's own.
+            aim: which failures count and are sought; by default all.
+            whole: whether the detector always evaluates whole pictures, instead of only what differs from the
+                benign one (`detectors.incremental`).
+            keep_mb: limit on cached layers in MB, those of `failures.margin_oracle` included.
+
+        Raises:
+            DetectorError: the detector knows no cars, or does not provide the candidates that a goal needs.
+            RangeError: there is no such term.
+        """
         self.compositor = compositor
         self.space = space
         self.detector = detector
         self.label_mode: LabelMode = label_mode
         self.term = term
-        self.t_star = t_star_of(detector, t_star)
-        self.judged = JudgedClasses.of(detector)
+        self.t_star = resolve_t_star(detector, t_star)
+        self.classes = EvaluatedClasses.from_detector(detector)
         self.aim = aim
         self.difficulty = difficulty or Difficulty()
         with torch.no_grad():
@@ -95,11 +112,11 @@ class Objective:
         self._labeller = Labeller(base, base_render, self.difficulty)
         self.keep_mb = keep_mb
         self._whole = True  # the reference comes first
-        self._reference: Reference | None = None
-        self._benign = self.look(base, base_render)
+        self._reference: ReferencePass | None = None
+        self._benign = self.evaluate_render(base, base_render)
         self._whole = whole
         self.passes = 1
-        self._recent: deque[tuple[Tensor, Rendered]] = deque(maxlen=_REMEMBERED)
+        self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
         self._previews: dict[bytes, Score] = {}
 
@@ -109,63 +126,86 @@ class Objective:
         return self._labeller
 
     @property
-    def benign(self) -> Rendered:
+    def benign(self) -> RenderEvaluation:
         """The scene at theta = 0, re-rendered; where vehicles were exchanged, added or taken away, the one
         before.
         """
         return self._benign
 
+    @classmethod
+    def from_config(
+        cls, scene: SceneIR, detector: Predictor, config: AttackConfig, difficulty: Difficulty | None = None
+    ) -> Objective:
+        """The objective of an attack's settings on one scene.
+
+        Args:
+            scene: on the detector's device.
+            detector: the detector under attack.
+            config: the settings.
+            difficulty: which objects are evaluated.
+        """
+        budget, params = parse_budget(config.budget), resolve_parameters(config)
+        return cls(
+            Compositor(scene, RenderSettings(backend=config.backend)),
+            ParameterSpace(scene, params, budget, parametrisation=config.parametrisation),
+            detector,
+            config.objective_labels,
+            config.objective,
+            difficulty,
+            config.t_star,
+            TargetSelection.from_options(config.target_objects, config.target_classes),
+            config.whole,
+            config.keep_mb,
+        )
+
     def __call__(self, theta: Tensor) -> Tensor:
         """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
-        return _losses([self], [theta])[0]
+        return _compute_losses([self], [theta])[0]
 
-    def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
-        """Loss and its gradient (D,). Raises RangeError naming the coordinate where either is not finite."""
-        losses, gradients = self.loss_and_grad_many(theta[None])
-        return float(losses[0]), gradients[0]
-
-    def loss_and_grad_many(self, thetas: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses (B,) and gradients (B, D) at thetas (B, D), such as restarts: one step for all. Raises as
-        `loss_and_grad` does.
+    def loss_and_grad(self, theta: Tensor, feasible: FeasibleSet | None = None) -> tuple[float, Tensor]:
+        """Loss and its gradient (D,) at theta (D,), for the coordinates that `feasible` leaves free. Raises
+        RangeError naming the coordinate where either is not finite.
         """
-        if thetas.ndim != 2 or len(thetas) == 0 or thetas.shape[1] != self.space.dim:
-            raise ShapeError("thetas", f"(B, {self.space.dim})", tuple(thetas.shape))
-        outcome = _losses_and_gradients([self] * len(thetas), thetas.unbind())
-        return torch.stack([loss for loss, _ in outcome]), torch.stack([gradient for _, gradient in outcome])
+        leaf = theta.detach().clone().requires_grad_(True)
+        (loss,) = _compute_losses([self], [leaf])
+        (gradient,) = torch.autograd.grad(loss, leaf)
+        self.passes += GRADIENT_PASSES
+        self.space.check_gradient(gradient)
+        return float(loss.detach()), gradient if feasible is None else feasible.project_gradient(theta, gradient)
 
     @torch.no_grad()
-    def evaluate(self, theta: Tensor) -> Rendered:
+    def evaluate(self, theta: Tensor) -> RenderEvaluation:
         """Render, detect and label at theta (D,), without gradients."""
         if self.space.scene.before is None and torch.equal(theta, self.space.theta0):
             return self._benign
-        for known, rendered in self._recent:
-            if torch.equal(theta, known):
-                return rendered
+        for recent_theta, evaluation in self._recent:
+            if torch.equal(theta, recent_theta):
+                return evaluation
         scene = self.space.apply(self.space.scene, theta)
         self.passes += 1
-        rendered = self.look(scene, self.compositor.render(scene))
-        self._recent.append((theta.clone(), rendered))
-        return rendered
+        evaluation = self.evaluate_render(scene, self.compositor.render(scene))
+        self._recent.append((theta.clone(), evaluation))
+        return evaluation
 
-    def failures(self, rendered: Rendered, mode: LabelMode) -> failures.Failures:
-        """What the detector gets wrong in `rendered` and got right in the benign re-render, by one label mode."""
-        labels = rendered.moved if mode == "moved" else rendered.paper
-        return self._failures(labels, rendered.detections)
+    def failures(self, evaluation: RenderEvaluation, mode: LabelMode) -> failures.FrameFailures:
+        """Failures in `evaluation` that the benign re-render does not have, by the labels of one mode."""
+        labels = evaluation.moved if mode == "moved" else evaluation.paper
+        return self._failures(labels, evaluation.detections)
 
-    def _failures(self, labels: MovedLabels, detections: Detections) -> failures.Failures:
-        found = failures.find(
-            self.judged.targets(self._benign.paper.targets),
+    def _failures(self, labels: SceneLabels, detections: Detections) -> failures.FrameFailures:
+        all_failures = failures.find_failures(
+            self.classes.map_targets(self._benign.paper.targets),
             self._benign.detections,
-            self.judged.targets(labels.targets),
+            self.classes.map_targets(labels.targets),
             detections,
             self.t_star,
         )
-        return self.aim.failures(found, labels.targets, detections, self.judged.names)
+        return self.aim.failures(all_failures, labels.targets, detections, self.classes.names)
 
     def score(self, theta: Tensor) -> Score:
-        """What the detector makes of theta (D,): a render of its own, judged under both label modes.
+        """The score of theta (D,), from a render of its own, under both label modes.
 
-        Scores are kept, which are small, so that a search without gradient pays for each theta once.
+        Scores are cached, so that a gradient-free search pays for each theta once.
         """
         key = _key(theta)
         if key not in self._scores:
@@ -174,14 +214,14 @@ class Objective:
         return self._scores[key]
 
     def preview(self, theta: Tensor) -> Score | None:
-        """What the gradient pass at theta (D,) saw, if there was one: of an image that is not rounded to 8 bits,
-        and in the precision of gradients.
+        """The score seen by the gradient pass at theta (D,), None without one: of an image that is not rounded to
+        8 bits, in the precision of gradients.
         """
         return self._previews.get(_key(theta))
 
-    def _score(self, loss: float, moved: MovedLabels, detections: Detections) -> Score:
+    def _score(self, loss: float, moved: SceneLabels, detections: Detections) -> Score:
         failed = self._failures(moved, detections)
-        # The projection takes cars for boxes, behind which another may lie from the start; a render knows.
+        # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
         hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
         return Score(
             loss=loss,
@@ -192,19 +232,22 @@ class Objective:
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
 
-    def feasible_set(self, limits: Limits | None = None, only_bounds: bool = False) -> FeasibleSet:
-        """What can be, and is seen through the weather as far as difficulty asks for it."""
-        fades, least = None, self.difficulty.min_contrast
-        if least > 0 and Parameter.WEATHER in self.space.params:
-            seen = ~self._labeller.paper().ignore.cpu().numpy()
+    def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:
+        """The feasible set of the scene; weather keeps objects visible as far as `difficulty` requires."""
+        find_invisible, min_contrast = None, self.difficulty.min_contrast
+        if min_contrast > 0 and Parameter.WEATHER in self.space.params:
+            visible = ~self._labeller.paper().ignore.cpu().numpy()
             environment = self.space.scene.environment
-            fades = Fading(self._benign.render, environment, self.compositor.air, seen, least)
-        return FeasibleSet(self.space, limits, only_bounds, fades)
+            air = self.compositor.air
+            find_invisible = VisibilityUnderWeather(self._benign.render, environment, air, visible, min_contrast)
+        return FeasibleSet(self.space, limits, only_bounds, find_invisible)
 
-    def problem(self, feasible: FeasibleSet, keep_last: bool = False, views: Views | None = None) -> Problem:
-        """This objective as attacks see it. keep_last, views: as of `Problem`."""
+    def problem(
+        self, feasible: FeasibleSet, keep_last: bool = False, margin_oracle: MarginOracle | None = None
+    ) -> Problem:
+        """This objective on a feasible set, as attacks use it; `keep_last`, `margin_oracle`: see `Problem`."""
         return Problem(
-            loss_and_grad=lambda theta: self._along(feasible, theta),
+            loss_and_grad=partial(self.loss_and_grad, feasible=feasible),
             project=feasible.project,
             score=self.score,
             step=self.space.step,
@@ -213,57 +256,50 @@ class Objective:
             groups=tuple(self._group(parameter, where) for parameter, where in self.space.blocks.items()),
             preview=self.preview,
             keep_last=keep_last,
-            views=views,
+            margin_oracle=margin_oracle,
         )
 
-    def _along(self, feasible: FeasibleSet, theta: Tensor) -> tuple[float, Tensor]:
-        """Loss and gradient (D,), as far as the feasible set leaves theta free."""
-        loss, gradient = self.loss_and_grad(theta)
-        return loss, feasible.along(theta, gradient)
-
-    def _group(self, parameter: Parameter, where: slice) -> Group:
-        owners = self.space.owners(parameter)
-        modes = ffd.low_modes() if parameter is Parameter.MESH else None
+    def _group(self, parameter: Parameter, where: slice) -> ParameterGroup:
+        owners = self.space.owner_count(parameter)
+        modes = ffd.low_order_modes() if parameter is Parameter.MESH else None
         smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.SIZE)
-        return Group(parameter.value, where, owners, modes, smooth)
+        return ParameterGroup(parameter.value, where, owners, modes, smooth)
 
-    def raw(self, render: Render) -> RawPredictions:
-        """What the detector says of a render of the scene, with a gradient wherever vehicles are drawn. RangeError
-        where it has none.
+    def predict(self, render: Render) -> AnchorPredictions:
+        """Raw predictions for a render of the scene, with a gradient wherever vehicles are drawn. Raises
+        RangeError for a detector without one.
         """
         image = render.image[None]
-        reference = None if render.drawn is None else self._kept()
-        if reference is None or render.drawn is None:
+        reference = None if render.vehicle_regions is None else self._reference_layers()
+        if reference is None or render.vehicle_regions is None:
             return self.differentiable(image)
-        return reference(image, [Rect(y0, y1, x0, x1) for x0, y0, x1, y1 in render.drawn.tolist()])
-
-    def sees_regions(self, render: Render) -> bool:
-        """Whether the detector is to see only what changes."""
-        return render.drawn is not None and self._kept() is not None
+        return reference(image, [Rect(y0, y1, x0, x1) for x0, y0, x1, y1 in render.vehicle_regions.tolist()])
 
     @property
     def whole(self) -> bool:
-        """Whether the detector always sees whole pictures."""
+        """Whether the detector always evaluates whole pictures."""
         return self._whole
 
     @property
-    def picture_mb(self) -> float:
-        """Of layers, the most that is kept of one picture."""
+    def layer_limit_mb(self) -> float:
+        """Limit on the cached layers of one picture, in MB."""
         return min(LIMIT_MB, self.keep_mb)
 
     @property
-    def kept_mb(self) -> float:
-        """Of the benign picture's layers."""
+    def reference_mb(self) -> float:
+        """Size of the benign picture's cached layers, in MB."""
         return 0.0 if self._reference is None else self._reference.bytes / 1e6
 
-    def forget(self) -> None:
-        """Let go of the benign picture's layers, which are made anew when they are asked for."""
+    def release_layers(self) -> None:
+        """Release the benign picture's layers, which are computed again when needed."""
         self._reference = None
 
-    def _kept(self) -> Reference | None:
-        """The benign picture's layers, or nothing where pictures are seen whole."""
+    def _reference_layers(self) -> ReferencePass | None:
+        """The benign picture's layers; None where pictures are evaluated whole."""
         if self._reference is None and not self._whole:
-            self._reference = Reference.of(self.differentiable, self._benign.render.image[None], self.picture_mb)
+            self._reference = ReferencePass.run(
+                self.differentiable, self._benign.render.image[None], self.layer_limit_mb
+            )
             self._whole = self._reference is None
         return self._reference
 
@@ -276,124 +312,120 @@ class Objective:
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> Detections:
-        """What the detector finds in an image (3, H, W), as far as it is judged."""
-        return self.judged.detections(predict(self.detector, image[None])[0])
+        """Detections of the evaluated classes in an image (3, H, W)."""
+        return self.classes.map_detections(predict(self.detector, image[None])[0])
 
-    def loss_of(self, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
+    def loss_from_predictions(self, raw: AnchorPredictions, scene: SceneIR, render: Render) -> Tensor:
         """The loss () of one image's predictions, by the labels of its scene and render."""
         labels = self._labeller.labels(self.label_mode, scene, render)
         return self._loss(self.differentiable, raw, labels.targets)
 
-    def loss_at(self, theta: Tensor, raw: RawPredictions, scene: SceneIR, render: Render) -> Tensor:
-        """The same at theta (D,); what is seen there is kept for `preview`."""
-        moved = self._labeller.moved(scene, render)
-        aimed = moved if self.label_mode == "moved" else self._labeller.paper()
-        loss = self._loss(self.differentiable, raw, aimed.targets)
-        with torch.no_grad():
-            found = self.judged.detections(self.differentiable.decode(raw)[0])
-        self._previews[_key(theta)] = self._score(float(loss.detach()), moved, found)
-        return loss
-
     @torch.no_grad()
-    def look(self, scene: SceneIR, render: Render) -> Rendered:
-        """A state of the scene that is drawn already, detected and labelled."""
-        # What is judged is what is written: a file holds 8 bits, and so does a camera's picture.
-        render = replace(render, image=as_written(render.image))
+    def evaluate_render(self, scene: SceneIR, render: Render) -> RenderEvaluation:
+        """Detect and label a rendered state of the scene."""
+        # Evaluate what is written: a file holds 8 bits, and so does a camera's picture.
+        render = replace(render, image=round_to_8bit(render.image))
         paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):
-            raw = self.raw(render)
+            raw = self.predict(render)
             loss = float(self._loss(self.detector, raw, labels))
-            found = self.judged.detections(self.detector.decode(raw)[0])
+            detections = self.classes.map_detections(self.detector.decode(raw)[0])
         else:
-            found = self.detect(render.image)
-            loss = self._loss_of_detections(found, labels)
-        return Rendered(scene, render, found, paper, moved, loss)
+            detections = self.detect(render.image)
+            loss = self._loss_without_gradient(detections, labels)
+        return RenderEvaluation(scene, render, detections, paper, moved, loss)
 
-    def _loss(self, detector: Detector, raw: RawPredictions, labels: Targets) -> Tensor:
-        targets = self.judged.own_targets(self.judged.targets(self.aim.targets(labels)))
-        if self.term in goals.GOALS:
-            known = [detector.classes.index(name) for name in self.aim.classes_of(self.judged.names)]
-            loss = goals.goal(self.term, detector.candidates(raw), targets, self.t_star, known)
+    def _loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> Tensor:
+        targets = self.classes.to_detector_targets(self.classes.map_targets(self.aim.targets(labels)))
+        if self.term in losses.GOALS:
+            columns = [detector.classes.index(name) for name in self.aim.classes_of(self.classes.names)]
+            loss = losses.goal_loss(self.term, detector.candidates(raw), targets, self.t_star, columns)
         else:
             terms = detector.loss(raw, [targets])
-            self._check_term((*terms, *goals.GOALS))
+            self._check_term((*terms, *losses.GOALS))
             loss = terms[self.term]
         if not bool(torch.isfinite(loss)):
             raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
         return loss
 
-    def _loss_of_detections(self, found: Detections, labels: Targets) -> float:
-        """The same where there is no gradient, of judged detections."""
-        self._check_term(OF_DETECTIONS)
-        names, targets = self.judged.names, self.judged.targets(self.aim.targets(labels))
-        if self.term not in goals.GOALS:
-            return detection_loss.objectness(targets, found)
-        known = [names.index(name) for name in self.aim.classes_of(names)]
-        return float(goals.goal(self.term, goals.of_detections(found, len(names)), targets, self.t_star, known))
+    def _loss_without_gradient(self, detections: Detections, labels: Targets) -> float:
+        self._check_term(GRADIENT_FREE_TERMS)
+        names, targets = self.classes.names, self.classes.map_targets(self.aim.targets(labels))
+        if self.term not in losses.GOALS:
+            return losses.detection_objectness(targets, detections)
+        columns = [names.index(name) for name in self.aim.classes_of(names)]
+        candidates = losses.candidates_from_detections(detections, len(names))
+        return float(losses.goal_loss(self.term, candidates, targets, self.t_star, columns))
 
     def _check_term(self, terms: Collection[str]) -> None:
         if self.term not in terms:
             raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
 
 
-class BatchObjective:
-    """Objectives of several scenes before one detector, which sees all images of a size at once.
+def compute_gradients(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """Losses and gradients at several thetas in one step, of one scene or of several.
 
-    Raises RangeError where there is no objective, or they have several detectors.
+    Args:
+        objectives: one for each theta, all of one detector.
+        thetas: (D,) each.
+
+    Returns:
+        Loss () and gradient (D,) at each theta. Split in halves where the device's memory cannot hold all at once.
+
+    Raises:
+        RangeError: there is no objective, they have several detectors, or a loss or gradient is not finite.
+        ShapeError: the numbers of thetas and objectives differ.
     """
+    detectors = {id(objective.detector) for objective in objectives}
+    if len(detectors) != 1:
+        raise RangeError("objectives", "one detector for all", f"{len(detectors)} detectors")
+    if len(thetas) != len(objectives):
+        raise ShapeError("thetas", f"{len(objectives)}, one for each objective", len(thetas))
+    return run_in_halves(_compute_batch, list(zip(objectives, thetas, strict=True)), "thetas")
 
-    def __init__(self, objectives: Sequence[Objective]) -> None:
-        detectors = {id(objective.detector) for objective in objectives}
-        if len(detectors) != 1:
-            raise RangeError("objectives", "one detector for all", f"{len(detectors)} detectors")
-        self.objectives = tuple(objectives)
 
-    def loss_and_grad(self, thetas: Sequence[Tensor]) -> list[tuple[float, Tensor]]:
-        """Loss and gradient (D,) of each scene at its own theta (D,). Raises as `Objective.loss_and_grad` does."""
-        if len(thetas) != len(self.objectives):
-            raise ShapeError("thetas", f"{len(self.objectives)}, one for each scene", len(thetas))
-        outcome = _losses_and_gradients(self.objectives, thetas)
-        return [(float(loss), gradient) for loss, gradient in outcome]
+def _compute_batch(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, Tensor]]:
+    objectives, thetas = zip(*pairs, strict=True)
+    leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
+    batch_losses = _compute_losses(objectives, leaves)
+    gradients = torch.autograd.grad(batch_losses, leaves)
+    for objective, gradient in zip(objectives, gradients, strict=True):
+        objective.passes += GRADIENT_PASSES
+        objective.space.check_gradient(gradient)
+    return [(loss.detach(), gradient) for loss, gradient in zip(batch_losses, gradients, strict=True)]
+
+
+def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[Tensor]:
+    """The loss () of each objective at its theta (D,), differentiable; all share one detector. Scores seen on the
+    way are cached for `Objective.preview`.
+    """
+    scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
+    renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
+    predictions: dict[int, AnchorPredictions] = {}
+    whole_images: dict[torch.Size, list[int]] = {}
+    for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
+        if render.vehicle_regions is not None and objective._reference_layers() is not None:
+            predictions[i] = objective.predict(render)
+        else:
+            whole_images.setdefault(render.image.shape, []).append(i)
+    for rows in whole_images.values():
+        images = [renders[i].image for i in rows]
+        raw = objectives[rows[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
+        # One by one: the loss of a batch is a mean over its images, weighted by their objects.
+        predictions |= {i: raw.select(row) for row, i in enumerate(rows)}
+    batch_losses = []
+    for i, (objective, theta) in enumerate(zip(objectives, thetas, strict=True)):
+        detector, raw = objective.differentiable, predictions[i]
+        moved = objective.labeller.moved(scenes[i], renders[i])
+        labels = moved if objective.label_mode == "moved" else objective.labeller.paper()
+        loss = objective._loss(detector, raw, labels.targets)
+        with torch.no_grad():
+            detections = objective.classes.map_detections(detector.decode(raw)[0])
+        objective._previews[_key(theta)] = objective._score(float(loss.detach()), moved, detections)
+        batch_losses.append(loss)
+    return batch_losses
 
 
 def _key(theta: Tensor) -> bytes:
     return theta.detach().cpu().numpy().tobytes()
-
-
-def _losses_and_gradients(
-    objectives: Sequence[Objective], thetas: Sequence[Tensor]
-) -> list[tuple[Tensor, Tensor]]:
-    """In halves, where the device's memory does not hold all renders and their layers."""
-    return in_halves(_together, list(zip(objectives, thetas, strict=True)), "thetas")
-
-
-def _together(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, Tensor]]:
-    objectives, thetas = zip(*pairs, strict=True)
-    leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
-    losses = _losses(objectives, leaves)
-    gradients = torch.autograd.grad(losses, leaves)
-    for objective, gradient in zip(objectives, gradients, strict=True):
-        objective.passes += GRADIENT_PASSES
-        objective.space.check_gradient(gradient)
-    return [(loss.detach(), gradient) for loss, gradient in zip(losses, gradients, strict=True)]
-
-
-def _losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[Tensor]:
-    """The loss () of each objective at its theta (D,), differentiable; all of them have one detector."""
-    scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
-    renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
-    of_size: dict[torch.Size, list[int]] = {}
-    losses: dict[int, Tensor] = {}
-    for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
-        if objective.sees_regions(render):
-            losses[i] = objective.loss_at(thetas[i], objective.raw(render), scenes[i], render)
-        else:
-            of_size.setdefault(render.image.shape, []).append(i)
-    for members in of_size.values():
-        images = [renders[i].image for i in members]
-        raw = objectives[members[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
-        for row, i in enumerate(members):
-            # Each by itself: the loss of a batch is a mean over its images, and weighs them by their objects.
-            losses[i] = objectives[i].loss_at(thetas[i], raw.one(row), scenes[i], renders[i])
-    return [losses[i] for i in range(len(renders))]

@@ -79,7 +79,7 @@ def test_a_cluster_that_loses_all_its_sizes_starts_anew() -> None:
 
     # Two first anchors are alike, so that the second of them has no size.
     sizes = np.array([[10.0, 10.0], [10.0, 12.0], [90.0, 90.0]])
-    found = anchors._settle(sizes, np.array([[10.0, 10.0], [10.0, 10.0]]))
+    found = anchors._run_k_means(sizes, np.array([[10.0, 10.0], [10.0, 10.0]]))
     assert sorted(map(tuple, found.tolist())) == [(10.0, 11.0), (90.0, 90.0)]
 
 

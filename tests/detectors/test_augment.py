@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from detectors.augment import AugmentSettings, cut_targets, degrade, mirror, recolour, view
+from detectors.augment import AugmentSettings, augment, crop_targets, degrade, flip_targets, jitter_colour
 from detectors.types import Targets
 
 QUIET = AugmentSettings(
@@ -40,7 +40,7 @@ def white_extent(image: torch.Tensor) -> list[float]:
 @pytest.mark.parametrize("seed", range(12))
 def test_boxes_follow_the_pixels(seed: int) -> None:
     image, targets = frame_with_block((140, 50, 189, 79))
-    seen, moved = view(image, targets, replace(QUIET, object_probability=1.0), np.random.default_rng(seed))
+    seen, moved = augment(image, targets, replace(QUIET, object_probability=1.0), np.random.default_rng(seed))
     assert seen.shape == (3, 96, 160)
     assert moved.labels.tolist() == [1]
     # Inclusive pixels against edges: at most one pixel, and the rounding of the zoom.
@@ -52,9 +52,9 @@ def test_view_is_a_function_of_frame_and_generator() -> None:
     settings = replace(
         AugmentSettings(window_hw=(96, 160)), blur_probability=1, noise_probability=1, jpeg_probability=1
     )
-    first, boxes = view(image, targets, settings, np.random.default_rng(5))
-    again, boxes_again = view(image, targets, settings, np.random.default_rng(5))
-    other, _ = view(image, targets, settings, np.random.default_rng(6))
+    first, boxes = augment(image, targets, settings, np.random.default_rng(5))
+    again, boxes_again = augment(image, targets, settings, np.random.default_rng(5))
+    other, _ = augment(image, targets, settings, np.random.default_rng(6))
     assert torch.equal(first, again)
     assert torch.equal(boxes.boxes_xyxy, boxes_again.boxes_xyxy)
     assert not torch.equal(first, other)
@@ -65,7 +65,7 @@ def test_a_frame_smaller_than_the_window_is_filled_with_the_mean_colour() -> Non
     image = np.zeros((40, 50, 3), np.uint8)
     nothing = Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
     settings = replace(QUIET, scale_probability=0, flip_probability=0)
-    seen, _ = view(image, nothing, settings, np.random.default_rng(0))
+    seen, _ = augment(image, nothing, settings, np.random.default_rng(0))
     outside = (seen * 255).round().permute(1, 2, 0).reshape(-1, 3).unique(dim=0).tolist()
     assert outside == [[0, 0, 0], [124, 117, 104]]
 
@@ -82,7 +82,7 @@ def test_a_frame_smaller_than_the_window_is_filled_with_the_mean_colour() -> Non
 )
 def test_cut_boxes(box: tuple, kept: bool, ignored: bool) -> None:
     targets = Targets(torch.tensor([box]).float(), torch.tensor([0]), torch.tensor([False]))
-    cut = cut_targets(targets, (0, 0), (1.0, 1.0), QUIET)
+    cut = crop_targets(targets, (0, 0), (1.0, 1.0), QUIET)
     assert len(cut) == int(kept)
     if kept:
         assert bool(cut.ignore[0]) is ignored
@@ -91,21 +91,21 @@ def test_cut_boxes(box: tuple, kept: bool, ignored: bool) -> None:
 
 def test_mirror_twice_is_the_same() -> None:
     targets = Targets(torch.tensor([[3.0, 5.0, 20.0, 30.0]]), torch.tensor([0]), torch.tensor([False]))
-    once = mirror(targets, 100)
+    once = flip_targets(targets, 100)
     assert once.boxes_xyxy.tolist() == [[79.0, 5.0, 96.0, 30.0]]
-    assert torch.equal(mirror(once, 100).boxes_xyxy, targets.boxes_xyxy)
+    assert torch.equal(flip_targets(once, 100).boxes_xyxy, targets.boxes_xyxy)
 
 
 def test_no_change_of_colour_is_none() -> None:
     image = torch.rand(3, 16, 24, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(recolour(image, QUIET, np.random.default_rng(0)), image)
+    torch.testing.assert_close(jitter_colour(image, QUIET, np.random.default_rng(0)), image)
     assert torch.equal(degrade(image, QUIET, np.random.default_rng(0)), image)
 
 
 def test_hue_and_saturation_keep_grey() -> None:
     grey = torch.full((3, 4, 4), 0.3)
     settings = replace(QUIET, hue_rad=0.5, hue_probability=1.0, saturation=0.8)
-    torch.testing.assert_close(recolour(grey, settings, np.random.default_rng(1)), grey)
+    torch.testing.assert_close(jitter_colour(grey, settings, np.random.default_rng(1)), grey)
 
 
 @pytest.mark.parametrize("name", ["blur_probability", "noise_probability", "jpeg_probability"])

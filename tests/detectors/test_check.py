@@ -133,13 +133,13 @@ def test_a_small_detector_keeps_its_contract() -> None:
     ("broken", "promise", "said"),
     [
         (Detached, "gradient to the image", "found zero everywhere"),
-        (Doubled, "gradient to the image", "off differences in float64"),
-        (Painter, "image untouched", "found them changed"),
+        (Doubled, "gradient to the image", "against differences in float64"),
+        (Painter, "image untouched", "expected unchanged images"),
         (Outside, "detections", "expected inside 0..95 x 0..63"),
         (WorstFirst, "detections", "expected best first"),
         (OtherLabels, "detections", "labels: expected 0..1, found 1 to 2"),
-        (Moving, "deterministic", "found another"),
-        (Silent, "planted prediction", "expected the planted box alone, found 0"),
+        (Moving, "deterministic", "expected identical detections"),
+        (Silent, "planted prediction", "expected only the injected box, found 0"),
         (Unnamed, "loss terms", "expected total and objectness, found total"),
         (Boundless, "loss terms", "expected a finite number"),
         (Elsewhere, "candidates", "expected every detection among them"),
@@ -151,8 +151,8 @@ def test_what_is_broken_is_named(broken: type[Small], promise: str, said: str) -
     report = check_detector(broken(), IMAGE_HW)
     found = {finding.name: finding for finding in report.failed}
     assert promise in found, report
-    assert said in found[promise].said
-    with pytest.raises(DetectorError, match=f"'small' does not keep its contract: .*{promise}"):
+    assert said in found[promise].detail
+    with pytest.raises(DetectorError, match=f"'small' violates the contract: .*{promise}"):
         report.require()
 
 
@@ -183,12 +183,12 @@ def test_raw_predictions_of_ones_own_need_a_hook() -> None:
     class _Plain(DensePredictions):
         planted = None
 
-        def one(self, index):
-            said = super().one(index)
+        def select(self, index):
+            said = super().select(index)
             return _Plain(said.boxes_xyxy, said.probabilities, said.image_hw)
 
     def plant(raw, box, label):
-        return DensePredictions(raw.boxes_xyxy, raw.probabilities, raw.image_hw).planted(box, label)
+        return DensePredictions(raw.boxes_xyxy, raw.probabilities, raw.image_hw).inject(box, label)
 
     def verdict(report):
         return next(f.verdict for f in report.findings if f.name == "planted prediction")
@@ -221,7 +221,7 @@ def test_a_planted_prediction_of_squeezedet_is_found() -> None:
     detector = SqueezeDet()
     raw = detector(torch.full((1, 3, 64, 128), 0.5))
     box = torch.tensor([20.0, 10, 90, 50])
-    (found,) = detector.decode(raw.planted(box, 2))
+    (found,) = detector.decode(raw.inject(box, 2))
     assert found.labels.tolist() == [2]
     torch.testing.assert_close(found.boxes_xyxy, box[None])
     assert float(found.scores[0]) > 0.999

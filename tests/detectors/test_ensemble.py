@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from detectors.base import DetectorError
-from detectors.ensemble import T_STAR, Ensemble, names_of
-from detectors.registry import code_of, load_detector, save_detector
+from detectors.ensemble import T_STAR, Ensemble, parse_member_names
+from detectors.registry import find_code_to_run, load_detector, save_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.types import Targets
 
@@ -32,11 +32,11 @@ def images() -> torch.Tensor:
 
 def test_a_loss_is_the_mean_of_the_members(both: Ensemble, images: torch.Tensor) -> None:
     raw = both(images)
-    members = [load_detector(name) for name in names_of(SPEC)]
+    members = [load_detector(name) for name in parse_member_names(SPEC)]
     for name, value in both.loss(raw, [CAR, CAR]).items():
         own = [float(one.loss(one(images), [CAR, CAR])[name]) for one in members]
         assert float(value) == pytest.approx(sum(own) / 2, rel=1e-4), name
-    assert (len(raw), len(raw.one(1))) == (2, 1)
+    assert (len(raw), len(raw.select(1))) == (2, 1)
     images = images.clone().requires_grad_(True)
     both.loss(both(images), [CAR, CAR])["objectness"].backward()
     assert images.grad is not None
@@ -93,5 +93,5 @@ def test_a_threshold_that_no_shift_moves_is_refused(t_star: float) -> None:
 
 
 def test_code_of_a_member_is_told() -> None:
-    assert code_of(SPEC) is None
-    assert code_of("ensemble:squeezedet+module:own.py") == code_of("module:own.py") == "own.py"
+    assert find_code_to_run(SPEC) is None
+    assert find_code_to_run("ensemble:squeezedet+module:own.py") == find_code_to_run("module:own.py") == "own.py"

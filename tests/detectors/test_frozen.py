@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from detectors.base import RawPredictions
-from detectors.convolving import Ordered
+from detectors.base import AnchorPredictions
+from detectors.convolution import OneDnnWeights
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 
@@ -35,13 +35,13 @@ def smooth(batch: int, height: int, width: int, dtype: torch.dtype = torch.float
     return (image / 3).clamp(0, 1)
 
 
-def functional(raw: RawPredictions) -> Tensor:
+def functional(raw: AnchorPredictions) -> Tensor:
     weight = torch.linspace(-1, 1, raw.deltas.numel(), dtype=raw.deltas.dtype).view_as(raw.deltas)
     total = raw.confidence_logits.sigmoid().square().sum() + raw.class_logits.square().sum()
     return total + (raw.deltas * weight).sum()
 
 
-def gradient(detector: SqueezeDet, images: Tensor) -> tuple[RawPredictions, Tensor]:
+def gradient(detector: SqueezeDet, images: Tensor) -> tuple[AnchorPredictions, Tensor]:
     leaf = images.clone().requires_grad_(True)
     raw = detector(leaf)
     (slope,) = torch.autograd.grad(functional(raw), leaf)
@@ -117,11 +117,11 @@ def test_onednns_order_of_the_weights_changes_no_number_but_by_rounding(
     images = smooth(batch, height, width, torch.float32)
     detector = shipped(torch.float32)
     raw, slope = gradient(detector, images)
-    assert isinstance(detector._frozen(coarse=False).stem.weight, Ordered)
+    assert isinstance(detector._frozen_layers(coarse=False).first_layers.weight, OneDnnWeights)
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
     other = shipped(torch.float32)
     plain_raw, plain = gradient(other, images)
-    assert not isinstance(other._frozen(coarse=False).stem.weight, Ordered)
+    assert not isinstance(other._frozen_layers(coarse=False).first_layers.weight, OneDnnWeights)
     for field in FIELDS:
         assert difference(getattr(raw, field), getattr(plain_raw, field)) < 1e-5
     assert difference(slope, plain) < 1e-4
@@ -159,10 +159,10 @@ def test_bfloat16_is_for_gradients_and_glances_only() -> None:
     exact, images = shipped(torch.float32), smooth(1, 120, 200, torch.float32)
     with torch.no_grad():
         assert torch.equal(coarse(images).confidence_logits, exact(images).confidence_logits)
-        assert torch.equal(exact.glance(images).confidence_logits, exact(images).confidence_logits)
+        assert torch.equal(exact.forward_for_search(images).confidence_logits, exact(images).confidence_logits)
     raw, slope = gradient(coarse, images)
     expected_raw, expected = gradient(exact, images)
-    glance = coarse.glance(images)
+    glance = coarse.forward_for_search(images)
     assert not glance.confidence_logits.requires_grad
     assert torch.equal(glance.confidence_logits, raw.confidence_logits)
     assert raw.boxes_xyxy.dtype == slope.dtype == torch.float32

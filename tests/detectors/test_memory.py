@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from detectors.base import DetectorError, predict
-from detectors.memory import in_halves
+from detectors.base import DetectorError, predict, run_in_halves
+from detectors.files import write_atomically
 from detectors.types import Detections
-from detectors.whole import write_whole
 
 
 class Few:
@@ -43,7 +42,7 @@ def test_images_are_looked_at_in_halves(
     torch.testing.assert_close(torch.cat([one.scores for one in found]), images.mean((1, 2, 3)))
     told = capsys.readouterr().err.splitlines()
     assert told[:1] == (
-        [] if most == 7 else ["drivesem: 7 images at once do not fit into the device's memory: trying 4"]
+        [] if most == 7 else ["drivesem: 7 images at once exceed the device's memory: trying 4"]
     )
 
 
@@ -60,13 +59,13 @@ def test_other_errors_are_not_tried_again() -> None:
         raise RuntimeError("shapes")
 
     with pytest.raises(RuntimeError, match="shapes"):
-        in_halves(fail, [1, 2], "numbers")
+        run_in_halves(fail, [1, 2], "numbers")
     assert calls == [2]
 
 
 def test_weights_that_cannot_be_written_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.weights"
-    write_whole(path, b"old")
+    write_atomically(path, b"old")
 
     def half(self: Path, data: bytes) -> None:
         with self.open("wb") as file:
@@ -75,7 +74,7 @@ def test_weights_that_cannot_be_written_are_named(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(Path, "write_bytes", half)
     with pytest.raises(DetectorError, match=r"a\.weights: expected a place .*, found no space left on device"):
-        write_whole(path, b"new")
+        write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -20,10 +20,10 @@ from detectors.planted import (
     PlantedDetector,
     PlantedFault,
     PlantedPredictor,
-    features,
-    parts_of,
-    seen_cars,
-    with_fault,
+    compute_features,
+    group_cars,
+    parse_planted_name,
+    plant_fault,
 )
 from detectors.registry import load_detector, load_predictor
 from detectors.squeezedet import SqueezeDet
@@ -76,7 +76,7 @@ def squeezedet() -> SqueezeDet:
     ],
 )
 def test_words_give_settings_and_settings_words(text: str) -> None:
-    assert PlantedFault.of(text).text == text
+    assert PlantedFault.parse(text).text == text
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_words_give_settings_and_settings_words(text: str) -> None:
 )
 def test_bad_words_are_one_line(text: str, said: str) -> None:
     with pytest.raises(DetectorError) as caught:
-        PlantedFault.of(text)
+        PlantedFault.parse(text)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -107,7 +107,7 @@ def test_features_by_hand() -> None:
     image = torch.full((1, 3, 40, 100), 0.2)
     image[:, :, 18:24, 24:36] = 0.6
     box = torch.tensor([[[19.5, 9.5, 39.5, 29.5]]])  # columns 20 to 39, rows 10 to 29
-    height, aspect, across, lightness, contrast = features(image, box)[:, 0, 0].tolist()
+    height, aspect, across, lightness, contrast = compute_features(image, box)[:, 0, 0].tolist()
     assert (height, aspect) == (20, 1)
     assert across == pytest.approx(0.295)
     # paint: columns 23.5 to 35.5, rows 17.5 to 24.5, of which the last row is 0.2
@@ -120,23 +120,25 @@ def test_pixels_that_an_edge_cuts_count_by_their_share() -> None:
     image = torch.zeros(1, 3, 20, 30)
     image[:, :, :, 15:] = 1
     # The paint's part is 12 of 20 px wide: columns 9.25 to 21.25 of which those from 14.5 on are white.
-    (lightness,) = features(image, torch.tensor([[[5.25, 0.0, 25.25, 19.0]]]), ("lightness",))[:, 0, 0].tolist()
+    (lightness,) = compute_features(image, torch.tensor([[[5.25, 0.0, 25.25, 19.0]]]), ("lightness",))[
+        :, 0, 0
+    ].tolist()
     assert lightness == pytest.approx((21.25 - 14.5) / 12, abs=1e-6)
 
 
 def test_features_have_gradients_to_boxes_and_pixels() -> None:
     image = picture(1, torch.float64)[:, :, :16, :24].clone().requires_grad_()
     placed = torch.tensor([[[3.3, 2.2, 14.1, 12.7], [8.4, 1.6, 20.3, 14.9]]], dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda i, b: features(i, b), (image, placed.requires_grad_()))
+    assert torch.autograd.gradcheck(lambda i, b: compute_features(i, b), (image, placed.requires_grad_()))
 
 
 def test_boxes_are_cut_at_the_border() -> None:
     inside, beyond = torch.tensor([[[0.0, 0, 50, 63]]]), torch.tensor([[[-9.0, -5, 50, 80]]])
-    assert torch.equal(features(picture(), inside), features(picture(), beyond))
+    assert torch.equal(compute_features(picture(), inside), compute_features(picture(), beyond))
 
 
 def test_a_box_without_an_area_has_features() -> None:
-    values = features(picture(), torch.tensor([[[200.0, 10, 210, 10]]]))
+    values = compute_features(picture(), torch.tensor([[[200.0, 10, 210, 10]]]))
     assert bool(torch.isfinite(values).all())
 
 
@@ -147,16 +149,16 @@ def test_outside_nothing_is_lowered_and_inside_by_the_depth(low: float, width: f
     reach = 10 * softness * width
     outside = torch.tensor([[low - reach, low + width + reach]], dtype=torch.float64)
     middle = torch.tensor([[low + width / 2]], dtype=torch.float64)
-    assert float(fault.depth * fault.share(outside).max()) < 1e-4
-    assert float(fault.share(middle)) > 0.78
+    assert float(fault.depth * fault.membership(outside).max()) < 1e-4
+    assert float(fault.membership(middle)) > 0.78
     assert fault.contains(middle).all()
     assert not fault.contains(outside).any()
 
 
 def test_a_pair_asks_for_both() -> None:
-    fault = PlantedFault.of("aspect=1:2,lightness=0.2:0.4")
+    fault = PlantedFault.parse("aspect=1:2,lightness=0.2:0.4")
     values = torch.tensor([[1.5, 1.5, 3.5], [0.3, 0.9, 0.3]])
-    assert fault.share(values).tolist() == pytest.approx([0.823, 0, 0], abs=2e-3)
+    assert fault.membership(values).tolist() == pytest.approx([0.823, 0, 0], abs=2e-3)
     assert fault.contains(values).tolist() == [True, False, False]
 
 
@@ -175,14 +177,14 @@ class Fixed(DenseDetector):
 
 
 def test_predictions_that_lie_on_each_other_are_one_car() -> None:
-    cars = seen_cars(Fixed.boxes, torch.tensor([0.9, 0.6, 0.8, 0.7, 0.01]))
+    cars = group_cars(Fixed.boxes, torch.tensor([0.9, 0.6, 0.8, 0.7, 0.01]))
     assert cars.rows.tolist() == [0, 1, 2, 3]
     assert cars.car.tolist() == [0, 0, 1, 1]
     mean = (0.81 * 25 + 0.36 * 30) / (0.81 + 0.36)
     torch.testing.assert_close(cars.boxes_xyxy[0, 3], torch.tensor(mean))
-    nothing = seen_cars(Fixed.boxes, torch.zeros(5))
+    nothing = group_cars(Fixed.boxes, torch.zeros(5))
     assert (len(nothing.rows), tuple(nothing.boxes_xyxy.shape)) == (0, (0, 4))
-    point = seen_cars(torch.tensor([[3.0, 3, 3, 3]]), torch.tensor([0.5]))
+    point = group_cars(torch.tensor([[3.0, 3, 3, 3]]), torch.tensor([0.5]))
     assert point.boxes_xyxy.tolist() == [[3, 3, 3, 3]]
 
 
@@ -190,18 +192,18 @@ def test_all_that_is_said_of_a_car_in_the_band_is_lowered_and_nothing_else() -> 
     """The first car's mean box is 21.5 px high, its second prediction's own is 25."""
     inner = Fixed()
     before = inner(picture())
-    after = with_fault(inner, PlantedFault.of("height_px=18:23,softness=0.02")).forward(picture())
+    after = plant_fault(inner, PlantedFault.parse("height_px=18:23,softness=0.02")).forward(picture())
     fallen = before.probabilities[0, :, 0].logit() - after.probabilities[0, :, 0].logit()
     assert fallen[:2].tolist() == pytest.approx([DEPTH, DEPTH], abs=1e-2)
     torch.testing.assert_close(after.probabilities[0, 2:], before.probabilities[0, 2:])
     assert torch.equal(after.boxes_xyxy, before.boxes_xyxy)
-    (found,) = with_fault(inner, PlantedFault.of("height_px=18:23")).decode(after)
+    (found,) = plant_fault(inner, PlantedFault.parse("height_px=18:23")).decode(after)
     assert found.labels[found.scores > 0.5].tolist() == [1, 0]
 
 
 def test_a_bus_stays_in_a_car_s_band() -> None:
     inner = Fixed()
-    after = with_fault(inner, PlantedFault.of("height_px=30:50,softness=0.02")).forward(picture())
+    after = plant_fault(inner, PlantedFault.parse("height_px=30:50,softness=0.02")).forward(picture())
     assert after.probabilities[0, :, 0].tolist() == pytest.approx([0.9, 0.6, 0.0013, 0.0008, 0], abs=1e-4)
     assert after.probabilities[0, 4, 1] == inner(picture()).probabilities[0, 4, 1]
 
@@ -209,7 +211,7 @@ def test_a_bus_stays_in_a_car_s_band() -> None:
 def test_of_anchors_only_those_that_say_car_are_lowered() -> None:
     inner = squeezedet()
     before = inner(picture())
-    after = with_fault(inner, PlantedFault.of("height_px=10:100,softness=0.02")).forward(picture())
+    after = plant_fault(inner, PlantedFault.parse("height_px=10:100,softness=0.02")).forward(picture())
     fallen = (before.confidence_logits - after.confidence_logits)[0]
     candidates = inner.candidates(before)
     counts = candidates.log_scores[:, 0].exp() >= FLOOR
@@ -220,7 +222,7 @@ def test_of_anchors_only_those_that_say_car_are_lowered() -> None:
     assert float(torch.minimum(within, (within - DEPTH).abs()).abs().quantile(0.9)) < 0.1
     assert float(within.max()) == pytest.approx(DEPTH, abs=0.1)
     assert not fallen[~(counts & car)].any()
-    told = with_fault(inner, PlantedFault.of("aspect=1:2")).candidates(after)  # type: ignore[attr-defined]
+    told = plant_fault(inner, PlantedFault.parse("aspect=1:2")).candidates(after)  # type: ignore[attr-defined]
     assert torch.equal(told.log_scores, inner.candidates(after).log_scores)
 
 
@@ -229,7 +231,7 @@ def test_of_anchors_only_those_that_say_car_are_lowered() -> None:
     "words", ["height_px=20:36,softness=0.3", "lightness=0.4:0.55,aspect=0.7:1.6,softness=0.3"]
 )
 def test_the_contract_is_kept(inner: type[Detector], words: str) -> None:
-    detector = with_fault(inner(), PlantedFault.of(words))
+    detector = plant_fault(inner(), PlantedFault.parse(words))
     report = check_detector(detector, HW).require()
     assert report.gradients
     tried = {finding.name for finding in report.findings if finding.verdict == "ok"}
@@ -240,7 +242,7 @@ def test_the_contract_is_kept(inner: type[Detector], words: str) -> None:
     "words", ["lightness=0.47:0.53", "contrast=0.2:0.25", "height_px=23:31,lightness=0.45:0.52"]
 )
 def test_the_gradient_is_that_of_differences(words: str) -> None:
-    detector = PlantedDetector(Cells().double(), PlantedFault.of(words)).requires_grad_(False)
+    detector = PlantedDetector(Cells().double(), PlantedFault.parse(words)).requires_grad_(False)
     image = picture(2, torch.float64)
     live = image.clone().requires_grad_()
 
@@ -271,7 +273,7 @@ class Plain:
 
 
 def test_a_detector_without_gradients_can_have_a_fault_too() -> None:
-    detector = with_fault(Plain(), PlantedFault.of("height_px=20:40"))
+    detector = plant_fault(Plain(), PlantedFault.parse("height_px=20:40"))
     assert isinstance(detector, PlantedPredictor)
     (found,) = predict(detector, picture())
     assert found.labels.tolist() == [0, 1]
@@ -280,7 +282,7 @@ def test_a_detector_without_gradients_can_have_a_fault_too() -> None:
 
 
 def test_names_of_detectors_with_faults() -> None:
-    assert parts_of("planted:aspect=1:2") == (PlantedFault.of("aspect=1:2"), "squeezedet")
+    assert parse_planted_name("planted:aspect=1:2") == (PlantedFault.parse("aspect=1:2"), "squeezedet")
     name = "planted:aspect=1:2@yolov3-slim"
     detector = load_detector(name)
     assert isinstance(detector, PlantedDetector)
@@ -301,14 +303,14 @@ def test_what_cannot_have_a_fault() -> None:
         def forward(self, images: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
             return images
 
-    fault = PlantedFault.of("aspect=1:2")
+    fault = PlantedFault.parse("aspect=1:2")
     with pytest.raises(DetectorError, match="expected one that knows Car"):
-        with_fault(Blind(), fault)
-    with pytest.raises(DetectorError, match="raw predictions that can be lowered, found Tensor"):
-        with_fault(Own(), fault).forward(picture())
+        plant_fault(Blind(), fault)
+    with pytest.raises(DetectorError, match="raw predictions with `suppress`, found Tensor"):
+        plant_fault(Own(), fault).forward(picture())
 
 
 def test_every_feature_can_be_in_a_fault() -> None:
     fault = PlantedFault(tuple(Band(name, 0.0, 1.0) for name in FEATURES))
-    assert fault.names == FEATURES
-    assert PlantedFault.of(fault.text) == fault
+    assert fault.feature_names == FEATURES
+    assert PlantedFault.parse(fault.text) == fault

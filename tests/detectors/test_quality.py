@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from detectors import grid, quality
-from detectors.base import RawPredictions
+from detectors.base import AnchorPredictions
 from detectors.squeezedet import SqueezeDet
 from detectors.types import Targets
 
@@ -18,7 +18,7 @@ ANCHORS = torch.tensor([[0.0, 0, 16, 16], [8.0, 0, 24, 16], [16.0, 0, 32, 16], [
 
 def test_an_object_is_answered_by_the_anchors_near_its_best_one() -> None:
     # IoU with the object: 1, 1/3 (not 0.6 of the best), 0, 0
-    found = quality.answers(ANCHORS, ANCHORS, ANCHORS[:1], torch.tensor([0]))
+    found = quality.choose_responsible_anchors(ANCHORS, ANCHORS, ANCHORS[:1], torch.tensor([0]))
     assert found.anchor.tolist() == [0]
     assert found.candidate.tolist() == [True]
     assert found.quality.tolist() == [1.0]
@@ -26,7 +26,7 @@ def test_an_object_is_answered_by_the_anchors_near_its_best_one() -> None:
 
 def test_what_lies_halfway_has_two_candidates_of_equal_weight() -> None:
     halfway = torch.tensor([[4.0, 0, 20, 16]])  # 12 px of 16 with the first two anchors: IoU 0.6 each
-    found = quality.answers(ANCHORS, ANCHORS, halfway, torch.tensor([1]))
+    found = quality.choose_responsible_anchors(ANCHORS, ANCHORS, halfway, torch.tensor([1]))
     assert found.anchor.tolist() == [0, 1]
     assert found.candidate.tolist() == [True, True]
     assert found.quality.tolist() == pytest.approx([0.6, 0.6])
@@ -35,35 +35,37 @@ def test_what_lies_halfway_has_two_candidates_of_equal_weight() -> None:
 
 def test_an_anchor_goes_to_the_object_it_overlaps_more_but_for_one_that_is_anothers_own() -> None:
     objects = torch.tensor([[0.0, 0, 16, 16], [2.0, 0, 18, 16]])
-    contested = quality.answers(ANCHORS, ANCHORS, objects, torch.tensor([0, 1]))
+    contested = quality.choose_responsible_anchors(ANCHORS, ANCHORS, objects, torch.tensor([0, 1]))
     assert dict(zip(contested.anchor.tolist(), contested.object.tolist(), strict=True)) == {0: 0, 1: 1}
-    swapped = quality.answers(ANCHORS, ANCHORS, objects, torch.tensor([1, 0]))
+    swapped = quality.choose_responsible_anchors(ANCHORS, ANCHORS, objects, torch.tensor([1, 0]))
     assert dict(zip(swapped.anchor.tolist(), swapped.object.tolist(), strict=True)) == {1: 0, 0: 1}
 
 
 def test_an_anchor_whose_box_meets_an_object_answers_though_it_lies_elsewhere() -> None:
     boxes_xyxy = ANCHORS.clone()
     boxes_xyxy[3] = torch.tensor([0.0, 0, 16, 12])
-    found = quality.answers(boxes_xyxy, ANCHORS, ANCHORS[:1], torch.tensor([0]))
+    found = quality.choose_responsible_anchors(boxes_xyxy, ANCHORS, ANCHORS[:1], torch.tensor([0]))
     assert found.anchor.tolist() == [0, 3]
     assert found.candidate.tolist() == [True, False]
     assert found.quality.tolist() == [1.0, 0.75]
 
 
 def test_own_anchor_answers_where_nothing_overlaps() -> None:
-    found = quality.answers(ANCHORS, ANCHORS, torch.tensor([[500.0, 0, 510, 10]]), torch.tensor([2]))
+    found = quality.choose_responsible_anchors(
+        ANCHORS, ANCHORS, torch.tensor([[500.0, 0, 510, 10]]), torch.tensor([2])
+    )
     assert found.anchor.tolist() == [2]
     assert found.quality.tolist() == [0.0]
 
 
-def one_row(confidence_logits: list[float], deltas: list[list[float]]) -> RawPredictions:
+def one_row(confidence_logits: list[float], deltas: list[list[float]]) -> AnchorPredictions:
     """Four cells of 16 px side by side, one anchor of 16x16 px each, two classes at even odds."""
     offsets = torch.tensor([deltas], requires_grad=True)
-    anchors = grid.anchors(SIZES, 1, 4, torch.float32, torch.device("cpu"))
+    anchors = grid.anchors_cxcywh(SIZES, 1, 4, torch.float32, torch.device("cpu"))
     centre = anchors[:, :2] + offsets[..., :2] * anchors[:, 2:]
     size = anchors[:, 2:] * grid.safe_exp(offsets[..., 2:])
     logits = torch.tensor([confidence_logits])
-    return RawPredictions(
+    return AnchorPredictions(
         torch.cat((centre - size / 2, centre + size / 2), -1), offsets, torch.zeros(1, 4, 2), logits, (16, 64)
     )
 
@@ -72,9 +74,11 @@ def at_anchor(k: int) -> list[float]:
     return [16.0 * k + 7.5 - 8, -0.5, 16.0 * k + 7.5 + 8, 15.5]
 
 
-def terms_of(raw: RawPredictions, target: Targets, own: list[int], silent: list[bool]) -> dict[str, torch.Tensor]:
+def terms_of(
+    raw: AnchorPredictions, target: Targets, own: list[int], silent: list[bool]
+) -> dict[str, torch.Tensor]:
     pair = torch.zeros(len(own), dtype=torch.int64), torch.tensor(own, dtype=torch.int64)
-    return quality.terms(raw, [target], SIZES, pair, torch.tensor([silent]))
+    return quality.quality_loss_terms(raw, [target], SIZES, pair, torch.tensor([silent]))
 
 
 def test_terms_by_hand() -> None:

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 
 from detectors.base import DetectorError
-from detectors.reading import read_state
+from detectors.files import read_state
 from detectors.registry import SHIPPED, load_detector, read_weights, save_detector, write_weights
 from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet, SqueezeDetPlus
 
@@ -64,7 +64,7 @@ def test_anchors_in_metadata_that_are_none(weights: Path) -> None:
 def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         DetectorError,
-        match=r"detector: expected squeezedet, yolov3-slim, a path\.safetensors, or what begins with darknet:, "
+        match=r"detector: expected squeezedet, yolov3-slim, a path\.safetensors, or a name with prefix darknet:, "
         r".*, module:, ensemble: or planted:, found 'yolo9'$",
     ):
         load_detector("yolo9")
@@ -156,7 +156,7 @@ def test_shipped_weights_are_those_of_their_card(
     path.write_bytes(data)
     load_detector(name)
     path.with_suffix(".md").write_text("# nothing\n")
-    with pytest.raises(DetectorError, match="which names none"):
+    with pytest.raises(DetectorError, match="which the card lacks"):
         load_detector(name)
 
 

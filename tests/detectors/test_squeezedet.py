@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from detectors import boxes
-from detectors.base import RawPredictions
-from detectors.squeezedet import ANCHOR_SIZES_WH, Assignment, SqueezeDet, SqueezeDetPlus
+from detectors.base import AnchorPredictions
+from detectors.squeezedet import ANCHOR_SIZES_WH, AnchorAssignment, SqueezeDet, SqueezeDetPlus
 from detectors.types import Targets
 
 
@@ -48,8 +48,8 @@ def anchor_at(row: int, column: int, shape: int, columns: int) -> int:
     return (row * columns + column) * 9 + shape
 
 
-def raw_of(parts: dict[str, Tensor], height: int, width: int) -> RawPredictions:
-    return RawPredictions(**parts, image_hw=(height, width))
+def raw_of(parts: dict[str, Tensor], height: int, width: int) -> AnchorPredictions:
+    return AnchorPredictions(**parts, image_hw=(height, width))
 
 
 def test_parameter_count_is_the_published_one() -> None:
@@ -458,7 +458,7 @@ def test_gradient_to_the_image_agrees_with_differences() -> None:
     generator = torch.Generator().manual_seed(4)
     image = torch.rand(1, 3, 40, 52, dtype=torch.float64, generator=generator)
     wanted = [targets([[5.0, 5.0, 35.0, 30.0], [20.0, 10.0, 50.0, 38.0]], [0, 2], [False, False])]
-    assignment: Assignment = detector.assign(detector(image), wanted)
+    assignment: AnchorAssignment = detector.assign(detector(image), wanted)
 
     def total(x: Tensor) -> Tensor:
         return detector.loss_terms(detector(x), assignment)["total"]

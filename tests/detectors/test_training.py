@@ -17,11 +17,11 @@ from torch.nn import functional
 
 from detectors import training
 from detectors.augment import AugmentSettings
-from detectors.base import DetectorError, RawPredictions
+from detectors.base import AnchorPredictions, DetectorError
 from detectors.boxes import iou_matrix
 from detectors.registry import read_weights, write_weights
 from detectors.squeezedet import SeededDropout, SqueezeDet
-from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, batch_of, schedule, train
+from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, learning_rate, make_batch, train
 from detectors.types import Targets
 
 KEPT = ("total", "objectness")
@@ -115,13 +115,13 @@ class Small(SqueezeDet):
 
     most = 2
 
-    def forward(self, images: torch.Tensor) -> RawPredictions:
+    def forward(self, images: torch.Tensor) -> AnchorPredictions:
         if len(images) > self.most:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
         return super().forward(images)
 
-    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
-        alone = [super(Small, self).loss(raw.one(i), [target]) for i, target in enumerate(targets)]
+    def loss(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
+        alone = [super(Small, self).loss(raw.select(i), [target]) for i, target in enumerate(targets)]
         return {name: torch.stack([terms[name] for terms in alone]).mean() for name in alone[0]}
 
 
@@ -140,7 +140,7 @@ def test_a_batch_for_which_there_is_no_memory_is_seen_in_parts(
 
     whole, halves, singles = (moved(most) for most in (4, 2, 1))
     told = capsys.readouterr().err.splitlines()
-    line = "drivesem: a batch of 4 does not fit into the device's memory: {} at once from now on"
+    line = "drivesem: a batch of 4 exceeds the device's memory: {} at once from now on"
     assert told == [line.format(2), line.format(2), line.format(1)], "once, not at every step"
     assert (halves - whole).norm() < 1e-3 * whole.norm()
     assert (singles - whole).norm() < 1e-3 * whole.norm()
@@ -151,7 +151,7 @@ def test_a_batch_for_which_there_is_no_memory_is_seen_in_parts(
 class Pooled(SqueezeDet):
     """ConvDet on mean colours: small enough for float16, which CPUs compute very slowly."""
 
-    def forward(self, images: torch.Tensor) -> RawPredictions:
+    def forward(self, images: torch.Tensor) -> AnchorPredictions:
         cells = functional.avg_pool2d(images, 16).repeat(1, 256, 1, 1)
         return self._interpret(self.convdet(self.dropout(cells)), (int(images.shape[2]), int(images.shape[3])))
 
@@ -185,18 +185,14 @@ def test_buffers_are_averaged_and_resumed(tmp_path: Path) -> None:
     assert not torch.equal(last, average)
 
 
-def test_a_checkpoint_of_before_there_were_precisions_is_read(tmp_path: Path) -> None:
-    whole = train(fresh(), painted(3), SMALL, tmp_path / "whole").state_dict()
-    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5)
-    facts, tensors = read_weights(tmp_path / "parts" / CHECKPOINT)
-    known = json.loads(facts["settings"])
-    for name in ("precision", "momentum", "drops", "drop_factor", "warmup_power"):
-        del known[name]
-    write_weights(
-        tmp_path / "parts" / CHECKPOINT, facts | {"settings": json.dumps(known | {"bfloat16": False})}, tensors
-    )
-    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts").state_dict()
-    assert all(torch.equal(parts[name], value) for name, value in whole.items())
+def test_a_checkpoint_that_lacks_a_setting_is_refused(tmp_path: Path) -> None:
+    train(fresh(), painted(3), SMALL, tmp_path, stop_after=5)
+    facts, tensors = read_weights(tmp_path / CHECKPOINT)
+    settings = json.loads(facts["settings"])
+    del settings["precision"]
+    write_weights(tmp_path / CHECKPOINT, facts | {"settings": json.dumps(settings)}, tensors)
+    with pytest.raises(DetectorError, match="precision: expected float32 as set, found None"):
+        train(fresh(), painted(3), SMALL, tmp_path)
 
 
 def test_threads_that_load_ahead_change_nothing(tmp_path: Path) -> None:
@@ -220,7 +216,7 @@ def test_a_data_set_may_choose_what_to_show() -> None:
         SMALL, augment=replace(SMALL.augment, brightness=0.0, contrast=0.0, gamma=0.0, channel_gain=0.0)
     )
     plain = replace(plain, augment=replace(plain.augment, noise_probability=0, jpeg_probability=0, hue_rad=0.0))
-    shown = [float(batch_of(Choosing(painted(2)), step, plain)[0].min()) * 255 for step in (3, 3, 8)]
+    shown = [float(make_batch(Choosing(painted(2)), step, plain)[0].min()) * 255 for step in (3, 3, 8)]
     assert shown[0] == shown[1]
     assert round(shown[0]) in (30, 31)
     assert round(shown[2]) in (80, 81)
@@ -228,7 +224,7 @@ def test_a_data_set_may_choose_what_to_show() -> None:
 
 def test_the_log_has_the_detectors_own_terms(tmp_path: Path) -> None:
     class Named(SqueezeDet):
-        def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
+        def loss(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
             terms = super().loss(raw, targets)
             return {"boxes": terms["box"], "rest": terms["total"] - terms["box"], **{k: terms[k] for k in KEPT}}
 
@@ -255,7 +251,7 @@ class Pulls:
 def test_a_further_term_is_added_to_the_loss(tmp_path: Path) -> None:
     """It has a column of its own, moves the weights by its gradient, and resumes to the bit."""
     runs = {
-        name: train(fresh(), painted(3), SMALL, tmp_path / name, beside=beside)
+        name: train(fresh(), painted(3), SMALL, tmp_path / name, auxiliary_loss=beside)
         for name, beside in (("alone", None), ("nothing", Pulls(0.0)), ("whole", Pulls(5.0)))
     }
     weights = {name: run.state_dict()["conv1.weight"] for name, run in runs.items()}
@@ -265,8 +261,8 @@ def test_a_further_term_is_added_to_the_loss(tmp_path: Path) -> None:
     terms = [float(rows[0][name]) for name in ("confidence", "box", "class", "pull")]
     assert float(rows[0]["total"]) == pytest.approx(sum(terms), rel=1e-4)
     assert terms[-1] > 0
-    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5, beside=Pulls(5.0))
-    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts", beside=Pulls(5.0))
+    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5, auxiliary_loss=Pulls(5.0))
+    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts", auxiliary_loss=Pulls(5.0))
     assert torch.equal(parts.state_dict()["conv1.weight"], weights["whole"])
 
 
@@ -333,7 +329,7 @@ def test_batches_cover_every_frame_once_an_epoch() -> None:
 
     counting = Counting(frames)
     for step in range(6):
-        batch_of(counting, step, SMALL)
+        make_batch(counting, step, SMALL)
     assert sorted(counting.asked[:6]) == list(range(6))
     assert sorted(counting.asked[6:]) == list(range(6))
     assert counting.asked[:6] != counting.asked[6:]
@@ -341,7 +337,7 @@ def test_batches_cover_every_frame_once_an_epoch() -> None:
 
 def test_schedule_warms_up_and_falls() -> None:
     settings = replace(SMALL, steps=100, rate=1.0, warmup_steps=10)
-    rates = [schedule(step / 100, step, settings) for step in range(100)]
+    rates = [learning_rate(step / 100, step, settings) for step in range(100)]
     assert rates[0] == pytest.approx(0.1)
     assert max(rates) == pytest.approx(rates[9], abs=0.01)
     assert rates[9:] == sorted(rates[9:], reverse=True)
@@ -350,12 +346,12 @@ def test_schedule_warms_up_and_falls() -> None:
 
 def test_published_schedules() -> None:
     squeezedet = replace(SMALL, rate=0.01, warmup_steps=0, drops=(10, 20, 30), drop_factor=0.5)
-    assert [schedule(0.9, step, squeezedet) for step in (0, 9, 10, 29, 30)] == pytest.approx(
+    assert [learning_rate(0.9, step, squeezedet) for step in (0, 9, 10, 29, 30)] == pytest.approx(
         [0.01, 0.01, 0.005, 0.0025, 0.00125]
     )
     darknet = replace(SMALL, rate=0.001, warmup_steps=1000, warmup_power=4, drops=(4000, 4500))
-    assert schedule(0.0, 499, darknet) == pytest.approx(0.001 * 0.5**4)
-    assert [schedule(0.0, step, darknet) for step in (999, 3999, 4000, 4500)] == pytest.approx(
+    assert learning_rate(0.0, 499, darknet) == pytest.approx(0.001 * 0.5**4)
+    assert [learning_rate(0.0, step, darknet) for step in (999, 3999, 4000, 4500)] == pytest.approx(
         [1e-3, 1e-3, 1e-4, 1e-5]
     )
 

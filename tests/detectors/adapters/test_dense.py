@@ -71,7 +71,7 @@ def test_a_loss_does_not_depend_on_the_pictures_beside() -> None:
     targets = aim(([60.0, 0, 90, 20], CAR, False))
     losses = [dense_loss(one, targets, CLASSES)["objectness"] for one in alone]
     for image, (one, loss) in enumerate(zip(alone, losses, strict=True)):
-        own = raw.one(image)
+        own = raw.select(image)
         assert torch.equal(own.probabilities, one.probabilities)
         assert torch.equal(own.boxes_xyxy, one.boxes_xyxy)
         assert torch.equal(dense_loss(own, targets, CLASSES)["objectness"], loss)
@@ -84,11 +84,11 @@ def test_a_loss_does_not_depend_on_the_pictures_beside() -> None:
 
 def test_a_prediction_is_planted_where_nothing_was_said() -> None:
     box = torch.tensor([10.0, 10, 50, 30])
-    silent = DensePredictions(torch.zeros(1, 0, 1, 4), torch.zeros(1, 0, 3), (64, 96)).planted(box, CAR)
+    silent = DensePredictions(torch.zeros(1, 0, 1, 4), torch.zeros(1, 0, 3), (64, 96)).inject(box, CAR)
     beside = DensePredictions(
         PLACES[None, :, None].repeat(2, 1, 1, 1), torch.tensor([ROWS, ROWS]), (64, 96), counts=(0, 4)
-    ).planted(box, CAR)
-    for raw in (silent, beside.one(0), beside.one(1)):
+    ).inject(box, CAR)
+    for raw in (silent, beside.select(0), beside.select(1)):
         assert torch.equal(raw.boxes_xyxy[0, 0, 0], box)
         assert raw.probabilities.nonzero().tolist() == [[0, 0, CAR]]
 

@@ -7,9 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from detectors.adapters.coco import CLASSES, CLASSES_91
-from detectors.adapters.formats import flat, reading
-from detectors.adapters.spec import Spec, fit, load_spec, prepare
+from detectors.adapters.formats import flatten_outputs, make_decoder
+from detectors.adapters.spec import (
+    COCO_CLASSES,
+    COCO_CLASSES_91,
+    NetworkSpec,
+    fit_images,
+    load_spec,
+    normalise_images,
+)
 from detectors.base import DetectorError
 
 INPUT_HW = (64, 128)
@@ -32,8 +38,8 @@ def yolov5(classes: int = 3, places: int = 40) -> torch.Tensor:
 
 def read(outputs, settings=None, names=("a", "b", "c")):
     shapes = [tuple(output.shape) for output in outputs]
-    found = reading(shapes, INPUT_HW, settings or {}, names, "own")
-    boxes, scores = found.read(outputs, INPUT_HW)
+    found = make_decoder(shapes, INPUT_HW, settings or {}, names, "own")
+    boxes, scores = found.decode(outputs, INPUT_HW)
     image, place, label = (scores > 0.1).nonzero()[0].tolist()
     return found, boxes[image, place].tolist(), found.classes[label], float(scores[image, place, label])
 
@@ -86,7 +92,7 @@ def test_other_boxes_and_activations() -> None:
 
 
 def test_classes_come_from_the_spec_the_file_or_their_number() -> None:
-    assert read([yolov8(80, 100)], names=None)[0].classes == CLASSES
+    assert read([yolov8(80, 100)], names=None)[0].classes == COCO_CLASSES
     assert read([ANCHORS, torch.full((1, 9, 91), 0.5)], names=None)[0].classes[2] == "Car"
     assert read([yolov8()], {"classes": ("x", "y", "z")})[0].classes == ("x", "y", "z")
     with pytest.raises(DetectorError, match="own: classes: expected 3 names in a YAML file, found none"):
@@ -96,11 +102,17 @@ def test_classes_come_from_the_spec_the_file_or_their_number() -> None:
 
 
 def test_cocos_numbers_with_gaps() -> None:
-    assert (CLASSES_91[0], CLASSES_91[1], CLASSES_91[3], CLASSES_91[12], CLASSES_91[90]) == (
+    assert (
+        COCO_CLASSES_91[0],
+        COCO_CLASSES_91[1],
+        COCO_CLASSES_91[3],
+        COCO_CLASSES_91[12],
+        COCO_CLASSES_91[90],
+    ) == (
         *("", "person", "Car"),
         *("", "toothbrush"),
     )
-    assert tuple(name for name in CLASSES_91 if name) == CLASSES
+    assert tuple(name for name in COCO_CLASSES_91 if name) == COCO_CLASSES
 
 
 def test_what_no_format_reads() -> None:
@@ -113,50 +125,56 @@ def test_what_no_format_reads() -> None:
 
 
 def test_labels_beyond_the_classes_are_nothing() -> None:
-    found = reading([(1, 4), (1,), (1,)], INPUT_HW, {}, ("a",), "own")
-    assert float(found.read(CHOSEN, INPUT_HW)[1].sum()) == 0
+    found = make_decoder([(1, 4), (1,), (1,)], INPUT_HW, {}, ("a",), "own")
+    assert float(found.decode(CHOSEN, INPUT_HW)[1].sum()) == 0
 
 
 def test_tensors_are_found_wherever_they_are() -> None:
     a, b, c = CHOSEN
-    assert [t.shape for t in flat(({}, [{"scores": c, "boxes": a, "labels": b}]))] == [a.shape, b.shape, c.shape]
+    assert [t.shape for t in flatten_outputs(({}, [{"scores": c, "boxes": a, "labels": b}]))] == [
+        a.shape,
+        b.shape,
+        c.shape,
+    ]
 
 
 def test_letterbox_and_stretch_bring_boxes_back() -> None:
     image = torch.zeros(1, 3, 32, 128)
     image[:, :, 8:16, 64:96] = 1
     for resize, size in (("letterbox", (64, 64)), ("stretch", (64, 64)), ("letterbox", (96, 200))):
-        fed, fitted = fit(image, Spec(size=size, resize=resize, pad=0.0))
+        fed, fitted = fit_images(image, NetworkSpec(size=size, resize=resize, pad=0.0))
         assert tuple(fed.shape[2:]) == size
         rows, columns = (fed[0, 0] > 0.5).nonzero().unbind(1)
         edges = torch.tensor([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
         # the block's first and last pixel, half a pixel outside their centres
-        torch.testing.assert_close(fitted.back(edges), torch.tensor([63.5, 7.5, 95.5, 15.5]), atol=1.1, rtol=0)
-    fed, fitted = fit(image[..., :120], Spec(multiple=32, centred=False, pad=0.25))
+        torch.testing.assert_close(fitted.to_image(edges), torch.tensor([63.5, 7.5, 95.5, 15.5]), atol=1.1, rtol=0)
+    fed, fitted = fit_images(image[..., :120], NetworkSpec(multiple=32, centred=False, pad=0.25))
     assert tuple(fed.shape) == (1, 3, 32, 128)
     assert bool((fed[..., 120:] == 0.25).all())
-    assert fitted.back(torch.tensor([0.0, 0, 4, 4])).tolist() == [-0.5, -0.5, 3.5, 3.5]
+    assert fitted.to_image(torch.tensor([0.0, 0, 4, 4])).tolist() == [-0.5, -0.5, 3.5, 3.5]
 
 
 def test_boxes_come_back_by_the_rounded_size() -> None:
     """375 x 1242 px at 416: 125.6 rows, of which 126 are shown; the picture's border comes back to its border."""
-    fed, fitted = fit(torch.ones(1, 3, 375, 1242), Spec(size=(416, 416), pad=0.0))
+    fed, fitted = fit_images(torch.ones(1, 3, 375, 1242), NetworkSpec(size=(416, 416), pad=0.0))
     rows, columns = (fed[0, 0] > 0).nonzero().unbind(1)
     edges = torch.tensor([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]).float()
-    torch.testing.assert_close(fitted.back(edges), torch.tensor([-0.5, -0.5, 1241.5, 374.5]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        fitted.to_image(edges), torch.tensor([-0.5, -0.5, 1241.5, 374.5]), atol=1e-3, rtol=0
+    )
 
 
 def test_a_picture_too_flat_for_a_row_has_one() -> None:
-    fed, fitted = fit(torch.ones(1, 3, 1, 1242), Spec(size=(416, 416), pad=0.0))
+    fed, fitted = fit_images(torch.ones(1, 3, 1, 1242), NetworkSpec(size=(416, 416), pad=0.0))
     assert float(fed.sum()) == pytest.approx(3 * 416)
     edges = torch.tensor([0.0, 207, 416, 208])
-    torch.testing.assert_close(fitted.back(edges), torch.tensor([-0.5, -0.5, 1241.5, 0.5]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(fitted.to_image(edges), torch.tensor([-0.5, -0.5, 1241.5, 0.5]), atol=1e-3, rtol=0)
 
 
 def test_what_a_network_is_fed() -> None:
     image = torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1)
-    spec = Spec(channels="bgr", scale=255.0, mean=(1.0, 2.0, 3.0), std=(2.0, 2.0, 4.0))
-    assert prepare(image, spec).flatten().tolist() == [-0.5, 62.75, 63.0]
+    spec = NetworkSpec(channels="bgr", scale=255.0, mean=(1.0, 2.0, 3.0), std=(2.0, 2.0, 4.0))
+    assert normalise_images(image, spec).flatten().tolist() == [-0.5, 62.75, 63.0]
 
 
 def test_a_yaml_file(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from detectors.planted import PlantedDetector, PlantedFault
 from detectors.registry import load_detector, load_predictor
 from detectors.types import Targets
 
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "detectors.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "guide" / "detector.md"
 SIDE = 64
 CLASSES = "[Car, bus, person]"
 
@@ -124,7 +124,7 @@ def test_files_that_are_none(tmp_path: Path, scripted: Path) -> None:
 @pytest.fixture
 def documented(tmp_path: Path) -> Path:
     """The class that the docs show."""
-    shown = re.search(r"```python\n# my_detector\.py\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    shown = re.search(r"my_detector\.py\"\)\.write_text\('''\n(.*?)'''\)", DOCS.read_text(encoding="utf-8"), re.DOTALL)
     assert shown is not None
     assert len(shown[1].splitlines()) <= 30
     path = tmp_path / "my_detector.py"
@@ -157,13 +157,13 @@ def test_pictures_do_not_share_what_a_network_that_suppresses_says() -> None:
     raw = detector(pictures)
     assert raw.counts == (4, 16, 0)
     box = Targets(torch.tensor([[8.0, 8, 40, 40]]), torch.tensor([0]), torch.tensor([False]))
-    faulty = PlantedDetector(detector, PlantedFault.of("height_px=20:40")).requires_grad_(False)
+    faulty = PlantedDetector(detector, PlantedFault.parse("height_px=20:40")).requires_grad_(False)
     lowered = faulty(pictures)
     for image, picture in enumerate(pictures):
         alone = detector(picture[None])
-        assert torch.equal(raw.one(image).probabilities, alone.probabilities)
-        assert torch.equal(detector.loss(raw.one(image), [box])["total"], detector.loss(alone, [box])["total"])
-        assert torch.equal(lowered.one(image).probabilities, faulty(picture[None]).probabilities)
+        assert torch.equal(raw.select(image).probabilities, alone.probabilities)
+        assert torch.equal(detector.loss(raw.select(image), [box])["total"], detector.loss(alone, [box])["total"])
+        assert torch.equal(lowered.select(image).probabilities, faulty(picture[None]).probabilities)
     assert float(lowered.probabilities.max()) < float(raw.probabilities.max())
     check_detector(detector, (64, 96)).require()
 

@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from detectors.adapters import nanodet
-from detectors.adapters.coco import NAMES
+from detectors.adapters import formats as nanodet
 from detectors.adapters.onnx import OnnxPredictor
-from detectors.adapters.spec import prepare
+from detectors.adapters.spec import COCO_NAMES, normalise_images
 from detectors.base import DetectorError, predict
 from detectors.registry import load_detector, load_predictor
 
 NANODET = Path(__file__).resolve().parents[4] / "shared" / "data" / "detectors" / "nanodet_m.onnx"
 SIDE = 64
 """Of the tiny graphs' input: 8 x 8, 4 x 4 and 2 x 2 cells."""
-CAR, TRUCK = NAMES.index("car"), NAMES.index("truck")
+CAR, TRUCK = COCO_NAMES.index("car"), COCO_NAMES.index("truck")
 
 
 def outputs(plants: Mapping[tuple[int, int, int, int], tuple[float, ...]]) -> dict[str, np.ndarray]:
@@ -89,7 +88,7 @@ def test_every_window_has_its_place(graph: Make) -> None:
 
 def test_what_the_network_is_fed() -> None:
     image = torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1)
-    blue, green, red = prepare(image, nanodet.SPEC).flatten().tolist()
+    blue, green, red = normalise_images(image, nanodet.NANODET_SPEC).flatten().tolist()
     assert blue == pytest.approx(-103.53 / 57.375)
     assert green == pytest.approx((127.5 - 116.28) / 57.12)
     assert red == pytest.approx((255 - 123.675) / 58.395)

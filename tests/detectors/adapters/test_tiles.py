@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from detectors.adapters.tiles import MOST_ENLARGED, OVERLAP, Window, cut, merge, windows
+from detectors.adapters.tiles import MAX_ENLARGEMENT, OVERLAP, Tile, is_cut_by_tile, make_tiles, merge_tiles
 
 
 @pytest.mark.parametrize(
@@ -19,8 +19,8 @@ from detectors.adapters.tiles import MOST_ENLARGED, OVERLAP, Window, cut, merge,
     ],
 )
 def test_windows_cover_the_picture_at_every_scale(height: int, width: int, input_hw: tuple[int, int]) -> None:
-    found = windows(height, width, input_hw)
-    assert found[0] == Window(0, 0, width, height)
+    found = make_tiles(height, width, input_hw)
+    assert found[0] == Tile(0, 0, width, height)
     sizes: dict[tuple[int, int], torch.Tensor] = {}
     for w in found:
         assert 0 <= w.x0 < w.x1 <= width
@@ -29,49 +29,49 @@ def test_windows_cover_the_picture_at_every_scale(height: int, width: int, input
         covered[w.y0 : w.y1, w.x0 : w.x1] = True
     assert all(bool(covered.all()) for covered in sizes.values())
     for high, wide in list(sizes)[1:]:
-        assert min(input_hw[0] / high, input_hw[1] / wide) <= MOST_ENLARGED + 1e-9
+        assert min(input_hw[0] / high, input_hw[1] / wide) <= MAX_ENLARGEMENT + 1e-9
 
 
 def test_neighbours_overlap() -> None:
-    fine = windows(375, 1242, (416, 416))[1:]
+    fine = make_tiles(375, 1242, (416, 416))[1:]
     assert [(w.x0, w.x1) for w in fine] == [(0, 621), (310, 931), (621, 1242)]
     for first, second in pairwise(fine):
         assert first.x1 - second.x0 >= OVERLAP * (first.x1 - first.x0) - 1
 
 
 def test_a_picture_of_the_networks_size_is_one_window() -> None:
-    assert windows(416, 416, (416, 416)) == [Window(0, 0, 416, 416)]
+    assert make_tiles(416, 416, (416, 416)) == [Tile(0, 0, 416, 416)]
 
 
 def test_only_borders_inside_the_picture_cut() -> None:
     boxes = torch.tensor([[0.0, 20, 50, 60], [100.0, 20, 200, 60], [340.0, 20, 399, 60], [110.0, 80, 200, 199]])
-    window = Window(100, 0, 400, 200)
-    assert cut(boxes, window, (200, 400)).tolist() == [True, True, False, False]
-    assert cut(boxes, Window(0, 0, 400, 200), (200, 400)).tolist() == [False] * 4
-    assert cut(boxes[3:], Window(100, 0, 400, 200), (300, 400)).tolist() == [True]
+    window = Tile(100, 0, 400, 200)
+    assert is_cut_by_tile(boxes, window, (200, 400)).tolist() == [True, True, False, False]
+    assert is_cut_by_tile(boxes, Tile(0, 0, 400, 200), (200, 400)).tolist() == [False] * 4
+    assert is_cut_by_tile(boxes[3:], Tile(100, 0, 400, 200), (300, 400)).tolist() == [True]
 
 
 def test_a_car_seen_by_two_windows_is_one_box() -> None:
     boxes = torch.tensor([[100.0, 50, 200, 100], [102.0, 51, 201, 101]])
-    kept = merge(boxes, torch.tensor([0.6, 0.8]), torch.tensor([2, 2]), torch.tensor([False, False]))
+    kept = merge_tiles(boxes, torch.tensor([0.6, 0.8]), torch.tensor([2, 2]), torch.tensor([False, False]))
     assert kept.tolist() == [1]
 
 
 def test_a_part_goes_beside_the_whole_however_sure_it_is() -> None:
     boxes = torch.tensor([[100.0, 50, 200, 100], [100.0, 50, 140, 100]])
     scores, labels = torch.tensor([0.4, 0.9]), torch.tensor([2, 2])
-    assert merge(boxes, scores, labels, torch.tensor([False, True])).tolist() == [0]
+    assert merge_tiles(boxes, scores, labels, torch.tensor([False, True])).tolist() == [0]
     # another class, or no cut: both stay, best first
-    assert merge(boxes, scores, torch.tensor([2, 7]), torch.tensor([False, True])).tolist() == [1, 0]
-    assert merge(boxes, scores, labels, torch.tensor([False, False])).tolist() == [1, 0]
+    assert merge_tiles(boxes, scores, torch.tensor([2, 7]), torch.tensor([False, True])).tolist() == [1, 0]
+    assert merge_tiles(boxes, scores, labels, torch.tensor([False, False])).tolist() == [1, 0]
 
 
 def test_a_part_stays_where_no_window_saw_the_whole() -> None:
     boxes = torch.tensor([[100.0, 50, 140, 100], [101.0, 50, 141, 100]])
-    kept = merge(boxes, torch.tensor([0.5, 0.7]), torch.tensor([2, 2]), torch.tensor([True, True]))
+    kept = merge_tiles(boxes, torch.tensor([0.5, 0.7]), torch.tensor([2, 2]), torch.tensor([True, True]))
     assert kept.tolist() == [1]
 
 
 def test_nothing_seen_is_nothing() -> None:
     none = torch.zeros(0)
-    assert merge(none.view(0, 4), none, none.long(), none.bool()).tolist() == []
+    assert merge_tiles(none.view(0, 4), none, none.long(), none.bool()).tolist() == []

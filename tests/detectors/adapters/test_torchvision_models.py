@@ -55,10 +55,10 @@ def test_each_picture_keeps_to_its_own_proposals(settled: Callable[[str], Any]) 
     images = torch.rand(2, 3, 64, 96)
     raw = detector(images)
     few = tuple(proposals[:count] for proposals, count in zip(raw.held, (3, 7), strict=True))
-    with detector.holding(replace(raw, held=few)):
+    with detector.freeze_choices(replace(raw, constants=few)):
         cut = detector(images)
     assert cut.counts == (3, 7)
-    assert [cut.one(i).probabilities.shape[1] for i in (0, 1)] == [3, 7]
+    assert [cut.select(i).probabilities.shape[1] for i in (0, 1)] == [3, 7]
 
 
 def test_what_is_decoded_is_what_torchvision_finds(settled: Callable[[str], Any]) -> None:

@@ -13,12 +13,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from detectors.base import Detector, RawPredictions, Trunk
-from detectors.incremental.graph import Graph, UntraceableError
-from detectors.incremental.passes import Changed, Picturing, forward
-from detectors.incremental.plan import Shapes
-from detectors.incremental.reference import AGREES, LIMIT_MB, Reference
-from detectors.incremental.regions import Rect, Region
+from detectors.base import AnchorPredictions, Detector, DetectorStages
+from detectors.incremental.graph import LayerGraph, UntraceableError
+from detectors.incremental.passes import ChangedOutputs, ImageInput, forward
+from detectors.incremental.plan import SizedGraph
+from detectors.incremental.reference import LIMIT_MB, MAX_LOGIT_DIFFERENCE, ReferencePass
+from detectors.incremental.regions import ColumnRegion, Rect
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import Detections, Targets
@@ -167,7 +167,7 @@ def functional(outputs: Sequence[Tensor]) -> Tensor:
     return total
 
 
-def of_raw(raw: RawPredictions) -> list[Tensor]:
+def of_raw(raw: AnchorPredictions) -> list[Tensor]:
     return [getattr(raw, field) for field in ("deltas", "class_logits", "confidence_logits")]
 
 
@@ -189,9 +189,9 @@ def agree(name: str, scene: Pictures) -> None:
     """
     model, tolerance = detector(name), 1e-9
     image, changed = scene.images(torch.float64)
-    reference = Reference.of(model, image)
+    reference = ReferencePass.run(model, image)
     assert reference is not None
-    reference = replace(reference, most_share=float("inf"))
+    reference = replace(reference, max_cost_share=float("inf"))
     found, slope = outcome(lambda x: of_raw(reference(x, scene.rects)), changed)
     expected, expected_slope = outcome(lambda x: of_raw(model(x)), changed)
     assert max(relative(a, b) for a, b in zip(found, expected, strict=True)) < tolerance
@@ -250,19 +250,19 @@ def test_full_yolov3_gives_what_a_whole_pass_gives_at_all_borders() -> None:
 def test_any_traceable_network_gives_what_a_whole_pass_gives(scene: Pictures, limit_mb: float) -> None:
     """Whatever is kept: nothing but picture and outputs, some layers, all that are wanted."""
     network = backbone()
-    graph = Graph.of(network)
+    graph = LayerGraph.trace(network)
     bottom, right = (-side % 16 for side in scene.hw)
     image, changed = (F.pad(x, (0, right, 0, bottom), value=0.5) for x in scene.images(torch.float64))
     hw = int(image.shape[2]), int(image.shape[3])
     everywhere = Rect(0, *hw[:1], 0, *hw[1:])
-    shapes = Shapes.of(graph, hw, limit_mb * 1e6)
-    first = shapes.plan(Region.of([everywhere], hw), everywhere)
-    parts, _ = forward(graph, first, Picturing(image), {}, shapes.kept)
+    shapes = SizedGraph.for_size(graph, hw, limit_mb * 1e6)
+    first = shapes.plan(ColumnRegion.from_rects([everywhere], hw), everywhere)
+    parts, _ = forward(graph, first, ImageInput(image), {}, shapes.stored)
     kept = {layer: several[0] for layer, several in parts.items()}
-    plan = shapes.plan(Region.of(scene.rects, hw), everywhere)
+    plan = shapes.plan(ColumnRegion.from_rects(scene.rects, hw), everywhere)
 
     def call(x: Tensor) -> list[Tensor]:
-        return list(Changed.apply(x, Picturing(x.detach()), graph, plan, kept))
+        return list(ChangedOutputs.apply(x, ImageInput(x.detach()), graph, plan, kept))
 
     found, slope = outcome(call, changed)
     expected, expected_slope = outcome(network, changed)
@@ -280,7 +280,7 @@ def test_single_precision_stays_within_rounding(name: str) -> None:
     changed = image.clone()
     for rect in rects:
         changed[inside(rect)] = other[inside(rect)]
-    reference = Reference.of(model, image)
+    reference = ReferencePass.run(model, image)
     assert reference is not None
     found, slope = outcome(lambda x: of_raw(reference(x, rects)), changed)
     expected, expected_slope = outcome(lambda x: of_raw(model(x)), changed)
@@ -293,7 +293,7 @@ def test_single_precision_stays_within_rounding(name: str) -> None:
 def test_what_differs_is_found_without_being_named() -> None:
     image = smooth(*KITTI_HW, 0, torch.float32)
     model = load_detector("squeezedet")
-    reference = Reference.of(model, image)
+    reference = ReferencePass.run(model, image)
     assert reference is not None
     changed = image.clone()
     changed[..., 200:260, 500:560] = 0
@@ -305,32 +305,35 @@ def test_what_differs_is_found_without_being_named() -> None:
 @pytest.mark.parametrize("name", ["squeezedet", "yolov3-slim", "yolov3"])
 def test_no_more_is_kept_than_the_limit(name: str) -> None:
     model = detector(name)
-    trunk = model.trunk(KITTI_HW)
+    trunk = model.stages(KITTI_HW)
     assert trunk is not None
     top, bottom, left, right = trunk.padding
-    shapes = Shapes.of(
-        Graph.of(trunk.network), (top + KITTI_HW[0] + bottom, left + KITTI_HW[1] + right), LIMIT_MB * 1e6
+    shapes = SizedGraph.for_size(
+        LayerGraph.trace(trunk.network), (top + KITTI_HW[0] + bottom, left + KITTI_HW[1] + right), LIMIT_MB * 1e6
     )
-    total = sum(4 * layer.channels * shapes.hw[layer][0] * shapes.hw[layer][1] for layer in shapes.kept)
+    total = sum(4 * layer.channels * shapes.hw[layer][0] * shapes.hw[layer][1] for layer in shapes.stored)
     assert total < LIMIT_MB * 1e6
 
 
 def test_kept_layers_take_what_they_say() -> None:
-    reference = Reference.of(load_detector("squeezedet"), smooth(*KITTI_HW, 0, torch.float32))
+    reference = ReferencePass.run(load_detector("squeezedet"), smooth(*KITTI_HW, 0, torch.float32))
     assert reference is not None
-    assert reference.bytes == sum(4 * t.numel() for t in reference.kept.values()) < 30e6
+    assert reference.bytes == sum(4 * t.numel() for t in reference.activations.values()) < 30e6
 
 
 def test_a_small_change_costs_a_small_share_and_a_large_one_is_a_whole_pass() -> None:
     image = smooth(*KITTI_HW, 0, torch.float32)
-    reference = Reference.of(load_detector("squeezedet"), image)
+    reference = ReferencePass.run(load_detector("squeezedet"), image)
     assert reference is not None
-    shapes, frame = reference.shapes, Rect(0, *KITTI_HW[:1], 0, *KITTI_HW[1:])
+    shapes, frame = reference.sized_graph, Rect(0, *KITTI_HW[:1], 0, *KITTI_HW[1:])
     hw = shapes.hw[reference.incremental.graph.layers[0]]
-    shares = [shapes.plan(Region.of([Rect(0, side, 0, side)], hw), frame).share for side in (16, 64, 128, 256)]
+    shares = [
+        shapes.plan(ColumnRegion.from_rects([Rect(0, side, 0, side)], hw), frame).cost_share
+        for side in (16, 64, 128, 256)
+    ]
     assert shares == sorted(shares)
     assert shares[0] < 0.08
-    assert shapes.plan(Region.of([frame], hw), frame).share > 0.99
+    assert shapes.plan(ColumnRegion.from_rects([frame], hw), frame).cost_share > 0.99
 
 
 class Counting(Detector):
@@ -341,17 +344,17 @@ class Counting(Detector):
         self.inner, self.name, self.classes, self.t_star = inner, "counting", inner.classes, inner.t_star
         self.passes = 0
 
-    def forward(self, images: Tensor) -> RawPredictions:
+    def forward(self, images: Tensor) -> AnchorPredictions:
         self.passes += 1
         return self.inner(images)
 
-    def trunk(self, image_hw: tuple[int, int]) -> Trunk | None:
-        return self.inner.trunk(image_hw)
+    def stages(self, image_hw: tuple[int, int]) -> DetectorStages | None:
+        return self.inner.stages(image_hw)
 
-    def loss(self, raw: RawPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
+    def loss(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> dict[str, Tensor]:
         return self.inner.loss(raw, targets)
 
-    def decode(self, raw: RawPredictions) -> list[Detections]:
+    def decode(self, raw: AnchorPredictions) -> list[Detections]:
         return self.inner.decode(raw)
 
 
@@ -363,37 +366,37 @@ def counting() -> Counting:
 
 def test_the_first_pass_is_compared_and_only_that() -> None:
     model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
-    reference = Reference.of(model, image)
+    reference = ReferencePass.run(model, image)
     assert reference is not None
     for _ in range(3):
         reference(image, [Rect(180, 220, 300, 340)])
     assert model.passes == 1
-    assert Reference.of(model, image) is not None
+    assert ReferencePass.run(model, image) is not None
 
 
 def test_a_pass_that_disagrees_is_told_once_and_all_are_whole_then(capsys: pytest.CaptureFixture[str]) -> None:
     model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
-    reference = Reference.of(model, image)
+    reference = ReferencePass.run(model, image)
     assert reference is not None
     for layer in reference.incremental.graph.outputs:
-        reference.kept[layer] += 10 * AGREES
+        reference.activations[layer] += 10 * MAX_LOGIT_DIFFERENCE
     rects = [Rect(180, 220, 300, 340)]
     first = reference(image, rects)
     second = reference(image, rects)
     told = capsys.readouterr().err
-    assert told.startswith("drivesem: detector counting: passes on changed regions differ")
+    assert told.startswith("drivesem: detector counting: incremental passes differ")
     assert told.count("\n") == 1
     expected = model(image)
     for field in FIELDS:
         assert torch.equal(getattr(first, field), getattr(expected, field))
         assert torch.equal(getattr(second, field), getattr(expected, field))
     assert model.passes == 3
-    assert Reference.of(model, image) is None
+    assert ReferencePass.run(model, image) is None
 
 
 def test_a_change_of_unknown_place_is_a_whole_pass() -> None:
     model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
-    reference = Reference.of(model, image)
+    reference = ReferencePass.run(model, image)
     assert reference is not None
     reference(image, None)
     reference(1 - image, [])
@@ -402,10 +405,10 @@ def test_a_change_of_unknown_place_is_a_whole_pass() -> None:
 
 def test_other_weights_are_read_anew() -> None:
     model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
-    first = Reference.of(model, image)
+    first = ReferencePass.run(model, image)
     with torch.no_grad():
         model.inner.convdet.weight *= 2
-    second = Reference.of(model, image)
+    second = ReferencePass.run(model, image)
     assert first is not None
     assert second is not None
     assert second.incremental is not first.incremental
@@ -449,20 +452,20 @@ class Branching(nn.Module):
 )  # fmt: skip
 def test_networks_whose_reach_is_not_known_are_refused(network: nn.Module) -> None:
     with pytest.raises(UntraceableError):
-        Graph.of(network.eval())
+        LayerGraph.trace(network.eval())
 
 
 def test_detectors_that_may_change_or_are_not_known_have_no_reference() -> None:
     image = smooth(64, 64, 0, torch.float32)
     trained = load_detector("squeezedet").requires_grad_(True)
-    assert Reference.of(trained, image) is None
+    assert ReferencePass.run(trained, image) is None
     coarse = load_detector("squeezedet")
     coarse.gradient_precision = torch.bfloat16
-    assert Reference.of(coarse, image) is None
+    assert ReferencePass.run(coarse, image) is None
 
 
 def test_a_plan_serves_the_next_small_moves() -> None:
-    reference = Reference.of(load_detector("squeezedet"), smooth(*KITTI_HW, 0, torch.float32))
+    reference = ReferencePass.run(load_detector("squeezedet"), smooth(*KITTI_HW, 0, torch.float32))
     assert reference is not None
 
     def plan(left: int) -> object:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from detectors.incremental.regions import Rect, Region, Span
+from detectors.incremental.regions import ColumnRegion, ReceptiveField, Rect
 
 HW = (24, 200)
 
@@ -22,7 +22,7 @@ def rects(draw: st.DrawFn, hw: tuple[int, int] = HW) -> list[Rect]:
     return found
 
 
-def mask(region: Region) -> NDArray[np.bool_]:
+def mask(region: ColumnRegion) -> NDArray[np.bool_]:
     rows = np.arange(region.height)[:, None]
     return (rows >= region.top) & (rows < region.bottom)
 
@@ -37,7 +37,7 @@ def painted(several: list[Rect], hw: tuple[int, int] = HW) -> NDArray[np.int64]:
 
 @given(rects())
 def test_a_region_covers_its_rectangles_and_what_lies_between(several: list[Rect]) -> None:
-    found, count = mask(Region.of(several, HW)), painted(several)
+    found, count = mask(ColumnRegion.from_rects(several, HW)), painted(several)
     assert bool((found | (count == 0)).all())
     for column in np.flatnonzero(found.any(0)):
         rows = np.flatnonzero(count[:, column])
@@ -46,7 +46,7 @@ def test_a_region_covers_its_rectangles_and_what_lies_between(several: list[Rect
 
 @given(rects())
 def test_rectangles_cover_a_region_once_each_place(several: list[Rect]) -> None:
-    region = Region.of(several, HW)
+    region = ColumnRegion.from_rects(several, HW)
     count = painted(list(region.rects()))
     assert int(count.max(initial=0)) <= 1
     assert bool((count[mask(region)] == 1).all())
@@ -54,15 +54,15 @@ def test_rectangles_cover_a_region_once_each_place(several: list[Rect]) -> None:
 
 
 def test_near_rectangles_are_joined_and_far_ones_are_not() -> None:
-    near = Region.of([Rect(4, 10, 0, 40), Rect(4, 10, 42, 80)], HW)
-    far = Region.of([Rect(4, 10, 0, 40), Rect(4, 10, 120, 160)], HW)
+    near = ColumnRegion.from_rects([Rect(4, 10, 0, 40), Rect(4, 10, 42, 80)], HW)
+    far = ColumnRegion.from_rects([Rect(4, 10, 0, 40), Rect(4, 10, 120, 160)], HW)
     assert len(near.rects()) == 1
     assert len(far.rects()) == 2
 
 
 def test_a_small_rectangle_beside_a_tall_one_stays_small() -> None:
     tall, low = Rect(0, 24, 100, 200), Rect(10, 12, 0, 100)
-    assert sum(rect.area for rect in Region.of([tall, low], HW).rects()) <= tall.area + 2 * low.area
+    assert sum(rect.area for rect in ColumnRegion.from_rects([tall, low], HW).rects()) <= tall.area + 2 * low.area
 
 
 @settings(max_examples=60)
@@ -79,7 +79,7 @@ def test_places_that_see_a_region_are_those_of_a_convolution(
     several: list[Rect], high: int, down: int, above: int, wide: int, across: int, before: int
 ) -> None:
     """Window by window: the output's size as a layer with that padding on both sides has it."""
-    region = Region.of(several, (20, 40))
+    region = ColumnRegion.from_rects(several, (20, 40))
     padded = np.pad(mask(region), ((above, above), (before, before)))
     hw = (20 + 2 * above - high) // down + 1, (40 + 2 * before - wide) // across + 1
     expected = np.array(
@@ -88,7 +88,7 @@ def test_places_that_see_a_region_are_those_of_a_convolution(
             for i in range(hw[0])
         ]
     )
-    found = region.reached(Span((high, wide), (down, across), (above, before)), hw)
+    found = region.propagate(ReceptiveField((high, wide), (down, across), (above, before)), hw)
     hull = np.maximum.accumulate(expected, 0) & np.maximum.accumulate(expected[::-1], 0)[::-1]
     assert np.array_equal(mask(found), hull)
 
@@ -99,28 +99,30 @@ def test_blocks_give_the_region_that_they_cover(several: list[Rect], side: int) 
     rows, columns = -HW[0] % side, -HW[1] % side
     whole = np.pad(count, ((0, rows), (0, columns)))
     blocks = whole.reshape(whole.shape[0] // side, side, -1, side).any((1, 3))
-    region = Region.of_blocks(blocks, side, HW)
-    assert region.contains(Region.of(several, HW))
+    region = ColumnRegion.from_blocks(blocks, side, HW)
+    assert region.contains(ColumnRegion.from_rects(several, HW))
     top, left = np.nonzero(blocks)
     squares = [Rect(y * side, (y + 1) * side, x * side, (x + 1) * side) for y, x in zip(top, left, strict=True)]
-    assert np.array_equal(mask(region), mask(Region.of(squares, HW)))
+    assert np.array_equal(mask(region), mask(ColumnRegion.from_rects(squares, HW)))
 
 
 def test_placing_and_enlarging_move_every_place() -> None:
-    region = Region.of([Rect(2, 5, 3, 7)], (10, 12))
-    assert np.array_equal(mask(region.placed((1, 4), (15, 20))), mask(Region.of([Rect(3, 6, 7, 11)], (15, 20))))
-    assert np.array_equal(mask(region.enlarged(3)), mask(Region.of([Rect(6, 15, 9, 21)], (30, 36))))
+    region = ColumnRegion.from_rects([Rect(2, 5, 3, 7)], (10, 12))
+    assert np.array_equal(
+        mask(region.embed((1, 4), (15, 20))), mask(ColumnRegion.from_rects([Rect(3, 6, 7, 11)], (15, 20)))
+    )
+    assert np.array_equal(mask(region.upsample(3)), mask(ColumnRegion.from_rects([Rect(6, 15, 9, 21)], (30, 36))))
 
 
 def test_growing_adds_rows_and_columns_inside_of_the_tensor() -> None:
-    grown = Region.of([Rect(2, 5, 3, 7)], (10, 12)).grown(3)
-    assert np.array_equal(mask(grown), mask(Region.of([Rect(0, 8, 0, 10)], (10, 12))))
+    grown = ColumnRegion.from_rects([Rect(2, 5, 3, 7)], (10, 12)).dilate(3)
+    assert np.array_equal(mask(grown), mask(ColumnRegion.from_rects([Rect(0, 8, 0, 10)], (10, 12))))
 
 
 @pytest.mark.parametrize(
     ("inner", "expected"), [(Rect(2, 5, 3, 7), True), (Rect(1, 5, 3, 7), False), (Rect(2, 5, 3, 8), False)]
 )
 def test_a_region_contains_what_lies_in_it(inner: Rect, expected: bool) -> None:
-    outer = Region.of([Rect(2, 5, 3, 7)], (10, 12))
-    assert outer.contains(Region.of([inner], (10, 12))) is expected
-    assert outer.contains(Region.of([], (10, 12)))
+    outer = ColumnRegion.from_rects([Rect(2, 5, 3, 7)], (10, 12))
+    assert outer.contains(ColumnRegion.from_rects([inner], (10, 12))) is expected
+    assert outer.contains(ColumnRegion.from_rects([], (10, 12)))

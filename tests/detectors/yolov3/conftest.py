@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from detectors.yolov3.cfg import Cfg, parse
+from detectors.yolov3.cfg import DarknetCfg, parse
 from detectors.yolov3.yolov3 import YoloV3
 
 CLASSES = ("Car", "Truck", "Cyclist")
@@ -122,12 +122,12 @@ def mini_text() -> str:
 
 
 @pytest.fixture
-def mini_cfg() -> Cfg:
+def mini_cfg() -> DarknetCfg:
     return parse(MINI, "mini.cfg")
 
 
 @pytest.fixture
-def mini(mini_cfg: Cfg) -> YoloV3:
+def mini(mini_cfg: DarknetCfg) -> YoloV3:
     """Random weights, and statistics that are not those of a new network; in eval mode, not frozen."""
     detector = YoloV3(CLASSES, cfg=mini_cfg)
     generator = torch.Generator().manual_seed(0)

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.augment import AugmentSettings
-from detectors.base import RawPredictions
+from detectors.base import AnchorPredictions
 from detectors.registry import load_detector, save_detector
 from detectors.training import TrainingSettings, train
 from detectors.types import Targets
-from detectors.yolov3.cfg import Cfg, MaxPool, parse, write
-from detectors.yolov3.network import Folded, Network, _max_pool
-from detectors.yolov3.yolov3 import Assignment, YoloV3, YoloV3Slim
+from detectors.yolov3.cfg import DarknetCfg, MaxPoolLayer, parse, write
+from detectors.yolov3.network import DarknetNetwork, FoldedNetwork, _max_pool
+from detectors.yolov3.yolov3 import YoloAssignment, YoloV3, YoloV3Slim
 
 HW = (32, 48)
 COARSE = 2 * 6 * 4
@@ -65,8 +65,8 @@ def silent(detector: YoloV3, batch: int = 1) -> dict[str, Tensor]:
     }
 
 
-def raw_of(parts: dict[str, Tensor]) -> RawPredictions:
-    return RawPredictions(**parts, image_hw=HW)
+def raw_of(parts: dict[str, Tensor]) -> AnchorPredictions:
+    return AnchorPredictions(**parts, image_hw=HW)
 
 
 def logit(p: float) -> float:
@@ -250,7 +250,7 @@ def test_ignored_regions_have_no_positive_and_excuse_what_lies_in_them(mini: Yol
     assert excused["confidence"].item() == pytest.approx(0, abs=1e-6)
 
 
-def test_targets_that_do_not_fit_are_refused(mini: YoloV3, mini_cfg: Cfg) -> None:
+def test_targets_that_do_not_fit_are_refused(mini: YoloV3, mini_cfg: DarknetCfg) -> None:
     raw = raw_of(silent(mini, 2))
     with pytest.raises(ValueError, match=r"targets: expected 2, one for each image, found 1"):
         mini.loss(raw, [targets([], [])])
@@ -288,7 +288,7 @@ def test_gradient_to_the_image_agrees_with_differences(mini: YoloV3) -> None:
     generator = torch.Generator().manual_seed(4)
     image = torch.rand(1, 3, 30, 44, dtype=torch.float64, generator=generator)
     wanted = [targets([[5.0, 5.0, 35.0, 28.0], [20.0, 10.0, 40.0, 25.0]], [0, 2])]
-    assignment: Assignment = detector.assign(detector(image), wanted)
+    assignment: YoloAssignment = detector.assign(detector(image), wanted)
     directions = torch.randn(12, *image.shape, dtype=torch.float64, generator=generator)
     for term in ("total", "objectness"):
 
@@ -310,7 +310,7 @@ def test_frozen_network_is_folded_and_says_the_same(mini: YoloV3) -> None:
     with torch.no_grad():
         plain = mini(image)
     mini.requires_grad_(False)
-    assert isinstance(mini._folded(torch.float32), Folded)
+    assert isinstance(mini._folded_network(torch.float32), FoldedNetwork)
     for raw in (mini(image), mini.train()(image)):  # nothing to train: statistics stay as they are
         torch.testing.assert_close(raw.boxes_xyxy, plain.boxes_xyxy, rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(raw.confidence_logits, plain.confidence_logits, rtol=1e-4, atol=1e-4)
@@ -339,10 +339,10 @@ def test_gradient_precision(mini: YoloV3, precision: torch.dtype) -> None:
         assert found.dtype == torch.float32
         assert float(torch.cosine_similarity(found.flatten(), exact.flatten(), 0)) > 0.98
     with torch.no_grad():  # what is judged is as precise as ever
-        judged, glance = mini(image).boxes_xyxy, mini.glance(image)
+        judged, glance = mini(image).boxes_xyxy, mini.forward_for_search(image)
         mini.gradient_precision = None
         assert torch.equal(mini(image).boxes_xyxy, judged)
-        assert torch.equal(mini.glance(image).boxes_xyxy, judged)
+        assert torch.equal(mini.forward_for_search(image).boxes_xyxy, judged)
     with torch.enable_grad():
         mini.gradient_precision = precision
         assert torch.equal(mini(image).confidence_logits, glance.confidence_logits)
@@ -368,7 +368,7 @@ def test_poolings_and_routes_by_hand() -> None:
         "[net]\n[maxpool]\nsize=2\nstride=1\n[route]\nlayers=-1,0\n[upsample]\nstride=1\n[convolutional]\n"
         "filters=6\nactivation=linear\n[yolo]\nmask=0\nanchors=2,2\nclasses=1\n"
     )
-    network = Network(cfg)
+    network = DarknetNetwork(cfg)
     block = network.blocks[3]
     assert block.conv.bias is not None
     with torch.no_grad():
@@ -397,7 +397,7 @@ def test_poolings_begin_where_darknet_s_do(size: int, stride: int) -> None:
             top, left = row * stride - padding // 2, column * stride - padding // 2
             window = picture[max(top, 0) : top + size, max(left, 0) : left + size]
             expected[row, column] = window.max()
-    assert torch.equal(_max_pool(picture[None, None], MaxPool(size, stride))[0, 0], expected)
+    assert torch.equal(_max_pool(picture[None, None], MaxPoolLayer(size, stride))[0, 0], expected)
 
 
 def test_weights_file_holds_the_cfg(mini: YoloV3, tmp_path: Path) -> None:

@@ -6,11 +6,20 @@ import pytest
 
 from detectors.base import DetectorError
 from detectors.yolov3 import layouts
-from detectors.yolov3.cfg import Convolution, Head, MaxPool, Route, Shortcut, Upsample, parse, write
-from detectors.yolov3.network import Network
+from detectors.yolov3.cfg import (
+    ConvolutionLayer,
+    MaxPoolLayer,
+    RouteLayer,
+    ShortcutLayer,
+    UpsampleLayer,
+    YoloHead,
+    parse,
+    write,
+)
+from detectors.yolov3.network import DarknetNetwork
 
 
-def numbers(network: Network) -> tuple[int, int]:
+def numbers(network: DarknetNetwork) -> tuple[int, int]:
     """How many are learned, and how many are measured: means and variances."""
     norms = [block.norm for block in network.blocks.values() if block.norm is not None]
     return sum(p.numel() for p in network.parameters()), sum(2 * norm.num_features for norm in norms)
@@ -18,13 +27,17 @@ def numbers(network: Network) -> tuple[int, int]:
 
 def test_layers_of_a_file(mini_text: str) -> None:
     cfg = parse(mini_text, "mini.cfg")
-    assert cfg.layers[0] == Convolution(4, 3, 2, 1, True, True)
-    assert cfg.layers[4] == Shortcut(1)
-    assert cfg.layers[5:7] == (MaxPool(2, 2), MaxPool(2, 1))
-    assert cfg.layers[7] == Convolution(16, 1, 1, 0, False, False)
+    assert cfg.layers[0] == ConvolutionLayer(4, 3, 2, 1, True, True)
+    assert cfg.layers[4] == ShortcutLayer(1)
+    assert cfg.layers[5:7] == (MaxPoolLayer(2, 2), MaxPoolLayer(2, 1))
+    assert cfg.layers[7] == ConvolutionLayer(16, 1, 1, 0, False, False)
     anchors = ((6.0, 6.0), (12.0, 8.0), (20.0, 20.0), (40.0, 24.0))
-    assert cfg.layers[8] == Head(anchors, (2, 3), 3, 0.7, 1.0)
-    assert (cfg.layers[9], cfg.layers[11], cfg.layers[12]) == (Route((6,)), Upsample(2), Route((11, 4)))
+    assert cfg.layers[8] == YoloHead(anchors, (2, 3), 3, 0.7, 1.0)
+    assert (cfg.layers[9], cfg.layers[11], cfg.layers[12]) == (
+        RouteLayer((6,)),
+        UpsampleLayer(2),
+        RouteLayer((11, 4)),
+    )
     assert cfg.strides == (2, 4, 4, 4, 4, 8, 8, 8, 8, 8, 8, 4, 4, 4, 4)
     assert cfg.channels == (4, 8, 4, 8, 8, 8, 8, 16, 16, 8, 4, 4, 12, 16, 16)
     assert (cfg.stride, cfg.classes, [i for i, _ in cfg.heads]) == (8, 3, [8, 14])
@@ -43,10 +56,10 @@ def test_published_yolov3() -> None:
     assert len(cfg.layers) == 107  # numbered 0 to 106
     assert [i for i, _ in cfg.heads] == [82, 94, 106]
     assert [cfg.strides[i] for i, _ in cfg.heads] == [32, 16, 8]
-    assert sum(isinstance(layer, Convolution) for layer in cfg.layers) == 75
-    assert sum(isinstance(layer, Convolution) for layer in cfg.layers[:75]) == 52  # Darknet-53 less its last
-    assert (cfg.layers[86], cfg.layers[98]) == (Route((85, 61)), Route((97, 36)))
-    learned, measured = numbers(Network(cfg))
+    assert sum(isinstance(layer, ConvolutionLayer) for layer in cfg.layers) == 75
+    assert sum(isinstance(layer, ConvolutionLayer) for layer in cfg.layers[:75]) == 52  # Darknet-53 less its last
+    assert (cfg.layers[86], cfg.layers[98]) == (RouteLayer((85, 61)), RouteLayer((97, 36)))
+    learned, measured = numbers(DarknetNetwork(cfg))
     assert learned == 61_949_149
     assert 20 + 4 * (learned + measured) == 248_007_048  # bytes of the published yolov3.weights
     assert parse(write(cfg)) == cfg
@@ -56,8 +69,8 @@ def test_published_yolov3_tiny() -> None:
     cfg = layouts.yolov3_tiny()
     assert len(cfg.layers) == 24
     assert [i for i, _ in cfg.heads] == [16, 23]
-    assert (cfg.layers[17], cfg.layers[20]) == (Route((13,)), Route((19, 8)))
-    learned, measured = numbers(Network(cfg))
+    assert (cfg.layers[17], cfg.layers[20]) == (RouteLayer((13,)), RouteLayer((19, 8)))
+    learned, measured = numbers(DarknetNetwork(cfg))
     assert (learned, learned + measured) == (8_852_366, 8_858_734)  # 8.86 M, as the published file holds them
     assert 20 + 4 * (learned + measured) == 35_434_956  # bytes of the published yolov3-tiny.weights
 

@@ -12,9 +12,10 @@ import torch
 
 from detectors.base import DetectorError
 from detectors.registry import load_detector
-from detectors.yolov3 import darknet, weights
-from detectors.yolov3.cfg import Cfg, parse
-from detectors.yolov3.network import Network
+from detectors.yolov3 import darknet
+from detectors.yolov3 import darknet as weights
+from detectors.yolov3.cfg import DarknetCfg, parse
+from detectors.yolov3.network import DarknetNetwork
 from detectors.yolov3.yolov3 import YoloV3
 
 TWO = """[net]
@@ -35,11 +36,11 @@ classes=1
 NUMBERS = 4 * 2 + 2 * 3 + 6 + 6 * 2
 
 
-def test_round_trip_gives_the_same_outputs(mini: YoloV3, mini_cfg: Cfg, tmp_path: Path) -> None:
+def test_round_trip_gives_the_same_outputs(mini: YoloV3, mini_cfg: DarknetCfg, tmp_path: Path) -> None:
     path = tmp_path / "mini.weights"
-    weights.write(mini.network, path, seen=2**33)
-    other = Network(mini_cfg).eval()
-    assert weights.read(other, path) == 2**33
+    weights.save_weights(mini.network, path, seen=2**33)
+    other = DarknetNetwork(mini_cfg).eval()
+    assert weights.load_weights(other, path) == 2**33
     x = torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         for ours, theirs in zip(mini.network(x), other(x), strict=True):
@@ -52,8 +53,8 @@ def test_order_and_header_by_hand(version: tuple[int, int, int], seen: str, tmp_
     path = tmp_path / "two.weights"
     numbers = np.arange(1, NUMBERS + 1, dtype="<f4")
     path.write_bytes(struct.pack("<3i", *version) + struct.pack(seen, 77) + numbers.tobytes())
-    network = Network(parse(TWO))
-    assert weights.read(network, path) == 77
+    network = DarknetNetwork(parse(TWO))
+    assert weights.load_weights(network, path) == 77
     first, second = network.blocks.values()
     assert first.norm is not None
     assert first.norm.bias.tolist() == [1, 2]
@@ -66,7 +67,7 @@ def test_order_and_header_by_hand(version: tuple[int, int, int], seen: str, tmp_
     assert second.conv.bias.tolist() == [15, 16, 17, 18, 19, 20]
     assert second.conv.weight.flatten().tolist() == list(range(21, 33))
     # The order in which they are written is the same.
-    weights.write(network, path, 77)
+    weights.save_weights(network, path, 77)
     written = path.read_bytes()
     assert struct.unpack("<3iq", written[:20]) == (0, 2, 0, 77)
     assert np.array_equal(np.frombuffer(written[20:], "<f4"), numbers)
@@ -79,20 +80,20 @@ def test_files_of_another_length(extra: int, found: str, tmp_path: Path) -> None
     with pytest.raises(
         DetectorError, match=rf"two\.weights: expected 32 numbers after the header, found {found}$"
     ):
-        weights.read(Network(parse(TWO)), path)
+        weights.load_weights(DarknetNetwork(parse(TWO)), path)
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
-    network = Network(parse(TWO))
+    network = DarknetNetwork(parse(TWO))
     with pytest.raises(DetectorError, match=r"gone\.weights: expected Darknet weights, found No such file"):
-        weights.read(network, tmp_path / "gone.weights")
+        weights.load_weights(network, tmp_path / "gone.weights")
     short = tmp_path / "short.weights"
     short.write_bytes(b"dark")
     with pytest.raises(DetectorError, match=r"short\.weights: expected Darknet weights, found 4 bytes"):
-        weights.read(network, short)
+        weights.load_weights(network, short)
     short.write_bytes(struct.pack("<3iq", 0, 2, 0, 0) + np.full(NUMBERS, np.nan, "<f4").tobytes())
     with pytest.raises(DetectorError, match=r"short\.weights: expected finite numbers"):
-        weights.read(network, short)
+        weights.load_weights(network, short)
 
 
 def test_darknet_files_by_name(mini: YoloV3, mini_text: str, tmp_path: Path) -> None:
@@ -122,7 +123,7 @@ def test_darknet_files_by_name(mini: YoloV3, mini_text: str, tmp_path: Path) -> 
 def test_coco_names_where_there_are_eighty(tmp_path: Path) -> None:
     path = tmp_path / "coco.cfg"
     path.write_text(TWO.replace("classes=1", "classes=80").replace("filters=6", "filters=85"))
-    weights.write(Network(parse(path.read_text())), tmp_path / "coco.weights")
+    weights.save_weights(DarknetNetwork(parse(path.read_text())), tmp_path / "coco.weights")
     detector = load_detector(f"darknet:{path}")
     assert detector.classes[:3] == ("person", "bicycle", "Car")
     (tmp_path / "coco.names").write_text("\n".join(["car", *map(str, range(79))]))

@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from detectors.adapters import coco
+from detectors.adapters.spec import COCO_CLASSES
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.judging import DEFAULT_T_STAR, JudgedClasses, t_star_of
+from drivesem.attack.targets import DEFAULT_T_STAR, EvaluatedClasses, resolve_t_star
 
 
 class Named:
@@ -27,10 +27,10 @@ TRUTH = Targets(BOXES, torch.arange(4), torch.tensor([False, False, False, True]
 
 
 def test_classes_of_coco_are_judged_by_name():
-    judged = JudgedClasses.of(Named(*coco.CLASSES))
+    judged = EvaluatedClasses.from_detector(Named(*COCO_CLASSES))
     assert judged.names == ("Car",)
-    person, car, bus = (coco.CLASSES.index(name) for name in ("person", "Car", "bus"))
-    found = judged.detections(
+    person, car, bus = (COCO_CLASSES.index(name) for name in ("person", "Car", "bus"))
+    found = judged.map_detections(
         Detections(BOXES[:3], torch.tensor([person, car, bus]), torch.tensor([0.9, 0.8, 0.7]))
     )
     assert torch.equal(found.boxes_xyxy, BOXES[1:2])
@@ -39,17 +39,17 @@ def test_classes_of_coco_are_judged_by_name():
 
 
 def test_a_detector_of_all_classes_sees_everything_as_it_is():
-    judged = JudgedClasses.of(Named(*CLASSES))
+    judged = EvaluatedClasses.from_detector(Named(*CLASSES))
     found = Detections(BOXES, torch.arange(4), torch.ones(4))
-    assert judged.detections(found) is found
-    assert judged.targets(TRUTH) is TRUTH
-    assert judged.own_targets(TRUTH) is TRUTH
+    assert judged.map_detections(found) is found
+    assert judged.map_targets(TRUTH) is TRUTH
+    assert judged.to_detector_targets(TRUTH) is TRUTH
 
 
 def test_objects_without_a_name_are_ignored_for_each_class_and_rows_stay():
-    judged = JudgedClasses.of(Named("tram", "Cyclist", "Car"))
+    judged = EvaluatedClasses.from_detector(Named("tram", "Cyclist", "Car"))
     assert judged.names == ("Car", "Cyclist")
-    targets = judged.targets(TRUTH)
+    targets = judged.map_targets(TRUTH)
     foreign = [i for i, name in enumerate(CLASSES) if name not in judged.names]
     assert torch.equal(targets.boxes_xyxy, torch.cat([BOXES, BOXES[foreign]]))
     expected = [judged.names.index(name) if name in judged.names else 0 for name in CLASSES]
@@ -60,19 +60,19 @@ def test_objects_without_a_name_are_ignored_for_each_class_and_rows_stay():
 
 
 def test_losses_get_the_detector_s_own_numbers():
-    judged = JudgedClasses.of(Named("tram", "Cyclist", "Car"))
-    own = judged.own_targets(Targets(BOXES[:2], torch.tensor([0, 1]), torch.zeros(2, dtype=torch.bool)))
+    judged = EvaluatedClasses.from_detector(Named("tram", "Cyclist", "Car"))
+    own = judged.to_detector_targets(Targets(BOXES[:2], torch.tensor([0, 1]), torch.zeros(2, dtype=torch.bool)))
     assert own.labels.tolist() == [2, 1]
 
 
 def test_a_detector_without_cars_is_refused():
     with pytest.raises(DetectorError, match=r"detector named: expected one that knows Car, found bus, tram$"):
-        JudgedClasses.of(Named("bus", "tram"))
+        EvaluatedClasses.from_detector(Named("bus", "tram"))
 
 
 def test_thresholds():
     plain, own, unset = Named("Car"), Named("Car"), Named("Car")
     own.t_star, unset.t_star = 0.6, None
-    assert t_star_of(plain) == t_star_of(unset) == DEFAULT_T_STAR
-    assert t_star_of(own) == t_star_of(own, otherwise=0.2) == 0.6
-    assert t_star_of(plain, otherwise=0.2) == t_star_of(own, asked=0.2) == 0.2
+    assert resolve_t_star(plain) == resolve_t_star(unset) == DEFAULT_T_STAR
+    assert resolve_t_star(own) == resolve_t_star(own, otherwise=0.2) == 0.6
+    assert resolve_t_star(plain, otherwise=0.2) == resolve_t_star(own, asked=0.2) == 0.2

@@ -17,19 +17,19 @@ import torch
 
 from detectors.base import Detector
 from detectors.types import CLASSES, Detections
-from drivesem.analysis.explain import asking as explain_asking
-from drivesem.analysis.explain import frame as explaining
+from drivesem.analysis.explain import run as explain_asking
+from drivesem.analysis.explain import run as explaining
 from drivesem.analysis.explain.results import read_explanation
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.methods.given import Given
+from drivesem.attack.methods.placebo import FixedTheta
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
+from drivesem.run.finished import rebuild_objective
 from drivesem.run.frame import FrameSettings, attack_scene, write_frame
-from drivesem.run.rebuilt import rebuilt
 from drivesem.run.results import load_frame
-from scene_ir.exchange import without
+from scene_ir.exchange import remove_vehicle
 from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -51,7 +51,7 @@ class Raw:
     def __len__(self) -> int:
         return len(self.logits)
 
-    def one(self, index: int) -> Raw:
+    def select(self, index: int) -> Raw:
         return Raw(self.logits[index : index + 1])
 
 
@@ -189,8 +189,8 @@ def test_the_least_change_fails_and_is_feasible(explained: Path) -> None:
     assert [f.kind for f in least.failures] == ["phantom"]
     # judged anew from what was written
     frame = explained / "frames" / "demo-000"
-    result, attack = load_frame(frame / "result.json"), run_folder.attack_of(explained)
-    objective, theta = rebuilt(result, frame, attack, ("translate", "rotate"), Jumpy())
+    result, attack = load_frame(frame / "result.json"), run_folder.load_attack_config(explained)
+    objective, theta = rebuild_objective(result, frame, attack, ("translate", "rotate"), Jumpy())
     names = [objective.space.name(i) for i in range(objective.space.dim)]
     small = torch.zeros_like(theta)
     for coordinate in least.theta:
@@ -255,11 +255,16 @@ def exchanged(run: Path, name: str, share: float, scene: SceneIR) -> None:
     """A further frame of the run, whose first car is gone, which makes it fail. share: of the step that its second
     car goes as well.
     """
-    scene, params = without(scene, 0), parse_params("translate,rotate")
+    scene, params = remove_vehicle(scene, 0), parse_params("translate,rotate")
     space = ParameterSpace(scene, params)
     theta = share * space.step * (torch.arange(space.dim) >= space.dim - 1)
     settings = FrameSettings(
-        attack=Given(theta), params=params, label_mode="moved", term="objectness", render=RenderSettings(), seed=0
+        attack=FixedTheta(theta),
+        params=params,
+        label_mode="moved",
+        term="objectness",
+        render=RenderSettings(),
+        seed=0,
     )
     result = write_frame(attack_scene(name, scene, Jumpy(), settings), run / "frames" / name)
     assert result.success_moved

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from detectors.adapters import choose
+from detectors import registry
 from detectors.registry import SHIPPED, read_weights, write_weights
 from detectors.types import CLASSES, Detections
 from drivesem import cli
@@ -426,6 +426,6 @@ def test_a_command_says_whose_code_it_runs(tmp_path: Path, capsys: pytest.Captur
     assert main(["check", "--detector", f"planted:height_px=30:38@module:{path}:A"]) == 2
     first, _ = capsys.readouterr().err.splitlines()
     assert first == f"drivesem: --detector: runs the code in {path}:A"
-    for kind in choose.KINDS:
+    for kind in registry.KINDS:
         said = cli._CODE.findall(f"squeezedet,{kind}:a.b")  # pyright: ignore[reportPrivateUsage]
-        assert said == (["a.b"] if kind in choose.RUNS_CODE else [])
+        assert said == (["a.b"] if kind in registry.RUNS_CODE else [])
