@@ -73,10 +73,9 @@ class Options:
 
         Blocks and commands extend this with conditions between fields.
         """
-        for field, kind in zip(
-            fields(self), get_type_hints(type(self), include_extras=True).values(), strict=True
-        ):
-            option, value = option_name(field.name), getattr(self, field.name)
+        hints = get_type_hints(type(self), include_extras=True)
+        for field in fields(self):
+            kind, option, value = hints[field.name], option_name(field.name), getattr(self, field.name)
             refuse(not _has_type(value, kind), option, _type_name(kind), repr(value))
             constraints = tuple(_find_constraints(kind))
             if not any(isinstance(constraint, AllowsUrl) for constraint in constraints):
@@ -91,8 +90,12 @@ class Options:
                     constraint.check(option, value)
 
 
+def find_constraints(command: type[Options], field: str) -> tuple[Constraint, ...]:
+    """What the type of a field demands of its values."""
+    return tuple(_find_constraints(get_type_hints(command, include_extras=True)[field]))
+
+
 def _find_constraints(kind: Any) -> Iterator[Constraint]:
-    """What a field's type demands of its values."""
     yield from (marker for marker in getattr(kind, "__metadata__", ()) if isinstance(marker, Constraint))
     for part in get_args(kind):
         yield from _find_constraints(part)

@@ -7,7 +7,7 @@ import difflib
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
-from itertools import takewhile
+from itertools import dropwhile, takewhile
 
 import tyro
 
@@ -56,14 +56,20 @@ def _parse_options(words: Sequence[str], kind: type[CommandConfig], prog: str) -
         with contextlib.redirect_stderr(printed):
             config, unknown = tyro.cli(kind, prog=prog, args=words, return_unknown_args=True)
     except SystemExit:
-        lines = takewhile(lambda line: "───" not in line, printed.getvalue().splitlines()[1:])
-        message = " ".join(line.strip("│ ") for line in lines).partition(" Got errors:")[0]
-        raise CommandLineError(message) from None
+        raise CommandLineError(_first_paragraph(printed.getvalue())) from None
     if unknown:
         names = [option_name(field.name) for field in fields(kind)]
         expected = f"options of {prog} (--help-all lists them)"
         raise UsageError("command line", expected, suggest(unknown[0].partition("=")[0], names))
     return config
+
+
+def _first_paragraph(text: str) -> str:
+    """The message in a box that tyro prints, without its title, hints and border."""
+    lines = [line.strip("│ ") for line in text.splitlines()[1:]]
+    body = dropwhile(lambda line: not line.strip("─-╰╯"), lines)
+    message = takewhile(lambda line: line.strip("─-╰╯"), body)
+    return " ".join(message).partition(" Got errors:")[0]
 
 
 def suggest(word: str, known: Iterable[str]) -> str:

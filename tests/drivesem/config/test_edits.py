@@ -11,16 +11,16 @@ import pytest
 import torch
 
 from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.scene_edits import edited, moved
+from drivesem.attack.scene_edits import apply_changes, apply_edit
 from drivesem.attack.space import ParameterSpace, Perturbation
 from drivesem.config.edits import (
     ALL,
-    WEATHER_NAMES,
-    WEATHERS,
+    WEATHER_CODES,
+    WEATHER_PRESETS,
     FrameEdit,
     ObjectEdit,
-    frame_edit,
-    merged,
+    merge_edits,
+    parse_frame_edit,
     parse_setting,
     read_frame_edit,
 )
@@ -34,8 +34,8 @@ Street = Callable[..., SceneIR]
 def edit_of(*settings: str) -> FrameEdit:
     changes: dict[Any, Any] = {}
     for text in settings:
-        changes = merged(changes, parse_setting(text))
-    return frame_edit("edit", changes)
+        changes = merge_edits(changes, parse_setting(text))
+    return parse_frame_edit("edit", changes)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def edit_of(*settings: str) -> FrameEdit:
         ("objects[all].rotate=0", {ALL: ObjectEdit()}),
         ("objects[3].size=-5%", {3: ObjectEdit(size=-0.05)}),
         ("objects[12].remove=true", {12: ObjectEdit(remove=True)}),
-        ("objects[1].mesh=60%", {1: ObjectEdit(mesh_share=0.6)}),
+        ("objects[1].mesh=60%", {1: ObjectEdit(mesh_fraction=0.6)}),
         (f"objects[1].mesh={','.join(['0.1'] * SYMMETRIC_DIM)}", {1: ObjectEdit(mesh=(0.1,) * SYMMETRIC_DIM)}),
     ],
 )
@@ -61,8 +61,8 @@ def test_settings_of_the_scene() -> None:
     assert edit_of("weather.rain=0.4", "foliage.hue=-0.5") == FrameEdit(
         weather=(0.0, 0.4, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
     )
-    for name, codes in WEATHERS.items():
-        assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_NAMES)
+    for name, codes in WEATHER_PRESETS.items():
+        assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_CODES)
 
 
 def test_a_share_of_a_shape_needs_a_shape(street: Street) -> None:
@@ -71,23 +71,23 @@ def test_a_share_of_a_shape_needs_a_shape(street: Street) -> None:
     offsets[2, 5] = torch.tensor([0.1, -0.05, 0.02])
     bent = scene.with_objects(ffd=scene.objects.ffd + offsets)
     edit = edit_of("objects[2].mesh=25%")
-    torch.testing.assert_close(moved(scene, edit, bent).objects.ffd, 0.25 * offsets)
+    torch.testing.assert_close(apply_changes(scene, edit, bent).objects.ffd, 0.25 * offsets)
     both = edit_of("objects[all].mesh=25%", "objects[2].mesh=50%")
-    torch.testing.assert_close(moved(scene, both, bent).objects.ffd, 0.75 * offsets)
+    torch.testing.assert_close(apply_changes(scene, both, bent).objects.ffd, 0.75 * offsets)
     message = r"objects\[2\]\.mesh: expected lattice offsets; shares need .* --photographed, found 25%"
     with pytest.raises(RangeError, match=message):
-        moved(scene, edit)
+        apply_changes(scene, edit)
     for text in ("101%", "-1%"):
         with pytest.raises(FormatError, match="expected a share from 0% to 100%"):
             edit_of(f"objects[2].mesh={text}")
     with pytest.raises(FormatError, match=r"expected a unit: 0\.5%"):
-        frame_edit("edit", {"objects": {2: {"mesh": "0.5"}}})
+        parse_frame_edit("edit", {"objects": {2: {"mesh": "0.5"}}})
 
 
 def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:
     edit = edit_of("sun.azimuth=-0.5", "sun.strength=1")
     assert edit == FrameEdit(sun=(-0.5, 0.0, 1.0))
-    assert edited(street(), edit).scene.environment.light.tolist() == [-0.5, 0.0, 1.0]
+    assert apply_edit(street(), edit).scene.environment.light.tolist() == [-0.5, 0.0, 1.0]
     with pytest.raises(FormatError, match=r"sun: height: expected one of azimuth, elevation, strength"):
         edit_of("sun.height=1")
     with pytest.raises(FormatError, match=r"sun.azimuth: expected a code in \[-1, 1\], found 2.0"):
@@ -99,7 +99,7 @@ def test_later_settings_of_the_same_thing_win() -> None:
     both = edit_of("objects[1].rotate=1deg", "objects[1].translate=1m,0m").objects[1]
     assert both == ObjectEdit(translate_m=(1.0, 0.0), rotate=math.radians(1))
     assert edit_of("weather.rain=0.4", "weather=sunset").weather == edit_of("weather=sunset").weather
-    fog = WEATHERS["fog"]["fog"]
+    fog = WEATHER_PRESETS["fog"]["fog"]
     assert edit_of("weather=fog", "weather.rain=0.4").weather[:2] == (fog, 0.4)
 
 
@@ -111,14 +111,14 @@ def test_a_file_and_the_command_line_say_it_alike(tmp_path: Path) -> None:
     written = edit_of(
         "weather=fog", "objects[2].translate=0.5m,0m", "objects[2].rotate=10deg", "objects[all].color=0.1,0,0,0,0"
     )
-    assert frame_edit("edit", read_frame_edit(path)) == written
+    assert parse_frame_edit("edit", read_frame_edit(path)) == written
     path.write_text("")
     assert read_frame_edit(path) == {}
 
 
 def test_bare_numbers_of_a_file_are_in_units_of_theta() -> None:
     entry = {"objects": {0: {"translate": [0.1, "1m"], "rotate": 0.2}}}
-    assert frame_edit("edit", entry).objects[0] == ObjectEdit(
+    assert parse_frame_edit("edit", entry).objects[0] == ObjectEdit(
         translate=(0.1, 0.0), translate_m=(0.0, 1.0), rotate=0.2
     )
 
@@ -174,7 +174,7 @@ def test_a_bad_file_is_named(text: str, message: str, tmp_path: Path) -> None:
 
 def test_metres_along_the_heading_and_to_the_left(street: Street) -> None:
     scene = street(yaw=0.3, tilt=0.02)
-    after = moved(scene, edit_of("objects[1].translate=0.5m,0.25m", "objects[1].rotate=10deg"))
+    after = apply_changes(scene, edit_of("objects[1].translate=0.5m,0.25m", "objects[1].rotate=10deg"))
     shift = after.objects.translation - scene.objects.translation
     assert not shift[[0, 2, 3]].any()
     front = torch.tensor([math.cos(0.3), 0.0, -math.sin(0.3)])
@@ -216,7 +216,7 @@ def test_it_moves_as_theta_does(street: Street) -> None:
             mesh=tuple(change.mesh[i].tolist()),
         )
     edit = FrameEdit(objects, tuple(change.weather.tolist()), tuple(change.foliage.tolist()))
-    found = moved(scene, edit)
+    found = apply_changes(scene, edit)
     for name in ("translation", "yaw", "ffd", "texture_code"):
         torch.testing.assert_close(getattr(found.objects, name), getattr(expected.objects, name))
     torch.testing.assert_close(found.environment.weather, expected.environment.weather)
@@ -225,27 +225,27 @@ def test_it_moves_as_theta_does(street: Street) -> None:
 
 def test_all_and_one_add_up_and_codes_end_at_their_bounds(street: Street) -> None:
     scene = street()
-    after = moved(scene, edit_of("objects[all].rotate=1deg", "objects[2].rotate=2deg"))
+    after = apply_changes(scene, edit_of("objects[all].rotate=1deg", "objects[2].rotate=2deg"))
     turned = torch.rad2deg(after.objects.yaw - scene.objects.yaw)
     torch.testing.assert_close(turned, torch.tensor([1.0, 1.0, 3.0, 1.0]), atol=1e-4, rtol=0)
-    foggy = moved(moved(scene, edit_of("weather.fog=0.8")), edit_of("weather.fog=0.8"))
+    foggy = apply_changes(apply_changes(scene, edit_of("weather.fog=0.8")), edit_of("weather.fog=0.8"))
     assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0]
 
 
 def test_no_change_keeps_every_bit(street: Street) -> None:
     scene = street()
-    after = moved(scene, edit_of("objects[all].rotate=0deg"))
+    after = apply_changes(scene, edit_of("objects[all].rotate=0deg"))
     assert torch.equal(after.objects.translation, scene.objects.translation)
     assert torch.equal(after.objects.yaw, scene.objects.yaw)
-    assert moved(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0))).environment.weather[0] == 1
+    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0))).environment.weather[0] == 1
 
 
 def test_removal_names_rows(street: Street) -> None:
     scene = street()
-    assert edited(scene, edit_of("objects[2].remove=true")).removed == (2,)
-    assert edited(scene, edit_of("objects[all].remove=true")).removed == (0, 1, 2, 3)
+    assert apply_edit(scene, edit_of("objects[2].remove=true")).removed == (2,)
+    assert apply_edit(scene, edit_of("objects[all].remove=true")).removed == (0, 1, 2, 3)
     with pytest.raises(RangeError, match=r"objects\[4\]: expected a row from 0 to 3, found 4"):
-        edited(scene, edit_of("objects[4].remove=true"))
+        apply_edit(scene, edit_of("objects[4].remove=true"))
 
 
 def test_places_that_vehicles_should_not_have(street: Street) -> None:
@@ -253,14 +253,14 @@ def test_places_that_vehicles_should_not_have(street: Street) -> None:
     rows = range(2)
     assert check_places(scene, scene, rows) == []
     # the heading is away from the camera; its left is the camera's left
-    into = moved(scene, edit_of("objects[0].translate=0m,-4.5m"))
+    into = apply_changes(scene, edit_of("objects[0].translate=0m,-4.5m"))
     assert [line.partition(",")[0] for line in check_places(scene, into, rows)] == [
         "objects[1]: collision with objects[0]"
     ]
     assert check_places(scene, into, [1]) == []
-    off = moved(scene, edit_of("objects[1].translate=0m,-5m"))
+    off = apply_changes(scene, edit_of("objects[1].translate=0m,-5m"))
     assert [line.partition(",")[0] for line in check_places(scene, off, rows)] == ["objects[1]: left the road"]
     raised = scene.with_objects(translation=scene.objects.translation - torch.tensor([0.0, 0.3, 0.0]))
     assert check_places(scene, raised, rows)[0] == "objects[0]: off the ground by 0.300 m"
-    far = moved(scene, edit_of("objects[1].translate=2m,0m"))
+    far = apply_changes(scene, edit_of("objects[1].translate=2m,0m"))
     assert check_places(scene, far, rows) == []
