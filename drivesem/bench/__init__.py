@@ -1,1 +1,1 @@
-"""Benchmarks as commands: the same scenes, methods and machines' facts for every figure in the documentation."""
+"""Benchmarks behind `drivesem bench`, with common scenes, timers and machine facts."""

@@ -1,8 +1,8 @@
-"""A whole attack step beside the detector's whole pass, with vehicles where KITTI's labels have them.
+"""Times a whole attack step against the detector's whole pass, with vehicles placed as in KITTI's labels.
 
-The labels are the user's; there are no pictures. Vehicles of the labels' 3D boxes stand in a frame of noise, are
-photographed by the compositor itself, and taken apart exactly. So the step, its regions among them, is that of a
-frame of KITTI; what the detector finds is not.
+The user provides labels, but no photographs. Vehicles of the labelled 3D boxes are placed in a frame of noise,
+rendered by the compositor and de-rendered exactly. So the steps, with their regions, are those of a KITTI frame;
+the detections are not.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from detectors.base import Detector
-from drivesem.attack.space import combo
+from drivesem.attack.space import combo_parameters
 from drivesem.bench.scenes import HEIGHT, WIDTH
-from drivesem.bench.step import Stepping, pair
+from drivesem.bench.step import AttackSteps, time_pair
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Clock, Spread
-from drivesem.config.blocks import KEEP_MB
+from drivesem.bench.timing import PairedTimer, Spread
+from drivesem.config.options import DEFAULT_KEEP_MB
 from drivesem.data.kitti import read_calib, read_labels
-from scene_ir.derender.derender import VEHICLES, DerenderSettings
+from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.templates import template
-from scene_ir.render.sources import from_own_picture
+from scene_ir.render.sources import photograph_scene
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
@@ -68,33 +68,47 @@ METHOD = (
 _PAIRS = 7
 _KINDS = {"Car": "sedan", "Van": "van", "Truck": "truck"}
 _EYE_M = 1.65
-"""Height of KITTI's camera above the road."""
+"""Height of KITTI's camera above the road, m."""
 _HORIZON = 0.46
 """Share of the frame's height at which the ground ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxesRow:
-    """Over frames: ratios of a whole step to the detector's whole pass; `FrameCost` has them one by one."""
+    """Summary over frames; ratios are of a whole step to the detector's whole pass, times are medians in ms."""
 
     frames: int
+    """Number of frames."""
     median_ratio: float
+    """Median."""
     p90_ratio: float
+    """90th percentile."""
     worst_ratio: float
+    """Maximum."""
     median_cpu_ratio: float
+    """Median for processor time."""
     p90_cpu_ratio: float
+    """90th percentile for processor time."""
     worst_cpu_ratio: float
+    """Maximum for processor time."""
     median_first_ratio: float
+    """Median for each frame's first step."""
     median_vehicles: float
+    """Vehicles per frame."""
     median_changed: float
+    """Share of pixels covered by vehicles and shadows."""
     step_ms: float
+    """Whole step."""
     detector_ms: float
+    """Detector forward and backward."""
     step_cpu_ms: float
+    """Processor time of the step."""
     detector_cpu_ms: float
+    """Processor time of the detector."""
 
     @classmethod
-    def of(cls, frames: Sequence[FrameCost]) -> BoxesRow:
-        """Of at least one frame."""
+    def from_frames(cls, frames: Sequence[FrameCost]) -> BoxesRow:
+        """The summary of at least one frame."""
 
         def at(name: str, share: float = 0.5) -> float:
             values = torch.tensor([float(getattr(frame, name)) for frame in frames], dtype=torch.float64)
@@ -109,34 +123,50 @@ class BoxesRow:
 
 @dataclass(frozen=True, slots=True)
 class FrameCost:
-    """What was measured in one frame. changed: share of the pixels that vehicles and shadows are drawn into."""
+    """Measurements in one frame; times are medians in ms."""
 
     frame: str
+    """Its name."""
     vehicles: int
+    """Number of vehicles."""
     changed: float
+    """Share of pixels covered by vehicles and shadows."""
     ratio: float
+    """Step over detector."""
     cpu_ratio: float
+    """The same for processor time."""
     first_ratio: float
+    """First step over detector."""
     step_ms: float
+    """Whole step."""
     detector_ms: float
+    """Detector forward and backward."""
     step_cpu_ms: float
+    """Processor time of the step."""
     detector_cpu_ms: float
+    """Processor time of the detector."""
 
 
 @dataclass(frozen=True, slots=True)
-class Labelled:
-    """One frame's labels and camera."""
+class LabelledFrame:
+    """Labels and camera of one frame."""
 
     name: str
+    """Its name."""
     labels: Labels
+    """All labels."""
     camera: Camera
+    """The camera."""
     rows: tuple[int, ...]
+    """Rows of the labels that are vehicles to place."""
 
 
-def frames_of(path: Path, count: int) -> list[Labelled]:
-    """`count` frames with vehicles of a tar archive of KITTI's label_2 and calib, evenly spread over their names.
+def read_labelled_frames(path: Path, count: int) -> list[LabelledFrame]:
+    """Read `count` frames with vehicles, evenly spread over their names, from a tar archive of KITTI's label_2 and
+    calib.
 
-    Raises FormatError naming the file.
+    Raises:
+        FormatError: The file is not such an archive; names it.
     """
     try:
         with tarfile.open(path) as archive:
@@ -150,18 +180,18 @@ def frames_of(path: Path, count: int) -> list[Labelled]:
     names = sorted(name for folder, name in texts if folder == "label_2" and ("calib", name) in texts)
     with TemporaryDirectory() as folder:
 
-        def labelled(name: str) -> Labelled:
+        def labelled(name: str) -> LabelledFrame:
             labels, calib = Path(folder) / f"{name}.txt", Path(folder) / f"{name}.calib.txt"
             labels.write_bytes(texts["label_2", name])
             calib.write_bytes(texts["calib", name])
             projection = read_calib(calib).projection
             camera = Camera(projection[:, :3].clone(), HEIGHT, WIDTH, projection)
-            found = read_labels(labels)
-            return Labelled(name, found, camera, _vehicles(found, camera))
+            frame_labels = read_labels(labels)
+            return LabelledFrame(name, frame_labels, camera, _vehicle_rows(frame_labels, camera))
 
-        chosen: dict[str, Labelled] = {}
+        chosen: dict[str, LabelledFrame] = {}
         for i in range(count if names else 0):
-            # The next one with vehicles from an evenly spaced place on.
+            # The next frame with vehicles, from an evenly spaced position on.
             for name in names[i * len(names) // count :]:
                 if name not in chosen and (one := labelled(name)).rows:
                     chosen[name] = one
@@ -171,60 +201,73 @@ def frames_of(path: Path, count: int) -> list[Labelled]:
     return list(chosen.values())
 
 
-def scene_of(frame: Labelled, seed: int) -> SceneIR:
-    """The frame's vehicles before noise, photographed and taken apart."""
-    return from_own_picture(_bare(frame, seed))
+def build_scene(frame: LabelledFrame, seed: int) -> SceneIR:
+    """The frame's vehicles before noise, rendered and de-rendered."""
+    return photograph_scene(_place_vehicles(frame, seed))
 
 
 def measure(
-    frames: Sequence[Labelled],
+    frames: Sequence[LabelledFrame],
     detector: Detector,
     seed: int,
     device: str,
     whole: bool = False,
-    keep_mb: float = KEEP_MB,
+    keep_mb: float = DEFAULT_KEEP_MB,
 ) -> Iterator[FrameCost]:
-    """One row a frame. whole, keep_mb: as of `Objective`."""
-    clock, params = Clock(device), combo(2)
+    """Measure one row per frame.
+
+    Args:
+        frames: What to measure.
+        detector: The detector.
+        seed: Seed of noise and thetas.
+        device: Device to measure.
+        whole: As in `Objective`.
+        keep_mb: As in `Objective`.
+    """
+    clock, params = PairedTimer(device), combo_parameters(2)
     layout: torch.memory_format | None = None
     for number, frame in enumerate(frames):
-        stepping = Stepping(scene_of(frame, seed), params, detector, seed, device, whole=whole, keep_mb=keep_mb)
-        layout = layout or stepping.faster_layout(clock)
-        detect = stepping.detector_alone(layout)
-        if number == 0:  # what is made once for all frames is nobody's
-            stepping()
-            stepping.objective.forget()
+        step = AttackSteps(build_scene(frame, seed), params, detector, seed, device, whole=whole, keep_mb=keep_mb)
+        layout = layout or step.faster_layout(clock)
+        detect = step.detector_alone(layout)
+        if number == 0:  # what is prepared once for all frames does not count
+            step()
+            step.objective.release_layers()
         detect()
-        first = clock.ms(stepping)
-        pairs = [pair(clock, stepping, detect, swapped=bool(i % 2)) for i in range(_PAIRS)]
-        detector_ms = Spread.of([alone.ms for _, alone in pairs]).median
+        first = clock.milliseconds(step)
+        pairs = [time_pair(clock, step, detect, swapped=bool(i % 2)) for i in range(_PAIRS)]
+        detector_ms = Spread.from_values([alone.ms for _, alone in pairs]).median
         yield FrameCost(
             frame=frame.name,
             vehicles=len(frame.rows),
-            changed=round(stepping.drawn_share(), 4),
-            ratio=round(Spread.of([step.ms / alone.ms for step, alone in pairs]).median, 4),
-            cpu_ratio=round(Spread.of([step.cpu_ms / alone.cpu_ms for step, alone in pairs]).median, 4),
+            changed=round(step.drawn_share(), 4),
+            ratio=round(Spread.from_values([step.ms / alone.ms for step, alone in pairs]).median, 4),
+            cpu_ratio=round(Spread.from_values([step.cpu_ms / alone.cpu_ms for step, alone in pairs]).median, 4),
             first_ratio=round(first / detector_ms, 4),
-            step_ms=round(Spread.of([step.ms for step, _ in pairs]).median, 3),
+            step_ms=round(Spread.from_values([step.ms for step, _ in pairs]).median, 3),
             detector_ms=round(detector_ms, 3),
-            step_cpu_ms=round(Spread.of([step.cpu_ms for step, _ in pairs]).median, 3),
-            detector_cpu_ms=round(Spread.of([alone.cpu_ms for _, alone in pairs]).median, 3),
+            step_cpu_ms=round(Spread.from_values([step.cpu_ms for step, _ in pairs]).median, 3),
+            detector_cpu_ms=round(Spread.from_values([alone.cpu_ms for _, alone in pairs]).median, 3),
         )
 
 
-def _vehicles(labels: Labels, camera: Camera) -> tuple[int, ...]:
-    """Rows that are vehicles, wholly before the camera and as large as a de-rendered one must be."""
-    rows = [i for i in range(len(labels.kind)) if labels.kind[i] in VEHICLES and bool(labels.size_lhw[i, 0] > 0)]
+def _vehicle_rows(labels: Labels, camera: Camera) -> tuple[int, ...]:
+    """Rows of vehicles completely in front of the camera and large enough to de-render."""
+    rows = [
+        i
+        for i in range(len(labels.kind))
+        if labels.kind[i] in VEHICLE_CATEGORIES and bool(labels.size_lhw[i, 0] > 0)
+    ]
     boxes = project_boxes(labels.size_lhw[rows], labels.yaw[rows], labels.translation[rows], camera.matrix)
     seen = clip_boxes(boxes, camera.height, camera.width)
     least = DerenderSettings().min_height_px
-    kept = (
+    is_large = (
         torch.isfinite(boxes).all(1) & (seen[:, 3] - seen[:, 1] >= least) & (seen[:, 2] - seen[:, 0] >= least / 2)
     )
-    return tuple(row for row, keep in zip(rows, kept.tolist(), strict=True) if keep)
+    return tuple(row for row, keep in zip(rows, is_large.tolist(), strict=True) if keep)
 
 
-def _bare(frame: Labelled, seed: int) -> SceneIR:
+def _place_vehicles(frame: LabelledFrame, seed: int) -> SceneIR:
     labels, rows, count = frame.labels, list(frame.rows), len(frame.rows)
     kinds = list(dict.fromkeys(labels.kind[row] for row in rows))
     objects = Objects(
@@ -234,7 +277,7 @@ def _bare(frame: Labelled, seed: int) -> SceneIR:
         size_lhw=labels.size_lhw[rows].float(),
         ffd=torch.zeros(count, LATTICE_POINTS, 3),
         texture_code=torch.zeros(count, TEXTURE_DIM),
-        category=torch.tensor([int(VEHICLES[labels.kind[row]]) for row in rows]),
+        category=torch.tensor([int(VEHICLE_CATEGORIES[labels.kind[row]]) for row in rows]),
         box2d=labels.boxes_xyxy[rows].float(),
         truncation=labels.truncation[rows].float(),
         occlusion=labels.occlusion[rows],

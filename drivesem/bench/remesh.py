@@ -1,4 +1,4 @@
-"""The same car with more or fewer triangles."""
+"""Changes the number of triangles of a car's mesh."""
 
 from __future__ import annotations
 
@@ -11,35 +11,39 @@ from scene_ir.meshes.lod import simplify
 from scene_ir.types import Mesh
 
 _PROPORTION = np.array([2.7, 1.0, 1.15])
-"""Length and width of a typical car in units of its height: edges are as long as the car's, not its unit box's."""
+"""Length and width of a typical car in units of its height, to measure edges on the car instead of the unit box.
+"""
 
 
-def with_triangles(mesh: Mesh, triangles: int) -> Mesh:
-    """The mesh with `triangles` faces, or one less where that number is odd: its edges collapsed, or the longest
-    ones split at their middles, which leaves the surface as it is. Closed surfaces stay closed.
+def set_triangle_count(mesh: Mesh, triangles: int) -> Mesh:
+    """The mesh with `triangles` faces, or one fewer if that number is odd.
 
-    Raises RangeError for triangles < 4.
+    Edges are collapsed, or the longest ones split at their middles, which preserves the surface. Closed surfaces
+    stay closed.
+
+    Raises:
+        RangeError: Fewer than 4 triangles.
     """
     if triangles < 4:
         raise RangeError("triangles", "at least 4", triangles)
     mesh = simplify(mesh, triangles)
     while mesh.faces.shape[0] + 2 <= triangles:
         before = mesh.faces.shape[0]
-        mesh = _split(mesh, (triangles - before) // 2)
+        mesh = _split_edges(mesh, (triangles - before) // 2)
         if mesh.faces.shape[0] == before:
             break
     return mesh
 
 
-def _split(mesh: Mesh, most: int) -> Mesh:
-    """At most `most` edges split in two, the longest first, no two of them of the same face.
+def _split_edges(mesh: Mesh, most: int) -> Mesh:
+    """Split at most `most` edges, the longest first, no two of the same face.
 
-    Edges are told apart by where they lie: the two sides of a seam between colours are split together.
+    Edges are identified by position: both sides of a colour seam are split together.
     """
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.numpy()
-    place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    positions = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
     pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    corners = place[faces]
+    corners = positions[faces]
     for f, face in enumerate(corners.tolist()):
         for k in range(3):
             a, b = face[k], face[(k + 1) % 3]
@@ -54,7 +58,7 @@ def _split(mesh: Mesh, most: int) -> Mesh:
             continue
         used[[f for f, _ in sides]] = True
         chosen.append(sides)
-    return _with_middles(mesh, chosen)
+    return _insert_middles(mesh, chosen)
 
 
 def _length(vertices: NDArray[np.float64], faces: NDArray[np.int64], side: tuple[int, int]) -> float:
@@ -62,8 +66,8 @@ def _length(vertices: NDArray[np.float64], faces: NDArray[np.int64], side: tuple
     return float(np.linalg.norm((vertices[faces[f, k]] - vertices[faces[f, (k + 1) % 3]]) * _PROPORTION))
 
 
-def _with_middles(mesh: Mesh, edges: list[list[tuple[int, int]]]) -> Mesh:
-    """Each edge's two faces (face, corner where the edge begins) cut from its middle to the opposite corner."""
+def _insert_middles(mesh: Mesh, edges: list[list[tuple[int, int]]]) -> Mesh:
+    """Cut each edge's two faces (face, corner at which the edge begins) from its middle to the opposite corner."""
     faces, part = mesh.faces.clone(), mesh.part
     count, ends, owners, added = mesh.vertices.shape[0], [], [], []
     middles: dict[tuple[int, int], int] = {}
@@ -82,14 +86,14 @@ def _with_middles(mesh: Mesh, edges: list[list[tuple[int, int]]]) -> Mesh:
         return mesh
     pair = torch.tensor(ends, dtype=torch.int64)
 
-    def extended(values: torch.Tensor) -> torch.Tensor:
+    def with_middles(values: torch.Tensor) -> torch.Tensor:
         return torch.cat([values, values[pair].mean(dim=1)])
 
     return Mesh(
-        vertices=extended(mesh.vertices),
+        vertices=with_middles(mesh.vertices),
         faces=torch.cat([faces, torch.tensor(added, dtype=torch.int64)]),
         part=torch.cat([part, part[torch.tensor(owners, dtype=torch.int64)]]),
         name=mesh.name,
-        colours=None if mesh.colours is None else extended(mesh.colours),
-        uv=None if mesh.uv is None else extended(mesh.uv),
+        colours=None if mesh.colours is None else with_middles(mesh.colours),
+        uv=None if mesh.uv is None else with_middles(mesh.uv),
     )

@@ -1,4 +1,4 @@
-"""The renderer on its own: against its reference, and verb by verb."""
+"""Times the renderer against its reference, as a whole and verb by verb."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from drivesem.bench.scenes import BenchScene, Placed, bench_scene
+from drivesem.bench.scenes import BenchScene, PackedMeshes, build_bench_scene
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Budget, Clock, Spread, rounds
+from drivesem.bench.timing import PairedTimer, Spread, TimeBudget, repetitions
 from scene_ir.raster import verbs
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import scene_to
+from scene_ir.types import convert_scene
 
 TITLE, VERBS_TITLE = "The renderer", "The four verbs"
 COLUMNS: Columns = {
@@ -44,97 +44,135 @@ METHOD = (
 BACKENDS: tuple[verbs.Backend, ...] = ("warp", "reference")
 _FEWEST, _MOST = 2, 60
 _SLOW_S = 0.5
-"""A call that takes longer than this is measured fewer times: noise is small beside it."""
+"""A longer call is repeated less often: its noise is relatively small, s."""
 _SCALES = (0.5, 1.5)
-"""Beside 1: fewer and more pixels of the same view."""
+"""Further image scales than 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSize:
-    """One size to measure at."""
+    """One size to measure."""
 
     cars: int
+    """Number of cars."""
     triangles: int
+    """Per car."""
     scale: float = 1.0
+    """Pixels along an axis, as a multiple of 1242x375."""
 
 
 @dataclass(frozen=True, slots=True)
 class RenderRow:
-    """What was measured; times in ms."""
+    """Measurements of the whole picture; times are medians in ms."""
 
     backend: str
+    """warp or reference."""
     cars: int
+    """Number of cars."""
     triangles: int
+    """Per car."""
     scale: float
+    """Pixels along an axis, as a multiple of 1242x375."""
     pixels: int
+    """Pixels hit by the meshes."""
     forward_ms: float
+    """Without gradients."""
     backward_ms: float
+    """From a gradient of the picture to the cars' parameters."""
     forward_backward_ms: float
+    """Recorded forward and backward together."""
     both_cpu_ms: float
+    """Their processor time."""
     forward_iqr: float
+    """Interquartile range of forward_ms."""
     backward_iqr: float
+    """Interquartile range of backward_ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class VerbRow:
-    """One verb alone, of all cars' rectangles at once; backward_ms None where it has no gradient."""
+    """Measurements of one verb for all cars' rectangles; times are medians in ms."""
 
     verb: str
+    """Name of the verb."""
     backend: str
+    """warp or reference."""
     cars: int
+    """Number of cars."""
     triangles: int
+    """Per car."""
     pixels: int
+    """Pixels hit by the meshes."""
     crop_pixels: int
+    """Pixels of the rectangles."""
     forward_ms: float
+    """Without gradients."""
     backward_ms: float | None
+    """None for a verb without gradient."""
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
-    """Of forward without gradients, of backward, and of both together; ms, None where there is no backward. spent:
-    the processor's, of both, or of forward where that is all.
-    """
+class RenderTimes:
+    """Times of a call, ms."""
 
     forward: Spread
+    """Without gradients."""
     backward: Spread | None
+    """None if there is no gradient."""
     both: Spread | None
-    spent: Spread
+    """Recorded forward and backward; None if there is no gradient."""
+    cpu: Spread
+    """Processor time of both, or of forward if there is no gradient."""
 
 
 def sizes(cars: Sequence[int], triangles: Sequence[int]) -> list[SceneSize]:
-    """All numbers of cars and triangles, and the usual size at other scales."""
+    """All combinations of cars and triangles, and the default size at other scales."""
     return [SceneSize(n, k) for n in cars for k in triangles] + [
-        replace(usual(cars, triangles), scale=scale) for scale in _SCALES
+        replace(default_size(cars, triangles), scale=scale) for scale in _SCALES
     ]
 
 
-def usual(cars: Sequence[int], triangles: Sequence[int]) -> SceneSize:
-    """The size at which more than speed against size is looked at: 8 cars, where they are asked for."""
+def default_size(cars: Sequence[int], triangles: Sequence[int]) -> SceneSize:
+    """The size for everything but speed against size: 8 cars, if requested, of the most triangles."""
     return SceneSize(8 if 8 in cars else max(cars), max(triangles))
 
 
 def measure(size_list: Sequence[SceneSize], seconds: float, seed: int, device: str) -> Iterator[RenderRow]:
-    """One row a backend and size, within about `seconds`."""
-    budget = Budget(seconds, len(size_list))
+    """Measure one row per backend and size.
+
+    Args:
+        size_list: What to measure.
+        seconds: Total time, about.
+        seed: Seed of scenes and gradients.
+        device: Device to measure.
+    """
+    budget = TimeBudget(seconds, len(size_list))
     for size in size_list:
         start = time.perf_counter()
-        bench = bench_scene(size.cars, size.triangles, seed, size.scale)
+        bench = build_bench_scene(size.cars, size.triangles, seed, size.scale)
         share = budget.share(time.perf_counter() - start) / len(BACKENDS)
         for backend in BACKENDS:
             yield _picture_row(size, bench, backend, (share, seed, device))
 
 
 def measure_verbs(size: SceneSize, seconds: float, seed: int, device: str) -> Iterator[VerbRow]:
-    """The four verbs at one size, fast and reference."""
-    bench = bench_scene(size.cars, size.triangles, seed, size.scale)
-    scene = scene_to(bench.scene, torch.float32, device)
-    placed, clock = Placed.of(scene), Clock(device)
+    """Measure the four verbs in both backends.
+
+    Args:
+        size: The size.
+        seconds: Total time, about.
+        seed: Seed of the scene and the lookups.
+        device: Device to measure.
+    """
+    bench = build_bench_scene(size.cars, size.triangles, seed, size.scale)
+    scene = convert_scene(bench.scene, torch.float32, device)
+    placed, clock = PackedMeshes.from_scene(scene), PairedTimer(device)
     layout = placed.layout(scene.camera)
-    budget = Budget(seconds, 4 * len(BACKENDS))
+    budget = TimeBudget(seconds, 4 * len(BACKENDS))
     generator = torch.Generator().manual_seed(seed)
     colours = torch.rand(placed.points.shape, generator=generator).to(placed.points)
-    # Off the pixel centres, where a lookup would be a copy.
-    uv = layout.pixels().to(colours) + torch.rand(layout.size, 2, generator=generator).to(colours)
+    # Off the pixel centres, where a lookup would be a plain copy.
+    uv = layout.pixel_xy().to(colours) + torch.rand(layout.size, 2, generator=generator).to(colours)
     for backend in BACKENDS:
         rasterize = partial(verbs.rasterize, placed.clip, placed.faces, placed.face_ranges, layout, backend)
         found = rasterize()
@@ -147,7 +185,7 @@ def measure_verbs(size: SceneSize, seconds: float, seed: int, device: str) -> It
             "antialias": (partial(verbs.antialias, found, clip, placed.faces, backend), clip),
         }
         for verb, (call, leaf) in calls.items():
-            times = timed(call, None if leaf is None else _pull(leaf), clock, budget.share())
+            times = time_render(call, None if leaf is None else _backward_to(leaf), clock, budget.share())
             yield VerbRow(
                 verb=verb,
                 backend=backend,
@@ -155,12 +193,12 @@ def measure_verbs(size: SceneSize, seconds: float, seed: int, device: str) -> It
                 triangles=size.triangles,
                 pixels=bench.hit_pixels,
                 crop_pixels=layout.size,
-                forward_ms=rounded(times.forward),
-                backward_ms=None if times.backward is None else rounded(times.backward),
+                forward_ms=round_median(times.forward),
+                backward_ms=None if times.backward is None else round_median(times.backward),
             )
 
 
-def _pull(leaf: Tensor) -> Callable[[Tensor], object]:
+def _backward_to(leaf: Tensor) -> Callable[[Tensor], object]:
     """Backward of a verb's result to `leaf`, from a gradient of ones."""
     return lambda result: torch.autograd.grad(result, leaf, torch.ones_like(result))
 
@@ -168,9 +206,9 @@ def _pull(leaf: Tensor) -> Callable[[Tensor], object]:
 def _picture_row(
     size: SceneSize, bench: BenchScene, backend: verbs.Backend, how: tuple[float, int, str]
 ) -> RenderRow:
-    """The whole re-rendered picture, gradients to pose and shape."""
+    """Measure the whole re-rendered picture with gradients to pose and shape."""
     seconds, seed, device = how
-    scene = scene_to(bench.scene, torch.float32, device)
+    scene = convert_scene(bench.scene, torch.float32, device)
     compositor = Compositor(scene, RenderSettings(backend=backend))
     generator = torch.Generator().manual_seed(seed)
     objects = scene.objects
@@ -192,7 +230,9 @@ def _picture_row(
         return compositor.render(moved).image
 
     inputs = list(leaves.values())
-    times = timed(forward, lambda image: torch.autograd.grad(image, inputs, weight), Clock(device), seconds)
+    times = time_render(
+        forward, lambda image: torch.autograd.grad(image, inputs, weight), PairedTimer(device), seconds
+    )
     assert times.backward is not None
     assert times.both is not None
     return RenderRow(
@@ -201,51 +241,60 @@ def _picture_row(
         triangles=size.triangles,
         scale=size.scale,
         pixels=bench.hit_pixels,
-        forward_ms=rounded(times.forward),
-        backward_ms=rounded(times.backward),
-        forward_backward_ms=rounded(times.both),
-        both_cpu_ms=rounded(times.spent),
+        forward_ms=round_median(times.forward),
+        backward_ms=round_median(times.backward),
+        forward_backward_ms=round_median(times.both),
+        both_cpu_ms=round_median(times.cpu),
         forward_iqr=round(times.forward.iqr, 3),
         backward_iqr=round(times.backward.iqr, 3),
     )
 
 
-def timed(
-    forward: Callable[[], Any], backward: Callable[[Any], object] | None, clock: Clock, seconds: float
-) -> Times:
-    """Forward without gradients, then forward and backward, repeated in turn after a warm-up."""
+def time_render(
+    forward: Callable[[], Any], backward: Callable[[Any], object] | None, clock: PairedTimer, seconds: float
+) -> RenderTimes:
+    """Time forward without gradients, then forward and backward, repeated after a warm-up.
+
+    Args:
+        forward: The call.
+        backward: Maps its result to gradients; None if it has none.
+        clock: The timer.
+        seconds: Total time, about.
+    """
     alone: list[float] = []
     back: list[float] = []
     both: list[float] = []
-    spent: list[float] = []
-    kept: list[Any] = []
+    cpu: list[float] = []
+    results: list[Any] = []
 
-    def keep() -> None:
-        kept[:] = [forward()]
+    def run_forward() -> None:
+        results[:] = [forward()]
 
     def once() -> None:
         with torch.no_grad():
-            taken = clock.taken(keep)
-        alone.append(taken.ms)
+            call_time = clock.time_call(run_forward)
+        alone.append(call_time.ms)
         if backward is None:
-            spent.append(taken.cpu_ms)
+            cpu.append(call_time.cpu_ms)
             return
-        first, last = clock.taken(keep), clock.taken(partial(backward, kept[0]))
+        first, last = clock.time_call(run_forward), clock.time_call(partial(backward, results[0]))
         back.append(last.ms)
         both.append(first.ms + last.ms)
-        spent.append(first.cpu_ms + last.cpu_ms)
+        cpu.append(first.cpu_ms + last.cpu_ms)
 
     start = time.perf_counter()
     once()
-    if time.perf_counter() - start < _SLOW_S:  # what is slow shows how slow it is at once
-        for times in (alone, back, both, spent):
+    if time.perf_counter() - start < _SLOW_S:  # the first call of a slow function counts
+        for times in (alone, back, both, cpu):
             times.clear()
-    for _ in rounds(seconds - (time.perf_counter() - start), 1 if alone else _FEWEST, _MOST):
+    for _ in repetitions(seconds - (time.perf_counter() - start), 1 if alone else _FEWEST, _MOST):
         once()
-    of_both = Spread.of(both) if both else None
-    return Times(Spread.of(alone), Spread.of(back) if back else None, of_both, Spread.of(spent))
+    of_both = Spread.from_values(both) if both else None
+    return RenderTimes(
+        Spread.from_values(alone), Spread.from_values(back) if back else None, of_both, Spread.from_values(cpu)
+    )
 
 
-def rounded(spread: Spread) -> float:
-    """The median, to the microsecond."""
+def round_median(spread: Spread) -> float:
+    """The median, rounded to microseconds."""
     return round(spread.median, 3)

@@ -1,8 +1,8 @@
-"""Streets to measure on: exactly N cars of K triangles each, seen as KITTI's camera sees them.
+"""Benchmark streets with exactly N cars of K triangles each, seen by KITTI's camera.
 
-The photographs are the scene generator's, taken apart as the embedded scenes are, so that nothing perturbed
-renders the photograph. The cars cover about as many pixels as in KITTI's frames with so many vehicles: that, more
-than their number, is what costs time.
+Photographs come from the scene generator and are de-rendered exactly, so that rendering without changes gives the
+photograph. The cars cover about as many pixels as in KITTI's frames with as many vehicles: that, more than their
+number, determines the cost.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from functools import lru_cache
 
 import torch
 
-from drivesem.bench.remesh import with_triangles
+from drivesem.bench.remesh import set_triangle_count
 from drivesem.synth.demo import take_apart
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, plan_frame, render_frame
 from drivesem.synth.layout import Actor, Lane, LayoutSettings, Road
 from scene_ir.errors import RangeError
-from scene_ir.geometry import clip_boxes, place, project_boxes, to_clip
+from scene_ir.geometry import clip_boxes, place_vertices, project_boxes, to_clip
 from scene_ir.meshes.templates import template, typical_size_lhw
 from scene_ir.raster import verbs
 from scene_ir.types import Camera, Mesh, SceneIR
@@ -25,10 +25,9 @@ from scene_ir.types import Camera, Mesh, SceneIR
 HEIGHT, WIDTH = 375, 1242
 """Pixels of a frame of KITTI's first camera."""
 _CAMERA = 0
-"""That camera among the generator's."""
+"""Index of that camera in the generator."""
 KITTI_BOX_PIXELS = {1: 2_700, 4: 18_100, 8: 87_000, 16: 137_700}
-"""Median area, px, of the union of the boxes of cars, vans and trucks, over those of KITTI's 7,481 labelled frames
-with that many of them."""
+"""Median area, px, of the union of vehicle boxes in KITTI's 7,481 labelled frames with that many vehicles."""
 _SHAPES = (("hatchback", 101), ("sedan", 100), ("estate", 102), ("suv", 101))
 """Kinds and variants of the cars, in turn; their templates have 4.6 to 4.8 thousand triangles."""
 _PAINTS = ((0.42, 0.43, 0.44), (0.018, 0.018, 0.02), (0.36, 0.025, 0.025), (0.78, 0.78, 0.77), (0.03, 0.07, 0.22))
@@ -44,50 +43,59 @@ _PLACES: dict[int, tuple[tuple[int, float], ...]] = {
          (_MIDDLE, 32.0), (_NEAR, 45.0), (_FAR, 36.0)),
 }  # fmt: skip
 """Lane and depth, m, of each car; the image's left border cuts the first of eight and of sixteen."""
-MOST_CARS = max(_PLACES)
-"""As many cars a street may have."""
+MAX_CARS = max(_PLACES)
+"""Maximum number of cars on a street."""
 _ROADS = 400
-"""Roads that are drawn until one has the lanes that are asked for."""
+"""Roads drawn until one has the required lanes."""
 _STRAIGHT = 3e-4
 """Curvature, 1/m, up to which a road counts as straight: a quarter of a metre at 40 m."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchScene:
-    """A scene to measure on. cars; triangles: nominal, a car; triangles_actual: their mean over the cars;
-    crop_pixels: of the rectangles that hold the cars' meshes; hit_pixels: pixel centres that the meshes hit, car
-    by car; box_pixels: the area of the boxes' union, px.
-    """
+    """A scene to measure."""
 
     scene: SceneIR
+    """The scene."""
     cars: int
+    """Number of cars."""
     triangles: int
+    """Per car, nominal."""
     triangles_actual: float
+    """Per car, mean."""
     crop_pixels: int
+    """Pixels of the rectangles around the meshes."""
     hit_pixels: int
+    """Pixel centres hit by the meshes, summed over cars."""
     box_pixels: int
+    """Area of the union of the boxes, px."""
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
-    """The cars' meshes of a scene in one list, as the four verbs take them. points (V, 3) m in camera axes; clip
-    (V, 3); faces (F, 3) int64; vertex_ranges, face_ranges (N, 2) int64.
-    """
+class PackedMeshes:
+    """The meshes of a scene's cars in one list, as input of the four verbs."""
 
     points: torch.Tensor
+    """(V, 3) m, camera axes."""
     clip: torch.Tensor
+    """(V, 3) clip coordinates."""
     faces: torch.Tensor
+    """(F, 3) int64."""
     vertex_ranges: torch.Tensor
+    """(N, 2) int64."""
     face_ranges: torch.Tensor
+    """(N, 2) int64."""
 
     @classmethod
-    def of(cls, scene: SceneIR) -> Placed:
-        """The meshes where the scene has them, undeformed."""
+    def from_scene(cls, scene: SceneIR) -> PackedMeshes:
+        """The meshes at their poses, undeformed."""
         objects = scene.objects
         points, faces, corners, ends = [], [], 0, [(0, 0)]
         for i, index in enumerate(objects.mesh_index.tolist()):
             mesh = scene.meshes[index]
-            points.append(place(mesh.vertices, objects.size_lhw[i], objects.yaw[i], objects.translation[i]))
+            points.append(
+                place_vertices(mesh.vertices, objects.size_lhw[i], objects.yaw[i], objects.translation[i])
+            )
             faces.append(mesh.faces + corners)
             corners += mesh.vertices.shape[0]
             ends.append((corners, ends[-1][1] + mesh.faces.shape[0]))
@@ -102,25 +110,34 @@ class Placed:
             face_ranges=ranges[..., 1].contiguous(),
         )
 
-    def layout(self, camera: Camera) -> verbs.Layout:
-        """The rectangles of the image that hold the meshes."""
-        return verbs.Layout.of(verbs.bounding_rects(self.clip, self.vertex_ranges, camera.height, camera.width))
+    def layout(self, camera: Camera) -> verbs.PixelLayout:
+        """The image rectangles that contain the meshes."""
+        return verbs.PixelLayout.from_rects(
+            verbs.bounding_rects(self.clip, self.vertex_ranges, camera.height, camera.width)
+        )
 
 
-def bench_scene(cars: int, triangles: int, seed: int = 0, scale: float = 1.0) -> BenchScene:
-    """`cars` cars of `triangles` triangles each on a street, in a frame of 1242x375 px times `scale`.
+def build_bench_scene(cars: int, triangles: int, seed: int = 0, scale: float = 1.0) -> BenchScene:
+    """Build a street with cars. Equal arguments give equal scenes.
 
-    Equal arguments give equal scenes. Raises RangeError for a number of cars there is no street for.
+    Args:
+        cars: Number of cars.
+        triangles: Per car.
+        seed: Seed of the street.
+        scale: Pixels along an axis, as a multiple of 1242x375.
+
+    Raises:
+        RangeError: No street has that many cars.
     """
-    if not 1 <= cars <= MOST_CARS:
-        raise RangeError("cars", f"1 to {MOST_CARS}", cars)
+    if not 1 <= cars <= MAX_CARS:
+        raise RangeError("cars", f"1 to {MAX_CARS}", cars)
     scene = take_apart(
-        _photograph(cars, seed, scale),
+        _render_street(cars, seed, scale),
         f"bench-{cars}x{triangles}",
-        lambda kind, variant: _mesh(kind, variant, triangles),
+        lambda kind, variant: _car_mesh(kind, variant, triangles),
     )
     assert len(scene.objects) == cars
-    placed = Placed.of(scene)
+    placed = PackedMeshes.from_scene(scene)
     layout = placed.layout(scene.camera)
     fragments = verbs.rasterize(placed.clip, placed.faces, placed.face_ranges, layout)
     return BenchScene(
@@ -130,55 +147,55 @@ def bench_scene(cars: int, triangles: int, seed: int = 0, scale: float = 1.0) ->
         triangles_actual=placed.faces.shape[0] / cars,
         crop_pixels=layout.size,
         hit_pixels=int((fragments.face >= 0).sum()),
-        box_pixels=_covered(scene),
+        box_pixels=_box_union_area(scene),
     )
 
 
 @lru_cache(maxsize=16)
-def _mesh(kind: str, variant: int, triangles: int) -> Mesh:
-    return with_triangles(template(kind, variant), triangles)
+def _car_mesh(kind: str, variant: int, triangles: int) -> Mesh:
+    return set_triangle_count(template(kind, variant), triangles)
 
 
 @lru_cache(maxsize=4)
-def _photograph(cars: int, seed: int, scale: float) -> SynthFrame:
+def _render_street(cars: int, seed: int, scale: float) -> SynthFrame:
     """The street with its cars, rendered once for all numbers of triangles."""
-    plan = _road(seed)
-    road, lanes = plan.setting.road, _lanes(plan.setting.road)
+    plan = _draw_road(seed)
+    road, lanes = plan.setting.road, _sorted_lanes(plan.setting.road)
     places = _PLACES[min(count for count in _PLACES if count >= cars)][:cars]
-    actors = tuple(_car(i, lanes[lane], depth, road, seed) for i, (lane, depth) in enumerate(places))
+    actors = tuple(_place_car(i, lanes[lane], depth, road, seed) for i, (lane, depth) in enumerate(places))
     view = plan.setting.view
-    setting = replace(plan.setting, view=replace(view, camera=_scaled(view.camera, scale)))
+    setting = replace(plan.setting, view=replace(view, camera=_scale_camera(view.camera, scale)))
     frame = render_frame(replace(plan, actors=actors, setting=setting), with_background=True)
     assert frame is not None
     return frame
 
 
-def _road(seed: int) -> Plan:
-    """The first straight motorway of a stream with the camera on the middle one of three lanes."""
+def _draw_road(seed: int) -> Plan:
+    """The first straight motorway of a stream with the camera in the middle one of three lanes."""
     layout = LayoutSettings(people=False, vehicles=(0, 0), kinds=("motorway",))
     settings = SynthSettings(layout, sunny=True, tilt_rad=0.004, camera=_CAMERA)
     for attempt in range(_ROADS):
         plan = plan_frame(seed, 0, "heldout", settings, attempt)
         road = plan.setting.road
-        lanes = _lanes(road)
+        lanes = _sorted_lanes(road)
         if len(lanes) == 6 and lanes[_OWN].middle_m == 0 and abs(road.curvature) < _STRAIGHT:
             return plan
     raise RangeError(f"road of seed {seed}", f"a straight one among {_ROADS}", "none")
 
 
-def _lanes(road: Road) -> list[Lane]:
+def _sorted_lanes(road: Road) -> list[Lane]:
     """From left to right."""
     return sorted(road.lanes, key=lambda lane: lane.middle_m)
 
 
-def _car(index: int, lane: Lane, depth_m: float, road: Road, seed: int) -> Actor:
+def _place_car(index: int, lane: Lane, depth_m: float, road: Road, seed: int) -> Actor:
     kind, variant = _SHAPES[index % len(_SHAPES)]
     x, z = road.point(lane.middle_m, depth_m)
     return Actor(
         kind=kind,
         variant=variant,
         position_xz=(float(x), float(z)),
-        # A trace of a turn, another for each car: cars that stand exactly along an axis are an easy case.
+        # A slight turn per car: cars aligned exactly with an axis are an easy case.
         yaw=road.yaw(depth_m, lane.direction) + 0.02 * ((index * 7) % 5 - 2),
         size_lhw=typical_size_lhw(kind, variant),
         paint=_PAINTS[index % len(_PAINTS)],
@@ -187,8 +204,8 @@ def _car(index: int, lane: Lane, depth_m: float, road: Road, seed: int) -> Actor
     )
 
 
-def _scaled(camera: Camera, scale: float) -> Camera:
-    """The same view with `scale` times as many pixels along each axis; pixel centres at integers."""
+def _scale_camera(camera: Camera, scale: float) -> Camera:
+    """The same view with `scale` times as many pixels along each axis; pixel centres are integers."""
     if scale == 1.0:
         return camera
     shift = (scale - 1.0) / 2.0
@@ -198,7 +215,7 @@ def _scaled(camera: Camera, scale: float) -> Camera:
     return Camera(to_new @ camera.intrinsics, height, width, projection)
 
 
-def _covered(scene: SceneIR) -> int:
+def _box_union_area(scene: SceneIR) -> int:
     """Pixels in the union of the cars' projected boxes."""
     objects, camera = scene.objects, scene.camera
     boxes = project_boxes(objects.size_lhw, objects.yaw, objects.translation, camera.matrix)

@@ -1,4 +1,4 @@
-"""What every benchmark's command shares: figures shown and written beside machine, versions and command line."""
+"""Runs a benchmark: prints its tables, and writes them with machine, versions and command line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from drivesem.bench import tables
-from drivesem.bench.timing import machine, versions
+from drivesem.bench.timing import machine_facts, package_versions
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.report.terminal import Console
@@ -22,13 +22,13 @@ from scene_ir import files
 T = TypeVar("T")
 
 _LOG_WIDTH = 120
-"""Columns of tables that go to a file."""
+"""Width of tables written to a file, columns."""
 _NOT_MEASURED = ("what", "json", "out", "markdown")
-"""Settings that do not change figures."""
+"""Settings that do not affect measurements."""
 
 
 class BenchSettings(Protocol):
-    """What all benchmarks are told. what: which one; markdown: a file one section of which is written anew."""
+    """Settings of all benchmarks: its name, torch threads, device, output paths, and whether to print JSON."""
 
     @property
     def what(self) -> str: ...
@@ -48,20 +48,28 @@ S = TypeVar("S", bound=BenchSettings)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """What a benchmark found: the fields of its JSON object, rows and method among them, and what is shown."""
+class BenchResult:
+    """A benchmark's measurements."""
 
     fields: dict[str, Any]
-    sections: Sequence[tables.Section]
+    """Fields of the JSON object, among them rows and method."""
+    tables: Sequence[tables.BenchTable]
+    """Tables to print."""
 
 
-def conduct(config: S, program: str, measure: Callable[[S, Console], Measured]) -> int:
-    """Measure, print, write; exit code 0. program: the words before the benchmark's name on the command line.
+def run_benchmark(config: S, program: str, measure: Callable[[S, Console], BenchResult]) -> int:
+    """Measure, print and write; returns the exit code 0.
 
-    Raises UsageError for a device or a place for results that cannot be, and what `measure` raises.
+    Args:
+        config: Settings.
+        program: Words before the benchmark's name on the command line.
+        measure: The benchmark.
+
+    Raises:
+        UsageError: An unavailable device or an invalid path for results.
     """
     start = time.perf_counter()
-    targets = targets_of(config)
+    targets = output_paths(config)
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     check_device(config.device)
@@ -70,33 +78,39 @@ def conduct(config: S, program: str, measure: Callable[[S, Console], Measured]) 
     result = {
         "what": config.what,
         **measured.fields,
-        "machine": machine(config.device),
-        "versions": versions(),
+        "machine": machine_facts(config.device),
+        "versions": package_versions(),
         "command": _command(config, program),
         "seconds": round(time.perf_counter() - start, 3),
     }
-    for section in measured.sections:
-        console.print(tables.terminal(section))
+    for section in measured.tables:
+        console.print(tables.build_terminal_table(section))
     if targets is not None:
         files.write_json(targets[0], result)
-        files.write_text(targets[1], tables.markdown(result, measured.sections))
+        files.write_text(targets[1], tables.format_markdown(result, measured.tables))
     if config.markdown is not None:
-        tables.rewrite(Path(config.markdown), result, measured.sections)
+        tables.replace_section(Path(config.markdown), result, measured.tables)
     if config.json:
         sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
     return 0
 
 
-def watched(rows: Iterable[T], total: int, console: Console) -> Iterator[T]:
-    """The same rows; says how far it has come."""
+def show_progress(rows: Iterable[T], total: int, console: Console) -> Iterator[T]:
+    """Pass rows through and show their count.
+
+    Args:
+        rows: Rows to pass through.
+        total: Expected number.
+        console: Where to show it.
+    """
     with console.status("measuring") as status:
         for done, row in enumerate(rows, start=1):
             status.update(f"measuring: {done} rows of about {total}")
             yield row
 
 
-def targets_of(config: BenchSettings) -> tuple[Path, Path] | None:
-    """Where JSON and Markdown go: files in the folder `--out`, or FILE.json and FILE.md."""
+def output_paths(config: BenchSettings) -> tuple[Path, Path] | None:
+    """Paths of JSON and Markdown: in the folder `--out`, or FILE.json and FILE.md."""
     if config.out is None:
         return None
     out = Path(config.out)
@@ -110,7 +124,7 @@ def targets_of(config: BenchSettings) -> tuple[Path, Path] | None:
 
 
 def _command(config: Any, program: str) -> str:
-    """The command line that measures this again."""
+    """The command line that repeats the measurement."""
     words = [program, config.what]
     for field in fields(config):
         value = getattr(config, field.name)

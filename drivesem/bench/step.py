@@ -1,4 +1,4 @@
-"""One whole attack step beside the detector alone, measured in turn in one process."""
+"""Times a whole attack step against the detector alone, in pairs in one process."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from detectors.types import Targets
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller
 from drivesem.attack.objective import Objective
-from drivesem.attack.space import Parameter, ParameterSpace, combo
-from drivesem.bench.scenes import BenchScene, bench_scene
+from drivesem.attack.space import Parameter, ParameterSpace, combo_parameters
+from drivesem.bench.scenes import BenchScene, build_bench_scene
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Budget, Clock, Spread, Taken, rounds
-from drivesem.config.blocks import KEEP_MB
+from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
+from drivesem.config.options import DEFAULT_KEEP_MB
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import SceneIR, scene_to
+from scene_ir.types import SceneIR, convert_scene
 
-TITLE, BESIDE_TITLE = (
-    "One attack step beside the detector alone",
-    "Beside it: full-frame parameters, and no level of detail",
+TITLE, EXTRA_TITLE = (
+    "One attack step against the detector alone",
+    "For comparison: full-frame parameters, and no level of detail",
 )
 COLUMNS: Columns = {
     "cars": ("cars", "cars"), "triangles": ("triangles a car", "triangles"), "params": ("parameters", None),
@@ -49,14 +49,14 @@ METHOD = (
     "ratio_iqr the distance of their quartiles, the milliseconds are medians. render_forward_ms (scene at "
     "theta and render, recorded for gradients), render_backward_ms, labels_ms and project_ms are medians of "
     "the parts on their own. Of processor time: the same pairs by the processor's time, all threads together, "
-    "which other work on the machine lengthens less than the clock's. pixels: crop_pixels of the rectangles "
+    "which depends less on other work on the machine. pixels: crop_pixels of the rectangles "
     "around the meshes, hit_pixels of the meshes."
 )
 _TERM = "objectness"
 _START_STEPS = 10
-"""Random starts lie within so many steps of the photograph: an attack of the paper takes 10."""
+"""Random starts lie within this many steps of the photograph; an attack of the paper takes 10."""
 _RESTART = 12
-"""Steps until the attack starts anew, so that measured thetas are neither all near a start nor far out."""
+"""Steps until a new random start, so that measured thetas are neither all near a start nor far from it."""
 _FEWEST, _MOST = 3, 200
 _WARM_UP = 1
 _LAYOUT_TRIES = 3
@@ -64,49 +64,72 @@ _LAYOUT_TRIES = 3
 
 @dataclass(frozen=True, slots=True)
 class StepCase:
-    """One row to measure. lod: level of detail on."""
+    """One row to measure."""
 
     cars: int
+    """Number of cars."""
     triangles: int
-    params: tuple[Parameter, ...] = combo(2)
+    """Per car."""
+    params: tuple[Parameter, ...] = combo_parameters(2)
+    """Attacked parameters."""
     lod: bool = True
+    """Whether level of detail is on."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """What was measured: times in ms, medians. pixels: hit and crop pixels of the meshes; box_pixels of the boxes'
-    union; repetitions: pairs of step and detector.
-    """
+    """Measurements of one case; times are medians in ms."""
 
     cars: int
+    """Number of cars."""
     triangles: int
+    """Per car, nominal."""
     triangles_actual: float
+    """Per car, mean."""
     params: str
+    """Attacked parameters."""
     lod: bool
+    """Whether level of detail is on."""
     ratio: float
+    """Step over detector, median of pairs."""
     ratio_iqr: float
+    """Interquartile range of the ratio."""
     cpu_ratio: float
+    """Ratio of processor time."""
     step_ms: float
+    """Whole step."""
     detector_ms: float
+    """Detector forward and backward."""
     step_cpu_ms: float
+    """Processor time of the step."""
     detector_cpu_ms: float
+    """Processor time of the detector."""
     render_forward_ms: float
+    """Rendering."""
     render_backward_ms: float
+    """Its gradient."""
     labels_ms: float
+    """Moved labels."""
     project_ms: float
+    """Projection to the feasible set."""
     pixels: int
+    """Pixels hit by the meshes."""
     crop_pixels: int
+    """Pixels of the rectangles around the meshes."""
     box_pixels: int
+    """Area of the union of the boxes."""
     repetitions: int
+    """Number of pairs."""
 
 
 def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[StepCase], list[StepCase]]:
-    """The sizes to measure, and what stands beside the one nearest to 8 cars of the most triangles: weather and
-    foliage, and level of detail off."""
+    """The sizes to measure, and two variants of the one nearest to 8 cars of the most triangles: with weather and
+    foliage, and without level of detail.
+    """
     sizes = [StepCase(n, k) for n in cars for k in triangles]
     usual = 8 if 8 in cars else max(cars)
-    beside = [StepCase(usual, max(triangles), (Parameter.WEATHER, Parameter.FOLIAGE))]
-    return sizes, [*beside, StepCase(usual, max(triangles), lod=False)]
+    variants = [StepCase(usual, max(triangles), (Parameter.WEATHER, Parameter.FOLIAGE))]
+    return sizes, [*variants, StepCase(usual, max(triangles), lod=False)]
 
 
 def measure(
@@ -116,18 +139,26 @@ def measure(
     seed: int,
     device: str,
     whole: bool = False,
-    keep_mb: float = KEEP_MB,
+    keep_mb: float = DEFAULT_KEEP_MB,
 ) -> Iterator[StepRow]:
-    """One row a case, within about `seconds` for all of them, as far as the fewest repetitions allow. whole,
-    keep_mb: as of `Objective`.
+    """Measure one row per case.
+
+    Args:
+        case_list: What to measure.
+        detector: The detector.
+        seconds: Total time, exceeded only for the least number of repetitions.
+        seed: Seed of scenes and thetas.
+        device: Device to measure.
+        whole: As in `Objective`.
+        keep_mb: As in `Objective`.
     """
-    budget = Budget(seconds, len(case_list))
-    clock = Clock(device)
+    budget = TimeBudget(seconds, len(case_list))
+    clock = PairedTimer(device)
     layout: torch.memory_format | None = None
     for case in case_list:
         start = time.perf_counter()
-        bench = bench_scene(case.cars, case.triangles, seed)
-        step = Stepping(bench.scene, case.params, detector, seed, device, case.lod, whole, keep_mb)
+        bench = build_bench_scene(case.cars, case.triangles, seed)
+        step = AttackSteps(bench.scene, case.params, detector, seed, device, case.lod, whole, keep_mb)
         layout = layout or step.faster_layout(clock)
         alone = step.detector_alone(layout)
         for _ in range(_WARM_UP):
@@ -138,17 +169,22 @@ def measure(
 
 
 def _row(
-    case: StepCase, bench: BenchScene, step: Stepping, alone: Callable[[], None], clock: Clock, seconds: float
+    case: StepCase,
+    bench: BenchScene,
+    step: AttackSteps,
+    alone: Callable[[], None],
+    clock: PairedTimer,
+    seconds: float,
 ) -> StepRow:
-    pairs: list[tuple[Taken, Taken]] = []
+    pairs: list[tuple[CallTime, CallTime]] = []
     parts: list[tuple[float, ...]] = []
-    # On a machine so busy that the seconds are gone, one pair a row has to do.
-    for i in rounds(seconds, _FEWEST if seconds > 0 else 1, _MOST):
-        pairs.append(pair(clock, step, alone, swapped=bool(i % 2)))
+    # If the time is already used up on a busy machine, one pair per row must suffice.
+    for i in repetitions(seconds, _FEWEST if seconds > 0 else 1, _MOST):
+        pairs.append(time_pair(clock, step, alone, swapped=bool(i % 2)))
         if i % 2 == 0:
             parts.append(step.parts(clock))
-    ratio = Spread.of([whole.ms / single.ms for whole, single in pairs])
-    medians = [Spread.of(part).median for part in zip(*parts, strict=True)]
+    ratio = Spread.from_values([whole.ms / single.ms for whole, single in pairs])
+    medians = [Spread.from_values(part).median for part in zip(*parts, strict=True)]
     return StepRow(
         cars=case.cars,
         triangles=case.triangles,
@@ -157,11 +193,11 @@ def _row(
         lod=case.lod,
         ratio=round(ratio.median, 4),
         ratio_iqr=round(ratio.iqr, 4),
-        cpu_ratio=round(Spread.of([whole.cpu_ms / single.cpu_ms for whole, single in pairs]).median, 4),
-        step_ms=round(Spread.of([whole.ms for whole, _ in pairs]).median, 3),
-        detector_ms=round(Spread.of([single.ms for _, single in pairs]).median, 3),
-        step_cpu_ms=round(Spread.of([whole.cpu_ms for whole, _ in pairs]).median, 3),
-        detector_cpu_ms=round(Spread.of([single.cpu_ms for _, single in pairs]).median, 3),
+        cpu_ratio=round(Spread.from_values([whole.cpu_ms / single.cpu_ms for whole, single in pairs]).median, 4),
+        step_ms=round(Spread.from_values([whole.ms for whole, _ in pairs]).median, 3),
+        detector_ms=round(Spread.from_values([single.ms for _, single in pairs]).median, 3),
+        step_cpu_ms=round(Spread.from_values([whole.cpu_ms for whole, _ in pairs]).median, 3),
+        detector_cpu_ms=round(Spread.from_values([single.cpu_ms for _, single in pairs]).median, 3),
         render_forward_ms=round(medians[0], 3),
         render_backward_ms=round(medians[1], 3),
         labels_ms=round(medians[2], 3),
@@ -173,17 +209,26 @@ def _row(
     )
 
 
-def pair(clock: Clock, step: Callable[[], None], alone: Callable[[], None], swapped: bool) -> tuple[Taken, Taken]:
-    """A step and the detector alone, measured one after the other. swapped: the step first."""
+def time_pair(
+    clock: PairedTimer, step: Callable[[], None], alone: Callable[[], None], swapped: bool
+) -> tuple[CallTime, CallTime]:
+    """Time a step and the detector alone, one after the other.
+
+    Args:
+        clock: The timer.
+        step: One attack step.
+        alone: The detector alone.
+        swapped: Whether the step comes first.
+    """
     if swapped:
-        whole = clock.taken(step)
-        return whole, clock.taken(alone)
-    single = clock.taken(alone)
-    return clock.taken(step), single
+        whole = clock.time_call(step)
+        return whole, clock.time_call(alone)
+    single = clock.time_call(alone)
+    return clock.time_call(step), single
 
 
-class Stepping:
-    """An attack on one scene, step by step. lod: level of detail on; whole, keep_mb: as of `Objective`."""
+class AttackSteps:
+    """Consecutive attack steps on one scene."""
 
     def __init__(
         self,
@@ -194,9 +239,21 @@ class Stepping:
         device: str,
         lod: bool = True,
         whole: bool = False,
-        keep_mb: float = KEEP_MB,
+        keep_mb: float = DEFAULT_KEEP_MB,
     ) -> None:
-        scene = scene_to(scene, torch.float32, device)
+        """Prepare the scene.
+
+        Args:
+            scene: The scene.
+            params: Attacked parameters.
+            detector: The detector.
+            seed: Seed of the random starts.
+            device: Device to use.
+            lod: Whether level of detail is on.
+            whole: As in `Objective`.
+            keep_mb: As in `Objective`.
+        """
+        scene = convert_scene(scene, torch.float32, device)
         self.space = ParameterSpace(scene, params)
         self.compositor = Compositor(scene, RenderSettings(lod=lod))
         self.objective = Objective(self.compositor, self.space, detector, term=_TERM, whole=whole, keep_mb=keep_mb)
@@ -206,12 +263,12 @@ class Stepping:
             self._benign = self.compositor.render(scene)
         self._labeller = Labeller(scene, self._benign)
         self._generator = torch.Generator().manual_seed(seed)
-        self._taken = 0
+        self._steps_done = 0
         self.theta = self._start()
         self._cotangent = torch.randn(scene.photograph.shape, generator=self._generator).to(scene.photograph)
 
     def _start(self) -> Tensor:
-        """A feasible theta other than 0, as an attack passes through."""
+        """A random feasible theta other than 0, such as an attack passes through."""
         noise = torch.rand(self.space.dim, generator=self._generator).to(self.space.step)
         theta = self.feasible.project(_START_STEPS * self.space.step * (2 * noise - 1)).theta
         assert bool(theta.any())
@@ -221,47 +278,47 @@ class Stepping:
         """One step: gradient, sign step, projection."""
         _, gradient = self.objective.loss_and_grad(self.theta)
         self.theta = self.feasible.project(self.theta + self.space.step * torch.sign(gradient)).theta
-        self._taken += 1
-        if self._taken % _RESTART == 0:
+        self._steps_done += 1
+        if self._steps_done % _RESTART == 0:
             self.theta = self._start()
 
-    def parts(self, clock: Clock) -> tuple[float, float, float, float]:
-        """Milliseconds of render forward, render backward, labels and projection at the present theta."""
+    def parts(self, clock: PairedTimer) -> tuple[float, float, float, float]:
+        """Milliseconds of render forward, render backward, labels and projection at the current theta."""
         leaf = self.theta.detach().clone().requires_grad_(True)
-        kept: list[Tensor] = []
+        images: list[Tensor] = []
         scene = self.space.apply(self.space.scene, self.theta)
 
         def forward() -> None:
-            kept.append(self.compositor.render(self.space.apply(self.space.scene, leaf)).image)
+            images.append(self.compositor.render(self.space.apply(self.space.scene, leaf)).image)
 
-        first = clock.ms(forward)
-        second = clock.ms(lambda: torch.autograd.grad(kept[0], leaf, self._cotangent))
+        first = clock.milliseconds(forward)
+        second = clock.milliseconds(lambda: torch.autograd.grad(images[0], leaf, self._cotangent))
         with torch.no_grad():
             render = self.compositor.render(scene)
-        third = clock.ms(lambda: self._labeller.moved(scene, render))
+        third = clock.milliseconds(lambda: self._labeller.moved(scene, render))
         signs = torch.randn(self.space.dim, generator=self._generator).sign().to(self.theta)
-        fourth = clock.ms(lambda: self.feasible.project(self.theta + self.space.step * signs))
+        fourth = clock.milliseconds(lambda: self.feasible.project(self.theta + self.space.step * signs))
         return first, second, third, fourth
 
     def drawn_share(self) -> float:
-        """Of the picture, that vehicles and shadows are drawn into at the present theta."""
+        """Share of the image covered by vehicles and shadows at the current theta."""
         with torch.no_grad():
             render = self.compositor.render(self.space.apply(self.space.scene, self.theta))
         drawn = torch.zeros(render.image.shape[1:], dtype=torch.bool)
-        for x0, y0, x1, y1 in [] if render.drawn is None else render.drawn.tolist():
+        for x0, y0, x1, y1 in [] if render.vehicle_regions is None else render.vehicle_regions.tolist():
             drawn[y0:y1, x0:x1] = True
         return float(drawn.float().mean())
 
-    def faster_layout(self, clock: Clock) -> torch.memory_format:
-        """The layout of its input in which the detector is faster."""
+    def faster_layout(self, clock: PairedTimer) -> torch.memory_format:
+        """The memory layout of its input in which the detector is faster."""
         layouts = (torch.contiguous_format, torch.channels_last)
         calls = [self.detector_alone(layout) for layout in layouts]
         calls[0]()
-        times = [min(clock.ms(call) for _ in range(_LAYOUT_TRIES)) for call in calls]
+        times = [min(clock.milliseconds(call) for _ in range(_LAYOUT_TRIES)) for call in calls]
         return layouts[times.index(min(times))]
 
     def detector_alone(self, layout: torch.memory_format) -> Callable[[], None]:
-        """The detector's forward and backward to its input, of that layout."""
+        """The detector's forward and backward pass, for an input in that layout."""
         image = self._benign.image[None].detach().contiguous(memory_format=layout)
         targets = self._labeller.paper().targets
         return lambda: self._alone(image, targets)

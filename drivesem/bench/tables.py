@@ -1,4 +1,4 @@
-"""Figures as tables: for a terminal, and as Markdown for the documentation."""
+"""Formats measurements as tables for the terminal and as Markdown."""
 
 from __future__ import annotations
 
@@ -10,50 +10,53 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from scene_ir import files
 from scene_ir.errors import FormatError
 
 Columns = dict[str, tuple[str, str | None]]
-"""Field of a row: its heading in the documentation, and the short one for terminals, where it is shown there."""
+"""By field: the heading in the documentation, and the short one for terminals, or None to omit it there."""
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class BenchTable:
     """Rows of one kind."""
 
     title: str
+    """Heading."""
     columns: Columns
+    """Fields to print."""
     rows: Sequence[dict[str, Any]]
+    """Values by field."""
 
 
-def terminal(section: Section) -> Table:
-    """For people at a terminal: the columns that matter, those without a value left out."""
+def build_terminal_table(section: BenchTable) -> Table:
+    """A table for the terminal, without columns that have no values."""
     table = Table(title=section.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    short = {name: brief for name, (_, brief) in _used(section).items() if brief is not None}
+    short = {name: brief for name, (_, brief) in _columns_with_values(section).items() if brief is not None}
     for heading in short.values():
         table.add_column(heading, justify="right")
     for row in section.rows:
-        table.add_row(*(_cell(row.get(name)) for name in short))
+        table.add_row(*(_format_cell(row.get(name)) for name in short))
     return table
 
 
-def markdown(result: dict[str, Any], sections: Sequence[Section]) -> str:
+def format_markdown(result: dict[str, Any], sections: Sequence[BenchTable]) -> str:
     """Tables, method, machine and versions of one benchmark."""
     lines: list[str] = []
     for section in sections:
-        columns = _used(section)
-        lines += [f"### {section.title}", "", _line(title for title, _ in columns.values())]
-        lines.append(_line("---:" for _ in columns))
-        lines += [_line(_cell(row.get(name)) for name in columns) for row in section.rows]
+        columns = _columns_with_values(section)
+        lines += [f"### {section.title}", "", _format_row(title for title, _ in columns.values())]
+        lines.append(_format_row("---:" for _ in columns))
+        lines += [_format_row(_format_cell(row.get(name)) for name in columns) for row in section.rows]
         lines.append("")
     machine, versions = result["machine"], result["versions"]
     gpu = f", {machine['gpu']}" if "gpu" in machine else ""
     lines += [
         f"Method. {result['method']}",
         "",
-        f"Machine: {machine['cpu']}, {number_of(machine['cores'], 'core')}, "
-        f"{number_of(machine['threads'], 'thread')} used, {machine['ram']} GB{gpu}. "
+        f"Machine: {machine['cpu']}, {format_count(machine['cores'], 'core')}, "
+        f"{format_count(machine['threads'], 'thread')} used, {machine['ram']} GB{gpu}. "
         f"{', '.join(f'{name} {version}' for name, version in versions.items())}. "
         f"Made by `{result['command']}` in {result['seconds']:.0f} s.",
         "",
@@ -61,16 +64,23 @@ def markdown(result: dict[str, Any], sections: Sequence[Section]) -> str:
     return "\n".join(lines)
 
 
-def rewrite(path: Path, result: dict[str, Any], sections: Sequence[Section]) -> None:
-    """Put a benchmark's tables between its marks in a Markdown file; the rest of the file stays as it is.
+def replace_section(path: Path, result: dict[str, Any], sections: Sequence[BenchTable]) -> None:
+    """Replace a benchmark's tables between its markers in a Markdown file.
 
-    A file that is missing is made; marks that are missing are added at its end. Raises FormatError for a beginning
-    without an end.
+    A missing file is created; missing markers are appended.
+
+    Args:
+        path: The file.
+        result: The benchmark's JSON object.
+        sections: Its tables.
+
+    Raises:
+        FormatError: A begin marker without an end marker.
     """
     what = result["what"]
     begin, end = f"<!-- bench {what}: begin -->", f"<!-- bench {what}: end -->"
     text = files.read_text(path) if path.exists() else "# Benchmarks\n"
-    body = f"{begin}\n\n{markdown(result, sections)}\n{end}"
+    body = f"{begin}\n\n{format_markdown(result, sections)}\n{end}"
     if begin in text:
         before, _, rest = text.partition(begin)
         _, found, after = rest.partition(end)
@@ -82,16 +92,18 @@ def rewrite(path: Path, result: dict[str, Any], sections: Sequence[Section]) -> 
     files.write_text(path, text)
 
 
-def _used(section: Section) -> Columns:
+def _columns_with_values(section: BenchTable) -> Columns:
     rows = section.rows
-    return {name: both for name, both in section.columns.items() if any(_cell(row.get(name)) for row in rows)}
+    return {
+        name: both for name, both in section.columns.items() if any(_format_cell(row.get(name)) for row in rows)
+    }
 
 
-def _line(cells: Any) -> str:
+def _format_row(cells: Any) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Stopwatches, medians, and the facts of the machine that every figure stands beside."""
+"""Timers, medians, and the machine facts reported with every measurement."""
 
 from __future__ import annotations
 
@@ -24,64 +24,67 @@ class Spread:
     """Median and quartiles of repeated measurements."""
 
     median: float
+    """The median."""
     q1: float
+    """Lower quartile."""
     q3: float
+    """Upper quartile."""
 
     @property
     def iqr(self) -> float:
-        """Distance of the quartiles."""
+        """Interquartile range."""
         return self.q3 - self.q1
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
-        """Of at least one value."""
+    def from_values(cls, values: Sequence[float]) -> Spread:
+        """The spread of at least one value."""
         q1, median, q3 = np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75]).tolist()
         return cls(median, q1, q3)
 
 
-class Taken(NamedTuple):
-    """Milliseconds of a call: by the clock, and of the processor, all threads together, which others on the
-    machine lengthen less.
-    """
+class CallTime(NamedTuple):
+    """Duration of a call."""
 
     ms: float
+    """Wall-clock time, ms."""
     cpu_ms: float
+    """Processor time over all threads, ms; less affected by other work on the machine."""
 
 
-class Clock:
-    """Milliseconds of calls on a device, waiting for the device before and after."""
+class PairedTimer:
+    """Times calls on a device, synchronising before and after."""
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
         self._cuda = torch.device(device).type == "cuda"
 
-    def ms(self, call: Callable[[], object]) -> float:
-        """How long one call takes."""
-        return self.taken(call).ms
+    def milliseconds(self, call: Callable[[], object]) -> float:
+        """Wall-clock time of a call, ms."""
+        return self.time_call(call).ms
 
-    def taken(self, call: Callable[[], object]) -> Taken:
-        """How long one call takes, by the clock and of the processor."""
+    def time_call(self, call: Callable[[], object]) -> CallTime:
+        """Wall-clock and processor time of a call."""
         self._wait()
         start, spent = time.perf_counter(), time.process_time()
         call()
         self._wait()
-        return Taken(1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - spent))
+        return CallTime(1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - spent))
 
     def _wait(self) -> None:
         if self._cuda:
             torch.cuda.synchronize()
 
 
-class Budget:
-    """Seconds that are shared between what is left to measure."""
+class TimeBudget:
+    """Seconds shared among the remaining measurements."""
 
     def __init__(self, seconds: float, rows: int) -> None:
-        """Starts now, with `rows` rows to come."""
+        """Start now, with `rows` rows to measure."""
         self._end = time.perf_counter() + seconds
         self._rows = rows
 
     def share(self, preparation: float = 0.0) -> float:
-        """Seconds for the next row, which is prepared: an equal part of what is left when each of the others has
-        been prepared in `preparation` seconds. What one row saves, the others may use.
+        """Seconds for the next row: an equal part of the rest, after `preparation` seconds for each other row.
+        Time saved in one row is available to the others.
         """
         rows = max(self._rows, 1)
         self._rows -= 1
@@ -89,8 +92,14 @@ class Budget:
         return max(left, 0.0) / rows
 
 
-def rounds(seconds: float, fewest: int, most: int) -> Iterator[int]:
-    """Numbers of repetitions until `seconds` are over: at least `fewest`, at most `most`."""
+def repetitions(seconds: float, fewest: int, most: int) -> Iterator[int]:
+    """Count repetitions until `seconds` have passed.
+
+    Args:
+        seconds: Time limit.
+        fewest: Least number of repetitions.
+        most: Largest number of repetitions.
+    """
     start = time.perf_counter()
     for i in range(most):
         if i >= fewest and time.perf_counter() - start >= seconds:
@@ -98,11 +107,11 @@ def rounds(seconds: float, fewest: int, most: int) -> Iterator[int]:
         yield i
 
 
-def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Processor, cores, threads that torch uses, memory in GB, and the GPU's name where one is measured."""
+def machine_facts(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Processor, cores, torch threads, memory in GB, and the GPU's name if one is used."""
     facts: dict[str, Any] = {
-        "cpu": _processor(),
-        "cores": _cores(),
+        "cpu": _processor_name(),
+        "cores": _core_count(),
         "threads": torch.get_num_threads(),
         "ram": memory_gb(),
     }
@@ -111,13 +120,13 @@ def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
     return facts
 
 
-def versions() -> dict[str, str]:
-    """Of Python and of the packages that decide the figures."""
+def package_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that affect the measurements."""
     found = {name: importlib.metadata.version(package) for name, package in _PACKAGES.items()}
     return {"python": platform.python_version(), **found}
 
 
-def _processor() -> str:
+def _processor_name() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -126,7 +135,7 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def _cores() -> int:
+def _core_count() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

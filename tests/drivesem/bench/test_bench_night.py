@@ -1,4 +1,4 @@
-"""How long a night's work takes, reckoned from hand-made frames; and two real frames in the command's tests."""
+"""How long an attack on many frames takes, estimated from hand-made frames; and two real frames in the command's tests."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from drivesem.bench import night
-from drivesem.bench.night import Spent
-from drivesem.config.commands import Bench
+from drivesem.bench.night import FrameTime
+from drivesem.config.commands import BenchConfig
 from drivesem.config.errors import UsageError
 
-FRAMES = [Spent(2.0, 4.0, 3.0, 1.0, 1.0), Spent(4.0, 8.0, 1.0, 1.0, 1.0)]
+FRAMES = [FrameTime(2.0, 4.0, 3.0, 1.0, 1.0), FrameTime(4.0, 8.0, 1.0, 1.0, 1.0)]
 
 
 def test_where_the_time_goes() -> None:
@@ -25,7 +25,7 @@ def test_where_the_time_goes() -> None:
 def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(night.os, "cpu_count", lambda: 4)
     first, *others = night.night_rows(FRAMES, 600, 2, 0)
-    assert (first["how"], first["processes"], first["frames"]) == ("as asked", 2, 600)
+    assert (first["how"], first["processes"], first["frames"]) == ("as configured", 2, 600)
     assert first["hours"] == pytest.approx(12 * 600 / 2 / 3600)
     assert first["low"] <= first["hours"] <= first["high"]
     hours = {row["how"]: row["hours"] * 3600 * 2 / 600 for row in others}
@@ -34,7 +34,7 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
             "--no-fit": 10.0,
             "no grades, --no-grade": 10.0,
             "half the --steps": 9.0,
-            "frames taken apart before, in --cache": 9.0,
+            "frames de-rendered before, in --cache": 9.0,
             "--workers": 6.0,
         }
     )
@@ -42,40 +42,40 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
 
 
 def test_frames_that_were_not_fitted_have_no_faster_way() -> None:
-    rows = night.night_rows([Spent(1.0, 1.0, 1.0, 1.0, None)], 10, 99, 0)
-    ways = ["half the --steps", "frames taken apart before, in --cache", "no grades, --no-grade"]
-    assert [row["how"] for row in rows] == ["as asked", *ways]
+    rows = night.night_rows([FrameTime(1.0, 1.0, 1.0, 1.0, None)], 10, 99, 0)
+    alternatives = ["half the --steps", "frames de-rendered before, in --cache", "no grades, --no-grade"]
+    assert [row["how"] for row in rows] == ["as configured", *alternatives]
 
 
 def test_frames_that_were_not_graded_save_nothing_by_that() -> None:
-    rows = night.night_rows([Spent(1.0, 1.0, 0.0, 1.0, None)], 10, 99, 0)
+    rows = night.night_rows([FrameTime(1.0, 1.0, 0.0, 1.0, None)], 10, 99, 0)
     assert not [row for row in rows if row["how"].startswith("no grades")]
 
 
-def test_beside_other_work_the_processors_seconds_tell() -> None:
+def test_processor_time_estimates_an_idle_machine() -> None:
     frames = [replace(frame, processor=2.5) for frame in FRAMES]
     rows = {row["how"]: row for row in night.night_rows(frames, 600, 2, 0)}
     alone = rows["no other work on the machine"]
-    assert (alone["hours"], alone["by"]) == (pytest.approx(2.5 * 600 / 2 / 3600), "reckoned")
+    assert (alone["hours"], alone["by"]) == (pytest.approx(2.5 * 600 / 2 / 3600), "estimated")
     some = [frames[0], FRAMES[1]]
     assert "no other work on the machine" not in {row["how"] for row in night.night_rows(some, 600, 2, 0)}
 
 
 def test_frames_lie_evenly() -> None:
     names = [f"{i:02d}" for i in range(11)]
-    assert night.spread(names, 3) == ["00", "05", "10"]
-    assert night.spread(names, 50) == names
-    assert night.spread([], 3) == []
+    assert night.pick_evenly(names, 3) == ["00", "05", "10"]
+    assert night.pick_evenly(names, 50) == names
+    assert night.pick_evenly([], 3) == []
 
 
 def test_no_frame_with_a_vehicle() -> None:
     with pytest.raises(UsageError, match="frames with vehicles"):
-        night.check_some([])
+        night.require_frames([])
 
 
 def test_the_attack_is_the_presets_on_this_commands_frames(tmp_path: Path) -> None:
     preset = tmp_path / "mine.yaml"
     preset.write_text("method: climb\nparams: weather\nseed: 4\n")
-    settings = night.settings_of(Bench(what="night", attack=str(preset), seed=9, workers=2))
+    settings = night.build_attack_config(BenchConfig(what="night", attack=str(preset), seed=9, workers=2))
     assert (settings.method, settings.params, settings.seed, settings.workers) == ("climb", "weather", 9, 2)
-    assert night.settings_of(Bench(what="night")).method == "si-fgsm"
+    assert night.build_attack_config(BenchConfig(what="night")).method == "si-fgsm"

@@ -35,30 +35,30 @@ def archive(path: Path, frames: dict[str, list[str]]) -> Path:
 
 def test_frames_with_vehicles_are_taken_evenly(tmp_path: Path) -> None:
     frames = {f"{i:06}": [CYCLIST, FAR] if i % 2 else [CAR, CYCLIST, VAN, FAR] for i in range(12)}
-    found = boxes.frames_of(archive(tmp_path / "a.tar.xz", frames), 3)
+    found = boxes.read_labelled_frames(archive(tmp_path / "a.tar.xz", frames), 3)
     assert [one.name for one in found] == ["000000", "000004", "000008"]
     assert [one.rows for one in found] == [(0, 2)] * 3  # neither people nor what is too far to be taken apart
-    few = boxes.frames_of(archive(tmp_path / "b.tar.xz", {"000001": [CAR], "000002": [CYCLIST]}), 9)
+    few = boxes.read_labelled_frames(archive(tmp_path / "b.tar.xz", {"000001": [CAR], "000002": [CYCLIST]}), 9)
     assert [one.name for one in few] == ["000001"]
 
 
 @pytest.mark.parametrize("frames", [{}, {"000001": [CYCLIST]}])
 def test_no_vehicles_are_refused(tmp_path: Path, frames: dict[str, list[str]]) -> None:
     with pytest.raises(FormatError, match="frames with vehicles"):
-        boxes.frames_of(archive(tmp_path / "a.tar.xz", frames), 3)
+        boxes.read_labelled_frames(archive(tmp_path / "a.tar.xz", frames), 3)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.tar.xz").write_text("no archive")
     with pytest.raises(FormatError, match="a tar archive"):
-        boxes.frames_of(tmp_path / "a.tar.xz", 3)
+        boxes.read_labelled_frames(tmp_path / "a.tar.xz", 3)
     with pytest.raises(FormatError, match="a tar archive"):
-        boxes.frames_of(tmp_path / "none.tar.xz", 3)
+        boxes.read_labelled_frames(tmp_path / "none.tar.xz", 3)
 
 
 def test_vehicles_stand_where_the_labels_have_them(tmp_path: Path) -> None:
-    (frame,) = boxes.frames_of(archive(tmp_path / "a.tar.xz", {"000001": [CAR, VAN]}), 1)
-    scene = boxes.scene_of(frame, 0)
+    (frame,) = boxes.read_labelled_frames(archive(tmp_path / "a.tar.xz", {"000001": [CAR, VAN]}), 1)
+    scene = boxes.build_scene(frame, 0)
     assert scene.photograph.shape == (3, 375, 1242)
     rendered = Compositor(scene).render(scene)
     assert torch.equal((rendered.image * 255).round(), (scene.photograph * 255).round())
@@ -72,12 +72,12 @@ def test_vehicles_stand_where_the_labels_have_them(tmp_path: Path) -> None:
 def test_a_frame_is_measured(tmp_path: Path) -> None:
     detector = load_detector("squeezedet")
     assert isinstance(detector, Detector)
-    frames = boxes.frames_of(archive(tmp_path / "a.tar.xz", {"000001": [CAR]}), 1)
+    frames = boxes.read_labelled_frames(archive(tmp_path / "a.tar.xz", {"000001": [CAR]}), 1)
     (cost,) = boxes.measure(frames, detector, 0, "cpu")
     assert (cost.frame, cost.vehicles) == ("000001", 1)
     assert 0.001 < cost.changed < 0.1
     assert min(cost.ratio, cost.first_ratio, cost.step_ms, cost.detector_ms) > 0
-    row = boxes.BoxesRow.of([cost, cost])
+    row = boxes.BoxesRow.from_frames([cost, cost])
     assert (row.frames, row.median_ratio, row.p90_ratio, row.worst_ratio) == (2, *(cost.ratio,) * 3)
     assert cost.cpu_ratio > 0
     assert (row.median_cpu_ratio, row.p90_cpu_ratio, row.worst_cpu_ratio) == (cost.cpu_ratio,) * 3

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.bench.remesh import with_triangles
-from drivesem.bench.scenes import HEIGHT, KITTI_BOX_PIXELS, WIDTH, Placed, bench_scene
+from drivesem.bench.remesh import set_triangle_count
+from drivesem.bench.scenes import HEIGHT, KITTI_BOX_PIXELS, WIDTH, PackedMeshes, build_bench_scene
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
 from scene_ir.render.compositor import Compositor
@@ -14,7 +14,7 @@ from scene_ir.types import Mesh
 
 @pytest.mark.parametrize("triangles", [2000, 5000])
 def test_a_mesh_gets_its_number_of_triangles_and_stays_closed(triangles: int) -> None:
-    mesh = with_triangles(template("sedan", 100), triangles)
+    mesh = set_triangle_count(template("sedan", 100), triangles)
     assert mesh.faces.shape[0] == triangles
     places = np.unique(mesh.vertices.numpy(), axis=0, return_inverse=True)[1].reshape(-1)
     corners = places[mesh.faces.numpy()]
@@ -24,7 +24,7 @@ def test_a_mesh_gets_its_number_of_triangles_and_stays_closed(triangles: int) ->
 
 def test_splitting_leaves_the_surface_as_it_is() -> None:
     mesh = template("sedan", 100)
-    fine = with_triangles(mesh, 5000)
+    fine = set_triangle_count(mesh, 5000)
 
     def area_by_part(one: Mesh) -> torch.Tensor:
         corner = one.vertices[one.faces].double()
@@ -37,16 +37,16 @@ def test_splitting_leaves_the_surface_as_it_is() -> None:
 
 def test_too_few_triangles() -> None:
     with pytest.raises(RangeError, match="triangles"):
-        with_triangles(template("sedan", 100), 3)
+        set_triangle_count(template("sedan", 100), 3)
 
 
 def test_a_scene_holds_what_it_says_and_renders_its_photograph() -> None:
-    bench = bench_scene(4, 2000)
+    bench = build_bench_scene(4, 2000)
     scene = bench.scene
     assert (scene.camera.height, scene.camera.width) == (HEIGHT, WIDTH)
     assert len(scene.objects) == bench.cars == 4
     assert bench.triangles_actual == bench.triangles == 2000
-    placed = Placed.of(scene)
+    placed = PackedMeshes.from_scene(scene)
     assert placed.faces.shape[0] == 8000
     assert placed.face_ranges.tolist() == [[2000 * i, 2000 * (i + 1)] for i in range(4)]
     assert 0.5 * KITTI_BOX_PIXELS[4] < bench.box_pixels < 2 * KITTI_BOX_PIXELS[4]
@@ -56,7 +56,7 @@ def test_a_scene_holds_what_it_says_and_renders_its_photograph() -> None:
 
 
 def test_half_the_scale_is_the_same_view_on_a_quarter_of_the_pixels() -> None:
-    whole, half = bench_scene(1, 2000), bench_scene(1, 2000, scale=0.5)
+    whole, half = build_bench_scene(1, 2000), build_bench_scene(1, 2000, scale=0.5)
     assert half.scene.camera.width == WIDTH // 2
     assert half.hit_pixels == pytest.approx(whole.hit_pixels / 4, rel=0.05)
     assert torch.equal(half.scene.objects.translation, whole.scene.objects.translation)
@@ -65,4 +65,4 @@ def test_half_the_scale_is_the_same_view_on_a_quarter_of_the_pixels() -> None:
 @pytest.mark.parametrize("cars", [0, 17])
 def test_more_cars_than_there_is_room_for(cars: int) -> None:
     with pytest.raises(RangeError, match="cars"):
-        bench_scene(cars, 2000)
+        build_bench_scene(cars, 2000)

@@ -22,18 +22,18 @@ def _result(what: str, **row: Any) -> dict[str, Any]:
     }
 
 
-def _sections(result: dict[str, Any]) -> list[tables.Section]:
+def _sections(result: dict[str, Any]) -> list[tables.BenchTable]:
     columns = {"step": step.COLUMNS, "memory": memory.COLUMNS}[result["what"]]
-    return [tables.Section("A title", columns, result["rows"])]
+    return [tables.BenchTable("A title", columns, result["rows"])]
 
 
 def _rewrite(path: Path, result: dict[str, Any]) -> None:
-    tables.rewrite(path, result, _sections(result))
+    tables.replace_section(path, result, _sections(result))
 
 
 def test_columns_without_a_value_are_left_out() -> None:
     result = _result("step", ratio=1.175, ratio_iqr=0.01, lod=True)
-    text = tables.markdown(result, _sections(result))
+    text = tables.format_markdown(result, _sections(result))
     lines = text.splitlines()
     assert "| cars | triangles a car | level of detail | ratio | IQR |" in lines
     assert "| 8 | 5,000 | on | 1.18 | 0.01 |" in lines
@@ -65,4 +65,4 @@ def test_a_section_without_an_end(tmp_path: Path) -> None:
 
 def test_a_terminal_shows_every_row() -> None:
     (section,) = _sections(_result("step", ratio=1.5))
-    assert tables.terminal(section).row_count == 1
+    assert tables.build_terminal_table(section).row_count == 1
