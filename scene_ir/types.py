@@ -1,6 +1,6 @@
-"""The central types. Frozen, validated on construction, without a batch dimension.
+"""The central types: frozen, validated on construction, without a batch dimension.
 
-Axes, units, pixel centres and colour space are fixed in `conventions.md`, once for all packages.
+`conventions.md` defines axes, units, pixel centres and colour space.
 """
 
 from __future__ import annotations
@@ -50,7 +50,17 @@ class Category(IntEnum):
 
 
 def check_shape(name: str, tensor: Tensor, *shape: int | None, floating: bool = True) -> None:
-    """Raise ShapeError unless `tensor` has `shape` (None: any size) and the right kind of dtype."""
+    """Check a tensor's shape and kind of dtype.
+
+    Args:
+        name: The field, for the message.
+        tensor: The tensor.
+        shape: Expected sizes; None for any.
+        floating: Whether its dtype must be floating or integer.
+
+    Raises:
+        ShapeError: It has another shape or dtype.
+    """
     if not isinstance(tensor, Tensor):
         raise ShapeError(name, "a torch tensor", type(tensor).__name__)
     actual = tuple(tensor.shape)
@@ -69,28 +79,38 @@ def check_finite(name: str, tensor: Tensor) -> None:
 
 
 def check_indices(name: str, indices: Tensor, count: int) -> None:
-    """Raise RangeError naming the first of `indices` that is not in [0, count)."""
+    """Check that indices are in [0, count).
+
+    Args:
+        name: The field, for the message.
+        indices: Integers of any shape.
+        count: Number of entries.
+
+    Raises:
+        RangeError: One of them is not.
+    """
     bad = indices[(indices < 0) | (indices >= count)]
     if bad.numel():
         raise RangeError(name, f"indices in [0, {count})", int(bad[0]))
 
 
 FOCAL_PX = (0.01, 1e5)
-"""Focal lengths of cameras, far beyond those of any: what is no length does not pass for one."""
+"""Bounds of focal lengths, far beyond those of real cameras, px."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera.
-
-    intrinsics: (3, 3) px. projection: (3, 4) px, where the data set has one (KITTI's P2, whose fourth
-    column carries the offset of camera 2); else it is `[intrinsics | 0]`. height, width: px.
-    """
+    """A pinhole camera."""
 
     intrinsics: Tensor
+    """(3, 3) px."""
     height: int
+    """Image height, px."""
     width: int
+    """Image width, px."""
     projection: Tensor | None = None
+    """(3, 4) px if the data set has one (KITTI's P2 has the offset of camera 2 in its fourth column); else
+    `[intrinsics | 0]`."""
 
     def __post_init__(self) -> None:
         check_shape("camera.intrinsics", self.intrinsics, 3, 3)
@@ -116,20 +136,21 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A closed triangle mesh in the unit box of its object frame.
-
-    vertices: (V, 3), x in [-0.5, 0.5] along the length (front is +x), y in [-1, 0] (0 is the bottom face,
-    -1 the roof: y points down), z in [-0.5, 0.5] along the width. faces: (F, 3) int64, counter-clockwise seen
-    from outside in a right-handed frame, so that cross(v1 - v0, v2 - v0) points outwards.
-    part: (F,) int64, a `Part`. colours: (V, 3) RGB in [0, 1] or None. uv: (V, 2) or None. name: for people.
-    """
+    """A closed triangle mesh in the unit box of its object frame."""
 
     vertices: Tensor
+    """(V, 3): x in [-0.5, 0.5] along the length, front at +x; y in [-1, 0], roof at -1; z in [-0.5, 0.5] along the
+    width."""
     faces: Tensor
+    """(F, 3) int64, wound so that cross(v1 - v0, v2 - v0) points outwards."""
     part: Tensor
+    """(F,) int64, a `Part`."""
     name: str = ""
+    """Display name."""
     colours: Tensor | None = None
+    """(V, 3) RGB in [0, 1]."""
     uv: Tensor | None = None
+    """(V, 2) texture coordinates."""
 
     def __post_init__(self) -> None:
         check_shape("mesh.vertices", self.vertices, None, 3)
@@ -145,11 +166,14 @@ class Mesh:
 
 @dataclass(frozen=True, slots=True)
 class Crop:
-    """A rectangle of an image: values (C, h, w) whose upper left pixel is column `x0`, row `y0` of the frame."""
+    """A rectangle of an image."""
 
     values: Tensor
+    """(C, h, w)."""
     x0: int
+    """Left column in the frame, px."""
     y0: int
+    """Top row in the frame, px."""
 
     def __post_init__(self) -> None:
         check_shape("crop.values", self.values, None, None, None)
@@ -157,27 +181,28 @@ class Crop:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One object as the photograph saw it: the fixed end of the projective texture.
-
-    translation (3,) m, yaw () rad, size_lhw (3,) m, ffd (P, 3): the geometry at which the photograph was taken.
-    foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity (the matte), in [0, 1].
-    shadow: Crop of (3, h, w): the factor in [0, 1] by which the object darkens the ground at each pixel, or None.
-    inflation: m beyond the mesh within which the matte may reach: its halo, which moves with the outline.
-    paint: (3,) RGB, the base colour of the paint. sunlight: how strongly the sun lights the object, see
-    `texture.shade`. region: Crop of (1, h, w) in [0, 1], how much of each pixel is paint, nothing beyond it; None
-    where that is known by the mesh's parts alone.
-    """
+    """One object as photographed: the fixed end of the projective texture."""
 
     translation: Tensor
+    """(3,) m, bottom-face centre in the photograph."""
     yaw: Tensor
+    """() rad, in the photograph."""
     size_lhw: Tensor
+    """(3,) m, in the photograph."""
     ffd: Tensor
+    """(P, 3) lattice offsets, in the photograph."""
     foreground: Crop
+    """Crop (4, h, w) in [0, 1]: RGB premultiplied by opacity, and opacity (the matte)."""
     shadow: Crop | None
+    """Crop (3, h, w) in [0, 1]: factor by which the object darkens the ground, or None."""
     inflation: float
+    """Margin of the mesh, m, that the matte may reach; it moves with the outline."""
     paint: Tensor
+    """(3,) RGB in [0, 1], base colour of the paint."""
     sunlight: float
+    """Strength of the sun on the object, >= 0."""
     region: Crop | None = None
+    """Crop (1, h, w) in [0, 1]: share of paint in each pixel; None if only the mesh's parts are known."""
 
     def __post_init__(self) -> None:
         check_shape("source.translation", self.translation, 3)
@@ -196,42 +221,45 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """Something that is no vehicle and may stand in front of one: a person, a pole, a trunk. It never moves.
-
-    foreground: Crop of (4, h, w): RGB premultiplied by opacity, and opacity, in [0, 1]. depth_m: along the optical
-    axis, to where it stands.
-    """
+    """An object that is no vehicle and may stand in front of one: a person, a pole, a trunk. It never moves."""
 
     foreground: Crop
+    """Crop (4, h, w) in [0, 1]: RGB premultiplied by opacity, and opacity."""
     depth_m: float
+    """Depth along the optical axis, m."""
 
     def __post_init__(self) -> None:
-        check_shape("front.foreground", self.foreground.values, 4, None, None)
+        check_shape("occluder.foreground", self.foreground.values, 4, None, None)
         if not 0 < self.depth_m < float("inf"):
-            raise RangeError("front.depth_m", "positive metres", self.depth_m)
+            raise RangeError("occluder.depth_m", "positive metres", self.depth_m)
 
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """N vehicles. mesh_index (N,) into `SceneIR.meshes`; translation (N, 3) m, the bottom-face centre;
-    yaw (N,) rad about the camera's y axis (KITTI's rotation_y); size_lhw (N, 3) m; ffd (N, P, 3), lattice offsets
-    as fractions of the unit box; texture_code (N, 5); category (N,) a `Category`.
-    box2d (N, 4) px, xyxy: the label's box as the data set gives it (`paper` labels, and the base of `moved` ones);
-    truncation (N,) in [0, 1]; occlusion (N,) int64, 0 to 3: as labelled.
-    source: one `Source` an object, or an empty tuple where nothing was photographed (pure mesh rendering).
-    """
+    """N vehicles."""
 
     mesh_index: Tensor
+    """(N,) int64, into `SceneIR.meshes`."""
     translation: Tensor
+    """(N, 3) m, bottom-face centre."""
     yaw: Tensor
+    """(N,) rad about the camera's y axis (KITTI's rotation_y)."""
     size_lhw: Tensor
+    """(N, 3) m, length, height, width."""
     ffd: Tensor
+    """(N, P, 3) lattice offsets, fractions of the unit box."""
     texture_code: Tensor
+    """(N, 5) in (-1, 1)."""
     category: Tensor
+    """(N,) int64, a `Category`."""
     box2d: Tensor
+    """(N, 4) px, xyxy, the labels' 2D boxes: `paper` labels, and the base of `moved` ones."""
     truncation: Tensor
+    """(N,) in [0, 1], as labelled."""
     occlusion: Tensor
+    """(N,) int64, 0 to 3, as labelled."""
     source: tuple[Source, ...] = ()
+    """One `Source` per object; empty if there is no photograph."""
 
     def __post_init__(self) -> None:
         n = self.translation.shape[0] if isinstance(self.translation, Tensor) and self.translation.ndim else -1
@@ -258,20 +286,24 @@ class Objects:
 
 @dataclass(frozen=True, slots=True)
 class Environment:
-    """What surrounds the cars. weather (4,) in [0, 1], foliage (3,) and light (3,) in [-1, 1], 0 is as
-    photographed; sun (3,) unit vector towards the photographed sun in camera axes; sky, foliage_map, road: (H, W)
-    soft maps in [0, 1]. ground: (4,) plane n.x + d = 0 in camera axes, n (3,) the unit normal pointing up
-    (n_y < 0).
-    """
+    """Codes and maps of the surroundings."""
 
     weather: Tensor
+    """(4,) in [0, 1]; 0 is as photographed."""
     foliage: Tensor
+    """(3,) in [-1, 1]; 0 is as photographed."""
     sun: Tensor
+    """(3,) unit vector towards the photographed sun, in camera axes."""
     ground: Tensor
+    """(4,), plane n.x + d = 0 in camera axes, with the unit normal n up (n_y < 0)."""
     sky: Tensor
+    """(H, W) in [0, 1], share of sky."""
     foliage_map: Tensor
+    """(H, W) in [0, 1], share of foliage."""
     road: Tensor
+    """(H, W) in [0, 1], share of road."""
     light: Tensor = field(default_factory=lambda: torch.zeros(LIGHT_DIM))
+    """(3,) in [-1, 1]; 0 is as photographed."""
 
     def __post_init__(self) -> None:
         check_shape("environment.weather", self.weather, WEATHER_DIM)
@@ -288,28 +320,34 @@ class Environment:
 
 @dataclass(frozen=True, slots=True)
 class SceneIR:
-    """One frame, taken apart. photograph, background: (3, H, W) RGB in [0, 1], the background without the cars and
-    their shadows, and equal to the photograph elsewhere; depth: (H, W) m of the background, inf in the sky.
-    ignore: (K, 4) px, xyxy, regions no detection is judged in (DontCare). provenance: where it came from.
-    others: what `ignore` is where labels said so: their regions, then what they tell of all that is no object here
-    (people, trams), which stays in the picture as it is.
-    front: what may stand in front of vehicles: drawn over those behind it, and part of the background too.
-    before: the scene of which this is what became when a vehicle was exchanged, added or taken away; None where
-    none was. It has the same objects, row by row; one that is not there stands behind the camera (`in_view`).
-    """
+    """One photograph as an editable scene."""
 
     camera: Camera
+    """The photograph's camera."""
     meshes: tuple[Mesh, ...]
+    """Meshes that objects refer to."""
     objects: Objects
+    """The vehicles."""
     environment: Environment
+    """Their surroundings."""
     photograph: Tensor
+    """(3, H, W) RGB in [0, 1]."""
     background: Tensor
+    """(3, H, W) RGB in [0, 1], without vehicles and their shadows; elsewhere the photograph."""
     depth: Tensor
+    """(H, W) m of the background; inf in the sky."""
     ignore: Tensor
+    """(K, 4) px, xyxy, regions in which no detection counts (DontCare)."""
     provenance: Mapping[str, str] = field(default_factory=dict)
+    """Where the scene comes from, by keyword."""
     occluders: tuple[Occluder, ...] = ()
+    """Objects that may stand in front of vehicles, and are part of the background too."""
     before: SceneIR | None = None
+    """The scene before a vehicle was exchanged, added or removed, with the same objects row by row; an absent one
+    stands behind the camera."""
     other_labels: Labels | None = None
+    """The labels that `ignore` was made of: DontCare regions, then labels that are no object here (people,
+    trams)."""
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width
@@ -326,8 +364,8 @@ class SceneIR:
         for i, source in enumerate(self.objects.source):
             for name in ("foreground", "shadow", "region"):
                 self._check_inside(f"objects.source[{i}].{name}", getattr(source, name))
-        for i, thing in enumerate(self.occluders):
-            self._check_inside(f"scene.front[{i}].foreground", thing.foreground)
+        for i, occluder in enumerate(self.occluders):
+            self._check_inside(f"scene.occluders[{i}].foreground", occluder.foreground)
         if self.before is not None:
             if self.before.before is not None:
                 raise RangeError("scene.before", "a scene without one", "a scene with one")
@@ -352,19 +390,20 @@ class SceneIR:
 
     @property
     def origin(self) -> SceneIR:
-        """The scene before vehicles were exchanged, added or taken away; this one where none was."""
+        """The scene before vehicles were exchanged, added or removed; itself if none was."""
         return self if self.before is None else self.before
 
     def as_photographed(self) -> SceneIR:
-        """The scene that the photograph shows: `origin`, at rest.
+        """The scene of the photograph: `origin`, unperturbed.
 
         A saved counterexample thus carries the scene that it was made from. Needs `objects.source`.
         """
         return self.origin.unperturbed()
 
     def unperturbed(self) -> SceneIR:
-        """The scene at theta0: every object at the geometry of its source, every code at 0. Vehicles that were
-        exchanged, added or taken away stay so. Needs `objects.source`.
+        """The scene at theta0: every object at the geometry of its source, every code at 0.
+
+        Exchanged, added and removed vehicles stay so. Needs `objects.source`.
         """
         source = self.objects.source
         if len(source) != len(self.objects):
@@ -390,21 +429,24 @@ class SceneIR:
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """What a data set says of the M objects in one frame, in file order, people included, DontCare apart.
-
-    kind: type as written, one a row ("Car", "Van", ...). boxes_xyxy (M, 4) px; truncation (M,) in [0, 1];
-    occlusion (M,) int64, 0 to 3; translation (M, 3) m, bottom-face centre; yaw (M,) rad; size_lhw (M, 3) m.
-    ignore_xyxy (K, 4) px: DontCare regions.
-    """
+    """The M labelled objects of a frame, in file order and with people; DontCare regions are separate."""
 
     kind: tuple[str, ...]
+    """M types as written ("Car", "Van", ...)."""
     boxes_xyxy: Tensor
+    """(M, 4) px."""
     truncation: Tensor
+    """(M,) in [0, 1]."""
     occlusion: Tensor
+    """(M,) int64, 0 to 3."""
     translation: Tensor
+    """(M, 3) m, bottom-face centre."""
     yaw: Tensor
+    """(M,) rad."""
     size_lhw: Tensor
+    """(M, 3) m."""
     ignore_xyxy: Tensor
+    """(K, 4) px, DontCare regions."""
 
     def __post_init__(self) -> None:
         m = len(self.kind)
@@ -417,7 +459,7 @@ class Labels:
         check_shape("labels.ignore_xyxy", self.ignore_xyxy, None, 4)
 
     def select(self, rows: Sequence[int]) -> Labels:
-        """Some of the objects, and all regions."""
+        """The labels of some rows, with all regions."""
         columns = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw")
         chosen = {name: getattr(self, name)[list(rows)] for name in columns}
         return replace(self, kind=tuple(self.kind[row] for row in rows), **chosen)
@@ -425,21 +467,28 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One photograph as a reader gives it. photograph (3, H, W) RGB in [0, 1]; labels where the data set has them;
-    masks (M, H, W) in [0, 1], one a label; depth (H, W) m; classes (H, W) int64 with `class_names`;
-    points (P, 3) m in camera axes. identifier: unique within its data set ("000008"). provenance: dataset, files.
-    """
+    """One photograph as a reader returns it."""
 
     identifier: str
+    """Unique within its data set ("000008")."""
     photograph: Tensor
+    """(3, H, W) RGB in [0, 1]."""
     camera: Camera
+    """The photograph's camera."""
     labels: Labels | None = None
+    """Labels, if the data set has them."""
     masks: Tensor | None = None
+    """(M, H, W) in [0, 1], one per label."""
     depth: Tensor | None = None
+    """(H, W) m."""
     classes: Tensor | None = None
+    """(H, W) int64, into `class_names`."""
     class_names: tuple[str, ...] = ()
+    """Names of the classes."""
     points: Tensor | None = None
+    """(P, 3) m in camera axes."""
     provenance: Mapping[str, str] = field(default_factory=dict)
+    """Data set and files, by keyword."""
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width
@@ -456,23 +505,31 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Render:
-    """A rendered scene. image (3, H, W) RGB in [0, 1]; depth (H, W) m, inf in the sky; object_id (H, W) int64,
-    0 is background, i + 1 object i (the front-most object whose opacity is at least one half);
-    opacity: one Crop (1, h, w) an object, before others occlude it, in [0, 1]. drawn: (K, 4) int64 px, half-open
-    (x0, y0, x1, y1): where vehicles and their shadows show; elsewhere no vehicle changes anything. None where
-    weather or foliage may change every pixel, or nobody knows.
-    """
+    """A rendered scene."""
 
     image: Tensor
+    """(3, H, W) RGB in [0, 1]."""
     depth: Tensor
+    """(H, W) m; inf in the sky."""
     object_id: Tensor
+    """(H, W) int64: 0 is background, i + 1 the front-most object i with an opacity of at least one half."""
     opacity: tuple[Crop, ...]
+    """One Crop (1, h, w) in [0, 1] per object, before others occlude it."""
     vehicle_regions: Tensor | None = None
+    """(K, 4) int64 px, half-open xyxy, outside which no vehicle or shadow is drawn; None if unknown or if weather
+    or foliage may change every pixel."""
 
 
 def convert_scene(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
-    """The same scene, or any part of it, with its floating tensors in `dtype`, all tensors on `device`; as they
-    are where that is None. What does not change is not copied.
+    """Convert a scene, or any part of it, to another dtype or device. Unchanged tensors are not copied.
+
+    Args:
+        value: A scene, one of its parts, or a tensor.
+        dtype: Of floating tensors; None to keep.
+        device: Of all tensors; None to keep.
+
+    Returns:
+        The same structure.
     """
     converted: Any = value
     if isinstance(value, Tensor):

@@ -1,1 +1,1 @@
-"""From a photograph with boxes to a scene: semantic, geometric and textural branch."""
+"""From a photograph with boxes to a scene: masks, geometry and textures."""

@@ -44,7 +44,7 @@ _TARGET_HW = (60.0, 116.0)
 _MAX_ZOOM, _MAX_STRETCH = 4.0, 1.6
 """Largest enlargement of crops, and largest ratio of their horizontal and vertical scales."""
 GUIDE_CHANNELS = 7
-"""Channels that the placed template gives, see `guides`."""
+"""Number of guide maps, see `render_guides`."""
 CLASSES = ("visible", "front", "shadow", "behind")
 _DETAIL_PX = 90.0
 """Height that selects a template's level of detail in crops."""
@@ -213,11 +213,20 @@ def render_guides(
     nearer_inside: Array,
     backend: verbs.Backend = "warp",
 ) -> Tensor:
-    """What the placed templates say of each pixel of their crops, (N, 7, 96, 160): coverage by the template; where
-    on it, in its unit box (x, y, z), 0 beside it; nearness to its footprint of the ground that the pixel shows, 1
-    in its middle, -1 far off; and as given, nearer vehicles and the photograph itself (N, 2, 96, 160).
+    """Render the guide maps of placed templates.
 
-    cameras: of the crops, see `zoomed`; ground: planes (4,), one each.
+    The maps are: coverage by the template; the point on it in its unit box (x, y, z), 0 outside; nearness of the
+    ground at the pixel to the footprint, from 1 in its middle to -1 far away; and `nearer_inside`.
+
+    Args:
+        placements: N placed templates.
+        cameras: Of their crops, see `crop_camera`.
+        ground: N planes (4,) n.x + d = 0.
+        nearer_inside: Masks (N, 2, 96, 160) of nearer vehicles and of the photograph.
+        backend: Of the rasteriser.
+
+    Returns:
+        (N, 7, 96, 160).
     """
     height, width = CROP_HW
     coarse = [_with_coarse_mesh(p) for p in placements]
@@ -242,7 +251,7 @@ def _with_coarse_mesh(placement: Placement) -> Placement:
 
 
 def _footprint_nearness(placement: Placement, ground: Tensor, camera: Camera) -> Array:
-    """How near (h, w) to its footprint the ground lies that a pixel shows, as `guides` says it."""
+    """Nearness (h, w) of the ground at each pixel to the footprint, see `render_guides`."""
     matrix = camera.matrix.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
     foot, normal = placement.translation.double().numpy(), ground[:3].double().numpy()

@@ -1,4 +1,6 @@
-"""The surroundings' geometry by simple, documented rules: ground plane, horizon, walls on its end, sun."""
+"""Geometry of the surroundings by simple rules: ground plane, horizon, footprints, walls at the end of the ground,
+sun.
+"""
 
 from __future__ import annotations
 
@@ -13,27 +15,26 @@ from scene_ir.types import Camera, Labels
 Array = NDArray[np.float32]
 
 CAMERA_HEIGHT_M = 1.65
-"""m, of KITTI's cameras above the road (Geiger et al., IJRR 2013)."""
+"""Height of KITTI's cameras above the road, m (Geiger et al., IJRR 2013)."""
 FAR_M = 80.0
-"""m, where upright surfaces without a visible foot are put."""
-_SEAMLESS = 0.02
-"""Of the image's width: over how much walls of other depths pass into each other."""
-_BESIDE = 0.03
-"""Of the image's width: how far the ground on which something stands goes on to its sides; most of what walls of
-other depths need to pass into each other."""
+"""Depth of upright surfaces without a visible foot, m."""
+_WALL_BLUR = 0.02
+"""Blur of walls' depths along the street, as a fraction of the image's width."""
+_FOOTPRINT_SIDE = 0.03
+"""Extension of footprints to their sides, as a fraction of the image's width: most of the wall blur."""
 _NEAR_M = 0.5
-"""Boxes that come nearer to the camera say nothing."""
-_FAR_OUT_PX = 10_000
-"""Far outside of any picture, and within OpenCV's integers."""
+"""Boxes nearer to the camera are ignored."""
+_MAX_PX = 10_000
+"""Bound of coordinates: far outside any image, and within OpenCV's integers."""
 DEFAULT_SUN = (-0.35, -0.85, -0.39)
-"""Towards the sun where nothing is known: high, a little to the left and behind the camera."""
+"""Direction towards the sun if nothing is known: high, a little to the left and behind the camera."""
 
 
 def fit_ground(labels: Labels | None, rows: list[int]) -> torch.Tensor:
-    """Plane (4,) n.x + d = 0 with n up, from the bottom centres of the labels `rows` and a prior of a level road.
+    """Fit the ground plane (4,) n.x + d = 0, n up, to the bottom centres of the labels `rows` and a level-road
+    prior.
 
-    y = a x + b z + c by iterated least squares with Huber weights; a point's error is 0.1 m and grows with
-    distance.
+    y = a x + b z + c by iterated least squares with Huber weights. A point's error is 0.1 m plus 1 % of its distance.
     """
     points = labels.translation[rows].double().numpy() if labels is not None and rows else np.zeros((0, 3))
     prior = np.diag([1 / 0.03, 1 / 0.015, 1 / 0.15])
@@ -54,7 +55,7 @@ def fit_ground(labels: Labels | None, rows: list[int]) -> torch.Tensor:
 
 
 def compute_plane_depth(ground: torch.Tensor, camera: Camera) -> Array:
-    """Depth z (H, W) m at which each pixel's ray meets the ground plane; inf where it does not."""
+    """Depth z (H, W) m of the ground plane on each pixel's ray; inf where there is none."""
     matrix = camera.matrix.double().numpy()
     normal = ground.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
@@ -70,15 +71,24 @@ def compute_plane_depth(ground: torch.Tensor, camera: Camera) -> Array:
 
 
 def horizon_row(ground: torch.Tensor, camera: Camera) -> float:
-    """Row, px, of the horizon in the image's middle column: where rays run parallel to the ground."""
+    """Row, px, of the horizon in the image's middle column."""
     inverse = np.linalg.inv(camera.intrinsics.double().numpy())
     across = ground[:3].double().numpy() @ inverse
     return float(-(across[0] * (camera.width - 1) / 2 + across[2]) / across[1])
 
 
 def draw_footprints(labels: Labels, rows: list[int], ground: torch.Tensor, camera: Camera) -> Array:
-    """1 where something labelled stands on the ground, else 0 (H, W): whatever the pixels look like, there is
-    ground."""
+    """Draw the footprints of labelled objects: there is ground, regardless of the pixels.
+
+    Args:
+        labels: A frame's labels.
+        rows: Labels to draw.
+        ground: Plane (4,) n.x + d = 0.
+        camera: The frame's camera.
+
+    Returns:
+        (H, W), 1 inside a footprint, else 0.
+    """
     corners = box_corners(labels.size_lhw[rows], labels.yaw[rows], labels.translation[rows])[:, :4].double()
     normal = ground.double()
     y = -(corners[..., 0] * normal[0] + corners[..., 2] * normal[2] + normal[3]) / normal[1]
@@ -86,25 +96,31 @@ def draw_footprints(labels: Labels, rows: list[int], ground: torch.Tensor, camer
     in_view = (clip[..., 2] > _NEAR_M).all(dim=1)
     stands = np.zeros((camera.height, camera.width), np.float32)
     for polygon in (clip[in_view, :, :2] / clip[in_view, :, 2:]).numpy():
-        cv2.fillConvexPoly(stands, np.rint(polygon.clip(-_FAR_OUT_PX, _FAR_OUT_PX)).astype(np.int32), 1)
+        cv2.fillConvexPoly(stands, np.rint(polygon.clip(-_MAX_PX, _MAX_PX)).astype(np.int32), 1)
     return stands
 
 
 def compute_wall_depth(ground_depth: Array, flat: Array, stood: Array, sky: Array, horizon: float) -> Array:
-    """Depth (H, W) m by rule: the plane's (H, W) where there is ground, upright walls on its upper end, inf in the
-    sky. flat, sky (H, W) in [0, 1]: where ground is seen, and where sky; stood (H, W): see `footprints`: there is
-    ground too, and a little to its sides, and what is seen around it stands no nearer.
+    """Depth by rule: the ground's, and upright walls at the end of each column's lowest stretch of ground.
 
-    Each column's wall stands where its lowest stretch of ground ends, at most `FAR` away.
+    Args:
+        ground_depth: Depth (H, W) m of the ground plane.
+        flat: Share of ground (H, W).
+        stood: Footprints (H, W) from `draw_footprints`, which are ground; pixels around them are no nearer.
+        sky: Share of sky (H, W).
+        horizon: Its row, px.
+
+    Returns:
+        Depth (H, W) m; at most `FAR_M` for walls, inf in the sky.
     """
     height, width = flat.shape
-    beside = 2 * round(_BESIDE * width) + 1
-    flat = np.where(cv2.dilate(stood, np.ones((1, beside), np.uint8)) > 0, np.float32(1), flat)
+    side = 2 * round(_FOOTPRINT_SIDE * width) + 1
+    flat = np.where(cv2.dilate(stood, np.ones((1, side), np.uint8)) > 0, np.float32(1), flat)
     ground = cv2.morphologyEx((flat > 0.5).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)) > 0
     rows = np.arange(height)[:, None]
     below = rows > horizon + 2
     top = np.where(ground.any(0), np.argmax(ground & below, axis=0), height - 1)
-    # Columns without ground: the foot of what stands there is interpolated from the neighbours.
+    # The foot of columns without ground is interpolated from their neighbours.
     known = ground.any(0)
     if known.any():
         top = np.interp(np.arange(width), np.nonzero(known)[0], top[known])
@@ -114,14 +130,14 @@ def compute_wall_depth(ground_depth: Array, flat: Array, stood: Array, sky: Arra
     top = cv2.blur(top.astype(np.float32)[None], (window, 1))[0]
     foot = np.clip(np.rint(top).astype(int), 0, height - 1)
     wall = np.minimum(ground_depth[foot, np.arange(width)], FAR_M)
-    # Fog shows the inverse of depth, and a step between columns as a seam.
-    wall = 1 / cv2.GaussianBlur(1 / wall[None], (0, 0), _SEAMLESS * width)[0]
+    # Blur the inverse of depth: fog would show a step between columns as a seam.
+    wall = 1 / cv2.GaussianBlur(1 / wall[None], (0, 0), _WALL_BLUR * width)[0]
     depth = np.minimum(ground_depth, wall[None])
     depth = np.where(rows >= foot[None], np.minimum(ground_depth, FAR_M), depth)
     return np.where(sky > 0.5, np.inf, depth).astype(np.float32)
 
 
 def default_sun() -> torch.Tensor:
-    """(3,) unit vector towards the sun: the documented constant (a photograph alone rarely tells)."""
+    """Unit vector (3,) towards the default sun: a photograph alone rarely determines it."""
     sun = torch.tensor(DEFAULT_SUN)
     return sun / sun.norm()

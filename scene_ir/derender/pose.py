@@ -1,14 +1,14 @@
-"""Where vehicles stand, from a photograph and 2D boxes alone: a small network, and the ground they stand on.
+"""Estimate vehicles' poses and sizes from a photograph and 2D boxes, with a small network and the ground plane.
 
-The network sees the photograph around a box and the box's own numbers, and says what the head of 3D-SDN (Yao et
-al., NeurIPS 2018, section 3.1) says: viewing angle as cosine and sine, offset of the projected centre, log sizes,
-log depth, template. Two departures: the angle is told within one of twelve bins (Mousavian et al., CVPR 2017), so
-that "front or back?" is a choice and not an average, and the depth comes with its own uncertainty. No deformation
-code: labels do not carry one, the fit to the outline finds its own, and within a kind shapes differ by less than a
-pixel of the network's input.
+The network sees the photograph around a box and the box's features. It predicts what the head of 3D-SDN does (Yao
+et al., NeurIPS 2018, section 3.1): viewing angle as cosine and sine, offset of the projected centre, log sizes,
+log depth, template. Two differences: the angle is relative to one of twelve bins (Mousavian et al., CVPR 2017), so
+that "front or back?" is a choice and not an average, and the depth has an uncertainty. There is no deformation
+code: labels have none, the silhouette fit finds its own, and shapes within a kind differ by less than a pixel of
+the input.
 
-Depths of the network and of the ground plane, which is estimated from all vehicles of the frame, are joined by
-their variances.
+The network's depths and those of the ground plane, estimated from all vehicles of the frame, are combined by their
+variances.
 """
 
 from __future__ import annotations
@@ -37,38 +37,38 @@ from scene_ir.weights import load_frozen
 Array = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights" / "pose.safetensors"
-"""What the package ships; `tools/train_pose.py` makes it."""
+"""The shipped weights, made by `tools/train_pose.py`."""
 CROP_HW = (64, 96)
 CONTEXT = 1.5
-"""Side of the crop, in sides of the box."""
+"""Side of the crop over side of the box."""
 BINS = 12
-"""Of the viewing angle, 30 degrees each, centred at multiples of that."""
+"""Number of bins of the viewing angle, 30 degrees each, centred at multiples of 30 degrees."""
 BOX_FEATURES = 9
-"""What the network is told of a box, see `box_numbers`."""
+"""Number of box features, see `box_features`."""
 MEAN_LHW = {"Car": (4.07, 1.62, 1.68), "Truck": (9.97, 3.30, 2.55)}
-"""m, of cars and vans together and of trucks and buses, in generated streets; KITTI's are within 6%."""
-_IS = {"Car": "Car", "Van": "Car", "Truck": "Truck"}
+"""Mean sizes, m, of cars with vans and of trucks with buses in generated streets; KITTI's are within 6 %."""
+_SIZE_CLASS = {"Car": "Car", "Van": "Car", "Truck": "Truck"}
 BORDER_PX = 2.0
-"""A box that comes this near to the image's border is cut by it."""
+"""A box this near to the image's border is cut by it."""
 _MEAN, _SPREAD = 0.45, 0.27
-"""Of the photograph's values, about."""
+"""Mean and standard deviation of photographs' values, about."""
 LEVEL_SIZE = (-2.0, -2.6)
-"""Middle of log(width / focal) and log(height / focal)."""
+"""Typical log(width / focal) and log(height / focal)."""
 
 _PRIOR = (0.02, 0.015, 0.15)
-"""Standard deviations of the road's slope to the side and ahead, and of the camera's height, m."""
-_GIVEN = (0.004, 0.003, 0.03)
-"""The same of a plane that the caller knows."""
-_LEAST_SIGMA = 0.03
-"""Of the network's log depth: it saw generated pictures only."""
+"""Standard deviations of the road's slope sideways and ahead, and of the camera's height, m."""
+_KNOWN_PRIOR = (0.004, 0.003, 0.03)
+"""The same for a plane that the caller knows."""
+_MIN_SIGMA = 0.03
+"""Least standard deviation of the network's log depth: it was trained on generated images only."""
 _FOOT_PX, _FOOT_SHARE = 1.0, 0.02
-"""Error of the row where a vehicle stands: px, and share of its height in the image."""
+"""Error of the row of a vehicle's foot: px, and share of its height in the image."""
 _HUBER = 1.5
-"""Standard deviations from which on a vehicle pulls at the plane, or the plane at a vehicle, no stronger."""
+"""Standard deviations beyond which a vehicle pulls at the plane, or the plane at a vehicle, no harder."""
 
 
 class PoseBlock(nn.Module):
-    """Convolution, normalisation, ReLU; added to its input where that has the same shape."""
+    """3x3 convolution, normalisation, ReLU; residual if input and output have the same shape."""
 
     def __init__(self, channels: int, out: int, stride: int = 1) -> None:
         super().__init__()
@@ -83,26 +83,29 @@ class PoseBlock(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class PosePrediction:
-    """What the network says of N boxes. bins (N, 12) logits; turn (N, 12, 2): cosine and sine, not normalised, of
-    the angle from each bin's centre; offset (N, 2): of the projected 3D centre from the box's centre, in box
-    sides; size (N, 3): log length, height, width over the class's means; depth (N,): log of the centre's depth
-    over that of a box of mean height; log_sigma (N,): of it; kind (N, 8): logits of `KINDS`.
-    """
+    """The network's output for N boxes."""
 
     bins: Tensor
+    """(N, 12), logits of the viewing angle's bins."""
     turn: Tensor
+    """(N, 12, 2), unnormalised cosine and sine of the angle from each bin's centre."""
     offset: Tensor
+    """(N, 2), projected 3D centre from the box's centre, in box sides."""
     size: Tensor
+    """(N, 3), log length, height, width over the class's means."""
     depth: Tensor
+    """(N,), log of the centre's depth over that of a vehicle of mean height."""
     log_sigma: Tensor
+    """(N,), log of its standard deviation."""
     kind: Tensor
+    """(N, 8), logits of `KINDS`."""
 
 
-_OUT = (BINS, 2 * BINS, 2, 3, 1, 1, len(KINDS))
+_HEAD_WIDTHS = (BINS, 2 * BINS, 2, 3, 1, 1, len(KINDS))
 
 
 class PoseNet(nn.Module):
-    """crops (N, 3, 64, 96) RGB in [0, 1] and numbers (N, 9) to `Said`."""
+    """Crops (N, 3, 64, 96) RGB in [0, 1] and box features (N, 9) -> `PosePrediction`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -111,13 +114,15 @@ class PoseNet(nn.Module):
         self.squeeze = nn.Conv2d(128, 40, 1)
         cells = 40 * (CROP_HW[0] // 16) * (CROP_HW[1] // 16)
         self.hidden = nn.Linear(cells + BOX_FEATURES, 160)
-        self.out = nn.Linear(160 + BOX_FEATURES, sum(_OUT))
+        self.out = nn.Linear(160 + BOX_FEATURES, sum(_HEAD_WIDTHS))
 
     def forward(self, crops: Tensor, numbers: Tensor) -> PosePrediction:
         x = ((crops - _MEAN) / _SPREAD).contiguous(memory_format=torch.channels_last)
         x = F.relu(self.squeeze(self.blocks(x))).flatten(1)
         x = F.relu(self.hidden(torch.cat([x, numbers], 1)))
-        bins, turn, offset, size, depth, log_sigma, kind = self.out(torch.cat([x, numbers], 1)).split(_OUT, 1)
+        bins, turn, offset, size, depth, log_sigma, kind = self.out(torch.cat([x, numbers], 1)).split(
+            _HEAD_WIDTHS, 1
+        )
         return PosePrediction(
             bins, turn.reshape(-1, BINS, 2), offset, size, depth[:, 0], log_sigma[:, 0].clamp(-4.5, 0.5), kind
         )
@@ -125,19 +130,22 @@ class PoseNet(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class VehiclePoses:
-    """Vehicles in camera axes, one a box. translation (N, 3) m, bottom-face centre; yaw (N,) rad in [-pi, pi);
-    size_lhw (N, 3) m; kind: one of `KINDS` each; log_depth_sigma (N,): standard deviation of the depth's
-    logarithm; facing (N,) in [0.5, 1]: how sure it is which end is the front; ground (4,): the plane
-    n.x + d = 0, n up.
-    """
+    """N vehicles in camera axes, one per box."""
 
     translation: Tensor
+    """(N, 3) m, bottom-face centre."""
     yaw: Tensor
+    """(N,) rad in [-pi, pi)."""
     size_lhw: Tensor
+    """(N, 3) m, length, height, width."""
     kind: tuple[str, ...]
+    """N of `KINDS`."""
     log_depth_sigma: Tensor
+    """(N,), standard deviation of the logarithm of the depth."""
     facing: Tensor
+    """(N,) in [0.5, 1], probability that the front is not the rear."""
     ground: Tensor
+    """(4,), plane n.x + d = 0 with n up."""
 
 
 @lru_cache(maxsize=2)
@@ -147,9 +155,18 @@ def load_network(path: Path = WEIGHTS) -> PoseNet:
 
 
 def box_features(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
-    """What the network is told of boxes (N, 4) px, (N, 9): centre from the principal point over focal length (2),
-    log width and height over focal length about their means (2), whether the image's border cuts it left, above,
-    right, below (4), and whether it is a truck. trucks (N,) bool; cameras (N or 1, 6): see `camera_numbers`.
+    """Compute the network's features of boxes.
+
+    They are: centre from the principal point over focal length (2); log width and height over focal length, about
+    their means (2); whether the image's border cuts the box left, above, right, below (4); whether it is a truck.
+
+    Args:
+        boxes_xyxy: (N, 4) px.
+        trucks: (N,) bool.
+        cameras: (N or 1, 6) from `camera_features`.
+
+    Returns:
+        (N, 9).
     """
     focal, principal, limit = cameras[:, :2], cameras[:, 2:4], cameras[:, 4:] - 1
     centre = ((boxes_xyxy[:, :2] + boxes_xyxy[:, 2:]) / 2 - principal) / focal
@@ -159,25 +176,32 @@ def box_features(boxes_xyxy: Tensor, trucks: Tensor, cameras: Tensor) -> Tensor:
 
 
 def camera_features(camera: Camera) -> Tensor:
-    """Focal lengths, principal point, width, height of a camera, (1, 6) px."""
+    """Focal lengths, principal point, width and height of a camera, (1, 6) px."""
     k = camera.intrinsics.float()
     size = k.new_tensor([camera.width, camera.height])
     return torch.cat([k.diagonal()[:2], k[:2, 2], size])[None]
 
 
 def is_truck(kinds: Sequence[str]) -> Tensor:
-    """Which of the vehicles are trucks or buses, (N,) bool."""
-    return torch.tensor([_IS[kind] == "Truck" for kind in kinds], dtype=torch.bool)
+    """Whether each vehicle is a truck or bus, (N,) bool."""
+    return torch.tensor([_SIZE_CLASS[kind] == "Truck" for kind in kinds], dtype=torch.bool)
 
 
 def crop_boxes(
     image: NDArray[Any], boxes_xyxy: Array, size_hw: tuple[int, int] = CROP_HW, context: float = CONTEXT
 ) -> NDArray[Any]:
-    """The picture around each box, resized: image (H, W, 3) float32 or uint8, boxes (N, 4) px -> (N, h, w, 3);
-    beyond the image it is grey.
+    """Crop and resize the image around boxes.
 
-    A crop is `context` times as wide and high as its box. Smaller ones are taken from a halved (quartered, ...)
-    picture, so that no pixel is skipped.
+    Small crops of large boxes are taken from a halved (quartered, ...) image, so that no pixel is skipped.
+
+    Args:
+        image: (H, W, 3) float32 or uint8; grey beyond its border.
+        boxes_xyxy: (N, 4) px.
+        size_hw: Height and width of the crops.
+        context: Side of a crop over side of its box.
+
+    Returns:
+        (N, h, w, 3).
     """
     height, width = size_hw
     halves = [image]
@@ -192,7 +216,7 @@ def crop_boxes(
             halves.append(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
         level = min(level, len(halves) - 1)
         scale = 0.5**level
-        # a pixel's centre is at its integer: crop column j shows image column left + (j + 1/2) * step
+        # pixel centres are at integers: crop column j is image column left + (j + 1/2) * step
         step = np.array([wide / width, high / height])
         left = np.array([(x0 + x1 - wide) / 2, (y0 + y1 - high) / 2])
         start = (left + 0.5 * step + 0.5) * scale - 0.5
@@ -210,42 +234,53 @@ def crop_boxes(
 
 def mean_sizes(kinds: Sequence[str]) -> Tensor:
     """Mean length, height, width (N, 3) m of the vehicles' classes."""
-    return torch.tensor([MEAN_LHW[_IS[kind]] for kind in kinds], dtype=torch.float32).reshape(-1, 3)
+    return torch.tensor([MEAN_LHW[_SIZE_CLASS[kind]] for kind in kinds], dtype=torch.float32).reshape(-1, 3)
 
 
 def mean_depth(boxes_xyxy: Tensor, kinds: Sequence[str], camera: Camera) -> Tensor:
-    """Depth (N,) m at which a vehicle of mean height is as high as its box."""
+    """Depth at which a vehicle of mean height is as high as its box.
+
+    Args:
+        boxes_xyxy: (N, 4) px.
+        kinds: N label types.
+        camera: The photograph's camera.
+
+    Returns:
+        (N,) m.
+    """
     return camera.intrinsics[1, 1] * mean_sizes(kinds)[:, 1] / (boxes_xyxy[:, 3] - boxes_xyxy[:, 1])
 
 
 def mirror_features(numbers: Tensor) -> Tensor:
-    """The numbers of a box in the mirrored image."""
+    """The features (N, 9) of boxes in the mirrored image."""
     turned = numbers[:, [0, 1, 2, 3, 6, 5, 4, 7, 8]].clone()
     turned[:, 0] = -turned[:, 0]
     return turned
 
 
-def unmirror_prediction(said: PosePrediction) -> PosePrediction:
-    """What was said of mirrored images, as of the images themselves: angle a becomes pi - a."""
+def unmirror_prediction(prediction: PosePrediction) -> PosePrediction:
+    """A prediction for mirrored images, converted to the original ones: angle a becomes pi - a."""
     bins = (BINS // 2 - torch.arange(BINS)) % BINS
     return PosePrediction(
-        said.bins[:, bins],
-        said.turn[:, bins] * said.turn.new_tensor([1.0, -1.0]),
-        said.offset * said.offset.new_tensor([-1.0, 1.0]),
-        said.size,
-        said.depth,
-        said.log_sigma,
-        said.kind,
+        prediction.bins[:, bins],
+        prediction.turn[:, bins] * prediction.turn.new_tensor([1.0, -1.0]),
+        prediction.offset * prediction.offset.new_tensor([-1.0, 1.0]),
+        prediction.size,
+        prediction.depth,
+        prediction.log_sigma,
+        prediction.kind,
     )
 
 
-def decode_viewing_angle(said: PosePrediction) -> tuple[Tensor, Tensor]:
-    """The viewing angle alpha (N,) rad and how sure its direction is (N,) in [0.5, 1]: the likeliest bin and its
-    neighbours, each with its say; against the same, half a turn away.
+def decode_viewing_angle(prediction: PosePrediction) -> tuple[Tensor, Tensor]:
+    """The viewing angle alpha (N,) rad, and the confidence (N,) in [0.5, 1] in its direction.
+
+    The likeliest bin and its neighbours, weighted by their probabilities; the confidence compares them with the
+    bins half a turn away.
     """
-    chance = said.bins.softmax(1)
+    chance = prediction.bins.softmax(1)
     centre = torch.arange(BINS) * (2 * math.pi / BINS)
-    angle = centre + torch.atan2(said.turn[..., 1], said.turn[..., 0])
+    angle = centre + torch.atan2(prediction.turn[..., 1], prediction.turn[..., 0])
     along = torch.arange(-1, 2)
     around = chance + chance.roll(1, 1) + chance.roll(-1, 1)
     best = around.argmax(1)
@@ -258,8 +293,8 @@ def decode_viewing_angle(said: PosePrediction) -> tuple[Tensor, Tensor]:
     return alpha, ahead / (ahead + behind).clamp(min=1e-9)
 
 
-def _both(network: PoseNet, crops: Tensor, numbers: Tensor) -> PosePrediction:
-    """What the network says of boxes, and of the same in the mirror, in the mean."""
+def _predict_with_flip(network: PoseNet, crops: Tensor, numbers: Tensor) -> PosePrediction:
+    """Mean prediction for boxes and their mirror images."""
     one = network(crops, numbers)
     other = unmirror_prediction(network(crops.flip(3), mirror_features(numbers)))
     return PosePrediction(
@@ -283,21 +318,33 @@ def estimate_poses(
     network: PoseNet | None = None,
     rounds: int = 1,
 ) -> VehiclePoses:
-    """Poses and sizes of the vehicles in 2D boxes.
+    """Estimate poses and sizes of the vehicles in 2D boxes.
 
-    photograph (3, H, W) RGB in [0, 1]; boxes_xyxy (N, 4) px; kinds: "Car", "Van" or "Truck", one a box; ground
-    (4,): the plane n.x + d = 0 with n up, where it is known, otherwise it is estimated from the vehicles and a
-    camera 1.65 m above a level road; network: another than the shipped one; looks: 1, or more for boxes that are
-    not tight, such as a detector's: each next look is at the boxes of what was found. Raises ShapeError and
-    RangeError.
+    Args:
+        photograph: (3, H, W) RGB in [0, 1].
+        boxes_xyxy: (N, 4) px.
+        kinds: N of "Car", "Van", "Truck".
+        camera: The photograph's camera.
+        ground: Plane (4,) n.x + d = 0 with n up if known; otherwise estimated from the vehicles and a camera 1.65 m
+            above a level road.
+        network: In place of the shipped one.
+        rounds: 1, or more for boxes that are not tight, such as a detector's: each further round uses the
+            projected boxes of the previous one.
+
+    Returns:
+        N poses.
+
+    Raises:
+        ShapeError: An input has the wrong shape.
+        RangeError: An unknown kind, a box without area, a plane that does not point up, or no rounds.
     """
     check_shape("photograph", photograph, 3, camera.height, camera.width)
     check_shape("boxes_xyxy", boxes_xyxy, None, 4)
     if len(kinds) != len(boxes_xyxy):
         raise ShapeError("kinds", f"{len(boxes_xyxy)}, one a box", len(kinds))
     for i, kind in enumerate(kinds):
-        if kind not in _IS:
-            raise RangeError(f"kinds[{i}]", " or ".join(_IS), repr(kind))
+        if kind not in _SIZE_CLASS:
+            raise RangeError(f"kinds[{i}]", " or ".join(_SIZE_CLASS), repr(kind))
     boxes = boxes_xyxy.detach().cpu().float()
     if rounds < 1:
         raise RangeError("looks", "at least 1", rounds)
@@ -307,46 +354,46 @@ def estimate_poses(
     if ground is not None:
         check_shape("ground", ground, 4)
         if not bool(torch.isfinite(ground).all()) or float(ground[1]) >= 0:
-            raise RangeError("ground", "a finite plane whose normal points up", ground.tolist())
+            raise RangeError("ground", "a finite plane with n up", ground.tolist())
     if not len(boxes):
-        plane, _ = fit_plane(np.zeros((0, 3)), np.zeros(0), *_known(ground))
+        plane, _ = fit_plane(np.zeros((0, 3)), np.zeros(0), *_ground_prior(ground))
         nothing = torch.zeros(0)
         return VehiclePoses(
-            torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _normal_form(plane)
+            torch.zeros(0, 3), nothing, torch.zeros(0, 3), (), nothing, nothing, _plane_from_slopes(plane)
         )
     image = np.ascontiguousarray(photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
     network = network or load_network()
-    poses = _look(network, image, boxes, kinds, camera, ground)
+    poses = _estimate_once(network, image, boxes, kinds, camera, ground)
     for _ in range(rounds - 1):
         found = project_boxes(poses.size_lhw, poses.yaw, poses.translation, camera.matrix.float())
         found = clip_boxes(found, camera.height, camera.width)
         tight = (found[:, 2:] - found[:, :2] >= 0.5 * (boxes[:, 2:] - boxes[:, :2])).all(1)
         boxes = torch.where(tight[:, None], found, boxes)
-        poses = _look(network, image, boxes, kinds, camera, ground)
+        poses = _estimate_once(network, image, boxes, kinds, camera, ground)
     return poses
 
 
-def _look(
+def _estimate_once(
     network: PoseNet, image: Array, boxes: Tensor, kinds: Sequence[str], camera: Camera, ground: Tensor | None
 ) -> VehiclePoses:
     """Poses from boxes (N, 4) px as they are; image (H, W, 3)."""
     crops = torch.from_numpy(crop_boxes(image, boxes.numpy())).permute(0, 3, 1, 2)
-    said = _both(network, crops, box_features(boxes, is_truck(kinds), camera_features(camera)))
-    alpha, facing = decode_viewing_angle(said)
-    size = mean_sizes(kinds) * said.size.exp()
-    depth = mean_depth(boxes, kinds, camera) * said.depth.exp()
-    sigma = said.log_sigma.exp().clamp(min=_LEAST_SIGMA)
-    centre_px = (boxes[:, :2] + boxes[:, 2:]) / 2 + said.offset * (boxes[:, 2:] - boxes[:, :2])
+    prediction = _predict_with_flip(network, crops, box_features(boxes, is_truck(kinds), camera_features(camera)))
+    alpha, facing = decode_viewing_angle(prediction)
+    size = mean_sizes(kinds) * prediction.size.exp()
+    depth = mean_depth(boxes, kinds, camera) * prediction.depth.exp()
+    sigma = prediction.log_sigma.exp().clamp(min=_MIN_SIGMA)
+    centre_px = (boxes[:, :2] + boxes[:, 2:]) / 2 + prediction.offset * (boxes[:, 2:] - boxes[:, :2])
     centre = back_project(centre_px, depth, camera)
     foot = centre + size[:, 1:2] * torch.tensor([0.0, 0.5, 0.0])
-    scale, sigma, plane = _onto_ground(foot, size, sigma, camera, ground)
+    scale, sigma, plane = _scale_onto_ground(foot, size, sigma, camera, ground)
     translation = foot * scale[:, None]
     yaw = alpha + torch.atan2(translation[:, 0], translation[:, 2])
     return VehiclePoses(
         translation,
         (yaw + math.pi) % (2 * math.pi) - math.pi,
         size * scale[:, None],
-        tuple(KINDS[int(i)] for i in said.kind.argmax(1)),
+        tuple(KINDS[int(i)] for i in prediction.kind.argmax(1)),
         sigma,
         facing,
         plane,
@@ -354,7 +401,16 @@ def _look(
 
 
 def back_project(pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:
-    """Points (N, 3) m in camera axes seen at pixels (N, 2) at depth z (N,) m."""
+    """Points in camera axes at pixels with known depth.
+
+    Args:
+        pixels: (N, 2).
+        depth: z (N,) m.
+        camera: The photograph's camera.
+
+    Returns:
+        (N, 3) m.
+    """
     p = camera.matrix.to(pixels)
     w = depth * p[2, 2] + p[2, 3]
     y = (pixels[:, 1] * w - p[1, 2] * depth - p[1, 3]) / p[1, 1]
@@ -362,15 +418,16 @@ def back_project(pixels: Tensor, depth: Tensor, camera: Camera) -> Tensor:
     return torch.stack([x, y, depth], 1)
 
 
-def _known(ground: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes and height (3,) of the plane before any vehicle is seen, and their standard deviations (3,)."""
+def _ground_prior(ground: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
+    """Expected slopes and height (3,) of the plane, and their standard deviations (3,)."""
     if ground is None:
         return np.array([0.0, 0.0, CAMERA_HEIGHT_M]), np.array(_PRIOR)
     n = ground.double().cpu().numpy()
-    return -n[[0, 2, 3]] / n[1], np.array(_GIVEN)
+    return -n[[0, 2, 3]] / n[1], np.array(_KNOWN_PRIOR)
 
 
-def _normal_form(plane: np.ndarray) -> Tensor:
+def _plane_from_slopes(plane: np.ndarray) -> Tensor:
+    """Plane (4,) n.x + d = 0 of slopes and height (3,)."""
     normal = np.array([plane[0], -1.0, plane[1], plane[2]])
     return torch.from_numpy((normal / np.linalg.norm(normal[:3])).astype(np.float32))
 
@@ -378,9 +435,16 @@ def _normal_form(plane: np.ndarray) -> Tensor:
 def fit_plane(
     points: np.ndarray, sigma: np.ndarray, expected: np.ndarray, spread: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The plane y = a x + b z + c, (3,), and its covariance (3, 3), from points (N, 3) m whose height above it is
-    known to sigma (N,) m, and what is expected of it (3,) with spread (3,). Iterated least squares, Huber's
-    weights.
+    """Fit the plane y = a x + b z + c by iterated least squares with Huber weights.
+
+    Args:
+        points: (N, 3) m.
+        sigma: Standard deviation (N,) m of each point's height above the plane.
+        expected: Prior a, b, c (3,).
+        spread: Its standard deviations (3,).
+
+    Returns:
+        a, b, c (3,) and their covariance (3, 3).
     """
     design = np.stack([points[:, 0], points[:, 2], np.ones(len(points))], 1) / sigma[:, None]
     goal = points[:, 1] / sigma
@@ -395,17 +459,18 @@ def fit_plane(
     return plane, np.linalg.inv(precision)
 
 
-def _onto_ground(
+def _scale_onto_ground(
     foot: Tensor, size: Tensor, sigma: Tensor, camera: Camera, ground: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """By how much (N,) each vehicle is farther away, and larger, than the network thinks, so that it stands on
-    the ground; the uncertainty (N,) of the depth's logarithm after that; the plane (4,).
+    """Scale each vehicle's distance and size, which keeps its image, so that it stands on the ground.
 
-    Along the ray to its foot (N, 3) a vehicle's size and depth grow together: what is seen stays the same. Each
-    one is held against the plane that the others stand on, so that no opinion counts twice.
+    Each vehicle is compared with the plane of the others, so that no estimate counts twice.
+
+    Returns the scales (N,), the standard deviation (N,) of the log depth afterwards, and the plane (4,). `foot` is
+    (N, 3) m.
     """
     points, spread = foot.double().numpy(), sigma.double().numpy()
-    known = _known(ground)
+    known = _ground_prior(ground)
     above = np.maximum(np.abs(points[:, 1]), 0.5) * spread
     rows = _FOOT_PX + _FOOT_SHARE * float(camera.intrinsics[1, 1]) * size[:, 1].numpy() / points[:, 2]
     foot_m = rows * points[:, 2] / float(camera.intrinsics[1, 1])
@@ -416,13 +481,13 @@ def _onto_ground(
         at = np.array([point[0], point[2], 1.0])
         slope = point[1] - plane[0] * point[0] - plane[1] * point[2]
         if slope <= 0.1:
-            continue  # above the horizon: it does not stand on this plane
+            continue  # above the horizon: not on this plane
         farther = math.log(plane[2] / slope)
         doubt = math.sqrt(at @ covariance @ at + foot_m[i] ** 2) / max(plane[2], 0.5)
-        # what contradicts the network by more than their errors explain is a kerb, a hill or a cut box
+        # a contradiction larger than both errors is a kerb, a hill or a cut box
         trust = min(1.0, _HUBER / max(abs(farther) / math.hypot(doubt, spread[i]), 1e-9)) ** 4
         own, its = 1 / spread[i] ** 2, trust / doubt**2
         scale[i] = math.exp(farther * its / (own + its))
         left[i] = (own + its) ** -0.5
     plane, _ = fit_plane(points * scale[:, None], np.hypot(above, foot_m), *known)
-    return torch.from_numpy(scale).float(), torch.from_numpy(left).float(), _normal_form(plane)
+    return torch.from_numpy(scale).float(), torch.from_numpy(left).float(), _plane_from_slopes(plane)

@@ -1,9 +1,7 @@
-"""What each pixel of a photograph shows: soft maps of sky, foliage, road, other ground, vehicles and people.
+"""Segment a photograph into soft maps of sky, foliage, road, other ground, vehicles and people.
 
-They come from a data set's classes where it has them, from a small network, or from a user's own segmenter.
-Foliage is what turns with the seasons: leaves and grass.
-
-The network is the one of `unet`, trained on generated streets.
+The maps come from a data set's classes if it has them, from a small network (`unet`) trained on generated streets,
+or from a user's segmenter. Foliage is what changes with the seasons: leaves and grass.
 """
 
 from __future__ import annotations
@@ -29,14 +27,14 @@ from scene_ir.weights import load_frozen
 Array = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights" / "segment.safetensors"
-"""What the package ships; `tools/train_segmenter.py` makes it."""
-_RARER_VEHICLES = 1.0
-"""By how much vehicles' log odds are lowered: photographs have fewer than generated streets, and where shade told
-nothing the network took walls and hedges for some."""
+"""The shipped weights, made by `tools/train_segmenter.py`."""
+_VEHICLE_PENALTY = 1.0
+"""Subtracted from the log odds of vehicles: they are rarer in photographs than in generated streets, and without
+shading cues the network took walls and hedges for some."""
 
 
 class StreetClass(IntEnum):
-    """What the network tells apart. GROUND is neither road nor grass: paving, kerbs, gravel."""
+    """The network's classes. GROUND is neither road nor grass: paving, kerbs, gravel."""
 
     SKY = 0
     LEAVES = 1
@@ -50,27 +48,32 @@ class StreetClass(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """Soft maps (H, W) float32 in [0, 1]. foliage: leaves and grass; ground: all that is level, road and grass
-    included; vehicle, person: also those that nobody labelled.
-    """
+    """Soft maps of a photograph."""
 
     sky: Array
+    """(H, W) float32 in [0, 1], share of sky."""
     foliage: Array
+    """(H, W), share of leaves and grass."""
     road: Array
+    """(H, W), share of road."""
     ground: Array
+    """(H, W), share of all level ground, with road and grass."""
     vehicle: Array
+    """(H, W), share of vehicles, labelled or not."""
     person: Array
+    """(H, W), share of people, labelled or not."""
 
     def merge_inside(self, mask: NDArray[np.bool_], other: Segmentation) -> Segmentation:
-        """These maps, and in a mask (H, W) the `other` ones."""
+        """These maps with the `other` ones inside a mask (H, W)."""
         return Segmentation(
             *(np.where(mask, getattr(other, f.name), getattr(self, f.name)) for f in fields(Segmentation))
         )
 
 
 Segmenter = Callable[[Array], tuple[Array, tuple[str, ...]]]
-"""A photograph (H, W, 3) RGB in [0, 1] to shares (C, h, w) in [0, 1], of any size, and the names of C classes."""
-_MEANING = {
+"""A photograph (H, W, 3) RGB in [0, 1] -> shares (C, h, w) in [0, 1] of any size, and the names of the C
+classes."""
+_MAPS_BY_CLASS = {
     "sky": ("sky",),
     "leaves": ("foliage",),
     "tree": ("foliage",),
@@ -88,30 +91,32 @@ _MEANING = {
         ("vehicle", "car", "van", "truck", "bus", "train", "tram", "motorcycle", "bicycle"), ("vehicle",)
     ),
 }
-"""Which maps a class belongs to, by its name in the network's classes, Virtual KITTI's and Cityscapes'; to none
-where it is not listed."""
-_MIXED = "terrain"
-"""Virtual KITTI's name of all ground that is no road: whether it is grass, the network has to tell."""
+"""Maps of each class, by its name in the network's classes, Virtual KITTI's and Cityscapes'; unlisted classes
+belong to no map."""
+_TERRAIN = "terrain"
+"""Virtual KITTI's name of all ground except roads: the network decides whether it is grass."""
 REQUIRED_MAPS = ("sky", "foliage", "road")
 """Maps that a segmenter's classes must fill."""
 _GROUND_ENDS, _SKY_ENDS = 0.02, -0.012
-"""Sines of the elevation above which no ground is, and below which no sky: between, there are hills and the
-plane's own error."""
-_ENDS_WITHIN = 0.006
+"""Sines of the elevation above which there is no ground, and below which there is no sky. Hills and the plane's
+error lie between."""
+_END_WIDTH = 0.006
+"""Width of the transition at both, in sines."""
 _RADIUS, _FLATNESS = 0.011, 2e-4
-"""Of the guided filter: radius in focal lengths, and the variance of colour below which a surface is one."""
+"""Guided filter: radius in focal lengths, and the variance of colour below which a surface is uniform."""
 _SUBSAMPLING = 0.5
 """Of the fast guided filter (He and Sun, 2015): half the time, and no worse on held-out frames."""
-_LEVELS = 255
-"""OpenCV's filter takes a guide in this range: the determinants of colours in [0, 1] vanish in float32, and it
-becomes a plain blur."""
-_LEAST, _MOST = 0.1, 0.9
-"""Filtered shares that count as none and as all."""
+_GUIDE_RANGE = 255
+"""Range of the filter's guide: with colours in [0, 1] determinants vanish in float32, and the filter becomes a
+blur."""
+_MIN_SHARE, _MAX_SHARE = 0.1, 0.9
+"""Filtered shares that count as 0 and as 1."""
 
 
 class SegmentNet(UNet):
-    """RGB (N, 3, h, w) in [0, 1] and `elevation` (N, 1, h, w), sides multiples of 16, to logits (N, 8, h/2, w/2)
-    of `Class`."""
+    """RGB (N, 3, h, w) in [0, 1] and elevation (N, 1, h, w), sides multiples of 16 -> logits (N, 8, h/2, w/2) of
+    `StreetClass`.
+    """
 
     def __init__(self) -> None:
         super().__init__(len(StreetClass))
@@ -125,9 +130,19 @@ def load_network(path: Path = WEIGHTS) -> SegmentNet:
 
 
 def predict_shares(image: Array, ground: Tensor, camera: Camera, network: SegmentNet | None = None) -> Array:
-    """Shares (8, h, w) of each `Class` in a photograph (H, W, 3) RGB in [0, 1], coarser than it."""
+    """Run the network on a photograph.
+
+    Args:
+        image: (H, W, 3) RGB in [0, 1].
+        ground: Plane (4,) n.x + d = 0 with n up.
+        camera: The photograph's camera.
+        network: In place of the shipped one.
+
+    Returns:
+        Shares (8, h, w) of each `StreetClass`, at a lower resolution.
+    """
     logits = (network or load_network()).predict(unet.prepare_input(image, ground, camera))
-    logits[:, StreetClass.VEHICLE] -= _RARER_VEHICLES
+    logits[:, StreetClass.VEHICLE] -= _VEHICLE_PENALTY
     return logits.softmax(1)[0].numpy()
 
 
@@ -139,12 +154,22 @@ def segment_photograph(
     shrink: int = 1,
     network: SegmentNet | None = None,
 ) -> Segmentation:
-    """The maps of a photograph (H, W, 3) RGB float32 in [0, 1].
+    """Compute the maps of a photograph, with borders along its edges (guided filter, He et al., TPAMI 2013).
 
-    ground: (4,) plane n.x + d = 0, n up: no sky lies below its horizon, no ground above. segmenter: instead of
-    the shipped network; network: likewise. Borders are laid along the photograph's edges (guided filter, He et
-    al., TPAMI 2013); shrink: with that at one over so much of the size. Raises RangeError for a segmenter without
-    classes for sky, foliage or road, ShapeError for shares of another number.
+    Args:
+        image: (H, W, 3) RGB float32 in [0, 1].
+        ground: Plane (4,) n.x + d = 0 with n up: there is no sky below its horizon, and no ground above.
+        camera: The photograph's camera.
+        segmenter: In place of the network.
+        shrink: Filter at one over this size.
+        network: In place of the shipped one.
+
+    Returns:
+        The maps.
+
+    Raises:
+        RangeError: The segmenter lacks a class for sky, foliage or road.
+        ShapeError: It returns another number of shares than of classes.
     """
     if segmenter is None:
         shares, names = predict_shares(image, ground, camera, network), tuple(kind.name for kind in StreetClass)
@@ -152,46 +177,46 @@ def segment_photograph(
         shares, names = segmenter(image)
         if shares.ndim != 3 or len(shares) != len(names):
             raise ShapeError("segmenter", f"shares ({len(names)}, h, w)", shares.shape)
-        missing = [name for name in REQUIRED_MAPS if not _members(names, name)]
+        missing = [name for name in REQUIRED_MAPS if not _classes_in_map(names, name)]
         if missing:
             raise RangeError("segmenter", f"a class for {missing[0]}", ", ".join(names)[:200])
     height, width = image.shape[:2]
-    coarse = np.stack([shares[_members(names, f.name)].sum(0) for f in fields(Segmentation)], -1)
+    coarse = np.stack([shares[_classes_in_map(names, f.name)].sum(0) for f in fields(Segmentation)], -1)
     large = cv2.resize(coarse.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     radius = max(2, round(_RADIUS * float(camera.intrinsics[0, 0])))
     soft = cv2.ximgproc.guidedFilter(
-        image * _LEVELS, large, radius, _FLATNESS * _LEVELS**2, scale=_SUBSAMPLING / shrink
+        image * _GUIDE_RANGE, large, radius, _FLATNESS * _GUIDE_RANGE**2, scale=_SUBSAMPLING / shrink
     )
-    soft = np.clip((soft - _LEAST) / (_MOST - _LEAST), 0, 1)
-    found = Segmentation(*(np.ascontiguousarray(m) for m in np.moveaxis(soft, -1, 0)))
-    looks = compute_elevation(ground, camera, coarse.shape[:2])
-    looks = cv2.resize(looks, (width, height), interpolation=cv2.INTER_LINEAR)
-    below = np.clip((_GROUND_ENDS - looks) / _ENDS_WITHIN, 0, 1)
-    above = np.clip((looks - _SKY_ENDS) / _ENDS_WITHIN, 0, 1)
-    sky = found.sky * above
+    soft = np.clip((soft - _MIN_SHARE) / (_MAX_SHARE - _MIN_SHARE), 0, 1)
+    maps = Segmentation(*(np.ascontiguousarray(m) for m in np.moveaxis(soft, -1, 0)))
+    elevation = compute_elevation(ground, camera, coarse.shape[:2])
+    elevation = cv2.resize(elevation, (width, height), interpolation=cv2.INTER_LINEAR)
+    below = np.clip((_GROUND_ENDS - elevation) / _END_WIDTH, 0, 1)
+    above = np.clip((elevation - _SKY_ENDS) / _END_WIDTH, 0, 1)
+    sky = maps.sky * above
     return replace(
-        found,
+        maps,
         sky=sky,
-        foliage=np.minimum(found.foliage, 1 - sky),
-        road=found.road * below,
-        ground=found.ground * below,
+        foliage=np.minimum(maps.foliage, 1 - sky),
+        road=maps.road * below,
+        ground=maps.ground * below,
     )
 
 
 def apply_frame_classes(frame: Frame, estimated: Segmentation) -> Segmentation:
-    """The maps as the frame's classes have them, all 0 or 1; as `estimated` where it has none.
+    """The maps of the frame's classes, all 0 or 1; the `estimated` maps if the frame has none.
 
-    Terrain, which is grass or paving, is foliage as far as the estimate says so.
+    Terrain, which is grass or paving, is foliage by the estimate's share.
     """
     if frame.classes is None:
         return estimated
     classes, names = frame.classes.numpy(), frame.class_names
-    maps = [np.isin(classes, _members(names, f.name)).astype(np.float32) for f in fields(Segmentation)]
+    maps = [np.isin(classes, _classes_in_map(names, f.name)).astype(np.float32) for f in fields(Segmentation)]
     given = Segmentation(*maps)
-    mixed = np.isin(classes, [i for i, name in enumerate(names) if name.lower() == _MIXED])
+    mixed = np.isin(classes, [i for i, name in enumerate(names) if name.lower() == _TERRAIN])
     return replace(given, foliage=np.where(mixed, estimated.foliage, given.foliage))
 
 
-def _members(names: Sequence[str], field: str) -> list[int]:
-    """Numbers of the classes that belong to a map."""
-    return [i for i, name in enumerate(names) if field in _MEANING.get(name.strip().lower(), ())]
+def _classes_in_map(names: Sequence[str], field: str) -> list[int]:
+    """Indices of the classes that belong to a map."""
+    return [i for i, name in enumerate(names) if field in _MAPS_BY_CLASS.get(name.strip().lower(), ())]

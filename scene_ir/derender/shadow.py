@@ -275,7 +275,7 @@ def estimate_sun(
     views: Sequence[GroundView],
     assumed: torch.Tensor,
 ) -> torch.Tensor:
-    """Estimate the sun whose box shadows best explain how dark the ground around the vehicles is.
+    """Estimate the sun with the box shadows that best explain how dark the ground around the vehicles is.
 
     Args:
         lighting: Actual and shadow-free brightness.

@@ -1,9 +1,8 @@
-"""A small network that looks at a street: what the networks of `segment` and `depth` share.
+"""The U-Net that the networks of `segmentation` and `depth` share.
 
-A U-Net of residual convolutions that sees the picture at 0.4 of KITTI's size, and how far each pixel looks above
-the horizon. Half of the channels of its first stages are normalised over the picture itself and not over the
-training set (IBN-Net, Pan et al., ECCV 2018): it has seen generated pictures only, and that is what lets it take a
-photograph's light and colours as they come.
+Its input is the photograph at 0.4 of KITTI's size and each pixel's elevation above the horizon. Half of the
+channels of its first stages are normalised over the photograph rather than over the training set (IBN-Net, Pan et
+al., ECCV 2018), so that a network trained on generated images generalises to the light and colours of photographs.
 """
 
 from __future__ import annotations
@@ -22,27 +21,35 @@ from scene_ir.types import Camera
 Array = NDArray[np.float32]
 
 INPUT_FOCAL_PX = 288.0
-"""Focal length that pictures are resized to: 0.4 of KITTI's 721 px."""
-_MOST_PX = 250_000
-"""Larger pictures are resized to fewer: three times KITTI's."""
+"""Focal length of the network's input: 0.4 of KITTI's 721 px."""
+_MAX_PX = 250_000
+"""Largest number of input pixels: three times KITTI's."""
 STRIDE = 16
 """Sides of the network's input are multiples of it."""
 _MEAN, _SPREAD = 0.42, 0.27
-"""Of the photograph's values, about."""
+"""Mean and standard deviation of photographs' values, about."""
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkInput:
-    """A photograph as a network sees it. image (h, w, 3) RGB in [0, 1]; elevation (h, w): see `elevation`."""
+    """A photograph as the network's input."""
 
     image: Array
+    """(h, w, 3) RGB in [0, 1]."""
     elevation: Array
+    """(h, w), see `compute_elevation`."""
 
 
 def compute_elevation(ground: Tensor, camera: Camera, size_hw: tuple[int, int]) -> Array:
-    """The sine (h, w) of the angle by which each pixel of the resized photograph looks above the ground's horizon.
+    """Sine of each pixel's elevation above the ground's horizon.
 
-    ground: (4,) plane n.x + d = 0, n up.
+    Args:
+        ground: Plane (4,) n.x + d = 0 with n up.
+        camera: The photograph's camera.
+        size_hw: Height and width of the result.
+
+    Returns:
+        (h, w) in [-1, 1], of the photograph resized to `size_hw`.
     """
     height, width = size_hw
     v = (np.arange(height) + 0.5) * (camera.height / height) - 0.5
@@ -54,17 +61,26 @@ def compute_elevation(ground: Tensor, camera: Camera, size_hw: tuple[int, int]) 
 
 
 def prepare_input(image: Array, ground: Tensor, camera: Camera) -> NetworkInput:
-    """A photograph (H, W, 3) RGB in [0, 1] at the size that networks are made for."""
+    """Resize a photograph for the network.
+
+    Args:
+        image: (H, W, 3) RGB in [0, 1].
+        ground: Plane (4,) n.x + d = 0 with n up.
+        camera: The photograph's camera.
+
+    Returns:
+        The network's input.
+    """
     height, width = image.shape[:2]
     scale = INPUT_FOCAL_PX / float(camera.intrinsics[0, 0])
-    scale *= min(1.0, (_MOST_PX / (height * width * scale**2)) ** 0.5)
+    scale *= min(1.0, (_MAX_PX / (height * width * scale**2)) ** 0.5)
     h, w = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     small = np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA), np.float32)
     return NetworkInput(small, compute_elevation(ground, camera, (h, w)))
 
 
 class _Norm(nn.Module):
-    """Normalisation: the first half of the channels over the picture itself, the others as in training."""
+    """Normalisation: the first half of the channels over the photograph, the others over the training set."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -77,7 +93,7 @@ class _Norm(nn.Module):
 
 
 class _Block(nn.Module):
-    """3x3 convolution, normalisation, ReLU; added to its input where that has the same shape."""
+    """3x3 convolution, normalisation, ReLU; residual if input and output have the same shape."""
 
     def __init__(self, channels: int, out: int, stride: int = 1, own: bool = False) -> None:
         super().__init__()
@@ -90,8 +106,8 @@ class _Block(nn.Module):
         return x + y if self.residual else y
 
 
-class _Wide(nn.Module):
-    """A 5x5 depthwise convolution, dilated, and a pointwise one; added to its input."""
+class _DilatedBlock(nn.Module):
+    """A dilated 5x5 depthwise convolution and a pointwise one; residual."""
 
     def __init__(self, channels: int, dilation: int) -> None:
         super().__init__()
@@ -106,8 +122,8 @@ class _Wide(nn.Module):
         return x + F.relu(self.norm(self.pointwise(F.relu(self.inner(self.depthwise(x))))))
 
 
-class _Up(nn.Module):
-    """What was seen coarsely, twice as large, joined with what was seen finely."""
+class _UpBlock(nn.Module):
+    """Coarse features upsampled by 2 and merged with fine ones."""
 
     def __init__(self, coarse: int, fine: int, out: int) -> None:
         super().__init__()
@@ -121,18 +137,20 @@ class _Up(nn.Module):
 
 
 class UNet(nn.Module):
-    """RGB (N, 3, h, w) in [0, 1] and `elevation` (N, 1, h, w), sides multiples of 16, to (N, C, h/2, w/2)."""
+    """RGB (N, 3, h, w) in [0, 1] and elevation (N, 1, h, w), sides multiples of 16 -> (N, C, h/2, w/2)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.fine = _Block(4, 16, 2, own=True)
         self.middle = nn.Sequential(_Block(16, 48, 2, own=True), _Block(48, 48, own=True), _Block(48, 48))
         self.coarse = nn.Sequential(_Block(48, 88, 2, own=True), _Block(88, 88), _Block(88, 88))
-        self.whole = nn.Sequential(_Block(88, 112, 2), _Wide(112, 1), _Wide(112, 2), _Wide(112, 3))
-        self.to_coarse = _Up(112, 88, 64)
-        self.to_middle = _Up(64, 48, 48)
+        self.whole = nn.Sequential(
+            _Block(88, 112, 2), _DilatedBlock(112, 1), _DilatedBlock(112, 2), _DilatedBlock(112, 3)
+        )
+        self.to_coarse = _UpBlock(112, 88, 64)
+        self.to_middle = _UpBlock(64, 48, 48)
         self.joined = _Block(48, 48)
-        self.to_fine = _Up(48, 16, 24)
+        self.to_fine = _UpBlock(48, 16, 24)
         self.out = nn.Conv2d(24, channels, 3, padding=1)
 
     def forward(self, image: Tensor, elevation: Tensor) -> Tensor:
@@ -144,7 +162,7 @@ class UNet(nn.Module):
         return self.out(self.to_fine(x, fine))
 
     def predict(self, view: NetworkInput) -> Tensor:
-        """What it makes of one view (1, channels, h/2, w/2)."""
+        """Output (1, C, h/2, w/2) for one input, without gradients."""
         with torch.no_grad():
             return self(
                 torch.from_numpy(view.image).permute(2, 0, 1)[None], torch.from_numpy(view.elevation)[None, None]
