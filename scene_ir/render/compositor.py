@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 
@@ -29,16 +29,16 @@ def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) ->
 class Compositor(PreparedScene):
     """Renders perturbations of one scene, and caches what no parameter affects."""
 
-    _fixed_geometry: fast.FixedGeometry | None = None
-    _compositor_before: Compositor | None = None
-
-    @property
+    @cached_property
+    @torch.no_grad()
     def fixed_geometry(self) -> fast.FixedGeometry | None:
         """Input of the fast kernels, gathered on first use; None where they do not apply."""
-        if self._fixed_geometry is None and self.texels is not None and self.backend == "warp":
-            with torch.no_grad():
-                self._fixed_geometry = fast.FixedGeometry.from_scene(self)
-        return self._fixed_geometry
+        return fast.FixedGeometry.from_scene(self) if self.texels is not None and self.backend == "warp" else None
+
+    @cached_property
+    def _compositor_before(self) -> Compositor:
+        assert self.scene.before is not None
+        return Compositor(self.scene.before, self.settings)
 
     def draw_layers(self, objects: Objects, sun: PerturbedSun | None = None) -> ObjectLayers:
         """Layers of the objects, not yet blended. sun: as of `perturbed_sun`."""
@@ -54,8 +54,6 @@ class Compositor(PreparedScene):
         (`SceneIR.before`). Raises RangeError for a state of which this scene is the one before.
         """
         if perturbed.before is None and self.scene.before is not None:
-            if self._compositor_before is None:
-                self._compositor_before = Compositor(self.scene.before, self.settings)
             return self._compositor_before.render(perturbed)
         if perturbed.before is not None and self.scene.before is None:
             raise RangeError("scene", "a state of the compositor's own", "one with vehicles exchanged")

@@ -14,6 +14,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -183,7 +184,7 @@ class PreparedScene:
             whole_patches: Keep all ground that a vehicle may darken, not only what its source's shadow darkens.
         """
         self.settings = settings or RenderSettings()
-        self.backend = self.settings.backend
+        self.backend: verbs.Backend = self.settings.backend
         if self.backend == "warp":
             scene = convert_scene(scene, torch.float32)
         self.scene = scene
@@ -193,7 +194,6 @@ class PreparedScene:
         self.centre = surfaces.camera_centre(scene.camera.matrix).to(self.like)
         self.unproject = torch.linalg.inv(scene.camera.matrix[:, :3]).to(self.like)
         self.air = sky_colour(scene.photograph, scene.environment.sky)
-        self._crown_maps: Tensor | None = None
         inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
         self.canvas = torch.cat([scene.background, inverse.to(self.like)[None]])
         self.occluders = OccluderLayers.from_scene(scene, self.like) if scene.occluders else None
@@ -219,8 +219,6 @@ class PreparedScene:
         if objects.source and not self._whole_patches:
             self.patch_corners = self._trimmed_corners(objects, base)
         self.corner_outwardness = surfaces.outwardness(self.patch_corners, base.size_lhw, self.base_shadow_offset)
-        self._base_sun_exposure: Tensor | None = None
-        self._shadow_is_own: Tensor | None = None
         self.base_yaw = base.yaw
         self.sunlight = self.like.new_tensor([s.sunlight for s in objects.source] or [model.SUNLIGHT] * len(base))
         self.placement: VertexPlacement | None = None
@@ -237,7 +235,6 @@ class PreparedScene:
         self.base_geometry = self._place(base)
         self.vertex_height = torch.cat([-s.unit[:, 1] for s in picked]) if picked else self.like.new_zeros(0)
         self.texels, self.shadows, self.regions = None, None, None
-        self._finish: Tensor | None = None
         self._base_visible: VisibleSurfaces | None = None  # until the finish is computed
         self.paint_lightness = self._base_lightness(objects)
         if objects.source:
@@ -316,15 +313,12 @@ class PreparedScene:
             torch.tensor([s.region is not None for s in objects.source], device=self.like.device),
         )
 
-    @property
+    @cached_property
     def finish(self) -> Tensor:
         """(V, 4) gains (3) and lift that match the templates' colours to the vehicles; computed on first use."""
-        if self._finish is None:
-            parts = zip(self.surfaces.templates, self.sample_photograph(), strict=True)
-            ground_points = [torch.from_numpy(finish.fit_finish(surface, samples)) for surface, samples in parts]
-            self._finish = torch.cat(ground_points).to(self.like)
-            self._base_visible = None
-        return self._finish
+        parts = zip(self.surfaces.templates, self.sample_photograph(), strict=True)
+        self._base_visible = None
+        return torch.cat([torch.from_numpy(finish.fit_finish(*part)) for part in parts]).to(self.like)
 
     def _base_lightness(self, objects: Objects) -> Tensor:
         """CIE L* (N,) of the objects' paint, about which gloss changes contrast."""
@@ -379,8 +373,6 @@ class PreparedScene:
         turned = objects.yaw.requires_grad or not torch.equal(objects.yaw, self.base_yaw)
         if not objects.source or not (turned or sun is not None):
             return self.like.new_zeros(self.surfaces.owner.shape[0])
-        if self._base_sun_exposure is None:
-            self._base_sun_exposure = self._sun_exposure(self.base_yaw)
         sunlight = self.surfaces.per_vertex(self.sunlight)
         then = (
             model.AMBIENT[0]
@@ -388,12 +380,14 @@ class PreparedScene:
             + sunlight * self._base_sun_exposure
         )
         now = self._sun_exposure(objects.yaw, sun)
-        more = (
-            now - self._base_sun_exposure
-            if sun is None
-            else now - self._base_sun_exposure + (sun.strength - 1.0) * now
-        )
+        more = now - self._base_sun_exposure
+        if sun is not None:
+            more = more + (sun.strength - 1.0) * now
         return texture.limit_brightening(sunlight * more / then, self.surfaces.paint)
+
+    @cached_property
+    def _base_sun_exposure(self) -> Tensor:
+        return self._sun_exposure(self.base_yaw)
 
     def _sun_exposure(self, yaw: Tensor, moved: PerturbedSun | None = None) -> Tensor:
         """How squarely (V,) the sun meets the surfaces of objects at yaw (N,)."""
@@ -434,34 +428,23 @@ class PreparedScene:
         direction, ground = (t.to(self.like) for t in (environment.sun, environment.ground))
         casts = self.like.new_zeros(count) if sun is None else self.shadow_is_own[:, 0].contiguous()
         return (
-            *(
-                self.patch_corners.contiguous(),
-                self.corner_outwardness.contiguous(),
-                self.base_shadow_offset.contiguous(),
-                self.base_size_lhw,
-            ),
+            *(t.contiguous() for t in (self.patch_corners, self.corner_outwardness, self.base_shadow_offset)),
+            self.base_size_lhw,
             *(direction.expand(count, 3).contiguous(), ground.expand(count, 4).contiguous()),
             *(self.scene.camera.matrix.to(self.like).expand(count, 3, 4).contiguous(), casts),
         )
 
-    @property
+    @cached_property
     def crown_maps(self) -> Tensor:
         """Result of `environment.compute_crown_maps`; computed on first use."""
-        if self._crown_maps is None:
-            self._crown_maps = compute_crown_maps(self.scene)
-        return self._crown_maps
+        return compute_crown_maps(self.scene)
 
-    @property
+    @cached_property
+    @torch.no_grad()
     def shadow_is_own(self) -> Tensor:
         """(N, 1): 1 where the photographed shadow is that of the object's box in the scene's sun, 0 where it
         includes others, such as a house's, or is cut by the picture's border; computed on first use.
         """
-        if self._shadow_is_own is None:
-            with torch.no_grad():
-                self._shadow_is_own = self._compare_shadows()
-        return self._shadow_is_own
-
-    def _compare_shadows(self) -> Tensor:
         source, casts = self.scene.objects.source, self.like.new_ones(len(self.scene.objects), 1)
         if not source:
             return casts
@@ -634,8 +617,7 @@ class SceneBatch:
             (c.height, c.width) for c, n in zip(cameras, self.counts, strict=True) for _ in range(n)
         ]
         self._patches = patch_faces(sum(self.counts), self._faces.device)
-        self._patch_ranges = [[4 * i, 4 * i + 4] for i in range(sum(self.counts))]
-        self._patch_faces = [[2 * i, 2 * i + 2] for i in range(sum(self.counts))]
+        self._patch_corners, self._patch_faces = (ranges.tolist() for ranges in self._patches[1:])
         self._shadowless = torch.tensor([s for m in members for s in m.objects_without_shadow()], dtype=torch.bool)
         self._still_patch_inputs: tuple[Tensor, ...] | None = None
 
@@ -717,7 +699,7 @@ class SceneBatch:
         coverage = verbs.antialias(mesh, geometry.clip, self._faces, backend=backend)
         faces, _, face_ranges = self._patches
         patch_rects = surfaces.crop_rects(
-            geometry.patch_clip, faces, self._patch_ranges, self._patch_faces, self._frames_hw, [0.0] * len(reach)
+            geometry.patch_clip, faces, self._patch_corners, self._patch_faces, self._frames_hw, [0.0] * len(reach)
         )
         patch_rects[self._shadowless] = 0
         ground_layout = verbs.PixelLayout.from_rects(patch_rects)

@@ -123,7 +123,7 @@ class PhotographedPixels(torch.autograd.Function):
         pixels = make_struct(shading.PackedPixels, table, layouts[0].rects, visible.mesh.face, coverage, nearest)
         templates = fixed.base_clip, fixed.base_attributes, fixed.template
         vertices = make_struct(shading.Vertices, fixed.faces, fixed.neighbours, clip, facing, brighter, *templates)
-        photograph = make_struct(shading.Photographs, *fixed.texels, fixed.frame_wh, turn, sun, fixed.unproject)
+        photograph = make_struct(shading.PhotographData, *fixed.texels, fixed.frame_wh, turn, sun, fixed.unproject)
         lookups = make_struct(shading.Lookups, torch.empty_like(lookup), lookup, mesh, halo, unseen)
         layers = make_struct(shading.MergedLayers, colour, opacity, depth)
         patches = make_struct(shadows.ShadowArrays, _pixel_to_patch(s), then, *fixed.darkness, fixed.frame_wh)

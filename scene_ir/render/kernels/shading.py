@@ -133,7 +133,7 @@ class Vertices:
 
 
 @wp.struct
-class Photographs:
+class PhotographData:
     """The photograph of each object.
 
     Attributes:
@@ -615,7 +615,7 @@ def crop_taps(uv: wp.vec2f, rect: wp.vec4i, start: wp.int64, clamp: bool):
 
 
 @wp.func
-def _texel_at(photograph: Photographs, draw: int, uv: wp.vec2f):
+def _texel_at(photograph: PhotographData, draw: int, uv: wp.vec2f):
     """The texel at a position of the frame; 0 in an empty crop."""
     out = texel_t()
     rect = read_rect(photograph.rects, draw)
@@ -625,7 +625,7 @@ def _texel_at(photograph: Photographs, draw: int, uv: wp.vec2f):
 
 
 @wp.func
-def _texel_with_slopes(photograph: Photographs, draw: int, uv: wp.vec2f):
+def _texel_with_slopes(photograph: PhotographData, draw: int, uv: wp.vec2f):
     """`_texel_at`, and its changes."""
     out = TexelSample()
     rect = read_rect(photograph.rects, draw)
@@ -869,7 +869,12 @@ def combine_backward_kernel(
 
 @wp.kernel(enable_backward=False)
 def shade_kernel(
-    start: int, pixels: PackedPixels, photograph: Photographs, lookups: Lookups, final: bool, layers: MergedLayers
+    start: int,
+    pixels: PackedPixels,
+    photograph: PhotographData,
+    lookups: Lookups,
+    final: bool,
+    layers: MergedLayers,
 ):
     """Colour mesh and halo by the photograph.
 
@@ -914,7 +919,7 @@ def shade_kernel(
 def shade_backward_kernel(
     start: int,
     pixels: PackedPixels,
-    photograph: Photographs,
+    photograph: PhotographData,
     lookups: Lookups,
     final: bool,
     to_layers: MergedLayers,
@@ -1210,7 +1215,7 @@ def _mirror_loss(own: attributes_t, g: wp.vec2f):
 
 
 @wp.func
-def _to_eye(photograph: Photographs, at: wp.vec4i):
+def _to_eye(photograph: PhotographData, at: wp.vec4i):
     """Unit vector towards the camera at a pixel."""
     ray = photograph.unproject[at[0]] @ wp.vec3f(wp.float32(at[1]), wp.float32(at[2]), 1.0)
     return _unit(ray) * -1.0
@@ -1222,7 +1227,7 @@ def complete_kernel(
     need: wp.array(dtype=wp.int64),
     pixels: PackedPixels,
     vertices: Vertices,
-    photograph: Photographs,
+    photograph: PhotographData,
     lookups: Lookups,
     final: bool,
     layers: MergedLayers,
@@ -1254,7 +1259,7 @@ def complete_backward_kernel(
     need: wp.array(dtype=wp.int64),
     pixels: PackedPixels,
     vertices: Vertices,
-    photograph: Photographs,
+    photograph: PhotographData,
     lookups: Lookups,
     final: bool,
     to_layers: MergedLayers,

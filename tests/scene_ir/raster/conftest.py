@@ -1,4 +1,4 @@
-"""Vehicles placed at random before a camera, to be drawn here and by other programs."""
+"""Vehicles placed at random in front of a camera, rendered by this and other renderers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Crowd:
 
 @pytest.fixture(scope="session")
 def crowd() -> Callable[[int], Crowd]:
-    """Six vehicles, a seed: they hide one another, are cut by the border, and one stands beside the camera."""
+    """Six vehicles for a seed: they hide one another, are cut by the border, and one stands next to the camera."""
     meshes = [simplify(template(kind), 1500) for kind in KINDS]
 
     def of(seed: int) -> Crowd:
@@ -73,7 +73,7 @@ def crowd() -> Callable[[int], Crowd]:
 
 
 def near_outlines(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels (H, W) with a neighbour, of eight, that shows another surface, or nothing where they show one."""
+    """Pixels (H, W) with one of eight neighbours on another surface, or empty where they are not."""
     far = np.where(np.isfinite(depth), depth, 1e6)
     square = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(far, square), cv2.dilate(far, square)
@@ -82,5 +82,21 @@ def near_outlines(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 @pytest.fixture
 def outlines() -> Callable[[NDArray[np.float32]], NDArray[np.bool_]]:
-    """Pixels within one pixel of where another surface begins."""
+    """Pixels within one pixel of another surface."""
     return near_outlines
+
+
+@pytest.fixture
+def inner_pixels() -> Callable[..., NDArray[np.bool_]]:
+    """Compare the silhouettes of two depth maps outside a band; returns the common pixels outside it."""
+
+    def compare(
+        ours: NDArray[np.float32], theirs: NDArray[np.float32], band: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        hit = np.isfinite(theirs)
+        assert 0.05 < hit.mean() < 0.98
+        assert not ((np.isfinite(ours) != hit) & ~band).any()
+        assert (hit & ~band).sum() > 500
+        return hit & ~band
+
+    return compare

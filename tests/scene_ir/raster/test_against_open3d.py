@@ -1,4 +1,4 @@
-"""Depth and silhouettes against rays cast by Open3D (Embree), which shares no code with this renderer."""
+"""Depth and silhouettes against rays cast by Open3D (Embree), an independent implementation."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def cast(crowd: Any, height: int, width: int) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_depth_and_silhouettes_agree_but_for_one_pixel_at_outlines(
-    crowd: Callable[[int], Any], outlines: Callable[[NDArray[np.float32]], NDArray[np.bool_]], seed: int
+def test_depth_and_silhouettes_agree_up_to_one_pixel_at_outlines(
+    crowd: Callable[[int], Any],
+    outlines: Callable[[NDArray[np.float32]], NDArray[np.bool_]],
+    inner_pixels: Callable[..., NDArray[np.bool_]],
+    seed: int,
 ) -> None:
     scene = crowd(seed)
     ours = scene.drawn(cull=False)
     theirs = cast(scene, *ours.shape)
     band = outlines(theirs)
-    hit = np.isfinite(theirs)
-    assert 0.05 < hit.mean() < 0.98
-    assert not ((np.isfinite(ours) != hit) & ~band).any()
-    inner = hit & ~band
-    assert inner.sum() > 500
+    inner = inner_pixels(ours, theirs, band)
     np.testing.assert_allclose(ours[inner], theirs[inner], rtol=2e-4, atol=0)
-    # Both look through pixel centres: also within the band nearly everything agrees.
+    # Both sample pixel centres: nearly everything agrees within the band too.
+    hit = np.isfinite(theirs)
     assert ((np.isfinite(ours) != hit) & band).sum() <= 0.01 * band.sum()
     both = np.isfinite(ours) & hit & band
     assert (np.abs(ours[both] - theirs[both]) > 0.02 * theirs[both]).mean() < 0.02

@@ -20,7 +20,7 @@ PLATFORM = "PYOPENGL_PLATFORM"
 
 @pytest.fixture(scope="module")
 def screen() -> Iterator[tuple[Any, Any]]:
-    """pyrender and an image to draw to, without a window; skipped where there is no such OpenGL."""
+    """pyrender and an off-screen image; skipped without a suitable OpenGL."""
     before = os.environ.get(PLATFORM)
     os.environ.setdefault(PLATFORM, "egl")
     try:
@@ -58,20 +58,17 @@ def drawn_by(screen: tuple[Any, Any], crowd: Any) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_depth_and_silhouettes_agree_but_for_one_pixel_at_outlines(
+def test_depth_and_silhouettes_agree_up_to_one_pixel_at_outlines(
     screen: tuple[Any, Any],
     crowd: Callable[[int], Any],
     outlines: Callable[[NDArray[np.float32]], NDArray[np.bool_]],
+    inner_pixels: Callable[..., NDArray[np.bool_]],
     seed: int,
 ) -> None:
     scene = crowd(seed)
     ours, theirs = scene.drawn(cull=False), drawn_by(screen, scene)
     band = outlines(ours)
-    hit = np.isfinite(theirs)
-    assert 0.05 < hit.mean() < 0.98
-    assert not ((np.isfinite(ours) != hit) & ~band).any()
-    inner = hit & ~band
-    assert inner.sum() > 500
+    inner = inner_pixels(ours, theirs, band)
     # pyrender reads one of four samples of a pixel, not its centre: the depth is that of somewhere within it.
     square = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(ours, square)[inner], cv2.dilate(ours, square)[inner]

@@ -1,4 +1,4 @@
-"""antialias: coverage at outlines and how it follows the vertices."""
+"""antialias: coverage at outlines, and its gradients."""
 
 import math
 
@@ -27,7 +27,7 @@ QUAD = [[0, 1, 2], [0, 2, 3]]
 
 
 def sphere(triangles, centre, radius, dtype=torch.float64):
-    """A ball before the camera, as (u, v, w) and faces."""
+    """A ball in front of the camera, as (u, v, w) and faces."""
     n = round(math.sqrt(triangles / 2))
     turn = torch.arange(n, dtype=dtype) * (2 * math.pi / n)
     tilt = torch.linspace(0.01, math.pi - 0.01, n + 1, dtype=dtype)
@@ -57,14 +57,14 @@ def test_straight_outlines_cover_exact_areas(backend, shift):
 
 
 @BOTH
-def test_outline_through_pixel_centres_is_one_half_whoever_owns_them(backend):
+def test_an_outline_through_pixel_centres_covers_half(backend):
     coverage = coverage_of(rectangle(3.0, 2.0, 9.0, 8.0, w=(1.0, 1.0, 1.0, 1.0)), QUAD, backend)
     assert coverage[5].tolist() == [0, 0, 0, 0.5, 1, 1, 1, 1, 1, 0.5, 0, 0, 0, 0]
     assert coverage[:, 6].tolist() == [0, 0, 0.5, 1, 1, 1, 1, 1, 0.5, 0, 0, 0]
 
 
 @BOTH
-def test_of_a_strip_narrower_than_a_pixel_the_nearer_side_counts(backend):
+def test_the_nearer_side_of_a_strip_narrower_than_a_pixel_counts(backend):
     coverage = coverage_of(rectangle(4.8, 1.0, 5.3, 10.0), QUAD, backend)
     assert float(coverage[5, 5]) == pytest.approx(0.7, abs=1e-5)
     assert float(coverage[5].sum()) == pytest.approx(0.7, abs=1e-5)
@@ -80,7 +80,7 @@ def test_edges_inside_a_surface_do_not_matter(backend):
 
 
 @BOTH
-def test_vertices_that_are_not_shared_make_no_seam(backend):
+def test_duplicate_vertices_make_no_seam(backend):
     outline = rectangle(2.3, 2.6, 10.1, 8.2)
     split = torch.cat([outline[[0, 1, 2]], outline[[0, 2, 3]]])
     coverage = coverage_of(split, [[0, 1, 2], [3, 4, 5]], backend)
@@ -109,7 +109,7 @@ def test_near_plane_is_no_outline(backend):
 
 
 @pytest.mark.parametrize("triangles", [200, 5000])
-def test_a_ball_is_covered_as_by_supersampling(triangles):
+def test_coverage_of_a_ball_matches_supersampling(triangles):
     uvw, faces = sphere(triangles, (20.3, 15.7), (13.2, 9.6))
     coverage = coverage_of(uvw, faces, size=(32, 42))
     factor = 16
@@ -134,7 +134,7 @@ def test_coverage_changes_continuously_while_a_ball_moves():
     assert 0 <= float(frames.min()) <= float(frames.max()) <= 1
 
 
-def test_gradient_of_area_is_the_length_of_the_side():
+def test_the_gradient_of_area_is_the_length_of_the_side():
     uvw = rectangle(2.2, 2.6, 10.1, 8.3, dtype=torch.float64).requires_grad_()
     coverage = coverage_of(uvw, QUAD)
     grad = torch.autograd.grad(coverage[4:7].sum(), uvw)[0]
@@ -144,7 +144,7 @@ def test_gradient_of_area_is_the_length_of_the_side():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_reference_gradients_agree_with_central_differences(seed):
+def test_reference_gradients_match_central_differences(seed):
     uvw, faces = sphere(300, (10.3, 8.7), (7.2, 5.6))
     generator = torch.Generator().manual_seed(seed)
     weights = torch.randn(18, 22, dtype=torch.float64, generator=generator)

@@ -43,7 +43,7 @@ def test_value_by_hand(backend):
     assert float(value) == pytest.approx(0.25, abs=1e-7)
 
 
-def test_reference_gradients_agree_with_central_differences():
+def test_reference_gradients_match_central_differences():
     clip = quad(torch.float64).requires_grad_()
     attributes = torch.randn(
         4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True
@@ -72,7 +72,7 @@ def test_near_plane_crossing_triangle_has_right_gradients():
 
 
 @pytest.mark.parametrize(("with_clip", "with_attributes"), [(True, True), (True, False), (False, True)])
-def test_gradients_only_where_asked(with_clip, with_attributes):
+def test_gradients_only_where_required(with_clip, with_attributes):
     generator = torch.Generator().manual_seed(2)
     weights = torch.randn(LAYOUT.size, 3, generator=generator)
     values = torch.randn(4, 3, generator=generator)

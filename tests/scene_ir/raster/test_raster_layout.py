@@ -1,4 +1,4 @@
-"""Layout: packing of rectangles."""
+"""PixelLayout: packing of rectangles."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 
 
-def test_pixels_are_packed_row_major_draw_after_draw():
+def test_pixels_are_packed_row_major_per_draw():
     layout = PixelLayout.from_rects(torch.tensor([[3, 5, 5, 7], [0, 0, 0, 9], [7, 1, 8, 3]]))
     assert layout.offsets.tolist() == [0, 4, 4, 6]
     assert layout.size == 6
@@ -16,7 +16,7 @@ def test_pixels_are_packed_row_major_draw_after_draw():
     assert layout.spans() == [(slice(0, 4), (2, 2)), (slice(4, 4), (9, 0)), (slice(4, 6), (2, 1))]
 
 
-def test_draws_of_a_pixel_each():
+def test_draws_of_one_pixel():
     pixels = torch.tensor([[3.0, 5.0], [-2.0, 9.0], [3.0, 5.0]], dtype=torch.float64)
     layout, places = PixelLayout.from_pixels(pixels), pixels.to(torch.int64)
     expected = PixelLayout.from_rects(torch.cat([places, places + 1], dim=1))

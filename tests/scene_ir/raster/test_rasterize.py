@@ -26,7 +26,7 @@ def draw(uvw, faces, backend, size=(12, 14), near=verbs.NEAR_M):
 
 
 @BOTH
-def test_one_triangle_hits_the_pixels_inside_and_one_side_of_those_on_its_edges(backend):
+def test_a_triangle_hits_inner_pixels_and_those_on_one_side_of_its_edges(backend):
     face, depth = draw(TRIANGLE, [[0, 1, 2]], backend)
     y, x = torch.meshgrid(torch.arange(12), torch.arange(14), indexing="ij")
     strictly_inside = (x > 2) & (y > 2) & (x + y < 12)
@@ -56,7 +56,7 @@ def test_depth_is_perspective_correct(backend):
 
 
 @BOTH
-def test_nearest_triangle_wins_and_of_equal_depths_the_lower_index(backend):
+def test_the_nearest_triangle_wins_then_the_lower_index(backend):
     near_triangle = TRIANGLE * torch.tensor([1.0, 1.0, 0.5])
     uvw = torch.cat([TRIANGLE, near_triangle, TRIANGLE])
     face, depth = draw(uvw, [[6, 7, 8], [0, 1, 2], [3, 4, 5]], backend)
@@ -75,7 +75,7 @@ def test_intersecting_triangles_swap_where_their_depths_cross(backend):
 
 
 @BOTH
-def test_near_plane_cuts_as_the_analytically_clipped_polygon(backend):
+def test_near_plane_clipping_matches_the_analytic_polygon(backend):
     # A road-like strip from 1 m behind the camera to 9 m before it, in camera space: x = +-1, y = 1.
     near = 0.47
     z = torch.tensor([-1.0, -1.0, 9.0, 9.0])
@@ -97,7 +97,7 @@ def test_near_plane_cuts_as_the_analytically_clipped_polygon(backend):
 
 
 @BOTH
-def test_what_lies_behind_the_camera_is_not_seen(backend):
+def test_triangles_behind_the_camera_are_invisible(backend):
     face, _ = draw(TRIANGLE * torch.tensor([1.0, 1.0, -1.0]), [[0, 1, 2]], backend)
     assert (face == -1).all()
 
@@ -155,7 +155,7 @@ def test_draws_are_independent_and_may_share_faces(backend):
 @BOTH
 @given(st.integers(0, 2**31 - 1), st.booleans())
 @settings(max_examples=15, deadline=None)
-def test_a_triangulated_rectangle_has_neither_holes_nor_doubly_hit_pixels(backend, seed, on_pixels):
+def test_a_triangulated_rectangle_has_no_holes_or_double_hits(backend, seed, on_pixels):
     # A grid whose inner vertices are moved at random, also on to pixel centres, where ties are frequent.
     generator = torch.Generator().manual_seed(seed)
     n = 4

@@ -25,7 +25,7 @@ def grid(height, width, dtype=torch.float32):
 
 @BOTH
 @BORDERS
-def test_integer_places_give_the_pixels_to_the_bit(backend, border):
+def test_integer_positions_return_the_exact_pixels(backend, border):
     image = image_of(5, 7)
     sampled = verbs.texture(image, grid(5, 7), backend, border)
     assert torch.equal(sampled, image.flatten(1).T)
@@ -71,7 +71,7 @@ def test_backends_agree_in_values_and_gradients(backend, border, seed):
 
 
 @BORDERS
-def test_reference_gradients_agree_with_central_differences(border):
+def test_reference_gradients_match_central_differences(border):
     image = image_of(4, 5, 2, torch.float64).requires_grad_()
     uv = torch.rand(12, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 7 - 1
     uv[:4] = uv[:4].round()  # where a bilinear lookup has its kinks
@@ -90,7 +90,7 @@ def crops_of(rects, channels=4, seed=0):
 
 @BOTH
 @BORDERS
-def test_packed_crops_are_the_single_textures(backend, border):
+def test_packed_crops_equal_single_textures(backend, border):
     crops, values = crops_of(torch.tensor([[3, 2, 9, 6], [0, 0, 1, 1], [10, 4, 13, 12]]))
     layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 8, 5], [0, 0, 3, 3], [8, 0, 14, 12]]))
     uv = layout.pixel_xy() + torch.rand(layout.size, 2, generator=torch.Generator().manual_seed(1)) - 0.5
@@ -107,9 +107,9 @@ def test_packed_identity_is_exact_and_empty_crops_are_zero(backend):
     crops, values = crops_of(rects)
     layout = verbs.PixelLayout.from_rects(torch.tensor([[3, 2, 9, 6], [0, 0, 2, 2], [10, 4, 13, 12]]))
     sampled = verbs.texture_packed(values, rects, crops.offsets, layout, layout.pixel_xy().float(), backend)
-    kept = layout.draw_index() != 1
-    assert torch.equal(sampled[kept], values)
-    assert not sampled[~kept].any()
+    filled_rows = layout.draw_index() != 1
+    assert torch.equal(sampled[filled_rows], values)
+    assert not sampled[~filled_rows].any()
 
 
 def test_packed_gradients_agree():

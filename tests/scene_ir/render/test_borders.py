@@ -1,4 +1,4 @@
-"""What is seen between two looks: faces too thin to be met, surfaces that end, outlines; walks over a mesh."""
+"""Borders between samples: thin faces, ends of surfaces, outlines; walks over a mesh."""
 
 import itertools
 import math
@@ -21,7 +21,7 @@ FLAT = Lights(torch.zeros(3), torch.tensor(0.0), torch.tensor(1.0))
 
 
 def upright(edges, colours, depth=DEPTH, slices=1):
-    """Corners and faces of upright strips between places, px, and colours; each strip in `slices` of its own."""
+    """Corners, faces and colours of upright strips between positions, px; each strip is split into `slices`."""
     places = [a + (b - a) * k / slices for a, b in itertools.pairwise(edges) for k in range(slices)]
     places.append(edges[-1])
     x = torch.tensor(places, dtype=torch.float64) / SIZE * depth / DEPTH
@@ -32,8 +32,8 @@ def upright(edges, colours, depth=DEPTH, slices=1):
     return corners.float(), faces, torch.tensor(colours).repeat_interleave(2 * slices)
 
 
-def row(parts, looks):
-    """What a row of pixels (SIZE,) across parts shows, times coverage; parts: corners, faces and colours."""
+def row(parts, samples_per_side):
+    """A row of pixels (SIZE,) across the parts, times coverage; parts: corners, faces and colours."""
     corners, faces, light, count = [], [], [], 0
     for vertices, triangles, colour in parts:
         corners.append(vertices)
@@ -44,46 +44,40 @@ def row(parts, looks):
     none = torch.zeros(len(diffuse))
     vertices = torch.cat(corners)
     mesh = LitMesh(vertices, torch.cat(faces), Materials(diffuse, none, none + 10.0))
-    drawn = mesh.render(vertices, CAMERA, FLAT, "reference", looks)
+    drawn = mesh.render(vertices, CAMERA, FLAT, "reference", samples_per_side)
     return (drawn[0] * drawn[3])[SIZE // 2]
 
 
-def shown(colour):
+def display_value(colour):
     return colour**GAMMA
 
 
-SAMPLES_PER_SIDE = pytest.mark.parametrize("looks", [1, 2])
+BOTH_COUNTS = pytest.mark.parametrize("samples_per_side", [1, 2])
 
 
-@SAMPLES_PER_SIDE
+@BOTH_COUNTS
+@pytest.mark.parametrize("at_outline", [False, True])
 @settings(deadline=None, max_examples=15)
 @given(start=st.floats(9.0, 11.0), thin=st.floats(0.02, 0.7))
-def test_a_strip_thinner_than_a_pixel_is_seen_by_its_width(looks, start, thin):
-    edges = [2.3, start, start + thin, 25.6]
-    found = float(row([upright(edges, [0.8, 0.02, 0.5])], looks).sum())
+def test_a_strip_thinner_than_a_pixel_counts_by_its_width(samples_per_side, at_outline, start, thin):
+    edges = [2.3, start, start + thin, *([] if at_outline else [25.6])]
+    colours = [0.8, 0.02, 0.5][: len(edges) - 1]
+    total = float(row([upright(edges, colours)], samples_per_side).sum())
     widths = [b - a for a, b in itertools.pairwise(edges)]
-    wanted = sum(width * shown(colour) for width, colour in zip(widths, (0.8, 0.02, 0.5), strict=True))
-    assert found == pytest.approx(wanted, abs=2e-3)
+    expected = sum(width * display_value(colour) for width, colour in zip(widths, colours, strict=True))
+    assert total == pytest.approx(expected, abs=2e-3)
 
 
-@SAMPLES_PER_SIDE
-@settings(deadline=None, max_examples=15)
-@given(end=st.floats(19.0, 21.0), thin=st.floats(0.02, 0.7))
-def test_so_is_one_at_the_outline(looks, end, thin):
-    found = float(row([upright([2.3, end, end + thin], [0.8, 0.02])], looks).sum())
-    assert found == pytest.approx((end - 2.3) * shown(0.8) + thin * shown(0.02), abs=2e-3)
-
-
-@SAMPLES_PER_SIDE
+@BOTH_COUNTS
 @settings(deadline=None, max_examples=15)
 @given(start=st.floats(9.0, 11.0), slices=st.integers(1, 40))
-def test_where_the_nearer_surface_ends_is_its_border_whatever_the_faces_behind(looks, start, slices):
+def test_the_end_of_the_nearer_surface_is_the_border_for_any_faces_behind(samples_per_side, start, slices):
     behind = upright([2.3, 25.6], [0.8], 2 * DEPTH, slices)
-    found = float(row([upright([start, start + 5.5], [0.02]), behind], looks).sum())
-    assert found == pytest.approx((25.6 - 2.3 - 5.5) * shown(0.8) + 5.5 * shown(0.02), abs=2e-3)
+    total = float(row([upright([start, start + 5.5], [0.02]), behind], samples_per_side).sum())
+    assert total == pytest.approx((25.6 - 2.3 - 5.5) * display_value(0.8) + 5.5 * display_value(0.02), abs=2e-3)
 
 
-def test_walks_by_the_kernel_are_those_by_torch():
+def test_kernel_walks_equal_torch_walks():
     solid = trimesh.creation.icosphere(3, 0.5)
     vertices, faces = torch.tensor(solid.vertices, dtype=torch.float32), torch.tensor(solid.faces)
     edges = MeshEdges.from_mesh(vertices, faces, torch.zeros(len(faces), 1), math.cos(0.1))
@@ -106,7 +100,7 @@ def test_walks_by_the_kernel_are_those_by_torch():
     assert int(fast.goes_on.sum(dim=1).max()) == MAX_WALK_FACES
 
 
-def test_edges_know_their_neighbours_and_where_looks_change():
+def test_mesh_edges_find_neighbours_and_creases():
     box = trimesh.creation.box((1, 1, 1))
     vertices, faces = torch.tensor(box.vertices, dtype=torch.float32), torch.tensor(box.faces)
     edges = MeshEdges.from_mesh(vertices, faces, torch.zeros(len(faces), 1), 0.766)

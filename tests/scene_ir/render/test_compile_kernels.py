@@ -68,9 +68,9 @@ def loaded():
     return {name for name, module in wp._src.context.user_modules.items() if module.execs}
 before = loaded()
 assert before >= set(fast._PICTURE_MODULES), before
-from drivesem.bench.scenes import bench_scene
+from drivesem.bench.scenes import build_bench_scene
 from scene_ir.render.compositor import Compositor
-scene = bench_scene(1, 2000, 0).scene
+scene = build_bench_scene(1, 2000, 0).scene
 translation = (scene.objects.translation.float() + 0.1).requires_grad_()
 Compositor(scene).render(scene.with_objects(translation=translation)).image.sum().backward()
 assert all(name.startswith("drivesem.synth") for name in loaded() - before), loaded() - before

@@ -1,4 +1,4 @@
-"""The fused kernels of weather, foliage and paint against the plain torch they stand for."""
+"""The fused kernels of weather, foliage and paint against their reference in plain torch."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _codes(size: int, low: float, high: float) -> st.SearchStrategy[list[float]]
 
 
 def _scenery(height: int, width: int, road_row: int) -> tuple[Tensor, Tensor, Environment, Tensor]:
-    """Picture, a little out of [0, 1]; inverse depth, some of it 0; environment; air. float64."""
+    """Picture, slightly beyond [0, 1]; inverse depth, partly 0; environment; air. float64."""
     generator = torch.Generator().manual_seed(height * 100 + width)
 
     def noise(*shape: int) -> Tensor:
@@ -91,7 +91,7 @@ def test_foliage_agrees_with_the_reference(code: list[float], frame: tuple[int, 
 
 @pytest.mark.parametrize(("name", "size"), [("weather", 4), ("foliage", 3)])
 @pytest.mark.parametrize("frame", [(40, 64, 24), (37, 51, 0), (9, 130, 90)])
-def test_code_zero_leaves_every_bit(name: str, size: int, frame: tuple[int, int, int]) -> None:
+def test_code_zero_changes_no_bit(name: str, size: int, frame: tuple[int, int, int]) -> None:
     out, *gradients = _run(name, [0.0] * size, frame, "warp")
     assert torch.equal(out, _scenery(*frame)[0].float())
     assert bool((gradients[1].abs() > 1e-3).all())
@@ -112,7 +112,7 @@ def test_same_bytes_with_any_number_of_threads(name: str) -> None:
         assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
 
 
-def test_two_pictures_may_wait_for_their_gradients() -> None:
+def test_two_pictures_can_await_their_gradients() -> None:
     first = _run("weather", [0.5, 0.5, 0.5, 0.5], (40, 60, 10), "warp")
     image, inverse, scenery, air = _scenery(40, 60, 10)
     names = ("sky", "road", "foliage_map", "sun", "ground", "foliage")
@@ -151,14 +151,14 @@ def test_paint_agrees_with_the_reference(code: list[float]) -> None:
     _agree(_paint_rows("warp", rows), _paint_rows("reference", rows), VALUES["paint"])
 
 
-def test_paint_zero_leaves_every_bit() -> None:
+def test_paint_code_zero_changes_no_bit() -> None:
     code = torch.zeros(5)
     out, _, _, grad_code, *_ = _paint_rows("warp", code)
     assert torch.equal(out, _paint_rows("reference", code)[0].float())
     assert bool((grad_code.abs().amax(dim=0) > 1e-2).all())
 
 
-def test_no_rows_no_paint() -> None:
+def test_paint_of_no_rows() -> None:
     empty = torch.zeros(0)
     out = texture.apply_texture_code(
         empty.view(0, 3), empty, empty.view(0, 5), empty, empty, empty, backend="warp"

@@ -1,4 +1,4 @@
-"""The fused kernels against the plain torch that defines them, and scenes drawn in one go against one by one."""
+"""The fast path against the reference, and batches of scenes against single renders."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def draws(scene: SceneIR, seed: int, spread: float, active: tuple[str, ...]) -> 
 def compared(
     scene: SceneIR, values: dict[str, Tensor], active: tuple[str, ...], keep: Tensor | None = None
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Picture, object numbers and gradient of a smooth functional of the pixels `keep`, fast and reference."""
+    """Picture, object numbers and gradient of a smooth functional of the pixels `keep`, by kernels and reference."""
     weight = torch.randn(1, 3, 24, 40, generator=torch.Generator().manual_seed(5))
     weight = torch.nn.functional.interpolate(weight, scene.photograph.shape[1:], mode="bicubic")[0]
     if keep is not None:
@@ -93,14 +93,14 @@ def check(scene: SceneIR, values: dict[str, Tensor], active: tuple[str, ...]) ->
     spread=st.sampled_from([0.0, 0.3, 1.0, 3.0]),
     active=st.sets(st.sampled_from(PARAMETERS), min_size=1, max_size=4),
 )
-def test_fused_is_the_reference(photographed: SceneIR, seed: int, spread: float, active: set[str]) -> None:
+def test_kernels_match_the_reference(photographed: SceneIR, seed: int, spread: float, active: set[str]) -> None:
     scene = convert_scene(photographed, torch.float32)
     chosen = tuple(n for n in PARAMETERS if n in active)
     check(scene, draws(scene, seed, spread, chosen), chosen)
 
 
 @pytest.mark.parametrize("place", [[0.3, 0.0, -8.9], [3.2, 0.0, -7.5], [40.0, 0.0, 0.0], [0.0, 0.0, -30.0]])
-def test_fused_is_the_reference_at_and_behind_the_camera(photographed: SceneIR, place: list[float]) -> None:
+def test_kernels_match_the_reference_at_and_behind_the_camera(photographed: SceneIR, place: list[float]) -> None:
     scene = convert_scene(photographed, torch.float32)
     active = ("translation", "yaw", "ffd")
     values = draws(scene, 3, 0.5, active)
@@ -108,15 +108,15 @@ def test_fused_is_the_reference_at_and_behind_the_camera(photographed: SceneIR, 
     check(scene, values, active)
 
 
-def test_a_sun_overhead_casts_shadows_that_reach_nowhere(photographed: SceneIR) -> None:
-    """Their length has a kink at 0, where its gradient is 0 and not infinite times 0."""
+def test_a_sun_overhead_casts_shadows_without_length(photographed: SceneIR) -> None:
+    """Their length has a kink at 0, where its gradient is 0, not infinity times 0."""
     scene = convert_scene(photographed, torch.float32)
     scene = scene.with_environment(sun=torch.tensor([0.0, -1.0, 0.0]))
     active = ("translation", "yaw")
     check(scene, draws(scene, 4, 0.5, active), active)
 
 
-def test_a_vehicle_that_the_photograph_never_showed(photographed: SceneIR) -> None:
+def test_a_vehicle_outside_the_photograph(photographed: SceneIR) -> None:
     scene = convert_scene(photographed, torch.float32)
     objects = scene.objects
     aside = torch.tensor([[40.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -128,7 +128,7 @@ def test_a_vehicle_that_the_photograph_never_showed(photographed: SceneIR) -> No
 
 
 def with_regions(scene: SceneIR) -> SceneIR:
-    """The scene with a soft region of paint for all objects but the last."""
+    """The scene with a soft paint region for all objects but the last."""
     sources = list(scene.objects.source)
     for i, source in enumerate(sources[:-1]):
         h, w = source.foreground.values.shape[1:]
@@ -139,7 +139,7 @@ def with_regions(scene: SceneIR) -> SceneIR:
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0])
-def test_codes_recolour_regions_of_paint(photographed: SceneIR, spread: float) -> None:
+def test_texture_codes_recolour_paint_regions(photographed: SceneIR, spread: float) -> None:
     scene = with_regions(convert_scene(photographed, torch.float32))
     active = ("translation", "yaw", "texture_code")
     values = draws(scene, 6, spread, active)
@@ -147,7 +147,7 @@ def test_codes_recolour_regions_of_paint(photographed: SceneIR, spread: float) -
     check(scene, values, active)
 
 
-def test_scenes_in_one_go_are_those_drawn_one_by_one(photographed: SceneIR) -> None:
+def test_a_batch_equals_single_renders(photographed: SceneIR) -> None:
     scene = convert_scene(photographed, torch.float32)
     fewer = scene.with_objects(**{
         n: getattr(scene.objects, n)[:2]

@@ -1,4 +1,4 @@
-"""Templates in the vehicles' own finish, and the light on them."""
+"""The finish of templates, and the light on them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def compositor(photographed: SceneIR) -> Compositor:
     return Compositor(photographed, RenderSettings("reference"))
 
 
-def test_the_template_is_the_photograph_where_that_shows_it(compositor: Compositor) -> None:
+def test_the_finished_template_matches_the_photograph_where_visible(compositor: Compositor) -> None:
     for surface, samples in zip(compositor.surfaces.templates, compositor.sample_photograph(), strict=True):
         own = finish.fit_finish(surface, samples)
         gain, lift = (
@@ -32,7 +32,7 @@ def test_the_template_is_the_photograph_where_that_shows_it(compositor: Composit
         assert np.abs(again[sure] - samples.photograph[sure]).mean() < min(0.05, 0.3 * before)
 
 
-def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> None:
+def test_unseen_paint_takes_the_gain_of_visible_paint(compositor: Compositor) -> None:
     surface, samples = compositor.surfaces.templates[0], compositor.sample_photograph()[0]
     own = finish.fit_finish(surface, samples)[:, :3]
     paint = surface.part.numpy() == Part.PAINT
@@ -43,7 +43,7 @@ def test_unseen_paint_takes_the_gain_of_seen_paint(compositor: Compositor) -> No
     assert np.median(np.abs(np.log(ratio))) < 0.3
 
 
-def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
+def test_without_samples_the_template_is_unchanged(compositor: Compositor) -> None:
     none = finish.FinishSamples(
         np.zeros((0, 3), np.int64), *(np.zeros((0, n)) for n in (3, 3, 3)), *[np.zeros(0)] * 3
     )
@@ -55,11 +55,11 @@ def test_nothing_seen_leaves_the_template(compositor: Compositor) -> None:
     assert finish.estimate_sunlight([(surface, none)] * 3, [1.2] * 3) == pytest.approx(1.2, abs=0.21)
 
 
-def test_base_paint_is_the_photographs(compositor: Compositor, photographed: SceneIR) -> None:
+def test_estimated_paint_is_the_photographed_one(compositor: Compositor, photographed: SceneIR) -> None:
     """The first car is painted red, the second blue."""
-    kept = torch.stack([s.paint for s in photographed.objects.source])
-    assert torch.allclose(kept, compositor.estimate_paint(compositor.sample_photograph()), atol=0.02)
-    red, blue = kept[:2]
+    filled_rows = torch.stack([s.paint for s in photographed.objects.source])
+    assert torch.allclose(filled_rows, compositor.estimate_paint(compositor.sample_photograph()), atol=0.02)
+    red, blue = filled_rows[:2]
     assert float(red[0]) > 1.5 * float(red[1])
     assert float(blue[2]) > 1.3 * float(blue[0])
 
@@ -70,25 +70,25 @@ def _lit(samples: finish.FinishSamples, strength: float) -> finish.FinishSamples
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.6, 1.4])
-def test_sunlight_is_read_off_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
+def test_sunlight_is_estimated_from_paint_on_several_sides(compositor: Compositor, strength: float) -> None:
     surface, samples = compositor.surfaces.templates[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, strength))]
     assert finish.estimate_sunlight(seen, [strength]) == pytest.approx(strength, abs=0.01)
     assert abs(finish.estimate_sunlight(seen, [strength + 0.4]) - strength) < 0.4
 
 
-def test_one_vehicle_in_the_shade_does_not_change_the_frames_sunlight(compositor: Compositor) -> None:
+def test_one_vehicle_in_the_shade_does_not_change_the_sunlight(compositor: Compositor) -> None:
     surface, samples = compositor.surfaces.templates[0], compositor.sample_photograph()[0]
     seen = [(surface, _lit(samples, s)) for s in (1.4, 1.4, 0.0)]
     assert finish.estimate_sunlight(seen, [1.4, 1.4, 0.0]) == pytest.approx(1.4, abs=0.01)
 
 
-def test_a_frames_vehicles_share_their_sunlight(photographed: SceneIR) -> None:
+def test_all_vehicles_of_a_frame_have_one_sunlight(photographed: SceneIR) -> None:
     assert len({s.sunlight for s in photographed.objects.source}) == 1
 
 
 def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a hidden car's completion would change once the others are there, and the picture with it."""
+    """Otherwise a hidden car's completion, and the picture, would depend on the other objects."""
     monkeypatch.setattr("scene_ir.render.prepare._MAX_SAMPLES", 150)
     names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "mesh_index", "category")
     names = (*names, "box2d", "truncation", "occlusion")
@@ -102,8 +102,8 @@ def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypat
     assert np.array_equal(together.photograph, alone.photograph)
 
 
-def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor) -> None:
-    """Without samples on one side, its gains are pulled towards the other's."""
+def test_gains_of_an_unseen_side_follow_the_other_side(compositor: Compositor) -> None:
+    """Without samples on one side, its gains are drawn towards the other side's."""
     surface: TemplateSurface = compositor.surfaces.templates[1]
     samples = compositor.sample_photograph()[1]
     brighter = replace(samples, photograph=np.minimum(1.5 * samples.photograph, 0.9))
@@ -112,7 +112,7 @@ def test_finish_of_equal_vertices_is_equal_on_both_sides(compositor: Compositor)
     assert (bright > 1.1 * plain)[surface.part.numpy() == Part.PAINT].mean() > 0.9
 
 
-def test_a_car_that_turns_is_relit(photographed: SceneIR) -> None:
+def test_a_turned_car_is_relit(photographed: SceneIR) -> None:
     compositor = Compositor(photographed, RenderSettings("reference"))
     objects = compositor.scene.objects
     assert bool((compositor.compute_brightening(objects) == 0).all())

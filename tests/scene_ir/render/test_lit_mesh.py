@@ -1,4 +1,4 @@
-"""Lit meshes: values by hand, both backends, gradients against central differences, what cannot be drawn."""
+"""Lit meshes: values by hand, both backends, gradients against central differences, invalid input."""
 
 import math
 
@@ -30,7 +30,7 @@ def materials(colours, specular=0.3):
 
 
 def solid(mesh, seed=0):
-    """A mesh of trimesh, each pair of faces in a colour of its own."""
+    """A trimesh mesh with a random colour per face."""
     vertices, faces = torch.tensor(mesh.vertices, dtype=torch.float32), torch.tensor(mesh.faces)
     colours = 0.1 + 0.8 * torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(seed))
     return LitMesh(vertices, faces, materials(colours))
@@ -50,7 +50,7 @@ def turned(vertices, angles):
     return vertices @ (z @ x @ y).T + vertices.new_tensor([0.0, 0.0, 2.2])
 
 
-def test_a_surface_that_faces_lamp_and_camera():
+def test_a_surface_facing_lamp_and_camera():
     point, normal = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
     lamp = Lights(torch.zeros(3), torch.tensor(0.5), torch.tensor(0.2), reach=2.0)
     one = torch.ones(1)
@@ -62,7 +62,7 @@ def test_a_surface_that_faces_lamp_and_camera():
     torch.testing.assert_close(nearer, torch.full((1, 3), 0.5 * 4 + 0.2))
 
 
-def test_a_surface_that_is_turned_away_has_the_environment_alone_and_more_from_above():
+def test_a_surface_facing_away_gets_only_environment_light_mostly_from_above():
     point, lamp = torch.tensor([[0.0, 0.0, 2.0]]), Lights(torch.zeros(3), torch.tensor(0.5), torch.tensor(0.2))
     one = torch.ones(1)
     up, down, away = (
@@ -75,7 +75,7 @@ def test_a_surface_that_is_turned_away_has_the_environment_alone_and_more_from_a
 
 
 @pytest.mark.parametrize("backend", ["warp", "reference"])
-def test_a_square_before_the_camera(backend):
+def test_a_square_in_front_of_the_camera(backend):
     vertices = torch.tensor([[-0.25, -0.25, 2.0], [0.25, -0.25, 2.0], [0.25, 0.25, 2.0], [-0.25, 0.25, 2.0]])
     square = LitMesh(vertices, torch.tensor([[0, 2, 1], [0, 3, 2]]), materials([[0.5] * 3] * 2, 0.0))
     flat = Lights(torch.tensor([0.0, 0.0, 0.0]), DARK, torch.tensor(0.8))
@@ -91,7 +91,7 @@ def test_a_square_before_the_camera(backend):
     torch.testing.assert_close(picture[:, SIZE // 2, SIZE // 2], torch.full((3,), 0.4**GAMMA))
 
 
-def test_what_lies_before_a_background_has_the_gradients_of_differences():
+def test_composite_over_passes_gradcheck():
     generator = torch.Generator().manual_seed(0)
     drawn, background = (
         torch.rand(channels, 3, 2, generator=generator, dtype=torch.float64).requires_grad_()
@@ -101,7 +101,7 @@ def test_what_lies_before_a_background_has_the_gradients_of_differences():
 
 
 @pytest.mark.parametrize("mesh", [trimesh.creation.box((0.5, 0.6, 1)), trimesh.creation.icosphere(2, 0.5)])
-def test_both_backends_draw_the_same(mesh):
+def test_backends_agree(mesh):
     lit = solid(mesh)
     placed = turned(lit.vertices, torch.tensor([0.35, 0.5, 0.1]))
     fast, plain = (lit.render(placed, camera(), lights(), backend) for backend in ("warp", "reference"))
@@ -109,7 +109,7 @@ def test_both_backends_draw_the_same(mesh):
     assert float((fast - plain).abs().mean()) < 1e-4
 
 
-def test_what_lies_behind_the_camera_or_beside_the_picture_is_not_drawn():
+def test_meshes_behind_the_camera_or_outside_the_picture_are_not_drawn():
     lit = solid(trimesh.creation.box((0.5, 0.6, 1)))
     for place in ([0.0, 0.0, -3.0], [9.0, 0.0, 3.0]):
         assert not bool(lit.render(lit.vertices + torch.tensor(place), camera(), lights()).any())
@@ -126,7 +126,7 @@ MESHES = {
 
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("moved", ["pose", "vertex", "light"])
-def test_gradients_are_those_of_central_differences(name, moved):
+def test_gradients_match_central_differences(name, moved):
     lit = solid(MESHES[name])
     generator = torch.Generator().manual_seed(1)
     weight = torch.nn.functional.avg_pool2d(torch.randn(1, 4, FINE_PX, FINE_PX, generator=generator), 9, 1, 4)[
@@ -153,8 +153,8 @@ def test_gradients_are_those_of_central_differences(name, moved):
 
 @settings(deadline=None, max_examples=10)
 @given(st.floats(-0.3, 0.3), st.floats(0.001, 0.01))
-def test_a_border_between_two_colours_sweeps_over_pixels_evenly(start, step):
-    """Two halves of a wide strip: as their border moves, the mean colour follows it, wherever it stands."""
+def test_a_border_between_two_colours_sweeps_evenly_over_pixels(start, step):
+    """As the border between two halves of a wide strip moves, the mean colour follows it at any position."""
     vertices = torch.tensor([[-2.0, -0.2, 2], [0, -0.2, 2], [2, -0.2, 2], [-2, 0.2, 2], [0, 0.2, 2], [2, 0.2, 2]])
     faces = torch.tensor([[0, 3, 4], [0, 4, 1], [1, 4, 5], [1, 5, 2]])
     strip = LitMesh(vertices, faces, materials([[1.0] * 3] * 2 + [[0.0] * 3] * 2, 0.0))
@@ -170,7 +170,7 @@ def test_a_border_between_two_colours_sweeps_over_pixels_evenly(start, step):
     assert moved == pytest.approx(step * 1.6 / 2 * (shade_of - dark), rel=0.02)
 
 
-def test_smooth_surfaces_have_smooth_normals_and_edges_stay_sharp():
+def test_normals_are_smooth_on_a_ball_and_sharp_on_a_box():
     ball, box = solid(trimesh.creation.icosphere(3, 0.5)), solid(MESHES["box"])
     centred = ball.vertices[ball.faces]
     away = ball.corners(ball.vertices + torch.tensor([0.0, 0.0, 3.0]))[1].reshape(-1, 3, 3)
@@ -184,7 +184,7 @@ def test_smooth_surfaces_have_smooth_normals_and_edges_stay_sharp():
     assert torch.allclose(normals.abs().amax(dim=1), torch.ones(len(normals)))
 
 
-def test_what_is_no_mesh():
+def test_invalid_meshes_are_rejected():
     vertices, faces = torch.zeros(3, 3), torch.tensor([[0, 1, 2]])
     with pytest.raises(RangeError, match=r"lit.vertices\[1, 0\]"):
         LitMesh(torch.tensor([[0.0, 0, 0], [math.nan, 0, 0], [1, 0, 0]]), faces, materials([[0.5] * 3]))

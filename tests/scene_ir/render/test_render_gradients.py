@@ -1,4 +1,4 @@
-"""Analytic gradients of the rendered picture against central differences, one parameter a row."""
+"""Analytic gradients of the rendered picture against central differences, per parameter."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ COSINE, RELATIVE = 0.99, 0.05
 
 @dataclass(frozen=True)
 class Parameter:
-    """dim: how many numbers; apply: (scene, numbers) -> scene; step: of the central difference; scale: of random
-    theta."""
+    """A parameter of the scene: its size, its effect, the step of differences, and the scale of random values."""
 
     dim: int
     apply: Callable[[SceneIR, Tensor], SceneIR]
@@ -44,7 +43,7 @@ def _translate(scene: SceneIR, theta: Tensor) -> SceneIR:
 
 
 def _ffd(scene: SceneIR, theta: Tensor) -> SceneIR:
-    """Offsets of the upper three lattice layers; some random symmetric directions of the three cars together."""
+    """Offsets of the upper three lattice layers in random symmetric directions of the three cars together."""
     generator = torch.Generator().manual_seed(5)
     codes = torch.randn(theta.shape[0], 3, 96, generator=generator, dtype=theta.dtype)
     offsets = from_symmetric(torch.einsum("k,kno->no", theta, codes)).reshape(3, *LATTICE, 3)
@@ -53,7 +52,7 @@ def _ffd(scene: SceneIR, theta: Tensor) -> SceneIR:
 
 
 def _in_weather(scene: SceneIR, theta: Tensor) -> SceneIR:
-    """Moved before a covered sky, on a wet road: cars hide both."""
+    """Moved in front of a covered sky on a wet road: cars hide both."""
     return _translate(scene.with_environment(weather=theta.new_tensor([0.2, 0.6, 0.1, 0.8])), theta)
 
 
@@ -98,7 +97,7 @@ def _compare(scene: SceneIR, parameter: Parameter, theta: Tensor) -> tuple[Tenso
 
 @pytest.mark.parametrize("where", ["zero", "random"])
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_gradient_agrees_with_central_differences(photographed: SceneIR, name: str, where: str) -> None:
+def test_gradient_matches_central_differences(photographed: SceneIR, name: str, where: str) -> None:
     parameter = PARAMETERS[name]
     generator = torch.Generator().manual_seed(3)
     theta = torch.zeros(parameter.dim, dtype=torch.float64)

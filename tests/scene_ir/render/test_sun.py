@@ -1,4 +1,4 @@
-"""A sun that moves: identity, where it goes, what follows it and what does not."""
+"""The moving sun: identity, position, shadows and light."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _lit(scene: SceneIR, *code: float) -> SceneIR:
 
 
 def _darkness(scene: SceneIR, base: SceneIR) -> Tensor:
-    """(H, W): how much the vehicles darken the ground of the picture."""
+    """(H, W) darkness of the vehicles' shadows on the ground."""
     compositor = Compositor(base, REFERENCE)
     layers = compositor.draw_layers(
         compositor.perturbed_objects(scene), compositor.perturbed_sun(scene.environment)
@@ -35,7 +35,7 @@ def _darkness(scene: SceneIR, base: SceneIR) -> Tensor:
     return out
 
 
-def test_code_0_is_the_photographs_to_the_bit(photographed: SceneIR) -> None:
+def test_light_code_zero_changes_no_bit(photographed: SceneIR) -> None:
     live = _lit(photographed, 0, 0, 0).environment.light.requires_grad_()
     picture = Compositor(photographed, REFERENCE).render(photographed.with_environment(light=live)).image
     assert torch.equal(picture.detach(), Compositor(photographed, REFERENCE).render(photographed).image)
@@ -47,7 +47,7 @@ def test_code_0_is_the_photographs_to_the_bit(photographed: SceneIR) -> None:
 
 
 @pytest.mark.parametrize("code", [(1.0, 0.0), (-0.5, 0.0), (0.0, 1.0), (0.7, -0.4)])
-def test_it_turns_about_the_vertical_and_rises(code: tuple[float, float]) -> None:
+def test_the_sun_turns_about_the_vertical_and_rises(code: tuple[float, float]) -> None:
     up, height, azimuth = torch.tensor([0.0, -1.0, 0.0]), math.radians(40), math.radians(30)
     flat = math.cos(height)
     sun = torch.tensor([flat * math.sin(azimuth), -math.sin(height), flat * math.cos(azimuth)])
@@ -57,7 +57,7 @@ def test_it_turns_about_the_vertical_and_rises(code: tuple[float, float]) -> Non
     assert math.degrees(math.atan2(x, z)) == pytest.approx(30 + 15 * code[0], abs=1e-3)
 
 
-def test_shadows_turn_away_from_it(photographed: SceneIR) -> None:
+def test_shadows_turn_away_from_the_sun(photographed: SceneIR) -> None:
     columns = torch.arange(photographed.camera.width, dtype=photographed.photograph.dtype)
     middles = []
     for azimuth in (-1.0, 0.0, 1.0):
@@ -68,7 +68,7 @@ def test_shadows_turn_away_from_it(photographed: SceneIR) -> None:
     assert (middles[2] - middles[0]) * float(sun[2]) < 0
 
 
-def test_a_stronger_sun_casts_darker_shadows_and_lights_what_faces_it(photographed: SceneIR) -> None:
+def test_a_stronger_sun_darkens_shadows_and_brightens_vehicles(photographed: SceneIR) -> None:
     scenes = [_lit(photographed, 0, 0, strength) for strength in (-1.0, 0.0, 1.0)]
     renders = [Compositor(photographed, REFERENCE).render(scene) for scene in scenes]
     cars = renders[1].object_id > 0
@@ -84,8 +84,8 @@ def test_a_stronger_sun_casts_darker_shadows_and_lights_what_faces_it(photograph
     assert torch.equal(renders[2].image[:, far], renders[1].image[:, far])
 
 
-def test_what_is_hardly_the_cars_own_shadow_stays(photographed: SceneIR) -> None:
-    """The shadow of a house, say, that was taken for the car's."""
+def test_foreign_shadows_do_not_follow_the_sun(photographed: SceneIR) -> None:
+    """Such as a house's shadow, mistaken for the car's."""
     sources = list(photographed.objects.source)
     shadow = sources[0].shadow
     assert shadow is not None

@@ -1,4 +1,4 @@
-"""Taking a picture apart gives the same bits for any number of torch's threads."""
+"""Decomposition gives the same bits for any number of torch threads."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def by_threads(work: Callable[[], Tensor]) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("shape", [(94451,), (3, 41001), (0, 5), (2, 3, 4)])
-def test_sigmoid(shape: tuple[int, ...]) -> None:
+def test_sigmoid_does_not_depend_on_threads(shape: tuple[int, ...]) -> None:
     values = 4 * torch.randn(shape, generator=RANDOM.manual_seed(0))
     one, *others = by_threads(lambda: _thread_invariant_sigmoid(values))
     assert all(torch.equal(one, other) for other in others)
     torch.testing.assert_close(one, torch.sigmoid(values), rtol=1e-6, atol=0)
 
 
-def test_continued_shadow() -> None:
+def test_extended_shadow_does_not_depend_on_threads() -> None:
     dark = torch.rand(3, 171, 498, generator=RANDOM.manual_seed(0))
     expected = torch.rand(171, 498, generator=RANDOM)
     covered = torch.rand(171, 498, generator=RANDOM) > 0.6
@@ -45,7 +45,7 @@ def test_continued_shadow() -> None:
     assert all(torch.equal(one, other) for other in others)
 
 
-def test_points_on_the_ground() -> None:
+def test_ground_points_do_not_depend_on_threads() -> None:
     down, across = torch.rand(2, 39988, generator=RANDOM.manual_seed(0)) * 300
     pixels = torch.stack([down * 3, across + 400], dim=1)
     camera = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]])
@@ -56,7 +56,7 @@ def test_points_on_the_ground() -> None:
 
 
 @pytest.mark.slow
-def test_an_embedded_scene() -> None:
+def test_a_demo_scene_does_not_depend_on_threads() -> None:
     from drivesem.synth.demo import demo_scene
 
     for index in (0, 1):

@@ -1,4 +1,4 @@
-"""What stands in front of vehicles: drawn over those behind it, under those before it, and part of no vehicle."""
+"""Occluders: drawn over vehicles behind them, under those in front, and part of none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COLOUR = (0.9, 0.8, 0.2)
 
 
 def with_pole(scene: SceneIR, backend: Backend, depth_m: float = POLE_M) -> SceneIR:
-    """The street photographed with an upright pole before the middle of its first car, and taken apart."""
+    """The street photographed with an upright pole in front of its first car's centre, and decomposed."""
     settings = RenderSettings(backend=backend)
     shot = Compositor(scene, settings).render(scene)
     height, width = scene.depth.shape
@@ -68,7 +68,7 @@ def levels(image: Tensor) -> Tensor:
 
 
 def solid(scene: SceneIR) -> Tensor:
-    """Pixels (H, W) that show nothing but the pole."""
+    """Pixels (H, W) fully covered by the pole."""
     crop = scene.occluders[0].foreground
     return on_frame(replace(crop, values=crop.values[3:]), scene.depth.shape) >= 1.0
 
@@ -91,7 +91,7 @@ def test_unperturbed_render_is_the_photograph(name: str, request: pytest.Fixture
     assert len(found.opacity) == len(scene.objects)
 
 
-def test_car_moves_behind_the_pole_and_is_whole(
+def test_car_moved_behind_the_pole_has_no_hole(
     fast_pole: SceneIR, street: Callable[[torch.dtype], SceneIR]
 ) -> None:
     found = Compositor(fast_pole).render(shifted(fast_pole, 0, (0.6, 0.0)))
@@ -106,7 +106,7 @@ def test_car_moves_behind_the_pole_and_is_whole(
 
 
 def on_frame(crop: Crop, size_hw: Sequence[int]) -> Tensor:
-    """A crop's only channel (H, W), 0 beyond it."""
+    """A one-channel crop on the whole frame (H, W), 0 outside it."""
     frame = crop.values.new_zeros(*size_hw)
     h, w = crop.values.shape[1:]
     frame[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] = crop.values[0]
@@ -122,7 +122,7 @@ def test_car_in_front_of_a_far_pole_hides_it(street: Callable[[torch.dtype], Sce
     assert torch.equal(levels(Compositor(far).render(far).image), levels(far.photograph))
 
 
-def test_pole_counts_as_hiding(fast_pole: SceneIR, street: Callable[[torch.dtype], SceneIR]) -> None:
+def test_pole_hides_a_share_of_the_car(fast_pole: SceneIR, street: Callable[[torch.dtype], SceneIR]) -> None:
     bare = replace(fast_pole, occluders=())
     shares = [hidden_shares(Compositor(s).render(s)) for s in (fast_pole, bare)]
     assert float(shares[0][0]) > float(shares[1][0])
@@ -147,7 +147,7 @@ def test_gradients_agree_with_the_reference(fast_pole: SceneIR) -> None:
         torch.testing.assert_close(fast.double(), slow, rtol=2e-2, atol=2e-2 * float(slow.abs().max()))
 
 
-def test_season_changes_a_pole_of_leaves(fast_pole: SceneIR) -> None:
+def test_season_changes_a_pole_with_leaves(fast_pole: SceneIR) -> None:
     leafy = fast_pole.with_environment(foliage_map=torch.ones_like(fast_pole.depth))
     autumn = leafy.with_environment(foliage=torch.tensor([0.8, 0.0, 0.0]))
     found = Compositor(leafy).render(autumn).image
@@ -159,7 +159,7 @@ def test_season_changes_a_pole_of_leaves(fast_pole: SceneIR) -> None:
     assert float((found - alone).abs()[:, mask].max()) < 1e-5
 
 
-def test_fog_veils_the_pole_by_its_own_distance(street: Callable[[torch.dtype], SceneIR]) -> None:
+def test_fog_veils_the_pole_by_its_distance(street: Callable[[torch.dtype], SceneIR]) -> None:
     near, far = (with_pole(street(torch.float32), "warp", depth) for depth in (2.0, POLE_M))
     pictures = []
     for scene in (near, far):
@@ -169,7 +169,7 @@ def test_fog_veils_the_pole_by_its_own_distance(street: Callable[[torch.dtype], 
     assert float((pictures[0] - air).abs().mean()) > float((pictures[1] - air).abs().mean())
 
 
-def test_removed_car_leaves_the_pole(fast_pole: SceneIR) -> None:
+def test_the_pole_remains_when_a_car_is_removed(fast_pole: SceneIR) -> None:
     for rows in ([0], [0, 1, 2]):
         scene = remove_objects(fast_pole, rows)
         image = Compositor(scene).render(scene).image
@@ -186,7 +186,7 @@ def test_removed_car_leaves_the_pole(fast_pole: SceneIR) -> None:
         assert float(inside.double().mean()) > 0.95
 
 
-def test_scene_folder_keeps_what_stands_in_front(fast_pole: SceneIR, tmp_path: Path) -> None:
+def test_scene_folder_stores_occluders(fast_pole: SceneIR, tmp_path: Path) -> None:
     save_scene(fast_pole, tmp_path / "scene")
     found = load_scene(tmp_path / "scene")
     assert len(found.occluders) == 1
@@ -203,17 +203,17 @@ def test_scene_folder_keeps_what_stands_in_front(fast_pole: SceneIR, tmp_path: P
         load_scene(tmp_path / "scene")
 
 
-def test_front_is_validated() -> None:
+def test_occluder_depth_is_validated() -> None:
     with pytest.raises(RangeError, match=r"front\.depth_m"):
         Occluder(Crop(torch.zeros(4, 2, 2), 0, 0), 0.0)
 
 
-def test_standing_things_follow_the_last_object_they_can_hide() -> None:
+def test_occluders_follow_the_last_object_they_can_hide() -> None:
     size = torch.tensor([[4.0, 1.5, 1.8]] * 2)
     place = torch.tensor([[0.0, 1.6, 20.0], [0.0, 1.6, 10.0]])
     matrix = torch.tensor([[700.0, 0.0, 100.0, 0.0], [0.0, 700.0, 50.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
-    things = [Occluder(Crop(torch.zeros(4, 4, 3), 99, 40), depth) for depth in (15.0, 5.0, 30.0)]
-    feet = blend.occluder_footprints(things, matrix)
+    occluders = [Occluder(Crop(torch.zeros(4, 4, 3), 99, 40), depth) for depth in (15.0, 5.0, 30.0)]
+    feet = blend.occluder_footprints(occluders, matrix)
     order = blend.paint_order(size, torch.zeros(2), place, torch.zeros(3), feet)
     assert order == [4, 0, 2, 1, 3]
     assert blend.paint_order(size, torch.zeros(2), place, torch.zeros(3)) == [0, 1]

@@ -1,4 +1,4 @@
-"""What a compositor keeps between pictures is never stale: one that drew many perturbations draws as a new one."""
+"""Caches of a compositor are never stale: a reused one renders like a new one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _cut_crop(crop: Crop, window: tuple[int, int, int, int]) -> Crop:
 
 
 def cut(scene: SceneIR, window: tuple[int, int, int, int]) -> SceneIR:
-    """The scene as a camera of the window's pixels (x0, y0, x1, y1) had taken it."""
+    """The part of a scene inside a window (x0, y0, x1, y1)."""
     x0, y0, x1, y1 = window
     shift = torch.eye(3, dtype=scene.camera.intrinsics.dtype)
     shift[0, 2], shift[1, 2] = -x0, -y0
@@ -61,7 +61,7 @@ def cut(scene: SceneIR, window: tuple[int, int, int, int]) -> SceneIR:
 
 @pytest.fixture(scope="module")
 def scenes(photographed: SceneIR) -> list[SceneIR]:
-    """Two windows of an embedded scene, around its nearest vehicles, and the small street."""
+    """Two windows of a demo scene around its nearest vehicles, and the small street."""
     demo = demo_scene(0, 0)
     order = demo.objects.translation[:, 2].argsort()[:2].tolist()
     windows = []
@@ -85,11 +85,11 @@ def perturbed(scene: SceneIR, active: frozenset[str], seed: int) -> SceneIR:
     return scene.with_objects(**objects).with_environment(**{n: c for n, c in changes.items() if n not in objects})
 
 
-def assert_same(kept: Render, fresh: Render) -> None:
-    assert torch.equal(kept.image, fresh.image)
-    assert torch.equal(kept.depth, fresh.depth)
-    assert torch.equal(kept.object_id, fresh.object_id)
-    for a, b in zip(kept.opacity, fresh.opacity, strict=True):
+def assert_same(reused: Render, fresh: Render) -> None:
+    assert torch.equal(reused.image, fresh.image)
+    assert torch.equal(reused.depth, fresh.depth)
+    assert torch.equal(reused.object_id, fresh.object_id)
+    for a, b in zip(reused.opacity, fresh.opacity, strict=True):
         assert (a.x0, a.y0) == (b.x0, b.y0)
         assert torch.equal(a.values, b.values)
 
@@ -102,24 +102,24 @@ THETAS = st.lists(
 @pytest.mark.slow
 @given(st.integers(0, 2), THETAS)
 @settings(max_examples=25)
-def test_a_kept_compositor_draws_as_a_new_one(
+def test_a_reused_compositor_renders_like_a_new_one(
     scenes: list[SceneIR], which: int, thetas: list[tuple[frozenset[str], int, bool]]
 ) -> None:
-    """Any parameters on and off in any order, with gradients in between or without."""
+    """Any parameters in any order, with or without gradients in between."""
     scene = scenes[which]
-    kept = Compositor(scene)
+    reused = Compositor(scene)
     for active, seed, differentiate in thetas:
         theta = perturbed(scene, active, seed)
         if differentiate:
             yaw = theta.objects.yaw.clone().requires_grad_()
             weather = theta.environment.weather.clone().requires_grad_()
-            picture = kept.render(theta.with_objects(yaw=yaw).with_environment(weather=weather))
+            picture = reused.render(theta.with_objects(yaw=yaw).with_environment(weather=weather))
             grads = torch.autograd.grad(picture.image.square().sum(), (yaw, weather))
             again = Compositor(scene).render(theta.with_objects(yaw=yaw).with_environment(weather=weather))
             expected = torch.autograd.grad(again.image.square().sum(), (yaw, weather))
             assert all(torch.equal(a, b) for a, b in zip(grads, expected, strict=True))
         with torch.no_grad():
-            assert_same(kept.render(theta), Compositor(scene).render(theta))
+            assert_same(reused.render(theta), Compositor(scene).render(theta))
 
 
 @given(st.integers(0, 2), st.permutations(range(4)))
@@ -135,26 +135,26 @@ def test_the_order_of_perturbations_does_not_matter(scenes: list[SceneIR], which
             assert_same(mixed.render(thetas[i]), first[i])
 
 
-def test_changing_parameters_in_place_is_seen(scenes: list[SceneIR]) -> None:
-    """Attacks keep one tensor and step it in place: nothing may be remembered by which tensor it is."""
+def test_parameters_changed_in_place_take_effect(scenes: list[SceneIR]) -> None:
+    """Attacks change one tensor in place: no cache may depend on a tensor's identity."""
     scene = scenes[0]
-    kept = Compositor(scene)
+    reused = Compositor(scene)
     theta = perturbed(scene, frozenset(NAMES), 1)
     with torch.no_grad():
-        before = kept.render(theta)
+        before = reused.render(theta)
         for tensor in (theta.objects.translation, theta.objects.ffd, theta.objects.texture_code):
             tensor.add_(0.05)
         theta.environment.weather.mul_(0.5)
         theta.environment.foliage.mul_(0.5)
-        after = kept.render(theta)
+        after = reused.render(theta)
         assert not torch.equal(before.image, after.image)
         assert_same(after, Compositor(scene).render(theta))
 
 
-def test_the_reference_keeps_nothing_stale_either(scenes: list[SceneIR]) -> None:
+def test_a_reused_reference_compositor_renders_like_a_new_one(scenes: list[SceneIR]) -> None:
     scene, settings_ = scenes[2], RenderSettings(backend="reference")
-    kept = Compositor(scene, settings_)
+    reused = Compositor(scene, settings_)
     with torch.no_grad():
         for active in (frozenset(NAMES), frozenset({"foliage"}), frozenset[str](), frozenset({"yaw", "weather"})):
             theta = perturbed(scene, active, 2)
-            assert_same(kept.render(theta), Compositor(scene, settings_).render(theta))
+            assert_same(reused.render(theta), Compositor(scene, settings_).render(theta))
