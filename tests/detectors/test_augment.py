@@ -40,14 +40,16 @@ def white_extent(image: torch.Tensor) -> list[float]:
 @pytest.mark.parametrize("seed", range(12))
 def test_boxes_follow_the_pixels(seed: int) -> None:
     image, targets = frame_with_block((140, 50, 189, 79))
-    seen, moved = augment(image, targets, replace(QUIET, object_probability=1.0), np.random.default_rng(seed))
-    assert seen.shape == (3, 96, 160)
-    assert moved.labels.tolist() == [1]
+    window, window_targets = augment(
+        image, targets, replace(QUIET, object_probability=1.0), np.random.default_rng(seed)
+    )
+    assert window.shape == (3, 96, 160)
+    assert window_targets.labels.tolist() == [1]
     # Inclusive pixels against edges: at most one pixel, and the rounding of the zoom.
-    assert np.abs(np.array(white_extent(seen)) - moved.boxes_xyxy[0].numpy()).max() <= 1.6
+    assert np.abs(np.array(white_extent(window)) - window_targets.boxes_xyxy[0].numpy()).max() <= 1.6
 
 
-def test_view_is_a_function_of_frame_and_generator() -> None:
+def test_augmentation_is_a_function_of_frame_and_generator() -> None:
     image, targets = frame_with_block((140, 50, 189, 79))
     settings = replace(
         AugmentSettings(window_hw=(96, 160)), blur_probability=1, noise_probability=1, jpeg_probability=1
@@ -65,13 +67,13 @@ def test_a_frame_smaller_than_the_window_is_filled_with_the_mean_colour() -> Non
     image = np.zeros((40, 50, 3), np.uint8)
     nothing = Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
     settings = replace(QUIET, scale_probability=0, flip_probability=0)
-    seen, _ = augment(image, nothing, settings, np.random.default_rng(0))
-    outside = (seen * 255).round().permute(1, 2, 0).reshape(-1, 3).unique(dim=0).tolist()
+    window, _ = augment(image, nothing, settings, np.random.default_rng(0))
+    outside = (window * 255).round().permute(1, 2, 0).reshape(-1, 3).unique(dim=0).tolist()
     assert outside == [[0, 0, 0], [124, 117, 104]]
 
 
 @pytest.mark.parametrize(
-    ("box", "kept", "ignored"),
+    ("box", "remains", "ignored"),
     [
         ((20, 20, 60, 60), True, False),
         ((-10, 20, 30, 60), True, False),  # 3/4 visible
@@ -80,11 +82,11 @@ def test_a_frame_smaller_than_the_window_is_filled_with_the_mean_colour() -> Non
         ((20, 20, 60, 28), True, True),  # too low
     ],
 )
-def test_cut_boxes(box: tuple, kept: bool, ignored: bool) -> None:
+def test_cropped_boxes(box: tuple, remains: bool, ignored: bool) -> None:
     targets = Targets(torch.tensor([box]).float(), torch.tensor([0]), torch.tensor([False]))
     cut = crop_targets(targets, (0, 0), (1.0, 1.0), QUIET)
-    assert len(cut) == int(kept)
-    if kept:
+    assert len(cut) == int(remains)
+    if remains:
         assert bool(cut.ignore[0]) is ignored
         assert float(cut.boxes_xyxy.min()) >= 0
 

@@ -64,12 +64,12 @@ def test_clip_keeps_boxes_on_pixels() -> None:
 
 
 def plain_nms(all_boxes: list, scores: list, threshold: float, labels: list) -> list[int]:
-    kept: list[int] = []
+    selected: list[int] = []
     for i in sorted(range(len(scores)), key=lambda i: -scores[i]):
-        rivals = [k for k in kept if labels[k] == labels[i]]
+        rivals = [k for k in selected if labels[k] == labels[i]]
         if all(plain_iou(all_boxes[i], all_boxes[k]) <= threshold for k in rivals):
-            kept.append(i)
-    return kept
+            selected.append(i)
+    return selected
 
 
 @settings(max_examples=60, deadline=None)

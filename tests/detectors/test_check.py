@@ -1,4 +1,4 @@
-"""The check of the contract: a small detector keeps it, and each way of breaking it is named."""
+"""The contract check: a small detector passes, and each violation is named."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from detectors.types import Detections
 IMAGE_HW = (64, 96)
 
 
-class Small(DenseDetector):
+class CellDetector(DenseDetector):
     """A convolution over cells of 16 px, each with a box around it."""
 
     def __init__(self) -> None:
@@ -36,41 +36,41 @@ class Small(DenseDetector):
         return DensePredictions(boxes, cells.flatten(2).transpose(1, 2).sigmoid(), (high, wide))
 
 
-class Detached(Small):
+class DetachedDetector(CellDetector):
     def predict(self, images):
         return super().predict(images.detach() + 0 * images)
 
 
-class Doubled(Small):
+class DoubledGradient(CellDetector):
     """A gradient of twice the length."""
 
     def predict(self, images):
         return super().predict(2 * images - images.detach())
 
 
-class Painter(Small):
+class InputWriter(CellDetector):
     def predict(self, images):
         images.data[:, :, 0, 0] = 0
         return super().predict(images)
 
 
-class Outside(Small):
+class BoxesOutside(CellDetector):
     def decode(self, raw):
         return [Detections(d.boxes_xyxy + 5, d.labels, d.scores) for d in super().decode(raw)]
 
 
-class WorstFirst(Small):
+class WorstFirst(CellDetector):
     def decode(self, raw):
         return [Detections(d.boxes_xyxy.flip(0), d.labels.flip(0), d.scores.flip(0)) for d in super().decode(raw)]
 
 
-class OtherLabels(Small):
+class OtherLabels(CellDetector):
     def decode(self, raw):
         return [Detections(d.boxes_xyxy, d.labels + 1, d.scores) for d in super().decode(raw)]
 
 
-class Moving(Small):
-    """Another answer each time."""
+class ChangingDetector(CellDetector):
+    """Other detections in each call."""
 
     calls = 0
 
@@ -79,40 +79,40 @@ class Moving(Small):
         return super().predict(images * (1 + 0.1 * self.calls))
 
 
-class Silent(Small):
+class SilentDetector(CellDetector):
     def decode(self, raw):
         return [Detections(d.boxes_xyxy[:0], d.labels[:0], d.scores[:0]) for d in super().decode(raw)]
 
 
-class Unnamed(Small):
+class MissingTerm(CellDetector):
     def loss(self, raw, targets):
         return {"total": super().loss(raw, targets)["total"]}
 
 
-class Boundless(Small):
-    """A loss that is no finite number."""
+class InfiniteLoss(CellDetector):
+    """A loss that is not finite."""
 
     def loss(self, raw, targets):
         return {name: term / 0 for name, term in super().loss(raw, targets).items()}
 
 
-class Elsewhere(Small):
+class OtherCandidates(CellDetector):
     """Candidates with other scores than the detections'."""
 
     def candidates(self, raw):
-        told = super().candidates(raw)
-        return Candidates(told.boxes_xyxy, told.log_scores - 1)
+        candidates = super().candidates(raw)
+        return Candidates(candidates.boxes_xyxy, candidates.log_scores - 1)
 
 
-class Mixing(Small):
-    """What one image shows changes what is said of the other."""
+class BatchMixing(CellDetector):
+    """One image affects the detections in the other."""
 
     def predict(self, images):
         return super().predict(images + images.mean(0, keepdim=True))
 
 
-class Training(Small):
-    """Dropout that does not ask whether anything can be trained."""
+class UnfrozenDropout(CellDetector):
+    """Dropout that ignores frozen weights."""
 
     def train(self, mode=True):
         self.shaken = mode
@@ -122,42 +122,42 @@ class Training(Small):
         return super().predict(images * 2 if getattr(self, "shaken", False) else images)
 
 
-def test_a_small_detector_keeps_its_contract() -> None:
-    report = check_detector(Small(), IMAGE_HW)
+def test_conforming_detector_passes() -> None:
+    report = check_detector(CellDetector(), IMAGE_HW)
     assert report.require() is report
     assert {finding.verdict for finding in report.findings} == {"ok"}
     assert report.gradients
 
 
 @pytest.mark.parametrize(
-    ("broken", "promise", "said"),
+    ("broken", "check", "detail"),
     [
-        (Detached, "gradient to the image", "found zero everywhere"),
-        (Doubled, "gradient to the image", "against differences in float64"),
-        (Painter, "image untouched", "expected unchanged images"),
-        (Outside, "detections", "expected inside 0..95 x 0..63"),
+        (DetachedDetector, "gradient to the image", "found zero everywhere"),
+        (DoubledGradient, "gradient to the image", "against differences in float64"),
+        (InputWriter, "image untouched", "expected unchanged images"),
+        (BoxesOutside, "detections", "expected inside 0..95 x 0..63"),
         (WorstFirst, "detections", "expected best first"),
         (OtherLabels, "detections", "labels: expected 0..1, found 1 to 2"),
-        (Moving, "deterministic", "expected identical detections"),
-        (Silent, "planted prediction", "expected only the injected box, found 0"),
-        (Unnamed, "loss terms", "expected total and objectness, found total"),
-        (Boundless, "loss terms", "expected a finite number"),
-        (Elsewhere, "candidates", "expected every detection among them"),
-        (Mixing, "batch as singles", "of the detections differ"),
-        (Training, "frozen", "differ after train()"),
+        (ChangingDetector, "deterministic", "expected identical detections"),
+        (SilentDetector, "planted prediction", "expected only the injected box, found 0"),
+        (MissingTerm, "loss terms", "expected total and objectness, found total"),
+        (InfiniteLoss, "loss terms", "expected a finite number"),
+        (OtherCandidates, "candidates", "expected every detection among them"),
+        (BatchMixing, "batch as singles", "of the detections differ"),
+        (UnfrozenDropout, "frozen", "differ after train()"),
     ],
 )
-def test_what_is_broken_is_named(broken: type[Small], promise: str, said: str) -> None:
+def test_violation_is_named(broken: type[CellDetector], check: str, detail: str) -> None:
     report = check_detector(broken(), IMAGE_HW)
     found = {finding.name: finding for finding in report.failed}
-    assert promise in found, report
-    assert said in found[promise].detail
-    with pytest.raises(DetectorError, match=f"'small' violates the contract: .*{promise}"):
+    assert check in found, report
+    assert detail in found[check].detail
+    with pytest.raises(DetectorError, match=f"'small' violates the contract: .*{check}"):
         report.require()
 
 
-def test_a_detector_without_gradients_is_tried_on_what_it_promises() -> None:
-    class Told:
+def test_predictor_without_gradients() -> None:
+    class PlainPredictor:
         name, classes = "told", ("Car",)
 
         def forward(self, images):
@@ -167,25 +167,25 @@ def test_a_detector_without_gradients_is_tried_on_what_it_promises() -> None:
             box = torch.tensor([[1.0, 2, 30, 40]])
             return [Detections(box, torch.tensor([0]), torch.tensor([0.5])) for _ in raw]
 
-    report = check_detector(Told(), IMAGE_HW)
+    report = check_detector(PlainPredictor(), IMAGE_HW)
     assert not report.failed
     assert not report.gradients
     tried = {finding.name for finding in report.findings if finding.verdict == "ok"}
     assert tried == {"name, classes, t*", "detections", "image untouched", "deterministic", "batch as singles"}
 
 
-def test_raw_predictions_of_ones_own_need_a_hook() -> None:
-    class Own(Small):
+def test_custom_predictions_need_a_plant_function() -> None:
+    class CustomPredictions(CellDetector):
         def predict(self, images):
-            said = super().predict(images)
-            return _Plain(said.boxes_xyxy, said.probabilities, said.image_hw)
+            detail = super().predict(images)
+            return _Plain(detail.boxes_xyxy, detail.probabilities, detail.image_hw)
 
     class _Plain(DensePredictions):
-        planted = None
+        inject = None
 
         def select(self, index):
-            said = super().select(index)
-            return _Plain(said.boxes_xyxy, said.probabilities, said.image_hw)
+            detail = super().select(index)
+            return _Plain(detail.boxes_xyxy, detail.probabilities, detail.image_hw)
 
     def plant(raw, box, label):
         return DensePredictions(raw.boxes_xyxy, raw.probabilities, raw.image_hw).inject(box, label)
@@ -193,13 +193,13 @@ def test_raw_predictions_of_ones_own_need_a_hook() -> None:
     def verdict(report):
         return next(f.verdict for f in report.findings if f.name == "planted prediction")
 
-    assert verdict(check_detector(Own(), IMAGE_HW, plant=plant)) == "ok"
-    assert verdict(check_detector(Own(), IMAGE_HW, plant=lambda raw, box, label: plant(raw, box + 9, label))) == (
-        "failed"
-    )
+    assert verdict(check_detector(CustomPredictions(), IMAGE_HW, plant=plant)) == "ok"
+    assert verdict(
+        check_detector(CustomPredictions(), IMAGE_HW, plant=lambda raw, box, label: plant(raw, box + 9, label))
+    ) == ("failed")
 
 
-def test_squeezedet_keeps_the_contract() -> None:
+def test_squeezedet_fulfils_the_contract() -> None:
     detector = SqueezeDet()
     detector.initialise(torch.Generator().manual_seed(0))
     check_detector(detector, (64, 128)).require()
@@ -217,7 +217,7 @@ def test_frozen_weights_stay_in_eval_mode() -> None:
     assert detector.train().dropout.training
 
 
-def test_a_planted_prediction_of_squeezedet_is_found() -> None:
+def test_squeezedet_decodes_an_injected_prediction() -> None:
     detector = SqueezeDet()
     raw = detector(torch.full((1, 3, 64, 128), 0.5))
     box = torch.tensor([20.0, 10, 90, 50])

@@ -1,4 +1,4 @@
-"""Several detectors as one: what each says, on one scale."""
+"""Ensembles: members' losses, candidates and detections on one scale."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_loss_is_the_mean_of_the_members(both: Ensemble, images: torch.Tensor)
     assert bool(images.grad.any())
 
 
-def test_a_members_threshold_is_the_ensembles(tmp_path: Path) -> None:
+def test_member_thresholds_map_to_the_ensembles(tmp_path: Path) -> None:
     """The same detector twice, with other thresholds: a score at t* of either is T_STAR of the ensemble."""
     paths = []
     for t_star in (0.2, 0.7):
@@ -73,7 +73,7 @@ def test_a_members_threshold_is_the_ensembles(tmp_path: Path) -> None:
     assert len(found) == len(own.decode(own(image))[0])
 
 
-def test_what_is_no_ensemble_is_told() -> None:
+def test_invalid_ensembles() -> None:
     for spec in ("ensemble:squeezedet", "ensemble:", "ensemble:squeezedet+"):
         with pytest.raises(DetectorError, match=r"expected ensemble:A\+B, at least two detectors"):
             load_detector(spec)
@@ -87,11 +87,11 @@ def test_what_is_no_ensemble_is_told() -> None:
 
 
 @pytest.mark.parametrize("t_star", [0.0, 1.0])
-def test_a_threshold_that_no_shift_moves_is_refused(t_star: float) -> None:
+def test_thresholds_of_0_and_1_are_refused(t_star: float) -> None:
     with pytest.raises(DetectorError, match=rf"squeezedet: expected a t\* above 0 and below 1, found {t_star:g}"):
         Ensemble([SqueezeDet(), SqueezeDet(t_star=t_star)])
 
 
-def test_code_of_a_member_is_told() -> None:
+def test_code_of_a_member_is_found() -> None:
     assert find_code_to_run(SPEC) is None
     assert find_code_to_run("ensemble:squeezedet+module:own.py") == find_code_to_run("module:own.py") == "own.py"

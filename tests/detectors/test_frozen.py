@@ -94,12 +94,12 @@ def test_single_precision_differs_by_rounding_only() -> None:
 def test_without_gradient_the_numbers_are_the_same() -> None:
     detector, images = shipped(torch.float32), smooth(1, 64, 80, torch.float32)
     with torch.no_grad():
-        judged = detector(images)
-    assert not judged.confidence_logits.requires_grad
+        without_gradient = detector(images)
+    assert not without_gradient.confidence_logits.requires_grad
     differentiable = detector(images.requires_grad_(True))
     assert differentiable.confidence_logits.requires_grad
     for field in FIELDS:
-        assert torch.equal(getattr(judged, field), getattr(differentiable, field))
+        assert torch.equal(getattr(without_gradient, field), getattr(differentiable, field))
 
 
 def test_a_detector_that_has_run_can_be_copied_and_pickled() -> None:
@@ -111,7 +111,7 @@ def test_a_detector_that_has_run_can_be_copied_and_pickled() -> None:
 
 
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 16, 16), (3, 40, 250), (2, 210, 33)])
-def test_onednns_order_of_the_weights_changes_no_number_but_by_rounding(
+def test_onednn_layouts_change_results_only_by_rounding(
     batch: int, height: int, width: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images = smooth(batch, height, width, torch.float32)
@@ -127,7 +127,7 @@ def test_onednns_order_of_the_weights_changes_no_number_but_by_rounding(
     assert difference(slope, plain) < 1e-4
 
 
-def test_weights_that_changed_are_seen() -> None:
+def test_changed_weights_take_effect() -> None:
     detector, images = shipped(), smooth(1, 48, 48)
     with torch.no_grad():
         before = detector(images).confidence_logits
@@ -153,7 +153,7 @@ def test_a_frozen_detector_prepares_no_gradient_of_a_weight() -> None:
     assert all(p.grad is None for p in detector.parameters())
 
 
-def test_bfloat16_is_for_gradients_and_glances_only() -> None:
+def test_bfloat16_applies_only_to_gradients_and_searches() -> None:
     coarse = load_detector("squeezedet", gradient_precision=torch.bfloat16)
     assert isinstance(coarse, SqueezeDet)
     exact, images = shipped(torch.float32), smooth(1, 120, 200, torch.float32)
@@ -162,9 +162,9 @@ def test_bfloat16_is_for_gradients_and_glances_only() -> None:
         assert torch.equal(exact.forward_for_search(images).confidence_logits, exact(images).confidence_logits)
     raw, slope = gradient(coarse, images)
     expected_raw, expected = gradient(exact, images)
-    glance = coarse.forward_for_search(images)
-    assert not glance.confidence_logits.requires_grad
-    assert torch.equal(glance.confidence_logits, raw.confidence_logits)
+    search_predictions = coarse.forward_for_search(images)
+    assert not search_predictions.confidence_logits.requires_grad
+    assert torch.equal(search_predictions.confidence_logits, raw.confidence_logits)
     assert raw.boxes_xyxy.dtype == slope.dtype == torch.float32
     assert 0 < difference(raw.confidence_logits, expected_raw.confidence_logits) < 0.02
     assert float(F.cosine_similarity(slope.flatten(), expected.flatten(), dim=0)) > 0.9

@@ -1,4 +1,4 @@
-"""Planted faults: what they measure, what they lower and what they leave alone, and their gradients."""
+"""Planted faults: features, suppression, and gradients."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from detectors.types import Detections
 HW = (64, 96)
 
 
-class Cells(DenseDetector):
+class MovingBoxes(DenseDetector):
     """Boxes of several heights in cells of 16 px that move a little with what the cell shows."""
 
     def __init__(self) -> None:
@@ -48,10 +48,10 @@ class Cells(DenseDetector):
         rows, columns = cells.shape[2:]
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
         corner = torch.stack((x, y), -1).view(1, -1, 2).to(cells) * 16
-        said = cells.flatten(2).transpose(1, 2)
-        grown = 10 + corner[..., :1] / 8 + said[..., :1]
+        logits = cells.flatten(2).transpose(1, 2)
+        grown = 10 + corner[..., :1] / 8 + logits[..., :1]
         boxes = torch.cat((corner - grown, corner + grown), -1)[:, :, None]
-        return DensePredictions(boxes, said.sigmoid(), (int(high), int(wide)))
+        return DensePredictions(boxes, logits.sigmoid(), (int(high), int(wide)))
 
 
 def picture(seed: int = 0, dtype: torch.dtype = torch.float32) -> torch.Tensor:
@@ -75,12 +75,12 @@ def squeezedet() -> SqueezeDet:
         "across=0.1:0.30000000000000004,contrast=0.01:0.02",
     ],
 )
-def test_words_give_settings_and_settings_words(text: str) -> None:
+def test_text_round_trip(text: str) -> None:
     assert PlantedFault.parse(text).text == text
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "expected features among height_px, aspect, across, lightness, contrast, found ''"),
         ("weight=1:2", "found 'weight'"),
@@ -95,10 +95,10 @@ def test_words_give_settings_and_settings_words(text: str) -> None:
         ("aspect=1:2,softness=0", "softness: expected a positive number, found 0"),
     ],
 )
-def test_bad_words_are_one_line(text: str, said: str) -> None:
+def test_invalid_faults_are_one_line_errors(text: str, message: str) -> None:
     with pytest.raises(DetectorError) as caught:
         PlantedFault.parse(text)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -155,14 +155,14 @@ def test_outside_nothing_is_lowered_and_inside_by_the_depth(low: float, width: f
     assert not fault.contains(outside).any()
 
 
-def test_a_pair_asks_for_both() -> None:
+def test_two_bands_must_both_match() -> None:
     fault = PlantedFault.parse("aspect=1:2,lightness=0.2:0.4")
     values = torch.tensor([[1.5, 1.5, 3.5], [0.3, 0.9, 0.3]])
     assert fault.membership(values).tolist() == pytest.approx([0.823, 0, 0], abs=2e-3)
     assert fault.contains(values).tolist() == [True, False, False]
 
 
-class Fixed(DenseDetector):
+class FixedDetector(DenseDetector):
     """Two cars, each told of twice, and a bus on one of them; nothing of it is in the picture."""
 
     boxes = torch.tensor([[5.0, 5, 25, 25], [5, 5, 27, 30], [50, 5, 80, 45], [50, 7, 80, 45], [50, 5, 80, 45]])
@@ -177,20 +177,20 @@ class Fixed(DenseDetector):
 
 
 def test_predictions_that_lie_on_each_other_are_one_car() -> None:
-    cars = group_cars(Fixed.boxes, torch.tensor([0.9, 0.6, 0.8, 0.7, 0.01]))
+    cars = group_cars(FixedDetector.boxes, torch.tensor([0.9, 0.6, 0.8, 0.7, 0.01]))
     assert cars.rows.tolist() == [0, 1, 2, 3]
     assert cars.car.tolist() == [0, 0, 1, 1]
     mean = (0.81 * 25 + 0.36 * 30) / (0.81 + 0.36)
     torch.testing.assert_close(cars.boxes_xyxy[0, 3], torch.tensor(mean))
-    nothing = group_cars(Fixed.boxes, torch.zeros(5))
+    nothing = group_cars(FixedDetector.boxes, torch.zeros(5))
     assert (len(nothing.rows), tuple(nothing.boxes_xyxy.shape)) == (0, (0, 4))
     point = group_cars(torch.tensor([[3.0, 3, 3, 3]]), torch.tensor([0.5]))
     assert point.boxes_xyxy.tolist() == [[3, 3, 3, 3]]
 
 
-def test_all_that_is_said_of_a_car_in_the_band_is_lowered_and_nothing_else() -> None:
+def test_only_predictions_of_cars_in_the_band_are_lowered() -> None:
     """The first car's mean box is 21.5 px high, its second prediction's own is 25."""
-    inner = Fixed()
+    inner = FixedDetector()
     before = inner(picture())
     after = plant_fault(inner, PlantedFault.parse("height_px=18:23,softness=0.02")).forward(picture())
     fallen = before.probabilities[0, :, 0].logit() - after.probabilities[0, :, 0].logit()
@@ -202,13 +202,13 @@ def test_all_that_is_said_of_a_car_in_the_band_is_lowered_and_nothing_else() -> 
 
 
 def test_a_bus_stays_in_a_car_s_band() -> None:
-    inner = Fixed()
+    inner = FixedDetector()
     after = plant_fault(inner, PlantedFault.parse("height_px=30:50,softness=0.02")).forward(picture())
     assert after.probabilities[0, :, 0].tolist() == pytest.approx([0.9, 0.6, 0.0013, 0.0008, 0], abs=1e-4)
     assert after.probabilities[0, 4, 1] == inner(picture()).probabilities[0, 4, 1]
 
 
-def test_of_anchors_only_those_that_say_car_are_lowered() -> None:
+def test_only_anchors_that_predict_cars_are_lowered() -> None:
     inner = squeezedet()
     before = inner(picture())
     after = plant_fault(inner, PlantedFault.parse("height_px=10:100,softness=0.02")).forward(picture())
@@ -222,16 +222,16 @@ def test_of_anchors_only_those_that_say_car_are_lowered() -> None:
     assert float(torch.minimum(within, (within - DEPTH).abs()).abs().quantile(0.9)) < 0.1
     assert float(within.max()) == pytest.approx(DEPTH, abs=0.1)
     assert not fallen[~(counts & car)].any()
-    told = plant_fault(inner, PlantedFault.parse("aspect=1:2")).candidates(after)  # type: ignore[attr-defined]
-    assert torch.equal(told.log_scores, inner.candidates(after).log_scores)
+    candidates_after = plant_fault(inner, PlantedFault.parse("aspect=1:2")).candidates(after)  # type: ignore[attr-defined]
+    assert torch.equal(candidates_after.log_scores, inner.candidates(after).log_scores)
 
 
-@pytest.mark.parametrize("inner", [Cells, squeezedet])
+@pytest.mark.parametrize("inner", [MovingBoxes, squeezedet])
 @pytest.mark.parametrize(
-    "words", ["height_px=20:36,softness=0.3", "lightness=0.4:0.55,aspect=0.7:1.6,softness=0.3"]
+    "text", ["height_px=20:36,softness=0.3", "lightness=0.4:0.55,aspect=0.7:1.6,softness=0.3"]
 )
-def test_the_contract_is_kept(inner: type[Detector], words: str) -> None:
-    detector = plant_fault(inner(), PlantedFault.parse(words))
+def test_faulty_detector_fulfils_the_contract(inner: type[Detector], text: str) -> None:
+    detector = plant_fault(inner(), PlantedFault.parse(text))
     report = check_detector(detector, HW).require()
     assert report.gradients
     tried = {finding.name for finding in report.findings if finding.verdict == "ok"}
@@ -239,10 +239,10 @@ def test_the_contract_is_kept(inner: type[Detector], words: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["lightness=0.47:0.53", "contrast=0.2:0.25", "height_px=23:31,lightness=0.45:0.52"]
+    "text", ["lightness=0.47:0.53", "contrast=0.2:0.25", "height_px=23:31,lightness=0.45:0.52"]
 )
-def test_the_gradient_is_that_of_differences(words: str) -> None:
-    detector = PlantedDetector(Cells().double(), PlantedFault.parse(words)).requires_grad_(False)
+def test_the_gradient_is_that_of_differences(text: str) -> None:
+    detector = PlantedDetector(MovingBoxes().double(), PlantedFault.parse(text)).requires_grad_(False)
     image = picture(2, torch.float64)
     live = image.clone().requires_grad_()
 
@@ -258,7 +258,7 @@ def test_the_gradient_is_that_of_differences(words: str) -> None:
     assert float((gradient - without).norm()) > 0.01 * float(without.norm())
 
 
-class Plain:
+class PlainCarPredictor:
     """A detector without gradients: one car, one bus."""
 
     name = "plain"
@@ -272,8 +272,8 @@ class Plain:
         return [Detections(boxes, torch.tensor([1, 0]), torch.tensor([0.9, 0.6])) for _ in raw]
 
 
-def test_a_detector_without_gradients_can_have_a_fault_too() -> None:
-    detector = plant_fault(Plain(), PlantedFault.parse("height_px=20:40"))
+def test_predictor_without_gradients_can_have_a_fault() -> None:
+    detector = plant_fault(PlainCarPredictor(), PlantedFault.parse("height_px=20:40"))
     assert isinstance(detector, PlantedPredictor)
     (found,) = predict(detector, picture())
     assert found.labels.tolist() == [0, 1]
@@ -288,18 +288,18 @@ def test_names_of_detectors_with_faults() -> None:
     assert isinstance(detector, PlantedDetector)
     assert (detector.name, detector.inner.name, detector.training) == (name, "yolov3-slim", False)
     assert isinstance(load_predictor("planted:aspect=1:2"), PlantedDetector)
-    for wrong, said in (("aspect=2:1", "aspect: expected LOW:HIGH"), ("aspect=1:2@no", "found 'no'")):
-        with pytest.raises(DetectorError, match=said):
+    for wrong, message in (("aspect=2:1", "aspect: expected LOW:HIGH"), ("aspect=1:2@no", "found 'no'")):
+        with pytest.raises(DetectorError, match=message):
             load_predictor(f"planted:{wrong}")
 
 
-def test_what_cannot_have_a_fault() -> None:
-    class Blind(Cells):
+def test_detectors_that_cannot_have_a_fault() -> None:
+    class Blind(MovingBoxes):
         def __init__(self) -> None:
             super().__init__()
             self.classes = ("dog", "bus")
 
-    class Own(Cells):
+    class Own(MovingBoxes):
         def forward(self, images: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
             return images
 

@@ -41,7 +41,7 @@ def test_an_anchor_goes_to_the_object_it_overlaps_more_but_for_one_that_is_anoth
     assert dict(zip(swapped.anchor.tolist(), swapped.object.tolist(), strict=True)) == {1: 0, 0: 1}
 
 
-def test_an_anchor_whose_box_meets_an_object_answers_though_it_lies_elsewhere() -> None:
+def test_distant_anchor_with_a_matching_box_is_responsible() -> None:
     boxes_xyxy = ANCHORS.clone()
     boxes_xyxy[3] = torch.tensor([0.0, 0, 16, 12])
     found = quality.choose_responsible_anchors(boxes_xyxy, ANCHORS, ANCHORS[:1], torch.tensor([0]))
@@ -112,7 +112,7 @@ def test_a_confident_loose_box_is_pulled_down_and_a_shy_tight_one_up() -> None:
     assert logits.grad[0, 0] > 0 > logits.grad[0, 1]
 
 
-def test_squeezedet_learns_by_it_where_asked() -> None:
+def test_squeezedet_trains_with_it_if_selected() -> None:
     detector = SqueezeDet().eval()
     detector.initialise(torch.Generator().manual_seed(1))
     image = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(2))

@@ -48,7 +48,7 @@ def anchor_at(row: int, column: int, shape: int, columns: int) -> int:
     return (row * columns + column) * 9 + shape
 
 
-def raw_of(parts: dict[str, Tensor], height: int, width: int) -> AnchorPredictions:
+def make_raw(parts: dict[str, Tensor], height: int, width: int) -> AnchorPredictions:
     return AnchorPredictions(**parts, image_hw=(height, width))
 
 
@@ -223,7 +223,7 @@ def test_confidence_term_by_hand() -> None:
     parts["confidence_logits"][0, at] = 0.0  # 0.5
     other = anchor_at(0, 0, 0, 10)
     parts["confidence_logits"][0, other] = math.log(0.2 / 0.8)
-    raw = raw_of(parts, 64, 160)
+    raw = make_raw(parts, 64, 160)
     terms = fresh().loss(raw, [targets([truth.tolist()], [0])])
     silent_anchors = 9 * 4 * 10 - 1
     expected = 75 * (0.5 - 0.6) ** 2 / 1 + 100 * 0.2**2 / silent_anchors
@@ -238,7 +238,7 @@ def test_confidence_term_of_a_batch_by_hand() -> None:
     parts["confidence_logits"][1, at] = 40.0  # 1.0
     parts["confidence_logits"][3, other] = math.log(0.2 / 0.8)
     wanted = [targets([truth], [0]), targets([truth], [0]), targets([], []), targets([], [])]
-    terms = fresh().loss(raw_of(parts, 64, 160), wanted)
+    terms = fresh().loss(make_raw(parts, 64, 160), wanted)
     # Two objects in the batch, 360 anchors an image, four images.
     expected = (75 * (0.5 - 1.0) ** 2 / 2 + 100 * 0.2**2 / (360 - 2)) / 4
     assert terms["confidence"].item() == pytest.approx(expected, rel=1e-4)
@@ -256,7 +256,7 @@ def test_objectness_by_hand() -> None:
     second = anchor_at(2, 5, 0, 10)
     parts["boxes_xyxy"][0, second] = torch.tensor(truth)
     parts["confidence_logits"][0, second] = math.log(0.7 / 0.3)
-    terms = fresh().loss(raw_of(parts, 64, 160), [targets([truth], [0])])
+    terms = fresh().loss(make_raw(parts, 64, 160), [targets([truth], [0])])
     unseen, missed = 75 * (1 - 0.7) ** 2, 75 * (0.6 - 0.4) ** 2
     assert terms["objectness"].item() == pytest.approx(unseen + 100 * 0.2**2 / (360 - 1), rel=1e-4)
     assert terms["confidence"].item() == pytest.approx(missed + 100 * (0.2**2 + 0.7**2) / (360 - 1), rel=1e-4)
@@ -269,7 +269,7 @@ def test_objectness_of_a_batch_by_hand() -> None:
     parts["confidence_logits"][0, at] = math.log(0.4 / 0.6)
     parts["confidence_logits"][1, other] = math.log(0.2 / 0.8)
     wanted = [targets([truth], [0]), targets([truth], [0])]  # the second is not seen at all
-    terms = fresh().loss(raw_of(parts, 64, 160), wanted)
+    terms = fresh().loss(make_raw(parts, 64, 160), wanted)
     expected = (75 * ((1 - 0.4) ** 2 + 1) / 2 + 100 * 0.2**2 / (360 - 2)) / 2
     assert terms["objectness"].item() == pytest.approx(expected, rel=1e-4)
 
@@ -282,7 +282,7 @@ def test_a_box_meets_an_object_from_half_an_overlap_on(shift: float, meets: bool
     truth = parts["boxes_xyxy"][0, at].tolist()
     parts["boxes_xyxy"][0, at] += torch.tensor([shift, 0, shift, 0])
     parts["confidence_logits"][0, at] = math.log(0.4 / 0.6)
-    terms = fresh().loss(raw_of(parts, 64, 160), [targets([truth], [0])])
+    terms = fresh().loss(make_raw(parts, 64, 160), [targets([truth], [0])])
     assert terms["objectness"].item() == pytest.approx(75 * (0.6**2 if meets else 1.0), rel=1e-4)
 
 
@@ -292,7 +292,7 @@ def test_an_ignored_region_excuses_what_it_covers_by_half(covered: float, excuse
     at = anchor_at(2, 5, 0, 10)  # 36 x 37
     left, top, _, bottom = parts["boxes_xyxy"][0, at].tolist()
     region = [left, top, left + 36 * covered, bottom]
-    assigned = fresh().assign(raw_of(parts, 64, 160), [targets([region], [0], [True])])
+    assigned = fresh().assign(make_raw(parts, 64, 160), [targets([region], [0], [True])])
     assert bool(assigned.negative[0, at]) is not excused
 
 
@@ -309,7 +309,7 @@ def test_box_and_class_terms_by_hand() -> None:
     scale = torch.log(torch.tensor([144.0, 43.0]) / size)
     parts["deltas"][0, at] = torch.tensor([0.3, 0.0, -0.2, 0.1])
     parts["class_logits"][0, at] = torch.tensor([1.0, 2.0, 3.0])
-    terms = fresh().loss(raw_of(parts, 64, 160), [targets([truth], [2])])
+    terms = fresh().loss(make_raw(parts, 64, 160), [targets([truth], [2])])
     wanted = torch.cat((shift, scale))
     box = 5 * float((torch.tensor([0.3, 0.0, -0.2, 0.1]) - wanted).square().sum())
     cross_entropy = math.log(math.exp(1) + math.exp(2) + math.exp(3)) - 3
@@ -324,7 +324,7 @@ def test_terms_are_means_over_all_objects_of_the_batch() -> None:
     boxes_xyxy = parts["boxes_xyxy"][0]
     parts["deltas"][0, first, 0] = 0.5
     terms = fresh().loss(
-        raw_of(parts, 64, 160),
+        make_raw(parts, 64, 160),
         [targets([boxes_xyxy[first].tolist(), boxes_xyxy[second].tolist()], [0, 0]), targets([], [])],
     )
     assert terms["box"].item() == pytest.approx(5 * 0.5**2 / 2)
@@ -334,7 +334,7 @@ def test_terms_are_means_over_all_objects_of_the_batch() -> None:
 def test_target_of_the_box_is_what_decoding_hits() -> None:
     parts = silent(1, 64, 160)
     truth = torch.tensor([10.0, 5.0, 150.0, 60.0])
-    raw = raw_of(parts, 64, 160)
+    raw = make_raw(parts, 64, 160)
     detector = fresh()
     wanted = detector.assign(raw, [targets([truth.tolist()], [1])])
     torch.nn.init.zeros_(detector.convdet.weight)
@@ -351,7 +351,7 @@ def test_each_object_has_an_anchor_of_its_own() -> None:
     parts = silent(1, 64, 160)
     box = parts["boxes_xyxy"][0, anchor_at(2, 5, 8, 10)].tolist()
     outside = [4000.0, 4000.0, 4010.0, 4010.0]  # overlaps nothing: the nearest anchor
-    assigned = fresh().assign(raw_of(parts, 64, 160), [targets([box, box, outside, outside], [0, 0, 0, 0])])
+    assigned = fresh().assign(make_raw(parts, 64, 160), [targets([box, box, outside, outside], [0, 0, 0, 0])])
     assert len(set(assigned.anchor.tolist())) == 4
     overlap = boxes.iou_matrix(torch.tensor([box]), parts["boxes_xyxy"][0])[0]
     assert overlap[assigned.anchor[:2]].tolist() == pytest.approx(overlap.topk(2).values.tolist())
@@ -364,7 +364,7 @@ def test_ignored_objects_have_no_positive_and_silence_no_anchor() -> None:
     at = anchor_at(2, 5, 8, 10)
     box = parts["boxes_xyxy"][0, at].tolist()
     parts["confidence_logits"][0, at] = 3.0
-    raw = raw_of(parts, 64, 160)
+    raw = make_raw(parts, 64, 160)
     detector = fresh()
     punished = detector.loss(raw, [targets([], [])])["confidence"].item()
     excused = detector.loss(raw, [targets([box], [0], [True])])
@@ -384,12 +384,12 @@ def test_ignored_object_excuses_the_box_predicted_over_it() -> None:
     at = anchor_at(2, 5, 0, 10)  # 36 x 37: too large for the small box below
     small = torch.tensor([80.0, 34.0, 92.0, 44.0])
     parts["boxes_xyxy"][0, at] = small
-    assigned = fresh().assign(raw_of(parts, 64, 160), [targets([small.tolist()], [0], [True])])
+    assigned = fresh().assign(make_raw(parts, 64, 160), [targets([small.tolist()], [0], [True])])
     assert not bool(assigned.negative[0, at])
 
 
 def test_targets_that_do_not_fit_are_refused() -> None:
-    detector, raw = fresh(), raw_of(silent(2, 32, 32), 32, 32)
+    detector, raw = fresh(), make_raw(silent(2, 32, 32), 32, 32)
     with pytest.raises(ValueError, match=r"targets: expected 2, one for each image, found 1"):
         detector.loss(raw, [targets([], [])])
     with pytest.raises(ValueError, match=r"targets\.labels: expected 0\.\.2, found \[3\]"):
@@ -413,7 +413,7 @@ def test_decode_planted_predictions() -> None:
     parts["boxes_xyxy"][1, other] = parts["boxes_xyxy"][1, left]
     parts["confidence_logits"][1, other], parts["class_logits"][1, other] = 0.0, torch.tensor([0.0, 0.0, 9.0])
     parts["confidence_logits"][1, weak] = math.log(0.014 / 0.986)  # times 1/3
-    nothing, found = fresh().decode(raw_of(parts, 64, 160))
+    nothing, found = fresh().decode(make_raw(parts, 64, 160))
     assert len(nothing) == 0
     share = math.exp(4) / (math.exp(4) + 2)
     assert found.labels.tolist() == [0, 1, 2]
@@ -424,15 +424,15 @@ def test_decode_planted_predictions() -> None:
     assert found.boxes_xyxy[1, 2] == 159
 
 
-@pytest.mark.parametrize(("shift", "kept"), [(33.4, 1), (36.4, 2)])
-def test_decode_suppresses_from_an_overlap_of_a_third_on(shift: float, kept: int) -> None:
+@pytest.mark.parametrize(("shift", "count"), [(33.4, 1), (36.4, 2)])
+def test_decode_suppresses_from_an_overlap_of_a_third_on(shift: float, count: int) -> None:
     # 72 px wide boxes: IoU 38.6 / 105.4 = 0.37 and 35.6 / 108.4 = 0.33
     parts = silent(1, 64, 160)
     for at, left, confidence in ((40, 10.0, 0.9), (80, 10.0 + shift, 0.8)):
         parts["boxes_xyxy"][0, at] = torch.tensor([left, 10.0, left + 72, 50.0])
         parts["confidence_logits"][0, at] = math.log(confidence / (1 - confidence))
-    (found,) = fresh().decode(raw_of(parts, 64, 160))
-    assert len(found) == kept
+    (found,) = fresh().decode(make_raw(parts, 64, 160))
+    assert len(found) == count
 
 
 def test_decode_keeps_scores_from_a_two_hundredth_on() -> None:
@@ -440,7 +440,7 @@ def test_decode_keeps_scores_from_a_two_hundredth_on() -> None:
     for at, confidence in ((40, 0.0052), (2000 // 9, 0.0048)):
         parts["confidence_logits"][0, at] = math.log(confidence / (1 - confidence))
         parts["class_logits"][0, at, 1] = 20.0
-    (found,) = fresh().decode(raw_of(parts, 64, 160))
+    (found,) = fresh().decode(make_raw(parts, 64, 160))
     assert found.scores.tolist() == pytest.approx([0.0052], rel=1e-3)
 
 
@@ -450,7 +450,7 @@ def test_decode_returns_at_most_1024() -> None:
     count = torch.arange(len(parts["boxes_xyxy"][0]))
     corner = torch.stack((count % 50 * 5.0, count // 50 * 5.0), 1)  # none touches another
     parts["boxes_xyxy"][0] = torch.cat((corner, corner + 4.0), 1)
-    assert len(fresh().decode(raw_of(parts, 256, 256))[0]) == 1024
+    assert len(fresh().decode(make_raw(parts, 256, 256))[0]) == 1024
 
 
 def test_gradient_to_the_image_agrees_with_differences() -> None:

@@ -24,7 +24,7 @@ from detectors.squeezedet import SeededDropout, SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, learning_rate, make_batch, train
 from detectors.types import Targets
 
-KEPT = ("total", "objectness")
+CHECKPOINTED = ("total", "objectness")
 SMALL = TrainingSettings(
     steps=6,
     batch=2,
@@ -110,7 +110,7 @@ def test_no_checkpoint_has_steps_that_the_log_lacks(tmp_path: Path, monkeypatch:
         train(fresh(), painted(3), SMALL, tmp_path)
 
 
-class Small(SqueezeDet):
+class SmallMemorySqueezeDet(SqueezeDet):
     """On a device that holds no more than so many views at once. Its loss is a mean over views."""
 
     most = 2
@@ -121,17 +121,17 @@ class Small(SqueezeDet):
         return super().forward(images)
 
     def loss(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
-        alone = [super(Small, self).loss(raw.select(i), [target]) for i, target in enumerate(targets)]
+        alone = [
+            super(SmallMemorySqueezeDet, self).loss(raw.select(i), [target]) for i, target in enumerate(targets)
+        ]
         return {name: torch.stack([terms[name] for terms in alone]).mean() for name in alone[0]}
 
 
-def test_a_batch_for_which_there_is_no_memory_is_seen_in_parts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_batch_is_split_when_memory_runs_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = fresh().state_dict()
 
     def moved(most: int) -> torch.Tensor:
-        detector = Small(classes=("Car", "Truck"), dropout=0)
+        detector = SmallMemorySqueezeDet(classes=("Car", "Truck"), dropout=0)
         detector.load_state_dict(start)
         detector.most = most
         settings = replace(SMALL, steps=2, batch=4, optimiser="sgd", warmup_steps=0)
@@ -139,16 +139,16 @@ def test_a_batch_for_which_there_is_no_memory_is_seen_in_parts(
         return torch.cat([(end[name] - start[name]).flatten() for name in start])
 
     whole, halves, singles = (moved(most) for most in (4, 2, 1))
-    told = capsys.readouterr().err.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     line = "drivesem: a batch of 4 exceeds the device's memory: {} at once from now on"
-    assert told == [line.format(2), line.format(2), line.format(1)], "once, not at every step"
+    assert lines == [line.format(2), line.format(2), line.format(1)], "once, not at every step"
     assert (halves - whole).norm() < 1e-3 * whole.norm()
     assert (singles - whole).norm() < 1e-3 * whole.norm()
     with pytest.raises(torch.OutOfMemoryError):
         moved(0)
 
 
-class Pooled(SqueezeDet):
+class PooledSqueezeDet(SqueezeDet):
     """ConvDet on mean colours: small enough for float16, which CPUs compute very slowly."""
 
     def forward(self, images: torch.Tensor) -> AnchorPredictions:
@@ -158,7 +158,7 @@ class Pooled(SqueezeDet):
 
 def test_float16_scales_its_loss_and_resumes(tmp_path: Path) -> None:
     def pooled() -> SqueezeDet:
-        detector = Pooled(classes=("Car", "Truck"))
+        detector = PooledSqueezeDet(classes=("Car", "Truck"))
         detector.initialise(torch.Generator().manual_seed(0))
         return detector
 
@@ -195,7 +195,7 @@ def test_a_checkpoint_that_lacks_a_setting_is_refused(tmp_path: Path) -> None:
         train(fresh(), painted(3), SMALL, tmp_path)
 
 
-def test_threads_that_load_ahead_change_nothing(tmp_path: Path) -> None:
+def test_loader_threads_change_nothing(tmp_path: Path) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -206,7 +206,7 @@ def test_threads_that_load_ahead_change_nothing(tmp_path: Path) -> None:
     assert all(torch.equal(ahead[name], value) for name, value in plain.items())
 
 
-def test_a_data_set_may_choose_what_to_show() -> None:
+def test_data_set_may_draw_its_frames() -> None:
     class Choosing(list[Sample]):
         def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
             image, targets = self[index]
@@ -216,24 +216,28 @@ def test_a_data_set_may_choose_what_to_show() -> None:
         SMALL, augment=replace(SMALL.augment, brightness=0.0, contrast=0.0, gamma=0.0, channel_gain=0.0)
     )
     plain = replace(plain, augment=replace(plain.augment, noise_probability=0, jpeg_probability=0, hue_rad=0.0))
-    shown = [float(make_batch(Choosing(painted(2)), step, plain)[0].min()) * 255 for step in (3, 3, 8)]
-    assert shown[0] == shown[1]
-    assert round(shown[0]) in (30, 31)
-    assert round(shown[2]) in (80, 81)
+    drawn = [float(make_batch(Choosing(painted(2)), step, plain)[0].min()) * 255 for step in (3, 3, 8)]
+    assert drawn[0] == drawn[1]
+    assert round(drawn[0]) in (30, 31)
+    assert round(drawn[2]) in (80, 81)
 
 
 def test_the_log_has_the_detectors_own_terms(tmp_path: Path) -> None:
     class Named(SqueezeDet):
         def loss(self, raw: AnchorPredictions, targets: Sequence[Targets]) -> dict[str, torch.Tensor]:
             terms = super().loss(raw, targets)
-            return {"boxes": terms["box"], "rest": terms["total"] - terms["box"], **{k: terms[k] for k in KEPT}}
+            return {
+                "boxes": terms["box"],
+                "rest": terms["total"] - terms["box"],
+                **{k: terms[k] for k in CHECKPOINTED},
+            }
 
     train(Named(classes=("Car", "Truck")), painted(2), replace(SMALL, steps=1), tmp_path)
     (row,) = csv.DictReader((tmp_path / LOG).read_text().splitlines())
     assert list(row) == ["step", "seconds", "rate", "boxes", "rest", "total", "norm"]
 
 
-class Pulls:
+class ConstantAuxiliaryLoss:
     """A term on a picture of its own, which pulls its confidences to a value."""
 
     name = "pull"
@@ -251,8 +255,12 @@ class Pulls:
 def test_a_further_term_is_added_to_the_loss(tmp_path: Path) -> None:
     """It has a column of its own, moves the weights by its gradient, and resumes to the bit."""
     runs = {
-        name: train(fresh(), painted(3), SMALL, tmp_path / name, auxiliary_loss=beside)
-        for name, beside in (("alone", None), ("nothing", Pulls(0.0)), ("whole", Pulls(5.0)))
+        name: train(fresh(), painted(3), SMALL, tmp_path / name, auxiliary_loss=auxiliary)
+        for name, auxiliary in (
+            ("alone", None),
+            ("nothing", ConstantAuxiliaryLoss(0.0)),
+            ("whole", ConstantAuxiliaryLoss(5.0)),
+        )
     }
     weights = {name: run.state_dict()["conv1.weight"] for name, run in runs.items()}
     assert torch.equal(weights["alone"], weights["nothing"])
@@ -261,8 +269,8 @@ def test_a_further_term_is_added_to_the_loss(tmp_path: Path) -> None:
     terms = [float(rows[0][name]) for name in ("confidence", "box", "class", "pull")]
     assert float(rows[0]["total"]) == pytest.approx(sum(terms), rel=1e-4)
     assert terms[-1] > 0
-    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5, auxiliary_loss=Pulls(5.0))
-    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts", auxiliary_loss=Pulls(5.0))
+    train(fresh(), painted(3), SMALL, tmp_path / "parts", stop_after=5, auxiliary_loss=ConstantAuxiliaryLoss(5.0))
+    parts = train(fresh(), painted(3), SMALL, tmp_path / "parts", auxiliary_loss=ConstantAuxiliaryLoss(5.0))
     assert torch.equal(parts.state_dict()["conv1.weight"], weights["whole"])
 
 
@@ -274,16 +282,16 @@ def test_training_changes_weights_and_returns_eval_mode(tmp_path: Path) -> None:
     assert not torch.equal(trained.convdet.weight, before)
 
 
-def test_progress_is_told_after_each_step(tmp_path: Path) -> None:
-    told: list[tuple[int, int, float]] = []
+def test_progress_is_reported_after_each_step(tmp_path: Path) -> None:
+    lines: list[tuple[int, int, float]] = []
 
     def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
-        told.append((done, steps, row["total"]))
+        lines.append((done, steps, row["total"]))
 
     train(fresh(), painted(2), replace(SMALL, steps=4), tmp_path, stop_after=3, progress=progress)
-    assert [told_now[:2] for told_now in told] == [(1, 4), (2, 4), (3, 4)]
+    assert [reported[:2] for reported in lines] == [(1, 4), (2, 4), (3, 4)]
     log = list(csv.DictReader((tmp_path / LOG).read_text().splitlines()))
-    assert [loss for *_, loss in told] == pytest.approx([float(row["total"]) for row in log], rel=1e-5)
+    assert [loss for *_, loss in lines] == pytest.approx([float(row["total"]) for row in log], rel=1e-5)
 
 
 @pytest.mark.slow
@@ -321,18 +329,18 @@ def test_batches_cover_every_frame_once_an_epoch() -> None:
     frames = painted(6)
 
     class Counting(list[Sample]):
-        asked: tuple[int, ...] = ()
+        drawn_frames: tuple[int, ...] = ()
 
         def __getitem__(self, index: int) -> Sample:  # type: ignore[override]
-            self.asked = (*self.asked, index)
+            self.drawn_frames = (*self.drawn_frames, index)
             return frames[index]
 
     counting = Counting(frames)
     for step in range(6):
         make_batch(counting, step, SMALL)
-    assert sorted(counting.asked[:6]) == list(range(6))
-    assert sorted(counting.asked[6:]) == list(range(6))
-    assert counting.asked[:6] != counting.asked[6:]
+    assert sorted(counting.drawn_frames[:6]) == list(range(6))
+    assert sorted(counting.drawn_frames[6:]) == list(range(6))
+    assert counting.drawn_frames[:6] != counting.drawn_frames[6:]
 
 
 def test_schedule_warms_up_and_falls() -> None:
@@ -356,7 +364,7 @@ def test_published_schedules() -> None:
     )
 
 
-def test_what_cannot_be_used_is_refused(tmp_path: Path) -> None:
+def test_invalid_input_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="dataset: expected at least one frame, found 0"):
         train(fresh(), [], SMALL, tmp_path)
     with pytest.raises(ValueError, match="optimiser: expected adamw or sgd, found 'lion'"):

@@ -1,4 +1,4 @@
-"""TorchScript and torch.export files and users' classes, with gradients; and what is none of them."""
+"""TorchScript and torch.export files and user classes as differentiable detectors; invalid files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIDE = 64
 CLASSES = "[Car, bus, person]"
 
 
-class Tiny(nn.Module):
+class TinyNetwork(nn.Module):
     """YOLOv8's output for an image of 64 x 64: a box of 24 px around each cell of 8 px."""
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class Tiny(nn.Module):
         return torch.cat((self.boxes, self.head(images).flatten(2).sigmoid()), 1)
 
 
-class Choosing(nn.Module):
+class SuppressingNetwork(nn.Module):
     """Suppresses by itself: a box of 32 px around each dark cell of 16 px, in torchvision's way."""
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ def scripted(tmp_path: Path) -> Path:
         # torch deprecates the writing of TorchScript; files of it stay
         for kind in (DeprecationWarning, FutureWarning):
             warnings.simplefilter("ignore", kind)
-        torch.jit.script(Tiny().eval()).save(str(path))
+        torch.jit.script(TinyNetwork().eval()).save(str(path))
     path.with_suffix(".yaml").write_text(f"size: {SIDE}\nclasses: {CLASSES}\nt_star: 0.4\n")
     return path
 
@@ -70,40 +70,40 @@ def scripted(tmp_path: Path) -> Path:
 @pytest.fixture
 def program(tmp_path: Path) -> Path:
     path = tmp_path / "exported.pt2"
-    torch.export.save(torch.export.export(Tiny().eval(), (torch.zeros(1, 3, SIDE, SIDE),)), path)
+    torch.export.save(torch.export.export(TinyNetwork().eval(), (torch.zeros(1, 3, SIDE, SIDE),)), path)
     path.with_suffix(".yaml").write_text(f"classes: {CLASSES}\nt_star: 0.4\n")
     return path
 
 
-def test_a_torchscript_file_keeps_the_contract(scripted: Path) -> None:
+def test_torchscript_file_fulfils_the_contract(scripted: Path) -> None:
     detector = load_detector(f"torchscript:{scripted}")
     assert (detector.name, detector.classes, detector.t_star) == ("tiny", ("Car", "bus", "person"), 0.4)
     assert check_detector(detector, (64, 96)).require().gradients
 
 
-def test_a_program_of_torch_export_keeps_the_contract(program: Path) -> None:
+def test_exported_program_fulfils_the_contract(program: Path) -> None:
     detector = load_detector(f"export:{program}")
     assert detector.classes == ("Car", "bus", "person")
     assert check_detector(detector, (64, 96)).require().gradients
 
 
-def test_both_say_what_the_network_says(scripted: Path, program: Path) -> None:
+def test_predictions_are_the_networks(scripted: Path, program: Path) -> None:
     image = torch.rand(1, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
-    raw = Tiny()(image)
+    raw = TinyNetwork()(image)
     for name in (f"torchscript:{scripted}", f"export:{program}"):
-        said = load_detector(name)(image)
-        torch.testing.assert_close(said.probabilities, raw[:, 4:].transpose(1, 2))
+        raw_detections = load_detector(name)(image)
+        torch.testing.assert_close(raw_detections.probabilities, raw[:, 4:].transpose(1, 2))
         # pixel centres lie at integers, the network counts from the corner
-        torch.testing.assert_close(said.boxes_xyxy[0, 0, 0], torch.tensor([-8.5, -8.5, 15.5, 15.5]))
+        torch.testing.assert_close(raw_detections.boxes_xyxy[0, 0, 0], torch.tensor([-8.5, -8.5, 15.5, 15.5]))
 
 
-def test_a_file_of_settings_may_be_named(scripted: Path, tmp_path: Path) -> None:
+def test_settings_file_as_argument(scripted: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.yml"
     other.write_text(f"size: {SIDE}\nclasses: [a, b, c]\n")
     assert load_predictor(f"torchscript:{scripted},{other}").classes == ("a", "b", "c")
 
 
-def test_files_that_are_none(tmp_path: Path, scripted: Path) -> None:
+def test_invalid_files(tmp_path: Path, scripted: Path) -> None:
     noise = tmp_path / "noise.pt"
     noise.write_bytes(b"no network")
     for kind, what in (("torchscript", "a TorchScript file"), ("export", "a program of torch.export")):
@@ -124,15 +124,17 @@ def test_files_that_are_none(tmp_path: Path, scripted: Path) -> None:
 @pytest.fixture
 def documented(tmp_path: Path) -> Path:
     """The class that the docs show."""
-    shown = re.search(r"my_detector\.py\"\)\.write_text\('''\n(.*?)'''\)", DOCS.read_text(encoding="utf-8"), re.DOTALL)
-    assert shown is not None
-    assert len(shown[1].splitlines()) <= 30
+    documented_code = re.search(
+        r"my_detector\.py\"\)\.write_text\('''\n(.*?)'''\)", DOCS.read_text(encoding="utf-8"), re.DOTALL
+    )
+    assert documented_code is not None
+    assert len(documented_code[1].splitlines()) <= 30
     path = tmp_path / "my_detector.py"
-    path.write_text(shown[1])
+    path.write_text(documented_code[1])
     return path
 
 
-def test_the_documented_class_keeps_the_contract(documented: Path) -> None:
+def test_documented_class_fulfils_the_contract(documented: Path) -> None:
     detector = load_detector(f"module:{documented}:Blobs")
     assert detector.classes == ("Car", "Pedestrian")
     assert not any(parameter.requires_grad for parameter in detector.parameters())
@@ -146,9 +148,9 @@ def test_the_documented_class_keeps_the_contract(documented: Path) -> None:
     assert 16 <= float(centre[1]) <= 32
 
 
-def test_pictures_do_not_share_what_a_network_that_suppresses_says() -> None:
+def test_images_of_a_batch_are_independent_with_built_in_suppression() -> None:
     settings = {"classes": ("Car", "person"), "multiple": 16, "format": "torchvision"}
-    detector = NetworkDetector("choosing", Choosing(), settings).requires_grad_(False)
+    detector = NetworkDetector("choosing", SuppressingNetwork(), settings).requires_grad_(False)
     light, dark = (
         torch.linspace(0.3, 0.9, 64).expand(1, 3, 64, 64),
         torch.linspace(0, 0.4, 64).expand(1, 3, 64, 64),
@@ -182,12 +184,12 @@ def test_a_class_of_an_installed_module() -> None:
         ("module:pathlib:Path", "expected a Detector or a torch.nn.Module, found PosixPath"),
     ],
 )
-def test_places_without_a_class(place: str, message: str) -> None:
+def test_invalid_class_names(place: str, message: str) -> None:
     with pytest.raises(DetectorError, match=message):
         load_detector(place)
 
 
-def test_a_missing_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_library_names_the_install_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import sys
 
     for library, name in (("torchvision", "fcos_resnet50_fpn,none"), ("ultralytics", str(tmp_path / "a.pt"))):

@@ -168,7 +168,7 @@ def test_inputs_that_are_no_image_of_one_size(shape: tuple[int | str, ...], grap
         OnnxPredictor(graph(outputs({}), shape))
 
 
-def test_a_missing_runtime_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_runtime_names_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(DetectorError, match=r"own\.onnx: needs ONNX Runtime: pip install 'onnxruntime>=1\.19'"):
         load_predictor("onnx:own.onnx")
@@ -179,7 +179,7 @@ def test_what_has_no_gradient_is_no_detector_to_attack() -> None:
         load_detector("onnx:own.onnx")
 
 
-def test_tiling_has_two_ways(graph: Make) -> None:
+def test_unknown_tiling_is_refused(graph: Make) -> None:
     with pytest.raises(DetectorError, match="tiles: expected auto or off, found 'some'"):
         load_predictor(f"onnx:{graph(outputs({}))}", tiling="some")
 

@@ -53,11 +53,11 @@ def test_only_borders_inside_the_picture_cut() -> None:
 
 def test_a_car_seen_by_two_windows_is_one_box() -> None:
     boxes = torch.tensor([[100.0, 50, 200, 100], [102.0, 51, 201, 101]])
-    kept = merge_tiles(boxes, torch.tensor([0.6, 0.8]), torch.tensor([2, 2]), torch.tensor([False, False]))
-    assert kept.tolist() == [1]
+    selected = merge_tiles(boxes, torch.tensor([0.6, 0.8]), torch.tensor([2, 2]), torch.tensor([False, False]))
+    assert selected.tolist() == [1]
 
 
-def test_a_part_goes_beside_the_whole_however_sure_it_is() -> None:
+def test_part_of_a_complete_box_is_dropped_at_any_score() -> None:
     boxes = torch.tensor([[100.0, 50, 200, 100], [100.0, 50, 140, 100]])
     scores, labels = torch.tensor([0.4, 0.9]), torch.tensor([2, 2])
     assert merge_tiles(boxes, scores, labels, torch.tensor([False, True])).tolist() == [0]
@@ -68,8 +68,8 @@ def test_a_part_goes_beside_the_whole_however_sure_it_is() -> None:
 
 def test_a_part_stays_where_no_window_saw_the_whole() -> None:
     boxes = torch.tensor([[100.0, 50, 140, 100], [101.0, 50, 141, 100]])
-    kept = merge_tiles(boxes, torch.tensor([0.5, 0.7]), torch.tensor([2, 2]), torch.tensor([True, True]))
-    assert kept.tolist() == [1]
+    selected = merge_tiles(boxes, torch.tensor([0.5, 0.7]), torch.tensor([2, 2]), torch.tensor([True, True]))
+    assert selected.tolist() == [1]
 
 
 def test_nothing_seen_is_nothing() -> None:

@@ -167,11 +167,11 @@ def functional(outputs: Sequence[Tensor]) -> Tensor:
     return total
 
 
-def of_raw(raw: AnchorPredictions) -> list[Tensor]:
+def raw_tensors(raw: AnchorPredictions) -> list[Tensor]:
     return [getattr(raw, field) for field in ("deltas", "class_logits", "confidence_logits")]
 
 
-def outcome(call: Callable[[Tensor], Sequence[Tensor]], image: Tensor) -> tuple[list[Tensor], Tensor]:
+def outputs_and_gradient(call: Callable[[Tensor], Sequence[Tensor]], image: Tensor) -> tuple[list[Tensor], Tensor]:
     """What comes out, and the gradient of a function of all of it."""
     leaf = image.clone().requires_grad_(True)
     outputs = call(leaf)
@@ -183,7 +183,7 @@ def relative(found: Tensor, expected: Tensor) -> float:
     return float((found - expected).norm() / expected.norm().clamp_min(1e-30))
 
 
-def agree(name: str, scene: Pictures) -> None:
+def assert_agreement(name: str, scene: Pictures) -> None:
     """All outputs, and the gradient inside each rectangle, are those of a whole pass. In double precision: in
     single, a number near 0 may be on the other side of a rectifier.
     """
@@ -192,8 +192,8 @@ def agree(name: str, scene: Pictures) -> None:
     reference = ReferencePass.run(model, image)
     assert reference is not None
     reference = replace(reference, max_cost_share=float("inf"))
-    found, slope = outcome(lambda x: of_raw(reference(x, scene.rects)), changed)
-    expected, expected_slope = outcome(lambda x: of_raw(model(x)), changed)
+    found, slope = outputs_and_gradient(lambda x: raw_tensors(reference(x, scene.rects)), changed)
+    expected, expected_slope = outputs_and_gradient(lambda x: raw_tensors(model(x)), changed)
     assert max(relative(a, b) for a, b in zip(found, expected, strict=True)) < tolerance
     for rect in scene.rects:
         assert relative(slope[inside(rect)], expected_slope[inside(rect)]) < tolerance
@@ -205,8 +205,8 @@ def agree(name: str, scene: Pictures) -> None:
 @example(OVERLAPPING)
 @example(NOTHING)
 @given(pictures())
-def test_squeezedet_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
-    agree("squeezedet", scene)
+def test_squeezedet_equals_a_whole_pass(scene: Pictures) -> None:
+    assert_agreement("squeezedet", scene)
 
 
 @settings(max_examples=5)
@@ -214,8 +214,8 @@ def test_squeezedet_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
 @example(OVERLAPPING)
 @example(NOTHING)
 @given(pictures())
-def test_squeezedet_plus_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
-    agree("squeezedet-plus", scene)
+def test_squeezedet_plus_equals_a_whole_pass(scene: Pictures) -> None:
+    assert_agreement("squeezedet-plus", scene)
 
 
 @settings(max_examples=20)
@@ -223,8 +223,8 @@ def test_squeezedet_plus_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
 @example(OVERLAPPING)
 @example(NOTHING)
 @given(pictures())
-def test_slim_yolov3_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
-    agree("yolov3-slim", scene)
+def test_slim_yolov3_equals_a_whole_pass(scene: Pictures) -> None:
+    assert_agreement("yolov3-slim", scene)
 
 
 @pytest.mark.slow
@@ -232,14 +232,14 @@ def test_slim_yolov3_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
 @example(OVERLAPPING)
 @example(NOTHING)
 @given(pictures())
-def test_full_yolov3_gives_what_a_whole_pass_gives(scene: Pictures) -> None:
-    agree("yolov3", scene)
+def test_full_yolov3_equals_a_whole_pass(scene: Pictures) -> None:
+    assert_agreement("yolov3", scene)
 
 
 @pytest.mark.slow
-def test_full_yolov3_gives_what_a_whole_pass_gives_at_all_borders() -> None:
+def test_full_yolov3_equals_a_whole_pass_at_all_borders() -> None:
     """With random weights: of the full size none ship."""
-    agree("yolov3", BORDERS)
+    assert_agreement("yolov3", BORDERS)
 
 
 @settings(max_examples=40)
@@ -247,7 +247,7 @@ def test_full_yolov3_gives_what_a_whole_pass_gives_at_all_borders() -> None:
 @example(OVERLAPPING, 0.0)
 @example(NOTHING, 100.0)
 @given(pictures(), st.sampled_from([0.0, 0.05, 100.0]))
-def test_any_traceable_network_gives_what_a_whole_pass_gives(scene: Pictures, limit_mb: float) -> None:
+def test_traceable_network_equals_a_whole_pass(scene: Pictures, limit_mb: float) -> None:
     """Whatever is kept: nothing but picture and outputs, some layers, all that are wanted."""
     network = backbone()
     graph = LayerGraph.trace(network)
@@ -258,14 +258,14 @@ def test_any_traceable_network_gives_what_a_whole_pass_gives(scene: Pictures, li
     shapes = SizedGraph.for_size(graph, hw, limit_mb * 1e6)
     first = shapes.plan(ColumnRegion.from_rects([everywhere], hw), everywhere)
     parts, _ = forward(graph, first, ImageInput(image), {}, shapes.stored)
-    kept = {layer: several[0] for layer, several in parts.items()}
+    activations = {layer: several[0] for layer, several in parts.items()}
     plan = shapes.plan(ColumnRegion.from_rects(scene.rects, hw), everywhere)
 
     def call(x: Tensor) -> list[Tensor]:
-        return list(ChangedOutputs.apply(x, ImageInput(x.detach()), graph, plan, kept))
+        return list(ChangedOutputs.apply(x, ImageInput(x.detach()), graph, plan, activations))
 
-    found, slope = outcome(call, changed)
-    expected, expected_slope = outcome(network, changed)
+    found, slope = outputs_and_gradient(call, changed)
+    expected, expected_slope = outputs_and_gradient(network, changed)
     assert max(relative(a, b) for a, b in zip(found, expected, strict=True)) < 1e-9
     for rect in scene.rects:
         assert relative(slope[inside(rect)], expected_slope[inside(rect)]) < 1e-9
@@ -282,15 +282,15 @@ def test_single_precision_stays_within_rounding(name: str) -> None:
         changed[inside(rect)] = other[inside(rect)]
     reference = ReferencePass.run(model, image)
     assert reference is not None
-    found, slope = outcome(lambda x: of_raw(reference(x, rects)), changed)
-    expected, expected_slope = outcome(lambda x: of_raw(model(x)), changed)
+    found, slope = outputs_and_gradient(lambda x: raw_tensors(reference(x, rects)), changed)
+    expected, expected_slope = outputs_and_gradient(lambda x: raw_tensors(model(x)), changed)
     assert max(relative(a, b) for a, b in zip(found, expected, strict=True)) < 1e-4
     for rect in rects:
         assert relative(slope[inside(rect)], expected_slope[inside(rect)]) < 1e-4
     assert float(slope[..., :100, :].abs().max()) == 0  # nothing changes there, nobody asks
 
 
-def test_what_differs_is_found_without_being_named() -> None:
+def test_unnamed_changes_are_found() -> None:
     image = smooth(*KITTI_HW, 0, torch.float32)
     model = load_detector("squeezedet")
     reference = ReferencePass.run(model, image)
@@ -303,7 +303,7 @@ def test_what_differs_is_found_without_being_named() -> None:
 
 
 @pytest.mark.parametrize("name", ["squeezedet", "yolov3-slim", "yolov3"])
-def test_no_more_is_kept_than_the_limit(name: str) -> None:
+def test_stored_activations_respect_the_limit(name: str) -> None:
     model = detector(name)
     trunk = model.stages(KITTI_HW)
     assert trunk is not None
@@ -315,7 +315,7 @@ def test_no_more_is_kept_than_the_limit(name: str) -> None:
     assert total < LIMIT_MB * 1e6
 
 
-def test_kept_layers_take_what_they_say() -> None:
+def test_size_of_stored_activations() -> None:
     reference = ReferencePass.run(load_detector("squeezedet"), smooth(*KITTI_HW, 0, torch.float32))
     assert reference is not None
     assert reference.bytes == sum(4 * t.numel() for t in reference.activations.values()) < 30e6
@@ -336,7 +336,7 @@ def test_a_small_change_costs_a_small_share_and_a_large_one_is_a_whole_pass() ->
     assert shapes.plan(ColumnRegion.from_rects([frame], hw), frame).cost_share > 0.99
 
 
-class Counting(Detector):
+class CountingDetector(Detector):
     """SqueezeDet, whose whole passes are counted."""
 
     def __init__(self, inner: SqueezeDet) -> None:
@@ -358,14 +358,14 @@ class Counting(Detector):
         return self.inner.decode(raw)
 
 
-def counting() -> Counting:
+def counting_detector() -> CountingDetector:
     inner = load_detector("squeezedet")
     assert isinstance(inner, SqueezeDet)
-    return Counting(inner).requires_grad_(False)
+    return CountingDetector(inner).requires_grad_(False)
 
 
 def test_the_first_pass_is_compared_and_only_that() -> None:
-    model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
+    model, image = counting_detector(), smooth(*KITTI_HW, 0, torch.float32)
     reference = ReferencePass.run(model, image)
     assert reference is not None
     for _ in range(3):
@@ -374,8 +374,8 @@ def test_the_first_pass_is_compared_and_only_that() -> None:
     assert ReferencePass.run(model, image) is not None
 
 
-def test_a_pass_that_disagrees_is_told_once_and_all_are_whole_then(capsys: pytest.CaptureFixture[str]) -> None:
-    model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
+def test_disagreement_is_reported_once_and_ends_incremental_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    model, image = counting_detector(), smooth(*KITTI_HW, 0, torch.float32)
     reference = ReferencePass.run(model, image)
     assert reference is not None
     for layer in reference.incremental.graph.outputs:
@@ -383,9 +383,9 @@ def test_a_pass_that_disagrees_is_told_once_and_all_are_whole_then(capsys: pytes
     rects = [Rect(180, 220, 300, 340)]
     first = reference(image, rects)
     second = reference(image, rects)
-    told = capsys.readouterr().err
-    assert told.startswith("drivesem: detector counting: incremental passes differ")
-    assert told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.startswith("drivesem: detector counting: incremental passes differ")
+    assert message.count("\n") == 1
     expected = model(image)
     for field in FIELDS:
         assert torch.equal(getattr(first, field), getattr(expected, field))
@@ -395,7 +395,7 @@ def test_a_pass_that_disagrees_is_told_once_and_all_are_whole_then(capsys: pytes
 
 
 def test_a_change_of_unknown_place_is_a_whole_pass() -> None:
-    model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
+    model, image = counting_detector(), smooth(*KITTI_HW, 0, torch.float32)
     reference = ReferencePass.run(model, image)
     assert reference is not None
     reference(image, None)
@@ -403,8 +403,8 @@ def test_a_change_of_unknown_place_is_a_whole_pass() -> None:
     assert model.passes == 2
 
 
-def test_other_weights_are_read_anew() -> None:
-    model, image = counting(), smooth(*KITTI_HW, 0, torch.float32)
+def test_changed_weights_are_traced_again() -> None:
+    model, image = counting_detector(), smooth(*KITTI_HW, 0, torch.float32)
     first = ReferencePass.run(model, image)
     with torch.no_grad():
         model.inner.convdet.weight *= 2
@@ -415,17 +415,17 @@ def test_other_weights_are_read_anew() -> None:
     torch.testing.assert_close(second(image, []).deltas, model(image).deltas, atol=1e-4, rtol=1e-4)
 
 
-class Shuffled(nn.Module):
+class ShuffleNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return x.flip(3)
 
 
-class MeanOfAll(nn.Module):
+class GlobalMeanNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return x - F.adaptive_avg_pool2d(x, 1)
 
 
-class InPlace(nn.Module):
+class InPlaceNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.conv = nn.Conv2d(3, 3, 1)
@@ -435,7 +435,7 @@ class InPlace(nn.Module):
         return F.relu(x, inplace=True) + x
 
 
-class Branching(nn.Module):
+class BranchingNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return x * 2 if bool(x.sum() > 0) else x
 
@@ -443,19 +443,20 @@ class Branching(nn.Module):
 @pytest.mark.parametrize(
     "network",
     [
-        Shuffled(), MeanOfAll(), InPlace(), Branching(), nn.Conv2d(3, 4, 3, padding_mode="reflect", padding=1),
+        ShuffleNetwork(), GlobalMeanNetwork(), InPlaceNetwork(), BranchingNetwork(),
+        nn.Conv2d(3, 4, 3, padding_mode="reflect", padding=1),
         nn.Sequential(nn.Conv2d(3, 4, 1), nn.InstanceNorm2d(4)), nn.ConstantPad2d(1, 2.0),
         nn.Sequential(nn.ZeroPad2d(1), nn.ReLU()), nn.Upsample(scale_factor=1.5),
         nn.Sequential(nn.Conv2d(3, 4, 1), nn.LeakyReLU(-0.1)),
     ],
     ids=lambda network: type(network).__name__,
 )  # fmt: skip
-def test_networks_whose_reach_is_not_known_are_refused(network: nn.Module) -> None:
+def test_untraceable_networks_are_refused(network: nn.Module) -> None:
     with pytest.raises(UntraceableError):
         LayerGraph.trace(network.eval())
 
 
-def test_detectors_that_may_change_or_are_not_known_have_no_reference() -> None:
+def test_trainable_or_untraceable_detectors_have_no_reference() -> None:
     image = smooth(64, 64, 0, torch.float32)
     trained = load_detector("squeezedet").requires_grad_(True)
     assert ReferencePass.run(trained, image) is None

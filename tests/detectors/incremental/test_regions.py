@@ -60,7 +60,7 @@ def test_near_rectangles_are_joined_and_far_ones_are_not() -> None:
     assert len(far.rects()) == 2
 
 
-def test_a_small_rectangle_beside_a_tall_one_stays_small() -> None:
+def test_small_rectangle_next_to_a_tall_one_stays_small() -> None:
     tall, low = Rect(0, 24, 100, 200), Rect(10, 12, 0, 100)
     assert sum(rect.area for rect in ColumnRegion.from_rects([tall, low], HW).rects()) <= tall.area + 2 * low.area
 

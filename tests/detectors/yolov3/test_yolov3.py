@@ -65,7 +65,7 @@ def silent(detector: YoloV3, batch: int = 1) -> dict[str, Tensor]:
     }
 
 
-def raw_of(parts: dict[str, Tensor]) -> AnchorPredictions:
+def make_raw(parts: dict[str, Tensor]) -> AnchorPredictions:
     return AnchorPredictions(**parts, image_hw=HW)
 
 
@@ -134,11 +134,11 @@ def test_confidence_term_by_hand(mini: YoloV3) -> None:
     near = coarse(2, 1, 2)
     parts["boxes_xyxy"][0, near] = torch.tensor(LARGE) + torch.tensor([2.0, 0, 2.0, 0])
     parts["confidence_logits"][0, near] = 3.0
-    terms = mini.loss(raw_of(parts), [targets([LARGE], [0])])
+    terms = mini.loss(make_raw(parts), [targets([LARGE], [0])])
     assert terms["confidence"].item() == pytest.approx(-math.log(0.4) - math.log(0.8), rel=1e-4)
     # Where it overlaps less, it must be silent.
     parts["boxes_xyxy"][0, near] += torch.tensor([8.0, 0, 8.0, 0])  # IoU 30 / 50
-    terms = mini.loss(raw_of(parts), [targets([LARGE], [0])])
+    terms = mini.loss(make_raw(parts), [targets([LARGE], [0])])
     silenced = math.log(1 + math.exp(3.0))
     assert terms["confidence"].item() == pytest.approx(-math.log(0.4) - math.log(0.8) + silenced, rel=1e-4)
 
@@ -148,20 +148,20 @@ def test_box_term_by_hand(mini: YoloV3) -> None:
     truth = box(16 + 8 * 0.25, 8 + 8 * 0.75, 30, 24)  # in the cell of row 1, column 2; nearest shape: anchor 3
     at = coarse(3, 1, 2)
     parts["deltas"][0, at] = torch.tensor([0.3, -0.2, 0.1, 0.4])
-    terms = mini.loss(raw_of(parts), [targets([truth], [0])])
+    terms = mini.loss(make_raw(parts), [targets([truth], [0])])
     shape = ((0.1 - math.log(30 / 40)) ** 2 + (0.4 - 0) ** 2) / 2
     scale = 2 - 30 * 24 / (32 * 48)
     least = entropy([logit(0.25), logit(0.75)], [0.25, 0.75])
     expected = scale * (entropy([0.3, -0.2], [0.25, 0.75]) - least + shape)
     assert terms["box"].item() == pytest.approx(expected, rel=1e-5)
     parts["deltas"][0, at] = torch.tensor([logit(0.25), logit(0.75), math.log(30 / 40), 0.0])
-    assert mini.loss(raw_of(parts), [targets([truth], [0])])["box"].item() == pytest.approx(0, abs=1e-6)
+    assert mini.loss(make_raw(parts), [targets([truth], [0])])["box"].item() == pytest.approx(0, abs=1e-6)
 
 
 def test_class_term_by_hand(mini: YoloV3) -> None:
     parts = silent(mini)
     parts["class_logits"][0, coarse(3, 1, 2)] = torch.tensor([1.0, 2.0, -1.0])
-    terms = mini.loss(raw_of(parts), [targets([LARGE], [2])])
+    terms = mini.loss(make_raw(parts), [targets([LARGE], [2])])
     assert terms["class"].item() == pytest.approx(entropy([1.0, 2.0, -1.0], [0, 0, 1]), rel=1e-5)
     assert terms["total"].item() == pytest.approx(sum(terms[k].item() for k in ("confidence", "box", "class")))
 
@@ -178,7 +178,7 @@ def test_objectness_by_hand(mini: YoloV3) -> None:
     parts["boxes_xyxy"][0, fine(1, 0, 11)] = torch.tensor([0.0, 30.0, 1.0, 31.0])
     parts["boxes_xyxy"][0, fine(0, 0, 11)] = torch.tensor([0.0, 30.0, 1.0, 31.0])
     parts["boxes_xyxy"][0, fine(1, 0, 10)] = torch.tensor([0.0, 30.0, 1.0, 31.0])
-    terms = mini.loss(raw_of(parts), [targets([LARGE, small], [0, 1])])
+    terms = mini.loss(make_raw(parts), [targets([LARGE, small], [0, 1])])
     expected = ((1 - 0.7) ** 2 + 1 + 0.2**2) / 2
     assert terms["objectness"].item() == pytest.approx(expected, rel=1e-4)
 
@@ -187,17 +187,17 @@ def test_sums_are_divided_by_all_objects_of_the_batch(mini: YoloV3) -> None:
     parts = silent(mini, 3)
     parts["confidence_logits"][2, 5] = logit(0.2)
     wanted = [targets([LARGE, box(2, 2, 6, 6)], [0, 0]), targets([], []), targets([], [])]
-    terms = mini.loss(raw_of(parts), wanted)
+    terms = mini.loss(make_raw(parts), wanted)
     assert terms["confidence"].item() == pytest.approx((2 * 60 - math.log(0.8)) / 2, rel=1e-5)
     assert terms["class"].item() == pytest.approx(3 * math.log(2))
-    nothing = mini.loss(raw_of(parts), [targets([], [])] * 3)
+    nothing = mini.loss(make_raw(parts), [targets([], [])] * 3)
     assert nothing["confidence"].item() == pytest.approx(-math.log(0.8), rel=1e-4)
     assert nothing["box"].item() == 0
     assert nothing["class"].item() == 0
 
 
 def test_each_object_has_the_best_anchor_that_is_free(mini: YoloV3) -> None:
-    raw = raw_of(silent(mini))
+    raw = make_raw(silent(mini))
     outside = box(400, -30, 40, 24)  # the nearest cell
     assigned = mini.assign(raw, [targets([LARGE, LARGE, box(2, 30, 6, 6), outside], [0, 1, 2, 0])])
     # The second has the shape that fits next best, of the same head or another.
@@ -211,7 +211,7 @@ def test_further_anchors_answer_beyond_the_match_threshold(mini_text: str) -> No
     text = mini_text.replace("ignore_thresh = .7\n", "ignore_thresh = .7\niou_thresh = 0.3\n")
     detector = YoloV3(("Car", "Truck", "Cyclist"), cfg=parse(text))
     truth = box(21, 13, 14, 10)  # shapes' IoU: 36/140, 96/140, 140/400, 140/960
-    assigned = detector.assign(raw_of(silent(detector)), [targets([truth], [1])])
+    assigned = detector.assign(make_raw(silent(detector)), [targets([truth], [1])])
     assert assigned.anchor.tolist() == [fine(1, 3, 5), coarse(2, 1, 2)]
     assert assigned.labels.tolist() == [1, 1]
     assert assigned.deltas[1].tolist() == pytest.approx([5 / 8, 5 / 8, math.log(14 / 20), math.log(10 / 20)])
@@ -220,7 +220,7 @@ def test_further_anchors_answer_beyond_the_match_threshold(mini_text: str) -> No
 
 def test_targets_of_the_box_are_what_decoding_hits(mini: YoloV3) -> None:
     truth = box(19.3, 12.9, 31, 17)
-    assigned = mini.assign(raw_of(silent(mini)), [targets([truth], [1])])
+    assigned = mini.assign(make_raw(silent(mini)), [targets([truth], [1])])
     place, shape = assigned.deltas[0, :2], assigned.deltas[0, 2:]
     with torch.no_grad():
         for parameter in mini.parameters():
@@ -238,20 +238,20 @@ def test_ignored_regions_have_no_positive_and_excuse_what_lies_in_them(mini: Yol
     at, beyond = coarse(3, 1, 2), fine(0, 0, 11)
     parts["confidence_logits"][0, at] = 3.0
     parts["confidence_logits"][0, beyond] = logit(0.2)
-    punished = mini.loss(raw_of(parts), [targets([], [])])
+    punished = mini.loss(make_raw(parts), [targets([], [])])
     assert punished["confidence"].item() == pytest.approx(math.log(1 + math.exp(3)) - math.log(0.8), rel=1e-4)
-    excused = mini.loss(raw_of(parts), [targets([LARGE], [0], ignore=True)])
+    excused = mini.loss(make_raw(parts), [targets([LARGE], [0], ignore=True)])
     assert excused["confidence"].item() == pytest.approx(-math.log(0.8), rel=1e-4)
     assert excused["box"].item() == 0
     assert excused["objectness"].item() == pytest.approx(0.2**2, rel=1e-4)
     # So does one whose box, not whose anchor, lies in the region.
     parts["boxes_xyxy"][0, beyond] = torch.tensor([4.0, 4.0, 9.0, 9.0])
-    excused = mini.loss(raw_of(parts), [targets([LARGE], [0], ignore=True)])
+    excused = mini.loss(make_raw(parts), [targets([LARGE], [0], ignore=True)])
     assert excused["confidence"].item() == pytest.approx(0, abs=1e-6)
 
 
 def test_targets_that_do_not_fit_are_refused(mini: YoloV3, mini_cfg: DarknetCfg) -> None:
-    raw = raw_of(silent(mini, 2))
+    raw = make_raw(silent(mini, 2))
     with pytest.raises(ValueError, match=r"targets: expected 2, one for each image, found 1"):
         mini.loss(raw, [targets([], [])])
     with pytest.raises(ValueError, match=r"targets\.labels: expected 0\.\.2, found \[3\]"):
@@ -275,7 +275,7 @@ def test_decode_planted_predictions(mini: YoloV3) -> None:
         parts["confidence_logits"][1, at] = logit(confidence)
         parts["class_logits"][1, at, label] = logit(probability)
     parts["class_logits"][1, first, 2] = logit(0.3)  # the same box, as another class
-    nothing, found = mini.decode(raw_of(parts))
+    nothing, found = mini.decode(make_raw(parts))
     assert len(nothing) == 0
     assert found.labels.tolist() == [0, 1, 2]
     assert found.scores.tolist() == pytest.approx([0.72, 0.64, 0.27])
@@ -305,7 +305,7 @@ def test_gradient_to_the_image_agrees_with_differences(mini: YoloV3) -> None:
         torch.testing.assert_close(analytic, numeric, rtol=1e-4, atol=1e-4 * float(numeric.abs().max()))
 
 
-def test_frozen_network_is_folded_and_says_the_same(mini: YoloV3) -> None:
+def test_frozen_network_is_folded_with_the_same_output(mini: YoloV3) -> None:
     image = torch.rand(2, 3, 30, 44, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
         plain = mini(image)

@@ -40,7 +40,7 @@ def test_too_few_triangles() -> None:
         set_triangle_count(template("sedan", 100), 3)
 
 
-def test_a_scene_holds_what_it_says_and_renders_its_photograph() -> None:
+def test_scene_has_the_stated_counts_and_renders_its_photograph() -> None:
     bench = build_bench_scene(4, 2000)
     scene = bench.scene
     assert (scene.camera.height, scene.camera.width) == (HEIGHT, WIDTH)

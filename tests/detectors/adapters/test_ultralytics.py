@@ -28,13 +28,13 @@ def weights(tmp_path: Path, settle: Callable[[nn.Module, object], None]) -> Path
     return path
 
 
-def test_the_contract_is_kept(weights: Path) -> None:
+def test_model_fulfils_the_contract(weights: Path) -> None:
     detector = load_detector(f"ultralytics:{weights}")
     assert len(detector.classes) == 80
     check_detector(detector, (64, 96)).require()
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_invalid_files(tmp_path: Path) -> None:
     noise = tmp_path / "noise.pt"
     noise.write_bytes(b"nothing")
     for path, found in ((noise, r"\S"), (tmp_path / "gone.pt", "none")):

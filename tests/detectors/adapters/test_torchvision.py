@@ -41,7 +41,7 @@ def settled(settle: Callable[[nn.Module, object], None]) -> Callable[[str], Any]
         pytest.param("fasterrcnn_resnet50_fpn_v2", marks=pytest.mark.slow),
     ],
 )
-def test_the_contract_is_kept(name: str, settled: Callable[[str], Any]) -> None:
+def test_models_fulfil_the_contract(name: str, settled: Callable[[str], Any]) -> None:
     detector = settled(name)
     detector.model.transform.min_size = (96,)
     check_detector(detector, (64, 96)).require()

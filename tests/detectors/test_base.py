@@ -1,4 +1,4 @@
-"""What does not fit into a device's memory is done in halves."""
+"""Prediction in parts when device memory runs out, and atomic writing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from detectors.files import write_atomically
 from detectors.types import Detections
 
 
-class Few:
+class SmallMemoryPredictor:
     """A predictor on a device that holds no more than `most` images at once. What it finds is an image's mean."""
 
     name, classes = "few", ("Car",)
@@ -33,25 +33,23 @@ class Few:
 
 
 @pytest.mark.parametrize(("most", "parts"), [(7, [7]), (4, [4, 3]), (3, [2, 2, 3]), (1, 7 * [1])])
-def test_images_are_looked_at_in_halves(
+def test_images_are_split_when_memory_runs_out(
     most: int, parts: Sequence[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    predictor, images = Few(most), torch.rand(7, 3, 4, 5)
+    predictor, images = SmallMemoryPredictor(most), torch.rand(7, 3, 4, 5)
     found = predict(predictor, images)
     assert predictor.seen == parts
     torch.testing.assert_close(torch.cat([one.scores for one in found]), images.mean((1, 2, 3)))
-    told = capsys.readouterr().err.splitlines()
-    assert told[:1] == (
-        [] if most == 7 else ["drivesem: 7 images at once exceed the device's memory: trying 4"]
-    )
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:1] == ([] if most == 7 else ["drivesem: 7 images at once exceed the device's memory: trying 4"])
 
 
-def test_one_that_does_not_fit_is_an_error() -> None:
+def test_single_image_beyond_memory_is_an_error() -> None:
     with pytest.raises(torch.OutOfMemoryError):
-        predict(Few(0), torch.rand(2, 3, 4, 5))
+        predict(SmallMemoryPredictor(0), torch.rand(2, 3, 4, 5))
 
 
-def test_other_errors_are_not_tried_again() -> None:
+def test_other_errors_are_not_retried() -> None:
     calls: list[int] = []
 
     def fail(items: Sequence[int]) -> list[int]:
@@ -79,6 +77,6 @@ def test_weights_that_cannot_be_written_are_named(tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_is_predicted_carries_no_gradient() -> None:
+def test_predictions_carry_no_gradient() -> None:
     images = torch.rand(2, 3, 4, 5, requires_grad=True)
-    assert not any(found.scores.requires_grad for found in predict(Few(2), images))
+    assert not any(found.scores.requires_grad for found in predict(SmallMemoryPredictor(2), images))
