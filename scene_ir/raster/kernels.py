@@ -22,7 +22,26 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, launch, split_range, start_warp, threads
+from scene_ir.raster.launch import (
+    Floats,
+    Floats2D,
+    Floats3D,
+    Ints,
+    Ints2D,
+    Longs,
+    Longs2D,
+    Vec2fs,
+    Vec3ds,
+    Vec3fs,
+    Vec3is,
+    Vec4is,
+    Words,
+    array,
+    launch,
+    split_range,
+    start_warp,
+    threads,
+)
 from scene_ir.raster.layout import Fragments, PixelLayout, RasterPlan, tensor_version
 from scene_ir.raster.plan import gpu_lanes, gpu_parts, int32_faces, split_for_threads, split_outlines
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
@@ -72,7 +91,7 @@ class TriangleEdges:
 
 
 @wp.func
-def _find_range(offsets: wp.array(dtype=wp.int64), count: int, i: int):
+def _find_range(offsets: Longs, count: int, i: int):
     """The last of `count` ranges that starts at or before i; offsets ascend, empty ranges are skipped."""
     if i < count:  # a shortcut for draws of one pixel each
         if offsets[i] == wp.int64(i) and offsets[i + 1] == wp.int64(i + 1):
@@ -89,7 +108,7 @@ def _find_range(offsets: wp.array(dtype=wp.int64), count: int, i: int):
 
 
 @wp.func
-def _find_part(parts: wp.array2d(dtype=wp.int32), i: int):
+def _find_part(parts: Ints2D, i: int):
     """The part that holds packed pixel i."""
     low = int(0)
     high = parts.shape[0]
@@ -125,7 +144,7 @@ def _merge_boxes(a: wp.vec4i, b: wp.vec4i):
 
 
 @wp.kernel
-def _corner_kernel(start: int, clip: wp.array(dtype=wp.vec3f), near: wp.float64, boxes: wp.array(dtype=wp.vec4i)):
+def _corner_kernel(start: int, clip: Vec3fs, near: wp.float64, boxes: Vec4is):
     i = start + wp.tid()
     c = wp.vec3d(clip[i])
     if c[2] >= near:
@@ -152,9 +171,7 @@ def _extend_by_edge(box: wp.vec4i, a: wp.vec3d, b: wp.vec3d, near: wp.float64):
 
 
 @wp.func
-def _face_bounds(
-    corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), boxes: wp.array(dtype=wp.vec4i), near: wp.float64
-):
+def _face_bounds(corner: wp.vec3i, clip: Vec3fs, boxes: Vec4is, near: wp.float64):
     """First and last pixel (x, y, x, y) of the part of a triangle beyond the near plane."""
     a = boxes[corner[0]]
     b = boxes[corner[1]]
@@ -198,7 +215,7 @@ def _owns_pixel(e: wp.float64, n: wp.vec3d):
 
 
 @wp.func
-def _face_edges(corner: wp.vec3i, clip: wp.array(dtype=wp.vec3f), cull: int):
+def _face_edges(corner: wp.vec3i, clip: Vec3fs, cull: int):
     """Edge functions of a triangle; none for a culled back face."""
     c0 = wp.vec3d(clip[corner[0]])
     c1 = wp.vec3d(clip[corner[1]])
@@ -245,7 +262,7 @@ def _fill_triangle(
     near: wp.float64,
     alone: bool,
     layered: bool,
-    keys: wp.array(dtype=wp.int64),
+    keys: Longs,
 ):
     """Offer a triangle to the pixels of `box`, half-open.
 
@@ -287,15 +304,7 @@ def _fill_triangle(
 
 @wp.func
 def _update_tiles(
-    part: int,
-    x0: int,
-    x1: int,
-    row: int,
-    row_end: int,
-    origin: int,
-    width: int,
-    keys: wp.array(dtype=wp.int64),
-    tiles: wp.array3d(dtype=wp.float32),
+    part: int, x0: int, x1: int, row: int, row_end: int, origin: int, width: int, keys: Longs, tiles: Floats3D
 ):
     """Record the farthest visible depth of each tile of a part."""
     for ty in range((row_end - row + TILE_PX - 1) // TILE_PX):
@@ -308,15 +317,7 @@ def _update_tiles(
 
 
 @wp.func
-def _is_hidden(
-    corner: wp.vec3i,
-    clip: wp.array(dtype=wp.vec3f),
-    part: int,
-    x0: int,
-    row: int,
-    box: wp.vec4i,
-    tiles: wp.array3d(dtype=wp.float32),
-):
+def _is_hidden(corner: wp.vec3i, clip: Vec3fs, part: int, x0: int, row: int, box: wp.vec4i, tiles: Floats3D):
     """Whether all tiles that a triangle in `box` may touch showed nearer surfaces at the last update."""
     nearest = wp.float64(wp.min(clip[corner[0]][2], wp.min(clip[corner[1]][2], clip[corner[2]][2])))
     for ty in range((box[1] - row) // TILE_PX, (box[3] - 1 - row) // TILE_PX + 1):
@@ -330,14 +331,14 @@ def _is_hidden(
 def _rasterize_kernel(
     start: int,
     lanes: int,
-    parts: wp.array2d(dtype=wp.int32),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    boxes: wp.array(dtype=wp.vec4i),
+    parts: Ints2D,
+    clip: Vec3fs,
+    faces: Vec3is,
+    boxes: Vec4is,
     near: wp.float64,
-    order: wp.array(dtype=wp.int32),
-    tiles: wp.array3d(dtype=wp.float32),
-    keys: wp.array(dtype=wp.int64),
+    order: Ints,
+    tiles: Floats3D,
+    keys: Longs,
 ):
     i = start + wp.tid()
     part = i // lanes
@@ -375,9 +376,7 @@ def _rasterize_kernel(
 
 
 @wp.kernel
-def unpack_kernel(
-    start: int, keys: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), depth: wp.array(dtype=wp.float32)
-):
+def unpack_kernel(start: int, keys: Longs, face: Ints, depth: Floats):
     i = start + wp.tid()
     key = keys[i]
     face[i] = wp.int32(key & wp.int64(0xFFFFFFFF))
@@ -385,7 +384,7 @@ def unpack_kernel(
 
 
 @wp.func
-def _pixel_xy(i: int, rects: wp.array2d(dtype=wp.int64), offsets: wp.array(dtype=wp.int64)):
+def _pixel_xy(i: int, rects: Longs2D, offsets: Longs):
     """Image coordinates of packed pixel i, and the width of its draw."""
     draw = _find_range(offsets, rects.shape[0], i)
     within = i - wp.int32(offsets[draw])
@@ -420,9 +419,7 @@ class TriangleHit:
 
 
 @wp.func
-def triangle_hit(
-    f: int, x: wp.float64, y: wp.float64, clip: wp.array(dtype=wp.vec3f), faces: wp.array(dtype=wp.vec3i)
-):
+def triangle_hit(f: int, x: wp.float64, y: wp.float64, clip: Vec3fs, faces: Vec3is):
     """The hit of face f at pixel (x, y).
 
     Args:
@@ -448,9 +445,7 @@ def triangle_hit(
 
 
 @wp.func
-def add_corner_gradients(
-    hit: TriangleHit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip: wp.array(dtype=wp.vec3d)
-):
+def add_corner_gradients(hit: TriangleHit, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, grad_clip: Vec3ds):
     """Add gradients to the edge functions, each times the pixel (x, y, 1), to the corners' gradients.
 
     Args:
@@ -467,13 +462,13 @@ def add_corner_gradients(
 @wp.kernel
 def _interpolate_kernel(
     start: int,
-    face: wp.array(dtype=wp.int32),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    attributes: wp.array2d(dtype=wp.float32),
-    out: wp.array2d(dtype=wp.float32),
+    face: Ints,
+    rects: Longs2D,
+    offsets: Longs,
+    clip: Vec3fs,
+    faces: Vec3is,
+    attributes: Floats2D,
+    out: Floats2D,
 ):
     i = start + wp.tid()
     f = face[i]
@@ -488,17 +483,17 @@ def _interpolate_kernel(
 @wp.kernel
 def _interpolate_backward_kernel(
     start: int,
-    face: wp.array(dtype=wp.int32),
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    attributes: wp.array2d(dtype=wp.float32),
-    grad_out: wp.array2d(dtype=wp.float32),
+    face: Ints,
+    rects: Longs2D,
+    offsets: Longs,
+    clip: Vec3fs,
+    faces: Vec3is,
+    attributes: Floats2D,
+    grad_out: Floats2D,
     with_clip: bool,
     with_attributes: bool,
-    grad_clip: wp.array(dtype=wp.vec3d),
-    grad_attributes: wp.array2d(dtype=wp.float32),
+    grad_clip: Vec3ds,
+    grad_attributes: Floats2D,
 ):
     i = start + wp.tid()
     f = face[i]
@@ -639,7 +634,7 @@ def bicubic_taps(
 
 
 @wp.func
-def _weighted_row(texels: wp.array(dtype=wp.float32), base: int, columns: wp.vec4i, weight: wp.vec4f):
+def _weighted_row(texels: Floats, base: int, columns: wp.vec4i, weight: wp.vec4f):
     low = weight[0] * texels[base + columns[0]] + weight[1] * texels[base + columns[1]]
     return low + (weight[2] * texels[base + columns[2]] + weight[3] * texels[base + columns[3]])
 
@@ -647,16 +642,16 @@ def _weighted_row(texels: wp.array(dtype=wp.float32), base: int, columns: wp.vec
 @wp.kernel
 def _texture_kernel(
     start: int,
-    texels: wp.array(dtype=wp.float32),
+    texels: Floats,
     channels: int,
     channel_stride: int,
     texel_stride: int,
-    crops: wp.array2d(dtype=wp.int64),
-    crop_offsets: wp.array(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
-    uv: wp.array(dtype=wp.vec2f),
+    crops: Longs2D,
+    crop_offsets: Longs,
+    offsets: Longs,
+    uv: Vec2fs,
     clamp: bool,
-    out: wp.array2d(dtype=wp.float32),
+    out: Floats2D,
 ):
     i = start + wp.tid()
     draw = _find_range(offsets, crops.shape[0], i)
@@ -678,20 +673,20 @@ def _texture_kernel(
 @wp.kernel
 def _texture_backward_kernel(
     start: int,
-    texels: wp.array(dtype=wp.float32),
+    texels: Floats,
     channels: int,
     channel_stride: int,
     texel_stride: int,
-    crops: wp.array2d(dtype=wp.int64),
-    crop_offsets: wp.array(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
-    uv: wp.array(dtype=wp.vec2f),
+    crops: Longs2D,
+    crop_offsets: Longs,
+    offsets: Longs,
+    uv: Vec2fs,
     clamp: bool,
-    grad_out: wp.array2d(dtype=wp.float32),
+    grad_out: Floats2D,
     with_uv: bool,
     with_texels: bool,
-    grad_uv: wp.array(dtype=wp.vec2f),
-    grad_texels: wp.array(dtype=wp.float32),
+    grad_uv: Vec2fs,
+    grad_texels: Floats,
 ):
     i = start + wp.tid()
     draw = _find_range(offsets, crops.shape[0], i)
@@ -720,8 +715,8 @@ def _texture_backward_kernel(
 
 @wp.func
 def _record_outline(
-    keys: wp.array2d(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
+    keys: Longs2D,
+    face: Ints,
     axis: int,
     value: wp.float64,
     s: int,
@@ -751,8 +746,8 @@ def _record_outline(
 
 @wp.func
 def _record_end(
-    keys: wp.array2d(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
+    keys: Longs2D,
+    face: Ints,
     axis: int,
     value: wp.float64,
     low: int,
@@ -806,7 +801,7 @@ def _clip_interval(span: wp.vec4d, slope: wp.float64, base: wp.float64, index: w
 
 
 @wp.func
-def _read_bits(words: wp.array(dtype=wp.uint64), first: int, count: int):
+def _read_bits(words: Words, first: int, count: int):
     """`count` bits, 1 to 64, from bit `first`, which becomes the lowest. Reads one word beyond them."""
     word = first >> 6
     bit = wp.uint64(first & 63)
@@ -815,7 +810,7 @@ def _read_bits(words: wp.array(dtype=wp.uint64), first: int, count: int):
 
 
 @wp.func
-def _any_bit(words: wp.array(dtype=wp.uint64), x: int, x_end: int, y: int, y_end: int, origin: int, width: int):
+def _any_bit(words: Words, x: int, x_end: int, y: int, y_end: int, origin: int, width: int):
     """Whether a bit is set in columns [x, x_end) of rows [y, y_end)."""
     seen = wp.uint64(0)
     if x_end - x <= 64:
@@ -843,12 +838,7 @@ def _lowest_bit(bits: wp.uint64):
 
 
 @wp.kernel
-def _hit_kernel(
-    start: int,
-    face: wp.array(dtype=wp.int32),
-    hits: wp.array(dtype=wp.uint64),
-    coverage: wp.array(dtype=wp.float32),
-):
+def _hit_kernel(start: int, face: Ints, hits: Words, coverage: Floats):
     """For 64 packed pixels, set a bit of `hits` and a coverage of 1 where a face is hit."""
     word = start + wp.tid()
     bits = wp.uint64(0)
@@ -862,13 +852,13 @@ def _hit_kernel(
 @wp.kernel
 def _boundary_kernel(
     start: int,
-    parts: wp.array2d(dtype=wp.int32),
-    hits: wp.array(dtype=wp.uint64),
-    boundary: wp.array(dtype=wp.uint64),
-    right: wp.array(dtype=wp.uint64),
-    below: wp.array(dtype=wp.uint64),
-    either: wp.array(dtype=wp.uint64),
-    keys: wp.array2d(dtype=wp.int64),
+    parts: Ints2D,
+    hits: Words,
+    boundary: Words,
+    right: Words,
+    below: Words,
+    either: Words,
+    keys: Longs2D,
 ):
     """For 64 packed pixels, mark where hit and empty pixels meet, and clear the pairs' keys.
 
@@ -931,8 +921,8 @@ def _scan_line(
     origin: int,
     step: int,
     near: wp.float64,
-    face: wp.array(dtype=wp.int32),
-    keys: wp.array2d(dtype=wp.int64),
+    face: Ints,
+    keys: Longs2D,
 ):
     """Record the ends of the triangle's interval on pixels [low, high) of a row (axis 0) or column (axis 1).
 
@@ -963,16 +953,16 @@ def _scan_line(
 def _outline_kernel(
     start: int,
     lanes: int,
-    parts: wp.array2d(dtype=wp.int32),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    boxes: wp.array(dtype=wp.vec4i),
+    parts: Ints2D,
+    clip: Vec3fs,
+    faces: Vec3is,
+    boxes: Vec4is,
     near: wp.float64,
-    face: wp.array(dtype=wp.int32),
-    right: wp.array(dtype=wp.uint64),
-    below: wp.array(dtype=wp.uint64),
-    either: wp.array(dtype=wp.uint64),
-    keys: wp.array2d(dtype=wp.int64),
+    face: Ints,
+    right: Words,
+    below: Words,
+    either: Words,
+    keys: Longs2D,
 ):
     """For each marked pair, find the triangle edge that reaches farthest from the hit to the empty pixel."""
     i = start + wp.tid()
@@ -1040,15 +1030,7 @@ class OutlineCrossing:
 
 
 @wp.func
-def _find_crossing(
-    axis: int,
-    x: int,
-    y: int,
-    first_is_hit: bool,
-    code: int,
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-):
+def _find_crossing(axis: int, x: int, y: int, first_is_hit: bool, code: int, clip: Vec3fs, faces: Vec3is):
     """The outline on edge `code` = face * 3 + edge between pixel (x, y) and the next one along `axis`."""
     found = OutlineCrossing()
     p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
@@ -1075,16 +1057,16 @@ def _find_crossing(
 @wp.kernel
 def _coverage_kernel(
     start: int,
-    parts: wp.array2d(dtype=wp.int32),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    face: wp.array(dtype=wp.int32),
-    boundary: wp.array(dtype=wp.uint64),
-    right: wp.array(dtype=wp.uint64),
-    below: wp.array(dtype=wp.uint64),
-    keys: wp.array2d(dtype=wp.int64),
-    choice: wp.array(dtype=wp.int64),
-    coverage: wp.array(dtype=wp.float32),
+    parts: Ints2D,
+    clip: Vec3fs,
+    faces: Vec3is,
+    face: Ints,
+    boundary: Words,
+    right: Words,
+    below: Words,
+    keys: Longs2D,
+    choice: Longs,
+    coverage: Floats,
 ):
     """For 64 packed pixels, coverage where a hit and an empty pixel meet.
 
@@ -1141,14 +1123,14 @@ def _coverage_kernel(
 @wp.kernel
 def _coverage_backward_kernel(
     start: int,
-    parts: wp.array2d(dtype=wp.int32),
-    clip: wp.array(dtype=wp.vec3f),
-    faces: wp.array(dtype=wp.vec3i),
-    face: wp.array(dtype=wp.int32),
-    boundary: wp.array(dtype=wp.uint64),
-    choice: wp.array(dtype=wp.int64),
-    grad_out: wp.array(dtype=wp.float32),
-    grad_clip: wp.array(dtype=wp.vec3d),
+    parts: Ints2D,
+    clip: Vec3fs,
+    faces: Vec3is,
+    face: Ints,
+    boundary: Words,
+    choice: Longs,
+    grad_out: Floats,
+    grad_clip: Vec3ds,
 ):
     word = start + wp.tid()
     bits = boundary[word]

@@ -19,6 +19,29 @@ import torch
 import warp as wp
 from torch import Tensor
 
+# Types of kernel arguments.
+Floats, Ints, Longs, Mat33ds, Mat33fs, Vec2ds, Vec2fs, Vec3ds, Vec3fs, Vec3is, Vec4ds, Vec4fs, Vec4is, Words = (
+    wp.array(dtype=t)
+    for t in (
+        wp.float32,
+        wp.int32,
+        wp.int64,
+        wp.mat33d,
+        wp.mat33f,
+        wp.vec2d,
+        wp.vec2f,
+        wp.vec3d,
+        wp.vec3f,
+        wp.vec3i,
+        wp.vec4d,
+        wp.vec4f,
+        wp.vec4i,
+        wp.uint64,
+    )
+)
+Bytes2D, Floats2D, Ints2D, Longs2D = (wp.array2d(dtype=t) for t in (wp.uint8, wp.float32, wp.int32, wp.int64))
+Floats3D = wp.array3d(dtype=wp.float32)
+
 _MIN_PIXELS = 32768
 """Least pixels (some 10 ns each) for a second thread: waking one takes up to 150 microseconds. Work of several
 kernels is handed over once, by `run_in_threads`.

@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from scene_ir.raster.launch import start_warp
+from scene_ir.raster.launch import Floats, start_warp
 
 start_warp()
 
@@ -36,11 +36,11 @@ wp.set_module_options(SIMD_OPTIONS)
 
 
 @wp.func_native("return ((const float*)values.data)[i];")
-def load(values: wp.array(dtype=wp.float32), i: int) -> wp.float32: ...
+def load(values: Floats, i: int) -> wp.float32: ...
 
 
 @wp.func_native("((float*)values.data)[i] = value;")
-def store(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
+def store(values: Floats, i: int, value: wp.float32):
     """Write a number without a check of the index.
 
     Args:
@@ -51,7 +51,7 @@ def store(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
 
 
 @wp.func
-def load3(values: wp.array(dtype=wp.float32), i: int, step: int):
+def load3(values: Floats, i: int, step: int):
     """Three numbers `step` apart, such as the colour of a pixel in a picture (3, H, W) with step H * W.
 
     Args:
@@ -63,7 +63,7 @@ def load3(values: wp.array(dtype=wp.float32), i: int, step: int):
 
 
 @wp.func
-def store3(values: wp.array(dtype=wp.float32), i: int, step: int, value: wp.vec3f):
+def store3(values: Floats, i: int, step: int, value: wp.vec3f):
     """Write three numbers `step` apart.
 
     Args:

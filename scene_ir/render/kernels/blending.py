@@ -15,7 +15,22 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import array, launch, make_struct, split_by_work, start_warp
+from scene_ir.raster.launch import (
+    Bytes2D,
+    Floats,
+    Floats2D,
+    Floats3D,
+    Ints,
+    Longs,
+    Longs2D,
+    Vec3fs,
+    Vec4fs,
+    array,
+    launch,
+    make_struct,
+    split_by_work,
+    start_warp,
+)
 from scene_ir.render import model
 
 start_warp()
@@ -32,9 +47,9 @@ class LayerStack:
         offsets: (N + 1,) first packed pixel of each draw.
     """
 
-    order: wp.array(dtype=wp.int32)
-    rects: wp.array2d(dtype=wp.int64)
-    offsets: wp.array(dtype=wp.int64)
+    order: Ints
+    rects: Longs2D
+    offsets: Longs
 
 
 @wp.struct
@@ -212,80 +227,65 @@ _UNSHADE_CODE = (
 
 
 @wp.func_native(_SHADE_CODE)
-def _shade_row(
-    image: wp.array3d(dtype=wp.float32),
-    y: int,
-    x0: int,
-    x1: int,
-    origin: int,
-    factor: wp.array(dtype=wp.vec3f),
-    under_shadow: wp.array(dtype=wp.vec3f),
-):
+def _shade_row(image: Floats3D, y: int, x0: int, x1: int, origin: int, factor: Vec3fs, under_shadow: Vec3fs):
     """Multiply columns [x0, x1) of a row by a shadow; origin: packed pixel of column 0."""
 
 
 @wp.func_native(_LAY_CODE)
 def _lay_row(
-    image: wp.array3d(dtype=wp.float32),
+    image: Floats3D,
     y: int,
     x0: int,
     x1: int,
     origin: int,
     draw: int,
-    colour: wp.array(dtype=wp.vec4f),
-    opacity: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
-    under_layer: wp.array(dtype=wp.vec4f),
-    nearest: wp.array2d(dtype=wp.float32),
-    number: wp.array2d(dtype=wp.int64),
+    colour: Vec4fs,
+    opacity: Floats,
+    depth: Floats,
+    under_layer: Vec4fs,
+    nearest: Floats2D,
+    number: Longs2D,
 ):
     """Lay a layer over them."""
 
 
 @wp.func_native(_CLAMP_CODE.replace("SATURATED", str(model.SATURATED)))
-def _clamp_row(image: wp.array3d(dtype=wp.float32), y: int, x0: int, x1: int, flags: wp.array2d(dtype=wp.uint8)):
+def _clamp_row(image: Floats3D, y: int, x0: int, x1: int, flags: Bytes2D):
     """Clamp to [0, 1] and record which channels had left it (bits 0 to 2) or reached a bound (3 to 5), and that it
     was done (6): rectangles overlap, and a clamped pixel stays as it is.
     """
 
 
 @wp.func_native(_START_CODE)
-def _start_row(
-    grad_image: wp.array3d(dtype=wp.float32),
-    y: int,
-    x0: int,
-    x1: int,
-    flags: wp.array2d(dtype=wp.uint8),
-    grad: wp.array3d(dtype=wp.float32),
-):
+def _start_row(grad_image: Floats3D, y: int, x0: int, x1: int, flags: Bytes2D, grad: Floats3D):
     """The gradient to pixels before clamping: see `blend.clamp_colour`."""
 
 
 @wp.func_native(_LIFT_CODE)
 def _lift_row(
-    grad: wp.array3d(dtype=wp.float32),
+    grad: Floats3D,
     y: int,
     x0: int,
     x1: int,
     origin: int,
-    opacity: wp.array(dtype=wp.float32),
-    under_layer: wp.array(dtype=wp.vec4f),
-    grad_colour: wp.array(dtype=wp.vec4f),
-    grad_opacity: wp.array(dtype=wp.float32),
+    opacity: Floats,
+    under_layer: Vec4fs,
+    grad_colour: Vec4fs,
+    grad_opacity: Floats,
 ):
     """Back through `_lay_row`."""
 
 
 @wp.func_native(_UNSHADE_CODE)
 def _unshade_row(
-    grad: wp.array3d(dtype=wp.float32),
+    grad: Floats3D,
     y: int,
     x0: int,
     x1: int,
     origin: int,
-    factor: wp.array(dtype=wp.vec3f),
-    under_shadow: wp.array(dtype=wp.vec3f),
-    grad_factor: wp.array(dtype=wp.vec3f),
+    factor: Vec3fs,
+    under_shadow: Vec3fs,
+    grad_factor: Vec3fs,
 ):
     """Back through `_shade_row`."""
 
@@ -295,17 +295,17 @@ def _blend_kernel(
     start: int,
     shadows: LayerStack,
     layers: LayerStack,
-    factor: wp.array(dtype=wp.vec3f),
-    colour: wp.array(dtype=wp.vec4f),
-    opacity: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
+    factor: Vec3fs,
+    colour: Vec4fs,
+    opacity: Floats,
+    depth: Floats,
     clamped: bool,
-    image: wp.array3d(dtype=wp.float32),
-    nearest: wp.array2d(dtype=wp.float32),
-    number: wp.array2d(dtype=wp.int64),
-    under_shadow: wp.array(dtype=wp.vec3f),
-    under_layer: wp.array(dtype=wp.vec4f),
-    flags: wp.array2d(dtype=wp.uint8),
+    image: Floats3D,
+    nearest: Floats2D,
+    number: Longs2D,
+    under_shadow: Vec3fs,
+    under_layer: Vec4fs,
+    flags: Bytes2D,
 ):
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):
@@ -330,16 +330,16 @@ def _blend_backward_kernel(
     start: int,
     shadows: LayerStack,
     layers: LayerStack,
-    factor: wp.array(dtype=wp.vec3f),
-    opacity: wp.array(dtype=wp.float32),
-    under_shadow: wp.array(dtype=wp.vec3f),
-    under_layer: wp.array(dtype=wp.vec4f),
-    flags: wp.array2d(dtype=wp.uint8),
-    grad_image: wp.array3d(dtype=wp.float32),
-    grad: wp.array3d(dtype=wp.float32),
-    grad_factor: wp.array(dtype=wp.vec3f),
-    grad_colour: wp.array(dtype=wp.vec4f),
-    grad_opacity: wp.array(dtype=wp.float32),
+    factor: Vec3fs,
+    opacity: Floats,
+    under_shadow: Vec3fs,
+    under_layer: Vec4fs,
+    flags: Bytes2D,
+    grad_image: Floats3D,
+    grad: Floats3D,
+    grad_factor: Vec3fs,
+    grad_colour: Vec4fs,
+    grad_opacity: Floats,
 ):
     y = start + wp.tid()
     for k in range(shadows.order.shape[0]):

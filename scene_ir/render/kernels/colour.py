@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import launch, split_range, start_warp
+from scene_ir.raster.launch import Floats, launch, split_range, start_warp
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, log_, store, store3
 from scene_ir.render import model
 
@@ -252,7 +252,7 @@ def _dust_share(height: wp.float32):
 
 
 @wp.func
-def _read_change(code: wp.array(dtype=wp.float32), i: int, height: wp.float32):
+def _read_change(code: Floats, i: int, height: wp.float32):
     change = PaintChange()
     change.shift = load(code, 5 * i)
     change.red = load(code, 5 * i + 1)
@@ -306,13 +306,13 @@ def _paint_opacity(opacity: wp.float32, paint: wp.float32):
 @wp.kernel
 def _paint_kernel(
     start: int,
-    colour: wp.array(dtype=wp.float32),
-    opacity: wp.array(dtype=wp.float32),
-    code: wp.array(dtype=wp.float32),
-    paint: wp.array(dtype=wp.float32),
-    height: wp.array(dtype=wp.float32),
-    base: wp.array(dtype=wp.float32),
-    out: wp.array(dtype=wp.float32),
+    colour: Floats,
+    opacity: Floats,
+    code: Floats,
+    paint: Floats,
+    height: Floats,
+    base: Floats,
+    out: Floats,
 ):
     i = start + wp.tid()
     alpha = load(opacity, i)
@@ -325,15 +325,15 @@ def _paint_kernel(
 @wp.kernel
 def _paint_adjoint_kernel(
     start: int,
-    colour: wp.array(dtype=wp.float32),
-    opacity: wp.array(dtype=wp.float32),
-    code: wp.array(dtype=wp.float32),
-    paint: wp.array(dtype=wp.float32),
-    height: wp.array(dtype=wp.float32),
-    base: wp.array(dtype=wp.float32),
-    grad: wp.array(dtype=wp.float32),
+    colour: Floats,
+    opacity: Floats,
+    code: Floats,
+    paint: Floats,
+    height: Floats,
+    base: Floats,
+    grad: Floats,
     rows: int,
-    grads: wp.array(dtype=wp.float32),
+    grads: Floats,
 ):
     """grads: opacity, paint, height, base, the code's five, the colour's three, `rows` numbers each."""
     i = start + wp.tid()

@@ -17,7 +17,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import launch, split_range, start_warp, threads
+from scene_ir.raster.launch import Floats, launch, split_range, start_warp, threads
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
 from scene_ir.render import model
 from scene_ir.render.kernels.colour import (
@@ -67,17 +67,12 @@ and its change by either of fog and rain, fully on alone (3).
 
 
 @wp.func
-def _grey_air(air: wp.array(dtype=wp.float32)):
+def _grey_air(air: Floats):
     return wp.float64(LUMA[0] * air[0] + LUMA[1] * air[1] + LUMA[2] * air[2])
 
 
 @wp.kernel
-def _settings_kernel(
-    start: int,
-    code: wp.array(dtype=wp.float32),
-    air: wp.array(dtype=wp.float32),
-    settings: wp.array(dtype=wp.float32),
-):
+def _settings_kernel(start: int, code: Floats, air: Floats, settings: Floats):
     """One thread per channel."""
     c = start + wp.tid()
     time = wp.float64(code[2])
@@ -135,7 +130,7 @@ def _apply_gain(x: wp.vec3f, gain: wp.vec3f):
 
 
 @wp.func
-def _overcast_change(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _overcast_change(x: wp.vec3f, sky: wp.float32, settings: Floats):
     """Change by full overcast."""
     y = _luma(x)
     flat = FLAT * x + _splat(FLAT_GREY * y + FLAT_LIGHT)
@@ -149,7 +144,7 @@ def _damp_change(x: wp.vec3f):
 
 
 @wp.func
-def _dampen(x: wp.vec3f, sky: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _dampen(x: wp.vec3f, sky: wp.float32, settings: Floats):
     """A pixel after overcast, time of day and damp."""
     covered = x + load(settings, OVERCAST) * _overcast_change(x, sky, settings)
     timed = _apply_gain(covered, load3(settings, GAIN, 1))
@@ -197,7 +192,7 @@ def _apply_veil_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3
 
 
 @wp.func
-def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: Floats):
     """A pixel after haze, streaks and fog."""
     rain = load(settings, WET)
     air = load3(settings, AIR, 1)
@@ -207,7 +202,7 @@ def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: wp
 
 
 @wp.func
-def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.array(dtype=wp.float32)):
+def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: Floats):
     """A pixel with the share `wet` in [0, 1] of the road's sheen."""
     return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, AIR, 1) - x)
 
@@ -215,13 +210,13 @@ def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: wp.
 @wp.kernel
 def _dry_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    inverse: wp.array(dtype=wp.float32),
-    sky: wp.array(dtype=wp.float32),
-    streaks: wp.array(dtype=wp.float32),
+    settings: Floats,
+    image: Floats,
+    inverse: Floats,
+    sky: Floats,
+    streaks: Floats,
     plane: int,
-    out: wp.array(dtype=wp.float32),
+    out: Floats,
 ):
     i = start + wp.tid()
     x = _dampen(load3(image, i, plane), load(sky, i), settings)
@@ -230,14 +225,7 @@ def _dry_kernel(
 
 @wp.kernel
 def _damp_kernel(
-    start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    sky: wp.array(dtype=wp.float32),
-    plane: int,
-    first: int,
-    wet_pixels: int,
-    out: wp.array(dtype=wp.float32),
+    start: int, settings: Floats, image: Floats, sky: Floats, plane: int, first: int, wet_pixels: int, out: Floats
 ):
     """Pixels before the mirror; out: planes of `wet_pixels` numbers, from pixel `first` on."""
     i = start + wp.tid()
@@ -247,16 +235,16 @@ def _damp_kernel(
 @wp.kernel
 def _wet_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    damp: wp.array(dtype=wp.float32),
-    mirrored: wp.array(dtype=wp.float32),
+    settings: Floats,
+    damp: Floats,
+    mirrored: Floats,
     first: int,
     wet_pixels: int,
-    inverse: wp.array(dtype=wp.float32),
-    road: wp.array(dtype=wp.float32),
-    streaks: wp.array(dtype=wp.float32),
+    inverse: Floats,
+    road: Floats,
+    streaks: Floats,
     plane: int,
-    out: wp.array(dtype=wp.float32),
+    out: Floats,
 ):
     i = start + wp.tid()
     depth = _haze_depth(load(inverse, i))
@@ -266,7 +254,7 @@ def _wet_kernel(
 
 
 @wp.func
-def _dampen_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: wp.array(dtype=wp.float32)):
+def _dampen_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: Floats):
     """Gradients of `_dampen` to x, to rain, time and overcast (3), and to sky."""
     overcast = load(settings, OVERCAST)
     damping = model.DAMP * load(settings, WET)
@@ -292,7 +280,7 @@ def _haze_adjoint(
     inverse: wp.float32,
     streak: wp.float32,
     g: wp.vec3f,
-    settings: wp.array(dtype=wp.float32),
+    settings: Floats,
 ):
     """Gradients of `_apply_sheen` and `_apply_haze` to x, mirrored, (fog, rain, time, overcast), inverse, road."""
     rain = load(settings, WET)
@@ -340,17 +328,17 @@ def _haze_adjoint(
 @wp.kernel
 def _dry_adjoint_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    inverse: wp.array(dtype=wp.float32),
-    sky: wp.array(dtype=wp.float32),
-    streaks: wp.array(dtype=wp.float32),
+    settings: Floats,
+    image: Floats,
+    inverse: Floats,
+    sky: Floats,
+    streaks: Floats,
     plane: int,
-    grad: wp.array(dtype=wp.float32),
-    grad_image: wp.array(dtype=wp.float32),
-    grad_inverse: wp.array(dtype=wp.float32),
-    code_parts: wp.array(dtype=wp.float32),
-    grad_maps: wp.array(dtype=wp.float32),
+    grad: Floats,
+    grad_image: Floats,
+    grad_inverse: Floats,
+    code_parts: Floats,
+    grad_maps: Floats,
 ):
     """shares: each pixel's part of the gradients to fog, rain, time, overcast, one plane each; grad_maps: to sky
     and road, likewise.
@@ -374,22 +362,22 @@ def _dry_adjoint_kernel(
 @wp.kernel
 def _wet_adjoint_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    inverse: wp.array(dtype=wp.float32),
-    sky: wp.array(dtype=wp.float32),
-    streaks: wp.array(dtype=wp.float32),
+    settings: Floats,
+    image: Floats,
+    inverse: Floats,
+    sky: Floats,
+    streaks: Floats,
     plane: int,
-    grad: wp.array(dtype=wp.float32),
-    road: wp.array(dtype=wp.float32),
-    mirrored: wp.array(dtype=wp.float32),
+    grad: Floats,
+    road: Floats,
+    mirrored: Floats,
     first: int,
     wet_pixels: int,
-    grad_mirrored: wp.array(dtype=wp.float32),
-    grad_image: wp.array(dtype=wp.float32),
-    grad_inverse: wp.array(dtype=wp.float32),
-    code_parts: wp.array(dtype=wp.float32),
-    grad_maps: wp.array(dtype=wp.float32),
+    grad_mirrored: Floats,
+    grad_image: Floats,
+    grad_inverse: Floats,
+    code_parts: Floats,
+    grad_maps: Floats,
 ):
     """Back to the mirror: grad_image receives the gradient to the picture before it."""
     i = start + wp.tid()
@@ -414,16 +402,16 @@ def _wet_adjoint_kernel(
 @wp.kernel
 def _damp_adjoint_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    sky: wp.array(dtype=wp.float32),
+    settings: Floats,
+    image: Floats,
+    sky: Floats,
     plane: int,
-    grad_damp: wp.array(dtype=wp.float32),
+    grad_damp: Floats,
     first: int,
     wet_pixels: int,
-    grad_image: wp.array(dtype=wp.float32),
-    code_parts: wp.array(dtype=wp.float32),
-    grad_maps: wp.array(dtype=wp.float32),
+    grad_image: Floats,
+    code_parts: Floats,
+    grad_maps: Floats,
 ):
     """From before the mirror back to the picture; grad_damp comes through the mirror."""
     i = start + wp.tid()
@@ -467,7 +455,7 @@ def _damp_adjoint_kernel(
     }
 """)
 def _mirror_columns(
-    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, wet_pixels: int, x0: int,
+    source: Floats, target: Floats, plane: int, wet_pixels: int, x0: int,
     columns: int, width: int, top: int, bottom: int, road_top: int, radius: int,
 ):  # fmt: skip
     """Reflection in columns [x0, x0 + columns), rows [road_top, bottom); 0 above, from `top` on."""
@@ -500,7 +488,7 @@ def _mirror_columns(
     }
 """)
 def _mirror_columns_adjoint(
-    source: wp.array(dtype=wp.float32), target: wp.array(dtype=wp.float32), plane: int, wet_pixels: int, x0: int,
+    source: Floats, target: Floats, plane: int, wet_pixels: int, x0: int,
     columns: int, width: int, top: int, bottom: int, radius: int,
 ):  # fmt: skip
     """The transpose of `_mirror_columns`."""
@@ -509,8 +497,8 @@ def _mirror_columns_adjoint(
 @wp.kernel
 def _mirror_kernel(
     start: int,
-    source: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
+    source: Floats,
+    target: Floats,
     columns: int,
     width: int,
     top: int,
@@ -666,7 +654,7 @@ thicker and thinner along density.
 
 
 @wp.kernel
-def _leaf_settings_kernel(start: int, code: wp.array(dtype=wp.float32), settings: wp.array(dtype=wp.float32)):
+def _leaf_settings_kernel(start: int, code: Floats, settings: Floats):
     """Thread 0 for the code, thread 1 for no change."""
     t = start + wp.tid()
     on = wp.float64(1 - t)
@@ -693,7 +681,7 @@ def _leaf_settings_kernel(start: int, code: wp.array(dtype=wp.float32), settings
 
 
 @wp.func
-def _leaf_lab(lab: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+def _leaf_lab(lab: wp.vec3f, settings: Floats, at: int):
     """The leaf model without density: L*a*b*."""
     _dampen = lightness_level(lab[0])
     odds = load(settings, at + ODDS)
@@ -717,7 +705,7 @@ class CrownPixel:
 
 
 @wp.func
-def _read_crown(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
+def _read_crown(crowns: Floats, i: int, plane: int):
     """crowns: five planes: thinned, thickened, behind (3)."""
     at = CrownPixel()
     at.thinned = load(crowns, i)
@@ -727,14 +715,14 @@ def _read_crown(crowns: wp.array(dtype=wp.float32), i: int, plane: int):
 
 
 @wp.func
-def _apply_crown(rgb: wp.vec3f, at: CrownPixel, settings: wp.array(dtype=wp.float32), first: int):
+def _apply_crown(rgb: wp.vec3f, at: CrownPixel, settings: Floats, first: int):
     """Leaves in a thicker or thinner crown."""
     dense = (1.0 - THICK * load(settings, first + THICKER) * at.thickened) * rgb
     return dense + (model.THIN_SHARE * load(settings, first + THINNER) * at.thinned) * (at.behind - dense)
 
 
 @wp.func
-def _leaf_adjoint(lab: wp.vec3f, crown: CrownPixel, g: wp.vec3f, settings: wp.array(dtype=wp.float32), at: int):
+def _leaf_adjoint(lab: wp.vec3f, crown: CrownPixel, g: wp.vec3f, settings: Floats, at: int):
     """Gradients to lab and to hue, lightness and density (3)."""
     changed = _leaf_lab(lab, settings, at)
     rgb = lab_to_rgb(changed)
@@ -782,13 +770,13 @@ def _leaf_share(amount: wp.float32):
 @wp.kernel
 def _foliage_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    code: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    amount: wp.array(dtype=wp.float32),
-    crowns: wp.array(dtype=wp.float32),
+    settings: Floats,
+    code: Floats,
+    image: Floats,
+    amount: Floats,
+    crowns: Floats,
     plane: int,
-    out: wp.array(dtype=wp.float32),
+    out: Floats,
 ):
     i = start + wp.tid()
     own = load3(image, i, plane)
@@ -804,15 +792,15 @@ def _foliage_kernel(
 @wp.kernel
 def _foliage_code_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    amount: wp.array(dtype=wp.float32),
-    crowns: wp.array(dtype=wp.float32),
+    settings: Floats,
+    image: Floats,
+    amount: Floats,
+    crowns: Floats,
     plane: int,
-    grad: wp.array(dtype=wp.float32),
+    grad: Floats,
     first: int,
     wet_pixels: int,
-    code_parts: wp.array(dtype=wp.float32),
+    code_parts: Floats,
 ):
     """shares: each pixel's part of the gradient to the code, planes of `wet_pixels` numbers, from pixel `first`
     on.
@@ -828,13 +816,13 @@ def _foliage_code_kernel(
 @wp.kernel
 def _foliage_image_kernel(
     start: int,
-    settings: wp.array(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    amount: wp.array(dtype=wp.float32),
-    crowns: wp.array(dtype=wp.float32),
+    settings: Floats,
+    image: Floats,
+    amount: Floats,
+    crowns: Floats,
     plane: int,
-    grad: wp.array(dtype=wp.float32),
-    grad_image: wp.array(dtype=wp.float32),
+    grad: Floats,
+    grad_image: Floats,
 ):
     i = start + wp.tid()
     own = load3(image, i, plane)

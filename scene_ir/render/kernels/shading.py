@@ -25,7 +25,22 @@ from scene_ir.raster.kernels import (
     bicubic_taps,
     triangle_hit,
 )
-from scene_ir.raster.launch import start_warp
+from scene_ir.raster.launch import (
+    Floats,
+    Ints,
+    Longs,
+    Longs2D,
+    Mat33fs,
+    Vec2ds,
+    Vec2fs,
+    Vec3ds,
+    Vec3fs,
+    Vec3is,
+    Vec4ds,
+    Vec4fs,
+    Vec4is,
+    start_warp,
+)
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import channels as ch
 from scene_ir.render import model
@@ -109,11 +124,11 @@ class PackedPixels:
         nearest: (T,) see `surfaces.nearest_hits`.
     """
 
-    table: wp.array(dtype=wp.vec4i)
-    rects: wp.array2d(dtype=wp.int64)
-    face: wp.array(dtype=wp.int32)
-    coverage: wp.array(dtype=wp.float32)
-    nearest: wp.array(dtype=wp.int64)
+    table: Vec4is
+    rects: Longs2D
+    face: Ints
+    coverage: Floats
+    nearest: Longs
 
 
 @wp.struct
@@ -122,13 +137,13 @@ class Vertices:
     `fast.FixedGeometry`.
     """
 
-    faces: wp.array(dtype=wp.vec3i)
-    neighbours: wp.array(dtype=wp.vec3i)
-    clip: wp.array(dtype=wp.vec3f)
-    facing: wp.array(dtype=wp.float32)
-    brighter: wp.array(dtype=wp.float32)
-    base_clip: wp.array(dtype=wp.vec3f)
-    base: wp.array(dtype=wp.vec3f)
+    faces: Vec3is
+    neighbours: Vec3is
+    clip: Vec3fs
+    facing: Floats
+    brighter: Floats
+    base_clip: Vec3fs
+    base: Vec3fs
     own: wp.array(dtype=attributes_t)
 
 
@@ -145,12 +160,12 @@ class PhotographData:
     """
 
     texels: wp.array(dtype=texel_t)
-    rects: wp.array2d(dtype=wp.int64)
-    offsets: wp.array(dtype=wp.int64)
-    frame_wh: wp.array(dtype=wp.vec2f)
-    turn: wp.array(dtype=wp.vec2f)
-    sun: wp.array(dtype=wp.vec4f)
-    unproject: wp.array(dtype=wp.mat33f)
+    rects: Longs2D
+    offsets: Longs
+    frame_wh: Vec2fs
+    turn: Vec2fs
+    sun: Vec4fs
+    unproject: Mat33fs
 
 
 @wp.struct
@@ -175,18 +190,18 @@ class Lookups:
 
     found: wp.array(dtype=lookup_t)
     lookup: wp.array(dtype=lookup_t)
-    mesh: wp.array(dtype=wp.vec4f)
-    halo: wp.array(dtype=wp.vec4f)
-    unseen: wp.array(dtype=wp.float32)
+    mesh: Vec4fs
+    halo: Vec4fs
+    unseen: Floats
 
 
 @wp.struct
 class MergedLayers:
     """Mesh and halo merged: premultiplied RGB and opacity / depth, opacity, depth in m; or gradients to these."""
 
-    colour: wp.array(dtype=wp.vec4f)
-    opacity: wp.array(dtype=wp.float32)
-    depth: wp.array(dtype=wp.float32)
+    colour: Vec4fs
+    opacity: Floats
+    depth: Floats
 
 
 @wp.struct
@@ -195,15 +210,15 @@ class PixelGradients:
 
     lookup: wp.array(dtype=lookup_t)
     moved_lookup: wp.array(dtype=lookup_t)
-    mesh: wp.array(dtype=wp.vec4f)
-    halo: wp.array(dtype=wp.vec4f)
-    unseen: wp.array(dtype=wp.float32)
-    coverage: wp.array(dtype=wp.float32)
-    clip: wp.array(dtype=wp.vec3d)
-    facing: wp.array(dtype=wp.float32)
-    brighter: wp.array(dtype=wp.float32)
-    turn: wp.array(dtype=wp.vec2d)
-    sun: wp.array(dtype=wp.vec4d)
+    mesh: Vec4fs
+    halo: Vec4fs
+    unseen: Floats
+    coverage: Floats
+    clip: Vec3ds
+    facing: Floats
+    brighter: Floats
+    turn: Vec2ds
+    sun: Vec4ds
 
 
 @wp.func
@@ -224,12 +239,7 @@ def _smoothstep_slope(x: float, edges: wp.vec2f):
 
 
 @wp.kernel(enable_backward=False)
-def table_kernel(
-    start: int,
-    rects: wp.array2d(dtype=wp.int64),
-    offsets: wp.array(dtype=wp.int64),
-    table: wp.array(dtype=wp.vec4i),
-):
+def table_kernel(start: int, rects: Longs2D, offsets: Longs, table: Vec4is):
     """Fill the table of the packed pixels of draws.
 
     Args:
@@ -426,7 +436,7 @@ def _outline_blend(pixels: PackedPixels, i: int):
 
 
 @wp.kernel(enable_backward=False)
-def save_kernel(start: int, partial: wp.array(dtype=wp.int64), lookups: Lookups):
+def save_kernel(start: int, partial: Longs, lookups: Lookups):
     """Save the lookups of partly covered pixels before `extend_kernel`.
 
     Args:
@@ -437,7 +447,7 @@ def save_kernel(start: int, partial: wp.array(dtype=wp.int64), lookups: Lookups)
 
 
 @wp.kernel(enable_backward=False)
-def extend_kernel(start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, lookups: Lookups):
+def extend_kernel(start: int, partial: Longs, pixels: PackedPixels, lookups: Lookups):
     """Extend the lookups over the outline.
 
     Args:
@@ -457,7 +467,7 @@ def extend_kernel(start: int, partial: wp.array(dtype=wp.int64), pixels: PackedP
 
 
 @wp.kernel(enable_backward=False)
-def move_gradients_kernel(start: int, partial: wp.array(dtype=wp.int64), grads: PixelGradients):
+def move_gradients_kernel(start: int, partial: Longs, grads: PixelGradients):
     """Move the gradients of partly covered pixels aside, for `extend_backward_kernel` to distribute.
 
     Args:
@@ -484,7 +494,7 @@ def _outline_to_coverage(
 
 @wp.kernel(enable_backward=False)
 def extend_backward_kernel(
-    start: int, partial: wp.array(dtype=wp.int64), pixels: PackedPixels, lookups: Lookups, grads: PixelGradients
+    start: int, partial: Longs, pixels: PackedPixels, lookups: Lookups, grads: PixelGradients
 ):
     """Gradient of `extend_kernel`.
 
@@ -556,13 +566,7 @@ def sample_texels(
 
 @wp.func_native(_SAMPLE.replace("WIDTH", str(DARKNESS)))
 def sample_darkness(
-    texels: wp.array(dtype=wp.vec4f),
-    rows: wp.vec4i,
-    columns: wp.vec4i,
-    wx: wp.vec4f,
-    wy: wp.vec4f,
-    sx: wp.vec4f,
-    sy: wp.vec4f,
+    texels: Vec4fs, rows: wp.vec4i, columns: wp.vec4i, wx: wp.vec4f, wy: wp.vec4f, sx: wp.vec4f, sy: wp.vec4f
 ) -> darkness_samples:
     """`sample_texels` for shadows.
 
@@ -597,7 +601,7 @@ def _sample_with_slopes(texels: wp.array(dtype=texel_t), t: BicubicTaps):
 
 
 @wp.func
-def read_rect(rects: wp.array2d(dtype=wp.int64), i: int):
+def read_rect(rects: Longs2D, i: int):
     return wp.vec4i(wp.int32(rects[i, 0]), wp.int32(rects[i, 1]), wp.int32(rects[i, 2]), wp.int32(rects[i, 3]))
 
 
@@ -1224,7 +1228,7 @@ def _to_eye(photograph: PhotographData, at: wp.vec4i):
 @wp.kernel(enable_backward=False)
 def complete_kernel(
     start: int,
-    need: wp.array(dtype=wp.int64),
+    need: Longs,
     pixels: PackedPixels,
     vertices: Vertices,
     photograph: PhotographData,
@@ -1256,7 +1260,7 @@ def complete_kernel(
 @wp.kernel(enable_backward=False)
 def complete_backward_kernel(
     start: int,
-    need: wp.array(dtype=wp.int64),
+    need: Longs,
     pixels: PackedPixels,
     vertices: Vertices,
     photograph: PhotographData,
@@ -1301,7 +1305,7 @@ def complete_backward_kernel(
 
 
 @wp.kernel(enable_backward=True)
-def _adjoints_kernel(out: wp.array(dtype=wp.float32)):
+def _adjoints_kernel(out: Floats):
     """Never run. Warp generates adjoints of what a differentiable kernel calls; with `wp.grad` alone, some
     functions further down may be missed (Warp 1.19), and their gradients are silently 0.
     """

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from scene_ir.raster.launch import start_warp
+from scene_ir.raster.launch import Floats, Longs, Longs2D, Mat33ds, Vec2fs, Vec3fs, Vec4fs, Vec4is, start_warp
 from scene_ir.raster.verbs import NEAR_M
 from scene_ir.render import model
 from scene_ir.render.kernels.shading import crop_taps, inside_weight, read_rect, sample_darkness
@@ -36,12 +36,12 @@ class ShadowArrays:
         frame_wh: (N,) px.
     """
 
-    inside: wp.array(dtype=wp.mat33d)
-    then: wp.array(dtype=wp.mat33d)
-    dark: wp.array(dtype=wp.vec4f)
-    rects: wp.array2d(dtype=wp.int64)
-    offsets: wp.array(dtype=wp.int64)
-    frame_wh: wp.array(dtype=wp.vec2f)
+    inside: Mat33ds
+    then: Mat33ds
+    dark: Vec4fs
+    rects: Longs2D
+    offsets: Longs
+    frame_wh: Vec2fs
 
 
 @wp.func
@@ -72,9 +72,7 @@ def _reaches_crop(uv: wp.vec2f, rect: wp.vec4i):
 
 
 @wp.kernel(enable_backward=False)
-def shadow_kernel(
-    start: int, table: wp.array(dtype=wp.vec4i), ground: ShadowArrays, out: wp.array(dtype=wp.vec3f)
-):
+def shadow_kernel(start: int, table: Vec4is, ground: ShadowArrays, out: Vec3fs):
     """Shadow factors of packed patch pixels.
 
     Args:
@@ -104,13 +102,7 @@ def _border_loss(place: wp.vec2f, wh: wp.vec2f):
 
 
 @wp.kernel(enable_backward=False)
-def shadow_backward_kernel(
-    start: int,
-    table: wp.array(dtype=wp.vec4i),
-    ground: ShadowArrays,
-    grad_out: wp.array(dtype=wp.vec3f),
-    grad_then: wp.array(dtype=wp.mat33d),
-):
+def shadow_backward_kernel(start: int, table: Vec4is, ground: ShadowArrays, grad_out: Vec3fs, grad_then: Mat33ds):
     """Gradient of `shadow_kernel` to `then`.
 
     Args:
@@ -156,6 +148,6 @@ def shadow_backward_kernel(
 
 
 @wp.kernel(enable_backward=True)
-def _adjoints_kernel(out: wp.array(dtype=wp.float32)):
+def _adjoints_kernel(out: Floats):
     """Never run: see `shading._adjoints_kernel`."""
     out[0] = _border_loss(wp.vec2f(0.0, 0.0), wp.vec2f(0.0, 0.0))
