@@ -1,1 +1,1 @@
-"""Figures of detections against labels: average precision, recall, failures."""
+"""Detection metrics: average precision, recall, failures."""

@@ -1,4 +1,4 @@
-"""Average precision and recall. pycocotools is the definition, ultrafast-pycocotools the same to the bit."""
+"""COCO's average precision and recall: pycocotools defines them, ultrafast-pycocotools gives equal numbers."""
 
 from __future__ import annotations
 
@@ -11,64 +11,68 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from drivesem.evaluation.instances import EVERY_CLASS, Found, Integers, Truths
+from drivesem.evaluation.instances import EVERY_CLASS, DetectionTable, GroundTruthTable, Integers
 
 if TYPE_CHECKING:
     from detectors.types import Detections, Targets
 
 Engine = Literal["pycocotools", "ultrafast-pycocotools"]
 STATS = ("AP", "AP50", "AP75", "APs", "APm", "APl", "AR1", "AR10", "AR100", "ARs", "ARm", "ARl")
-"""The twelve numbers, in pycocotools' order; -1 where there is no object."""
+"""COCO's twelve numbers in pycocotools' order; -1 without objects."""
 IOU_THRESHOLDS = np.linspace(0.5, 0.95, round((0.95 - 0.5) / 0.05) + 1)
-"""As pycocotools has them, to the last bit."""
+"""Equal to pycocotools' to the last bit."""
 
 MAX_DETECTIONS = 100
-"""Detections judged an image and class, as COCO does."""
+"""Maximum number of detections per image and class (COCO)."""
 IOU_50, IOU_70 = 0, 4
-"""Places of 0.5 and 0.7 among IOU_THRESHOLDS."""
+"""Indices of 0.5 and 0.7 in `IOU_THRESHOLDS`."""
 
 
 SCORE_TITLES = ("AP50", "AP70", "AP50:95", "recall", "recall at t*")
-"""Titles of `ClassScores.shown`."""
+"""Titles of `ClassScores.columns`."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClassScores:
-    """Fractions of 1; None where there is no object to find. ap50, ap70: at IoU 0.5 and 0.7; ap: mean over IoU 0.5
-    to 0.95; recall: at IoU 0.5 with all detections; recall_at_t_star: with those of score t* and above; objects:
-    how many were judged.
-    """
+    """Metrics of one class in [0, 1]; None without objects."""
 
     ap50: float | None
+    """Average precision at IoU 0.5."""
     ap70: float | None
+    """Average precision at IoU 0.7."""
     ap: float | None
+    """Mean average precision over IoU 0.5 to 0.95."""
     recall: float | None
+    """Recall at IoU 0.5 with all detections."""
     recall_at_t_star: float | None
+    """Recall at IoU 0.5 with detections of at least t*."""
     objects: int
+    """Number of evaluated objects."""
 
     @property
-    def shown(self) -> tuple[float | None, ...]:
-        """The figures that tables show, as SCORE_TITLES calls them."""
+    def columns(self) -> tuple[float | None, ...]:
+        """Metrics in the order of `SCORE_TITLES`."""
         return self.ap50, self.ap70, self.ap, self.recall, self.recall_at_t_star
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
-    """per_class: in the detector's order; overall: the mean over classes that have objects (recall: over objects);
-    headline: the class the paper reports.
-    """
+class CocoScores:
+    """COCO's metrics of a detector."""
 
     headline: ClassScores
+    """Metrics of the class that the paper reports."""
     overall: ClassScores
+    """Mean over classes with objects; recall is weighted by objects."""
     per_class: dict[str, ClassScores]
+    """Metrics by class, in the detector's order."""
 
     @classmethod
-    def of(cls, per_class: dict[str, ClassScores], headline: str) -> Scores:
-        """From the figures of each class."""
+    def from_classes(cls, per_class: dict[str, ClassScores], headline: str) -> CocoScores:
+        """Combine the metrics of all classes."""
         return cls(headline=per_class[headline], overall=_overall(list(per_class.values())), per_class=per_class)
 
     def to_json(self) -> dict[str, Any]:
-        """The headline's figures in front, `overall` and `per_class` beside them."""
+        """The headline's metrics, then `overall` and `per_class`."""
         return {
             **asdict(self.headline),
             "overall": asdict(self.overall),
@@ -82,11 +86,20 @@ def evaluate(
     classes: Sequence[str],
     t_star: float,
     headline: str = "Car",
-) -> Scores:
-    """COCO's figures over images; the i-th targets and detections belong to one image.
+) -> CocoScores:
+    """Compute COCO's metrics over images.
 
-    Ignored targets are COCO's crowds: a detection whose share on one reaches the IoU threshold counts nowhere.
-    Raises ValueError where the two lists differ in length or `headline` is no class.
+    Ignored targets are COCO's crowds: a detection with a sufficient share on one does not count.
+
+    Args:
+        targets: Labels of each image.
+        detections: Detections in each image.
+        classes: Names of the classes.
+        t_star: Score threshold for the recall.
+        headline: Class that the paper reports.
+
+    Raises:
+        ValueError: The lists differ in length, or `headline` is no class.
     """
     if len(targets) != len(detections):
         raise ValueError(f"detections: expected {len(targets)} images, found {len(detections)}")
@@ -94,22 +107,30 @@ def evaluate(
         raise ValueError(f"headline: expected one of {', '.join(classes)}, found {headline!r}")
     evaluator = _run(targets, detections, classes)
     per_class = {name: _class_scores(evaluator, k, len(targets), t_star) for k, name in enumerate(classes)}
-    return Scores.of(per_class, headline)
+    return CocoScores.from_classes(per_class, headline)
 
 
 def fastest_engine(truth_ids: Integers | None = None) -> Engine:
-    """ultrafast-pycocotools where it is installed and none of the truth_ids (M,) is 0, which it would find."""
+    """ultrafast-pycocotools if it is installed and no id (M,) is 0: unlike pycocotools, it matches those."""
     fast = importlib.util.find_spec("ultrafast_pycocotools") is not None
     return "ultrafast-pycocotools" if fast and (truth_ids is None or bool(truth_ids.all())) else "pycocotools"
 
 
-def twelve_numbers(
-    truths: Truths, found: Found, classes: int, engine: Engine, truth_ids: Integers | None = None
+def coco_stats(
+    truths: GroundTruthTable,
+    found: DetectionTable,
+    classes: int,
+    engine: Engine,
+    truth_ids: Integers | None = None,
 ) -> list[float]:
-    """COCO's `stats` (12) in the order of `STATS`.
+    """Compute COCO's twelve numbers in the order of `STATS`.
 
-    Ignored truths are crowds; those of EVERY_CLASS are crowds of each of the `classes`. truth_ids (M,): the ids
-    that the file gives them, which matter where one is 0: pycocotools takes that for "no match".
+    Args:
+        truths: Objects. Ignored ones are crowds; those of `EVERY_CLASS` are crowds of every class.
+        found: Detections.
+        classes: Number of classes.
+        engine: Library that computes them.
+        truth_ids: (M,) ids of the objects in the file; pycocotools takes an id of 0 for "no match".
     """
     every = truths.label == EVERY_CLASS
     rows = np.concatenate([np.flatnonzero(~every), np.repeat(np.flatnonzero(every), classes)])
@@ -147,7 +168,7 @@ def twelve_numbers(
         if engine == "pycocotools" or not len(found):
             detected.dataset = shared | {"annotations": _detected(found)}
             detected.createIndex()
-        else:  # as an array it needs no dictionary a detection, which take as long as all the rest
+        else:  # an array avoids one dictionary per detection, which would double the time
             columns = [found.frame, found.boxes[:, [0, 1, 4, 5]], found.score, found.label]
             detected = dataset.loadRes(np.column_stack(columns))
         evaluator: Any = Evaluator(dataset, detected, iouType="bbox")
@@ -157,8 +178,8 @@ def twelve_numbers(
     return [float(value) for value in evaluator.stats[: len(STATS)]]
 
 
-def _detected(found: Found) -> list[dict[str, Any]]:
-    """Detections as pycocotools' annotations."""
+def _detected(found: DetectionTable) -> list[dict[str, Any]]:
+    """Convert detections to pycocotools' annotations."""
     return [
         {"id": i, "image_id": f, "category_id": k, "bbox": box, "area": box[2] * box[3], "iscrowd": 0, "score": s}
         for i, (f, k, box, s) in enumerate(
@@ -175,7 +196,7 @@ def _detected(found: Found) -> list[dict[str, Any]]:
 
 
 def _run(targets: Sequence[Targets], detections: Sequence[Detections], classes: Sequence[str]) -> Any:
-    """pycocotools' evaluator after `accumulate`; it prints its progress, which is swallowed."""
+    """Run pycocotools' evaluator up to `accumulate`, without the progress that it prints."""
     from pycocotools.coco import COCO
     from pycocotools.cocoeval import COCOeval
 
@@ -196,7 +217,7 @@ def _run(targets: Sequence[Targets], detections: Sequence[Detections], classes: 
             content: Any = {
                 "images": [{"id": i + 1} for i in range(len(targets))],
                 "categories": [{"id": k + 1, "name": name} for k, name in enumerate(classes)],
-                # pycocotools takes id 0 for "no match": they begin at 1.
+                # Ids start at 1: pycocotools takes 0 for "no match".
                 "annotations": [a | {"id": n + 1} for n, a in enumerate(annotations)],
             }
             dataset.dataset = content

@@ -1,8 +1,8 @@
-"""How sure a figure is: bootstrap over frames, and paired tests of two detectors on the same frames.
+"""Uncertainty of metrics: bootstrap over frames, and paired tests of two detectors on the same frames.
 
-Frames, not objects, are drawn: what a detector finds in one image hangs together. Intervals are percentiles (Efron
-1979). The paired test swaps the two detectors' detections in random frames: if both were alike, no swap would
-matter; p is the share of swaps whose difference is at least the observed one, the observed one included.
+Frames are drawn instead of objects, as detections in one image are correlated. Intervals are percentiles (Efron 1979).
+The paired test swaps the two detectors' detections in random frames, which would not matter if both were equal; p is
+the share of swaps with at least the observed difference, including the observed one.
 """
 
 from __future__ import annotations
@@ -13,136 +13,160 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivesem.evaluation.curves import Rule, Tally, average_precision
+from drivesem.evaluation.curves import ClassMatches, InterpolationRule, average_precision
 from drivesem.evaluation.instances import Floats
-from drivesem.evaluation.kitti import Curve
+from drivesem.evaluation.kitti import KittiCurve
 
 LEVEL = 0.95
 """Share of draws inside an interval."""
 DRAWS = 200
-"""Bootstrap draws by default."""
+"""Default number of bootstrap draws."""
 _Z_95 = 1.959964
-"""Of the normal distribution, two-sided 95 %."""
+"""Two-sided 95 % quantile of the normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)
-class Averaged:
-    """Average precision of one tally by one rule, at weights of frames."""
+class WeightedAveragePrecision:
+    """Average precision of one class under weights of the frames."""
 
-    tally: Tally
-    rule: Rule
+    matches: ClassMatches
+    """Matches of the class."""
+    rule: InterpolationRule
+    """How recall is sampled."""
 
     def value(self, weights: Floats | None) -> float | None:
-        """None where no object is drawn."""
-        return average_precision(self.tally, self.rule, weights)
+        """The metric under weights (F,) of the frames; None where no object is drawn."""
+        return average_precision(self.matches, self.rule, weights)
 
-    def beside(self, other: Averaged) -> Averaged:
-        """Both at once: the other's frames are counted on from this one's."""
-        return replace(self, tally=_beside(self.tally, other.tally))
+    def concatenate(self, other: WeightedAveragePrecision) -> WeightedAveragePrecision:
+        """Join both detectors' frames: the other's follow this one's."""
+        return replace(self, matches=_concatenate(self.matches, other.matches))
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
-    """KITTI's R40 of one curve, at weights of frames."""
+class WeightedKittiPrecision:
+    """KITTI's R40 of one curve under weights of the frames."""
 
-    curve: Curve
+    curve: KittiCurve
+    """Matches of one class at one difficulty."""
 
     def value(self, weights: Floats | None) -> float | None:
-        """None where no object is drawn."""
+        """The metric under weights (F,) of the frames; None where no object is drawn."""
         return self.curve.r40(weights)
 
-    def beside(self, other: Sampled) -> Sampled:
-        """Both at once: the other's frames are counted on from this one's."""
+    def concatenate(self, other: WeightedKittiPrecision) -> WeightedKittiPrecision:
+        """Join both detectors' frames: the other's follow this one's."""
         a, b = self.curve, other.curve
-        frames = len(a.tally.objects)
+        frames = len(a.matches.objects)
         joined = replace(
             a,
-            tally=_beside(a.tally, b.tally),
+            matches=_concatenate(a.matches, b.matches),
             collected_score=np.concatenate([a.collected_score, b.collected_score]),
             collected_frame=np.concatenate([a.collected_frame, b.collected_frame + frames]),
         )
-        return Sampled(joined)
+        return WeightedKittiPrecision(joined)
 
 
 @dataclass(frozen=True, slots=True)
-class Recalled:
-    """Recall of one tally with all its detections, at weights of frames."""
+class WeightedRecall:
+    """Recall of one class with all detections under weights of the frames."""
 
-    tally: Tally
+    matches: ClassMatches
+    """Matches of the class."""
 
     def value(self, weights: Floats | None) -> float | None:
-        """None where no object is drawn."""
-        objects = self.tally.count(weights)
+        """The metric under weights (F,) of the frames; None where no object is drawn."""
+        objects = self.matches.object_count(weights)
         if objects <= 0:
             return None
-        hits, _ = self.tally.curve(weights)
+        hits, _ = self.matches.cumulative_counts(weights)
         return float(hits[-1]) / objects if len(hits) else 0.0
 
-    def beside(self, other: Recalled) -> Recalled:
-        """Both at once: the other's frames are counted on from this one's."""
-        return Recalled(_beside(self.tally, other.tally))
+    def concatenate(self, other: WeightedRecall) -> WeightedRecall:
+        """Join both detectors' frames: the other's follow this one's."""
+        return WeightedRecall(_concatenate(self.matches, other.matches))
 
 
-Part = Averaged | Sampled | Recalled
+WeightedMetric = WeightedAveragePrecision | WeightedKittiPrecision | WeightedRecall
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
-    """A named figure: the mean of its parts that have objects."""
+class NamedMetric:
+    """A named metric: the mean over those of its parts that have objects."""
 
     name: str
-    parts: tuple[Part, ...]
+    """Name of the metric."""
+    parts: tuple[WeightedMetric, ...]
+    """Metrics of classes."""
 
     def value(self, weights: Floats | None = None) -> float | None:
-        """At weights (F,) of the frames; None where no part has objects."""
+        """The metric under weights (F,) of the frames; None where no part has objects."""
         known = [v for part in self.parts if (v := part.value(weights)) is not None]
         return sum(known) / len(known) if known else None
 
-    def beside(self, other: Figure) -> Figure:
-        """Both detectors' figures in one, over twice the frames."""
+    def concatenate(self, other: NamedMetric) -> NamedMetric:
+        """Join both detectors' metrics over twice the frames."""
         pairs = zip(self.parts, other.parts, strict=True)
-        return Figure(self.name, tuple(a.beside(b) for a, b in pairs))  # pyright: ignore[reportArgumentType]
+        return NamedMetric(self.name, tuple(a.concatenate(b) for a, b in pairs))  # pyright: ignore[reportArgumentType]
 
 
-def rate(name: str, hits: Floats, of: Floats) -> Figure:
-    """So many `hits` (F,) a frame of so many (F,): a share, or another ratio of sums over frames."""
+def ratio_metric(name: str, hits: Floats, totals: Floats) -> NamedMetric:
+    """A ratio of sums over frames.
+
+    Args:
+        name: Name of the metric.
+        hits: (F,) numerators.
+        totals: (F,) denominators.
+    """
     count = len(hits)
-    return Figure(name, (Recalled(Tally(np.ones(count), np.arange(count), hits, np.zeros(count), of)),))
+    matches = ClassMatches(np.ones(count), np.arange(count), hits, np.zeros(count), totals)
+    return NamedMetric(name, (WeightedRecall(matches),))
 
 
-def _beside(a: Tally, b: Tally) -> Tally:
+def _concatenate(a: ClassMatches, b: ClassMatches) -> ClassMatches:
     score = np.concatenate([a.score, b.score])
     order = np.argsort(-score, kind="stable")
-    return Tally(
+    return ClassMatches(
         score=score[order],
         frame=np.concatenate([a.frame, b.frame + len(a.objects)])[order],
-        hits=np.concatenate([a.hits, b.hits])[order],
-        misfires=np.concatenate([a.misfires, b.misfires])[order],
+        true_positives=np.concatenate([a.true_positives, b.true_positives])[order],
+        false_positives=np.concatenate([a.false_positives, b.false_positives])[order],
         objects=np.concatenate([a.objects, b.objects]),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A figure and the bounds within which LEVEL of the draws lie; None where it has no objects."""
+    """A metric and the bounds that enclose `LEVEL` of the draws; None without objects."""
 
     name: str
+    """Name of the metric."""
     value: float | None
+    """Its value."""
     low: float | None
+    """Lower bound."""
     high: float | None
+    """Upper bound."""
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """Second detector minus first. low, high: of the paired bootstrap; p: of the permutation test, two-sided."""
+class PairedDifference:
+    """Difference of a metric between two detectors."""
 
     name: str
+    """Name of the metric."""
     first: float | None
+    """Value of the first detector."""
     second: float | None
+    """Value of the second detector."""
     difference: float | None
+    """Second minus first."""
     low: float | None
+    """Lower bound of the paired bootstrap."""
     high: float | None
+    """Upper bound of the paired bootstrap."""
     p: float | None
+    """p value of the two-sided permutation test."""
 
     @property
     def interval(self) -> Interval:
@@ -150,48 +174,62 @@ class Difference:
         return Interval(self.name, self.difference, self.low, self.high)
 
 
-def intervals(
-    figures: Sequence[Figure], frames: int, draws: int, generator: np.random.Generator
+def bootstrap_intervals(
+    metrics: Sequence[NamedMetric], frames: int, draws: int, generator: np.random.Generator
 ) -> list[Interval]:
-    """Bootstrap intervals of figures that share frames; all see the same draws."""
+    """Compute bootstrap intervals of metrics on the same frames and draws.
+
+    Args:
+        metrics: Metrics.
+        frames: Number of frames.
+        draws: Number of draws.
+        generator: Source of random numbers.
+    """
     weights = _draws(frames, draws, generator)
     found: list[Interval] = []
-    for figure in figures:
-        low, high = _bounds([figure.value(w) for w in weights])
-        found.append(Interval(figure.name, figure.value(), low, high))
+    for metric in metrics:
+        low, high = _bounds([metric.value(w) for w in weights])
+        found.append(Interval(metric.name, metric.value(), low, high))
     return found
 
 
-def differences(
-    first: Sequence[Figure],
-    second: Sequence[Figure],
+def paired_differences(
+    first: Sequence[NamedMetric],
+    second: Sequence[NamedMetric],
     frames: int,
     draws: int,
     generator: np.random.Generator,
     test: bool = True,
-) -> list[Difference]:
-    """Paired differences of the same figures of two detectors on the same frames. test: with the permutation test,
-    which takes as long again.
+) -> list[PairedDifference]:
+    """Compute paired differences of two detectors on the same frames.
+
+    Args:
+        first: Metrics of the first detector.
+        second: The same metrics of the second one.
+        frames: Number of frames.
+        draws: Number of draws.
+        generator: Source of random numbers.
+        test: Whether to add the permutation test, which doubles the time.
     """
     weights = _draws(frames, draws, generator)
     swaps = generator.random((draws if test else 0, frames)) < 0.5
-    found: list[Difference] = []
+    found: list[PairedDifference] = []
     for a, b in zip(first, second, strict=True):
         va, vb = a.value(), b.value()
         if va is None or vb is None:
-            found.append(Difference(a.name, va, vb, None, None, None, None))
+            found.append(PairedDifference(a.name, va, vb, None, None, None, None))
             continue
         low, high = _bounds([_minus(b.value(w), a.value(w)) for w in weights])
-        both = a.beside(b)
+        joined = a.concatenate(b)
         extreme = 0
         for swap in swaps.astype(np.float64):
             swapped = _minus(
-                both.value(np.concatenate([swap, 1 - swap])), both.value(np.concatenate([1 - swap, swap]))
+                joined.value(np.concatenate([swap, 1 - swap])), joined.value(np.concatenate([1 - swap, swap]))
             )
-            # a hair's breadth: the same sum in another order must count as equal
+            # tolerance: the same sum in another order must count as equal
             extreme += swapped is not None and abs(swapped) >= abs(vb - va) - 1e-12
         p = (1 + extreme) / (1 + len(swaps)) if len(swaps) else None
-        found.append(Difference(a.name, va, vb, vb - va, low, high, p))
+        found.append(PairedDifference(a.name, va, vb, vb - va, low, high, p))
     return found
 
 
@@ -200,7 +238,7 @@ def _minus(a: float | None, b: float | None) -> float | None:
 
 
 def _draws(frames: int, draws: int, generator: np.random.Generator) -> list[Floats]:
-    """How often each frame is drawn, `frames` times with replacement."""
+    """Draw `frames` frames with replacement, `draws` times: how often each is drawn (F,)."""
     if not frames:
         return []
     shares = np.full(frames, 1 / frames)
@@ -216,7 +254,7 @@ def _bounds(values: Sequence[float | None]) -> tuple[float | None, float | None]
 
 
 def holm(ps: Sequence[float | None]) -> list[float | None]:
-    """p values of one table, each as small as may be said when all are looked at (Holm 1979); None stays."""
+    """Adjust the p values of one table for multiple testing (Holm 1979); None stays."""
     known = sorted((p, i) for i, p in enumerate(ps) if p is not None)
     found: list[float | None] = [None] * len(ps)
     least = 0.0
@@ -227,7 +265,7 @@ def holm(ps: Sequence[float | None]) -> list[float | None]:
 
 
 def wilson(found: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a share, after Wilson (1927). ValueError unless 0 <= found <= count and count >= 1."""
+    """95 % interval of a proportion (Wilson 1927). Raises ValueError unless 0 <= found <= count and count >= 1."""
     if count < 1 or not 0 <= found <= count:
         raise ValueError(f"share: expected 0 to all of at least one, found {found} of {count}")
     share, z2 = found / count, _Z_95 * _Z_95
@@ -237,8 +275,8 @@ def wilson(found: int, count: int) -> tuple[float, float]:
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
-    """The 95 % interval of how much larger the second of two independent shares is, each so many found of a count:
-    of both shares' `wilson` intervals, after Newcombe (1998), method 10. ValueError as of `wilson`.
+    """95 % interval of the difference between two independent proportions, second minus first (Newcombe 1998, method
+    10). Each is a pair of successes and count; raises ValueError as `wilson` does.
     """
     (low, high), (lower, upper) = wilson(*first), wilson(*second)
     one, other = first[0] / first[1], second[0] / second[1]

@@ -49,7 +49,7 @@ def object_margins(
     """
     margins = []
     for label, box, visible in zip(labels.tolist(), boxes_xyxy, visible_xyxy, strict=True):
-        candidate_boxes = candidates.boxes_of(label)
+        candidate_boxes = candidates.boxes_for_class(label)
         ious = boxes.iou_matrix(torch.stack([box, visible]).to(candidate_boxes), candidate_boxes).amax(dim=0)
         logits = log_score_logits(candidates.log_scores[:, label])
         margins.append(_best_margin(logits, ious, MATCH_IOU, t_star, sharpness))
@@ -71,7 +71,7 @@ def place_margins(
         (K,) logits, at most -`MIN_MARGIN`.
     """
     logits = log_score_logits(candidates.log_scores.T.flatten())
-    candidate_boxes = torch.cat([candidates.boxes_of(label) for label in range(candidates.log_scores.shape[1])])
+    candidate_boxes = torch.cat([candidates.boxes_for_class(label) for label in range(candidates.log_scores.shape[1])])
     ious = boxes.iou_matrix(places_xyxy.to(candidate_boxes), candidate_boxes)
     margins = [-_best_margin(logits, row, SAME_PLACE_IOU, t_star, sharpness) for row in ious]
     return torch.stack(margins) if margins else candidates.log_scores[:0, 0]
@@ -93,7 +93,7 @@ def background_margin(
     """
     margins = []
     for label in range(candidates.log_scores.shape[1]):
-        candidate_boxes = candidates.boxes_of(label)
+        candidate_boxes = candidates.boxes_for_class(label)
         labelled = labelled_xyxy.to(candidate_boxes)
         touches = boxes.iou_matrix(candidate_boxes, labelled) >= BACKGROUND_IOU
         on_nothing = ~(touches | (boxes.ioa_matrix(candidate_boxes, labelled) >= MATCH_IOU)).any(dim=1)

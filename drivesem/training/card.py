@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from detectors.base import Detector
+from detectors.registry import SHIPPED
 from drivesem.attack.labels import Difficulty
-from drivesem.evaluation.coco import ClassScores
-from drivesem.training.judging import Marks
-from drivesem.training.targets import TRAINED
+from drivesem.evaluation.coco import ClassScores, CocoScores
+from drivesem.report.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
+from drivesem.report.terminal import Console
+from drivesem.training.frames import TRAINING_LIMITS
 from scene_ir import files
 
 _CARD = """# {title}
@@ -40,7 +49,30 @@ Not for use in a vehicle.
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ValidationScores:
+    """COCO's figures, and the best F1 over all classes with its score."""
+
+    scores: CocoScores
+    f1: float
+    t_star: float
+
+    @property
+    def selection_score(self) -> float:
+        """What weights are chosen by: the headline's AP50, and a quarter of the mean over classes."""
+        return (self.scores.headline.ap50 or 0.0) + 0.25 * (self.scores.overall.ap50 or 0.0)
+
+    def summary(self) -> str:
+        """One line."""
+        rows = [
+            f"{name} AP50 {s.ap50:.4f} recall {s.recall:.4f} ({s.objects})"
+            for name, s in self.scores.per_class.items()
+            if s.objects
+        ]
+        return ", ".join(rows) + f", F1 {self.f1:.4f} at {self.t_star:.3f}"
+
+
+@dataclass(frozen=True)
+class CardFacts:
     """What a card says besides figures. data: a sentence on the frames; start: one on the first weights; machine:
     what it was trained on; commands: lines that train it again; also: a phrase for further frames.
     """
@@ -57,12 +89,12 @@ class Recipe:
     judged: Difficulty = field(default_factory=Difficulty)
 
 
-def card(
+def format_card(
     detector: Detector,
-    recipe: Recipe,
+    recipe: CardFacts,
     weights: Path,
     done: tuple[int, float],
-    held_out: tuple[int, Marks] | None,
+    held_out: tuple[int, ValidationScores] | None,
     also: tuple[int, ClassScores] | None,
     chosen_on: int | None = None,
 ) -> str:
@@ -76,10 +108,10 @@ def card(
         parameters=sum(p.numel() for p in detector.parameters()),
         classes=", ".join(detector.classes),
         file=weights.name,
-        sha256=files.digest(weights),
+        sha256=files.sha256_digest(weights),
         start=recipe.start,
         data=recipe.data,
-        minimum=TRAINED.min_height_px,
+        minimum=TRAINING_LIMITS.min_height_px,
         step=step,
         batch=recipe.batch,
         minutes=seconds / 60,
@@ -98,8 +130,8 @@ def card(
 
 
 def _figures(
-    recipe: Recipe,
-    held_out: tuple[int, Marks] | None,
+    recipe: CardFacts,
+    held_out: tuple[int, ValidationScores] | None,
     also: tuple[int, ClassScores] | None,
     chosen_on: int | None,
 ) -> str:
@@ -133,3 +165,144 @@ def _figures(
             "",
         ]
     return "\n".join(lines)
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SIZE_IN, _DPI = (7.0, 7.4), 130
+_SMOOTHED_OVER = 0.02
+"""Share of the run over which the thick line averages."""
+_FACTS = ("step", "seconds", "rate", "norm")
+"""Columns of the log that are no terms of the loss."""
+_MOST_DIGITS = 2
+EVALUATED = ("car_ap50", "car_recall", "ap50", "f1")
+"""Columns of evaluations that are drawn."""
+
+
+def read_columns(path: Path) -> dict[str, np.ndarray]:
+    """A CSV of numbers by column, float64; empty fields are NaN. Nothing where there is no such file."""
+    if not path.is_file():
+        return {}
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = list(rows[0]) if rows else []
+    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
+
+
+def moving_average(values: Sequence[float] | np.ndarray, over: int) -> np.ndarray:
+    """Means over `over` values around each; fewer at the ends."""
+    sums = np.cumsum(np.concatenate([[0.0], np.asarray(values, np.float64)]))
+    place = np.arange(len(sums) - 1)
+    first, last = np.maximum(place - over // 2, 0), np.minimum(place + (over - over // 2), len(place))
+    return (sums[last] - sums[first]) / (last - first)
+
+
+def plot_curves(log: Path, evaluations: Path, out: Path, title: str) -> None:
+    """Terms of the loss, evaluations and the rate over steps, as PNG; nothing where the log has no step yet."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    steps, judged = read_columns(log), read_columns(evaluations)
+    if not steps:
+        return
+    with mpl.rc_context(dict(PLOT_STYLE)):  # pyright: ignore[reportArgumentType]
+        figure = Figure(figsize=_SIZE_IN, layout="constrained")
+        heights = (3, 2.2, 1) if judged else (3, 1)
+        panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+        loss, rate = panels[0], panels[-1]
+        over = max(round(len(steps["step"]) * _SMOOTHED_OVER), 1)
+        terms = [name for name in steps if name not in _FACTS]
+        for i, name in enumerate(terms):
+            colour = PLOT_COLOURS[i % len(PLOT_COLOURS)]
+            loss.plot(steps["step"], steps[name], color=colour, linewidth=0.6, alpha=0.25)
+            loss.plot(
+                steps["step"],
+                moving_average(steps[name], over),
+                LINE_STYLES[i % len(LINE_STYLES)],
+                color=colour,
+                label=name,
+                linewidth=1.8,
+            )
+        loss.set(ylabel="loss", yscale="log")
+        loss.set_title(title, loc="left", fontsize=11)
+        loss.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=max(len(terms), 1))
+        if judged:
+            _draw_marks(panels[1], judged)
+        rate.plot(steps["step"], steps["rate"], color=PLOT_COLOURS[0], linewidth=1.5)
+        rate.set(ylabel="rate", xlabel="steps", ylim=(0, None))
+        rate.ticklabel_format(axis="y", style="sci", scilimits=(-_MOST_DIGITS, _MOST_DIGITS))
+        buffer = io.BytesIO()
+        # no date and no version in the file: equal figures give equal bytes
+        figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    files.write_bytes(out, buffer.getvalue())
+
+
+def _draw_marks(axes: Axes, judged: Mapping[str, np.ndarray]) -> None:
+    for i, name in enumerate(name for name in EVALUATED if name in judged):
+        axes.plot(
+            judged["step"],
+            100 * judged[name],
+            LINE_STYLES[i % len(LINE_STYLES)],
+            color=PLOT_COLOURS[i],
+            label=name.replace("_", " ").replace("ap50", "AP50").replace("car", "Car").replace("f1", "F1"),
+            linewidth=1.8,
+            marker="o",
+            markersize=4,
+        )
+    axes.set(ylabel="held out, %", ylim=(0, 102))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(EVALUATED))
+
+
+SHARED = ("split", "seed", "vehicles", "building", "tree", "bush", "surface")
+"""What a frame's manifest says of its origin and of the shapes it shows."""
+MANIFEST = "manifest.json"
+_NAMED = re.compile(r"`([\w.-]+_data\.json)`")
+"""Files beside a model card that say what frames were made of."""
+
+
+def describe_data(folders: Iterable[Path], frames: int | None = None) -> dict[str, Any]:
+    """Splits, seeds and the union of shapes over folders of `drivesem synth`, the first `frames` of each."""
+    manifests = [files.read_json(folder / MANIFEST)["frames"] for folder in folders]
+    entries = [entry for manifest in manifests for entry in manifest[:frames]]
+    union: dict[str, Any] = {"frames": len(entries)}
+    for key in SHARED:
+        values = [entry[key] for entry in entries]
+        union[key] = sorted({v for value in values for v in (value if isinstance(value, list) else [value])})
+    return union
+
+
+def generated_folders(folders: str | None) -> list[Path]:
+    """The folders, with commas between, where `drivesem synth` made all of them; else none."""
+    found = [Path(part) for part in (folders or "").split(",") if part]
+    return found if found and all((folder / MANIFEST).is_file() for folder in found) else []
+
+
+def street_seeds(described: dict[str, Any]) -> set[tuple[str, int]]:
+    """Split and seed of streets that `describe` tells of: where two sets share one, they share streets."""
+    return {(split, seed) for split in described["split"] for seed in described["seed"]}
+
+
+def list_overlaps(detector: str, folders: str | None) -> list[str]:
+    """Lines that say which frames of generated folders a detector's model card names as its own, to train on or to
+    choose by; none where the card or the folders do not tell.
+    """
+    here = generated_folders(folders)
+    card = SHIPPED.get(detector, Path(detector)).with_suffix(".md")
+    if not here or not card.is_file():
+        return []
+    own, lines = street_seeds(describe_data(here)), []
+    for name in dict.fromkeys(_NAMED.findall(files.read_text(card))):
+        path = card.with_name(name)
+        for split, seed in sorted(own & street_seeds(files.read_json(path)) if path.is_file() else ()):
+            lines.append(
+                f"{folders}: streets of split {split}, seed {seed}, are among those of {name}, which the card of "
+                f"{detector} names: figures on them are not of held-out frames"
+            )
+    return lines
+
+
+def warn_about_overlaps(detectors: Sequence[str], folders: str | None, console: Console) -> None:
+    """Say it, a line each."""
+    for line in dict.fromkeys(line for one in detectors for line in list_overlaps(one, folders)):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)

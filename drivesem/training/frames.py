@@ -5,18 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from detectors.anchors import fit_anchors, target_sizes
 from detectors.squeezedet import ANCHOR_SIZES_WH
 from detectors.training import Sample
-from detectors.types import Targets
+from detectors.types import CLASSES, Targets
 from drivesem.attack.labels import Difficulty
+from drivesem.data.classes import ROAD_USERS
 from drivesem.data.registry import Dataset
-from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import to_uint8
@@ -47,7 +49,7 @@ class FrameStore(Sequence[Sample]):
         chosen = list(names)
         index = _known(cache, dataset, chosen)
         end = sum(height * width * 3 for _, height, width in index.values())
-        with files.writing(cache / PIXELS):
+        with files.name_write_errors(cache / PIXELS):
             cache.mkdir(parents=True, exist_ok=True)
             with (cache / PIXELS).open("r+b" if (cache / PIXELS).is_file() else "w+b") as file:
                 file.truncate(end)
@@ -67,7 +69,7 @@ class FrameStore(Sequence[Sample]):
         self._places = [index[name] for name in chosen]
         self._pixels = np.memmap(cache / PIXELS, np.uint8, "r", shape=(max(end, 1),)) if end else np.zeros(0, "u1")
         self.labels = [_labels(dataset, name) for name in chosen]
-        trained = suited(TRAINED, self.labels)
+        trained = adapt_limits(TRAINING_LIMITS, self.labels)
         self._targets = [training_targets(labels, trained, self.classes) for labels in self.labels]
 
     def __len__(self) -> int:
@@ -89,11 +91,11 @@ class FrameStore(Sequence[Sample]):
             known.update(self.image(index).tobytes())
         return known.hexdigest()
 
-    def objects(self) -> int:
+    def object_count(self) -> int:
         """How many objects there are to learn."""
         return sum(int((~targets.ignore).sum()) for targets in self._targets)
 
-    def anchors(self, seed: int) -> tuple[tuple[float, float], ...]:
+    def fit_anchors(self, seed: int) -> tuple[tuple[float, float], ...]:
         """As many anchors as SqueezeDet has published ones, by k-means of the objects' sizes.
 
         Raises ValueError where fewer sizes differ.
@@ -101,10 +103,10 @@ class FrameStore(Sequence[Sample]):
         sizes = np.concatenate([target_sizes(targets) for targets in self._targets])
         return fit_anchors(sizes, len(ANCHOR_SIZES_WH), seed).sizes_wh
 
-    def judged(self, difficulty: Difficulty) -> list[Targets]:
+    def evaluation_targets(self, difficulty: Difficulty) -> list[Targets]:
         """What a detector is judged by, frame by frame."""
-        limits = suited(difficulty, self.labels)
-        return [judged_targets(labels, limits, self.classes) for labels in self.labels]
+        limits = adapt_limits(difficulty, self.labels)
+        return [evaluation_targets(labels, limits, self.classes) for labels in self.labels]
 
 
 def _known(cache: Path, dataset: Dataset, names: Sequence[str]) -> dict[str, tuple[int, int, int]]:
@@ -121,7 +123,7 @@ def _known(cache: Path, dataset: Dataset, names: Sequence[str]) -> dict[str, tup
         image = to_uint8(dataset.frame(name).photograph)
         kept = np.fromfile(cache / PIXELS, np.uint8, image.size, offset=start)
         if image.shape[:2] != (height, width) or not np.array_equal(kept, image.reshape(-1)):
-            with files.writing(cache / INDEX):
+            with files.name_write_errors(cache / INDEX):
                 (cache / INDEX).unlink()  # before its pixels go: a process may be killed in between
             return {}
     return index
@@ -132,3 +134,62 @@ def _labels(dataset: Dataset, name: str) -> Labels:
     if labels is None:
         raise FormatError(f"frame {name}", "labels", "none")
     return labels
+
+
+OCCLUSION_UNKNOWN = 3
+"""KITTI's code for it."""
+
+TRAINING_LIMITS = Difficulty(min_height_px=12.0, max_occlusion=OCCLUSION_UNKNOWN - 1, max_truncation=1.0)
+"""What is trained on: all that is high enough for a 16 px grid and not known to be hidden altogether."""
+
+
+def adapt_limits(difficulty: Difficulty, labels: Iterable[Labels]) -> Difficulty:
+    """The difficulty without its limit on occlusion where a data set never says how occluded an object is."""
+    if any(bool((one.occlusion != OCCLUSION_UNKNOWN).any()) for one in labels):
+        return difficulty
+    return replace(difficulty, max_occlusion=OCCLUSION_UNKNOWN)
+
+
+def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[str]) -> Targets:
+    """Targets among `classes`; too hard objects and regions are ignored, objects of other classes left out.
+    So are types that are no road users: they are background.
+    """
+    labels = ROAD_USERS.known(labels)
+    targets = ROAD_USERS.targets(labels)
+    ignore = targets.ignore.clone()
+    ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
+    own = _places(classes)[targets.labels]
+    kept = (own >= 0) | ignore
+    return Targets(targets.boxes_xyxy[kept], own[kept].clamp_min(0), ignore[kept])
+
+
+def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[str]) -> Targets:
+    """What is judged, with labels among `classes`. Too hard objects, those of other classes, and regions are
+    ignored, for each of the classes. Types that are no road users are background.
+    """
+    labels = ROAD_USERS.known(labels)
+    named = ROAD_USERS.targets(labels)
+    ignore = named.ignore.clone()
+    ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
+    own = _places(classes)[named.labels]
+    # an object of its own class that is not judged, a neighbour of a class, or a region: said for every class
+    every = ignore | (own < 0)
+    rows = torch.cat([torch.arange(len(ignore))[~every], torch.arange(len(ignore))[every].repeat(len(classes))])
+    label = torch.cat([own[~every], torch.arange(len(classes)).repeat_interleave(int(every.sum()))])
+    left_out = torch.ones(int(every.sum()) * len(classes), dtype=torch.bool)
+    return Targets(named.boxes_xyxy[rows], label, torch.cat([ignore[~every], left_out]))
+
+
+def _too_hard(labels: Labels, difficulty: Difficulty) -> torch.Tensor:
+    """(N,) bool. An unknown truncation (NaN) is no reason to leave an object out."""
+    height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+    return (
+        (height < difficulty.min_height_px)
+        | (labels.occlusion > difficulty.max_occlusion)
+        | (labels.truncation > difficulty.max_truncation)
+    )
+
+
+def _places(classes: Sequence[str]) -> torch.Tensor:
+    """Where each of CLASSES stands among `classes`; -1 where it does not."""
+    return torch.tensor([classes.index(name) if name in classes else -1 for name in CLASSES])

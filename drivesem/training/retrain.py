@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from detectors.base import Detector
-from detectors.registry import save_detector
-from detectors.training import CHECKPOINT, LOG, Sample
+from detectors.augment import AugmentSettings
+from detectors.base import Detector, DetectorError
+from detectors.registry import load_detector, save_detector
+from detectors.squeezedet import SqueezeDet
+from detectors.training import CHECKPOINT, LOG, AuxiliaryLoss, Sample, TrainingSettings, train
 from detectors.types import CLASSES, Detections
-from drivesem.attack.judging import JudgedClasses
 from drivesem.attack.labels import LabelMode
-from drivesem.config.commands import Attack, Retrain
+from drivesem.attack.targets import EvaluatedClasses
+from drivesem.config.commands import AttackConfig, RetrainConfig
+from drivesem.config.constraints import parse_interval, parse_size_hw
 from drivesem.config.errors import UsageError
 from drivesem.data.registry import open_dataset
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
-from drivesem.report.tables import Sheet, csv_text, percent
-from drivesem.report.terminal import Console
-from drivesem.run.attack import Worker, attack_frames
-from drivesem.run.folder import SHARING, claim, trusted_attack
-from drivesem.run.frame import as_targets
-from drivesem.training.attacked import AttackedFrame, AttackedSamples, Stage, figures, frames_of, look
-from drivesem.training.curves import draw
+from drivesem.report.tables import ReportTable, format_percent, rows_to_csv
+from drivesem.report.terminal import Console, training_progress_bar
+from drivesem.run.attack import AttackWorker, attack_frames
+from drivesem.run.folder import SHARING, claim_folder, load_trusted_config
+from drivesem.run.frame import targets_from_records
+from drivesem.training.card import plot_curves, warn_about_overlaps
 from drivesem.training.frames import FrameStore
-from drivesem.training.judging import judge
-from drivesem.training.known import warn_of_overlaps
-from drivesem.training.mixture import Mixture
-from drivesem.training.retraining import WEIGHTS, broken, forget_other_weights, shares_of, startable, train_on
+from drivesem.training.samples import (
+    AttackedFrame,
+    AttackedSamples,
+    MixtureShares,
+    Stage,
+    TrainingMixture,
+    detect_in_frames,
+    headline_scores,
+    load_attacked_frames,
+)
+from drivesem.training.validation import score_detections
 from scene_ir import files
 
 FIGURES, CURVES = "retrain.json", "curves.png"
@@ -63,20 +73,20 @@ class RetrainRow:
         return told | asdict(self.scores) | {"broken": self.broken}
 
 
-def retrain_run(config: Retrain, console: Console) -> tuple[dict[str, Any], list[RetrainRow]]:
+def retrain_detector(config: RetrainConfig, console: Console) -> tuple[dict[str, Any], list[RetrainRow]]:
     """Retrain, or go on with it: the JSON's form, and its rows. Raises UsageError or SceneError for bad input."""
-    attack = trusted_attack(Path(config.run), config.trust)
-    frames = frames_of(Path(config.run))
+    attack = load_trusted_config(Path(config.run), config.trust)
+    frames = load_attacked_frames(Path(config.run))
     kept_out, learned = _divided(frames, config)
     start = config.start or attack.detector
-    before, after = startable(start, config.device), startable(start, config.device)
+    before, after = load_start(start, config.device), load_start(start, config.device)
     if attack.dataset == "kitti":
-        warn_of_overlaps([start], attack.root, console)
+        warn_about_overlaps([start], attack.root, console)
     out = Path(config.out or f"runs/retrain-{Path(config.run).name}-seed{config.seed}")
-    claim(out, config, _WRITTEN, _FREE)
+    claim_folder(out, config, _WRITTEN, _FREE)
     mixture = _mixture(config, attack, learned, {frame.name for frame in kept_out}, out, after)
-    train_on(config, after, mixture, out, console)
-    found = look(after, kept_out, "benign", config.device)
+    fine_tune(config, after, mixture, out, console)
+    found = detect_in_frames(after, kept_out, "benign", config.device)
     after.t_star = _t_star(after, kept_out, found)
     save_detector(after, out / WEIGHTS, {"retrained_from": Path(start).name, "steps": str(config.steps)})
     rows = _known(before, "before", kept_out, config.device) + _known(after, "after", kept_out, config.device)
@@ -87,18 +97,20 @@ def retrain_run(config: Retrain, console: Console) -> tuple[dict[str, Any], list
         "run": config.run,
         "detector": start,
         "frames": len(mixture),
-        "counterexamples": len(mixture.shown),
+        "counterexamples": len(mixture.drawn_counterexamples),
         "held_out": len(kept_out),
         "t_star": {"before": before.t_star, "after": after.t_star},
         "rows": [row.to_json() for row in rows],
     }
     files.write_json(out / FIGURES, data)
     _write(out, rows)
-    draw(out / LOG, out / "evaluations.csv", out / CURVES, f"{before.name}, retrained")
+    plot_curves(out / LOG, out / "evaluations.csv", out / CURVES, f"{before.name}, retrained")
     return data, rows
 
 
-def _divided(frames: Sequence[AttackedFrame], config: Retrain) -> tuple[list[AttackedFrame], list[AttackedFrame]]:
+def _divided(
+    frames: Sequence[AttackedFrame], config: RetrainConfig
+) -> tuple[list[AttackedFrame], list[AttackedFrame]]:
     """Frames that are never trained on, drawn at random, and the others."""
     order = np.random.default_rng([config.seed, 6]).permutation(len(frames))
     count = max(round(config.validation * len(frames)), 1)
@@ -110,15 +122,15 @@ def _divided(frames: Sequence[AttackedFrame], config: Retrain) -> tuple[list[Att
 
 
 def _mixture(
-    config: Retrain,
-    attack: Attack,
+    config: RetrainConfig,
+    attack: AttackConfig,
     learned: Sequence[AttackedFrame],
     kept_out: set[str],
     out: Path,
     after: Detector,
-) -> Mixture:
+) -> TrainingMixture:
     mode, classes = config.label_mode, after.classes
-    counterexamples = AttackedSamples(broken(learned, mode), "counterexample", mode, classes)
+    counterexamples = AttackedSamples(select_counterexamples(learned, mode), "counterexample", mode, classes)
     benign: Sequence[Sample]
     if config.dataset is None:
         benign = AttackedSamples(learned, "benign", "paper", classes)
@@ -130,14 +142,14 @@ def _mixture(
         if not names:
             raise UsageError("--root", "frames that are not held out", "none")
         benign = FrameStore(dataset, names, out / CACHE, classes)
-    return Mixture(benign, counterexamples, shares_of(config))
+    return TrainingMixture(benign, counterexamples, mixture_shares(config))
 
 
 def _t_star(detector: Detector, frames: Sequence[AttackedFrame], found: Sequence[Detections]) -> float:
     """The score of best F1 on the benign frames that were held out."""
-    judged = JudgedClasses.of(detector)
-    wanted = [judged.targets(as_targets(frame.result.targets_benign, CLASSES)) for frame in frames]
-    return judge(found, wanted, judged.names).t_star
+    judged = EvaluatedClasses.from_detector(detector)
+    wanted = [judged.map_targets(targets_from_records(frame.result.targets_benign, CLASSES)) for frame in frames]
+    return score_detections(found, wanted, judged.names).t_star
 
 
 def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], device: str) -> list[RetrainRow]:
@@ -148,9 +160,9 @@ def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], devic
         ("counterexample", ("moved", "paper")),
     )
     for stage, modes in stages:
-        found = look(detector, frames, stage, device)
+        found = detect_in_frames(detector, frames, stage, device)
         for mode in modes:
-            scores = figures(detector, detector.t_star, frames, found, mode)
+            scores = headline_scores(detector, detector.t_star, frames, found, mode)
             share = None
             if stage == "counterexample" and name == "before":
                 won = [f.result.success_moved if mode == "moved" else f.result.success_paper for f in frames]
@@ -160,7 +172,9 @@ def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], devic
     return rows
 
 
-def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], out: Path) -> list[RetrainRow]:
+def _fresh(
+    config: RetrainConfig, attack: AttackConfig, kept_out: Sequence[AttackedFrame], out: Path
+) -> list[RetrainRow]:
     """The same attack on the same frames, against the retrained detector."""
     names = [frame.name for frame in kept_out][: config.fresh]
     if not names:
@@ -176,8 +190,8 @@ def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], o
         device=config.device,
         t_star=None,
     )
-    forget_other_weights(out / FRESH, out / WEIGHTS, out / _FRESH_OF)
-    summary = attack_frames(Worker.of(again), names, out / FRESH)
+    discard_stale_run(out / FRESH, out / WEIGHTS, out / _FRESH_OF)
+    summary = attack_frames(AttackWorker.from_config(again), names, out / FRESH)
     rows = []
     for mode, scores, won in (
         ("moved", summary.attacked_moved, summary.successes_moved),
@@ -191,13 +205,90 @@ def _fresh(config: Retrain, attack: Attack, kept_out: Sequence[AttackedFrame], o
 def _write(out: Path, rows: Sequence[RetrainRow]) -> None:
     """The table as CSV and as Markdown."""
     words = ("frames", "labels", "detector")
-    sheet = Sheet("", (*words, *SCORE_TITLES, "objects", "frames broken"), tuple(map(_cells, rows)))
+    sheet = ReportTable("", (*words, *SCORE_TITLES, "objects", "frames broken"), tuple(map(_cells, rows)))
     csv_name, markdown_name = TABLES
-    files.write_text(out / csv_name, csv_text([row.to_json() for row in rows], line_end="\r\n"))
-    files.write_text(out / markdown_name, "\n".join(sheet.markdown(words)[2:]) + "\n")  # without a heading
+    files.write_text(out / csv_name, rows_to_csv([row.to_json() for row in rows], line_end="\r\n"))
+    files.write_text(out / markdown_name, "\n".join(sheet.to_markdown(words)[2:]) + "\n")  # without a heading
 
 
 def _cells(row: RetrainRow) -> tuple[str, ...]:
     share = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
-    figures = map(percent, row.scores.shown)
+    figures = map(format_percent, row.scores.columns)
     return row.frames, row.labels, row.detector, *figures, str(row.scores.objects), share
+
+
+WEIGHTS = "retrained.safetensors"
+
+
+def load_start(name: str, device: str, setting: str = "--start") -> Detector:
+    """A detector that can be trained on. Raises UsageError, naming the setting, where it is none."""
+    try:
+        detector = load_detector(name, device)
+        EvaluatedClasses.from_detector(detector)
+    except DetectorError as error:
+        raise UsageError.from_detector_error(setting, "a detector that can be trained", error) from error
+    return detector
+
+
+def select_counterexamples(
+    frames: Sequence[AttackedFrame], mode: LabelMode, setting: str = "--run"
+) -> list[AttackedFrame]:
+    """The frames whose counterexamples break the detector by labels of a mode. Raises UsageError where none do."""
+    failed = [f for f in frames if (f.result.success_moved if mode == "moved" else f.result.success_paper)]
+    if not failed:
+        raise UsageError(setting, f"counterexamples that break the detector, by {mode} labels", "none")
+    return failed
+
+
+def mixture_shares(config: RetrainConfig) -> MixtureShares:
+    """How many counterexamples there are among the benign frames, and when."""
+    return MixtureShares(config.fraction, config.mix, round(config.ramp * config.steps), config.seed)
+
+
+def fine_tune(
+    config: RetrainConfig,
+    detector: Detector,
+    frames: Sequence[Sample],
+    out: Path,
+    console: Console,
+    beside: AuxiliaryLoss | None = None,
+) -> None:
+    """Train in place, or go on with it, with checkpoints in `out`; frozen again at the end. beside: a further term
+    of the loss. Raises UsageError.
+    """
+    settings = TrainingSettings(
+        steps=config.steps,
+        minutes=config.minutes,
+        batch=config.batch,
+        rate=config.rate,
+        backbone_rate=1.0,  # nothing starts anew
+        warmup_steps=config.warmup,
+        precision=config.precision,
+        seed=config.seed,
+        checkpoint_every=config.checkpoint_every,
+        augment=AugmentSettings(
+            window_hw=parse_size_hw("--window", config.window), scale=parse_interval("--scale", config.scale)
+        ),
+    )
+    if isinstance(detector, SqueezeDet):
+        detector.trained_by = config.loss
+    detector.requires_grad_(True)
+    with training_progress_bar(console) as bar:
+        task = bar.add_task("retraining", total=config.steps)
+
+        def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
+            bar.update(task, completed=done, description=f"loss {row['total']:.3f}")
+
+        try:
+            train(detector, frames, settings, out, progress=progress, auxiliary_loss=beside)
+        except FloatingPointError as error:
+            raise UsageError("--rate", "one at which the loss stays finite", error) from error
+    detector.requires_grad_(False)
+
+
+def discard_stale_run(run: Path, weights: Path, stamp: Path) -> None:
+    """Remove a run that was against other weights than those that are there now. stamp: a file that says which."""
+    digest = files.sha256_digest(weights)
+    if run.is_dir() and (not stamp.is_file() or files.read_text(stamp) != digest):
+        shutil.rmtree(run)
+    files.write_text(stamp, digest)

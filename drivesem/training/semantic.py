@@ -12,11 +12,10 @@ from torch import Tensor
 from detectors.training import Sample
 from detectors.types import Targets
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import Labeller, to_kitti_labels, with_others
-from drivesem.attack.space import SIX, Parameter, ParameterSpace
+from drivesem.attack.labels import Labeller, append_other_labels, to_kitti_labels
+from drivesem.attack.space import PAPER_PARAMETERS, Parameter, ParameterSpace
 from drivesem.data import kitti
-from drivesem.training.frames import FrameStore
-from drivesem.training.targets import TRAINED, training_targets
+from drivesem.training.frames import TRAINING_LIMITS, FrameStore, training_targets
 from scene_ir import files
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.errors import SceneError
@@ -26,13 +25,13 @@ from scene_ir.types import Frame, Labels, SceneIR
 
 VARIANTS = 4
 """Different perturbations of a frame: a frame's scene costs more than a few renders of it."""
-PARAMETERS = SIX
+PARAMETERS = PAPER_PARAMETERS
 _BENT_BY = 0.3
 """Share of the budget that lattice offsets are drawn from: further out nearly all are scaled back to the same
 bound on strain."""
 
 
-class SemanticFrames(Sequence[Sample]):
+class PerturbedFrames(Sequence[Sample]):
     """The frames of a store, a share of which is shown perturbed, each time by chance.
 
     A frame is taken apart when it is first drawn, and its variants stay in `folder`: they depend on the frame, its
@@ -60,14 +59,16 @@ class SemanticFrames(Sequence[Sample]):
         if not (folder / f"{variant}.png").is_file():
             return self._store[index]
         labels = kitti.read_labels(folder / f"{variant}.txt")
-        return files.read_image(folder / f"{variant}.png"), training_targets(labels, TRAINED, self._store.classes)
+        return files.read_image(folder / f"{variant}.png"), training_targets(
+            labels, TRAINING_LIMITS, self._store.classes
+        )
 
     def _make(self, index: int, folder: Path) -> None:
         """All variants of a frame, whole or not at all; an empty folder where there can be none."""
-        with files.whole_folder(folder) as part:
+        with files.atomic_folder(folder) as part:
             frame = self._store.dataset.frame(self._store.names[index])
             try:
-                variants = perturbed(frame, [self._seed, index])
+                variants = perturb_frame(frame, [self._seed, index])
             except SceneError:
                 return
             for i, (image, labels) in enumerate(variants):
@@ -76,7 +77,7 @@ class SemanticFrames(Sequence[Sample]):
 
 
 @torch.no_grad()
-def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Labels]]:
+def perturb_frame(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Labels]]:
     """VARIANTS feasible perturbations of a labelled frame: pixels (H, W, 3) uint8 RGB, and labels that moved too.
 
     None for a frame without vehicles. Raises SceneError where the frame cannot be taken apart.
@@ -89,19 +90,19 @@ def perturbed(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Label
     labeller = Labeller(scene, compositor.render(scene))
     generator = np.random.default_rng([*seed, 4])
     reach = torch.ones(space.dim)
-    reach[space.slice_of(Parameter.MESH)] = _BENT_BY
+    reach[space.blocks.get(Parameter.MESH)] = _BENT_BY
     found = []
     for _ in range(VARIANTS):
         # Cubed: most codes stay near the photograph, as most days are no storm.
         drawn = torch.from_numpy(generator.uniform(-1, 1, space.dim).astype(np.float32)) ** 3 * reach
         theta = torch.where(drawn < 0, -drawn * space.lower, drawn * space.upper)
-        image, labels, _ = state_at(feasible.project(theta).theta, space, compositor, labeller, scene)
+        image, labels, _ = render_state(feasible.project(theta).theta, space, compositor, labeller, scene)
         found.append((image, labels))
     return found
 
 
 @torch.no_grad()
-def state_at(
+def render_state(
     theta: Tensor, space: ParameterSpace, compositor: Compositor, labeller: Labeller, base: SceneIR
 ) -> tuple[np.ndarray, Labels, Targets]:
     """The scene at theta (D,): pixels (H, W, 3) uint8 RGB, its labels, those of people and whatever else stays
@@ -111,5 +112,5 @@ def state_at(
     moved = space.apply(space.scene, theta)
     render = compositor.render(moved)
     labels = labeller.moved(moved, render)
-    every = with_others(to_kitti_labels(labels, base, moved), base.others)
+    every = append_other_labels(to_kitti_labels(labels, base, moved), base.other_labels)
     return to_uint8(render.image), every, labels.targets

@@ -20,7 +20,7 @@ _AVERAGE = "average."
 """Before the names of the averaged weights in a training checkpoint."""
 
 
-def architecture(name: str, anchors: Sequence[Sequence[float]] | None = None) -> Detector:
+def build_detector(name: str, anchors: Sequence[Sequence[float]] | None = None) -> Detector:
     """A detector of one of ARCHITECTURES with any weights. UsageError for an unknown name."""
     if name not in ARCHITECTURES:
         raise UsageError("--detector", f"one of {', '.join(ARCHITECTURES)}", repr(name))
@@ -32,7 +32,7 @@ def architecture(name: str, anchors: Sequence[Sequence[float]] | None = None) ->
     return build(anchors=anchors)
 
 
-def begin(detector: Detector, start: str, seed: int) -> str:
+def initialise_weights(detector: Detector, start: str, seed: int) -> str:
     """Give the detector its first weights; a sentence for the model card about where they come from.
 
     start: "none", drawn from `seed`; "auto", the shipped weights of the architecture, or none; "squeezenet", the

@@ -11,33 +11,35 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import distributed
 
+from detectors.anchors import fit_anchors, mean_best_iou
 from detectors.augment import AugmentSettings
 from detectors.base import Detector
 from detectors.registry import read_weights
-from detectors.squeezedet import SqueezeDet
+from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
-from drivesem.config.commands import SYNTH, Train
+from drivesem.config.commands import SYNTH, TrainConfig
+from drivesem.config.constraints import parse_integers, parse_interval, parse_size_hw
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.config.text import command_line
-from drivesem.config.values import interval, numbers, size_hw
+from drivesem.config.options import format_command_line
 from drivesem.data.joined import open_folders
+from drivesem.data.registry import Dataset, open_dataset
 from drivesem.data.splits import chosen
-from drivesem.report.progress import training_bar
-from drivesem.report.terminal import Console
-from drivesem.run.folder import SHARING, claim
-from drivesem.run.workers import mapping
-from drivesem.training import keeper
-from drivesem.training.card import Recipe
+from drivesem.report.terminal import Console, training_progress_bar
+from drivesem.run.folder import SHARING, claim_folder
+from drivesem.run.workers import make_parallel_map
+from drivesem.training import validation as keeper
+from drivesem.training.card import CardFacts, describe_data, generated_folders
 from drivesem.training.frames import FrameStore
-from drivesem.training.keeper import HeldOut, Keeper
-from drivesem.training.known import describe, generated
-from drivesem.training.semantic import SemanticFrames
-from drivesem.training.start import architecture, begin, set_dropout
+from drivesem.training.semantic import PerturbedFrames
+from drivesem.training.start import build_detector, initialise_weights, set_dropout
+from drivesem.training.validation import CheckpointSelector, ValidationSet
 from scene_ir import files
+from scene_ir.errors import FormatError
 
 CACHES = "cache"
 """Folder of decoded frames in the run's folder."""
@@ -56,7 +58,7 @@ _NOT_IN_COMMAND = ("out", "weights", "json", "resume", "workers", "loaders", "no
 """Settings that a card's command need not repeat."""
 
 
-class Pace:
+class TrainingTime:
     """Steps, and seconds by the clock and of the processor that they took, without what is done `beside` them."""
 
     def __init__(self, batch: int) -> None:
@@ -70,7 +72,7 @@ class Pace:
         self._ended = time.perf_counter(), time.process_time()
 
     @contextmanager
-    def beside(self) -> Iterator[None]:
+    def paused(self) -> Iterator[None]:
         """What is done inside is no step."""
         clock, processor = time.perf_counter(), time.process_time()
         yield
@@ -89,25 +91,25 @@ class Pace:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainingResult:
     """What came of a run. data: the JSON; pace: of the steps that were taken now."""
 
     data: dict[str, Any]
-    pace: Pace
+    time: TrainingTime
 
 
-def train_run(config: Train) -> Trained | None:
+def run_training(config: TrainConfig) -> TrainingResult | None:
     """Train or go on training; None in all processes but the first. Raises UsageError or SceneError for bad
     input.
     """
     with _processes(config) as (rank, device):
         console = Console(stderr=True, quiet=rank > 0)
         settings = _settings(config)
-        detector = architecture(config.detector)
+        detector = build_detector(config.detector)
         start = _begin(config, detector)  # before the folder is made: bad settings leave nothing behind
         out = Path(config.out or f"runs/train-{config.detector}-seed{config.seed}")
         if rank == 0:
-            claim(out, config, _WRITTEN, _FREE)
+            claim_folder(out, config, _WRITTEN, _FREE)
         frames, held_out = _data(config, out, detector, rank, console)
         if config.anchors == "kmeans":
             detector = _with_own_anchors(config, frames)
@@ -118,14 +120,14 @@ def train_run(config: Train) -> Trained | None:
         recipe = _recipe(config, frames, start)
         if rank == 0:
             recipe = replace(recipe, data=f"{recipe.data}{_described(config, weights)}")
-        judge = Keeper(out, weights, recipe, held_out, device, tell)
+        judge = CheckpointSelector(out, weights, recipe, held_out, device, tell)
         shown: Sequence[Sample] = frames
         if config.semantic:
-            shown = SemanticFrames(frames, out / SEMANTIC, config.semantic, config.seed)
-        pace = Pace(config.batch)
+            shown = PerturbedFrames(frames, out / SEMANTIC, config.semantic, config.seed)
+        pace = TrainingTime(config.batch)
 
         def evaluate(detector: Detector, step: int) -> None:
-            with pace.beside():
+            with pace.paused():
                 judge(detector, step)
 
         with _shown(pace, out, console) as progress:
@@ -139,7 +141,7 @@ def train_run(config: Train) -> Trained | None:
         return _trained(config, out, weights, len(frames), pace) if rank == 0 else None
 
 
-def _settings(config: Train) -> TrainingSettings:
+def _settings(config: TrainConfig) -> TrainingSettings:
     return TrainingSettings(
         steps=config.steps,
         minutes=config.minutes,
@@ -151,7 +153,7 @@ def _settings(config: Train) -> TrainingSettings:
         weight_decay=config.weight_decay,
         warmup_steps=config.warmup,
         warmup_power=config.warmup_power,
-        drops=tuple(numbers("--drops", config.drops)) if config.drops else (),
+        drops=tuple(parse_integers("--drops", config.drops)) if config.drops else (),
         drop_factor=config.drop_factor,
         clip_norm=config.clip,
         average_decay=config.average,
@@ -160,14 +162,14 @@ def _settings(config: Train) -> TrainingSettings:
         checkpoint_every=config.checkpoint_every,
         evaluate_every=config.evaluate_every,
         augment=AugmentSettings(
-            window_hw=size_hw("--window", config.window), scale=interval("--scale", config.scale)
+            window_hw=parse_size_hw("--window", config.window), scale=parse_interval("--scale", config.scale)
         ),
     )
 
 
-def _begin(config: Train, detector: Detector) -> str:
+def _begin(config: TrainConfig, detector: Detector) -> str:
     """Give the detector its first weights and settings; a sentence about where they come from."""
-    start = begin(detector, config.start, config.seed)
+    start = initialise_weights(detector, config.start, config.seed)
     set_dropout(detector, config.dropout)
     if isinstance(detector, SqueezeDet):
         detector.trained_by = config.loss
@@ -176,24 +178,24 @@ def _begin(config: Train, detector: Detector) -> str:
     return start
 
 
-def _with_own_anchors(config: Train, frames: FrameStore) -> Detector:
+def _with_own_anchors(config: TrainConfig, frames: FrameStore) -> Detector:
     try:
-        anchors = frames.anchors(config.seed)
+        anchors = frames.fit_anchors(config.seed)
     except ValueError as error:
         raise UsageError("--anchors", "more different boxes for kmeans", error) from error
-    return architecture(config.detector, anchors)
+    return build_detector(config.detector, anchors)
 
 
 def _data(
-    config: Train, out: Path, detector: Detector, rank: int, console: Console
-) -> tuple[FrameStore, HeldOut | None]:
+    config: TrainConfig, out: Path, detector: Detector, rank: int, console: Console
+) -> tuple[FrameStore, ValidationSet | None]:
     """The frames to train on and to judge by, decoded by the first process and read by the others."""
     if rank > 0:
         distributed.barrier()
     name, root, held_out = _folders(config, out, rank, console)
     _warn_of_shared(config, console)
     frames = _store(config, name, root, out / CACHES / "train", detector, console, split=config.split)
-    if frames.objects() == 0:
+    if frames.object_count() == 0:
         raise UsageError(str(root), f"frames with objects of {', '.join(detector.classes)}", "none")
     judged = None
     if held_out is not None:
@@ -206,13 +208,13 @@ def _data(
         also = None
         if config.also is not None:
             also = _store(config, "kitti", Path(config.also), out / CACHES / "also", detector, console, whole=True)
-        judged = HeldOut(store, config.thin, also, test)
+        judged = ValidationSet(store, config.thin, also, test)
     if rank == 0 and distributed.is_initialized():
         distributed.barrier()
     return frames, judged
 
 
-def _warn_of_shared(config: Train, console: Console) -> None:
+def _warn_of_shared(config: TrainConfig, console: Console) -> None:
     """Say where frames to judge by are among those that are trained on, or that choose t*."""
 
     def folders(of: str | None) -> dict[Path, str]:
@@ -231,7 +233,7 @@ def _warn_of_shared(config: Train, console: Console) -> None:
                 console.print(f"{setting}: {part} {told}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
+def _folders(config: TrainConfig, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
     """Layout, folder to train on, folder to judge by."""
     if config.dataset != SYNTH:
         held_out = config.held_out or (config.root if config.held_out_split else None)
@@ -244,15 +246,15 @@ def _folders(config: Train, out: Path, rank: int, console: Console) -> tuple[str
         orders.append(Order(held_out, config.held_out_frames, config.seed, split="heldout"))
     if rank == 0:
         for order in orders:
-            done = synthesise(order, mapping(config))
-            with training_bar(console) as bar:
+            done = synthesise(order, make_parallel_map(config))
+            with training_progress_bar(console) as bar:
                 for _ in bar.track(done, total=order.frames, description="making frames"):
                     pass
     return "kitti", root, held_out if config.held_out_frames else None
 
 
 def _store(
-    config: Train,
+    config: TrainConfig,
     name: str,
     root: Path,
     cache: Path,
@@ -267,45 +269,45 @@ def _store(
     names = dataset.identifiers if whole else dataset.identifiers[: config.limit]
     if not names:
         raise UsageError(str(root), "at least one frame", "none")
-    with training_bar(console) as bar:
+    with training_progress_bar(console) as bar:
         task = bar.add_task(f"reading {root.name}", total=len(names))
         return FrameStore(dataset, names, cache, detector.classes, lambda: bar.advance(task))
 
 
-def _recipe(config: Train, frames: FrameStore, start: str) -> Recipe:
+def _recipe(config: TrainConfig, frames: FrameStore, start: str) -> CardFacts:
     threads = torch.get_num_threads()
     machine = f"{threads} CPU thread{'s' if threads > 1 else ''}"
     if config.device != "cpu" and torch.cuda.is_available():
         machine = torch.cuda.get_device_name()
     source = "the project's own generator" if config.dataset == SYNTH else f"layout {config.dataset}"
     folders = "" if config.root is None else f" (`{_names(config.root).replace(',', '`, `')}`)"
-    return Recipe(
+    return CardFacts(
         data=f"{len(frames):,} frames of {source}{folders}.",
         start=start,
         batch=config.batch,
         seed=config.seed,
         machine=machine,
-        commands=(command_line("train", _portable(config), _NOT_IN_COMMAND),),
+        commands=(format_command_line("train", _portable(config), _NOT_IN_COMMAND),),
         by_clock=config.minutes > 0,
         note=config.note,
     )
 
 
-def _described(config: Train, weights: Path) -> str:
+def _described(config: TrainConfig, weights: Path) -> str:
     """Write beside the weights which generated streets they have seen; a sentence for the card that names the
     files, empty where the folders do not tell.
     """
     told = []
     chosen = config.validation or config.held_out
     for folders, kind, what in ((config.root, "", "of these frames"), (chosen, "_chosen", "of those that chose")):
-        if known := generated(folders):
+        if known := generated_folders(folders):
             path = weights.with_name(f"{weights.stem}{kind}_data.json")
-            files.write_json(path, describe(known))
+            files.write_json(path, describe_data(known))
             told.append(f"`{path.name}` lists seeds and shapes {what}.")
     return "".join(f"\n  {line}" for line in told)
 
 
-def _portable(config: Train) -> Train:
+def _portable(config: TrainConfig) -> TrainConfig:
     """The configuration with folders and files by their names, not where they lay on this machine."""
     names = {key: getattr(config, key) for key in ("root", "held_out", "validation", "also", "start")}
     return replace(config, **{key: _names(value) for key, value in names.items() if value is not None})
@@ -317,7 +319,7 @@ def _names(folders: str) -> str:
 
 
 @contextmanager
-def _processes(config: Train) -> Iterator[tuple[int, str]]:
+def _processes(config: TrainConfig) -> Iterator[tuple[int, str]]:
     """This process's number and its device; a process group where torchrun started several."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         check_device(config.device)
@@ -336,10 +338,12 @@ def _processes(config: Train) -> Iterator[tuple[int, str]]:
 
 
 @contextmanager
-def _shown(pace: Pace, out: Path, console: Console) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
+def _shown(
+    pace: TrainingTime, out: Path, console: Console
+) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
     """A bar with the loss and the speed, and TensorBoard's events where it is installed."""
     writer = _tensorboard(out)
-    with training_bar(console) as bar:
+    with training_progress_bar(console) as bar:
         task = bar.add_task("training", total=None)
 
         def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
@@ -366,7 +370,7 @@ def _tensorboard(out: Path) -> Any:
     return SummaryWriter(str(out / "tensorboard"))
 
 
-def _trained(config: Train, out: Path, weights: Path, frames: int, pace: Pace) -> Trained:
+def _trained(config: TrainConfig, out: Path, weights: Path, frames: int, pace: TrainingTime) -> TrainingResult:
     data = {
         "out": str(out),
         "weights": str(weights),
@@ -379,4 +383,50 @@ def _trained(config: Train, out: Path, weights: Path, frames: int, pace: Pace) -
         "processor_seconds_an_image": round(pace.processor_seconds_an_image, 4),
         "best": files.read_json(out / keeper.BEST) if (out / keeper.BEST).is_file() else None,
     }
-    return Trained(data, pace)
+    return TrainingResult(data, pace)
+
+
+_MIN_HEIGHT_PX = 12.0
+"""Lower boxes are left out: nothing is trained on them."""
+
+
+def fit_dataset_anchors(config: TrainConfig, count: int) -> dict[str, Any]:
+    """Fit anchors by k-means of the boxes with 1 - IoU as the distance: the data of `--json`.
+
+    Args:
+        config: Data set, number of frames and seed.
+        count: Number of anchors.
+
+    Raises:
+        UsageError: For more anchors than different boxes, or no boxes.
+        FormatError: For a frame without labels.
+    """
+    datasets = [open_dataset(config.dataset, Path(root)) for root in (config.root or "").split(",")]
+    frames = [(dataset, name) for dataset in datasets for name in dataset.identifiers][: config.limit]
+    sizes_wh = np.concatenate([np.zeros((0, 2)), *(_box_sizes(dataset, name) for dataset, name in frames)])
+    if not len(sizes_wh):
+        raise UsageError("--root", f"boxes of at least {_MIN_HEIGHT_PX:g} px", f"none in {len(frames)} frames")
+    different = len(np.unique(sizes_wh, axis=0))
+    if count > different:
+        raise UsageError("--anchors", f"at most {different}, the number of different sizes", count)
+    anchors = fit_anchors(sizes_wh, count, config.seed)
+    return {
+        "dataset": config.dataset,
+        "frames": len(frames),
+        "boxes": len(sizes_wh),
+        "min_height": _MIN_HEIGHT_PX,
+        "anchors": [[round(w, 2), round(h, 2)] for w, h in anchors.sizes_wh],
+        "mean_iou": round(anchors.mean_iou, 4),
+        "published_anchors": [list(size) for size in ANCHOR_SIZES_WH],
+        "published_mean_iou": round(mean_best_iou(sizes_wh, np.array(ANCHOR_SIZES_WH)), 4),
+    }
+
+
+def _box_sizes(dataset: Dataset, name: str) -> np.ndarray:
+    """(N, 2) width and height, px, of a frame's labelled boxes; regions to ignore are no boxes."""
+    labels = dataset.labels(name)
+    if labels is None:
+        raise FormatError(f"frame {name}", "labels", "none")
+    corners = labels.boxes_xyxy.double().numpy()
+    sizes_wh = corners[:, 2:] - corners[:, :2]
+    return sizes_wh[(sizes_wh[:, 0] > 0) & (sizes_wh[:, 1] >= _MIN_HEIGHT_PX)]

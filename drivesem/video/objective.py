@@ -10,25 +10,25 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.objective import Objective, Rendered
+from drivesem.attack.methods.base import ParameterGroup, Problem, Score
+from drivesem.attack.objective import Objective, RenderEvaluation
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
-from drivesem.config.commands import Drive
-from drivesem.evaluation.failures import judge
-from drivesem.video.space import ClipSpace, project
-from drivesem.video.taking import TakenClip
+from drivesem.config.commands import DriveConfig
+from drivesem.evaluation.failures import match_detections
+from drivesem.video.clips import DerenderedClip
+from drivesem.video.space import ClipSpace, project_clip
 from scene_ir import ffd
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class FrameDetection:
     """What a detector makes of one frame. found, counted: of each object, whether it is found, and judged; lost,
     phantoms: which are missed and how many are made up that were right in the photograph.
     """
 
-    rendered: Rendered
+    rendered: RenderEvaluation
     found: tuple[bool, ...]
     counted: tuple[bool, ...]
     lost: tuple[int, ...]
@@ -42,11 +42,11 @@ class ClipObjective:
 
     def __init__(
         self,
-        clip: TakenClip,
+        clip: DerenderedClip,
         detector: Predictor,
         params: Sequence[Parameter],
         budget: Budget,
-        config: Drive,
+        config: DriveConfig,
     ) -> None:
         self.frames = [
             Objective(
@@ -65,7 +65,7 @@ class ClipObjective:
             objective.feasible_set(only_bounds=config.project == "bounds") for objective in self.frames
         ]
         self._keys = max(min(config.keys, len(self.frames)), 1)
-        self.looked: Callable[[], object] = lambda: None
+        self.on_frame: Callable[[], object] = lambda: None
         self._steps = 0
         self._scores: dict[bytes, Score] = {}
         self._previews: dict[bytes, Score] = {}
@@ -80,7 +80,7 @@ class ClipObjective:
         space = self.space
         return Problem(
             loss_and_grad=self.loss_and_grad,
-            project=lambda theta: project(space, self.sets, theta),
+            project=lambda theta: project_clip(space, self.sets, theta),
             score=self.score,
             step=space.step,
             lower=space.lower,
@@ -99,13 +99,13 @@ class ClipObjective:
         total, gradient = 0.0, torch.zeros_like(theta)
         seen: list[Score] = []
         for frame in sorted(chosen):
-            objective, here = self.frames[frame], self.space.of_frame(leaf, frame)
+            objective, here = self.frames[frame], self.space.frame_theta(leaf, frame)
             loss, along = objective.loss_and_grad(here.detach())
             total += loss
             gradient += torch.autograd.grad(here, leaf, along)[0]
             preview = objective.preview(here.detach())
             seen += [] if preview is None else [preview]
-            self.looked()
+            self.on_frame()
         self._previews[_key(theta)] = _summed(seen)
         return total / len(chosen), gradient / len(chosen)
 
@@ -113,31 +113,31 @@ class ClipObjective:
         """What the detector makes of the whole clip at theta (D,)."""
         key = _key(theta)
         if key not in self._scores:
-            self._scores[key] = _summed([self._scored(frame, sight) for frame, sight in self.sights(theta)])
+            self._scores[key] = _summed([self._scored(frame, sight) for frame, sight in self.detect_clip(theta)])
         return self._scores[key]
 
-    def sights(self, theta: Tensor) -> Iterator[tuple[int, Sight]]:
+    def detect_clip(self, theta: Tensor) -> Iterator[tuple[int, FrameDetection]]:
         """Every frame at theta (D,), rendered, judged, by its number; none is kept."""
         for frame in range(len(self.frames)):
-            yield frame, self.sight(theta, frame)
+            yield frame, self.detect_frame(theta, frame)
 
     @torch.no_grad()
-    def sight(self, theta: Tensor, frame: int) -> Sight:
+    def detect_frame(self, theta: Tensor, frame: int) -> FrameDetection:
         """One frame at theta (D,)."""
-        objective, here = self.frames[frame], self.space.of_frame(theta, frame)
+        objective, here = self.frames[frame], self.space.frame_theta(theta, frame)
         scene = objective.space.apply(objective.space.scene, here)
         objective.passes += 1
-        self.looked()
-        return self.judged(frame, objective.look(scene, objective.compositor.render(scene)))
+        self.on_frame()
+        return self.match_frame(frame, objective.evaluate_render(scene, objective.compositor.render(scene)))
 
-    def judged(self, frame: int, rendered: Rendered) -> Sight:
+    def match_frame(self, frame: int, rendered: RenderEvaluation) -> FrameDetection:
         """What stands in a frame's picture."""
         objective = self.frames[frame]
         count = len(objective.space.scene.objects)
-        targets = objective.judged.targets(rendered.moved.targets)
-        found = judge(targets, rendered.detections, objective.t_star).found[:count]
+        targets = objective.classes.map_targets(rendered.moved.targets)
+        found = match_detections(targets, rendered.detections, objective.t_star).detected[:count]
         failed = objective.failures(rendered, "moved")
-        return Sight(
+        return FrameDetection(
             rendered,
             tuple(found.tolist()),
             tuple((~targets.ignore[:count]).tolist()),
@@ -145,7 +145,7 @@ class ClipObjective:
             len(failed.phantoms),
         )
 
-    def _scored(self, frame: int, sight: Sight) -> Score:
+    def _scored(self, frame: int, sight: FrameDetection) -> Score:
         hidden = sight.rendered.moved.out_of_sight.nonzero()[:, 0].tolist()
         tracks = [self.space.tracks[int(self.space.rows[frame][i])] for i in hidden]
         paper = self.frames[frame].failures(sight.rendered, "paper")
@@ -158,9 +158,11 @@ class ClipObjective:
             violations=tuple(f"cars[{track}]: visibility" for track in tracks),
         )
 
-    def _group(self, parameter: Parameter, where: slice) -> Group:
-        owners = self.space.owners(parameter)
-        return Group(parameter.value, where, owners, ffd.low_modes() if parameter is Parameter.MESH else None)
+    def _group(self, parameter: Parameter, where: slice) -> ParameterGroup:
+        owners = self.space.owner_count(parameter)
+        return ParameterGroup(
+            parameter.value, where, owners, ffd.low_order_modes() if parameter is Parameter.MESH else None
+        )
 
 
 def _summed(scores: Sequence[Score]) -> Score:

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from itertools import groupby
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import cv2
+import numpy as np
+from markupsafe import Markup
 from rich import box
 
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet, number_of
-from drivesem.video.results import CarResult, DriveResult
+from drivesem.report import web
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.run.folder import FRAMES
+from drivesem.video.results import ABSENT, FOUND, LOST, UNCOUNTED, CarResult, DriveResult
+from scene_ir import files
+from scene_ir.errors import WriteError
+from scene_ir.raster.launch import suppress_stderr
 
 WORDS = ("car",)
 NOTES = (
@@ -19,7 +31,7 @@ NOTES = (
     "longest: frames of the longest unbroken stretch of misses after it. unseen: metres by which the camera comes "
     "nearer to the car while it is missed, of the metres while it is judged.",
     "certain: of the frames in which it is newly missed and that were looked at again in draws, those in which "
-    "it is missed for certain (docs/grades.md).",
+    "it is missed for certain (docs/guide/ideas.md).",
 )
 _LOOKS: dict[str, Any] = {
     "unbroken": (*WORDS, "longest", "certain"),
@@ -30,25 +42,25 @@ _LOOKS: dict[str, Any] = {
 """Narrow enough for 80 columns."""
 
 
-def answer_of(result: DriveResult) -> Answer:
+def build_report(result: DriveResult) -> AnalysisReport:
     """The answer, in the result's folder."""
     title = f"{result.detector} on {result.clip}: {' + '.join(result.params)}, {result.method}"
-    rows = [row_of(car) for car in result.cars]
-    sheet = Sheet(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), _LOOKS)
-    return Answer(
+    rows = [format_car(car) for car in result.cars]
+    sheet = ReportTable(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), _LOOKS)
+    return AnalysisReport(
         out=Path(result.out),
         name="drive",
-        heading=f"{number_of(result.frames, 'frame')} of {result.clip}",
+        heading=f"{format_count(result.frames, 'frame')} of {result.clip}",
         data=asdict(result),
-        tables={"drive": [figures(car) for car in result.cars]},
-        sheets=[sheet],
-        notes=[*NOTES, summary(result), *unfeasible(result)],
-        words=WORDS,
+        csv_tables={"drive": [car_metrics(car) for car in result.cars]},
+        tables=[sheet],
+        notes=[*NOTES, format_summary(result), *list_infeasible(result)],
+        text_columns=WORDS,
         failed={f"frame {name}": reason for name, reason in result.failed.items()},
     )
 
 
-def row_of(car: CarResult) -> dict[str, str]:
+def format_car(car: CarResult) -> dict[str, str]:
     """A car's line of the table."""
     return {
         "car": f"{car.track} {car.kind}",
@@ -65,26 +77,157 @@ def row_of(car: CarResult) -> dict[str, str]:
     }
 
 
-def summary(result: DriveResult) -> str:
+def format_summary(result: DriveResult) -> str:
     """The clip in a line."""
     before, after, control = (
         sum(getattr(car, f"lost_{state}") for car in result.cars) for state in ("before", "after", "control")
     )
-    sights = number_of(sum(car.frames for car in result.cars), "sight")
-    phantoms, frames = number_of(result.phantoms["after"], "phantom"), number_of(result.frames, "frame")
-    queries, passes = number_of(result.queries, "query", "queries"), number_of(result.passes, "pass", "passes")
+    sights = format_count(sum(car.frames for car in result.cars), "sight")
+    phantoms, frames = format_count(result.phantoms["after"], "phantom"), format_count(result.frames, "frame")
+    queries, passes = (
+        format_count(result.queries, "query", "queries"),
+        format_count(result.passes, "pass", "passes"),
+    )
     return (
-        f"{after} of {sights} of {number_of(len(result.cars), 'car')} missed ({before} before, {control} by a "
+        f"{after} of {sights} of {format_count(len(result.cars), 'car')} missed ({before} before, {control} by a "
         f"random change), {phantoms} ({result.phantoms['control']} random); "
         f"feasible in {result.feasible} of {frames}; {queries}, {passes}, {result.seconds:.0f} s"
     )
 
 
-def unfeasible(result: DriveResult) -> list[str]:
+def list_infeasible(result: DriveResult) -> list[str]:
     """Frames in which the change is not feasible."""
     return [f"not feasible in frame {name}: {'; '.join(lines)}" for name, lines in result.violations.items()]
 
 
-def figures(car: CarResult) -> dict[str, Any]:
+def car_metrics(car: CarResult) -> dict[str, Any]:
     """A car's numbers by name, without what there is of each frame."""
     return {name: value for name, value in asdict(car).items() if name not in ("states", "distance_m", "path_m")}
+
+
+_CLASSES = {FOUND: "f", LOST: "l", UNCOUNTED: "u"}
+
+
+def write_page(path: Path, result: DriveResult) -> None:
+    """Write the page, which shows the pictures and the video beside it. Atomic."""
+    pictures = [
+        {"name": name} | {side: quote(f"{FRAMES}/{name}/{side}.jpg") for side in ("before", "after")}
+        for name in result.names
+    ]
+    rows = [format_car(car) for car in result.cars]
+    text = web.render_page(
+        "drivesem.video:page.html",
+        "drivesem.video:page.js",
+        runs=_runs,
+        data=Markup(json.dumps(pictures).replace("<", "\\u003c")),
+        title=f"{result.detector} on {result.clip}",
+        headline=_headline(result),
+        lead=_lead(result),
+        tiles=_tiles(result),
+        pictures=pictures,
+        columns=list(rows[0]),
+        rows=[list(row.values()) for row in rows],
+        notes=(*NOTES, format_summary(result), *list_infeasible(result)),
+        result=result,
+    )
+    files.write_text(path, text)
+
+
+def _runs(states: str) -> Iterator[tuple[int, int, str]]:
+    """Stretches of frames of one kind: where each begins, how long it is, its class; none where the car is not."""
+    start = 0
+    for state, group in groupby(states):
+        length = len(list(group))
+        if state != ABSENT:
+            yield start, length, _CLASSES[state]
+        start += length
+
+
+def _headline(result: DriveResult) -> str:
+    worst = result.cars[0]
+    if worst.new_misses <= 0:
+        return f"{result.detector} misses no car of {result.clip} for longer than before"
+    return (
+        f"{result.detector} misses car {worst.track} in {worst.lost_after} of {format_count(worst.frames, 'frame')}, "
+        f"{worst.lost_before} before"
+    )
+
+
+def _lead(result: DriveResult) -> str:
+    return (
+        f"{' + '.join(result.params)} changed by {result.method}: each of {format_count(len(result.cars), 'car')} "
+        f"by the same over all of {format_count(result.frames, 'frame')}. Beside it, a random change as large."
+    )
+
+
+def _tiles(result: DriveResult) -> list[dict[str, str]]:
+    cars = result.cars
+    lost, before, control, counted = (
+        sum(getattr(car, name) for car in cars) for name in ("lost_after", "lost_before", "lost_control", "frames")
+    )
+    unseen = max(cars, key=lambda car: car.metres_lost_after)
+    longest = max(cars, key=lambda car: car.longest_after)
+    graded, certain = sum(car.graded for car in cars), sum(car.certain for car in cars)
+    return [
+        {
+            "title": "sights of cars that are missed",
+            "figure": f"{before} → {lost}",
+            "more": f"of {counted}; by a random change {control}",
+        },
+        {
+            "title": "longest unbroken stretch",
+            "figure": f"{longest.longest_after / 10:.1f} s",
+            "more": f"car {longest.track}; {longest.longest_before / 10:.1f} s before",
+        },
+        {
+            "title": "most metres of approach unseen",
+            "figure": f"{unseen.metres_lost_after:.1f} m",
+            "more": f"car {unseen.track}, of {unseen.metres:.1f} m; {unseen.metres_lost_before:.1f} m before",
+        },
+        {
+            "title": "new misses that are certain",
+            "figure": f"{certain} of {graded}" if graded else "none",
+            "more": "in frames that were looked at again in draws",
+        },
+        {
+            "title": "feasible",
+            "figure": f"{result.feasible} of {result.frames}",
+            "more": "frames, by the independent check",
+        },
+    ]
+
+
+FRAMES_A_SECOND = 10
+_GAP_PX = 4
+
+
+def write_video(path: Path, folders: Sequence[Path]) -> None:
+    """Write a video of folders with before.jpg and after.jpg, a frame each, atomically. WriteError where OpenCV
+    was built without VP8.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        part = Path(folder) / path.name
+        writer: cv2.VideoWriter | None = None
+        for one in folders:
+            picture = _above_each_other(one)
+            writer = writer or _writer(part, (picture.shape[1], picture.shape[0]))
+            if not writer.isOpened():
+                raise WriteError(str(path), "this OpenCV cannot write VP8")
+            writer.write(picture[..., ::-1])
+        if writer is not None:
+            writer.release()
+            files.write_bytes(path, files.read_bytes(part))
+
+
+def _above_each_other(folder: Path) -> np.ndarray:
+    """The frame before and after (h, w, 3), with even sides, as the codec needs: the last row and column twice."""
+    before, after = (files.read_image(folder / f"{name}.jpg") for name in ("before", "after"))
+    picture = np.concatenate([before, np.zeros((_GAP_PX, *before.shape[1:]), np.uint8), after])
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _writer(path: Path, size_wh: tuple[int, int]) -> cv2.VideoWriter:
+    with suppress_stderr():  # where it says that WebM has no such tag, which it does not need
+        code = cv2.VideoWriter.fourcc(*"VP80")
+        return cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, FRAMES_A_SECOND, size_wh)

@@ -15,7 +15,7 @@ STATES: tuple[State, ...] = ("before", "after", "control")
 
 
 @dataclass(frozen=True, slots=True)
-class Missed:
+class MissedInterval:
     """How a car is missed in a clip. frames: in which it counts; lost: of these, missed; longest: frames of the
     longest unbroken stretch of misses; metres: by which the camera comes nearer while it counts; metres_lost:
     while it is missed.
@@ -28,7 +28,7 @@ class Missed:
     metres_lost: float
 
     @classmethod
-    def of(cls, states: str, distance_m: Sequence[float | None]) -> Missed:
+    def from_states(cls, states: str, distance_m: Sequence[float | None]) -> MissedInterval:
         """states: FOUND, LOST, UNCOUNTED or ABSENT a frame; distance_m: from the camera, None where absent."""
         nearer = [0.0]
         for before, now in pairwise(distance_m):
@@ -80,7 +80,7 @@ class CarResult:
     path_m: tuple[tuple[float, float] | None, ...]
 
     @classmethod
-    def of(
+    def from_states(
         cls,
         track: int,
         kind: str,
@@ -90,7 +90,7 @@ class CarResult:
         certain: Sequence[bool],
     ) -> CarResult:
         """certain: one a frame that was graded."""
-        missed = {state: Missed.of(letters, distance_m) for state, letters in states.items()}
+        missed = {state: MissedInterval.from_states(letters, distance_m) for state, letters in states.items()}
         figures = {
             f"{name}_{state}": getattr(one, name)
             for state, one in missed.items()
@@ -110,7 +110,7 @@ class CarResult:
         )
 
     @property
-    def newly(self) -> int:
+    def new_misses(self) -> int:
         """Frames in which it is missed beyond those before."""
         return self.lost_after - self.lost_before
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import SPECS, Parameter, ParameterSpace
-from drivesem.attack.theta import ParameterSpec, Projected, ThetaSpace
+from drivesem.attack.theta import ParameterSpec, ProjectedTheta, ThetaSpace
 from scene_ir.errors import RangeError
 
 _INSIDE = 1 - 1e-5
@@ -59,7 +59,7 @@ class ClipSpace(ThetaSpace[Parameter]):
         spec = self.specs[parameter]
         return f"cars[{self.tracks[owner]}].{spec.names[k]}" if spec.per_object else spec.names[k]
 
-    def of_frame(self, theta: Tensor, frame: int) -> Tensor:
+    def frame_theta(self, theta: Tensor, frame: int) -> Tensor:
         """theta (D,) as that of a frame's own space (D',); differentiable."""
         parts = []
         for parameter in self.params:
@@ -73,7 +73,7 @@ class ClipSpace(ThetaSpace[Parameter]):
             parts.append(block.reshape(-1))
         return torch.cat(parts)
 
-    def held_back(self, theta: Tensor, frame: int, asked: Tensor, granted: Tensor, whole: bool) -> Tensor:
+    def restrict(self, theta: Tensor, frame: int, asked: Tensor, granted: Tensor, whole: bool) -> Tensor:
         """theta (D,) with what a frame granted (D',) of what was asked of it (D',). Of a path, those control
         points that matter there give way, or, where `whole`, all of it by as large a part.
         """
@@ -96,7 +96,7 @@ class ClipSpace(ThetaSpace[Parameter]):
                 block.copy_(there)
         return theta
 
-    def at_rest(self, theta: Tensor, cars: Tensor) -> Tensor:
+    def reset_geometry(self, theta: Tensor, cars: Tensor) -> Tensor:
         """theta (D,) without the changes of shape and place of `cars` (N,) bool."""
         theta = theta.clone()
         for parameter in self.params:
@@ -105,10 +105,10 @@ class ClipSpace(ThetaSpace[Parameter]):
                 block[cars] = 0
         return theta
 
-    def path(self, theta: Tensor, frame: int) -> Tensor:
+    def path_offsets(self, theta: Tensor, frame: int) -> Tensor:
         """How far each object of a frame stands from its place (n, 2) m, along its heading and across."""
         space = self.spaces[frame]
-        offset = space.block(self.of_frame(theta, frame), Parameter.TRANSLATE)
+        offset = space.block(self.frame_theta(theta, frame), Parameter.TRANSLATE)
         length_m = space.scene.objects.size_lhw[:, :1]
         return length_m.new_zeros(len(length_m), 2) if offset is None else offset * length_m
 
@@ -137,12 +137,12 @@ class ClipSpace(ThetaSpace[Parameter]):
                 block[rows] = tighter(block[rows], there)
             else:
                 block.copy_(tighter(block, there))
-        where, there = self.slice_of(parameter), space.slice_of(parameter)
+        where, there = self.blocks.get(parameter), space.blocks.get(parameter)
         if where is not None and there is not None and len(space.step[there]):
             self.step[where] = space.step[there].max()
 
 
-def project(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> Projected:
+def project_clip(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> ProjectedTheta:
     """theta (D,) brought back to what is feasible in every frame (sets, one a frame): what one frame holds back is
     held back in the whole clip, in turn until no frame asks for more. theta = 0 is feasible.
     """
@@ -152,19 +152,19 @@ def project(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> Pro
         offenders = torch.zeros(space.count, dtype=torch.bool, device=theta.device)
         held = False
         for frame, feasible in enumerate(sets):
-            asked = space.of_frame(theta, frame)
+            asked = space.frame_theta(theta, frame)
             found = feasible.project(asked)
             if torch.allclose(found.theta, asked, rtol=0, atol=_SAME):
                 continue
             held = True
             active += [_renamed(name, space, frame) for name in found.active]
-            theta = space.held_back(theta, frame, asked, found.theta, whole=attempt >= _ROUNDS // 2)
+            theta = space.restrict(theta, frame, asked, found.theta, whole=attempt >= _ROUNDS // 2)
             offenders[space.rows[frame][_differing(space.spaces[frame], asked, found.theta)]] = True
         if not held:
-            return Projected(theta, tuple(dict.fromkeys(active)))
+            return ProjectedTheta(theta, tuple(dict.fromkeys(active)))
         if attempt >= _ROUNDS:
-            theta = space.at_rest(theta, offenders)
-    return Projected(torch.zeros_like(theta), tuple(dict.fromkeys(active)))
+            theta = space.reset_geometry(theta, offenders)
+    return ProjectedTheta(torch.zeros_like(theta), tuple(dict.fromkeys(active)))
 
 
 def _differing(space: ParameterSpace, one: Tensor, other: Tensor) -> Tensor:

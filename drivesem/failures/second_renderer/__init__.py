@@ -1,1 +1,1 @@
-"""Second renderers: the same scene drawn by something that shares no code with the compositor."""
+"""Second renderers: they render a scene again without sharing code with the compositor."""

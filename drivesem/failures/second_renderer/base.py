@@ -1,4 +1,4 @@
-"""What every second renderer is: it draws states of one scene, and labels what it drew."""
+"""The interface of second renderers: they render states of one scene and label them."""
 
 from __future__ import annotations
 
@@ -14,37 +14,44 @@ from scene_ir.types import SceneIR
 
 @dataclass(frozen=True, slots=True)
 class SecondRender:
-    """One picture of a second renderer.
-
-    image: (3, H, W) RGB in [0, 1], on the 8-bit grid. targets: labels among `CLASSES`; the first N rows are the
-    scene's objects in order, ignored where the renderer has no counterpart; then regions in which no detection
-    counts. shown_xyxy: (N, 4) px, the box of what shows of each object, zeros where nothing does.
-    """
+    """One image of a second renderer, with its labels."""
 
     image: Tensor
+    """(3, H, W) RGB in [0, 1], on the 8-bit grid."""
     targets: Targets
+    """Labels among `CLASSES`: the scene's N objects in order, ignored where they have no counterpart, then regions
+    in which no detection counts."""
     visible_xyxy: Tensor
+    """(N, 4) px, box of the visible part of each object; zeros where nothing is visible."""
 
 
 class SecondRenderer(Protocol):
-    """A renderer of one frame's scene, before and after any change. name: of what draws, for people."""
+    """A renderer of one frame's scene, before and after any change."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the renderer, for people."""
+        ...
 
     def render(self, changed: SceneIR) -> SecondRender:
-        """A state of the scene. Raises SceneError where the change cannot be drawn."""
+        """Render a state of the scene. Raises SceneError where the change cannot be rendered."""
         ...
 
     def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
-        """What of a change `render` leaves out, in words; nothing where it draws it whole."""
+        """List the changes that `render` leaves out, as text; empty where it renders all."""
         ...
 
 
 class NoSecondRendererError(SceneError):
-    """Nothing on this machine can draw the scene a second time; the message says what to install."""
+    """No second renderer works on this machine; the message names what to install."""
 
     @classmethod
     def from_exception(cls, renderer: str, expected: str, error: BaseException) -> NoSecondRendererError:
-        """What a library raised, on one line."""
+        """Format a library's exception on one line.
+
+        Args:
+            renderer: Name of the renderer.
+            expected: What it needs.
+            error: What the library raised.
+        """
         return cls(renderer, expected, " ".join(f"{type(error).__name__} {error}".split()))

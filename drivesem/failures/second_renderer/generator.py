@@ -65,7 +65,7 @@ class PlanSource(Protocol):
 
 
 class DemoPlans:
-    """Plans of the embedded scenes, whose provenance names seed, street and attempt."""
+    """Plans of the embedded scenes, from the seed, street and attempt in their provenance."""
 
     def find_plan(self, identifier: str, scene: SceneIR) -> PlanMatch:
         """Find a plan; the scene's objects are its actors, in order."""

@@ -1,8 +1,7 @@
 """Pyrender as a second renderer of photographs: vehicles are meshes with textures baked from the photograph.
 
-It shares no code with the compositor, beyond the scene that both read. The compositor carries pixels along with
-their matte; here a vehicle's outline is its mesh's, what hides what is OpenGL's depth test, and a pixel is the
-average of sixteen samples.
+It shares no code with the compositor but the scene types. The compositor moves pixels with their matte; here a
+vehicle's outline is that of its mesh, OpenGL's depth test decides occlusion, and a pixel averages sixteen samples.
 """
 
 from __future__ import annotations
@@ -37,37 +36,35 @@ from scene_ir.errors import RangeError
 from scene_ir.types import Crop, Occluder, Render, SceneIR, Source
 
 _MIN_SHARE = 0.5
-"""Coverage from which on a pixel shows an object; share of its outline's hull that is to show."""
+"""Minimum coverage of a pixel that shows an object; minimum visible share of an object, relative to the
+photograph."""
 _MIN_OCCLUDER_OPACITY = 0.05
-"""Opacity from which on what stands nearer may colour a pixel."""
+"""Minimum opacity at which a nearer object may colour a pixel."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Vehicle:
-    """What of a vehicle no change touches. texture: (h, w, 3) uint8, of its own paint; box_xyxy: (4,) px of its
-    mesh as photographed, not cut at the border."""
+    """What no change of a vehicle touches."""
 
     body: BodyMesh
     atlas: TextureAtlas
-    texture: NDArray[np.uint8]
+    texture: NDArray[np.uint8]  # (h, w, 3), of its own paint
     shadow: GroundShadow
-    box_xyxy: Array
+    box_xyxy: Array  # (4,) px, of its mesh as photographed, not clipped at the border
 
 
 @dataclass(frozen=True, slots=True)
 class _RenderedScene:
-    """One state, drawn and composed. placed: (F, 3, 3) m of each vehicle; image: (H, W, 3) on the 8-bit grid;
-    owner: (H, W), object + 1 by pixel; shares: (N,), how much of its outline's hull shows of each."""
+    """One rendered state."""
 
-    placed: list[Array]
-    image: Array
-    owner: NDArray[np.int64]
-    shares: Array
+    placed: list[Array]  # (F, 3, 3) m, triangles of each vehicle
+    image: Array  # (H, W, 3) on the 8-bit grid
+    owner: NDArray[np.int64]  # (H, W), object + 1 by pixel
+    shares: Array  # (N,), visible share of the hull of each vehicle's outline
 
 
 class PhotographRenderer:
-    """Of one photograph's scene, whatever its state. Raises NoSecondRendererError where this machine has no
-    OpenGL.
+    """Renders any state of one photograph's scene. Raises NoSecondRendererError where this machine has no OpenGL.
     """
 
     name = "pyrender"
@@ -79,10 +76,17 @@ class PhotographRenderer:
         difficulty: Difficulty | None = None,
         before: PhotographRenderer | None = None,
     ) -> None:
-        """before: of the scene before vehicles were exchanged, which says how much of each is to show."""
+        """Bake the vehicles' textures.
+
+        Args:
+            identifier: Name of the frame.
+            scene: Any state of its scene.
+            difficulty: Limits of what is evaluated; by default the usual ones.
+            before: Renderer of the scene before vehicles were exchanged; its visible shares count.
+        """
         still = scene.unperturbed()
         self._identifier, self._still, self._difficulty = identifier, still, difficulty or Difficulty()
-        self._lens, self._screen = PictureCamera.from_camera(still.camera), shared_context()
+        self._camera, self._context = PictureCamera.from_camera(still.camera), shared_context()
         self._photograph, self._background = (_to_image(p) for p in (still.photograph, still.background))
         self._depth_m = to_numpy(still.depth)
         self._air = weathering.estimate_air_colour(self._photograph, to_numpy(still.environment.sky))
@@ -93,14 +97,15 @@ class PhotographRenderer:
         self._ignore = self._too_hard(to_numpy(still.objects.box2d), to_numpy(still.objects.truncation), rest)
 
     def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
-        """The sun: textures that are baked from the photograph keep its light."""
+        """List changes of the sun: textures baked from the photograph keep its light."""
         moved = not torch.equal(changed.environment.light, self._still.environment.light)
-        return ("the sun, whose light is baked into the textures",) if moved else ()
+        return ("the sun: its light is baked into the textures",) if moved else ()
 
     @torch.no_grad()
     def render(self, changed: SceneIR) -> SecondRender:
-        """A state of the scene. Labels: the photograph's, moved as the boxes of the meshes move. Ignored are
-        objects that are too hard in the photograph or now, and those of which most is hidden only now.
+        """Render a state of the scene. Labels are the photograph's, moved as the meshes' boxes move.
+
+        Objects are ignored that are too hard in the photograph or now, or that only the change hides mostly.
         """
         if len(changed.objects) != len(self._vehicles):
             raise RangeError(
@@ -117,14 +122,12 @@ class PhotographRenderer:
         )
 
     def textured_vehicles(self, changed: SceneIR) -> list[tuple[Array, TexturedSurface]]:
-        """The vehicles of a state of the scene: triangles (F, 3, 3) m in the camera's own axes, and what is on
-        them.
-        """
+        """The vehicles of a state: triangles (F, 3, 3) m in the camera's own axes, and their textures."""
         poses = [VehiclePose.from_objects(changed.objects, i) for i in range(len(changed.objects))]
         codes = to_numpy(changed.objects.texture_code)
         return [
             (
-                vehicle.body.place(pose, self._lens),
+                vehicle.body.place(pose, self._camera),
                 TexturedSurface(vehicle.atlas.uv, _paint_texture(vehicle, code)),
             )
             for vehicle, pose, code in zip(self._vehicles, poses, codes, strict=True)
@@ -133,20 +136,23 @@ class PhotographRenderer:
     def _make_vehicle(self, source: Source, i: int) -> _Vehicle:
         objects = self._still.objects
         body = BodyMesh(self._still.meshes[int(objects.mesh_index[i])])
-        seen = BakedAppearance(source, self._occluded_area(i))
+        appearance = BakedAppearance(source, self._occluded_area(i))
         normal = to_numpy(self._still.environment.ground)[:3]
-        placed, lens = body.place(VehiclePose.from_source(source), self._lens), self._lens
-        window = _enclosing_window([placed], lens)
-        alone = (
-            None if window is None else self._screen.render_depth(placed.reshape(-1, 3), lens.intrinsics, window)
+        placed, camera = body.place(VehiclePose.from_source(source), self._camera), self._camera
+        window = _enclosing_window([placed], camera)
+        own_depth = (
+            None
+            if window is None
+            else self._context.render_depth(placed.reshape(-1, 3), camera.intrinsics, window)
         )
-        atlas = bake_atlas(body, source, seen, lens, alone)
-        shadow = GroundShadow(source, lens, normal, self._shadow_in_matte(source, alone))
-        return _Vehicle(body, atlas, _to_levels(atlas.colour), shadow, lens.bounding_box(placed))
+        atlas = bake_atlas(body, source, appearance, camera, own_depth)
+        shadow = GroundShadow(source, camera, normal, self._shadow_in_matte(source, own_depth))
+        return _Vehicle(body, atlas, _to_levels(atlas.colour), shadow, camera.bounding_box(placed))
 
-    def _shadow_in_matte(self, source: Source, alone: ObjectDepth | None) -> Array:
-        """(H, W, 3): how much darker the photograph is than the background, as optical depth, beside a vehicle's
-        mesh and within its matte: what of its shadow the matte has taken in."""
+    def _shadow_in_matte(self, source: Source, own_depth: ObjectDepth | None) -> Array:
+        """Optical depth (H, W, 3) of the photograph against the background, within a vehicle's matte but outside
+        of its mesh: the part of its shadow that the matte contains.
+        """
         out, matte = np.zeros_like(self._photograph), np.zeros(self._photograph.shape[:2], bool)
         crop = source.foreground
         alpha = to_numpy(crop.values)[3]
@@ -154,20 +160,20 @@ class PhotographRenderer:
             alpha > _MIN_OCCLUDER_OPACITY
         )
         covered = np.zeros_like(matte)
-        if alone is not None:
-            s, window = SUPERSAMPLING, alone.window
-            samples = np.isfinite(alone.depth_m).reshape(window.height, s, window.width, s)
+        if own_depth is not None:
+            s, window = SUPERSAMPLING, own_depth.window
+            samples = np.isfinite(own_depth.depth_m).reshape(window.height, s, window.width, s)
             covered[window.slices] = samples.any(axis=(1, 3))
         matte &= ~covered
         floor = 1 / 255
         out[matte] = np.log((self._background[matte] + floor) / (self._photograph[matte] + floor))
         out = np.maximum(out, 0)
-        # It goes on under the mesh, whose border covers its pixels in part only.
+        # It continues under the mesh: border pixels are covered only partly.
         return np.where(covered[..., None], cv2.dilate(out, np.ones((5, 5), np.uint8)), out).astype(np.float32)
 
     def _occluded_area(self, i: int) -> NDArray[np.bool_]:
-        """(H, W): where the photograph shows something nearer than an object."""
-        out = np.zeros((self._lens.height, self._lens.width), bool)
+        """(H, W) bool: where the photograph shows something nearer than an object."""
+        out = np.zeros((self._camera.height, self._camera.width), bool)
         depth = float(self._still.objects.translation[i, 2])
         nearer = [s.foreground for s in self._still.objects.source if float(s.translation[2]) < depth]
         nearer += [front.foreground for front in self._still.occluders if front.depth_m < depth]
@@ -179,31 +185,33 @@ class PhotographRenderer:
         return out
 
     def _render_state(self, scene: SceneIR) -> _RenderedScene:
-        objects, lens = scene.objects, self._lens
+        objects, camera = scene.objects, self._camera
         poses = [VehiclePose.from_objects(objects, i) for i in range(len(objects))]
-        placed = [v.body.place(pose, lens) for v, pose in zip(self._vehicles, poses, strict=True)]
+        placed = [v.body.place(pose, camera) for v, pose in zip(self._vehicles, poses, strict=True)]
         environment = scene.environment
         shade = np.zeros_like(self._background)
         for vehicle, pose in zip(self._vehicles, poses, strict=True):
             vehicle.shadow.cast(pose, shade)
-        # Leaves stand behind vehicles, or in `front`, which keeps the photograph's.
+        # Foliage stands behind vehicles, or in `front`, which keeps the photograph's pixels.
         behind = weathering.apply_foliage(self._background, to_numpy(environment.foliage), self._leaves, self._air)
         image = behind * np.exp(-weathering.remaining_shade(to_numpy(environment.weather)) * shade)
         depth_m, owner = self._depth_m.copy(), np.zeros(image.shape[:2], np.int64)
-        window = _enclosing_window(placed, lens)
+        window = _enclosing_window(placed, camera)
         if window is not None:
             codes = to_numpy(objects.texture_code)
-            skins = [
+            surfaces = [
                 TexturedSurface(v.atlas.uv, _paint_texture(v, code))
                 for v, code in zip(self._vehicles, codes, strict=True)
             ]
-            drawn = self._screen.render([p.reshape(-1, 3) for p in placed], skins, lens.intrinsics, window)
-            owner[window.slices] = _pixel_owners(drawn, len(placed))
+            rendered = self._context.render(
+                [p.reshape(-1, 3) for p in placed], surfaces, camera.intrinsics, window
+            )
+            owner[window.slices] = _pixel_owners(rendered, len(placed))
             _composite(
                 image[window.slices],
                 depth_m[window.slices],
                 owner[window.slices],
-                drawn,
+                rendered,
                 self._occluder_layers(window),
             )
         image = weathering.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
@@ -212,32 +220,32 @@ class PhotographRenderer:
         return _RenderedScene(placed, image, owner, shares)
 
     def _occluder_layers(self, window: ImageWindow) -> list[tuple[Array, float]]:
-        """What may stand in front, seen through a window: (h, w, 4), premultiplied, and its distance."""
+        """What may stand in front of vehicles in a window: (h, w, 4), premultiplied, and its distance."""
         return [(_crop_to_window(front, window), front.depth_m) for front in self._still.occluders]
 
-    def _visible_share(self, placed: Array, shown: NDArray[np.bool_]) -> float:
-        """How much of the hull of a vehicle's outline shows, of what lies in the picture."""
+    def _visible_share(self, placed: Array, visible: NDArray[np.bool_]) -> float:
+        """Visible share of the hull of a vehicle's outline, of the part inside the image."""
         corners = placed[(placed[..., 2] > 0).all(axis=1)].reshape(-1, 3)
         if not len(corners):
             return 0.0
-        limit = 4 * max(shown.shape)
-        hull = cv2.convexHull(np.clip(self._lens.project(corners), -limit, limit).astype(np.float32))
-        filled = np.zeros(shown.shape, np.uint8)
+        limit = 4 * max(visible.shape)
+        hull = cv2.convexHull(np.clip(self._camera.project(corners), -limit, limit).astype(np.float32))
+        filled = np.zeros(visible.shape, np.uint8)
         cv2.fillConvexPoly(filled, np.rint(hull).astype(np.int32), 1)
-        return float(np.count_nonzero(shown)) / max(int(filled.sum()), 1)
+        return float(np.count_nonzero(visible)) / max(int(filled.sum()), 1)
 
     def _moved_targets(self, changed: SceneIR, state: _RenderedScene) -> Targets:
-        """The scene's objects in order, then regions in which no detection counts, each once for each class."""
+        """The scene's objects in order, then regions in which no detection counts, each once per class."""
         objects = self._still.objects
-        limit = np.array([self._lens.width - 1, self._lens.height - 1] * 2, np.float32)
+        limit = np.array([self._camera.width - 1, self._camera.height - 1] * 2, np.float32)
         labelled, truncation = to_numpy(objects.box2d), to_numpy(objects.truncation)
-        now = np.array([self._lens.bounding_box(placed) for placed in state.placed]).reshape(-1, 4)
+        now = np.array([self._camera.bounding_box(placed) for placed in state.placed]).reshape(-1, 4)
         then = np.array([vehicle.box_xyxy for vehicle in self._vehicles]).reshape(-1, 4)
         gone = np.isnan(now).any(axis=1) | np.isnan(then).any(axis=1)
         now, then = np.nan_to_num(now), np.nan_to_num(then)
         inside, before = np.clip(now, 0, limit), np.clip(then, 0, limit)
         boxes = labelled + inside - before
-        # A label that is drawn beyond the border stays there.
+        # A label that extends beyond the border stays there.
         boxes = np.clip(boxes, np.minimum(labelled, 0), np.maximum(labelled, limit)).astype(np.float32)
         truncation = np.clip(truncation + _share_outside(now, inside) - _share_outside(then, before), 0, 1)
         hidden = (state.shares < _MIN_SHARE * self._shares) | (state.shares == 0)
@@ -276,27 +284,27 @@ def _paint_texture(vehicle: _Vehicle, code: Array) -> NDArray[np.uint8]:
 
 
 def _to_levels(colour: Array) -> NDArray[np.uint8]:
-    """Of 255, what is in [0, 1]."""
+    """Convert values in [0, 1] to levels of 255."""
     return np.rint(colour * 255).astype(np.uint8)
 
 
-def _enclosing_window(placed: Sequence[Array], lens: PictureCamera) -> ImageWindow | None:
-    """The part of the picture that shows vehicles; None where none does."""
-    boxes = np.array([lens.bounding_box(p) for p in placed]).reshape(-1, 4)
+def _enclosing_window(placed: Sequence[Array], camera: PictureCamera) -> ImageWindow | None:
+    """The part of the image with vehicles; None where there is none."""
+    boxes = np.array([camera.bounding_box(p) for p in placed]).reshape(-1, 4)
     boxes = boxes[~np.isnan(boxes).any(axis=1)]
     if not len(boxes):
         return None
-    limit = np.array([lens.width, lens.height])
+    limit = np.array([camera.width, camera.height])
     x0, y0 = np.clip(np.floor(boxes[:, :2].min(axis=0)) - 1, 0, limit).astype(int).tolist()
     x1, y1 = np.clip(np.ceil(boxes[:, 2:].max(axis=0)) + 2, 0, limit).astype(int).tolist()
     return ImageWindow(x0, y0, x1 - x0, y1 - y0) if x1 > x0 and y1 > y0 else None
 
 
-def _pixel_owners(drawn: WindowImage, count: int) -> NDArray[np.int64]:
-    """(h, w) object + 1 of which a pixel shows at least half; 0 where of none."""
-    height, width = drawn.depth_m.shape
+def _pixel_owners(rendered: WindowImage, count: int) -> NDArray[np.int64]:
+    """(h, w): object + 1 that covers at least half of a pixel; 0 where none does."""
+    height, width = rendered.depth_m.shape
     s = SUPERSAMPLING
-    blocks = drawn.owner.reshape(height, s, width, s)
+    blocks = rendered.owner.reshape(height, s, width, s)
     out = np.zeros((height, width), np.int64)
     for i in range(1, count + 1):
         out[(blocks == i).sum(axis=(1, 3), dtype=np.uint8) >= _MIN_SHARE * s * s] = i
@@ -307,28 +315,28 @@ def _composite(
     image: Array,
     depth_m: Array,
     owner: NDArray[np.int64],
-    drawn: WindowImage,
+    rendered: WindowImage,
     fronts: Sequence[tuple[Array, float]],
 ) -> None:
-    """Put vehicles over the background (h, w, 3), and what stands in front of them over both, in place.
+    """Composite vehicles over the background (h, w, 3), and occluders over both, in place.
 
-    The background shows what stands in front too: there, vehicles lose what it covers.
+    The background already contains the occluders, so vehicles lose what those cover.
     """
-    colour, cover = drawn.colour[..., :3], drawn.colour[..., 3:]
+    colour, cover = rendered.colour[..., :3], rendered.colour[..., 3:]
     veiled, added = np.ones_like(cover), np.zeros_like(colour)
     for rgba, distance in sorted(fronts, key=lambda front: -front[1]):
-        over = (drawn.depth_m > distance)[..., None]
+        over = (rendered.depth_m > distance)[..., None]
         alpha = np.where(over, rgba[..., 3:], 0)
         veiled, added = veiled * (1 - alpha), added * (1 - alpha) + np.where(over, rgba[..., :3], 0)
     owner[veiled[..., 0] < _MIN_SHARE] = 0
     image *= 1 - cover
     image += veiled * colour + cover * added
-    shown = owner > 0
-    depth_m[shown] = drawn.depth_m[shown]
+    visible = owner > 0
+    depth_m[visible] = rendered.depth_m[visible]
 
 
 def _crop_to_window(front: Occluder, window: ImageWindow) -> Array:
-    """A front layer's (h, w, 4) through a window; nothing beside it."""
+    """An occluder's layer (h, w, 4) in a window; transparent outside of it."""
     crop = front.foreground
     rgba = to_numpy(crop.values).transpose(1, 2, 0)
     out = np.zeros((window.height, window.width, 4), np.float32)
@@ -341,24 +349,24 @@ def _crop_to_window(front: Occluder, window: ImageWindow) -> Array:
 
 
 def _share_outside(whole: Array, inside: Array) -> Array:
-    """Shares (N,) of boxes that lie beyond the border."""
+    """Shares (N,) of boxes that lie outside of the image."""
     areas = [np.prod(np.maximum(b[:, 2:] - b[:, :2], 0), axis=1) for b in (whole, inside)]
     return 1 - areas[1] / np.maximum(areas[0], 1e-6)
 
 
 def _visible_boxes(owner: NDArray[np.int64], count: int) -> Array:
-    """(N, 4) px of what shows of each object; zeros where nothing does."""
+    """(N, 4) px, boxes of the visible part of each object; zeros where nothing is visible."""
     out = np.zeros((count, 4), np.float32)
     for i in range(count):
-        seen = (owner == i + 1).astype(np.uint8)
-        x, y, width, height = cv2.boundingRect(seen)
+        appearance = (owner == i + 1).astype(np.uint8)
+        x, y, width, height = cv2.boundingRect(appearance)
         if width:
             out[i] = x, y, x + width - 1, y + height - 1
     return out
 
 
 def _object_contrasts(state: _RenderedScene, count: int) -> NDArray[np.float64]:
-    """How much (N,) each object stands out in the picture."""
+    """Contrast (N,) of each object to its surroundings in the image."""
     image = torch.from_numpy(np.ascontiguousarray(state.image.transpose(2, 0, 1)))
     owner = torch.from_numpy(state.owner)
     crops = []

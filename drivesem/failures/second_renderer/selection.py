@@ -1,4 +1,4 @@
-"""Which second renderer draws a frame again: the generator, where it made the frame; else pyrender."""
+"""Selects a frame's second renderer: the generator where it made the frame, else pyrender."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from drivesem.failures.second_renderer.base import SecondRender, SecondRenderer
 from drivesem.failures.second_renderer.generator import DemoPlans, FolderPlans, GeneratorRenderer, PlanSource
 from drivesem.failures.second_renderer.opengl import shared_context
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
-from drivesem.store import place
+from drivesem.store import local_copy
 from scene_ir.errors import FormatError
 from scene_ir.types import SceneIR, convert_scene
 
 
 class ExchangedSceneRenderer:
-    """Of a scene whose vehicles were exchanged, added or taken away: the scenes before and after it, each drawn
-    from its own textures. The generator's plan has no vehicle for a new one, so that pyrender draws it. scene:
-    any state after it. Raises SceneError where a second renderer cannot be had.
+    """Renders a scene with exchanged, added or removed vehicles: the scenes before and after, each from its
+    own textures, by pyrender, as the generator's plan lacks the new vehicles. `scene` is any state after the
+    exchange.
     """
 
     def __init__(self, identifier: str, scene: SceneIR) -> None:
@@ -32,16 +32,16 @@ class ExchangedSceneRenderer:
         return self._after.name
 
     def render(self, changed: SceneIR) -> SecondRender:
-        """A state of the scene, before or after."""
+        """Render a state of the scene, before or after the exchange."""
         return (self._before if changed.before is None else self._after).render(changed)
 
     def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
-        """See `PhotographRedraw`."""
+        """List the changes that `PhotographRenderer` leaves out."""
         return self._after.unsupported_changes(changed)
 
 
 class CpuSecondRenderer:
-    """Of a scene on a GPU: second renderers draw on the processor; their pictures go where the scene lies."""
+    """Renders a scene that is on a GPU: the wrapped renderer runs on the CPU, its images go to the scene's device."""
 
     def __init__(self, renderer: SecondRenderer) -> None:
         self._renderer = renderer
@@ -51,42 +51,44 @@ class CpuSecondRenderer:
         return self._renderer.name
 
     def render(self, changed: SceneIR) -> SecondRender:
-        """A state of the scene."""
-        drawn = self._renderer.render(convert_scene(changed, None, "cpu"))
-        return replace(drawn, image=drawn.image.to(changed.photograph.device))
+        """Render a state of the scene."""
+        render = self._renderer.render(convert_scene(changed, None, "cpu"))
+        return replace(render, image=render.image.to(changed.photograph.device))
 
     def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
-        """What of a change `render` leaves out."""
+        """List the changes that the wrapped renderer leaves out."""
         return self._renderer.unsupported_changes(convert_scene(changed, None, "cpu"))
 
 
 class SecondRenderers:
-    """Second renderers of one data set's frames. dataset, root: as a run's settings name it.
+    """Second renderers of one data set's frames.
 
-    An embedded scene is known by its provenance, whatever the data set: in Python a scene may come from anywhere.
+    An embedded scene is recognised by its provenance in any data set, as in Python it may come from anywhere.
     """
 
     def __init__(self, dataset: str, root: str | None) -> None:
+        """Take the data set's name and root as in a run's settings."""
         self._dataset = dataset
         self._folder = _find_folder_plans(dataset, root)
         self._last: tuple[Tensor, Tensor, SecondRenderer] | None = None
 
     def renderer_for(self, identifier: str, scene: SceneIR) -> SecondRenderer:
-        """What draws a frame again. scene: any state of it; attacks on the same scene, one after the other, share
-        the renderer. Raises SceneError where nothing can.
+        """Make the renderer of a frame from any state of its scene; consecutive calls for a scene share it.
+
+        Raises SceneError where no renderer works.
         """
-        same = (scene.photograph, scene.objects.mesh_index)  # the same state of affairs: no theta touches them
+        same = (scene.photograph, scene.objects.mesh_index)  # no theta changes them
         if self._last is None or any(a is not b for a, b in zip(self._last, same, strict=False)):
             self._last = (*same, self._make_renderer(identifier, scene))
         return self._last[2]
 
     @property
     def generated(self) -> bool:
-        """Whether the generator made the data set's frames, and draws them again."""
+        """Whether the generator made the data set's frames, and so can render them again."""
         return self._folder is not None or self._dataset == DEMO
 
     def check(self) -> None:
-        """Raises NoSecondRendererError where no frame of the data set could be drawn a second time."""
+        """Raise NoSecondRendererError where no frame of the data set can be rendered a second time."""
         if not self.generated:
             shared_context()
 
@@ -102,10 +104,10 @@ class SecondRenderers:
 
 
 def _find_folder_plans(dataset: str, root: str | None) -> PlanSource | None:
-    """Of a folder that the generator wrote; None where it did not, or where it is not known how."""
+    """Plans of a folder that the generator wrote; None for other folders, and for those without their settings."""
     if dataset != "kitti":
         return None
     try:
-        return FolderPlans(place(root or ""))
+        return FolderPlans(local_copy(root or ""))
     except (UsageError, FormatError):
         return None

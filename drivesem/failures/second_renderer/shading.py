@@ -1,9 +1,9 @@
-"""Paint, leaves and weather of the second renderer: its own formulas for what the codes mean.
+"""Paint, foliage, weather and ground shadows of the second renderer, by its own formulas.
 
-Light and the veils of fog and rain are linear values (display values to the power of 2.2), where the first
-renderer works on display values and their squares. A code of 0 changes nothing. The codes' meaning is in
-scene_ir/conventions.md; strengths are those of what they name: fog 1 lets 130 m be seen, rain 1 is a cloudburst,
-time 1 the end of civil twilight, overcast 1 a closed cover.
+Light, fog and rain are computed on linear values (display values to the power of 2.2); the first renderer uses
+display values and their squares. A code of 0 changes nothing. scene_ir/conventions.md defines the codes: at fog 1
+the visibility is 130 m, rain 1 is a cloudburst, time 1 the end of civil twilight, overcast 1 a closed cloud cover.
+The photographed shadow moves with its vehicle; a contact shadow fills what the photograph does not show of it.
 """
 
 from __future__ import annotations
@@ -21,32 +21,42 @@ _GAMMA = 2.2
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 _LIGHTNESS, _CHROMA, _GLOSS, _DIRT = 2.2, 45.0, 0.9 / 30, 0.55
-"""Paint code 1: on the logit of L*, on a* and b* of a middle grey, on L*'s distance from the paint's own; opacity
-of dust at the foot."""
+"""Effect of paint code 1 on the logit of L*, on a* and b* of a middle grey, and on the contrast of L* to the
+paint's own; opacity of dust at the foot."""
 _DUST = np.array([0.47, 0.42, 0.35], np.float32)
 _DUSTLESS = 0.75
-"""Share of it that is gone at the roof."""
+"""Share of the dust that is missing at the roof."""
 
 _FOG_PER_M, _RAIN_PER_M = 0.03, 0.006
 _LAYER_M = 300.0
-"""How far one sees through the air before it ends: the sky is beyond the layer."""
+"""Thickness of the air in front of the sky."""
 _GREY_AIR = (0.78, 0.82, 0.87)
 _DUSK = np.array([2.0, 1.75, 1.25], np.float32)
 """Optical depth of red, green and blue light at time code 1."""
 _GLOW = np.array([0.35, 0.0, -0.35], np.float32)
-"""What a low sun, at half the time code, adds to the logarithm of light."""
+"""What a low sun adds to the logarithm of light, at half the time code."""
 _SOFTENING = np.array([0.5, 0.4, 0.5, 0.6], np.float32)
-"""What is lost of cast shadows at code 1 of fog, rain, time, overcast."""
+"""Share of a cast shadow that vanishes at code 1 of fog, rain, time, overcast."""
 
-_AUTUMN, _SPRING, _MOST_TURN = 28.0, 150.0, 65.0
-"""Hues, in degrees, towards which hue code 1 and -1 turn the leaves, and how far at most."""
+_AUTUMN, _SPRING, _MAX_TURN = 28.0, 150.0, 65.0
+"""Hues in degrees towards which hue codes 1 and -1 turn the leaves; largest turn."""
 _LEAF_GAMMA = 1.1
-"""How lightness code 1 changes the exponent of leaves' values, as a logarithm."""
+"""Effect of lightness code 1 on the logarithm of the leaves' exponent."""
 
 
 def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: Array) -> Array:
-    """Texels (h, w, 3) of a vehicle whose paint has a texture code (5,). paint, height: (h, w), base: (3,), see
-    `baking.Atlas`."""
+    """Apply a texture code to a vehicle's texels.
+
+    Args:
+        colour: (h, w, 3) RGB in [0, 1].
+        code: (5,) texture code.
+        paint: (h, w) in [0, 1], see `TextureAtlas.paint_share`.
+        height: (h, w) in [0, 1], see `TextureAtlas.height`.
+        base: (3,) paint's own colour.
+
+    Returns:
+        (h, w, 3) RGB in [0, 1].
+    """
     if not code.any():
         return colour
     rows, columns = np.nonzero(paint > 0)
@@ -57,7 +67,7 @@ def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: A
     level = np.clip(lab[:, 0] / 100, 0.01, 0.99)
     lifted = np.log(level / (1 - level)) + _LIGHTNESS * lightness + _GLOSS * gloss * (lab[:, 0] - own)
     level = 1 / (1 + np.exp(-lifted))
-    # Neither black nor white has a hue.
+    # Black and white have no hue.
     room = _CHROMA * 4 * level * (1 - level)
     changed = np.stack([100 * level, lab[:, 1] + red * room, lab[:, 2] + yellow * room], axis=1)
     rgb = np.clip(cv2.cvtColor(changed[None].astype(np.float32), cv2.COLOR_LAB2RGB)[0], 0, 1)
@@ -69,20 +79,30 @@ def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: A
 
 
 def remaining_shade(weather: Array) -> float:
-    """Share of a cast shadow's optical depth that is left under a weather code (4,)."""
+    """Share of a cast shadow's optical depth that remains under a weather code (4,)."""
     return float(np.prod(1 - _SOFTENING * weather))
 
 
 def estimate_air_colour(photograph: Array, sky: Array) -> Array:
-    """Colour (3,) of the air, as the photograph's sky has it; (H, W, 3), (H, W)."""
-    shown = sky > 0.5
-    count = int(np.count_nonzero(shown))
-    grey = np.array(_GREY_AIR, np.float32)
-    return grey if count < 500 else photograph[shown].mean(axis=0).astype(np.float32)
+    """Mean colour (3,) of the sky (H, W) in the photograph (H, W, 3); grey where it is too small."""
+    is_sky = sky > 0.5
+    if np.count_nonzero(is_sky) < 500:
+        return np.array(_GREY_AIR, np.float32)
+    return photograph[is_sky].mean(axis=0).astype(np.float32)
 
 
 def apply_foliage(image: Array, code: Array, leaves: Array, air: Array) -> Array:
-    """The picture (H, W, 3) with its foliage (H, W) in [0, 1] changed by a code (3,)."""
+    """Apply a foliage code.
+
+    Args:
+        image: (H, W, 3) RGB in [0, 1].
+        code: (3,) foliage code.
+        leaves: (H, W) in [0, 1], how much of a pixel is foliage.
+        air: (3,) colour of the air.
+
+    Returns:
+        (H, W, 3) RGB in [0, 1].
+    """
     if not code.any():
         return image
     rows, columns = np.nonzero(leaves > 0)
@@ -91,8 +111,8 @@ def apply_foliage(image: Array, code: Array, leaves: Array, air: Array) -> Array
     hue, lightness, density = (float(c) for c in code)
     here = image[rows, columns]
     hsv = cv2.cvtColor(here[None], cv2.COLOR_RGB2HSV)[0]
-    way = np.mod((_AUTUMN if hue > 0 else _SPRING) - hsv[:, 0] + 180, 360) - 180
-    hsv[:, 0] = np.mod(hsv[:, 0] + abs(hue) * np.clip(way, -_MOST_TURN, _MOST_TURN), 360)
+    turn = np.mod((_AUTUMN if hue > 0 else _SPRING) - hsv[:, 0] + 180, 360) - 180
+    hsv[:, 0] = np.mod(hsv[:, 0] + abs(hue) * np.clip(turn, -_MAX_TURN, _MAX_TURN), 360)
     hsv[:, 1] = np.clip(hsv[:, 1] * (1 + 0.3 * hue), 0, 1)
     hsv[:, 2] = np.clip(hsv[:, 2], 0, 1) ** np.exp(-_LEAF_GAMMA * lightness)
     rgb = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
@@ -105,8 +125,18 @@ def apply_foliage(image: Array, code: Array, leaves: Array, air: Array) -> Array
 
 
 def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Environment, air: Array) -> Array:
-    """The picture (H, W, 3) under the environment's weather. depth_m: (H, W), inf in the sky; open_to: (H, W), 0
-    where a vehicle hides the sky and the road."""
+    """Apply the environment's weather.
+
+    Args:
+        image: (H, W, 3) RGB in [0, 1].
+        depth_m: (H, W), inf in the sky.
+        open_to: (H, W), 0 where a vehicle hides the sky and the road, else 1.
+        environment: Weather and maps.
+        air: (3,) colour of the air.
+
+    Returns:
+        (H, W, 3) RGB in [0, 1].
+    """
     fog, rain, time, overcast = environment.weather.tolist()
     if not (fog or rain or time or overcast):
         return image
@@ -114,7 +144,7 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
     light, air = image**_GAMMA, air**_GAMMA
     if overcast:
         grey = (light @ _LUMA)[..., None]
-        # Sun and shade come nearer to each other, around the light of the day's middle.
+        # Sun and shade converge around the light of midday.
         plain = 0.16 * (np.maximum(0.5 * light + 0.5 * grey, 1e-4) / 0.16) ** 0.75
         cover = float(air @ _LUMA) * 0.6 + 0.1 + 0.1 * (grey - grey.mean())
         plain += sky * (cover - plain)
@@ -131,7 +161,7 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
         wet += road * np.clip(0.1 + depth / 90, 0, 0.5) * (mirror - wet)
         light = light + rain * (wet - light)
     light = np.clip(light, 0, 1)
-    # Drops scatter all colours alike.
+    # Drops scatter all colours equally.
     mist = np.exp(-1.6 * (fog + rain))
     air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
@@ -143,7 +173,7 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
 
 
 def _reflect_in_road(light: Array) -> Array:
-    """What a wet road mirrors: what stands above it, drawn out downwards."""
+    """The reflection in a wet road: what stands above it, smeared downwards."""
     rows = light.shape[0] // 8
     above = cv2.blur(light, (5, rows))
     shifted = np.concatenate([above[:1].repeat(rows // 2, axis=0), above[: light.shape[0] - rows // 2]])
@@ -152,7 +182,7 @@ def _reflect_in_road(light: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def _rain_streaks(height: int, width: int) -> Array:
-    """Streaks of rain (H, W) in [0, 1]; the same for each size."""
+    """Streaks of rain (H, W) in [0, 1]; deterministic for each size."""
     chance = np.random.default_rng(41)
     streaks = np.zeros((height, width), np.float32)
     for x, y, length in zip(
@@ -168,52 +198,58 @@ def _rain_streaks(height: int, width: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _leaf_gaps(height: int, width: int) -> Array:
-    """Where thin leaves let the air through (H, W) in [0, 1]; the same for each size."""
+    """Where thinned foliage shows the air (H, W) in [0, 1]; deterministic for each size."""
     noise = cv2.GaussianBlur(np.random.default_rng(43).normal(size=(height, width)), (0, 0), 1.5)
     return (1 / (1 + np.exp(1 - 3 * noise / noise.std()))).astype(np.float32)
 
 
 _MIN_FACTOR = 0.05
-"""Factors below this count as this: their logarithms are added."""
+"""Smallest shadow factor: logarithms are added."""
 _CONTACT_DEPTH, _CONTACT_PERCENTILE = (0.7, 2.0), 80
-"""Optical depth of the shadow under a vehicle, least and most; the percentile of what the photograph shows of its
-shadow that it is taken for."""
+"""Smallest and largest optical depth of the shadow under a vehicle; percentile of the photographed shadow that
+sets it."""
 _EDGE_BLUR_M = 0.15
-"""Over how far that one fades at the footprint's edge."""
+"""Width over which the contact shadow fades at the footprint's edge."""
 
 
 class GroundShadow:
-    """Of one vehicle, as optical depth. normal: (3,) of the ground, in the camera's axes. dark: (H, W, 3), what
-    the photograph shows of it, besides that of the scene.
-    """
+    """One vehicle's shadow on the ground, as optical depth."""
 
-    def __init__(self, source: Source, lens: PictureCamera, normal: Array, dark: Array) -> None:
-        self._lens, self._normal = lens, normal.astype(np.float64)
+    def __init__(self, source: Source, camera: PictureCamera, normal: Array, dark: Array) -> None:
+        """Measure the photographed shadow.
+
+        Args:
+            source: The vehicle in the photograph.
+            camera: Camera.
+            normal: (3,) of the ground in the camera's axes.
+            dark: (H, W, 3) optical depth of the shadow in the photograph, besides the scene's shadow layer.
+        """
+        self._camera, self._normal = camera, normal.astype(np.float64)
         self._before = VehiclePose.from_source(source)
         if source.shadow is not None and source.shadow.values.numel():
             crop = source.shadow
             factor = to_numpy(crop.values).transpose(1, 2, 0)
             where = slice(crop.y0, crop.y0 + factor.shape[0]), slice(crop.x0, crop.x0 + factor.shape[1])
-            # What is dark about a vehicle above the ground is no shadow.
+            # Dark parts of a vehicle above the ground are no shadow.
             low = np.zeros_like(dark)
             low[where] = np.maximum(dark[where], -np.log(np.clip(factor, _MIN_FACTOR, 1)))
             dark = low
         x, y, width, height = cv2.boundingRect((dark.max(axis=2) > 0).astype(np.uint8))
-        # Nothing is known beyond: there the shadow is to end.
+        # Nothing is known beyond its box, so the shadow ends there.
         density = np.minimum(dark[y : y + height, x : x + width], -np.log(_MIN_FACTOR))
         self._density = (
             cv2.copyMakeBorder(density, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(0, 0, 0)) if width else None
         )
         self._origin = (x - 1, y - 1)
-        told = density[density > 0]
+        known = density[density > 0]
         self._core = (
-            float(np.clip(np.percentile(told, _CONTACT_PERCENTILE), *_CONTACT_DEPTH))
-            if len(told)
+            float(np.clip(np.percentile(known, _CONTACT_PERCENTILE), *_CONTACT_DEPTH))
+            if len(known)
             else _CONTACT_DEPTH[0]
         )
 
     def cast(self, pose: VehiclePose, density: Array) -> None:
-        """Add what the vehicle casts where it stands now to the picture's optical depth (H, W, 3)."""
+        """Add the shadow of the vehicle at a pose to the image's optical depth (H, W, 3), in place."""
         contact = self._contact(pose)
         if contact is not None:
             where, dark = contact
@@ -226,7 +262,7 @@ class GroundShadow:
         if (corners[:, 2] <= 0).any():
             return
         at = corners[:, :2] / corners[:, 2:]
-        limit = [self._lens.width, self._lens.height]
+        limit = [self._camera.width, self._camera.height]
         x0, y0 = np.clip(np.floor(at.min(axis=0)), 0, limit).astype(int).tolist()
         x1, y1 = np.clip(np.ceil(at.max(axis=0)) + 1, 0, limit).astype(int).tolist()
         if x1 <= x0 or y1 <= y0:
@@ -235,29 +271,29 @@ class GroundShadow:
         density[y0:y1, x0:x1] = np.maximum(density[y0:y1, x0:x1], moved)
 
     def _ground_motion(self, pose: VehiclePose) -> np.ndarray:
-        """(3, 3) by which pixels of the ground under the vehicle move when it does: a plane's homography."""
-        k = self._lens.intrinsics.astype(np.float64)
-        before, after = (p.translation.astype(np.float64) + self._lens.shift_m for p in (self._before, pose))
+        """Homography (3, 3) by which pixels of the ground move with the vehicle."""
+        k = self._camera.intrinsics.astype(np.float64)
+        before, after = (p.translation.astype(np.float64) + self._camera.shift_m for p in (self._before, pose))
         turn = pose.rotation().astype(np.float64) @ self._before.rotation().T
         level = self._normal @ before
         return k @ (turn + np.outer(after - turn @ before, self._normal) / level) @ np.linalg.inv(k)
 
     def _contact(self, pose: VehiclePose) -> tuple[tuple[slice, slice], Array] | None:
-        """Optical depth (h, w) of the contact shadow, and where; None where it is not in the picture."""
-        lens = self._lens
+        """Where the contact shadow is, and its optical depth (h, w); None outside of the image."""
+        camera = self._camera
         half = np.array([pose.size_lhw[0], pose.size_lhw[2]]) / 2 - _EDGE_BLUR_M
         flat = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half
         ends = np.stack([flat[:, 0], np.zeros(4), flat[:, 1]], axis=1) @ pose.rotation().T
-        ends += pose.translation + lens.shift_m
+        ends += pose.translation + camera.shift_m
         if ends[:, 2].min() < 1.0:
             return None
-        at = lens.project(ends.astype(np.float32))
-        soft = max(0.7, _EDGE_BLUR_M * float(lens.intrinsics[0, 0]) / float(ends[:, 2].mean()))
-        # Seen at a slant, the ground is foreshortened by the camera's height over the distance.
+        at = camera.project(ends.astype(np.float32))
+        soft = max(0.7, _EDGE_BLUR_M * float(camera.intrinsics[0, 0]) / float(ends[:, 2].mean()))
+        # The ground is foreshortened by the camera's height over the distance.
         flatter = max(0.5, soft * abs(float(self._normal @ ends.mean(axis=0))) / float(ends[:, 2].mean()))
         reach = int(np.ceil(3 * soft))
-        x0, y0 = np.clip(np.floor(at.min(axis=0)) - reach, 0, [lens.width, lens.height]).astype(int).tolist()
-        x1, y1 = np.clip(np.ceil(at.max(axis=0)) + reach, 0, [lens.width, lens.height]).astype(int).tolist()
+        x0, y0 = np.clip(np.floor(at.min(axis=0)) - reach, 0, [camera.width, camera.height]).astype(int).tolist()
+        x1, y1 = np.clip(np.ceil(at.max(axis=0)) + reach, 0, [camera.width, camera.height]).astype(int).tolist()
         if x1 <= x0 or y1 <= y0:
             return None
         mask = np.zeros((y1 - y0, x1 - x0), np.float32)

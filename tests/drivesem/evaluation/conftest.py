@@ -5,20 +5,20 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from drivesem.evaluation.instances import Found, Truths, from_xyxy
+from drivesem.evaluation.instances import DetectionTable, GroundTruthTable, boxes_from_xyxy
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
 
 
-def truths_of(rows: Sequence[tuple], frames: int, kinds: Sequence[str] = KINDS) -> Truths:
+def truths_of(rows: Sequence[tuple], frames: int, kinds: Sequence[str] = KINDS) -> GroundTruthTable:
     """Rows of frame, kind ("DontCare" too), box xyxy, truncation, occlusion."""
     names = {**{kind: i for i, kind in enumerate(kinds)}, "DontCare": -1}
     boxes = np.array([row[2] for row in rows], float).reshape(-1, 4)
-    return Truths(
+    return GroundTruthTable(
         frames=frames,
         frame=np.array([row[0] for row in rows], np.int64),
         label=np.array([names[row[1]] for row in rows], np.int64),
-        boxes=from_xyxy(boxes),
+        boxes=boxes_from_xyxy(boxes),
         ignore=np.array([row[1] == "DontCare" for row in rows], np.bool_),
         truncation=np.array([row[3] if len(row) > 3 else 0.0 for row in rows], float),
         occlusion=np.array([row[4] if len(row) > 4 else 0 for row in rows], np.int64),
@@ -27,13 +27,13 @@ def truths_of(rows: Sequence[tuple], frames: int, kinds: Sequence[str] = KINDS) 
     )
 
 
-def found_of(rows: Sequence[tuple], kinds: Sequence[str] = KINDS) -> Found:
+def found_of(rows: Sequence[tuple], kinds: Sequence[str] = KINDS) -> DetectionTable:
     """Rows of frame, kind, box xyxy, score; sorted by frame here."""
     rows = sorted(rows, key=lambda row: row[0])
-    return Found(
+    return DetectionTable(
         frame=np.array([row[0] for row in rows], np.int64),
         label=np.array([kinds.index(row[1]) for row in rows], np.int64),
-        boxes=from_xyxy(np.array([row[2] for row in rows], float).reshape(-1, 4)),
+        boxes=boxes_from_xyxy(np.array([row[2] for row in rows], float).reshape(-1, 4)),
         score=np.array([row[3] for row in rows], float),
     )
 
@@ -65,12 +65,12 @@ def random_rows(seed: int, frames: int, crowded: bool) -> tuple[list[tuple], lis
 
 
 @pytest.fixture
-def make_truths() -> Callable[..., Truths]:
+def make_truths() -> Callable[..., GroundTruthTable]:
     return truths_of
 
 
 @pytest.fixture
-def make_found() -> Callable[..., Found]:
+def make_found() -> Callable[..., DetectionTable]:
     return found_of
 
 

@@ -10,10 +10,10 @@ import ultrafast_pycocotools
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from drivesem.evaluation.coco import IOU_THRESHOLDS, STATS, Engine, fastest_engine, twelve_numbers
+from drivesem.evaluation.coco import IOU_THRESHOLDS, STATS, Engine, coco_stats, fastest_engine
 from drivesem.evaluation.curves import average_precision
-from drivesem.evaluation.instances import Found, Truths, from_xywh
-from drivesem.evaluation.matching import Candidates, mean_of
+from drivesem.evaluation.instances import DetectionTable, GroundTruthTable, boxes_from_xywh
+from drivesem.evaluation.matching import CandidatePairs, mean_of_known
 
 ENGINES: list[Engine] = ["pycocotools", "ultrafast-pycocotools"]
 CLASSES = 3
@@ -40,23 +40,23 @@ def _case(
     return truth, found, frames
 
 
-def _arrays(truth, found, frames) -> tuple[Truths, Found]:
+def _arrays(truth, found, frames) -> tuple[GroundTruthTable, DetectionTable]:
     boxes = np.array([t[2] for t in truth], float).reshape(-1, 4)
-    truths = Truths(
+    truths = GroundTruthTable(
         frames=frames,
         frame=np.array([t[0] for t in truth], np.int64),
         label=np.array([t[1] for t in truth], np.int64),
-        boxes=from_xywh(boxes),
+        boxes=boxes_from_xywh(boxes),
         ignore=np.array([t[3] for t in truth], np.bool_),
         truncation=np.full(len(truth), -1.0),
         occlusion=np.full(len(truth), -1, np.int64),
         distance_m=np.full(len(truth), np.nan),
         area=np.array([t[4] for t in truth], float),
     )
-    return truths, Found(
+    return truths, DetectionTable(
         frame=np.array([d[0] for d in found], np.int64),
         label=np.array([d[1] for d in found], np.int64),
-        boxes=from_xywh(np.array([d[2] for d in found], float).reshape(-1, 4)),
+        boxes=boxes_from_xywh(np.array([d[2] for d in found], float).reshape(-1, 4)),
         score=np.array([d[3] for d in found], float),
     )
 
@@ -131,7 +131,7 @@ CASES = {
 def test_twelve_numbers(engine: Engine, name: str):
     expected = _reference(*CASES[name]).stats
     truths, found = _arrays(*CASES[name])
-    numbers = twelve_numbers(truths, found, CLASSES, engine)
+    numbers = coco_stats(truths, found, CLASSES, engine)
     assert len(numbers) == len(STATS) == 12
     assert numbers == expected.tolist()
 
@@ -152,7 +152,7 @@ def test_an_id_of_zero_is_no_match():
     truth, found, frames = CASES["a box without an area"]
     truths, detections = _arrays(truth, found, frames)
     expected = _reference(truth, found, frames, first_id=0).stats.tolist()
-    ours = twelve_numbers(truths, detections, CLASSES, engine, np.arange(len(truth)))
+    ours = coco_stats(truths, detections, CLASSES, engine, np.arange(len(truth)))
     assert ours == pytest.approx(expected, abs=1e-9)
     assert expected != pytest.approx(_reference(truth, found, frames).stats.tolist(), abs=1e-9)
 
@@ -161,12 +161,12 @@ def test_an_id_of_zero_is_no_match():
 def test_our_own_matching_gives_the_same_precision(name: str):
     evaluator = _reference(*CASES[name])
     truths, found = _arrays(*CASES[name])
-    candidates = Candidates.of(truths, found, float(IOU_THRESHOLDS[0]))
+    candidates = CandidatePairs.from_tables(truths, found, float(IOU_THRESHOLDS[0]))
     means = []
     for t, threshold in enumerate(IOU_THRESHOLDS.tolist()):
-        match = candidates.coco(threshold)
+        match = candidates.match_coco(threshold)
         for k in range(CLASSES):
-            tally = candidates.tally(match, k)
+            tally = candidates.class_matches(match, k)
             expected = evaluator.eval["precision"][t, :, k, 0, 2]
             ours = average_precision(tally, "coco")
             means.append(ours)
@@ -174,5 +174,5 @@ def test_our_own_matching_gives_the_same_precision(name: str):
             assert ours is None or ours == pytest.approx(expected.mean(), abs=1e-12)
             recall = evaluator.eval["recall"][t, k, 0, 2]
             assert tally.recall() == (None if recall == -1 else pytest.approx(recall, abs=1e-12))
-    whole = mean_of(means)
+    whole = mean_of_known(means)
     assert (-1 if whole is None else whole) == pytest.approx(evaluator.stats[0], abs=1e-12)

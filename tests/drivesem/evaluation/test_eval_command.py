@@ -12,7 +12,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from drivesem.cli import main
-from drivesem.run.report.pictures import LOST_COLOUR
+from drivesem.report.drawing import LOST_COLOUR
 from scene_ir import files
 
 Run = Callable[..., tuple[int, dict, str]]
@@ -134,7 +134,7 @@ def test_coco_stats_are_those_of_pycocotools(run: Run, tmp_path: Path, seed: int
     code, data, _ = run("--gt", gt, "--pred", pred, "--bootstrap", 0)
     assert code == 0
     assert data["stats"] == pytest.approx(_pycocotools(gt, results), abs=1e-9)
-    assert data["figures"]["AP"] == pytest.approx(data["stats"][0], abs=1e-12)
+    assert data["metrics"]["AP"] == pytest.approx(data["stats"][0], abs=1e-12)
 
 
 def test_coco_without_detections(run: Run, tmp_path: Path):

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from detectors.types import Detections, Targets
 from drivesem.evaluation.coco import evaluate
-from drivesem.evaluation.failures import by_class, find, judge
+from drivesem.evaluation.failures import count_by_class, find_failures, match_detections
 
 CLASSES = ("Car", "Truck", "Pedestrian")
 A, B, C = [0.0, 0, 40, 30], [100.0, 50, 160, 90], [200.0, 20, 280, 70]
@@ -48,17 +48,19 @@ def _shift(box, dx):
     ],
 )
 def test_judge(detections, found, false_positive):
-    judgement = judge(_targets([A, B]), detections, T_STAR)
-    assert judgement.found.tolist() == found
+    judgement = match_detections(_targets([A, B]), detections, T_STAR)
+    assert judgement.detected.tolist() == found
     assert judgement.false_positive.tolist() == false_positive
 
 
 def test_detections_on_ignored_targets_are_excused():
-    judgement = judge(_targets([A, B], ignore=[False, True]), _detections([B, [100, 50, 120, 60], C]), T_STAR)
-    assert judgement.found.tolist() == [False, False]
+    judgement = match_detections(
+        _targets([A, B], ignore=[False, True]), _detections([B, [100, 50, 120, 60], C]), T_STAR
+    )
+    assert judgement.detected.tolist() == [False, False]
     assert judgement.false_positive.tolist() == [False, False, True]
     # Only those of the class.
-    other = judge(_targets([B], [1], [True]), _detections([B]), T_STAR)
+    other = match_detections(_targets([B], [1], [True]), _detections([B]), T_STAR)
     assert other.false_positive.tolist() == [True]
 
 
@@ -67,52 +69,52 @@ def test_lost_is_what_was_found_before_and_is_not_now():
     before = _detections([A, B])
     moved = _targets([_shift(A, 30.0), B, C])
     after = _detections([A])  # the first box stayed behind, the second is gone, the third was never found
-    failures = find(benign, before, moved, after, T_STAR)
+    failures = find_failures(benign, before, moved, after, T_STAR)
     assert failures.lost == (0, 1)
     assert failures.phantoms == (0,)
     assert failures.success
     # Under the benign labels, as in the paper, the first one is still met.
-    assert find(benign, before, benign, after, T_STAR).lost == (1,)
+    assert find_failures(benign, before, benign, after, T_STAR).lost == (1,)
 
 
 def test_what_became_ignored_is_not_lost():
     benign = _targets([A, B])
     hidden = _targets([A, B], ignore=[False, True])
-    assert find(benign, _detections([A, B]), hidden, _detections([A]), T_STAR).success is False
+    assert find_failures(benign, _detections([A, B]), hidden, _detections([A]), T_STAR).success is False
 
 
 def test_false_positives_that_were_there_before_are_no_phantoms():
     truth = _targets([A])
     before = _detections([A, C], labels=[0, 2])
-    same = find(truth, before, truth, _detections([A, _shift(C, 5.0)], labels=[0, 2]), T_STAR)
+    same = find_failures(truth, before, truth, _detections([A, _shift(C, 5.0)], labels=[0, 2]), T_STAR)
     assert same.phantoms == ()
-    other_class = find(truth, before, truth, _detections([A, C], labels=[0, 1]), T_STAR)
+    other_class = find_failures(truth, before, truth, _detections([A, C], labels=[0, 1]), T_STAR)
     assert other_class.phantoms == (1,)
-    elsewhere = find(truth, before, truth, _detections([A, B], labels=[0, 2]), T_STAR)
+    elsewhere = find_failures(truth, before, truth, _detections([A, B], labels=[0, 2]), T_STAR)
     assert elsewhere.phantoms == (1,)
-    faint = find(truth, before, truth, _detections([A, B], [0.9, 0.3], [0, 2]), T_STAR)
+    faint = find_failures(truth, before, truth, _detections([A, B], [0.9, 0.3], [0, 2]), T_STAR)
     assert not faint.success
 
 
 def test_rising_above_the_threshold_makes_a_phantom():
     truth = _targets([A])
-    result = find(truth, _detections([A, B], [0.9, 0.4]), truth, _detections([A, B], [0.9, 0.6]), T_STAR)
+    result = find_failures(truth, _detections([A, B], [0.9, 0.4]), truth, _detections([A, B], [0.9, 0.6]), T_STAR)
     assert result.phantoms == (1,)
 
 
 def test_a_box_without_an_area_is_no_phantom():
     truth, found = _targets([A]), _detections([A, [60.0, 10, 60, 40]])
-    assert find(truth, found, truth, found, T_STAR).phantoms == ()
+    assert find_failures(truth, found, truth, found, T_STAR).phantoms == ()
 
 
 def test_counts_by_class():
     labels = torch.tensor([0, 2, 2, 1])
-    assert by_class((1, 2, 3), labels, CLASSES) == {"Car": 0, "Truck": 1, "Pedestrian": 2}
+    assert count_by_class((1, 2, 3), labels, CLASSES) == {"Car": 0, "Truck": 1, "Pedestrian": 2}
 
 
 def test_targets_must_correspond():
     with pytest.raises(ValueError, match="targets: expected the 2 benign objects, found 1"):
-        find(_targets([A, B]), _detections([]), _targets([A]), _detections([]), T_STAR)
+        find_failures(_targets([A, B]), _detections([]), _targets([A]), _detections([]), T_STAR)
 
 
 @settings(max_examples=30, deadline=None)
@@ -128,9 +130,9 @@ def test_found_objects_are_cocos_recall_at_t_star(seed):
         torch.rand(6, generator=generator),
     )
     recall = evaluate([truth], [found], CLASSES, T_STAR).overall.recall_at_t_star
-    assert float(judge(truth, found, T_STAR).found.double().mean()) == pytest.approx(recall)
+    assert float(match_detections(truth, found, T_STAR).detected.double().mean()) == pytest.approx(recall)
 
 
 def test_nothing_changes_nothing_fails():
     truth, found = _targets([A, B], ignore=[False, True]), _detections([A, C])
-    assert not find(truth, found, truth, found, T_STAR).success
+    assert not find_failures(truth, found, truth, found, T_STAR).success

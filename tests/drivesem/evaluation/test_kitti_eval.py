@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivesem.evaluation.instances import Found
+from drivesem.evaluation.instances import DetectionTable
 from drivesem.evaluation.kitti import DIFFICULTIES, evaluate, recall_thresholds
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
@@ -120,7 +120,7 @@ def _compare(truth, found, frames, truths, detections, small):
     assert [(c.name, c.difficulty) for c in curves] == [(n, d) for n in MIN_OVERLAP for d in DIFFICULTIES]
     for curve in curves:
         r11, r40, objects = _slow(truth, found, frames, curve.name, curve.difficulty, small)
-        assert curve.ground_truth == objects
+        assert curve.object_count == objects
         for ours, theirs in ((curve.r11(), r11), (curve.r40(), r40)):
             assert (ours is None) == (theirs is None)
             assert ours is None or ours == pytest.approx(theirs, abs=1e-12)
@@ -330,6 +330,6 @@ def test_weights_are_copies_of_frames(make_truths, make_found, draw_rows):
 
 def test_letter_case_is_free(make_truths, make_found):
     truths = make_truths([(0, "Car", BOX, 0.0, 0)], 1)
-    found: Found = make_found([(0, "Car", BOX, 0.9)])
+    found: DetectionTable = make_found([(0, "Car", BOX, 0.9)])
     curve = evaluate(truths, found, tuple(kind.upper() for kind in KINDS))[0]
     assert curve.r11() == pytest.approx(1 / 11)

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from detectors.types import Detections, Targets
-from drivesem.evaluation.coco import IOU_THRESHOLDS, Scores, evaluate
-from drivesem.evaluation.matches import Matches
-from drivesem.evaluation.resampling import Averaged, Recalled
+from drivesem.evaluation.coco import IOU_THRESHOLDS, CocoScores, evaluate
+from drivesem.evaluation.matched_class import ThresholdMatches
+from drivesem.evaluation.resampling import WeightedAveragePrecision, WeightedRecall
 
 CLASSES = ("Car", "Truck", "Cyclist")
 
@@ -38,25 +38,27 @@ def random_frames(seed: int, frames: int) -> tuple[list[Targets], list[Detection
 def test_figures_are_those_of_coco_to_the_last_bit(seed: int) -> None:
     targets, found = random_frames(seed, 6)
     expected = evaluate(targets, found, CLASSES, 0.4)
-    own = {name: Matches.of(targets, found, label).scores(0.4) for label, name in enumerate(CLASSES)}
+    own = {
+        name: ThresholdMatches.from_frames(targets, found, label).scores(0.4) for label, name in enumerate(CLASSES)
+    }
     assert own == expected.per_class
     assert own["Car"].objects > 3
-    assert Scores.of(own, "Car") == expected
+    assert CocoScores.from_classes(own, "Car") == expected
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_what_has_no_say_changes_no_figure(seed: int) -> None:
     """To the last bit, at any weights of the frames."""
-    matches = Matches.of(*random_frames(seed, 6), 0)
-    kept = matches.telling()
+    matches = ThresholdMatches.from_frames(*random_frames(seed, 6), 0)
+    kept = matches.affects_metrics()
     assert 0 < kept.sum() < len(kept)
-    less = Matches(matches.frame[kept], matches.score[kept], matches.marks[kept], matches.objects)
-    assert less.telling().all()
+    less = ThresholdMatches(matches.frame[kept], matches.score[kept], matches.marks[kept], matches.objects)
+    assert less.affects_metrics().all()
     assert less.scores(0.4) == matches.scores(0.4)
     draws = np.random.default_rng(seed).multinomial(6, np.full(6, 1 / 6), 200).astype(np.float64)
     for place in range(len(IOU_THRESHOLDS)):
-        one, other = less.tally(place), matches.tally(place)
-        for figure in (Recalled, lambda tally: Averaged(tally, "coco")):
+        one, other = less.class_matches(place), matches.class_matches(place)
+        for figure in (WeightedRecall, lambda tally: WeightedAveragePrecision(tally, "coco")):
             assert [figure(one).value(w) for w in draws] == [figure(other).value(w) for w in draws]
 
 
@@ -65,5 +67,5 @@ def test_nothing_to_find_or_nothing_found() -> None:
     empty = [Targets(t.boxes_xyxy[:0], t.labels[:0], t.ignore[:0]) for t in targets]
     none = [Detections(d.boxes_xyxy[:0], d.labels[:0], d.scores[:0]) for d in found]
     for case in ((targets, none), (empty, found)):
-        assert not Matches.of(*case, 0).telling().any()
-        assert Matches.of(*case, 0).scores(0.4) == evaluate(*case, CLASSES, 0.4).headline
+        assert not ThresholdMatches.from_frames(*case, 0).affects_metrics().any()
+        assert ThresholdMatches.from_frames(*case, 0).scores(0.4) == evaluate(*case, CLASSES, 0.4).headline

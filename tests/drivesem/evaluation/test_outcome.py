@@ -10,8 +10,8 @@ import torch
 
 from detectors.types import Detections, Targets
 from drivesem.cli import main
-from drivesem.evaluation.matching import NOTHING
-from drivesem.evaluation.outcome import Outcome
+from drivesem.evaluation.matched_class import MatchedClass
+from drivesem.evaluation.matching import UNMATCHED
 from scene_ir import files
 
 
@@ -31,21 +31,21 @@ def _random(draw: np.random.Generator) -> tuple[Targets, Detections]:
 def test_marks_are_those_of_the_frame(seed: int) -> None:
     draw = np.random.default_rng(seed)
     targets, found = zip(*(_random(draw) for _ in range(12)), strict=True)
-    outcome = Outcome.of(targets, found, 0)
-    truths, detections, match = outcome.candidates.truths, outcome.candidates.found, outcome.match
+    outcome = MatchedClass.from_frames(targets, found, 0)
+    truths, detections, match = outcome.candidates.ground_truth, outcome.candidates.detections, outcome.match
     for frame in range(12):
         mine = truths.frame == frame
         seen = (detections.frame == frame) & (detections.score >= 0.4)
-        hit = np.isin(np.arange(len(truths)), match.truth[seen])
-        alarms = seen & (match.truth == NOTHING) & ~match.excused
-        marks = outcome.marks(frame, 0.4)
-        assert np.array_equal(marks.found, detections.boxes[seen & (match.truth != NOTHING), :4])
-        assert np.array_equal(marks.hit, truths.boxes[mine & hit, :4])
+        hit = np.isin(np.arange(len(truths)), match.ground_truth[seen])
+        alarms = seen & (match.ground_truth == UNMATCHED) & ~match.excused
+        marks = outcome.frame_marks(frame, 0.4)
+        assert np.array_equal(marks.hits, detections.boxes[seen & (match.ground_truth != UNMATCHED), :4])
+        assert np.array_equal(marks.matched, truths.boxes[mine & hit, :4])
         assert np.array_equal(marks.missed, truths.boxes[mine & ~hit & ~truths.ignore, :4])
         assert np.array_equal(marks.ignored, truths.boxes[mine & truths.ignore, :4])
-        assert np.array_equal(marks.alarms, detections.boxes[alarms, :4])
-        assert np.array_equal(marks.alarm_scores, detections.score[alarms])
-        assert marks.mistakes == len(marks.missed) + len(marks.alarms)
+        assert np.array_equal(marks.false_positives, detections.boxes[alarms, :4])
+        assert np.array_equal(marks.false_positive_scores, detections.score[alarms])
+        assert marks.error_count == len(marks.missed) + len(marks.false_positives)
 
 
 def test_nothing_is_marked_without_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,8 +54,8 @@ def test_nothing_is_marked_without_pictures(tmp_path: Path, monkeypatch: pytest.
     files.write_text(tmp_path / "labels/train/a.txt", "0 0.5 0.5 0.4 0.4\n")
     files.write_text(tmp_path / "data.yaml", "train: images/train\nval: images/train\nnames: [Car]\n")
     looked: list[int] = []
-    marks = Outcome.marks
-    monkeypatch.setattr(Outcome, "marks", lambda *words: looked.append(words[1]) or marks(*words))
+    marks = MatchedClass.frame_marks
+    monkeypatch.setattr(MatchedClass, "marks", lambda *words: looked.append(words[1]) or marks(*words))
     words = ["eval", "--detector", "squeezedet", "--dataset", "yolo", "--root", str(tmp_path), "--bootstrap", "0"]
     assert main([*words, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out/metrics.json").is_file()

@@ -4,43 +4,43 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from drivesem.evaluation.curves import Tally
+from drivesem.evaluation.curves import ClassMatches
 from drivesem.evaluation.kitti import evaluate
 from drivesem.evaluation.resampling import (
-    Averaged,
-    Figure,
-    Recalled,
-    Sampled,
-    differences,
+    NamedMetric,
+    WeightedAveragePrecision,
+    WeightedKittiPrecision,
+    WeightedRecall,
+    bootstrap_intervals,
     holm,
-    intervals,
     newcombe,
+    paired_differences,
     wilson,
 )
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
 
 
-def _tally(found: np.ndarray, frames: int, per_frame: int = 5) -> Tally:
+def _tally(found: np.ndarray, frames: int, per_frame: int = 5) -> ClassMatches:
     """Objects of which found[i] of `per_frame` are found in frame i, at falling scores, with no misfire."""
     frame = np.repeat(np.arange(frames), found)
-    return Tally(
+    return ClassMatches(
         score=np.linspace(1, 0, len(frame)),
         frame=frame,
-        hits=np.ones(len(frame)),
-        misfires=np.zeros(len(frame)),
+        true_positives=np.ones(len(frame)),
+        false_positives=np.zeros(len(frame)),
         objects=np.full(frames, float(per_frame)),
     )
 
 
-def _figure(found: np.ndarray) -> Figure:
-    return Figure("AP", (Averaged(_tally(found, len(found)), "voc"),))
+def _figure(found: np.ndarray) -> NamedMetric:
+    return NamedMetric("AP", (WeightedAveragePrecision(_tally(found, len(found)), "voc"),))
 
 
 def test_an_interval_is_that_of_the_mean_where_ap_is_recall():
     draw = np.random.default_rng(0)
     found = draw.binomial(5, 0.6, 200)
-    (one,) = intervals([_figure(found)], 200, 400, draw)
+    (one,) = bootstrap_intervals([_figure(found)], 200, 400, draw)
     mean, error = found.mean() / 5, found.std() / 5 / np.sqrt(200)
     assert one.value == pytest.approx(mean)
     assert one.low == pytest.approx(mean - 1.96 * error, abs=0.3 * error)
@@ -49,18 +49,18 @@ def test_an_interval_is_that_of_the_mean_where_ap_is_recall():
 
 def test_the_same_seed_gives_the_same_interval():
     figure = _figure(np.random.default_rng(1).binomial(5, 0.5, 30))
-    first = intervals([figure], 30, 50, np.random.default_rng(3))
-    assert first == intervals([figure], 30, 50, np.random.default_rng(3))
-    assert first != intervals([figure], 30, 50, np.random.default_rng(4))
+    first = bootstrap_intervals([figure], 30, 50, np.random.default_rng(3))
+    assert first == bootstrap_intervals([figure], 30, 50, np.random.default_rng(3))
+    assert first != bootstrap_intervals([figure], 30, 50, np.random.default_rng(4))
 
 
 def test_equal_detectors_do_not_differ_and_unequal_ones_do():
     draw = np.random.default_rng(2)
     worse = draw.binomial(5, 0.5, 60)
     better = np.minimum(worse + draw.integers(0, 2, 60), 5)
-    (same,) = differences([_figure(worse)], [_figure(worse)], 60, 100, draw)
+    (same,) = paired_differences([_figure(worse)], [_figure(worse)], 60, 100, draw)
     assert (same.difference, same.low, same.high, same.p) == (0, 0, 0, 1)
-    (other,) = differences([_figure(worse)], [_figure(better)], 60, 300, draw)
+    (other,) = paired_differences([_figure(worse)], [_figure(better)], 60, 300, draw)
     assert other.difference == pytest.approx((better.mean() - worse.mean()) / 5)
     assert other.low is not None
     assert other.low > 0
@@ -73,7 +73,7 @@ def test_p_is_uniform_where_nothing_differs():
     values = []
     for _ in range(60):
         a, b = draw.binomial(5, 0.5, 40), draw.binomial(5, 0.5, 40)
-        (one,) = differences([_figure(a)], [_figure(b)], 40, 40, draw)
+        (one,) = paired_differences([_figure(a)], [_figure(b)], 40, 40, draw)
         assert one.p is not None
         values.append(one.p)
     assert 0.35 < np.mean(values) < 0.65
@@ -87,26 +87,28 @@ def test_kitti_curves_side_by_side_weigh_as_each_alone(make_truths, make_found, 
     second = evaluate(make_truths(truth, 8), make_found(other), KINDS)
     ones, none = np.ones(8), np.zeros(8)
     for a, b in zip(first, second, strict=True):
-        both = Figure("R40", (Sampled(a),)).beside(Figure("R40", (Sampled(b),)))
+        both = NamedMetric("R40", (WeightedKittiPrecision(a),)).concatenate(
+            NamedMetric("R40", (WeightedKittiPrecision(b),))
+        )
         assert both.value(np.concatenate([ones, none])) == a.r40()
         assert both.value(np.concatenate([none, ones])) == b.r40()
 
 
 def test_recall_weighs_frames_and_counts_on():
-    first, second = Recalled(_tally(np.array([5, 0, 2]), 3)), Recalled(_tally(np.array([1, 1, 1]), 3))
+    first, second = WeightedRecall(_tally(np.array([5, 0, 2]), 3)), WeightedRecall(_tally(np.array([1, 1, 1]), 3))
     assert first.value(None) == pytest.approx(7 / 15)
     assert first.value(np.array([2.0, 0.0, 1.0])) == pytest.approx(12 / 15)
     assert first.value(np.zeros(3)) is None
-    both = first.beside(second)
+    both = first.concatenate(second)
     assert both.value(np.array([0, 0, 0, 1.0, 1.0, 1.0])) == pytest.approx(3 / 15)
-    assert Recalled(_tally(np.zeros(2, int), 2)).value(None) == 0
+    assert WeightedRecall(_tally(np.zeros(2, int), 2)).value(None) == 0
 
 
 def test_figures_without_objects():
-    empty = Figure("AP", (Averaged(_tally(np.zeros(3, int), 3, per_frame=0), "coco"),))
-    (one,) = intervals([empty], 3, 10, np.random.default_rng(0))
+    empty = NamedMetric("AP", (WeightedAveragePrecision(_tally(np.zeros(3, int), 3, per_frame=0), "coco"),))
+    (one,) = bootstrap_intervals([empty], 3, 10, np.random.default_rng(0))
     assert (one.value, one.low, one.high) == (None, None, None)
-    (pair,) = differences([empty], [empty], 3, 10, np.random.default_rng(0))
+    (pair,) = paired_differences([empty], [empty], 3, 10, np.random.default_rng(0))
     assert pair.p is None
 
 
@@ -152,9 +154,9 @@ def test_holm_steps_down_keeps_the_order_and_leaves_out_what_was_not_tested() ->
 
 def test_a_difference_without_its_test_is_the_same() -> None:
     rng = np.random.default_rng(0)
-    sides = [[Figure("r", (Recalled(_tally(rng.integers(0, 6, 12), 12)),))] for _ in range(2)]
+    sides = [[NamedMetric("r", (WeightedRecall(_tally(rng.integers(0, 6, 12), 12)),))] for _ in range(2)]
     (with_p,), (without,) = (
-        differences(*sides, 12, 30, np.random.default_rng(1), test=test) for test in (True, False)
+        paired_differences(*sides, 12, 30, np.random.default_rng(1), test=test) for test in (True, False)
     )
     assert without.interval == with_p.interval
     assert (without.p, with_p.p is None) == (None, False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivesem.evaluation.curves import average_precision
-from drivesem.evaluation.matching import Candidates
+from drivesem.evaluation.matching import CandidatePairs
 
 KINDS = ("Car", "Van", "Pedestrian", "Person_sitting", "Cyclist", "Truck")
 
@@ -55,11 +55,11 @@ def test_random_frames(make_truths, make_found, draw_rows, seed):
     truth = [(t[0], t[1], tuple(t[2] + more), *t[3:]) for t, more in zip(truth, wide, strict=True)]
     truths = make_truths(truth, 10)
     truths = replace(truths, ignore=truths.ignore | difficult)
-    candidates = Candidates.of(truths, make_found(found), 0.5, None)
-    match = candidates.voc(0.5)
+    candidates = CandidatePairs.from_tables(truths, make_found(found), 0.5, None)
+    match = candidates.match_voc(0.5)
     for label, kind in enumerate(KINDS):
-        tally = candidates.tally(match, label)
-        if not tally.count():
+        tally = candidates.class_matches(match, label)
+        if not tally.object_count():
             assert average_precision(tally, "voc") is None
             continue
         new, old = _slow(truth, difficult, found, kind)
@@ -72,9 +72,9 @@ def test_a_second_detection_does_not_take_the_next_best_object(make_truths, make
     near = (5.0, 0.0, 105.0, 100.0)
     truths = make_truths([(0, "Car", left), (0, "Car", right)], 1)
     found = make_found([(0, "Car", left, 0.9), (0, "Car", near, 0.8)])
-    candidates = Candidates.of(truths, found, 0.5, None)
-    assert candidates.voc(0.5).truth.tolist() == [0, -1]
-    assert candidates.coco(0.5).truth.tolist() == [0, 1]
+    candidates = CandidatePairs.from_tables(truths, found, 0.5, None)
+    assert candidates.match_voc(0.5).ground_truth.tolist() == [0, -1]
+    assert candidates.match_coco(0.5).ground_truth.tolist() == [0, 1]
 
 
 def test_a_detection_belongs_to_a_difficult_object_only_if_it_overlaps_none_more(make_truths, make_found):
@@ -84,6 +84,6 @@ def test_a_detection_belongs_to_a_difficult_object_only_if_it_overlaps_none_more
     truths = make_truths([(0, "Car", car), (0, "Car", difficult), (1, "Car", car), (1, "Car", large)], 2)
     truths = replace(truths, ignore=np.array([False, True, False, True]))
     rows = [(0, "Car", car, 0.9), (0, "Car", near, 0.8), (1, "Car", car, 0.7), (1, "Car", near, 0.6)]
-    match = Candidates.of(truths, make_found(rows), 0.5, None).voc(0.5)
-    assert match.truth.tolist() == [0, -1, 2, -1]
+    match = CandidatePairs.from_tables(truths, make_found(rows), 0.5, None).match_voc(0.5)
+    assert match.ground_truth.tolist() == [0, -1, 2, -1]
     assert match.excused.tolist() == [False, True, False, False]

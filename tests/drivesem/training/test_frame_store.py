@@ -12,8 +12,14 @@ import pytest
 from detectors.types import CLASSES
 from drivesem.attack.labels import Difficulty
 from drivesem.data.kitti import KittiDataset
-from drivesem.training.frames import PIXELS, FrameStore
-from drivesem.training.targets import TRAINED, judged_targets, suited, training_targets
+from drivesem.training.frames import (
+    PIXELS,
+    TRAINING_LIMITS,
+    FrameStore,
+    adapt_limits,
+    evaluation_targets,
+    training_targets,
+)
 from scene_ir.errors import FormatError
 from scene_ir.io import to_uint8
 from scene_ir.types import Labels
@@ -27,7 +33,10 @@ def test_what_is_trained_on_and_what_is_judged(labels: Callable[..., Labels]) ->
         [0, 1, 0, 3, 0, 2, 0],
         [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, float("nan")],
     )
-    trained, judged = training_targets(rows, TRAINED, CLASSES), judged_targets(rows, Difficulty(), CLASSES)
+    trained, judged = (
+        training_targets(rows, TRAINING_LIMITS, CLASSES),
+        evaluation_targets(rows, Difficulty(), CLASSES),
+    )
     assert trained.labels.tolist()[:4] == [0, 0, 1, 0]
     assert trained.ignore.tolist() == [False, False, True, True, True, False, False, True]
     # left: a car and a person; the other five and the region are ignored for each of the four classes
@@ -38,19 +47,19 @@ def test_what_is_trained_on_and_what_is_judged(labels: Callable[..., Labels]) ->
 def test_a_detector_of_other_classes(labels: Callable[..., Labels]) -> None:
     box = [10.0, 10.0, 60.0, 40.0]
     rows = labels(("Truck", "Car", "Truck"), [box, box, [1.0, 1.0, 9.0, 9.0]], [0, 0, 0], [0.0, 0.0, 0.0])
-    trained = training_targets(rows, TRAINED, ("Pedestrian", "Car"))
+    trained = training_targets(rows, TRAINING_LIMITS, ("Pedestrian", "Car"))
     assert trained.labels[~trained.ignore].tolist() == [1]
     assert trained.ignore.tolist() == [False, True, True]
-    judged = judged_targets(rows, Difficulty(), ("Pedestrian", "Car"))
+    judged = evaluation_targets(rows, Difficulty(), ("Pedestrian", "Car"))
     assert judged.labels.tolist() == [1, 0, 0, 0, 1, 1, 1]
 
 
 def test_occlusion_that_is_never_known_leaves_nothing_out(labels: Callable[..., Labels]) -> None:
     box = [10.0, 10.0, 60.0, 40.0]
     never, once = labels(("Car",), [box], [3], [0.0]), labels(("Car",), [box], [0], [0.0])
-    assert suited(TRAINED, [never, once]) == TRAINED
-    assert not bool(training_targets(never, suited(TRAINED, [never]), CLASSES).ignore[0])
-    assert bool(training_targets(never, suited(TRAINED, [never, once]), CLASSES).ignore[0])
+    assert adapt_limits(TRAINING_LIMITS, [never, once]) == TRAINING_LIMITS
+    assert not bool(training_targets(never, adapt_limits(TRAINING_LIMITS, [never]), CLASSES).ignore[0])
+    assert bool(training_targets(never, adapt_limits(TRAINING_LIMITS, [never, once]), CLASSES).ignore[0])
 
 
 def test_frame_store_reads_on_where_it_stopped(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:
@@ -62,7 +71,7 @@ def test_frame_store_reads_on_where_it_stopped(tmp_path: Path, kitti_folder: Cal
     assert len(store()) == 1
     kitti_folder(tmp_path / "data", 3)
     frames = store()
-    assert len(frames) == frames.objects() == 3
+    assert len(frames) == frames.object_count() == 3
     for i, name in enumerate(frames.names):
         photograph = frames.dataset.frame(name).photograph
         assert np.array_equal(frames[i][0], (photograph * 255).round().permute(1, 2, 0).byte().numpy())
@@ -119,7 +128,7 @@ def test_anchors_of_few_boxes_are_refused(tmp_path: Path, kitti_folder: Callable
     dataset = KittiDataset(kitti_folder(tmp_path / "data", 2))
     store = FrameStore(dataset, dataset.identifiers, tmp_path / "cache", CLASSES)
     with pytest.raises(ValueError, match="count: expected 1 to 1"):
-        store.anchors(0)
+        store.fit_anchors(0)
 
 
 def test_frames_without_labels_are_refused(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:

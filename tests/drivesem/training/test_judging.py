@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.training.judging import judge
+from drivesem.training.validation import score_detections
 
 
 def test_judge_by_hand() -> None:
@@ -17,11 +17,11 @@ def test_judge_by_hand() -> None:
     wanted = Targets(torch.tensor([car, far, region]), torch.tensor([0, 0, 0]), torch.tensor([False, False, True]))
     # hit at 0.9; double at 0.8 is false; inside the ignored region at 0.7 counts nowhere; hit at 0.6
     detections = found([car, [0.0, 0.0, 10.0, 11.0], [82.0, 2.0, 90.0, 9.0], far], [0.9, 0.8, 0.7, 0.6])
-    marks = judge([detections], [wanted], CLASSES)
+    marks = score_detections([detections], [wanted], CLASSES)
     assert marks.scores.headline.objects == 2
     assert marks.scores.headline.recall == 1.0
     assert marks.scores.headline.ap50 == pytest.approx((51 * 1.0 + 50 * 2 / 3) / 101)
-    assert marks.mark == pytest.approx(1.25 * (51 * 1.0 + 50 * 2 / 3) / 101)
+    assert marks.selection_score == pytest.approx(1.25 * (51 * 1.0 + 50 * 2 / 3) / 101)
     assert marks.f1 == pytest.approx(2 * 2 / (3 + 2))
     assert marks.t_star == pytest.approx(0.6)
 
@@ -29,5 +29,5 @@ def test_judge_by_hand() -> None:
 def test_nothing_found_is_no_threshold() -> None:
     none = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
     wanted = Targets(torch.tensor([[0.0, 0.0, 10.0, 10.0]]), torch.tensor([0]), torch.tensor([False]))
-    marks = judge([none], [wanted], CLASSES)
+    marks = score_detections([none], [wanted], CLASSES)
     assert (marks.f1, marks.t_star, marks.scores.headline.recall) == (0.0, 0.5, 0.0)

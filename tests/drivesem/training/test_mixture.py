@@ -8,7 +8,7 @@ import torch
 
 from detectors.training import Sample
 from detectors.types import Targets
-from drivesem.training.mixture import Mix, Mixture, Shares
+from drivesem.training.samples import Mix, MixtureShares, TrainingMixture
 
 NOTHING = Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
 
@@ -17,26 +17,26 @@ def frames(first: int, count: int) -> list[Sample]:
     return [(np.full((2, 2, 3), first + i, np.uint8), NOTHING) for i in range(count)]
 
 
-def numbers(mixture: Mixture) -> list[int]:
+def numbers(mixture: TrainingMixture) -> list[int]:
     return [int(mixture[i][0][0, 0, 0]) for i in range(len(mixture))]
 
 
 @pytest.mark.parametrize(("mix", "benign", "total"), [("replace", 30, 40), ("add", 40, 53)])
 def test_shares(mix: Mix, benign: int, total: int) -> None:
-    mixture = Mixture(frames(0, 40), frames(100, 4), Shares(0.25, mix, 0, 7))
+    mixture = TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 7))
     shown = numbers(mixture)
     assert len(shown) == total
     assert len({n for n in shown if n < 100}) == sum(n < 100 for n in shown) == benign
     counts = [shown.count(n) for n in range(100, 104)]
     assert sum(counts) == total - benign
     assert max(counts) - min(counts) <= 1
-    assert numbers(Mixture(frames(0, 40), frames(100, 4), Shares(0.25, mix, 0, 7))) == shown
-    other = Mixture(frames(0, 40), frames(100, 4), Shares(0.25, mix, 0, 8))
+    assert numbers(TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 7))) == shown
+    other = TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 8))
     assert numbers(other) != shown
 
 
 def test_counterexamples_come_in_little_by_little() -> None:
-    mixture = Mixture(frames(0, 4), frames(100, 4), Shares(0.5, "add", 1000, 0))
+    mixture = TrainingMixture(frames(0, 4), frames(100, 4), MixtureShares(0.5, "add", 1000, 0))
     last = len(mixture) - 1
 
     def share(step: int) -> float:
@@ -57,7 +57,7 @@ class Anew(list[Sample]):
 
 
 def test_counterexamples_may_be_drawn_anew() -> None:
-    mixture = Mixture(frames(0, 2), Anew(frames(100, 2)), Shares(0.5, "add", 0, 0))
+    mixture = TrainingMixture(frames(0, 2), Anew(frames(100, 2)), MixtureShares(0.5, "add", 0, 0))
     drawn = [[int(mixture.draw(i, s, np.random.default_rng(0))[0][0, 0, 0]) for i in range(4)] for s in (1, 2)]
     assert [sorted(one) for one in drawn] == [[0, 1, 201, 211], [0, 1, 202, 212]]
 
@@ -65,4 +65,4 @@ def test_counterexamples_may_be_drawn_anew() -> None:
 @pytest.mark.parametrize(("benign", "counterexamples"), [(0, 1), (1, 0)])
 def test_either_without_frames_is_refused(benign: int, counterexamples: int) -> None:
     with pytest.raises(ValueError, match="expected at least one frame, found 0"):
-        Mixture(frames(0, benign), frames(100, counterexamples), Shares(0.25, "replace", 0, 0))
+        TrainingMixture(frames(0, benign), frames(100, counterexamples), MixtureShares(0.25, "replace", 0, 0))

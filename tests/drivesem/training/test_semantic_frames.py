@@ -12,14 +12,13 @@ import pytest
 import torch
 
 from detectors.types import CLASSES
-from drivesem.attack.labels import Labeller, to_kitti_labels, with_others
-from drivesem.attack.space import SIX, ParameterSpace
+from drivesem.attack.labels import Labeller, append_other_labels, to_kitti_labels
+from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
 from drivesem.data import kitti
 from drivesem.data.kitti import KittiDataset
-from drivesem.training.attacked import AttackedSamples, Stage, frames_of
-from drivesem.training.frames import FrameStore
-from drivesem.training.semantic import VARIANTS, SemanticFrames, state_at
-from drivesem.training.targets import TRAINED, training_targets
+from drivesem.training.frames import TRAINING_LIMITS, FrameStore, training_targets
+from drivesem.training.samples import AttackedSamples, Stage, load_attacked_frames
+from drivesem.training.semantic import VARIANTS, PerturbedFrames, render_state
 from scene_ir.io import load_scene, save_scene
 from scene_ir.render.compositor import Compositor
 
@@ -31,7 +30,7 @@ def store(root: Path, cache: Path) -> FrameStore:
 
 def test_frames_without_vehicles_stay_as_they_are(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:
     frames = store(kitti_folder(tmp_path / "data", 1, kind="Pedestrian"), tmp_path / "cache")
-    semantic = SemanticFrames(frames, tmp_path / "semantic", 1.0, 0)
+    semantic = PerturbedFrames(frames, tmp_path / "semantic", 1.0, 0)
     assert len(semantic) == 1
     image, targets = semantic.draw(0, 0, np.random.default_rng(0))
     assert np.array_equal(image, frames[0][0])
@@ -46,7 +45,7 @@ def test_vehicles_move_and_their_labels_too(tmp_path: Path) -> None:
     list(synthesise(Order(tmp_path / "data", 3, seed=1)))
     frames = store(tmp_path / "data", tmp_path / "cache")
     index = max(range(3), key=lambda i: sum(kind in ("Car", "Van") for kind in frames.labels[i].kind))
-    semantic = SemanticFrames(frames, tmp_path / "semantic", 1.0, 0)
+    semantic = PerturbedFrames(frames, tmp_path / "semantic", 1.0, 0)
     drawn = [semantic.draw(index, 0, np.random.default_rng(seed)) for seed in range(8)]
     assert len(list((tmp_path / "semantic").glob("*/*.png"))) == VARIANTS
     benign_image, benign = frames[index]
@@ -57,9 +56,9 @@ def test_vehicles_move_and_their_labels_too(tmp_path: Path) -> None:
     boxes = {tuple(targets.boxes_xyxy[~targets.ignore].flatten().tolist()) for _, targets in drawn}
     assert 2 <= len(boxes) <= VARIANTS
     assert tuple(benign.boxes_xyxy[~benign.ignore].flatten().tolist()) not in boxes
-    plain = SemanticFrames(frames, tmp_path / "semantic", 0.0, 0).draw(index, 0, np.random.default_rng(0))
+    plain = PerturbedFrames(frames, tmp_path / "semantic", 0.0, 0).draw(index, 0, np.random.default_rng(0))
     assert np.array_equal(plain[0], benign_image)
-    again = SemanticFrames(frames, tmp_path / "again", 1.0, 0).draw(index, 5, np.random.default_rng(0))
+    again = PerturbedFrames(frames, tmp_path / "again", 1.0, 0).draw(index, 5, np.random.default_rng(0))
     assert np.array_equal(again[0], drawn[0][0])
 
 
@@ -70,21 +69,21 @@ def test_what_stays_keeps_its_labels(tmp_path: Path, small_run: Path) -> None:
     """A person and a tram beside the cars: objects among the labels of a state, not regions."""
     scene = load_scene(small_run / "frames" / "demo-000" / "scene")
     boxes = torch.tensor([[20.0, 150.0, 50.0, 230.0], [1000.0, 100.0, 1100.0, 200.0]])
-    row = to_kitti_labels(Labeller(scene).paper(), scene, scene).rows([0, 0])
+    row = to_kitti_labels(Labeller(scene).paper(), scene, scene).select([0, 0])
     region = torch.tensor([[300.0, 10.0, 320.0, 20.0]])
     others = replace(row, kind=PEOPLE, boxes_xyxy=boxes, ignore_xyxy=region)
-    scene = replace(scene, others=others, ignore=torch.cat([region, boxes]))
-    space, compositor = ParameterSpace(scene, SIX), Compositor(scene)
+    scene = replace(scene, other_labels=others, ignore=torch.cat([region, boxes]))
+    space, compositor = ParameterSpace(scene, PAPER_PARAMETERS), Compositor(scene)
     labeller = Labeller(scene, compositor.render(scene))
-    _, labels, judged = state_at(torch.zeros(space.dim), space, compositor, labeller, scene)
+    _, labels, judged = render_state(torch.zeros(space.dim), space, compositor, labeller, scene)
     assert labels.kind[-2:] == PEOPLE
     assert torch.equal(labels.boxes_xyxy[-2:], boxes)
     assert torch.equal(labels.ignore_xyxy, region)
     assert int(judged.ignore[len(scene.objects) :].sum()) == 3 * len(CLASSES), "they are not judged"
     written = tmp_path / "labels.txt"
-    assert with_others(labels, None) is labels
+    assert append_other_labels(labels, None) is labels
     kitti.write_labels(written, labels)
-    targets = training_targets(kitti.read_labels(written), TRAINED, CLASSES)
+    targets = training_targets(kitti.read_labels(written), TRAINING_LIMITS, CLASSES)
     person = targets.labels == CLASSES.index("Pedestrian")
     assert targets.ignore[person].tolist() == [False]
 
@@ -93,15 +92,15 @@ def test_what_stays_keeps_its_labels(tmp_path: Path, small_run: Path) -> None:
 def test_a_runs_pictures_have_people(stage: Stage, small_run: Path, tmp_path: Path) -> None:
     """To a detector that knows people, pictures without any would say that there are none."""
     shutil.copytree(small_run, tmp_path / "run")
-    (frame,) = frames_of(tmp_path / "run")
+    (frame,) = load_attacked_frames(tmp_path / "run")
     before = AttackedSamples([frame], stage, "moved", CLASSES)[0][1]
     scene = load_scene(frame.folder / "scene")
     region = torch.tensor([[20.0, 150.0, 50.0, 230.0]])
     for name in ("labels_moved.txt", "labels_paper.txt"):
         labels = kitti.read_labels(frame.folder / name)
         kitti.write_labels(frame.folder / name, replace(labels, ignore_xyxy=region))
-    others = replace(labels.rows([0]), kind=("Cyclist",), boxes_xyxy=region, ignore_xyxy=region[:0])
-    save_scene(replace(scene, others=others, ignore=region), frame.folder / "scene")
+    others = replace(labels.select([0]), kind=("Cyclist",), boxes_xyxy=region, ignore_xyxy=region[:0])
+    save_scene(replace(scene, other_labels=others, ignore=region), frame.folder / "scene")
     after = AttackedSamples([frame], stage, "moved", CLASSES)[0][1]
     cyclist = after.labels == CLASSES.index("Cyclist")
     assert after.boxes_xyxy[cyclist & ~after.ignore].tolist() == region.tolist()

@@ -18,7 +18,7 @@ import torch
 from detectors.registry import load_detector, read_weights
 from detectors.training import CHECKPOINT, LOG
 from drivesem.cli import main
-from drivesem.training.keeper import BEST, CURVES, EVALUATIONS
+from drivesem.training.validation import BEST, CURVES, EVALUATIONS
 
 STEPS = ["--steps", "4", "--batch", "2", "--window", "96x64", "--rate", "1e-4", "--checkpoint-every", "2"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from drivesem.video.taking import TakenClip
-from scene_ir.render.sources import from_own_picture
+from drivesem.video.clips import DerenderedClip
+from scene_ir.render.sources import photograph_scene
 from scene_ir.types import SceneIR
 
 PLACES = {4: (-2.5, 16.0), 7: (2.7, 22.0), 9: (-2.6, 34.0)}
@@ -17,7 +17,7 @@ STEP_M = 0.8
 
 def clip_of(
     street: Callable[..., SceneIR], frames: int, drawn: bool = False, without: int | None = None
-) -> TakenClip:
+) -> DerenderedClip:
     """drawn: with pictures, else grey all over. without: a frame that the last car is not in."""
     scenes, tracks = [], []
     for frame in range(frames):
@@ -25,6 +25,6 @@ def clip_of(
         scene = street([(PLACES[t][0], PLACES[t][1] - STEP_M * frame) for t in there])
         told = {"tracks": ",".join(map(str, there))} | {f"objects[{i}].label": str(i) for i in range(len(there))}
         scene = replace(scene, provenance=told)
-        scenes.append(from_own_picture(scene) if drawn else scene)
+        scenes.append(photograph_scene(scene) if drawn else scene)
         tracks.append(tuple(there))
-    return TakenClip("street", tuple(f"{f:03d}" for f in range(frames)), tuple(scenes), tuple(tracks))
+    return DerenderedClip("street", tuple(f"{f:03d}" for f in range(frames)), tuple(scenes), tuple(tracks))

@@ -17,10 +17,11 @@ import pytest
 from drivesem.cli import main
 from drivesem.run.records import from_json
 from drivesem.synth.write import Order, synthesise
-from drivesem.video import running, taking
-from drivesem.video.page import write_page
+from drivesem.video import clips as taking
+from drivesem.video import run as running
+from drivesem.video.clips import DerenderedClip
+from drivesem.video.report import write_page
 from drivesem.video.results import DriveResult
-from drivesem.video.taking import TakenClip
 from scene_ir import files
 from scene_ir.io import load_scene
 from scene_ir.types import SceneIR
@@ -30,12 +31,12 @@ WORDS = ["drive", "--params", "color,translate", "--steps", "1", "--keys", "2", 
 
 
 @pytest.fixture(scope="module")
-def taken(street: Callable[..., SceneIR]) -> TakenClip:
+def taken(street: Callable[..., SceneIR]) -> DerenderedClip:
     return clip_of(street, 3, drawn=True, without=1)
 
 
 @pytest.fixture(scope="module")
-def finished(taken: TakenClip, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(taken: DerenderedClip, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A command on a clip that is taken apart already."""
     out = tmp_path_factory.mktemp("drive") / "out"
     with pytest.MonkeyPatch.context() as patch:
@@ -62,7 +63,7 @@ def test_it_is_told_from_an_attack_that_was_killed(
     assert "stopped early" not in error
 
 
-def test_what_is_written(finished: Path, taken: TakenClip) -> None:
+def test_what_is_written(finished: Path, taken: DerenderedClip) -> None:
     told = json.loads((finished / "drive.json").read_text())
     assert told["frames"] == 3
     assert told["names"] == list(taken.names)
@@ -85,7 +86,7 @@ def test_what_is_written(finished: Path, taken: TakenClip) -> None:
             assert files.read_image(finished / "frames" / name / f"{side}.jpg").shape == (188, 621, 3)
     assert (finished / "config.yaml").is_file()
     assert len((finished / "drive.csv").read_text().splitlines()) == 4
-    assert not files.leftovers(finished)
+    assert not files.find_leftovers(finished)
 
 
 def test_the_video_has_all_frames(finished: Path) -> None:

@@ -11,8 +11,8 @@ import torch
 
 from drivesem.attack.space import ParameterSpace
 from drivesem.synth.drives import drive_of
+from drivesem.video.clips import DerenderedClip, object_tracks
 from drivesem.video.space import ClipSpace
-from drivesem.video.taking import TakenClip, tracks_of
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
 from scene_ir.render.compositor import Compositor
@@ -28,7 +28,7 @@ NOISE_M = 0.05
 class Watched:
     """A clip as it was taken, and how its pictures are drawn."""
 
-    def __init__(self, clip: TakenClip) -> None:
+    def __init__(self, clip: DerenderedClip) -> None:
         self.clip = clip
         self._compositors = [Compositor(scene) for scene in clip.scenes]
 
@@ -62,7 +62,7 @@ def middle_of_hull(scene: SceneIR, row: int) -> tuple[float, float]:
     return found["m10"] / found["m00"], found["m01"] / found["m00"]
 
 
-def changed(clip: TakenClip, noise_m: float = 0.0) -> list[SceneIR]:
+def changed(clip: DerenderedClip, noise_m: float = 0.0) -> list[SceneIR]:
     """The clip with a path aside, and each frame's places off by noise of its own."""
     spaces = [ParameterSpace(scene, ("color", "translate")) for scene in clip.scenes]
     space = ClipSpace(spaces, clip.tracks)
@@ -70,7 +70,7 @@ def changed(clip: TakenClip, noise_m: float = 0.0) -> list[SceneIR]:
     theta = space.lower + torch.rand(space.dim, generator=generator) * (space.upper - space.lower)
     found = []
     for frame, one in enumerate(spaces):
-        scene = one.apply(one.scene, space.of_frame(theta, frame))
+        scene = one.apply(one.scene, space.frame_theta(theta, frame))
         noise = noise_m * torch.randn(scene.objects.translation.shape, generator=generator)
         found.append(
             scene.with_objects(translation=scene.objects.translation + noise * torch.tensor([1.0, 0.0, 1.0]))
@@ -89,7 +89,9 @@ def test_cars_move_as_their_places_do(street: Callable[..., SceneIR]) -> None:
 def test_cars_of_the_embedded_drive_move_as_their_places_do() -> None:
     drive = drive_of(0, 30)
     scenes = tuple(drive.scene(number) for number in range(5))
-    clip = TakenClip("drive", tuple(map(str, range(5))), scenes, tuple(tracks_of(scene) for scene in scenes))
+    clip = DerenderedClip(
+        "drive", tuple(map(str, range(5))), scenes, tuple(object_tracks(scene) for scene in scenes)
+    )
     watched, meant = Watched(clip), changed(clip)
     plain = (8, 20)  # in all of these frames, and hidden by nothing
     assert max(watched.trembling_px(meant, meant, *plain)) < STEADY_PX

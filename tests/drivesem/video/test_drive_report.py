@@ -4,7 +4,7 @@ import io
 from pathlib import Path
 
 from drivesem.report.terminal import Console
-from drivesem.video.report import answer_of, summary
+from drivesem.video.report import build_report, format_summary
 from drivesem.video.results import STATES, CarResult, DriveResult
 
 
@@ -12,7 +12,10 @@ def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
     """Cars, by track and kind, that come nearer by a metre a frame and are missed from the second one on."""
     states: dict[str, str] = dict.fromkeys(map(str, STATES), "f" + "l" * (frames - 1))
     distance_m = tuple(float(frames - i) for i in range(frames))
-    told = (CarResult.of(track, kind, states, distance_m, (None,) * frames, (True, False)) for track, kind in cars)
+    told = (
+        CarResult.from_states(track, kind, states, distance_m, (None,) * frames, (True, False))
+        for track, kind in cars
+    )
     return DriveResult(
         out=str(out),
         clip="Scene01/clone",
@@ -38,7 +41,7 @@ def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
 
 def test_the_table_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
     shown = io.StringIO()
-    answer = answer_of(_result(tmp_path, 140, (3, "Car"), (1012, "Truck")))
+    answer = build_report(_result(tmp_path, 140, (3, "Car"), (1012, "Truck")))
     answer.print(Console(file=shown, width=80))
     lines = [line.split() for line in shown.getvalue().splitlines()[:6]]
     figures = ["before", "after", "random", "of", "longest", "before", "after", "random", "of", "m", "certain"]
@@ -48,6 +51,6 @@ def test_the_table_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
 
 
 def test_one_is_told_as_one(tmp_path: Path) -> None:
-    said = summary(_result(tmp_path, 1, (3, "Car")))
+    said = format_summary(_result(tmp_path, 1, (3, "Car")))
     for part in ("of 1 sight of 1 car missed", ", 1 phantom (", "in 1 of 1 frame; 1 query, 1 pass, "):
         assert part in said

@@ -9,9 +9,9 @@ import torch
 
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
-from drivesem.video.results import CarResult, Missed
-from drivesem.video.space import ClipSpace, project
-from drivesem.video.taking import TakenClip
+from drivesem.video.clips import DerenderedClip
+from drivesem.video.results import CarResult, MissedInterval
+from drivesem.video.space import ClipSpace, project_clip
 from scene_ir.types import SceneIR
 from tests.drivesem.video.clips import clip_of
 
@@ -19,12 +19,12 @@ PARAMS = ("color", "weather", "translate", "rotate", "mesh")
 
 
 @pytest.fixture(scope="module")
-def streets(street: Callable[..., SceneIR]) -> TakenClip:
+def streets(street: Callable[..., SceneIR]) -> DerenderedClip:
     return clip_of(street, 4, without=2)
 
 
 @pytest.fixture(scope="module")
-def space(streets: TakenClip) -> ClipSpace:
+def space(streets: DerenderedClip) -> ClipSpace:
     return ClipSpace([ParameterSpace(scene, PARAMS) for scene in streets.scenes], streets.tracks)
 
 
@@ -34,46 +34,46 @@ def random_theta(space: ClipSpace, share: float = 1.0, seed: int = 0) -> torch.T
     return share * (space.lower + place * (space.upper - space.lower))
 
 
-def test_what_is_a_cars_is_the_same_in_all_frames(space: ClipSpace, streets: TakenClip) -> None:
+def test_what_is_a_cars_is_the_same_in_all_frames(space: ClipSpace, streets: DerenderedClip) -> None:
     theta = random_theta(space)
     for parameter in (Parameter.COLOR, Parameter.ROTATE, Parameter.MESH):
         seen: dict[int, torch.Tensor] = {}
         for frame, tracks in enumerate(streets.tracks):
-            block = space.spaces[frame].block(space.of_frame(theta, frame), parameter)
+            block = space.spaces[frame].block(space.frame_theta(theta, frame), parameter)
             assert block is not None
             for row, track in enumerate(tracks):
                 assert torch.equal(seen.setdefault(track, block[row]), block[row])
     for frame, one in enumerate(space.spaces):
-        weather = one.block(space.of_frame(theta, frame), Parameter.WEATHER)
+        weather = one.block(space.frame_theta(theta, frame), Parameter.WEATHER)
         assert weather is not None
         assert torch.equal(weather, theta[space.blocks[Parameter.WEATHER]])
 
 
-def test_theta_0_is_the_clip_as_it_was(space: ClipSpace, streets: TakenClip) -> None:
+def test_theta_0_is_the_clip_as_it_was(space: ClipSpace, streets: DerenderedClip) -> None:
     for frame, scene in enumerate(streets.scenes):
-        here = space.of_frame(space.theta0, frame)
+        here = space.frame_theta(space.theta0, frame)
         assert not here.any()
         assert torch.equal(space.spaces[frame].apply(scene, here).objects.translation, scene.objects.translation)
 
 
-def test_a_path_is_a_cubic_within_its_bounds(streets: TakenClip) -> None:
+def test_a_path_is_a_cubic_within_its_bounds(streets: DerenderedClip) -> None:
     spaces = [ParameterSpace(streets.scenes[0], ("translate",))] * 9
     space = ClipSpace(spaces, [streets.tracks[0]] * 9)
     theta = random_theta(space)
-    path = torch.stack([space.of_frame(theta, frame) for frame in range(9)]).double()
+    path = torch.stack([space.frame_theta(theta, frame) for frame in range(9)]).double()
     assert (path.abs() <= 0.25).all()
     fourth = torch.diff(path, n=4, dim=0)
     assert fourth.abs().max() < 1e-5
     assert torch.diff(path, n=3, dim=0).abs().max() > 1e-3
     length_m = streets.scenes[0].objects.size_lhw[:, :1]
-    assert torch.equal(space.path(theta, 3), space.of_frame(theta, 3).reshape(-1, 2) * length_m)
+    assert torch.equal(space.path_offsets(theta, 3), space.frame_theta(theta, 3).reshape(-1, 2) * length_m)
     still = ClipSpace(spaces, [streets.tracks[0]] * 9, bend=0)
     theta = random_theta(still)
-    assert all(torch.equal(still.of_frame(theta, f), still.of_frame(theta, 0)) for f in range(9))
+    assert all(torch.equal(still.frame_theta(theta, f), still.frame_theta(theta, 0)) for f in range(9))
 
 
-def test_bounds_are_the_tightest_of_a_cars_frames(streets: TakenClip) -> None:
-    budget = Budget(translate_m=4.0, translate=1.5, of_distance=0.05)
+def test_bounds_are_the_tightest_of_a_cars_frames(streets: DerenderedClip) -> None:
+    budget = Budget(translate_m=4.0, translate=1.5, distance_share=0.05)
     spaces = [ParameterSpace(scene, ("translate",), budget) for scene in streets.scenes]
     space = ClipSpace(spaces, streets.tracks)
     upper = space.upper.reshape(space.count, -1)
@@ -89,10 +89,10 @@ def test_bounds_are_the_tightest_of_a_cars_frames(streets: TakenClip) -> None:
 def test_gradients_go_back_to_the_clip(space: ClipSpace) -> None:
     theta = random_theta(space).double().requires_grad_(True)
     weights = torch.rand(space.spaces[1].dim, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    (gradient,) = torch.autograd.grad((space.of_frame(theta, 1) * weights).sum(), theta)
+    (gradient,) = torch.autograd.grad((space.frame_theta(theta, 1) * weights).sum(), theta)
     step = torch.zeros_like(gradient)
     step[space.blocks[Parameter.TRANSLATE].start + 2] = 1e-3
-    moved = space.of_frame(theta.detach() + step, 1) - space.of_frame(theta.detach(), 1)
+    moved = space.frame_theta(theta.detach() + step, 1) - space.frame_theta(theta.detach(), 1)
     change = (moved * weights).sum() / 1e-3
     assert float((gradient * step).sum() / 1e-3) == pytest.approx(float(change), rel=1e-5, abs=1e-9)
 
@@ -106,16 +106,18 @@ def test_names_units_and_values_are_a_cars(space: ClipSpace) -> None:
     assert "weather.fog" in told
 
 
-def test_projection_is_feasible_in_every_frame_and_keeps_what_is(space: ClipSpace, streets: TakenClip) -> None:
+def test_projection_is_feasible_in_every_frame_and_keeps_what_is(
+    space: ClipSpace, streets: DerenderedClip
+) -> None:
     sets = [FeasibleSet(one) for one in space.spaces]
-    found = project(space, sets, random_theta(space, 0.9))
+    found = project_clip(space, sets, random_theta(space, 0.9))
     assert found.active
     for frame, feasible in enumerate(sets):
-        here = space.of_frame(found.theta, frame)
+        here = space.frame_theta(found.theta, frame)
         assert torch.allclose(feasible.project(here).theta, here, atol=1e-5)
-    again = project(space, sets, found.theta)
+    again = project_clip(space, sets, found.theta)
     assert torch.allclose(again.theta, found.theta, atol=1e-5)
-    assert torch.equal(project(space, sets, space.theta0).theta, space.theta0)
+    assert torch.equal(project_clip(space, sets, space.theta0).theta, space.theta0)
     assert bool(found.theta.any())
 
 
@@ -127,19 +129,19 @@ def test_cars_that_cannot_move_stay(space: ClipSpace) -> None:
             return type("Found", (), {"theta": torch.zeros_like(theta), "active": ("objects[0]: road",)})()
 
     sets = [FeasibleSet(one) for one in space.spaces]
-    found = project(space, [Nothing(), *sets[1:]], random_theta(space, 0.5))  # pyright: ignore[reportArgumentType]
-    assert not space.of_frame(found.theta, 0).any()
+    found = project_clip(space, [Nothing(), *sets[1:]], random_theta(space, 0.5))  # pyright: ignore[reportArgumentType]
+    assert not space.frame_theta(found.theta, 0).any()
     assert f"cars[{space.tracks[int(space.rows[0][0])]}]: road" in found.active
 
 
 def test_misses_are_counted_by_stretch_and_metre() -> None:
     away = (30.0, 28.0, 25.0, 24.0, 25.0, None, 20.0, 19.0)
-    missed = Missed.of("flll- lf", away)
-    assert missed == Missed(frames=6, lost=4, longest=3, metres=7.0, metres_lost=6.0)
-    nothing = Missed.of("--  ", (9.0, 8.0, None, None))
-    assert nothing == Missed(0, 0, 0, 0.0, 0.0)
-    car = CarResult.of(
+    missed = MissedInterval.from_states("flll- lf", away)
+    assert missed == MissedInterval(frames=6, lost=4, longest=3, metres=7.0, metres_lost=6.0)
+    nothing = MissedInterval.from_states("--  ", (9.0, 8.0, None, None))
+    assert nothing == MissedInterval(0, 0, 0, 0.0, 0.0)
+    car = CarResult.from_states(
         4, "Car", {"before": "ff", "after": "fl", "control": "ll"}, (9.0, 7.5), (None, None), [True]
     )
-    assert (car.frames, car.lost_before, car.lost_after, car.lost_control, car.newly) == (2, 0, 1, 2, 1)
+    assert (car.frames, car.lost_before, car.lost_after, car.lost_control, car.new_misses) == (2, 0, 1, 2, 1)
     assert (car.metres, car.metres_lost_after, car.graded, car.certain) == (1.5, 1.5, 1, 1)

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from drivesem.data.clips import Clip
-from drivesem.video import taking
-from drivesem.video.taking import Taker, Taking
+from drivesem.video import clips as taking
+from drivesem.video.clips import ClipDerenderer, ClipSource
 from scene_ir.derender.derender import DerenderSettings
-from scene_ir.derender.silhouette import Placement, placed
+from scene_ir.derender.silhouette import Placement, place_mesh
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera, Frame, Labels, SceneIR
 
@@ -57,18 +57,18 @@ class Drive:
 @pytest.fixture
 def taker(
     street: Callable[..., SceneIR], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., tuple[Taker, dict[str, list[str]]]]:
+) -> Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]]:
     """What takes the clip apart, and the meshes that each frame's cars got."""
 
     def shapes(frame: Frame, _: DerenderSettings) -> dict[int, Placement]:
         here = torch.zeros(3), torch.tensor(0.0)
-        return {row: placed(MESHES[frame.identifier], *here, SIZE) for row in range(len(TRACKS))}
+        return {row: place_mesh(MESHES[frame.identifier], *here, SIZE) for row in range(len(TRACKS))}
 
-    def build(*damaged: str, keep_going: bool) -> tuple[Taker, dict[str, list[str]]]:
+    def build(*damaged: str, keep_going: bool) -> tuple[ClipDerenderer, dict[str, list[str]]]:
         meshes: dict[str, list[str]] = {}
 
         def derender(frame: Frame, settings: DerenderSettings) -> SceneIR:
-            names = [known.mesh.name for known in settings.known or () if known is not None]
+            names = [known.mesh.name for known in settings.known_placements or () if known is not None]
             meshes[frame.identifier] = [name.split("-")[0] for name in names]
             return street([(-2.0, 15.0), (3.0, 20.0)])
 
@@ -76,14 +76,14 @@ def taker(
         monkeypatch.setattr(taking, "clips_in", lambda _: {"clip": clip})
         monkeypatch.setattr(taking, "placements", shapes)
         monkeypatch.setattr(taking, "derender", derender)
-        return Taker(Taking("folder", None, None, 0, False, keep_going), tmp_path), meshes
+        return ClipDerenderer(ClipSource("folder", None, None, 0, False, keep_going), tmp_path), meshes
 
     return build
 
 
 @pytest.mark.parametrize("order", [NAMES, NAMES[::-1], ("b", "a", "c")])
 def test_the_next_best_view_stands_in_for_a_damaged_one(
-    order: tuple[str, ...], taker: Callable[..., tuple[Taker, dict[str, list[str]]]]
+    order: tuple[str, ...], taker: Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]]
 ) -> None:
     whole, meshes = taker(keep_going=True)
     for name in order:
@@ -100,7 +100,7 @@ def test_the_next_best_view_stands_in_for_a_damaged_one(
 
 
 def test_without_keep_going_no_frame_is_taken_apart_with_another_shape(
-    taker: Callable[..., tuple[Taker, dict[str, list[str]]]],
+    taker: Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]],
 ) -> None:
     """The picture is repaired, and the command goes on: all of its frames have the best view's shapes."""
     damaged, meshes = taker("b", keep_going=False)
@@ -111,7 +111,7 @@ def test_without_keep_going_no_frame_is_taken_apart_with_another_shape(
 
 
 def test_a_clip_whose_first_picture_is_damaged_has_a_camera(
-    taker: Callable[..., tuple[Taker, dict[str, list[str]]]],
+    taker: Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]],
 ) -> None:
     camera = taker("a", keep_going=True)[0].source.camera()
     assert camera is not None

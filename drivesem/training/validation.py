@@ -5,18 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from detectors.base import Detector
+import numpy as np
+import torch
+
+from detectors import boxes
+from detectors.base import Detector, Predictor, predict
 from detectors.registry import save_detector
 from detectors.training import LOG
+from detectors.types import Detections, Targets
 from drivesem.evaluation.coco import evaluate
-from drivesem.training.card import Recipe, card
-from drivesem.training.curves import draw, read_columns
+from drivesem.training.card import CardFacts, ValidationScores, format_card, plot_curves, read_columns
 from drivesem.training.frames import FrameStore
-from drivesem.training.judging import Marks, detect, judge
 from scene_ir import files
 
 EVALUATIONS, BEST, CURVES = "evaluations.csv", "best.json", "curves.png"
@@ -24,7 +27,7 @@ _COLUMNS: tuple[str, ...] = ("step", "mark", "car_ap50", "car_recall", "car_ap",
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class ValidationSet:
     """frames: to choose and to judge by; thin: every so-and-so-many-th of them while training goes on, all for the
     card; also: further frames whose figures go into the card; test: what is judged by in the place of `frames`,
     which then only choose.
@@ -36,7 +39,7 @@ class HeldOut:
     test: FrameStore | None = None
 
 
-class Keeper:
+class CheckpointSelector:
     """Called with the averaged detector now and then: writes evaluations, curves, and the weights if they are the
     best so far, as float16 with t* and figures, and the card beside them.
 
@@ -47,14 +50,14 @@ class Keeper:
         self,
         run: Path,
         weights: Path,
-        recipe: Recipe,
-        held_out: HeldOut | None,
+        recipe: CardFacts,
+        held_out: ValidationSet | None,
         device: str = "cpu",
         tell: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.run, self.weights, self.recipe, self.held_out = run, weights, recipe, held_out
         self.device, self.tell = device, tell
-        self.wanted = held_out.frames.judged(recipe.judged) if held_out is not None else []
+        self.wanted = held_out.frames.evaluation_targets(recipe.judged) if held_out is not None else []
         best = files.read_json(run / BEST) if (run / BEST).is_file() else {}
         self.best = float(best.get("mark", 0.0))
         self._judged_step = -1
@@ -70,23 +73,27 @@ class Keeper:
             marks = self._judge(detector, self.held_out.frames, indices)
             self._record(step, marks)
             self.tell(f"step {step}: {marks.summary()}")
-            if marks.mark >= self.best:
-                self.best = marks.mark
+            if marks.selection_score >= self.best:
+                self.best = marks.selection_score
                 whole = marks
                 if len(indices) < len(self.wanted):
                     whole = self._judge(detector, self.held_out.frames, range(len(self.wanted)))
                 self._export(detector, step, whole)
-                files.write_json(self.run / BEST, {"mark": marks.mark, "step": step} | _row(step, whole))
-        draw(self.run / LOG, self.run / EVALUATIONS, self.run / CURVES, f"{detector.name}, {self.run.name}")
+                files.write_json(
+                    self.run / BEST, {"mark": marks.selection_score, "step": step} | _row(step, whole)
+                )
+        plot_curves(self.run / LOG, self.run / EVALUATIONS, self.run / CURVES, f"{detector.name}, {self.run.name}")
 
-    def _judge(self, detector: Detector, frames: FrameStore, indices: range) -> Marks:
-        found = detect(detector, frames, indices, self.device)
+    def _judge(self, detector: Detector, frames: FrameStore, indices: range) -> ValidationScores:
+        found = detect_in_store(detector, frames, indices, self.device)
         wanted = (
-            self.wanted if self.held_out and frames is self.held_out.frames else frames.judged(self.recipe.judged)
+            self.wanted
+            if self.held_out and frames is self.held_out.frames
+            else frames.evaluation_targets(self.recipe.judged)
         )
-        return judge(found, [wanted[i] for i in indices], detector.classes)
+        return score_detections(found, [wanted[i] for i in indices], detector.classes)
 
-    def _export(self, detector: Detector, step: int, marks: Marks | None) -> None:
+    def _export(self, detector: Detector, step: int, marks: ValidationScores | None) -> None:
         facts = {"step": str(step)}
         if marks is not None:
             detector.t_star = marks.t_star
@@ -101,16 +108,19 @@ class Keeper:
         told, chosen_on = None if marks is None else (len(self.wanted), marks), None
         if marks is not None and self.held_out is not None and self.held_out.test is not None:
             test, chosen_on = self.held_out.test, len(self.wanted)
-            found, wanted = detect(detector, test, range(len(test)), self.device), test.judged(self.recipe.judged)
+            found, wanted = (
+                detect_in_store(detector, test, range(len(test)), self.device),
+                test.evaluation_targets(self.recipe.judged),
+            )
             scores = evaluate(wanted, found, detector.classes, marks.t_star, "Car")
             told = len(test), replace(marks, scores=scores)
         files.write_text(
             self.weights.with_suffix(".md"),
-            card(detector, self.recipe, self.weights, (step, seconds), told, also, chosen_on),
+            format_card(detector, self.recipe, self.weights, (step, seconds), told, also, chosen_on),
         )
         self.tell(f"step {step}: wrote {self.weights}")
 
-    def _record(self, step: int, marks: Marks) -> None:
+    def _record(self, step: int, marks: ValidationScores) -> None:
         """Add a line; lines from this step on are of a run that was killed and went on from before."""
         path = self.run / EVALUATIONS
         kept: list[dict[str, str]] = []
@@ -126,11 +136,11 @@ class Keeper:
         files.write_text(path, table.getvalue())
 
 
-def _row(step: int, marks: Marks) -> dict[str, float | None]:
+def _row(step: int, marks: ValidationScores) -> dict[str, float | None]:
     car, every = marks.scores.headline, marks.scores.overall
     return {
         "step": step,
-        "mark": marks.mark,
+        "mark": marks.selection_score,
         "car_ap50": car.ap50,
         "car_recall": car.recall,
         "car_ap": car.ap,
@@ -139,3 +149,55 @@ def _row(step: int, marks: Marks) -> dict[str, float | None]:
         "f1": marks.f1,
         "t_star": marks.t_star,
     }
+
+
+EXCUSED = 0.5
+"""Overlap with an ignored box, or share inside it, from which a detection counts nowhere."""
+HIT_IOU = 0.5
+
+
+def score_detections(
+    found: Sequence[Detections], wanted: Sequence[Targets], classes: Sequence[str], headline: str = "Car"
+) -> ValidationScores:
+    """Figures of detections in images, and the score at which F1 over all classes is best."""
+    outcomes = [_outcomes(d, t, k) for d, t in zip(found, wanted, strict=True) for k in range(len(classes))]
+    rows = np.concatenate(outcomes)
+    rows = rows[np.argsort(-rows[:, 0], kind="stable")]
+    hits = np.cumsum(rows[:, 1])
+    f1 = 2 * hits / (np.arange(1, len(rows) + 1) + sum(int((~t.ignore).sum()) for t in wanted))
+    best = int(np.argmax(f1)) if len(f1) else -1
+    f1, t_star = (float(f1[best]), float(rows[best, 0])) if len(f1) else (0.0, 0.5)
+    return ValidationScores(evaluate(wanted, found, classes, t_star, headline), f1, t_star)
+
+
+def _outcomes(found: Detections, wanted: Targets, label: int) -> np.ndarray:
+    """(K, 2) score and hit of each detection of a class that counts."""
+    mine = found.labels == label
+    boxes_xyxy, scores = found.boxes_xyxy[mine], found.scores[mine]
+    counted = (wanted.labels == label) & ~wanted.ignore
+    overlap = boxes.iou_matrix(boxes_xyxy, wanted.boxes_xyxy[counted]).numpy()
+    ignored = wanted.boxes_xyxy[wanted.ignore & (wanted.labels == label)]
+    excused = (boxes.iou_matrix(boxes_xyxy, ignored) > EXCUSED) | (boxes.ioa_matrix(boxes_xyxy, ignored) > EXCUSED)
+    excused = excused.any(1).numpy() if len(ignored) else np.zeros(len(scores), bool)
+    free = np.ones(overlap.shape[1], bool)
+    rows = []
+    for i, score in enumerate(scores.tolist()):
+        candidates = np.where(free, overlap[i], 0.0)
+        if candidates.size and candidates.max() >= HIT_IOU:
+            free[candidates.argmax()] = False
+            rows.append((score, 1.0))
+        elif not excused[i]:
+            rows.append((score, 0.0))
+    return np.array(rows, np.float64).reshape(-1, 2)
+
+
+def detect_in_store(
+    detector: Predictor, frames: FrameStore, indices: Sequence[int], device: str = "cpu"
+) -> list[Detections]:
+    """Detections in whole frames, on the CPU."""
+    found = []
+    for index in indices:
+        image = torch.from_numpy(np.array(frames.image(index))).permute(2, 0, 1)[None].float() / 255
+        for one in predict(detector, image.to(device)):
+            found.append(Detections(one.boxes_xyxy.cpu(), one.labels.cpu(), one.scores.cpu()))
+    return found

@@ -8,17 +8,17 @@ from functools import cache, partial
 from operator import itemgetter
 from pathlib import Path
 
-from drivesem.config.blocks import DEMO, Sharing
-from drivesem.config.commands import Derender
+from drivesem.config.commands import DerenderConfig
 from drivesem.config.devices import memory_gb
 from drivesem.config.errors import UsageError
+from drivesem.config.options import DEMO, WorkerOptions
 from drivesem.data.clips import Clip, clip_of, clips_in
-from drivesem.report.tables import number_of
-from drivesem.run.ask import Bar, ask
+from drivesem.report.tables import format_count
 from drivesem.run.derender import RECORD
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.scenes.sources import derender_settings, make_ready
-from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender, placements
-from scene_ir.derender.silhouette import Placement, candidates, placed
+from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings, derender, place_vehicles
+from scene_ir.derender.silhouette import Placement, place_mesh, rank_template_kinds
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.io import load_scene, save_scene
 from scene_ir.types import Camera, Labels, SceneIR
@@ -32,7 +32,7 @@ _BYTES_A_PIXEL = 180
 
 
 @dataclass(frozen=True, slots=True)
-class Taking:
+class ClipSource:
     """What is taken apart. folder: of clips, None for the embedded drive; name: of the clip, None for the first;
     limit: frames, from the first on; fit: whether shapes are fitted; keep_going: past frames that cannot be used.
     """
@@ -46,7 +46,7 @@ class Taking:
 
 
 @dataclass(frozen=True, slots=True)
-class TakenClip:
+class DerenderedClip:
     """scenes, in order; tracks: of each scene's objects; failed: why others could not be used, by frame."""
 
     name: str
@@ -56,10 +56,10 @@ class TakenClip:
     failed: dict[str, str] = field(default_factory=dict)
 
 
-class _Demo:
+class _DemoFrames:
     """The embedded drive's frames."""
 
-    def __init__(self, taking: Taking) -> None:
+    def __init__(self, taking: ClipSource) -> None:
         from drivesem.synth.drives import drive_of
 
         self._drive = drive_of(taking.seed, taking.limit or DEMO_FRAMES)
@@ -74,13 +74,13 @@ class _Demo:
         return self._drive.plan(0).setting.view.camera
 
 
-class _Labelled:
+class _LabelledFrames:
     """The frames of a labelled clip. A car's shape and size are those of the frame in which it is seen best; it
     stands where each frame's label says, whatever the photograph shows: what is found frame by frame differs from
     frame to frame, and cars would tremble.
     """
 
-    def __init__(self, taking: Taking) -> None:
+    def __init__(self, taking: ClipSource) -> None:
         self._clip = clip_of(clips_in(taking.folder or ""), taking.name)
         self.name = self._clip.name
         self.names = self._clip.frames[: taking.limit]
@@ -105,12 +105,12 @@ class _Labelled:
     def _standing(self, labels: Labels, row: int, track: int) -> Placement | None:
         """A label's vehicle where the label says; None where it is none."""
         kind, size = labels.kind[row], labels.size_lhw[row]
-        if kind not in VEHICLES or not bool((size > 0).all()):
+        if kind not in VEHICLE_CATEGORIES or not bool((size > 0).all()):
             return None
         at = labels.translation[row], labels.yaw[row]
         shape = self._known().get(track)
         if shape is None:  # in no frame could it be told what it is
-            return placed(candidates(kind, size.tolist())[0], *at, size)
+            return place_mesh(rank_template_kinds(kind, size.tolist())[0], *at, size)
         return replace(shape, translation=at[0], yaw=at[1])
 
     def _known(self) -> dict[int, Placement]:
@@ -128,7 +128,7 @@ class _Labelled:
     def _shapes_in(self, name: str) -> dict[int, Placement] | None:
         """The shapes that a frame shows, by track; None where it is passed over."""
         with suppress(*self._passed_over):
-            found = placements(self._clip.dataset.frame(name), derender_settings(self._fit))
+            found = place_vehicles(self._clip.dataset.frame(name), derender_settings(self._fit))
             tracks = self._clip.tracks(name)
             return {tracks[row]: placement for row, placement in found.items()}
         return None
@@ -143,7 +143,7 @@ class _Labelled:
                 labels = _labels_of(self._clip, name)
                 heights = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
                 for row, track in enumerate(self._clip.tracks(name)):
-                    if labels.kind[row] in VEHICLES:
+                    if labels.kind[row] in VEHICLE_CATEGORIES:
                         plain = int(labels.occlusion[row]) <= 1, float(labels.truncation[row]) < 0.1
                         views.setdefault(track, []).append(((*plain, float(heights[row])), name))
         return {
@@ -157,16 +157,16 @@ def _labels_of(clip: Clip, name: str) -> Labels:
     if labels is None or len(labels.kind) != len(clip.tracks(name)):
         found = "none" if labels is None else f"{len(labels.kind)}"
         raise FormatError(
-            f"frame {name}: labels", f"one for each of {number_of(len(clip.tracks(name)), 'track')}", found
+            f"frame {name}: labels", f"one for each of {format_count(len(clip.tracks(name)), 'track')}", found
         )
     return labels
 
 
-class Taker:
+class ClipDerenderer:
     """What one process needs: built once, used for many frames."""
 
-    def __init__(self, taking: Taking, out: Path) -> None:
-        self.source = _Demo(taking) if taking.folder is None else _Labelled(taking)
+    def __init__(self, taking: ClipSource, out: Path) -> None:
+        self.source = _DemoFrames(taking) if taking.folder is None else _LabelledFrames(taking)
         self.taking, self.out = taking, out
 
     def __call__(self, name: str) -> None:
@@ -174,7 +174,7 @@ class Taker:
         save_scene(self.source.scene(name), self.out / name)
 
 
-def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
+def derender_clip(work: ClipDerenderer, sharing: WorkerOptions) -> DerenderedClip:
     """The clip's frames, taken apart into the taker's folder as far as they are not there yet. Raises UsageError
     or SceneError for a clip that cannot be read, or has no vehicle.
     """
@@ -183,30 +183,34 @@ def take_clip(work: Taker, sharing: Sharing) -> TakenClip:
     _check_memory(work.source)
     todo = [name for name in names if not (out / name / RECORD).is_file()]
     if todo:
-        make_ready(Derender(dataset=DEMO if taking.folder is None else "kitti", root=taking.folder))
-    failed = ask(
-        todo, work, partial(Taker, taking, out), sharing, Bar("taking frames apart", remaining=True)
+        make_ready(DerenderConfig(dataset=DEMO if taking.folder is None else "kitti", root=taking.folder))
+    failed = run_frame_jobs(
+        todo,
+        work,
+        partial(ClipDerenderer, taking, out),
+        sharing,
+        ProgressSettings("taking frames apart", show_remaining=True),
     ).failed
     kept = tuple(name for name in names if name not in failed)
     scenes = tuple(load_scene(out / name) for name in kept)
     if not any(len(scene.objects) for scene in scenes):
-        found = next(iter(failed.values()), f"none in {number_of(len(kept), 'frame')}")
+        found = next(iter(failed.values()), f"none in {format_count(len(kept), 'frame')}")
         raise UsageError("CLIP", "frames with cars, vans or trucks that can be taken apart", found)
-    return TakenClip(work.source.name, kept, scenes, tuple(tracks_of(scene) for scene in scenes), failed)
+    return DerenderedClip(work.source.name, kept, scenes, tuple(object_tracks(scene) for scene in scenes), failed)
 
 
-def _check_memory(source: _Demo | _Labelled) -> None:
+def _check_memory(source: _DemoFrames | _LabelledFrames) -> None:
     """UsageError where the clip's frames would not fit into memory together."""
     camera = source.camera()
     if camera is None:
         return
     there, needed = memory_gb(), _BYTES_A_PIXEL * camera.width * camera.height / 2**30
     if there is not None and len(source.names) * needed > there:
-        expected = f"at most {number_of(int(there / needed), 'frame')}, as memory of {there:g} GB holds"
+        expected = f"at most {format_count(int(there / needed), 'frame')}, as memory of {there:g} GB holds"
         raise UsageError("CLIP: frames", f"{expected} (--limit takes the first)", f"{len(source.names)}")
 
 
-def tracks_of(scene: SceneIR) -> tuple[int, ...]:
+def object_tracks(scene: SceneIR) -> tuple[int, ...]:
     """The tracks of a scene's objects."""
     told = scene.provenance[_TRACKS].split(",")
     return tuple(int(told[int(scene.provenance[f"objects[{i}].label"])]) for i in range(len(scene.objects)))
