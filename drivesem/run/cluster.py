@@ -1,7 +1,7 @@
-"""Independent pieces of work shared by the machines of a Ray cluster: https://docs.ray.io.
+"""Shares independent jobs among the machines of a Ray cluster (https://docs.ray.io).
 
-One actor of Ray is one process, and has one job at a time, so that what a machine takes with it is what was in its
-hands. It is begun anew elsewhere, and the job is tried again.
+Each Ray actor is one process and runs one job at a time. If its machine fails, it is restarted elsewhere, and its job
+is tried again.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 J = TypeVar("J")
 _PATIENCE_S, _PAUSE_S = 10.0, 1.0
 _LOST_S = 60.0
-"""A process that ended is begun anew; one that is not back after so long is given up."""
+"""Time after which an actor that does not restart is given up."""
 _TRIES = 3
-"""How often a process may end with a job in hand, before that is listed."""
+"""Number of tries of a job before it counts as failed."""
 
 
-class _Process:
-    """What an actor is. Made on another machine: paths of settings are relative to the folder of the command."""
+class _RayWorker:
+    """Class of the actors. Paths in settings are relative to the working directory of the command."""
 
     def __init__(self, folder: str, start: Start) -> None:
         os.chdir(folder)
         begin(start)
 
     def ready(self) -> None:
-        """Returns once everything that jobs need has been made."""
+        """Return once the worker has been made."""
 
     def do(self, job: Any) -> tuple[Any, Exception | None]:
-        """A job's result, or what went wrong with it."""
+        """Run a job. Returns its result or its error."""
         try:
             return do(job), None
         except Exception as error:
@@ -51,35 +51,42 @@ class _Process:
 
 
 @dataclass(frozen=True, slots=True)
-class _InHand:
-    """An actor and the job that it does, None while it is getting ready. tries: of the job, before this one; gone:
-    since when the actor has not been there, None where it was when it was last asked.
-    """
+class _ActorState:
+    """An actor and its job."""
 
     actor: Any
+    """The actor."""
     job: Any = None
+    """Its job; None while it starts."""
     tries: int = 0
-    gone: float | None = None
+    """Earlier tries of the job."""
+    missing_since: float | None = None
+    """Time at which the actor failed; None if it responded last time."""
 
 
 def run_jobs_on_ray(
     start: Start, jobs: Sequence[J], config: WorkerOptions
 ) -> Iterator[tuple[J, Callable[[], Any]]]:
-    """Each job with a call that gives its result or raises what went wrong, as they are done.
+    """Yield each job, as it completes, with a function that returns its result or raises its error.
 
-    By `--workers` processes on the machines of the cluster, by default one for each CPU. Raises UsageError where
-    there is no Ray, or no cluster.
+    Args:
+        start: How a process starts.
+        jobs: The jobs.
+        config: Number of processes, by default one per CPU of the cluster, and its address.
+
+    Raises:
+        UsageError: Ray or the cluster is missing.
     """
     if not jobs:
         return
-    ray = _loaded()
-    if not ray.is_initialized():  # it stays until this process ends: commands ask more than once
+    ray = _import_ray()
+    if not ray.is_initialized():  # stays for further calls until this process ends
         _connect(ray, config.address)
     count = min(config.workers or max(int(ray.cluster_resources().get("CPU", 1)), 1), len(jobs))
-    kind = ray.remote(num_cpus=1, max_restarts=-1, scheduling_strategy="SPREAD")(_Process)
+    kind = ray.remote(num_cpus=1, max_restarts=-1, scheduling_strategy="SPREAD")(_RayWorker)
     actors = [kind.remote(os.getcwd(), start) for _ in range(count)]
     try:
-        yield from _shared(ray, actors, deque((job, 0) for job in jobs))
+        yield from _distribute_jobs(ray, actors, deque((job, 0) for job in jobs))
     finally:
         for actor in actors:
             ray.kill(actor)
@@ -89,9 +96,9 @@ def _connect(ray: ModuleType, address: str | None) -> None:
     host, _, port = (address or "").removeprefix("ray://").rpartition(":")
     before, expected = signal.getsignal(signal.SIGTERM), "a Ray cluster"
     try:
-        if host and port.isdecimal():  # Ray itself would go on asking for minutes
+        if host and port.isdecimal():  # Ray itself would retry for minutes
             socket.create_connection((host, int(port)), _PATIENCE_S).close()
-        # Not whatever cluster ran here last, which is what Ray takes without an address.
+        # without an address, Ray would connect to the last cluster of this machine
         expected = "a Ray cluster (which may ask for RAY_AUTH_MODE=token)"
         ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR")
     except OSError as error:
@@ -100,44 +107,44 @@ def _connect(ray: ModuleType, address: str | None) -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-def _shared(
+def _distribute_jobs(
     ray: ModuleType, actors: Sequence[Any], left: deque[tuple[Any, int]]
 ) -> Iterator[tuple[Any, Callable[[], Any]]]:
-    pending: dict[Any, _InHand] = {actor.ready.remote(): _InHand(actor) for actor in actors}
-    absent: deque[tuple[float, _InHand]] = deque()  # and when they are asked again
+    pending: dict[Any, _ActorState] = {actor.ready.remote(): _ActorState(actor) for actor in actors}
+    absent: deque[tuple[float, _ActorState]] = deque()  # with the time of the next check
     while pending or absent:
         while absent and (time.monotonic() >= absent[0][0] or not pending):
-            due, hand = absent.popleft()
+            due, state = absent.popleft()
             time.sleep(max(due - time.monotonic(), 0))
-            pending[hand.actor.ready.remote()] = hand
+            pending[state.actor.ready.remote()] = state
         done, _ = ray.wait(list(pending), num_returns=1, timeout=_PAUSE_S if absent else None)
         if not done:
             continue
-        hand = pending.pop(done[0])
+        state = pending.pop(done[0])
         outcome: Callable[[], Any] | None = None
         try:
             result, error = ray.get(done[0]) or (None, None)
-            outcome = partial(_hand_over, result, error)
+            outcome = partial(_make_outcome, result, error)
             ready = True
         except ray.exceptions.RayActorError as error:
             if getattr(error, "actor_init_failed", False):
                 raise
-            # Begun anew by Ray where there is room: only then it gets a job again. Or never: where the head takes
-            # this machine for lost, it ends all that this process began.
+            # Ray restarts the actor where there is room, and only then it gets a job. It never does if the head
+            # node lost this machine.
             now = time.monotonic()
-            gone = now if hand.gone is None else hand.gone
-            if now - gone < _LOST_S:
-                absent.append((now + _PAUSE_S, _InHand(hand.actor, gone=gone)))
+            missing_since = now if state.missing_since is None else state.missing_since
+            if now - missing_since < _LOST_S:
+                absent.append((now + _PAUSE_S, _ActorState(state.actor, missing_since=missing_since)))
             ready = False
-            if hand.job is not None and hand.tries + 1 < _TRIES:
-                left.appendleft((hand.job, hand.tries + 1))
-            elif hand.job is not None:
+            if state.job is not None and state.tries + 1 < _TRIES:
+                left.appendleft((state.job, state.tries + 1))
+            elif state.job is not None:
                 outcome = ended
         if ready and left:
             job, tries = left.popleft()
-            pending[hand.actor.do.remote(job)] = _InHand(hand.actor, job, tries)
-        if hand.job is not None and outcome is not None:
-            yield hand.job, outcome
+            pending[state.actor.do.remote(job)] = _ActorState(state.actor, job, tries)
+        if state.job is not None and outcome is not None:
+            yield state.job, outcome
         if not left and not any(one.job is not None for one in pending.values()):
             return
     raise UsageError(
@@ -145,13 +152,13 @@ def _shared(
     )
 
 
-def _hand_over(result: Any, error: Exception | None) -> Any:
+def _make_outcome(result: Any, error: Exception | None) -> Any:
     if error is not None:
         raise error
     return result
 
 
-def _loaded() -> ModuleType:
+def _import_ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""What a detector finds in pictures on disk, remembered by content: of the picture, and of the detector."""
+"""Caches a detector's detections in pictures on disk, by content of the picture and of the detector."""
 
 from __future__ import annotations
 
@@ -28,52 +28,56 @@ from scene_ir.errors import FormatError
 
 _SCHEMA = 1
 _FINGERPRINT = 16
-"""Hexadecimal digits of a fingerprint: enough for folder names that never meet."""
+"""Hexadecimal digits of a fingerprint, enough for unique folder names."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorSpec:
-    """How to look: a detector by name or file, its device, tiles or not. folder: of what is remembered."""
+    """How to load a detector, and where to cache its detections."""
 
     detector: str
+    """Name or file."""
     device: str
+    """Device."""
     tiles: str
+    """Setting of tiled detection."""
     folder: Path
+    """Folder of the cache."""
 
     def load(self) -> Predictor:
-        """The detector. Raises DetectorError."""
+        """Load the detector. Raises DetectorError."""
         return load_predictor(self.detector, self.device, self.tiles)
 
 
 def image_to_tensor(image: np.ndarray, device: str) -> Tensor:
-    """An image (H, W, 3) uint8 as (3, H, W) in [0, 1]."""
+    """Convert an image (H, W, 3) uint8 to (3, H, W) in [0, 1]."""
     return torch.from_numpy(image).permute(2, 0, 1).to(device) / 255
 
 
 def detect_objects(predictor: Predictor, picture: Tensor) -> Detections:
-    """What is found in a picture (3, H, W) in [0, 1]: labels among the judged classes, on the CPU."""
+    """Detect objects of the evaluated classes in a picture (3, H, W) in [0, 1]. Returns them on the CPU."""
     found = EvaluatedClasses.from_detector(predictor).map_detections(predict(predictor, picture[None])[0])
     return Detections(found.boxes_xyxy.cpu(), found.labels.cpu(), found.scores.cpu())
 
 
 class DetectionCache:
-    """One detector's detections, a file for each picture. Pictures with the same bytes share one."""
+    """Detections of one detector, a file per picture; equal pictures share one."""
 
-    def __init__(self, order: DetectorSpec, predictor: Predictor) -> None:
-        self._folder = order.folder / detector_fingerprint(order, predictor)
+    def __init__(self, spec: DetectorSpec, predictor: Predictor) -> None:
+        self._folder = spec.folder / detector_fingerprint(spec, predictor)
         self._judged = EvaluatedClasses.from_detector(predictor)
 
     def contains(self, picture: Path) -> bool:
-        """Whether a picture was looked at."""
+        """Whether the detections in a picture are cached."""
         return self.path_for(picture).is_file()
 
     def store(self, picture: Path, found: Detections) -> None:
-        """Remember detections whose labels are indices into the judged classes."""
+        """Store detections, labelled by evaluated class."""
         records = [asdict(record) for record in detection_records(found, self._judged.names)]
         files.write_json(self.path_for(picture), {"schema": _SCHEMA, "detections": records})
 
     def load(self, picture: Path) -> Detections:
-        """What was found in a picture. Raises FormatError where the file is damaged."""
+        """Load the detections in a picture. Raises FormatError if the file is damaged."""
         path = self.path_for(picture)
         data = files.read_json(path)
         try:
@@ -83,19 +87,19 @@ class DetectionCache:
             raise FormatError(str(path), "detections as drivesem transfer writes them", error) from error
 
     def path_for(self, picture: Path) -> Path:
-        """The file of a picture's detections: that of its bytes."""
+        """Return the file of a picture's detections, named after its bytes."""
         return self._folder / f"{files.sha256_digest(picture)}.json"
 
 
-def detector_fingerprint(order: DetectorSpec, predictor: Predictor) -> str:
-    """Differs where anything may that decides what is found: weights or files, classes, tiles, device, version."""
+def detector_fingerprint(spec: DetectorSpec, predictor: Predictor) -> str:
+    """Return a digest of all that affects detections: weights or files, classes, tiles, device and version."""
     known = hashlib.sha256()
-    facts = [importlib.metadata.version("drivesem"), order.detector, order.tiles, order.device, *predictor.classes]
+    facts = [importlib.metadata.version("drivesem"), spec.detector, spec.tiles, spec.device, *predictor.classes]
     known.update(json.dumps(facts).encode())
     if isinstance(predictor, nn.Module):
         known.update(weights_digest(predictor).encode())
-    # The files that a name speaks of, such as an adapter's, and the settings that may lie beside one.
-    for part in re.split("[,:]", order.detector):
+    # files in the name, such as an adapter's, and their settings files
+    for part in re.split("[,:]", spec.detector):
         for path in (Path(part), Path(part).with_suffix(".yaml")) if part else ():
             if path.is_file():
                 known.update(files.read_bytes(path))
@@ -103,7 +107,7 @@ def detector_fingerprint(order: DetectorSpec, predictor: Predictor) -> str:
 
 
 def weights_digest(module: nn.Module) -> str:
-    """Of all tensors and their names, hexadecimal."""
+    """Return the SHA-256 of all tensors and their names."""
     known = hashlib.sha256()
     for name, tensor in module.state_dict().items():
         known.update(name.encode())
@@ -112,24 +116,35 @@ def weights_digest(module: nn.Module) -> str:
 
 
 def cache_detections(
-    order: DetectorSpec, predictor: Predictor, pictures: Sequence[Path], config: WorkerOptions, title: str
+    spec: DetectorSpec, predictor: Predictor, pictures: Sequence[Path], config: WorkerOptions, title: str
 ) -> dict[str, str]:
-    """Look at each picture that is not known yet. Returns which could not be used, and why, where the settings
-    keep going; else the first ends it. Pictures with the same bytes are looked at once. title: of the bar.
+    """Cache the detections in all pictures; equal pictures are evaluated once.
+
+    Args:
+        spec: The detector and its cache.
+        predictor: The loaded detector.
+        pictures: The pictures.
+        config: Number of workers, engine, and whether to keep going.
+        title: Text of the progress bar.
+
+    Returns:
+        Reasons by picture that could not be used; without `keep_going`, the first error is raised.
     """
-    memory = DetectionCache(order, predictor)
-    unknown = {memory.path_for(picture): picture for picture in reversed(pictures) if not memory.contains(picture)}
+    cache = DetectionCache(spec, predictor)
+    unknown = {cache.path_for(picture): picture for picture in reversed(pictures) if not cache.contains(picture)}
     todo = list(reversed(unknown.values()))
-    work = partial(_look, predictor=predictor, memory=memory, device=order.device)
+    work = partial(_detect_and_store, predictor=predictor, cache=cache, device=spec.device)
     return run_frame_jobs(
-        todo, work, partial(_in_process, order), config, ProgressSettings(title, keep=False)
+        todo, work, partial(_make_worker, spec), config, ProgressSettings(title, keep=False)
     ).failed
 
 
-def _look(picture: Path, predictor: Predictor, memory: DetectionCache, device: str) -> None:
-    memory.store(picture, detect_objects(predictor, image_to_tensor(files.read_image(picture), device)))
+def _detect_and_store(picture: Path, predictor: Predictor, cache: DetectionCache, device: str) -> None:
+    cache.store(picture, detect_objects(predictor, image_to_tensor(files.read_image(picture), device)))
 
 
-def _in_process(order: DetectorSpec) -> Callable[[Path], None]:
-    predictor = order.load()
-    return partial(_look, predictor=predictor, memory=DetectionCache(order, predictor), device=order.device)
+def _make_worker(spec: DetectorSpec) -> Callable[[Path], None]:
+    predictor = spec.load()
+    return partial(
+        _detect_and_store, predictor=predictor, cache=DetectionCache(spec, predictor), device=spec.device
+    )

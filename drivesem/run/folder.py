@@ -1,11 +1,11 @@
-"""The folder of a run: new, or one with the same settings to go on in."""
+"""Claims the output folder of a run, new or with the same settings, and loads the settings of finished runs."""
 
 from __future__ import annotations
 
 import re
 import shutil
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import MISSING, asdict, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +20,16 @@ from drivesem.run.records import from_json
 from scene_ir import files
 
 CONFIG = "config.yaml"
-"""The resolved settings, in the run's folder."""
+"""File of the resolved settings."""
 REFERENCED_FILES = "files.json"
-"""Digests of the files that these name."""
+"""File of the digests of files that the settings name."""
 FRAMES = "frames"
-"""Folder of the frames in a run's folder, and of what a question keeps of each."""
+"""Folder of the frames of a run or an analysis."""
 SHARING = ("workers", "engine", "address", "keep_going")
-"""Settings of who shares the frames."""
+"""Settings of workers."""
 ARMS, HELD_OUT, RETRAINED = "arms", "held-out", "retrained"
-"""In a study's folder: that of its runs, the name of the run on held-out frames against the detector that is
-retrained, and the folder of retrained detectors."""
+"""In the folder of a study: folder of its runs, name of the run on held-out frames, folder of retrained detectors.
+"""
 PRESENTATION = (
     *SHARING,
     "out",
@@ -42,7 +42,7 @@ PRESENTATION = (
     "incremental",
     "trust",
 )
-"""Settings that change no frame's result: a run may be continued with others."""
+"""Settings that do not affect a frame's result, so a run may be resumed with others."""
 
 
 def claim_folder(
@@ -52,54 +52,59 @@ def claim_folder(
     presentation: Collection[str] = PRESENTATION,
     renews: bool = False,
 ) -> None:
-    """Make `out` this run's folder, and hold it. written: names of the files and folders in it that an earlier run
-    wrote, which --no-resume removes, and nothing else; renews: so does a file that the settings name, such as
-    weights, where it holds something else than before.
+    """Claim and lock `out` for this run, and write its settings.
 
-    Raises UsageError where `out` is a file, holds other files, a run whose settings or files were others, or what
-    another process is writing.
+    Args:
+        out: The folder; new, or of an earlier run with the same settings.
+        config: The settings.
+        written: Files and folders that a run writes; --no-resume removes them, and nothing else.
+        presentation: Settings that may differ from the earlier run.
+        renews: Also remove them if a file that the settings name, such as weights, has changed.
+
+    Raises:
+        UsageError: `out` is a file, holds other files or a run with other settings, or is in use.
     """
     path = out / CONFIG
     resolve_output_folder(None, out)
     if out.is_dir() and not path.exists() and any(file.name != LOCK for file in out.iterdir()):
         raise UsageError("--out", "a new folder, or one of an earlier run", f"{out}, which holds other files")
     acquire_folder_lock(out)
-    named = _named(config, presentation)
+    digests = _digest_referenced_files(config, presentation)
     if path.exists():
         if config.resume:
-            _check_settings(path, config, presentation)
-        other = _others(out, named) if config.resume else []
-        if other and not renews:
+            _check_same_settings(path, config, presentation)
+        changed = _changed_files(out, digests) if config.resume else []
+        if changed and not renews:
             expected = "the files of this run (else another --out, or --no-resume)"
-            raise UsageError(str(out / REFERENCED_FILES), expected, f"another content of {', '.join(other)}")
-        if other or not config.resume:
+            raise UsageError(str(out / REFERENCED_FILES), expected, f"other contents of {', '.join(changed)}")
+        if changed or not config.resume:
             _remove(out / name for name in written)
     files.write_text(path, to_yaml(config))
-    if named:
-        files.write_json(out / REFERENCED_FILES, named)
+    if digests:
+        files.write_json(out / REFERENCED_FILES, digests)
 
 
-def _named(config: OutputOptions, presentation: Collection[str]) -> dict[str, str]:
-    """Digests of the files that settings name, such as weights, by how they name them."""
+def _digest_referenced_files(config: OutputOptions, presentation: Collection[str]) -> dict[str, str]:
+    """Return digests of the files that settings name, such as weights, by that name."""
     values = [value for value in result_settings(config, presentation).values() if isinstance(value, str)]
     words = {word for value in values for word in (value, *re.split("[,:]", value)) if word}
     return {word: files.sha256_digest(Path(word)) for word in sorted(words) if Path(word).is_file()}
 
 
-def _others(folder: Path, named: Mapping[str, str]) -> list[str]:
-    """Which of the files hold something else than when the folder was claimed."""
+def _changed_files(folder: Path, digests: Mapping[str, str]) -> list[str]:
+    """Return the files that have changed since the folder was claimed."""
     path = folder / REFERENCED_FILES
     before = files.read_json(path) if path.is_file() else {}
-    known = before if isinstance(before, dict) else {}
-    return [word for word, digest in named.items() if known.get(word, digest) != digest]
+    earlier = before if isinstance(before, dict) else {}
+    return [name for name, digest in digests.items() if earlier.get(name, digest) != digest]
 
 
 def check_referenced_files(run: Path, config: OutputOptions) -> None:
-    """UsageError where a file that a run's settings name is no longer the one that the run was made with."""
-    other = _others(run, _named(config, PRESENTATION))
-    if other:
+    """Raise UsageError if a file that a run's settings name has changed since the run."""
+    changed = _changed_files(run, _digest_referenced_files(config, PRESENTATION))
+    if changed:
         raise UsageError(
-            str(run / REFERENCED_FILES), "the files that this run was made with", f"another {', '.join(other)}"
+            str(run / REFERENCED_FILES), "the files that this run was made with", f"another {', '.join(changed)}"
         )
 
 
@@ -112,7 +117,7 @@ def _remove(paths: Iterable[Path]) -> None:
 
 
 def resolve_output_folder(given: str | None, default: Path) -> Path:
-    """The folder that --out names, or the default. Raises UsageError for a file."""
+    """Return the folder that --out names, or the default. Raises UsageError for a file."""
     out = Path(given) if given else default
     if out.exists() and not out.is_dir():
         raise UsageError("--out", "a folder", f"the file {out}")
@@ -120,14 +125,15 @@ def resolve_output_folder(given: str | None, default: Path) -> Path:
 
 
 def is_attack_run(run: Path) -> bool:
-    """Whether the settings of a run are those of `drivesem attack`, and not of another command."""
+    """Whether a run's settings are those of `drivesem attack`."""
     loaded = files.read_yaml(run / CONFIG)
     return isinstance(loaded, dict) and set(loaded) <= {field.name for field in fields(AttackConfig)}
 
 
 def load_attack_config(run: Path, setting: str = "--run") -> AttackConfig:
-    """The configuration of a run of `drivesem attack`. setting: what names it on the command line. Raises
-    UsageError where the folder is none.
+    """Load the settings of a run of `drivesem attack`. setting: option that names the run.
+
+    Raises UsageError if the folder holds no such run.
     """
     path = run / CONFIG
     if not path.is_file():
@@ -136,7 +142,7 @@ def load_attack_config(run: Path, setting: str = "--run") -> AttackConfig:
         raise UsageError(setting, "a run of drivesem attack", run)
     attack: AttackConfig = from_json(AttackConfig, files.read_yaml(path), str(path))
     try:
-        # The run that a placebo was like may be gone.
+        # the run that a placebo imitates may be gone
         replace(attack, like=attack.like and str(run)).check()
     except UsageError as error:
         raise UsageError(f"{path}: {error.field}", error.expected, error.actual) from error
@@ -144,8 +150,15 @@ def load_attack_config(run: Path, setting: str = "--run") -> AttackConfig:
 
 
 def load_trusted_config(run: Path, trust: bool, setting: str = "--run") -> AttackConfig:
-    """The same, to load its detectors: a run comes from anywhere, and so would code that its settings name.
-    trust: whether that may run. Raises UsageError as `attack_of`, and where it may not.
+    """Load the settings of a run before loading its detectors, as the settings may name code of unknown origin.
+
+    Args:
+        run: Folder of the run.
+        trust: Whether that code may run.
+        setting: Option that names the run.
+
+    Raises:
+        UsageError: The folder holds no run, a file has changed, or code is not trusted.
     """
     attack = load_attack_config(run, setting)
     for setting in ("detector", "peer", "witness"):
@@ -158,9 +171,15 @@ def load_trusted_config(run: Path, trust: bool, setting: str = "--run") -> Attac
 
 
 def load_run_detector(attack: AttackConfig, device: str, setting: str = "--run") -> Predictor:
-    """The run's detector, in float32, in which a run judges too whatever it took its gradients in.
+    """Load a run's detector in float32, which runs evaluate in at any precision of gradients.
 
-    setting: what names the run on the command line. Raises UsageError where it cannot be had, or knows no cars.
+    Args:
+        attack: The run's settings.
+        device: Device of the detector.
+        setting: Option that names the run.
+
+    Raises:
+        UsageError: It cannot be loaded, or has no class of vehicles.
     """
     try:
         detector = load_predictor(attack.detector, device, attack.tiles)
@@ -171,18 +190,18 @@ def load_run_detector(attack: AttackConfig, device: str, setting: str = "--run")
 
 
 def result_settings(config: OutputOptions, presentation: Collection[str] = PRESENTATION) -> dict[str, Any]:
-    """The settings that may change a frame's result, by name."""
+    """Return the settings that may affect a frame's result."""
     return {key: value for key, value in asdict(config).items() if key not in presentation}
 
 
-def _check_settings(path: Path, config: OutputOptions, presentation: Collection[str]) -> None:
+def _check_same_settings(path: Path, config: OutputOptions, presentation: Collection[str]) -> None:
     before = files.read_yaml(path)
-    # A setting that came with a later version had its default before.
-    defaults = {f.name: f.default for f in fields(config) if f.default is not MISSING}
-    known = defaults | before if isinstance(before, dict) else {}
+    before = before if isinstance(before, dict) else {}
     wanted = result_settings(config, presentation)
-    if {key: value for key, value in known.items() if key not in presentation} != wanted:
-        changed = [key for key, value in wanted.items() if known.get(key) != value]
+    if {key: value for key, value in before.items() if key not in presentation} != wanted:
+        changed = [
+            key for key in {**before, **wanted} if before.get(key) != wanted.get(key) and key not in presentation
+        ]
         raise UsageError(
             str(path),
             "the settings of this run (else another --out, or --no-resume)",

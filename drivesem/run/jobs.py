@@ -39,7 +39,7 @@ class Start:
     build: Callable[[], Callable[[Any], Any]]
     threads: int
     keep_going: bool
-    elsewhere: store.Store | None = None
+    elsewhere: store.RemoteFolder | None = None
 
 
 def begin(start: Start) -> None:
@@ -47,7 +47,7 @@ def begin(start: Start) -> None:
     global _work
     keep_freed_memory()
     torch.set_num_threads(start.threads)
-    store.write_to(start.elsewhere)
+    store.set_output_store(start.elsewhere)
     _work = partial(attempt, start.build(), start.keep_going)
 
 
@@ -55,8 +55,8 @@ def do(job: Any) -> Any:
     """A job, in a process that has begun."""
     assert _work is not None
     result = _work(job)
-    if (elsewhere := store.current()) is not None:
-        elsewhere.keep(now=True)
+    if (elsewhere := store.output_store()) is not None:
+        elsewhere.upload(now=True)
     return result
 
 

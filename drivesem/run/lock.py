@@ -1,4 +1,4 @@
-"""One command at a time writes into a folder. Light: needs no torch."""
+"""Locks output folders, so that one command at a time writes into them. Imports no torch."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 LOCK = ".lock"
-"""Empty file in the folder. It stays: the system forgets who held it when a process ends, however it ends."""
+"""Empty file in the folder, which stays. The system releases the lock when the process ends in any way."""
 _held: dict[Path, BaseFileLock] = {}
-"""Of this process, by file."""
+"""Locks of this process, by file."""
 
 
 def acquire_folder_lock(folder: Path) -> None:
-    """Make `folder`, and keep other processes that ask from writing into it, until `let_go` or this process' end.
+    """Create and lock `folder` until `release_folder_locks` or the end of this process, which may lock it again.
 
-    This process may ask again. Raises UsageError where another one holds the folder,
-    WriteError where it cannot be made.
+    Raises UsageError if another process holds the lock, WriteError if the folder cannot be created.
     """
     from filelock import FileLock, Timeout  # when needed: `drivesem --help` starts without
 
@@ -42,7 +41,7 @@ def acquire_folder_lock(folder: Path) -> None:
 
 
 def is_locked_elsewhere(folder: Path) -> bool:
-    """Whether another process writes into the folder now."""
+    """Whether another process holds the lock of the folder."""
     from filelock import FileLock, Timeout
 
     path = folder.resolve() / LOCK
@@ -53,13 +52,13 @@ def is_locked_elsewhere(folder: Path) -> bool:
             return False
     except Timeout:
         return True
-    except OSError:  # a folder that may only be read tells nothing
+    except OSError:  # a read-only folder
         return False
 
 
 @contextmanager
 def release_folder_locks() -> Iterator[None]:
-    """What is held inside is free at the end."""
+    """Release the locks that are acquired inside the block."""
     before = set(_held)
     try:
         yield

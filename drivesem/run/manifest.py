@@ -1,4 +1,4 @@
-"""manifest.json: versions, settings and hashes of a run, which a second run reproduces to the byte."""
+"""Builds manifest.json: versions, settings and hashes of a run, which an equal run reproduces to the byte."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 
 VOLATILE_KEYS = ("out", "seconds")
-"""Keys of metrics.json and result.json that differ between two runs with the same settings: in no hash."""
+"""Keys of metrics.json and result.json that may differ between equal runs; not hashed."""
 HASHED_RUN_FIELDS = ("frames_without_vehicles", "frames_failed")
 HASHED_FRAME_FIELDS = (
     *("loss_trace", "queries", "passes", "active_constraints", "violated_at_start", "became_ignored"),
     *("failures", "grade_notes", "checked_by", "change"),
 )
-"""What metrics.json and result.json hold that does not follow from other files, or not all of it. Each has a hash
-of its own, so that what was changed has a name."""
+"""Values of metrics.json and result.json that do not follow from other files. Each has its own hash, so that a change
+can be named."""
 _DIGITS = 16
-"""Of such a hash, hexadecimal: the whole file's is beside it."""
+"""Hexadecimal digits of such a hash; the hash of the whole file is complete."""
 _PACKAGES = (
     "drivesem",
     "torch",
@@ -42,7 +42,14 @@ _PACKAGES = (
 def build_manifest(
     config: AttackConfig, out: Path, names: Sequence[str], metrics: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The manifest of the run in `out`. names: of its frames; metrics: as metrics.json has them."""
+    """Build the manifest of a run.
+
+    Args:
+        config: The run's settings.
+        out: Its folder.
+        names: Its frames.
+        metrics: Contents of metrics.json.
+    """
     packages = [*_PACKAGES]
     packages += ["cma"] if config.method == "cma-es" else []
     packages += ["onnxruntime"] if config.detector.startswith(ONNX) else []
@@ -63,29 +70,29 @@ def build_manifest(
 
 
 def hash_frame_files(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file of a frame's folder, by its path in there; of result.json without its times. Raises
-    FormatError for a file that cannot be read.
+    """Hash every file of a frame's folder with SHA-256, result.json without its times. Returns hashes by path.
+
+    Raises FormatError for a file that cannot be read.
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): _hash(path, folder) for path in paths}
+    return {path.relative_to(folder).as_posix(): _hash_file(path, folder) for path in paths}
 
 
-def _hash(path: Path, folder: Path) -> str:
+def _hash_file(path: Path, folder: Path) -> str:
     return hash_json(files.read_json(path)) if path == folder / RESULT else files.sha256_digest(path)
 
 
 def hash_fields(data: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
-    """The first digits of the SHA-256 of single values of a JSON object, null for those that it lacks."""
-    return {name: _sha(data.get(name))[:_DIGITS] for name in names}
+    """Return the first digits of the SHA-256 of values of a JSON object; a missing value counts as null."""
+    return {name: _sha256(data.get(name))[:_DIGITS] for name in names}
 
 
 def hash_json(data: Any) -> str:
-    """SHA-256 of a JSON object without OF_PLACE_AND_TIME. Raises FormatError where it is none."""
+    """Return the SHA-256 of a JSON object without VOLATILE_KEYS. Raises FormatError if it is not an object."""
     if not isinstance(data, Mapping):
-        raise FormatError("a run's figures", "an object", type(data).__name__)
-    told = {key: value for key, value in data.items() if key not in VOLATILE_KEYS}
-    return _sha(told)
+        raise FormatError("the metrics of a run", "an object", type(data).__name__)
+    return _sha256({key: value for key, value in data.items() if key not in VOLATILE_KEYS})
 
 
-def _sha(value: Any) -> str:
+def _sha256(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Parts of one attack, made on several machines, as one run."""
+"""Merges parts of one attack, made on several machines, into one run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,16 @@ from scene_ir.errors import FormatError
 
 
 def merge_runs(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
-    """Make one run in the folder `out` of the frames of several finished ones with the same settings, or go on
-    with it. Frames that are the same in two of them count once. `out` may be one of them. trust: see
-    `trusted_attack`.
+    """Merge finished runs with the same settings, or resume. Equal frames count once.
 
-    Raises UsageError for runs that are no parts of one, FormatError naming a file that is damaged.
+    Args:
+        folders: Folders of the runs.
+        out: Folder of the merged run; may be one of them.
+        trust: Whether code that the settings name may run.
+
+    Raises:
+        UsageError: The runs have different settings or results.
+        FormatError: A file is damaged.
     """
     files.check_utf8("--out", str(out))
     parts = load_runs(folders, setting="FOLDER", may_be_empty=True)
@@ -35,44 +40,44 @@ def merge_runs(folders: Sequence[str], out: Path, trust: bool) -> RunSummary:
         raise UsageError("FOLDER", "runs with frames", f"none in {', '.join(folders)}")
     attacks = [load_trusted_config(part.folder, trust, "FOLDER") for part in parts]
     for part, attack in zip(parts, attacks, strict=True):
-        _check_alike(parts[0], attacks[0], part, attack)
-    # Whatever the first was told of frames that are there: those of `out` stay, which may be a part's own.
+        _check_equal_settings(parts[0], attacks[0], part, attack)
+    # always resume: `out` may be one of the parts
     config = replace(attacks[0], out=str(out), part=None, limit=None, resume=True)
     claim_folder(out, config, WRITTEN)
     results = {}
     for part in parts:
         for frame in part.frames:
             name = frame.result.identifier
-            there = (out / FRAMES / name / RESULT).is_file()
-            if there and _told(frame.folder) != _told(out / FRAMES / name):
+            exists = (out / FRAMES / name / RESULT).is_file()
+            if exists and _digest_result(frame.folder) != _digest_result(out / FRAMES / name):
                 if name in results:
                     raise UsageError("FOLDER", "runs in which a frame is the same", f"two results of frame {name}")
                 raise UsageError("--out", "a new folder, or one of the same frames", f"another {name} in {out}")
-            if not there:
+            if not exists:
                 with files.atomic_folder(out / FRAMES / name) as whole:
                     shutil.copytree(frame.folder, whole, dirs_exist_ok=True, copy_function=_link_or_copy)
             results[name] = frame.result
     ordered = [results[name] for name in sorted(results)]
     metrics = [files.read_json(part.folder / METRICS) for part in parts]
-    emptied = [_emptied(part.folder) for part in parts]
+    empty_by_part = [_frames_without_vehicles(part.folder) for part in parts]
     try:
-        failed = {name: str(why) for figures in metrics for name, why in figures["frames_failed"].items()}
-        # Each part passed over all frames without vehicles, and found for itself which cannot be taken apart.
-        counts = [int(figures["frames_without_vehicles"]) for figures in metrics]
-        passed_over = max(count - len(own) for count, own in zip(counts, emptied, strict=True))
-        seconds = round(sum(float(figures["seconds"]) for figures in metrics), 3)
+        failed = {name: str(why) for part in metrics for name, why in part["frames_failed"].items()}
+        # each part counts all frames without labelled vehicles, and those of its own without a de-rendered one
+        counts = [int(part["frames_without_vehicles"]) for part in metrics]
+        skipped = max(count - len(own) for count, own in zip(counts, empty_by_part, strict=True))
+        seconds = round(sum(float(part["seconds"]) for part in metrics), 3)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise FormatError(METRICS, "frames_failed, frames_without_vehicles and seconds", error) from error
     failed = {name: why for name, why in sorted(failed.items()) if name not in results}
     detector = load_run_detector(config, config.device, "FOLDER")
     summary = summarise_run(config, parse_params(parts[0].params), detector, ordered)
-    empty = set().union(*emptied)
-    without = passed_over + len(empty)
+    empty = set().union(*empty_by_part)
+    without = skipped + len(empty)
     summary = replace(summary, frames_failed=failed, frames_without_vehicles=without, seconds=seconds)
     return write_run_summary(out, config, summary, ordered, empty)
 
 
-def _check_alike(first: AttackRun, wanted: AttackConfig, part: AttackRun, attack: AttackConfig) -> None:
+def _check_equal_settings(first: AttackRun, wanted: AttackConfig, part: AttackRun, attack: AttackConfig) -> None:
     one, other = result_settings(wanted), result_settings(attack)
     if one != other:
         changed = ", ".join(key for key, value in one.items() if other[key] != value)
@@ -81,18 +86,18 @@ def _check_alike(first: AttackRun, wanted: AttackConfig, part: AttackRun, attack
         )
 
 
-def _emptied(run: Path) -> set[str]:
-    """Frames of a run of whose vehicles none could be taken apart; none are known of runs of earlier versions."""
-    told = files.read_json(run / MANIFEST).get("empty", [])
-    return set(from_json(tuple[str, ...], told, f"{run / MANIFEST}: empty"))
+def _frames_without_vehicles(run: Path) -> set[str]:
+    """Return the frames of a run in which no vehicle could be de-rendered."""
+    empty = files.read_json(run / MANIFEST).get("empty", [])
+    return set(from_json(tuple[str, ...], empty, f"{run / MANIFEST}: empty"))
 
 
-def _told(frame: Path) -> str:
+def _digest_result(frame: Path) -> str:
     return hash_json(files.read_json(frame / RESULT))
 
 
 def _link_or_copy(source: str, target: str) -> None:
-    """Files of runs are replaced and never written into: a second name for one is as good as a copy."""
+    """Link a file, as files of runs are replaced and never modified, or copy it."""
     try:
         os.link(source, target)
     except OSError:  # another file system, or one without links

@@ -1,4 +1,4 @@
-"""Dataclasses as JSON and as rows of CSV, and back from these."""
+"""Converts dataclasses to JSON and CSV, and back."""
 
 from __future__ import annotations
 
@@ -22,12 +22,19 @@ _hints = functools.cache(get_type_hints)
 
 
 def from_json(kind: Any, value: Any, where: str) -> Any:
-    """A value of a type, of what `dataclasses.asdict` and JSON made of it: dataclasses, tuples and dicts of others
-    are built again, all else is as JSON has it. where: the file. FormatError naming a field of another type.
+    """Restore a value from what `dataclasses.asdict` and JSON made of it.
+
+    Args:
+        kind: Type of the value: a dataclass, tuple, dict or plain type.
+        value: The JSON value.
+        where: Name of the file, for errors.
+
+    Raises:
+        FormatError: A field is missing, unknown, or of another type.
     """
     origin, parts = get_origin(kind), get_args(kind)
     if dataclasses.is_dataclass(kind):
-        return _record(kind, value, where)
+        return _parse_record(kind, value, where)
     if origin is tuple:
         _require(isinstance(value, list), where, "a list", value)
         kinds = parts[:1] * len(value) if parts[1:] == (...,) else parts
@@ -41,16 +48,16 @@ def from_json(kind: Any, value: Any, where: str) -> Any:
         return None if value is None else from_json(whole, value, where)
     if origin is Literal:
         _require(value in parts, where, f"one of {', '.join(map(str, parts))}", value)
-    if kind in _WORDS:
+    if kind in _TYPE_NAMES:
         known = type(value) in ((int, float) if kind is float else (kind,))
-        _require(known and (kind is not float or math.isfinite(value)), where, _WORDS[kind], value)
+        _require(known and (kind is not float or math.isfinite(value)), where, _TYPE_NAMES[kind], value)
     return value
 
 
-_WORDS = {str: "text", int: "an integer", float: "a finite number", bool: "true or false"}
+_TYPE_NAMES = {str: "text", int: "an integer", float: "a finite number", bool: "true or false"}
 
 
-def _record(kind: Any, value: Any, where: str) -> Any:
+def _parse_record(kind: Any, value: Any, where: str) -> Any:
     _require(isinstance(value, dict), where, "an object", value)
     own = dataclasses.fields(kind)
     for name in value.keys() - {field.name for field in own}:
@@ -67,30 +74,51 @@ def _require(good: bool, where: str, expected: str, found: object) -> None:
 
 
 def dump_record(record: Any, schema: int) -> str:
-    """JSON text of a dataclass, with the version of its fields. ValueError where a number is not finite."""
+    """Return a dataclass as JSON text, with the version of its fields. Raises ValueError if a number is not
+    finite.
+    """
     return json.dumps({"schema": schema, **dataclasses.asdict(record)}, indent=1, allow_nan=False) + "\n"
 
 
 def load_record(path: Path, kind: type[T], schema: int) -> T:
-    """Read what `dump_record` gave. Raises FormatError naming the file and the field."""
+    """Load a dataclass from a file of `dump_record`.
+
+    Args:
+        path: The file.
+        kind: The dataclass.
+        schema: Version of its fields.
+
+    Raises:
+        FormatError: The file is damaged, or another version of drivesem wrote it.
+    """
     data = files.read_json(path)
-    if not isinstance(data, dict) or data.pop("schema", None) != schema:
-        raise FormatError(f"{path}: schema", str(schema), "another one")
+    found = data.pop("schema", None) if isinstance(data, dict) else None
+    if found != schema:
+        raise FormatError(f"{path}: schema", str(schema), f"{found!r}, of another version of drivesem")
     return from_json(kind, data, str(path))
 
 
 def dump_rows(kind: type[Any], rows: Iterable[Any]) -> str:
-    """Dataclasses of plain fields as CSV, a column a field: nothing for None, and true or false."""
+    """Return dataclasses of plain fields as CSV, a column per field."""
     columns = list(_hints(kind))
-    return cells_to_csv(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
+    return cells_to_csv(columns, ([_format_cell(getattr(row, name)) for name in columns] for row in rows))
 
 
-def _cell(value: Any) -> Any:
+def _format_cell(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
 
 
 def load_rows(text: str, kind: type[T], where: str) -> Iterator[tuple[str, T]]:
-    """What `dump_rows` wrote, each with its place. where: the file. Raises FormatError naming line and column."""
+    """Yield the dataclasses of a CSV text of `dump_rows`, each with its location.
+
+    Args:
+        text: The CSV text.
+        kind: The dataclass.
+        where: Name of the file, for errors.
+
+    Raises:
+        FormatError: A line or cell is damaged.
+    """
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     hints = _hints(kind)
     columns, known = list(hints), dict[tuple[str, str], Any]()
@@ -101,25 +129,25 @@ def load_rows(text: str, kind: type[T], where: str) -> Iterator[tuple[str, T]]:
             here = f"{where}:{reader.line_num}"
             _require(len(cells) == len(columns), here, f"{len(columns)} cells", len(cells))
             for one in zip(columns, cells, strict=True):
-                if one not in known:  # most cells are as one above
+                if one not in known:  # most cells repeat
                     hint = hints[one[0]]
-                    known[one] = from_json(hint, _value(hint, one[1]), f"{here}: {one[0]}")
+                    known[one] = from_json(hint, _parse_cell(hint, one[1]), f"{here}: {one[0]}")
             yield here, kind(**{one[0]: known[one] for one in zip(columns, cells, strict=True)})
     except csv.Error as error:
         raise FormatError(f"{where}:{reader.line_num}", "CSV", error) from error
 
 
-def _value(kind: Any, cell: str) -> Any:
-    """As JSON would have it; a text where that is none of the type's values, which `from_json` refuses."""
+def _parse_cell(kind: Any, cell: str) -> Any:
+    """Return a cell as JSON would hold it; if that fails, as text, which `from_json` refuses."""
     if not cell:
         return None
     for plain in (kind, *get_args(kind)):
-        if plain in _CELLS:
+        if plain in _CELL_PARSERS:
             try:
-                return _CELLS[plain](cell)
+                return _CELL_PARSERS[plain](cell)
             except (ValueError, KeyError):
                 return cell
     return cell
 
 
-_CELLS = {int: int, float: float, bool: {"true": True, "false": False}.__getitem__}
+_CELL_PARSERS = {int: int, float: float, bool: {"true": True, "false": False}.__getitem__}

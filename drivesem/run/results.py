@@ -1,75 +1,86 @@
-"""What a run leaves behind, as plain dataclasses: written as JSON, read by the report and by a resumed run."""
+"""Results of a run, as plain dataclasses that are stored as JSON."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from drivesem.evaluation.coco import CocoScores
 from drivesem.failures.grades import Certificate, SecondOpinion
-from drivesem.run.records import from_json
-from scene_ir import files
+from drivesem.run.records import dump_record, load_record
 from scene_ir.errors import FormatError
 
 SCHEMA = 2
-"""Of what is written; 1, which knew no grades, is still read."""
+"""Version of result.json and metrics.json."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxRecord:
-    """One true or detected box. xyxy px; label: class name; score in [0, 1] for detections;
-    ignore: true boxes that are neither missed nor a hit. index: the object of the scene, where it is one.
-    """
+    """One true or detected box."""
 
     xyxy: tuple[float, float, float, float]
+    """Corners, px."""
     label: str
+    """Class."""
     score: float | None = None
+    """Score of a detection, in [0, 1]."""
     ignore: bool = False
+    """Whether a true box counts neither as missed nor as a hit."""
     index: int | None = None
+    """Number of the scene's object, if it is one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Coordinate:
-    """One coordinate of theta. name such as `objects[3].yaw`; value, lower, upper in `unit`;
-    display: the value in the unit that people use (metres, degrees).
-    """
+    """One coordinate of theta."""
 
     name: str
+    """Such as `objects[3].yaw`."""
     unit: str
+    """Unit of the next three."""
     value: float
+    """Value."""
     lower: float
+    """Lower bound."""
     upper: float
+    """Upper bound."""
     display: str
+    """Value for people, in metres or degrees."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One thing the detector got wrong only after the change, by threshold. kind: lost or phantom; label: class
-    name; xyxy: the true box that was lost, or the detection that nothing supports; index: the lost object, or the
-    one that is reported twice. error: its kind as `truth.kinds` names it, None where it is none (found as far as
-    it shows; on a real object; suspect before the change). grade: how sure it is, None where nobody asked (runs of
-    earlier versions). count: the draws of its certificate; second, peer: what another renderer and another
-    architecture say.
-    """
+    """A failure of the detector that the change causes."""
 
     kind: str
+    """"lost" or "phantom", by threshold."""
     label: str
+    """Class."""
     xyxy: tuple[float, float, float, float]
+    """True box of a lost object, or the detected box of a phantom, px."""
     index: int | None = None
+    """Number of the lost object, or of the one that is reported twice."""
     score: float | None = None
+    """Score of a phantom, in [0, 1]."""
     error: str | None = None
+    """Kind (`failures.kinds`); None if the object is detected as far as it is visible, or the phantom lies on
+    something.
+    """
     grade: str | None = None
+    """Grade; None if not graded."""
     count: Certificate | None = None
+    """Draws of the certificate."""
     second: SecondOpinion | None = None
+    """Opinion of a second renderer."""
     peer: SecondOpinion | None = None
+    """Opinion of a second detector."""
 
     def to_row(self) -> dict[str, Any]:
-        """A flat dict: kind (as `truth.kinds`), grade, draws and second opinions; boxes in px; None where unknown.
+        """Return a flat row: kind, grade, draws, second opinions, and box in px; None if unknown.
 
-        by_threshold is lost or phantom; right_before, wrong_after are draws, of draws_before, draws_after.
+        by_threshold is lost or phantom; right_before and wrong_after count draws, of draws_before and draws_after.
         """
         count, (x0, y0, x1, y1) = self.count or Certificate(), self.xyxy
         row: dict[str, Any] = {"kind": self.error, "grade": self.grade, "by_threshold": self.kind}
@@ -84,85 +95,129 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """One frame of a run. Lists of boxes are in the frame's pixels; `seconds` is the only field that may differ
-    between two runs with the same configuration. violated_at_start: constraints that the photographed scene does
-    not meet, and that may only not get worse. checked_by: what the second feasibility check judged with, open3d or
-    (as before there was a choice) outlines. min_contrast: below it objects were ignored, 0 where that was no rule;
-    joint_weather: whether that check bounded weather codes together, too; both as in earlier runs by default.
-    passes: of the detector, a gradient counted as 3, without what grading took. grade_notes: why a grade could not
-    be reached. change: which vehicle was exchanged, added or taken away, in words; empty where none was.
-    """
+    """Result of one frame. Boxes are in px of the frame."""
 
     identifier: str
+    """The frame."""
     objects: int
+    """Number of objects."""
     queries: int
+    """Gradients and evaluated renders."""
     loss_trace: tuple[float, ...]
+    """Loss of each query."""
     theta: tuple[Coordinate, ...]
+    """The change."""
     active_constraints: tuple[str, ...]
+    """Constraints that limit the change."""
     violations: tuple[str, ...]
+    """Violations found by the independent check."""
     targets_benign: tuple[BoxRecord, ...]
+    """True boxes before the change."""
     targets_moved: tuple[BoxRecord, ...]
+    """True boxes after it."""
     detections_benign: tuple[BoxRecord, ...]
+    """Detections in the photograph."""
     detections_rerendered: tuple[BoxRecord, ...]
+    """Detections in the re-rendered photograph."""
     detections_attacked: tuple[BoxRecord, ...]
+    """Detections in the counterexample."""
     failures: tuple[Failure, ...]
+    """Lost objects and phantoms."""
     became_ignored: tuple[int, ...]
+    """Objects that the change makes ignored."""
     success_paper: bool
+    """Whether the detector fails with benign labels."""
     success_moved: bool
+    """Whether it fails with moved labels."""
     identity_psnr_db: float | None
+    """PSNR of the re-rendered photograph in the vehicles; None if it is exact."""
     seconds: float
+    """Run time; the only field that may differ between equal runs."""
     violated_at_start: tuple[str, ...] = ()
+    """Constraints that the photographed scene violates, and the change may not worsen."""
     checked_by: Literal["open3d", "outlines"] = "outlines"
+    """Method of the independent feasibility check."""
     min_contrast: float = 0.0
+    """Contrast below which objects are ignored."""
     joint_weather: bool = False
+    """Whether weather codes are bounded together."""
     passes: int | None = None
+    """Detector passes of the search; a gradient counts as 3."""
     grade_notes: tuple[str, ...] = ()
+    """Reasons why a grade could not be reached."""
     change: str = ""
+    """Description of an exchanged, added or removed vehicle; empty if none."""
 
     @property
     def feasible(self) -> bool:
-        """Whether the independent check found nothing violated."""
+        """Whether the independent check found no violation."""
         return not self.violations
 
     @property
     def graded(self) -> bool:
-        """Whether somebody asked how sure its failures are; a frame without failures leaves nothing to ask."""
+        """Whether all failures have a grade."""
         return all(failure.grade is not None for failure in self.failures)
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """The figures of a run; `to_json` is what `--json` prints."""
+    """Summary of a run."""
 
     out: str
+    """Folder."""
     dataset: str
+    """Data set."""
     params: tuple[str, ...]
+    """Attacked parameters."""
     detector: str
+    """The attacked detector."""
     headline: str
+    """Class of the headline scores."""
     t_star: float
+    """Score from which detections count."""
     frames: int
+    """Number of frames."""
     frames_without_vehicles: int
+    """Frames skipped because they have no vehicle."""
     frames_failed: dict[str, str]
+    """Reasons by frame that could not be used."""
     objects: int
+    """Number of objects."""
     benign: CocoScores
+    """Scores on the photographs."""
     rerendered: CocoScores
+    """Scores on the re-rendered photographs."""
     attacked_paper: CocoScores
+    """Scores after the attack, with benign labels."""
     attacked_moved: CocoScores
+    """Scores after the attack, with moved labels."""
     lost_objects: dict[str, int]
+    """Lost objects by class."""
     phantoms: dict[str, int]
+    """Phantoms by class."""
     successes_paper: int
+    """Frames that fail with benign labels."""
     successes_moved: int
+    """Frames that fail with moved labels."""
     feasible_fraction: float | None
+    """Share of frames that pass the independent feasibility check."""
     queries: int
+    """Gradients and evaluated renders."""
     passes: int
+    """Detector passes of the search."""
     grades: dict[str, int]
+    """Failures of at least each grade."""
     kinds: dict[str, int]
+    """Failures by kind."""
     frames_ungraded: int
+    """Frames with ungraded failures."""
     grade_notes: dict[str, int]
+    """Frames by reason why a grade could not be reached."""
     seconds: float
+    """Run time."""
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object; classes stand apart, totals in front."""
+        """Return a JSON object with totals, followed by counts by class."""
         data = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         paper, moved = data.pop("attacked_paper"), data.pop("attacked_moved")
         return {
@@ -180,16 +235,13 @@ class RunSummary:
 
 
 def dump_frame(result: FrameResult) -> str:
-    """JSON text of one frame's result, exact and in a fixed order."""
-    return json.dumps({"schema": SCHEMA, **dataclasses.asdict(result)}, indent=1, allow_nan=False) + "\n"
+    """Return the JSON text of a frame's result."""
+    return dump_record(result, SCHEMA)
 
 
 def load_frame(path: Path) -> FrameResult:
-    """Read what `dump_frame` wrote. Raises FormatError naming the file and the field."""
-    data = files.read_json(path)
-    if not isinstance(data, dict) or data.pop("schema", None) not in (1, SCHEMA):
-        raise FormatError(f"{path}: schema", f"1 or {SCHEMA}", "another one")
-    result: FrameResult = from_json(FrameResult, data, str(path))
+    """Load a frame's result. Raises FormatError naming the file and the field."""
+    result = load_record(path, FrameResult, SCHEMA)
     for i, failure in enumerate(result.failures):
         if failure.kind not in ("lost", "phantom"):
             raise FormatError(f"{path}: failures[{i}].kind", "lost or phantom", repr(failure.kind))

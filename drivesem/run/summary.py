@@ -1,4 +1,4 @@
-"""What the frames of a run add up to: said once, for runs and for parts of them."""
+"""Summarises the frames of a run, or of a part of it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivesem.run.results import FrameResult
 
 
 class GradedFailure(Protocol):
-    """A failure, as `results.Failure`, or what is counted of one."""
+    """A failure with a kind and a grade, such as `results.Failure`."""
 
     @property
     def index(self) -> int | None: ...
@@ -31,34 +31,43 @@ F_co = TypeVar("F_co", bound=GradedFailure, covariant=True)
 
 
 class FrameWithFailures(Protocol[F_co]):
-    """A frame with failures."""
+    """A frame with failures, such as `results.FrameResult`."""
 
     @property
     def failures(self) -> Sequence[F_co]: ...
 
 
 def targets_and_detections(
-    results: Sequence[FrameResult], judged: EvaluatedClasses, labels: str, seen: str
+    results: Sequence[FrameResult], classes: EvaluatedClasses, labels: str, picture: str
 ) -> tuple[list[Targets], list[Detections]]:
-    """Targets and detections of each frame. labels: benign or moved; seen: benign, rerendered or attacked."""
-    targets = [judged.map_targets(targets_from_records(getattr(r, f"targets_{labels}"), CLASSES)) for r in results]
-    return targets, [detections_from_records(getattr(r, f"detections_{seen}"), judged.names) for r in results]
+    """Return targets and detections of each frame.
+
+    Args:
+        results: The frames.
+        classes: Evaluated classes.
+        labels: benign or moved.
+        picture: benign, rerendered or attacked.
+    """
+    targets = [
+        classes.map_targets(targets_from_records(getattr(r, f"targets_{labels}"), CLASSES)) for r in results
+    ]
+    return targets, [detections_from_records(getattr(r, f"detections_{picture}"), classes.names) for r in results]
 
 
 def has_grade(grade: Grade) -> Callable[[GradedFailure], bool]:
-    """Whether a failure has that grade or a higher one; every failure has that of the threshold."""
+    """Return a predicate: whether a failure has at least this grade. Every failure has that of the threshold."""
     higher = list(Grade)[list(Grade).index(grade) :]
     return lambda failure: failure.grade in higher or grade is Grade.THRESHOLD
 
 
 def certain_losses(result: FrameWithFailures[F]) -> list[F]:
-    """Certain failures of objects; a phantom has no object whose states could be looked through."""
+    """Return the certain failures of objects, without phantoms."""
     certain = has_grade(Grade.CERTAIN)
     return [f for f in result.failures if f.index is not None and f.error in OBJECT_KINDS and certain(f)]
 
 
 def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
-    """Those of the fields that say how sure the failures are, and what the search cost."""
+    """Count failures by grade and kind, and detector passes."""
     failures = [failure for r in results for failure in r.failures]
     return {
         "passes": sum(r.passes or 0 for r in results),
@@ -70,18 +79,25 @@ def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
 
 
 def summarise_frames(
-    results: Sequence[FrameResult], judged: EvaluatedClasses, t_star: float, headline: str
+    results: Sequence[FrameResult], classes: EvaluatedClasses, t_star: float, headline: str
 ) -> dict[str, Any]:
-    """Those fields of `RunSummary` that follow from its frames, by name."""
+    """Compute the fields of `RunSummary` that follow from its frames.
 
-    def scores(labels: str, seen: str) -> coco.CocoScores:
+    Args:
+        results: The frames.
+        classes: Evaluated classes.
+        t_star: Score from which detections count.
+        headline: Class of the headline.
+    """
+
+    def scores(labels: str, picture: str) -> coco.CocoScores:
         return coco.evaluate(
-            *targets_and_detections(results, judged, labels, seen), judged.names, t_star, headline
+            *targets_and_detections(results, classes, labels, picture), classes.names, t_star, headline
         )
 
     def count(kind: str) -> dict[str, int]:
         labels = [failure.label for r in results for failure in r.failures if failure.kind == kind]
-        return {name: labels.count(name) for name in judged.names}
+        return {name: labels.count(name) for name in classes.names}
 
     return {
         "frames": len(results),

@@ -1,4 +1,4 @@
-"""Independent pieces of work, such as frames, shared by processes of one machine, or of a cluster."""
+"""Shares independent jobs, such as frames, among processes of one machine or a cluster."""
 
 from __future__ import annotations
 
@@ -35,24 +35,32 @@ def run_jobs(
     config: WorkerOptions,
     in_subprocess: bool = False,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
-    """Each job with a call that gives its result or raises what went wrong, as they are done.
+    """Yield each job, as it completes, with a function that returns its result or raises its error.
 
-    work: does a job in this process, where one process is enough. build: makes the like of it in another process,
-    once for each, and can be pickled, as jobs and results can. With `keep_going` an error for which no input is to
-    blame is raised as UnforeseenError, which says where it arose. So is, always, a job at which its process ended,
-    and ended again when the job was tried alone. apart: in no case in this process. UsageError for a cluster that
-    is not there.
+    With `keep_going`, an error that no input explains is raised as UnforeseenError, which names its place. So is a
+    job that ended its process twice, the second time alone.
+
+    Args:
+        worker: Runs a job in this process, if one process suffices.
+        make_worker: Makes the worker of another process, once per process; can be pickled, as jobs and results
+            can.
+        jobs: The jobs.
+        config: Number of workers, engine, and whether to keep going.
+        in_subprocess: Never run jobs in this process.
+
+    Raises:
+        UsageError: The cluster is missing.
     """
-    elsewhere = store.current()
-    for job, outcome in _outcomes(worker, make_worker, jobs, config, in_subprocess):
+    elsewhere = store.output_store()
+    for job, outcome in _run_jobs(worker, make_worker, jobs, config, in_subprocess):
         yield job, outcome
         if elsewhere is not None:
-            elsewhere.keep()
+            elsewhere.upload()
     if elsewhere is not None and config.engine == "ray":
-        elsewhere.fetch()  # what other machines made
+        elsewhere.fetch()  # files of other machines
 
 
-def _outcomes(
+def _run_jobs(
     work: Callable[[J], R],
     build: Callable[[], Callable[[J], R]],
     jobs: Sequence[J],
@@ -60,70 +68,72 @@ def _outcomes(
     apart: bool,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     if config.engine == "ray":
-        yield from run_jobs_on_ray(Start(build, 1, config.keep_going, store.current()), jobs, config)
+        yield from run_jobs_on_ray(Start(build, 1, config.keep_going, store.output_store()), jobs, config)
         return
-    # The number of threads follows from the settings, not from the jobs left: a resumed run adds up alike.
-    # No more than torch would take by itself: OMP_NUM_THREADS says what is left beside other work.
+    # The number of threads depends on the settings only, as it affects sums, and a resumed run must equal another.
+    # It does not exceed torch's own, which OMP_NUM_THREADS limits.
     before = torch.get_num_threads()
     threads = max(min((os.cpu_count() or 1) // config.processes, before), 1)
     torch.set_num_threads(threads)
     try:
         count = min(config.processes, len(jobs))
         if count > 1 or apart:
-            yield from _shared(Start(build, threads, config.keep_going), jobs, count)
+            yield from _run_in_processes(Start(build, threads, config.keep_going), jobs, count)
             return
         for job in jobs:
             yield job, partial(attempt, work, config.keep_going, job)
     finally:
-        torch.set_num_threads(before)  # what follows, such as training, is alone again
+        torch.set_num_threads(before)  # what follows, such as training, uses all
 
 
 def make_parallel_map(
     config: WorkerOptions, in_subprocess: bool = False
 ) -> Callable[[Callable[[J], R], Sequence[J]], Iterator[R]]:
-    """What does jobs that nothing has to be made for, and gives their results as they are done; see `outcomes`."""
+    """Return a parallel map, which yields results as they complete; see `run_jobs`."""
 
-    def over(work: Callable[[J], R], jobs: Sequence[J]) -> Iterator[R]:
-        for _, outcome in run_jobs(work, partial(_as_it_is, work), jobs, config, in_subprocess):
+    def parallel_map(work: Callable[[J], R], jobs: Sequence[J]) -> Iterator[R]:
+        for _, outcome in run_jobs(work, partial(_make_plain_worker, work), jobs, config, in_subprocess):
             yield outcome()
 
-    return over
+    return parallel_map
 
 
-def _as_it_is(work: Callable[[J], R]) -> Callable[[J], R]:
-    cv2.setNumThreads(1)  # the work is parallel over jobs already
+def _make_plain_worker(work: Callable[[J], R]) -> Callable[[J], R]:
+    cv2.setNumThreads(1)  # jobs run in parallel already
     return work
 
 
-def _shared(start: Start, jobs: Sequence[J], count: int) -> Iterator[tuple[J, Callable[[], Any]]]:
+def _run_in_processes(start: Start, jobs: Sequence[J], count: int) -> Iterator[tuple[J, Callable[[], Any]]]:
     left = list(jobs)
     while left:
         lost: list[J] = []
-        for job, outcome in _pooled(start, tuple(left), count, lost):
+        for job, outcome in _run_in_pool(start, tuple(left), count, lost):
             left.remove(job)
             yield job, outcome
-        # A process is gone, for want of memory say, and nobody knows at which of these: each has one try alone.
+        # A process ended, perhaps out of memory, during one of these jobs: each gets one try alone.
         for job in lost:
             left.remove(job)
             again: list[J] = []
-            yield from _pooled(start, [job], 1, again)
+            yield from _run_in_pool(start, [job], 1, again)
             if again:
                 yield job, ended
 
 
-def _pooled(start: Start, jobs: Sequence[J], count: int, lost: list[J]) -> Iterator[tuple[J, Callable[[], Any]]]:
-    """Jobs by so many processes, as they are done. Where a process ends by itself all end, and those that were at
-    work are `lost`.
+def _run_in_pool(
+    start: Start, jobs: Sequence[J], count: int, lost: list[J]
+) -> Iterator[tuple[J, Callable[[], Any]]]:
+    """Run jobs in `count` processes. If a process ends unexpectedly, all end, and their jobs are appended to
+    `lost`.
     """
     from loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
-    # A process that has grown by 300 MB, which layers that it keeps may take, is replaced between jobs: no news.
+    # loky replaces a process that has grown by 300 MB, as cached layers may, between jobs
     warnings.filterwarnings("ignore", "A worker was restarted", UserWarning)
-    pool = ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(), start))
+    pool = ProcessPoolExecutor(count, initializer=_start_process, initargs=(os.getpid(), start))
     waiting, pending = iter(jobs), {}
     try:
-        # No more jobs at a time than processes: what is pending is what is at work.
-        with _unheard():
+        # submit no more jobs than processes, so that pending jobs are running jobs
+        with _block_interrupts():
             pending |= {pool.submit(do, job): job for job in islice(waiting, count)}
         while pending:
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
@@ -136,19 +146,19 @@ def _pooled(start: Start, jobs: Sequence[J], count: int, lost: list[J]) -> Itera
                 lost += pending.values()
                 return
     finally:
-        # Done with, interrupted, or broken: nobody waits for what is still at work, which is whole or not there.
+        # do not wait for running jobs: their output is complete or absent
         pool.shutdown(kill_workers=True)
 
 
 @contextmanager
-def _unheard() -> Iterator[None]:
-    """Processes that start inside never hear of Ctrl-C, which reaches all processes of a terminal, not even while
-    Python itself loads: the one that starts them ends them. There it counts afterwards.
+def _block_interrupts() -> Iterator[None]:
+    """Block Ctrl-C in processes that start inside the block, also while Python loads; the parent ends them. The
+    parent handles it after the block.
     """
     if sys.platform == "win32":
         yield
         return
-    resource_tracker.ensure_running()  # starting it lets signals through again
+    resource_tracker.ensure_running()  # starting it unblocks signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -156,15 +166,15 @@ def _unheard() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(parent: int, start: Start) -> None:
+def _start_process(parent: int, start: Start) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
     begin(start)
 
 
-def _leave_with(parent: int) -> None:
-    """End this process when the one that started it is gone: killed, it can no longer say so itself, and its
-    workers would wait for ever, each with a detector in memory.
+def _exit_with_parent(parent: int) -> None:
+    """End this process when its parent is gone. A killed parent cannot end its workers, which would wait for ever,
+    each with a detector in memory.
     """
     while os.getppid() == parent:
         time.sleep(1)

@@ -1,4 +1,4 @@
-"""A detector's precision and recall on a data set's photographs."""
+"""Evaluates a detector on a data set, and draws its mistakes."""
 
 from __future__ import annotations
 
@@ -49,26 +49,27 @@ from scene_ir.types import Labels
 
 @dataclass(frozen=True, slots=True)
 class DetectorMetrics:
-    """What a detector sees of a data set. data: the JSON; intervals: of the headline's class."""
+    """Metrics of a detector on a data set."""
 
     data: dict[str, Any]
+    """The JSON data."""
     per_class: Mapping[str, coco.ClassScores]
+    """Scores by class."""
     intervals: Sequence[Interval]
+    """Bootstrap intervals of the headline class."""
 
 
 def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
-    """Run the detector over the frames, count, and write what is asked for. UsageError or SceneError for bad
-    input.
-    """
+    """Evaluate a detector on a data set, and write the results. Raises UsageError or SceneError for bad input."""
     dataset = open_dataset(config.dataset, config.root or "")
     detector = _detector(config)
     names = dataset.identifiers[: config.limit]
-    looker, build = _Looker(config, dataset, detector), partial(_Looker, config)
-    looked = run_frame_jobs(names, looker, build, config, ProgressSettings("frames", keep=False))
-    names = [name for name in names if name in looked.results]
+    frame_detector, make_detector = _FrameDetector(config, dataset, detector), partial(_FrameDetector, config)
+    jobs = run_frame_jobs(names, frame_detector, make_detector, config, ProgressSettings("frames", keep=False))
+    names = [name for name in names if name in jobs.results]
     if not names:
         raise UsageError("--root", "frames that can be used", "none")
-    found, labels = [looked.results[name][0] for name in names], [looked.results[name][1] for name in names]
+    found, labels = [jobs.results[name][0] for name in names], [jobs.results[name][1] for name in names]
     t_star = resolve_t_star(detector)
     judged = EvaluatedClasses.from_detector(detector).names
     limits = adapt_limits(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
@@ -83,7 +84,7 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
         "detector": config.detector,
         "dataset": config.dataset,
         "frames": len(names),
-        "failed": dict(sorted(looked.failed.items())),
+        "failed": dict(sorted(jobs.failed.items())),
         "headline": HEADLINE,
         "t_star": t_star,
         "min_height": config.min_height,
@@ -104,7 +105,7 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
 def _draw(
     config: EvalConfig, dataset: Dataset, names: Sequence[str], outcome: MatchedClass, t_star: float
 ) -> None:
-    """The frames with most mistakes, worst first."""
+    """Write pictures of the frames with most mistakes, worst first."""
     marks = [outcome.frame_marks(frame, t_star) for frame in range(len(names))]
     worst = sorted(range(len(names)), key=lambda i: (-marks[i].error_count, i))
     for rank, frame in enumerate(worst[: config.pictures], start=1):
@@ -122,8 +123,8 @@ def _detector(config: EvalConfig) -> Predictor:
     return detector
 
 
-class _Looker:
-    """What one process needs: built once, used for many frames."""
+class _FrameDetector:
+    """Detects objects in frames; made once per process."""
 
     def __init__(
         self, config: EvalConfig, dataset: Dataset | None = None, detector: Predictor | None = None
@@ -133,7 +134,7 @@ class _Looker:
         self._device = config.device
 
     def __call__(self, name: str) -> tuple[Detections, Labels]:
-        """What is found in a frame, and its labels. Raises FormatError for a frame without."""
+        """Return the detections in a frame and its labels. Raises FormatError for a frame without labels."""
         frame = self._dataset.frame(name)
         if frame.labels is None:
             raise FormatError(f"frame {name}", "labels", "none")
@@ -143,18 +144,18 @@ class _Looker:
 def _write(
     out: Path, data: Mapping[str, Any], names: Sequence[str], found: Sequence[Detections], judged: Sequence[str]
 ) -> None:
-    """metrics.json, and the detections as KITTI's results, which drivesem eval --pred reads."""
+    """Write metrics.json, and the detections as KITTI results, which drivesem eval --pred reads."""
     from drivesem.data.kitti import write_labels
 
     files.write_json(out / "metrics.json", data)
     for name, one in zip(names, found, strict=True):
-        # a box without an area meets nothing, and one that ends before it begins would not be read
-        kept = ((one.boxes_xyxy[:, 2:] - one.boxes_xyxy[:, :2]) >= 0.01).all(dim=1)
-        n = int(kept.sum())
+        # empty boxes match nothing, and inverted ones cannot be read
+        is_valid = ((one.boxes_xyxy[:, 2:] - one.boxes_xyxy[:, :2]) >= 0.01).all(dim=1)
+        n = int(is_valid.sum())
         unknown = torch.full((n, 3), torch.nan)
         labels = Labels(
-            kind=tuple(judged[int(k)] for k in one.labels[kept]),
-            boxes_xyxy=one.boxes_xyxy[kept],
+            kind=tuple(judged[int(k)] for k in one.labels[is_valid]),
+            boxes_xyxy=one.boxes_xyxy[is_valid],
             truncation=unknown[:, 0],
             occlusion=torch.full((n,), 3, dtype=torch.int64),
             translation=unknown,
@@ -163,27 +164,27 @@ def _write(
             ignore_xyxy=torch.zeros(0, 4),
         )
         path = out / "detections" / f"{name.replace('/', '_')}.txt"
-        write_labels(path, labels, one.scores[kept])
+        write_labels(path, labels, one.scores[is_valid])
 
 
-def print_detector_metrics(figures: DetectorMetrics, console: Console) -> None:
-    """The table, the intervals, and who was judged."""
-    data = figures.data
+def print_detector_metrics(metrics: DetectorMetrics, console: Console) -> None:
+    """Print scores, intervals, and which objects were evaluated."""
+    data = metrics.data
     for name, reason in data["failed"].items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True, markup=False)
     table = Table(title=f"{data['detector']} on {data['dataset']}, %", title_justify="left")
     table.add_column("class")
     for title in (*coco.SCORE_TITLES, "objects"):
         table.add_column(title, justify="right")
-    for name, scores in figures.per_class.items():
+    for name, scores in metrics.per_class.items():
         table.add_row(name, *map(format_percent, scores.columns), str(scores.objects))
     console.print(table)
-    for one in figures.intervals:
+    for one in metrics.intervals:
         if one.low is not None and one.high is not None:
             bounds = f"{format_percent(one.low)} to {format_percent(one.high)} in 95 % of {data['bootstrap']} draws of frames"
             console.print(f"{HEADLINE} {one.name} {format_percent(one.value)}, {bounds}", soft_wrap=True)
     console.print(
-        f"{format_count(data['frames'], 'frame')}; judged: at least {data['min_height']:g} px high, occlusion "
+        f"{format_count(data['frames'], 'frame')}; evaluated: at least {data['min_height']:g} px high, occlusion "
         f"at most {data['max_occlusion']}, truncation at most {data['max_truncation']:g}; t* {data['t_star']:.3f}",
         soft_wrap=True,
     )
@@ -199,7 +200,7 @@ _LEGEND_PX = 22
 
 
 def draw_mistakes(image: NDArray[np.uint8], marks: FrameMarks) -> NDArray[np.uint8]:
-    """The image (H, W, 3) uint8 RGB with its marks, and a line below that names their colours."""
+    """Draw hits, misses and false alarms into an image (H, W, 3) uint8, above a legend."""
     canvas = np.concatenate([image, np.full((_LEGEND_PX, image.shape[1], 3), 250, np.uint8)])
     labels = LabelLayout(
         (image.shape[1], image.shape[0]), [*marks.missed.tolist(), *marks.false_positives.tolist()]

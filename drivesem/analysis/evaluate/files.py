@@ -1,4 +1,4 @@
-"""Figures of detections against labels, by the rules of one protocol."""
+"""Evaluates files of detections against labels by the rules of a protocol."""
 
 from __future__ import annotations
 
@@ -33,15 +33,13 @@ from drivesem.evaluation.resampling import (
 from drivesem.evaluation.results import ClassRow, EvaluationMetrics, KittiRow
 
 VOC_OVERLAP = 0.5
-"""At least so much must overlap (VOC)."""
+"""Least IoU of a match (VOC)."""
 MANY_FRAMES = 5000
-"""From so many frames on there are no bootstrap draws by default."""
+"""Number of frames above which there is no bootstrap by default."""
 
 
 def evaluate_files(config: EvalConfig) -> EvaluationMetrics:
-    """Read what the configuration names, count, and write what it asks for. Raises UsageError or SceneError for
-    bad input.
-    """
+    """Evaluate files of detections, and write the results. Raises UsageError or SceneError for bad input."""
     with _no_garbage_collection():
         result = evaluate(config, load_evaluation_data(config))
     if config.out is not None:
@@ -51,7 +49,7 @@ def evaluate_files(config: EvalConfig) -> EvaluationMetrics:
 
 @contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Python's search for cycles, again and again through a million annotations, takes a sixth of the time."""
+    """Switch off garbage collection, which takes a sixth of the time for a million annotations."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -62,9 +60,9 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
-    """All figures that the configuration asks for."""
-    judge = _Judge(config, sets)
-    first = judge.looked_at(sets.found[0])
+    """Compute all metrics of the configured protocol. sets: labels and detections."""
+    evaluator = _ProtocolEvaluator(config, sets)
+    first = evaluator.evaluate(sets.found[0])
     generator = np.random.default_rng(config.seed)
     compared: list[PairedDifference] = []
     spread: list[Interval] = []
@@ -72,11 +70,11 @@ def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
     if draws is None:
         draws = 0 if sets.truths.frames > MANY_FRAMES and len(sets.found) == 1 else DRAWS
     if draws:
-        spread = bootstrap_intervals(first.figures, sets.truths.frames, draws, generator)
+        spread = bootstrap_intervals(first.metrics, sets.truths.frames, draws, generator)
     if len(sets.found) > 1:
-        second = judge.looked_at(sets.found[1])
-        compared = paired_differences(first.figures, second.figures, sets.truths.frames, draws, generator)
-    stats, facts = judge.stats(sets.found[0])
+        second = evaluator.evaluate(sets.found[1])
+        compared = paired_differences(first.metrics, second.metrics, sets.truths.frames, draws, generator)
+    stats, facts = evaluator.stats(sets.found[0])
     counted = sets.truths.label[~sets.truths.ignore]
     return EvaluationMetrics(
         protocol=config.protocol,
@@ -92,8 +90,10 @@ def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
         },
         classes=first.classes,
         curves=first.curves,
-        parts=tuple(breakdown.score_parts(first.candidates, first.matches, judge.names, judge.rule, sets.weather)),
-        metrics={figure.name: figure.value() for figure in first.figures},
+        parts=tuple(
+            breakdown.score_parts(first.candidates, first.matches, evaluator.names, evaluator.rule, sets.weather)
+        ),
+        metrics={metric.name: metric.value() for metric in first.metrics},
         stats=stats,
         rows=first.rows,
         intervals=tuple(spread),
@@ -103,23 +103,23 @@ def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
 
 
 @dataclass(frozen=True, slots=True)
-class _Looked:
-    """One set of detections, matched and counted. matches: one a class, at its overlap."""
+class _DetectionMetrics:
+    """Matches and metrics of one set of detections."""
 
     candidates: CandidatePairs
     matches: tuple[MatchResult, ...]
     classes: tuple[ClassRow, ...]
     curves: dict[str, list[list[float]]]
-    figures: tuple[NamedMetric, ...]
+    metrics: tuple[NamedMetric, ...]
     rows: tuple[KittiRow, ...] = ()
 
 
-_MOST_DETECTIONS = 2000
-"""KITTI's rule plays a frame again for each of them: its cost grows with the square."""
+_MAX_DETECTIONS = 2000
+"""Largest number of detections of a class per frame; the cost of KITTI's matching grows with its square."""
 
 
-class _Judge:
-    """One protocol's rules. names: the classes with figures, in the order of their labels after `_own`."""
+class _ProtocolEvaluator:
+    """Rules of one protocol. names: the evaluated classes."""
 
     def __init__(self, config: EvalConfig, sets: EvaluationData) -> None:
         self.config, self.sets = config, sets
@@ -135,7 +135,7 @@ class _Judge:
             self.relabel, self.truths = _without_others(sets, self.names)
 
     def stats(self, found: DetectionTable) -> tuple[list[float] | None, dict[str, Any]]:
-        """COCO's twelve numbers, and who counted."""
+        """Return COCO's twelve numbers, and facts about the evaluation."""
         if self.config.protocol == "kitti":
             return None, {"small_detections": self.config.small_detections}
         if self.config.protocol == "voc":
@@ -145,18 +145,20 @@ class _Judge:
         return coco.coco_stats(self.truths, found, len(self.names), engine, ids), {"engine": engine}
 
     def overlap(self, name: str) -> float:
-        """The overlap at which a class is looked at."""
+        """Return the least IoU of a match for a class."""
         return kitti.CLASSES[name] if self.config.protocol == "kitti" else VOC_OVERLAP
 
-    def looked_at(self, found: DetectionTable) -> _Looked:
-        """Match one set of detections and count."""
+    def evaluate(self, found: DetectionTable) -> _DetectionMetrics:
+        """Match one set of detections, and compute its metrics."""
         curves: list[kitti.KittiCurve] = []
         if self.config.protocol == "kitti":
             small = self.config.small_detections
-            of_frame_and_class = np.bincount(found.frame * len(self.sets.classes) + found.label)
-            most = int(of_frame_and_class.max(initial=0))
-            expected = f"at most {_MOST_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
-            refuse(most > _MOST_DETECTIONS, "--pred", expected, f"{most:,}")
+            count_by_frame_and_class = np.bincount(found.frame * len(self.sets.classes) + found.label)
+            largest_count = int(count_by_frame_and_class.max(initial=0))
+            expected = (
+                f"at largest_count {_MAX_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
+            )
+            refuse(largest_count > _MAX_DETECTIONS, "--pred", expected, f"{largest_count:,}")
             curves = kitti.evaluate(self.sets.truths, found, self.sets.classes, small)
             curves = [curve for curve in curves if curve.name in self.names]
             labels = self.relabel[found.label]
@@ -166,13 +168,13 @@ class _Judge:
         by_overlap = {o: self._match(candidates, o) for o in {self.overlap(name) for name in self.names}}
         matches = tuple(by_overlap[self.overlap(name)] for name in self.names)
         tallies = [candidates.class_matches(match, k) for k, match in enumerate(matches)]
-        further, figures = self._figures(candidates, tallies, curves)
-        return _Looked(
+        further, metrics = self._compute_metrics(candidates, tallies, curves)
+        return _DetectionMetrics(
             candidates,
             matches,
             tuple(self._row(k, tally, found, further[k]) for k, tally in enumerate(tallies)),
             {name: sampled_curve(tally) for name, tally in zip(self.names, tallies, strict=True)},
-            figures,
+            metrics,
             tuple(
                 KittiRow(c.name, c.difficulty, c.r11(), c.r40(), c.object_count, c.precision().tolist())
                 for c in curves
@@ -201,10 +203,10 @@ class _Judge:
             further=further,
         )
 
-    def _figures(
+    def _compute_metrics(
         self, candidates: CandidatePairs, tallies: Sequence[ClassMatches], curves: Sequence[kitti.KittiCurve]
     ) -> tuple[list[dict[str, float | None]], tuple[NamedMetric, ...]]:
-        """Further figures of each class, and those that intervals are given for."""
+        """Return further metrics of each class, and the metrics with intervals."""
         if self.config.protocol == "kitti":
             names = [f"{c.name} {c.difficulty} R40" for c in curves]
             return [{} for _ in tallies], tuple(
@@ -238,8 +240,8 @@ class _Judge:
 
 
 def _without_others(sets: EvaluationData, names: Sequence[str]) -> tuple[np.ndarray, GroundTruthTable]:
-    """Labels among `names` by label (-1: another class, or every one), and the truths of `names`; neighbours are
-    ignored there.
+    """Return the label in `names` by label (-1 for others), and the labels of `names`, with neighbouring classes
+    ignored.
     """
     relabel = np.full(len(sets.classes) + 1, -1)
     neighbour = np.zeros(len(sets.classes) + 1, np.bool_)
@@ -251,18 +253,18 @@ def _without_others(sets: EvaluationData, names: Sequence[str]) -> tuple[np.ndar
             relabel[i], neighbour[i] = names.index(near), True
     truths = sets.truths
     labels = relabel[truths.label]
-    kept = truths.select((labels >= 0) | (truths.label == EVERY_CLASS))
-    label = relabel[kept.label]
-    ignore = kept.ignore | neighbour[kept.label] | (label < 0)
+    selected = truths.select((labels >= 0) | (truths.label == EVERY_CLASS))
+    label = relabel[selected.label]
+    ignore = selected.ignore | neighbour[selected.label] | (label < 0)
     own = np.where(neighbour, -1, relabel)
     return own, GroundTruthTable(
-        kept.frames,
-        kept.frame,
+        selected.frames,
+        selected.frame,
         label,
-        kept.boxes,
+        selected.boxes,
         ignore,
-        kept.truncation,
-        kept.occlusion,
-        kept.distance_m,
-        kept.area,
+        selected.truncation,
+        selected.occlusion,
+        selected.distance_m,
+        selected.area,
     )

@@ -1,4 +1,4 @@
-"""What an evaluation prints and writes: a table for people, JSON, CSV, Markdown, PNG."""
+"""Reports an evaluation: tables, JSON, CSV, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from drivesem.report.tables import ReportTable, cells_to_csv, format_count, form
 from drivesem.report.terminal import Console
 from scene_ir import files
 
-_COCO_WORDS = (
+_COCO_DESCRIPTIONS = (
     *("AP, IoU 0.50:0.95", "AP, IoU 0.50", "AP, IoU 0.75", "AP, small", "AP, medium", "AP, large"),
     *("AR, 1 detection", "AR, 10 detections", "AR, 100 detections", "AR, small", "AR, medium", "AR, large"),
 )
-_WORDS = ("class", "figure", "what", "difficulty", "by", "part")
-"""Columns of words; the others hold numbers."""
+_TEXT_COLUMNS = ("class", "figure", "what", "difficulty", "by", "part")
+"""Columns of text; the others hold numbers."""
 _AXES = {"distance": "distance", "size": "height", "occlusion": "occlusion as labelled", "weather": "weather"}
 
 
@@ -27,10 +27,10 @@ def _signed(value: float | None) -> str:
 
 
 def build_evaluation_tables(result: EvaluationMetrics, wide: bool = False) -> list[ReportTable]:
-    """The tables of an evaluation, the protocol's own figures first. wide: parts by class beside one another."""
+    """Build the tables of an evaluation, those of the protocol first. wide: one column per class in breakdowns."""
     found: list[ReportTable] = []
     if result.stats is not None:
-        rows = zip(STATS, _COCO_WORDS, map(format_percent, result.stats), strict=True)
+        rows = zip(STATS, _COCO_DESCRIPTIONS, map(format_percent, result.stats), strict=True)
         found.append(ReportTable("COCO, all classes, %", ("figure", "what", "%"), tuple(rows)))
     if result.rows:
         kit = result.facts["small_detections"]
@@ -131,7 +131,8 @@ def print_evaluation(result: EvaluationMetrics, console: Console) -> None:
     """The tables, and what a reader must know."""
     for sheet in build_evaluation_tables(result, wide=True):
         console.print(
-            *sheet.fit_to_console(console, _WORDS, min_width=min(len(sheet.title) + 4, console.width)), sep="\n"
+            *sheet.fit_to_console(console, _TEXT_COLUMNS, min_width=min(len(sheet.title) + 4, console.width)),
+            sep="\n",
         )
     facts = result.facts
     counted = f", counted by {facts['engine']}" if "engine" in facts else ""
@@ -144,7 +145,7 @@ def print_evaluation(result: EvaluationMetrics, console: Console) -> None:
 
 
 def write_evaluation(out: Path, result: EvaluationMetrics) -> None:
-    """metrics.json, one CSV a table, curves.csv, report.md and PNGs in `out`."""
+    """Write metrics.json, a CSV per table, curves.csv, report.md and PNGs into `out`."""
     files.write_json(out / "metrics.json", result.to_json())
     for sheet in build_evaluation_tables(result):
         cells = [["" if cell == "-" else cell for cell in row] for row in sheet.rows]
@@ -156,12 +157,12 @@ def write_evaluation(out: Path, result: EvaluationMetrics) -> None:
 
 
 def _file_name(title: str) -> str:
-    """The first words of a title: "KITTI 2D, %" is kitti-2d."""
+    """Return a file name for a title, such as kitti-2d for "KITTI 2D, %"."""
     return re.sub(r"[^a-z0-9]+", "-", re.split(r"[,;]", title)[0].lower()).strip("-")
 
 
 def _pictures(out: Path, result: EvaluationMetrics) -> dict[str, str]:
-    """File name -> what it shows."""
+    """Write the plots. Returns descriptions by file name."""
     found: dict[str, str] = {}
     overlaps = {row.name: row.overlap for row in result.classes}
     curves = {
@@ -196,7 +197,7 @@ def _pictures(out: Path, result: EvaluationMetrics) -> dict[str, str]:
 
 
 def _reached(precision: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Recall and precision of KITTI's samples, as far as there are thresholds."""
+    """Return recall and precision of KITTI's samples up to the last threshold."""
     count = max((k + 1 for k, value in enumerate(precision) if value > 0), default=1)
     return [k / (len(precision) - 1) for k in range(count)], list(precision[:count])
 
@@ -207,7 +208,7 @@ def _markdown(result: EvaluationMetrics, pictures: Mapping[str, str]) -> str:
     lines += [f"- {key}: {value}" for key, value in facts.items()]
     lines += [f"- {note}" for note in result.notes]
     for sheet in build_evaluation_tables(result):
-        lines += ["", *sheet.to_markdown(_WORDS)]
+        lines += ["", *sheet.to_markdown(_TEXT_COLUMNS)]
     for file, text in pictures.items():
         lines += ["", f"![{text}]({file})"]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""Labels and detections as `drivesem eval` takes them: the same frames, the same classes, the same edges."""
+"""Reads and aligns labels and detections for `drivesem eval`: the same frames, classes and box edges."""
 
 from __future__ import annotations
 
@@ -17,36 +17,41 @@ from drivesem.evaluation import kitti
 from drivesem.evaluation.instances import DetectionTable, GroundTruthTable, boxes_from_xywh, boxes_from_xyxy
 from drivesem.report.tables import format_count
 from drivesem.run.labels import detect_labels_layout, read_labels
-from drivesem.store import place
+from drivesem.store import local_copy
 from scene_ir import files
 
-_SHOWN = 3
+_MAX_LISTED = 3
 _KITTI_TYPES = tuple(kind for kind in TYPES if kind != "DontCare")
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationData:
-    """Labels and one or two sets of detections. classes: labels are indices into it. truth_ids (M,): as the file
-    numbers the labels, where it does. weather (F,): of the frames. notes: what a reader of the figures must know.
-    """
+    """Labels, and one or two sets of detections."""
 
     frames: tuple[str, ...]
+    """Names of the frames."""
     classes: tuple[str, ...]
+    """Class names; labels are indices into them."""
     truths: GroundTruthTable
+    """Labels."""
     found: list[DetectionTable]
+    """One or two sets of detections."""
     truth_ids: np.ndarray | None
+    """Ids of the labels in their file (M,), if it has them."""
     weather: tuple[str | None, ...]
+    """Weather of each frame, if known."""
     notes: tuple[str, ...] = ()
+    """Remarks on the evaluation."""
 
 
 def load_evaluation_data(config: EvalConfig) -> EvaluationData:
-    """Read, map and align what the configuration names.
+    """Read labels and detections, and map their classes.
 
-    UsageError or FormatError, one line: ids that do not match, a class that nobody mapped, a score that is no
-    number, no detections at all.
+    Raises UsageError or FormatError for frames that do not match, unmapped classes, invalid scores, or no
+    detections.
     """
-    gt_path = place(config.gt or "", "--gt")
-    paths = [place(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
+    gt_path = local_copy(config.gt or "", "--gt")
+    paths = [local_copy(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
     gt_layout = detect_labels_layout(gt_path) if config.gt_format == "auto" else config.gt_format
     truth = read_labels(gt_path, gt_layout, stage=config.stage)
     wanted = _wanted(config, truth)
@@ -81,7 +86,7 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
 
 
 def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
-    """Classes that a layout has names for, whether they occur or not."""
+    """Return the classes that a layout defines, and those that occur."""
     fixed: tuple[str, ...] = _KITTI_TYPES if layout in ("kitti", "vkitti1", "vkitti2") else ()
     if layout == "run":
         from detectors.types import CLASSES
@@ -101,7 +106,7 @@ def _wanted(config: EvalConfig, truth: LabelTable) -> tuple[str, ...] | None:
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > _SHOWN else "")
+    return ", ".join(names[:_MAX_LISTED]) + (f", ... ({len(names)} in all)" if len(names) > _MAX_LISTED else "")
 
 
 def _aligned(table: LabelTable, truth: LabelTable, path: Path, needed: Sequence[str]) -> LabelTable:
@@ -136,7 +141,7 @@ def _classes(
 
 
 def _used(table: LabelTable) -> list[str]:
-    """The kinds that occur."""
+    """Return the classes that occur."""
     return [table.kinds[i] for i in np.unique(table.kind[table.kind >= 0]).tolist()]
 
 
@@ -152,14 +157,22 @@ def _chosen(config: EvalConfig, classes: Sequence[str]) -> tuple[str, ...] | Non
 
 
 def parse_class_list(text: str) -> tuple[str, ...]:
-    """The names of "Car,Van", each once."""
+    """Parse "Car,Van" into unique names."""
     return tuple(dict.fromkeys(word.strip() for word in text.split(",")))
 
 
 def _renamed(
     table: LabelTable, mapping: Mapping[str, str | None], classes: Sequence[str], path: Path, option: str
 ) -> LabelTable:
-    """The table with `classes` as its kinds; boxes of a class that is left out are left out."""
+    """Rename classes, and drop the boxes of excluded ones.
+
+    Args:
+        table: The boxes.
+        mapping: New names of classes; None excludes a class.
+        classes: Classes of the result.
+        path: File of the table, for errors.
+        option: Option of the mapping, for errors.
+    """
     index = {name.lower(): i for i, name in reversed(list(enumerate(classes)))}
     exact = {name: i for i, name in enumerate(classes)}
     unknown = sorted(set(mapping) - set(table.kinds))
@@ -193,7 +206,7 @@ def _renamed(
 def _selection(
     kind: np.ndarray, kinds: Sequence[str], chosen: Sequence[str] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which boxes are of a chosen class or a region, and their labels among the chosen."""
+    """Return which boxes belong to a selected class or a region, and their labels among the selected classes."""
     if chosen is None:
         return np.ones(len(kind), np.bool_), kind
     places = np.full(len(kinds) + 1, len(chosen))
@@ -229,7 +242,7 @@ def _found(table: LabelTable, chosen: Sequence[str] | None) -> DetectionTable:
 
 
 def _notes(config: EvalConfig, truths: GroundTruthTable) -> tuple[str, ...]:
-    """What a reader of the figures must know."""
+    """Return remarks on the evaluation."""
     notes: list[str] = []
     if config.protocol == "kitti":
         unknown = int(((truths.occlusion < 0) & ~truths.ignore & (truths.label >= 0)).sum())
@@ -251,5 +264,7 @@ def _notes(config: EvalConfig, truths: GroundTruthTable) -> tuple[str, ...]:
                 )
             )
         judged = ", ".join(kitti.CLASSES)
-        notes.append(f"judged are {judged}; detections below the minimum height: {config.small_detections}")
+        notes.append(
+            f"evaluated classes: {judged}; detections below the minimum height: {config.small_detections}"
+        )
     return tuple(notes)

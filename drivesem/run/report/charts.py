@@ -1,7 +1,6 @@
-"""Curves and falls as inline SVG.
+"""Draws curves and drops of metrics as inline SVG.
 
-Colours are classes (`s0`, `s1`, ...) that the style sheet fills in, for light and dark; dashes are a second sign
-beside them.
+Colours are CSS classes (`s0`, `s1`, ...) for light and dark; dashes distinguish lines without colour.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from markupsafe import Markup, escape
 from drivesem.run.report.page import ChartLine, Point, ReportChart
 
 SERIES = 7
-"""Colours in the style sheet; more lines repeat them with other dashes."""
+"""Colours in the style sheet; further lines repeat them with other dashes."""
 _DASHES = ("", "7 4", "2 3", "10 3 2 3")
 _WIDTH, _HEIGHT = 560, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 12, 46
@@ -25,17 +24,21 @@ _ROW_PX, _NAME_LEFT, _BAR_LEFT, _BAR_RIGHT = 46, 6, 60, 60
 
 @dataclass(frozen=True, slots=True)
 class MetricDrop:
-    """A figure before and after, in percent. theirs: the paper's, not ours."""
+    """A metric before and after the attack."""
 
     name: str
+    """Label."""
     before: float
+    """Value before, percent."""
     after: float
-    theirs: bool = False
+    """Value after, percent."""
+    from_paper: bool = False
+    """Whether it is the paper's."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Axes:
-    """From values to places in the picture, px."""
+class _ChartAxes:
+    """Maps values to px."""
 
     low: float
     high: float
@@ -60,29 +63,29 @@ class _Axes:
 
 
 def curve_chart(chart: ReportChart) -> Markup:
-    """The chart as `<svg>`, with a text for those who do not see it."""
-    axes = _Axes(*chart.x_range, chart.log2_x)
+    """Draw a chart as `<svg>`, with a text alternative."""
+    axes = _ChartAxes(*chart.x_range, chart.log2_x)
     parts = [_frame(chart, axes)]
     parts += [_line(line, place, axes) for place, line in reversed(list(enumerate(chart.lines)))]
-    told = f"{chart.title}: {chart.y_label} over {chart.x_label}. {_told(chart.lines)}"
+    text = f"{chart.title}: {chart.y_label} over {chart.x_label}. {_describe_lines(chart.lines)}"
     return Markup(
-        f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(told)}">'
+        f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(text)}">'
         f"{''.join(parts)}</svg>"
     )
 
 
 def legend_key(place: int) -> Markup:
-    """The sign of the i-th line, for a legend."""
+    """Draw the i-th line's sample in a legend."""
     return Markup(
         f'<svg class="sign" viewBox="0 0 34 10" aria-hidden="true"><path class="line s{place % SERIES}"'
         f'{_dash(place)} d="M1 5H33"/></svg>'
     )
 
 
-def drop_chart(falls: Sequence[MetricDrop], label: str) -> Markup:
-    """Rows that lead from before to after on one scale of percent; `label` names the figure."""
-    height = _ROW_PX * len(falls) + 34
-    lowest = min([100.0, *(min(f.before, f.after) for f in falls)])
+def drop_chart(drops: Sequence[MetricDrop], label: str) -> Markup:
+    """Draw a row per metric from before to after on a common scale, percent. label: name of the metric."""
+    height = _ROW_PX * len(drops) + 34
+    lowest = min([100.0, *(min(f.before, f.after) for f in drops)])
     low = max(0.0, 10 * math.floor((lowest - 5) / 10))
     scale = (_WIDTH - _BAR_LEFT - _BAR_RIGHT) / (100 - low)
 
@@ -90,7 +93,7 @@ def drop_chart(falls: Sequence[MetricDrop], label: str) -> Markup:
         return _BAR_LEFT + (value - low) * scale
 
     parts = []
-    bottom = _ROW_PX * len(falls)
+    bottom = _ROW_PX * len(drops)
     step = 10 if low >= 40 else 20
     for tick in range(int(low), 101, step):
         parts.append(
@@ -100,46 +103,52 @@ def drop_chart(falls: Sequence[MetricDrop], label: str) -> Markup:
     parts.append(
         f'<text class="axis" x="{x(100):.1f}" y="{bottom + 31}" text-anchor="end">{escape(label)}, %</text>'
     )
-    for row, fall in enumerate(falls):
+    for row, drop in enumerate(drops):
         y = row * _ROW_PX + 31
-        kind = "theirs" if fall.theirs else "ours"
-        # the figures stand outside the dots, so that they cannot meet
-        side = 1 if fall.after >= fall.before else -1
+        kind = "theirs" if drop.from_paper else "ours"
+        # values stand outside the dots, so that they cannot overlap
+        side = 1 if drop.after >= drop.before else -1
         ends = ("end", "start") if side < 0 else ("start", "end")
         parts.append(
-            f'<text class="name" x="{_NAME_LEFT}" y="{y - 14}">{escape(fall.name)}</text>'
-            f'<g class="{kind}"><path class="way" d="M{x(fall.before):.1f} {y}H{x(fall.after):.1f}"/>'
-            f'<circle class="from" cx="{x(fall.before):.1f}" cy="{y}" r="5"/>'
-            f'<circle class="to" cx="{x(fall.after):.1f}" cy="{y}" r="6"/></g>'
-            f'<text class="value" x="{x(fall.before) - side * 10:.1f}" y="{y + 4}" text-anchor="{ends[1]}">'
-            f"{fall.before:.1f}</text>"
-            f'<text class="value strong" x="{x(fall.after) + side * 11:.1f}" y="{y + 4}" text-anchor="{ends[0]}">'
-            f"{fall.after:.1f}</text>"
+            f'<text class="name" x="{_NAME_LEFT}" y="{y - 14}">{escape(drop.name)}</text>'
+            f'<g class="{kind}"><path class="way" d="M{x(drop.before):.1f} {y}H{x(drop.after):.1f}"/>'
+            f'<circle class="from" cx="{x(drop.before):.1f}" cy="{y}" r="5"/>'
+            f'<circle class="to" cx="{x(drop.after):.1f}" cy="{y}" r="6"/></g>'
+            f'<text class="value" x="{x(drop.before) - side * 10:.1f}" y="{y + 4}" text-anchor="{ends[1]}">'
+            f"{drop.before:.1f}</text>"
+            f'<text class="value strong" x="{x(drop.after) + side * 11:.1f}" y="{y + 4}" text-anchor="{ends[0]}">'
+            f"{drop.after:.1f}</text>"
         )
-    told = "; ".join(f"{f.name}: {f.before:.1f} to {f.after:.1f}" for f in falls)
+    text = "; ".join(f"{f.name}: {f.before:.1f} to {f.after:.1f}" for f in drops)
     return Markup(
         f'<svg class="chart falls" viewBox="0 0 {_WIDTH} {height}" role="img" '
-        f'aria-label="{escape(f"{label}, percent, before and after. {told}")}">{"".join(parts)}</svg>'
+        f'aria-label="{escape(f"{label}, percent, before and after. {text}")}">{"".join(parts)}</svg>'
     )
 
 
 def loss_trace_chart(values: Sequence[float], width: int = 180, height: int = 40) -> Markup:
-    """A frame's loss by query, from its least to its greatest value."""
+    """Draw a frame's loss by query.
+
+    Args:
+        values: Loss of each query.
+        width: Width, px.
+        height: Height, px.
+    """
     low, high = min(values), max(values)
     places = " ".join(
         f"{4 + (width - 8) * i / max(len(values) - 1, 1):.1f},"
         f"{height - 4 - (height - 8) * (v - low) / max(high - low, 1e-12):.1f}"
         for i, v in enumerate(values)
     )
-    told = f"Loss by query: from {values[0]:.3g} to {values[-1]:.3g}, at most {high:.3g}"
+    text = f"Loss by query: from {values[0]:.3g} to {values[-1]:.3g}, at most {high:.3g}"
     return Markup(
-        f'<svg class="trace" viewBox="0 0 {width} {height}" role="img" aria-label="{told}">'
+        f'<svg class="trace" viewBox="0 0 {width} {height}" role="img" aria-label="{text}">'
         f'<polyline class="line s0" points="{places}"/></svg>'
     )
 
 
-def _frame(chart: ReportChart, axes: _Axes) -> str:
-    """Grid, ticks and the names of the axes."""
+def _frame(chart: ReportChart, axes: _ChartAxes) -> str:
+    """Draw the grid, ticks and labels of the axes."""
     bottom, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
     parts = []
     for tick in range(0, 101, _TICK):
@@ -163,7 +172,7 @@ def _frame(chart: ReportChart, axes: _Axes) -> str:
     return "".join(parts)
 
 
-def _line(line: ChartLine, place: int, axes: _Axes) -> str:
+def _line(line: ChartLine, place: int, axes: _ChartAxes) -> str:
     colour = f"s{place % SERIES}"
     parts = []
     if line.band:
@@ -180,7 +189,7 @@ def _line(line: ChartLine, place: int, axes: _Axes) -> str:
     return "".join(parts)
 
 
-def _path(points: Sequence[Point], steps: bool, axes: _Axes) -> list[str]:
+def _path(points: Sequence[Point], steps: bool, axes: _ChartAxes) -> list[str]:
     found: list[str] = []
     for i, (x, y) in enumerate(points):
         if steps and i:
@@ -194,7 +203,7 @@ def _dash(place: int) -> str:
     return f' stroke-dasharray="{dash}"' if dash else ""
 
 
-def _told(lines: Sequence[ChartLine]) -> str:
+def _describe_lines(lines: Sequence[ChartLine]) -> str:
     ends = (
         f"{line.name} ends at {line.points[-1][0]:.0f}, {line.points[-1][1]:.0f}" for line in lines if line.points
     )

@@ -1,4 +1,4 @@
-"""A frame as the page shows it: pictures, boxes, what failed, what changed. Boxes are px of the run's pictures."""
+"""Prepares frames for the page: pictures, boxes, failures and changes. Boxes are in px of the run's pictures."""
 
 from __future__ import annotations
 
@@ -21,25 +21,24 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 QUALITIES = (82, 74, 66, 58)
-"""Of WebP, the best that keeps a frame's photograph small enough; all pictures of a frame have the same, lest the
-flip from one to another show what only the encoder did. At 82 generated frames have the PSNR of JPEG at 88 in half
-of the bytes.
+"""WebP qualities, best first; the first that keeps a frame's photograph small enough serves all of its pictures, so that
+flipping between them shows no encoder artefacts. Generated frames at 82 have the PSNR of JPEG at 88 in half the size.
 """
 MOST_BYTES = 72_000
-"""Of an encoded photograph: with as much for the counterexample, and close-ups, 100 frames stay below 25 MB."""
+"""Largest size of an encoded photograph; with counterexamples and close-ups, 100 frames stay below 25 MB."""
 CLOSE_QUALITY = 80
 _EFFORT = 2
-"""Of WebP's encoder: 0.02 s a frame; 4, the default, gains 5 % and takes ten times as long."""
+"""Effort of the WebP encoder, 0.02 s per frame; the default, 4, saves 5 % and takes ten times as long."""
 LARGEST_PX = 1600
-"""Longest side of a picture in the page; the full one lies beside it."""
+"""Longest side of a picture on the page; the run's folder has it at full size."""
 _CLOSE_UPS = 3
-"""Failures of a frame that are shown close up."""
+"""Number of close-ups per frame."""
 _CLOSE_ROOM, _CLOSE_LEAST_PX, _CLOSE_LARGEST_PX = 1.8, 96, 280
-"""A close-up is so many times as large as the box, at least so wide, and encoded at most so wide."""
+"""Size of a close-up relative to the box, its least width in the picture, and its largest encoded width, px."""
 _ASPECT = 4 / 3
 _THREADS = 2
 _OVERLAP = 0.5
-"""IoU from which a detection is of a box, as failures are judged."""
+"""IoU from which a detection matches a box."""
 _PARAMETERS = {
     "paint": "color",
     "weather": "weather",
@@ -50,41 +49,49 @@ _PARAMETERS = {
     "size": "size",
     "sun": "sun",
 }
-"""The parameter by the first word of a coordinate's name, after the object it belongs to."""
+"""Parameter by the first word of a coordinate's name after its object."""
 _FAILED = ("lost", "phantom")
 _CUT_BEFORE, _CUT_LEAST = 4, 2
-"""Percent of the width."""
+"""Percent of the picture's width."""
 _LABEL_ROOM = 8.0
-"""Percent of the height that a label takes."""
+"""Height of a label, percent of the picture's height."""
 _NEAR = 0.2
-"""IoU with a failure from which another box is shown in its close-up."""
+"""IoU with a failure from which another box appears in its close-up."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxMark:
-    """A box to be drawn. kind: true, ignored, found, lost or phantom; x, y, width, height: px; left, top, bottom:
-    percent of the picture; text: of its label; unsure: a failure that chance may explain.
-    """
+    """A box drawn on a picture."""
 
     kind: str
+    """true, ignored, found, lost or phantom."""
     x: float
+    """Left side, px."""
     y: float
+    """Top side, px."""
     width: float
+    """Width, px."""
     height: float
+    """Height, px."""
     left: float
+    """Left side, percent of the picture."""
     top: float
+    """Top side, percent."""
     bottom: float
+    """Bottom side, percent."""
     text: str
+    """Label."""
     unsure: bool = False
+    """Whether chance may explain the failure."""
 
     @property
     def label_below(self) -> bool:
-        """Where its label hangs: below what was made up, which often lies on something lost."""
+        """Whether its label hangs below the box, as for phantoms, which often lie on a lost object."""
         return self.kind == "phantom" or self.top < _LABEL_ROOM
 
     @property
     def label_top(self) -> float:
-        """Of the corner at which the label is, percent of the picture; inside the box at the picture's edge."""
+        """Top of the label, percent of the picture; inside the box at the picture's edge."""
         if not self.label_below:
             return self.top
         return self.bottom if self.bottom < 100 - _LABEL_ROOM else self.top
@@ -92,116 +99,154 @@ class BoxMark:
 
 @dataclass(frozen=True, slots=True)
 class CloseUp:
-    """A failure, cut out of both pictures. view: x, y, width, height, px, of what is shown; text: what happened;
-    grade: how sure that is, "" where nobody asked; rank: of it, as of `grading.rank`; evidence: draws, and what a
-    second renderer and another detector say; scores: what the detector said of it before and after.
-    """
+    """A failure, cropped from both pictures."""
 
     kind: str
+    """"lost" or "phantom"."""
     text: str
+    """Description of the failure."""
     grade: str
+    """Grade."""
     rank: int
+    """Its rank (`grade_rank`)."""
     evidence: tuple[str, ...]
+    """Draws and second opinions."""
     scores: str
+    """Scores of the detector before and after."""
     view: tuple[float, float, float, float]
+    """Cropped part: x, y, width, height, px."""
     before: str
+    """Crop before the change, a data URL."""
     after: str
+    """Crop after the change, a data URL."""
     marks_before: tuple[BoxMark, ...]
+    """Boxes before."""
     marks_after: tuple[BoxMark, ...]
+    """Boxes after."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnerChange:
-    """What happened to one owner (`object 2`, `scene`): parts such as ("along", "+0.14 m")."""
+    """Changes of one object, or of the scene."""
 
     owner: str
+    """Such as `object 2` or `scene`."""
     parts: tuple[tuple[str, str], ...]
+    """Names and values, such as ("along", "+0.14 m")."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailureRow:
-    """A failure as text. margin: in logits, before and after; score: the detector's, before and after."""
+    """A failure as text."""
 
     text: str
+    """Description."""
     grade: str
+    """Grade."""
     draws: str
+    """Draws of the certificate."""
     margin: str
+    """Margins before and after, logits."""
     second: str
+    """Opinion of the second renderer."""
     peer: str
+    """Opinion of the second detector."""
     score: str
+    """Scores before and after."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameOutcome:
-    """A frame in one run. size: the greatest share of its bound that a coordinate takes, percent; params: those
-    that changed; furthest, turned: the greatest move and turn, as text; risen: the loss, last less first.
-    """
+    """One frame in one run."""
 
     run: ReportedRun
+    """The run."""
     result: FrameResult
+    """The result."""
     lost: int
+    """Number of lost objects."""
     phantoms: int
+    """Number of phantoms."""
     size: float
+    """Largest share of its bound that a coordinate takes, percent."""
     params: tuple[str, ...]
+    """Changed parameters."""
     furthest: str
+    """Largest move, as text."""
     turned: str
+    """Largest turn, as text."""
     risen: float
+    """Rise of the loss from first to last query."""
     changes: tuple[OwnerChange, ...]
+    """Changes by owner."""
     rows: tuple[FailureRow, ...]
+    """Failures, highest grade first."""
 
     @property
     def failures(self) -> int:
-        """Lost objects and phantoms."""
+        """Number of lost objects and phantoms."""
         return self.lost + self.phantoms
 
     @property
     def rank(self) -> int:
-        """Of its surest failure, as of `grading.rank`."""
+        """Rank of its highest grade (`grade_rank`)."""
         return max(map(grading.grade_rank, self.result.failures), default=0)
 
     @property
     def surest(self) -> int:
-        """Failures of the highest grade."""
+        """Number of failures of the highest grade."""
         return sum(grading.grade_rank(f) == self.rank for f in self.result.failures) if self.rank else 0
 
     @property
     def sure(self) -> int:
-        """Failures that are certain, or more than that."""
+        """Number of failures that are at least certain."""
         return sum(map(grading.is_certain, self.result.failures))
 
     @property
     def grade(self) -> str:
-        """The highest; "" without a failure, or where nobody asked."""
+        """Highest grade; "" without a failure."""
         ranks = {grading.grade_rank(f): f.grade or "" for f in self.result.failures}
         return ranks[max(ranks)] if ranks else ""
 
 
 @dataclass(frozen=True, slots=True)
 class PictureLayer:
-    """A picture with its boxes. sets: the boxes by run, each with the places of the runs that share them."""
+    """A picture with its boxes."""
 
     title: str
+    """Title."""
     alt: str
+    """Text alternative."""
     source: str
+    """Data URL."""
     sets: tuple[tuple[tuple[int, ...], tuple[BoxMark, ...]], ...]
+    """Sets of boxes, each with the numbers of the runs that have it."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameCard:
-    """A frame in all runs; layers (the photograph, then one a run) and close-ups where it is in the gallery."""
+    """A frame in all runs."""
 
     identifier: str
+    """The frame."""
     anchor: str
+    """Anchor on the page."""
     weather: str | None
+    """Weather of the frame, if known."""
     outcomes: tuple[FrameOutcome, ...]
+    """Outcome in each run."""
     width: int = 0
+    """Width of the pictures, px."""
     height: int = 0
+    """Height, px."""
     layers: tuple[PictureLayer, ...] = ()
+    """The photograph, then a picture per run; empty outside the gallery."""
     close_ups: tuple[tuple[CloseUp, ...], ...] = ()
+    """Close-ups per run."""
 
     @property
     def cut(self) -> int:
-        """Where the slider begins, percent: in the middle, or left of what failed, which is then seen."""
+        """Initial position of the slider, percent: in the middle, or left of the first failure."""
         failed = (
             m.left for layer in self.layers[1:2] for _, marks in layer.sets for m in marks if m.kind in _FAILED
         )
@@ -209,48 +254,50 @@ class FrameCard:
 
     @property
     def failures(self) -> int:
-        """Of all runs."""
+        """Number of failures in all runs."""
         return sum(one.failures for one in self.outcomes)
 
     @property
     def rank(self) -> int:
-        """Of the surest failure in any run, as of `grading.rank`."""
+        """Rank of the highest grade in any run (`grade_rank`)."""
         return max(one.rank for one in self.outcomes)
 
     @property
     def grade(self) -> str:
-        """The highest in any run; "" without a failure, or where nobody asked."""
+        """Highest grade in any run; "" without a failure."""
         return max(self.outcomes, key=lambda one: one.rank).grade
 
     @property
     def surest(self) -> int:
-        """Failures of the highest grade, of all runs."""
+        """Number of failures of the highest grade, in all runs."""
         return sum(one.surest for one in self.outcomes if one.rank == self.rank)
 
     @property
     def lost(self) -> int:
-        """The most that a run lost."""
+        """Largest number of lost objects in a run."""
         return max(one.lost for one in self.outcomes)
 
     @property
     def phantoms(self) -> int:
-        """The most that a run made up."""
+        """Largest number of phantoms in a run."""
         return max(one.phantoms for one in self.outcomes)
 
     @property
     def size(self) -> float:
-        """The largest change, percent of a bound."""
+        """Largest change, percent of its bound."""
         return max(one.size for one in self.outcomes)
 
     @property
     def params(self) -> tuple[str, ...]:
-        """Those that a run changed."""
+        """Parameters that a run changed."""
         return tuple(p for p in _PARAMETERS.values() if any(p in one.params for one in self.outcomes))
 
 
 def build_cards(runs: Sequence[ReportedRun], gallery: int) -> list[FrameCard]:
-    """All frames, worst first: by the highest grade, then most failures of it, then most of any, then the smallest
-    change that was enough; pictures for the first `gallery`. Raises FormatError where a picture is missing.
+    """Prepare all frames, worst first, with pictures for the first `gallery`.
+
+    Frames are ordered by highest grade, number of failures of that grade, number of failures, and smallest change.
+    Raises FormatError if a picture is missing.
     """
     plain = [
         FrameCard(
@@ -282,17 +329,17 @@ def _outcome(run: ReportedRun, result: FrameResult) -> FrameOutcome:
         turned=_greatest(changed, "rotate"),
         risen=trace[-1] - trace[0] if trace else 0.0,
         changes=_changes(changed),
-        rows=tuple(_row(result, failure) for failure in _surest_first(result.failures)),
+        rows=tuple(_failure_row(result, failure) for failure in _by_grade(result.failures)),
     )
 
 
-def _surest_first(failures: Sequence[Failure]) -> list[Failure]:
+def _by_grade(failures: Sequence[Failure]) -> list[Failure]:
     return sorted(failures, key=lambda failure: -grading.grade_rank(failure))
 
 
-def _row(result: FrameResult, failure: Failure) -> FailureRow:
+def _failure_row(result: FrameResult, failure: Failure) -> FailureRow:
     return FailureRow(
-        text=_named(failure),
+        text=_describe_with_object(failure),
         grade=failure.grade or "",
         draws=grading.format_draws(failure),
         margin=grading.format_margins(failure.count),
@@ -302,24 +349,24 @@ def _row(result: FrameResult, failure: Failure) -> FailureRow:
     )
 
 
-def _named(failure: Failure) -> str:
+def _describe_with_object(failure: Failure) -> str:
     return grading.describe_failure(failure) + ("" if failure.index is None else f", object {failure.index}")
 
 
 def _parameter(coordinate: Coordinate) -> str:
-    """`rotate` of `objects[3].yaw`; the word itself where it is unknown."""
+    """Return the parameter of a coordinate, such as `rotate` for `objects[3].yaw`."""
     word = coordinate.name.split("].", 1)[-1].split(".")[0].split("[")[0]
     return _PARAMETERS.get(word, word)
 
 
 def _share(c: Coordinate) -> float:
-    """How much of the bound on its side a coordinate takes."""
+    """Return a coordinate's share of its bound, in [0, 1]."""
     bound = c.upper if c.value > 0 else -c.lower
     return abs(c.value) / bound if bound > 0 else 0.0
 
 
 def _amount(display: str) -> float:
-    """The number in front of a unit, without its sign; 0 where there is none."""
+    """Return the absolute number in front of a unit, or 0."""
     try:
         return abs(float(display.split(" ")[0]))
     except ValueError:
@@ -327,13 +374,13 @@ def _amount(display: str) -> float:
 
 
 def _greatest(changed: Sequence[Coordinate], parameter: str) -> str:
-    """The display of a parameter's greatest change, without its sign; "" where there is none."""
+    """Return the display of a parameter's largest change without its sign, or ""."""
     mine = [c.display.lstrip("+-") for c in changed if _parameter(c) == parameter]
     return max(mine, key=_amount, default="")
 
 
 def _changes(changed: Sequence[Coordinate]) -> tuple[OwnerChange, ...]:
-    """By owner, in their order; the many offsets of a mesh as one."""
+    """Group changes by owner, with the offsets of a mesh as one entry."""
     owners: dict[str, list[Coordinate]] = {}
     for c in changed:
         head, _, _ = c.name.partition("].")
@@ -350,19 +397,19 @@ def _changes(changed: Sequence[Coordinate]) -> tuple[OwnerChange, ...]:
 
 
 def _word(c: Coordinate) -> str:
-    """`along` of `objects[0].translate.along`, `turn` of a yaw."""
+    """Return a short name, such as `along` for `objects[0].translate.along`, or `turn` for a yaw."""
     name = c.name.split("].", 1)[-1].removeprefix("translate.").replace("_", " ").replace(".", " ")
     return "turn" if name == "yaw" else name
 
 
 def _signed(display: str) -> str:
-    """With a true minus or a plus, and the degree sign."""
+    """Format a value with a minus or plus sign, and a degree sign."""
     text = display.removesuffix(" deg") + "°" if display.endswith(" deg") else display
     return f"−{text[1:]}" if text.startswith("-") else f"+{text}"
 
 
 def format_size(display: str) -> str:
-    """A size for people: `1.6°`, `0.14 m`, or a dash."""
+    """Format a size for people: `1.6°`, `0.14 m`, or a dash."""
     return _signed(display)[1:] if display else "–"
 
 
@@ -374,7 +421,7 @@ def _with_pictures(card: FrameCard) -> FrameCard:
     encoded, quality = _small(_reduced(photograph, LARGEST_PX))
     before = PictureLayer(
         title="before",
-        alt=f"Frame {card.identifier} before the change: {_told_before(first)}",
+        alt=f"Frame {card.identifier} before the change: {_describe_vehicles(first)}",
         source=_address(encoded),
         sets=_shared([_before(one, (width, height)) for one in card.outcomes]),
     )
@@ -382,7 +429,7 @@ def _with_pictures(card: FrameCard) -> FrameCard:
     after = [
         PictureLayer(
             title=one.run.name if several else "after",
-            alt=f"Frame {card.identifier} after the change{f' by {one.run.name}' if several else ''}: {told(one)}",
+            alt=f"Frame {card.identifier} after the change{f' by {one.run.name}' if several else ''}: {describe_outcome(one)}",
             source=_address(_encoded(_reduced(picture, LARGEST_PX), quality)),
             sets=(((place,), _after(one, (width, height))),),
         )
@@ -390,8 +437,7 @@ def _with_pictures(card: FrameCard) -> FrameCard:
     ]
     close_ups = tuple(
         tuple(
-            _close_up(one, failure, photograph, picture)
-            for failure in _surest_first(one.result.failures)[:_CLOSE_UPS]
+            _close_up(one, failure, photograph, picture) for failure in _by_grade(one.result.failures)[:_CLOSE_UPS]
         )
         for one, picture in zip(card.outcomes, pictures, strict=True)
     )
@@ -408,7 +454,7 @@ def _with_pictures(card: FrameCard) -> FrameCard:
 
 
 def describe_outcome(one: FrameOutcome) -> str:
-    """`1 certain of 1 lost, 2 phantoms`."""
+    """Describe failures, such as `1 certain of 1 lost, 2 phantoms`."""
     parts = [f"{one.lost} lost"] if one.lost else []
     if one.phantoms:
         parts.append(format_count(one.phantoms, "phantom"))
@@ -418,12 +464,12 @@ def describe_outcome(one: FrameOutcome) -> str:
     return sure + ", ".join(parts)
 
 
-def _told_before(one: FrameOutcome) -> str:
+def _describe_vehicles(one: FrameOutcome) -> str:
     return format_count(one.result.objects, "vehicle")
 
 
 def _shared(sets: Sequence[tuple[BoxMark, ...]]) -> tuple[tuple[tuple[int, ...], tuple[BoxMark, ...]], ...]:
-    """Equal sets once, with the places that have them."""
+    """Merge equal sets of boxes; return each with the runs that have it."""
     places: dict[tuple[BoxMark, ...], list[int]] = {}
     for place, marks in enumerate(sets):
         places.setdefault(marks, []).append(place)
@@ -442,8 +488,8 @@ def _after(one: FrameOutcome, size: tuple[int, int]) -> tuple[BoxMark, ...]:
             _mark(f.kind, f.xyxy, f"{grading.what(f)}{f': {f.grade}' if grading.is_sure(f) else ''}", size),
             unsure=f.grade is not None and not grading.is_certain(f),
         )
-        # What is surest is drawn last, over the others.
-        for f in reversed(_surest_first(result.failures))
+        # the highest grade is drawn last, over the others
+        for f in reversed(_by_grade(result.failures))
     )
     return (
         *_true(result.targets_moved, size),
@@ -453,7 +499,7 @@ def _after(one: FrameOutcome, size: tuple[int, int]) -> tuple[BoxMark, ...]:
 
 
 def _true(boxes: Sequence[BoxRecord], size: tuple[int, int]) -> list[BoxMark]:
-    """A region that is ignored for several classes is drawn once."""
+    """Mark true boxes; a region that is ignored for several classes is drawn once."""
     marks = [_mark("ignored" if b.ignore else "true", b.xyxy, b.label, size) for b in boxes]
     seen = {mark.kind + str((mark.x, mark.y, mark.width, mark.height)): mark for mark in marks}
     return list(seen.values())
@@ -468,7 +514,7 @@ def _found(boxes: Sequence[BoxRecord], threshold: float, size: tuple[int, int]) 
 
 
 def _mark(kind: str, xyxy: tuple[float, float, float, float], text: str, size: tuple[int, int]) -> BoxMark:
-    """Cut off at the picture's edge, so that every side can be seen."""
+    """Make a mark, clipped so that all sides lie inside the picture."""
     x0, x1 = (min(max(v, 1.0), size[0] - 1.0) for v in xyxy[0::2])
     y0, y1 = (min(max(v, 1.0), size[1] - 1.0) for v in xyxy[1::2])
     return BoxMark(
@@ -488,7 +534,7 @@ def _close_up(one: FrameOutcome, failure: Failure, photograph: Image, picture: I
     size = photograph.size
     before = _before_it_moved(one.result, failure)
     view = _view(_hull(before, failure.xyxy), size)
-    row = _row(one.result, failure)
+    row = _failure_row(one.result, failure)
     return CloseUp(
         kind=failure.kind,
         text=row.text,
@@ -505,7 +551,7 @@ def _close_up(one: FrameOutcome, failure: Failure, photograph: Image, picture: I
 
 
 def _before_it_moved(result: FrameResult, failure: Failure) -> tuple[float, float, float, float]:
-    """Where the lost object was; of a phantom, where it is."""
+    """Return the box before the change: of the lost object, or of the phantom itself."""
     mine = (
         t.xyxy
         for t in result.targets_benign
@@ -515,7 +561,7 @@ def _before_it_moved(result: FrameResult, failure: Failure) -> tuple[float, floa
 
 
 def _scores(result: FrameResult, failure: Failure, before: tuple[float, float, float, float]) -> str:
-    """What the detector said there, of that class: the best score before and after."""
+    """Format the best score of the class on the box, before and after."""
     best = (
         _best(result.detections_benign, before, failure.label),
         _best(result.detections_attacked, failure.xyxy, failure.label),
@@ -545,7 +591,7 @@ def _hull(
 
 
 def _view(xyxy: tuple[float, float, float, float], size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """A part of the picture around a box: x, y, width, height in whole px, 4 to 3 where there is room."""
+    """Return the part of the picture around a box: x, y, width, height, px; 4 to 3 if there is room."""
     x0, y0, x1, y1 = xyxy
     wanted = max(_CLOSE_ROOM * (x1 - x0), _CLOSE_ROOM * (y1 - y0) * _ASPECT, _CLOSE_LEAST_PX)
     width = min(math.ceil(wanted), size[0], math.floor(size[1] * _ASPECT))
@@ -556,7 +602,7 @@ def _view(xyxy: tuple[float, float, float, float], size: tuple[int, int]) -> tup
 
 
 def _near(xyxy: tuple[float, float, float, float], marks: Sequence[BoxMark]) -> tuple[BoxMark, ...]:
-    """Those that lie on a failure, but for what is ignored."""
+    """Select the marks that overlap a failure, without ignored ones."""
     return tuple(
         m for m in marks if m.kind != "ignored" and _iou(xyxy, (m.x, m.y, m.x + m.width, m.y + m.height)) >= _NEAR
     )
@@ -587,7 +633,7 @@ def _reduced(picture: Image, longest: int) -> Image:
 
 
 def _small(picture: Image) -> tuple[bytes, int]:
-    """A picture at the best quality that is small enough, or at the worst; and that quality."""
+    """Encode a picture at the best quality that is small enough, or the lowest. Returns that quality, too."""
     encoded, quality = b"", QUALITIES[0]
     for quality in QUALITIES:
         encoded = _encoded(picture, quality)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page from runs' results: no network, no server."""
+"""Renders the self-contained HTML page of runs: no network, no server."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivesem.report import web
 from drivesem.report.tables import format_count
 from drivesem.run.report import page as grading
 from drivesem.run.report.charts import MetricDrop, curve_chart, drop_chart, legend_key, loss_trace_chart
-from drivesem.run.report.frames import FrameCard, CloseUp, build_cards, format_size, describe_outcome
+from drivesem.run.report.frames import CloseUp, FrameCard, build_cards, describe_outcome, format_size
 from drivesem.run.report.page import ReportedRun, ReportPage
 from drivesem.run.results import RunSummary
 
@@ -29,31 +29,31 @@ _COLUMNS = {
     "recall at t*": "recall_at_t_star",
 }
 _GLANCE = 4
-"""Failures at the head of the page."""
+"""Failures at the top of the page."""
 _LARGEST_SIZE = 100
 _FROM_CERTAIN = (Grade.CERTAIN, Grade.CONFIRMED, Grade.SHARED)
 _NONE = "–"
 
 
 @dataclass(frozen=True, slots=True)
-class _Row:
+class _MetricRow:
     name: str
     cells: tuple[str, ...]
     words: tuple[str, ...] = ()
-    theirs: bool = False
+    from_paper: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class _Tile:
+class _SummaryTile:
     title: str
     figure: str
     more: str
 
 
 def render_report(page: ReportPage, at: Path) -> str:
-    """The page's text. at: the file it will be, from which its links lead to the runs' folders.
+    """Return the text of the page. at: its file, which links to the runs' folders are relative to.
 
-    Raises FormatError where a picture of the gallery is missing.
+    Raises FormatError if a picture of the gallery is missing.
     """
     runs, several = page.runs, len(page.runs) > 1
     cards = build_cards(runs, page.gallery)
@@ -63,9 +63,9 @@ def render_report(page: ReportPage, at: Path) -> str:
         "drivesem.run.report:page.js",
         link_to=lambda folder, frame=None: _link(at, folder, frame),
         scene_of=lambda folder, frame: shlex.quote((folder / "frames" / frame / "scene").as_posix()),
-        told=describe_outcome,
-        in_units=format_size,
-        trace=loss_trace_chart,
+        describe_outcome=describe_outcome,
+        format_size=format_size,
+        loss_trace_chart=loss_trace_chart,
         title=f"{len(runs)} runs" if several else f"{first.summary.detector} on {first.summary.dataset}",
         runs=runs,
         several=several,
@@ -78,7 +78,7 @@ def render_report(page: ReportPage, at: Path) -> str:
         frames=len(cards),
         left_out=page.left_out,
         paper_before=next((f"{100 * run.paper.before:.1f}" for run in runs if run.paper), ""),
-        falls=_falls(runs),
+        falls=_draw_drops(runs),
         charts=[
             {
                 "title": chart.title,
@@ -106,7 +106,7 @@ def render_report(page: ReportPage, at: Path) -> str:
 
 
 def _link(at: Path, folder: Path, frame: str | None) -> str:
-    """A relative URL that ends in a slash."""
+    """Return a relative URL that ends in a slash."""
     target = folder if frame is None else folder / "frames" / frame
     relative = os.path.relpath(target.resolve(), at.resolve().parent)
     return quote(Path(relative).as_posix()) + "/"
@@ -138,13 +138,13 @@ def _verdict(run: ReportedRun) -> str:
         return f"{failures} of {summary.detector}, in {frames} of {format_count(summary.frames, 'frame')}"
     parts = [f"loses {format_count(lost, 'object')}"] if lost else []
     if phantoms:
-        parts.append(f"makes up {phantoms if lost else format_count(phantoms, 'object')}")
+        parts.append(f"reports {phantoms if lost else format_count(phantoms, 'object')}")
     frames = f"{summary.successes_moved} of {format_count(summary.frames, 'frame')}"
     return f"{summary.detector} {' and '.join(parts)}, in {frames}"
 
 
 def _how_sure(run: ReportedRun) -> str:
-    """Failures by highest grade and kind, in a sentence each; "" without any."""
+    """Describe the failures of each highest grade by kind, a sentence each; "" without any."""
     failures = [failure for result in run.frames for failure in result.failures]
     if not failures:
         return ""
@@ -186,7 +186,7 @@ def _comparison(runs: Sequence[ReportedRun]) -> str:
 
 
 def _tie(runs: Sequence[ReportedRun], counts: Sequence[int], what: str) -> str:
-    """Who shares the first place, in words; nothing where one run has it alone."""
+    """Describe which runs share the first place, or return ""."""
     most = max(counts)
     names = [run.name for run, count in zip(runs, counts, strict=True) if count == most]
     if len(names) == 1:
@@ -197,7 +197,7 @@ def _tie(runs: Sequence[ReportedRun], counts: Sequence[int], what: str) -> str:
 
 
 def _notes(runs: Sequence[ReportedRun]) -> list[str]:
-    """Why grades could not be reached."""
+    """Return the reasons why grades could not be reached."""
     several = len(runs) > 1
     return [
         f"{f'{run.name}: ' if several else ''}{note} ({format_count(frames, 'frame')})"
@@ -210,33 +210,34 @@ def _lead(runs: Sequence[ReportedRun]) -> str:
     summary = runs[0].summary
     data = f"{format_count(summary.frames, 'frame')} of {summary.dataset} with {format_count(summary.objects, 'vehicle')}"
     if len(runs) > 1:
-        return f"The same {data}, each run beside the others."
+        return f"The same {data}, run by run."
     changed = " + ".join(summary.params)
     return (
-        f"{changed} changed by {runs[0].method} within what is feasible, on {data}. Everything that fails was "
-        "right before the change, and is judged by labels that moved with the cars."
+        f"{changed} changed by {runs[0].method} within feasible limits, on {data}. Each failure was correct "
+        f"before "
+        "the change, and is evaluated with labels that moved with the vehicles."
     )
 
 
-def _tiles(run: ReportedRun) -> list[_Tile]:
+def _tiles(run: ReportedRun) -> list[_SummaryTile]:
     summary = run.summary
     before, moved, stay = (
         s.headline.ap50 for s in (summary.benign, summary.attacked_moved, summary.attacked_paper)
     )
     lost, phantoms = _totals(summary)
     paper = f"paper's mAP: {_percent(run.paper.before)} → {_percent(run.paper.after)}" if run.paper else ""
-    by_labels = f"by benign labels {_percent(stay)}"
+    by_labels = f"with benign labels {_percent(stay)}"
     share = f"{100 * summary.successes_moved / summary.frames:.0f} % of the frames" if summary.frames else ""
     return [
         *_graded_tile(run),
-        _Tile(
+        _SummaryTile(
             f"AP50 of {summary.headline}, %",
             f"{_percent(before)} → {_percent(moved)}",
-            f"{_points(before, moved)} points less; {by_labels}" + (f"; {paper}" if paper else ""),
+            f"{_points(before, moved)} points lower; {by_labels}" + (f"; {paper}" if paper else ""),
         ),
-        _Tile("frames broken, by threshold", f"{summary.successes_moved} of {summary.frames}", share),
-        _Tile("lost and made up, by threshold", f"{lost} + {phantoms}", _by_class(summary)),
-        _Tile(
+        _SummaryTile("frames broken, by threshold", f"{summary.successes_moved} of {summary.frames}", share),
+        _SummaryTile("lost + phantoms, by threshold", f"{lost} + {phantoms}", _by_class(summary)),
+        _SummaryTile(
             "feasible, %",
             _percent(summary.feasible_fraction),
             f"by the independent check; {format_count(summary.queries, 'query', 'queries')}",
@@ -244,25 +245,25 @@ def _tiles(run: ReportedRun) -> list[_Tile]:
     ]
 
 
-def _graded_tile(run: ReportedRun) -> list[_Tile]:
+def _graded_tile(run: ReportedRun) -> list[_SummaryTile]:
     grades, failures = run.summary.grades, sum(_totals(run.summary))
     if not failures:
         return []
     if not grading.is_known(run.summary, run.frames):
-        return [_Tile("certain failures", "unknown", "run of an older version, or without grades")]
+        return [_SummaryTile("certain failures", "unknown", "the failures of this run are not graded")]
     more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only"
-    return [_Tile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
+    return [_SummaryTile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
 
 
 def _by_class(summary: RunSummary) -> str:
     parts = []
-    for word, counts in (("lost", summary.lost_objects), ("made up", summary.phantoms)):
+    for word, counts in (("lost", summary.lost_objects), ("phantoms", summary.phantoms)):
         found = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
         parts += [f"{word}: {found}"] if found else []
     return "; ".join(parts) or "nothing"
 
 
-def _figure_rows(run: ReportedRun) -> list[_Row]:
+def _figure_rows(run: ReportedRun) -> list[_MetricRow]:
     summary = run.summary
     rows = [
         ("before: photographs", summary.benign),
@@ -271,24 +272,24 @@ def _figure_rows(run: ReportedRun) -> list[_Row]:
         ("after, benign labels (as in the paper)", summary.attacked_paper),
     ]
     found = [
-        _Row(name, tuple(_percent(getattr(scores.headline, key)) for key in _COLUMNS.values()))
+        _MetricRow(name, tuple(_percent(getattr(scores.headline, key)) for key in _COLUMNS.values()))
         for name, scores in rows
     ]
     if run.paper is not None:
         empty = (_NONE,) * (len(_COLUMNS) - 1)
         found += [
-            _Row("the paper's mAP, before", (_percent(run.paper.before), *empty), theirs=True),
-            _Row("the paper's mAP, after", (_percent(run.paper.after), *empty), theirs=True),
+            _MetricRow("the paper's mAP, before", (_percent(run.paper.before), *empty), from_paper=True),
+            _MetricRow("the paper's mAP, after", (_percent(run.paper.after), *empty), from_paper=True),
         ]
     return found
 
 
-def _run_row(run: ReportedRun, papers: bool) -> _Row:
-    """papers: whether there is a column of the paper's figures."""
+def _run_row(run: ReportedRun, papers: bool) -> _MetricRow:
+    """Build the row of a run. papers: whether there is a column of the paper's mAP."""
     summary = run.summary
     before, moved = summary.benign.headline, summary.attacked_moved.headline
     lost, phantoms = _totals(summary)
-    return _Row(
+    return _MetricRow(
         run.name,
         (
             *_graded_cells(run),
@@ -309,14 +310,14 @@ def _run_row(run: ReportedRun, papers: bool) -> _Row:
 
 
 def _graded_cells(run: ReportedRun) -> tuple[str, ...]:
-    """Failures of each grade and above, from certain on."""
+    """Count failures of at least each grade, from certain on."""
     if not grading.is_known(run.summary, run.frames):
         return (_NONE,) * len(_FROM_CERTAIN)
     return tuple(str(run.summary.grades[str(grade)]) for grade in _FROM_CERTAIN)
 
 
-def _falls(runs: Sequence[ReportedRun]) -> Markup | None:
-    """Rows from before to after; None without objects to find."""
+def _draw_drops(runs: Sequence[ReportedRun]) -> Markup | None:
+    """Draw the drops of AP50; None without objects."""
     found: list[MetricDrop] = []
     for run in runs:
         summary, several = run.summary, len(runs) > 1
@@ -329,7 +330,7 @@ def _falls(runs: Sequence[ReportedRun]) -> Markup | None:
             found.append(MetricDrop("benign labels, as in the paper", 100 * before, 100 * stay))
     papers = dict.fromkeys((run.summary.params, run.paper) for run in runs if run.paper is not None)
     found += [
-        MetricDrop(f"the paper: {' + '.join(params)}", 100 * paper.before, 100 * paper.after, theirs=True)
+        MetricDrop(f"the paper: {' + '.join(params)}", 100 * paper.before, 100 * paper.after, from_paper=True)
         for params, paper in papers
         if paper is not None
     ]
@@ -338,7 +339,7 @@ def _falls(runs: Sequence[ReportedRun]) -> Markup | None:
 
 
 def _glance(cards: Sequence[FrameCard]) -> Iterator[tuple[FrameCard, str, CloseUp]]:
-    """Close-ups of the worst frames, surest first; of a grade the first of each frame, then the second, ..."""
+    """Yield close-ups, highest grade first; within a grade the first of each frame, then the second, ..."""
     shots = [
         [
             (card, one.run.name, shot)
@@ -353,10 +354,10 @@ def _glance(cards: Sequence[FrameCard]) -> Iterator[tuple[FrameCard, str, CloseU
 
 
 def _glance_title(shots: Sequence[CloseUp]) -> str:
-    """Of the close-ups at the head of the page: no more sure than the surest of them is."""
+    """Return the heading of the close-ups, which depends on their highest grade."""
     if not shots or not any(shot.grade for shot in shots):
-        return "What went wrong, close up"
+        return "Failures in close-up"
     surest = max(shots, key=lambda shot: shot.rank)
     if surest.rank > grading.rank_of_grade(Grade.THRESHOLD):
-        return "What went wrong, close up, surest first"
-    return "What went wrong by threshold, close up: none of it is certain"
+        return "Failures in close-up, highest grade first"
+    return "Failures by threshold in close-up: none is certain"

@@ -1,4 +1,4 @@
-"""What a report shows of runs of `drivesem attack`: their figures on the frames that they share, and curves."""
+"""Builds the HTML report of runs of `drivesem attack` from their metrics on common frames, and curves."""
 
 from __future__ import annotations
 
@@ -32,41 +32,42 @@ from drivesem.run.report.page import (
     ReportPage,
 )
 from drivesem.run.results import FrameResult, RunSummary
-from drivesem.run.summary import count_grades, summarise_frames, targets_and_detections
+from drivesem.run.summary import summarise_frames, targets_and_detections
 from scene_ir import files
 from scene_ir.errors import FormatError
 
 PAGE = "report.html"
 _STUDY, _ARMS = "study.json", "arms"
 PICTURES = 200
-"""Pictures of a page, unless asked otherwise: 100 frames of one run, 14 to 21 MB of KITTI."""
-_NOT_TOLD = ("out", "json", "resume", "workers")
-"""Settings that change nothing in the result: left out of the report's command line."""
-_MOST_LINES = 7
-"""Of a chart: as many as there are colours."""
+"""Default number of pictures on a page: 100 frames of one run, 14 to 21 MB for KITTI."""
+_OMITTED_SETTINGS = ("out", "json", "resume", "workers")
+"""Settings that do not affect the result, omitted from the command line in the report."""
+_MAX_LINES = 7
+"""Largest number of lines in a chart, as there are that many colours."""
+_GRADE_FIELDS = ("passes", "grades", "kinds", "frames_ungraded", "grade_notes")
 
 
 def build_reports(config: ReportConfig) -> dict[str, Any]:
-    """Write the page of runs, or of the finished arms of studies: the JSON's form. Raises UsageError or SceneError
-    for bad input.
+    """Write the page of runs, or of the finished arms of studies. Returns the JSON data.
+
+    Raises UsageError or SceneError for bad input.
     """
     folders: list[str] = []
     charts: list[ReportChart] = []
     for given in config.runs:
-        folders += [str(folder) for folder in _runs_of(Path(given))]
+        folders += [str(folder) for folder in _find_runs(Path(given))]
         if (Path(given) / _STUDY).is_file():
             charts += query_curves(Path(given))
-    # In the folder that was given, or where the command is called.
     out = Path(config.out or (Path(config.runs[0]) / PAGE if len(config.runs) == 1 else PAGE))
     if out.is_dir():
         raise UsageError("--out", "an HTML file", f"the folder {out}")
-    shown, left_out = load_reported_runs(folders)
-    size = write_report(out, shown, config.frames, left_out, charts)
-    return _data(out, size, shown, left_out)
+    runs, left_out = load_reported_runs(folders)
+    size = write_report(out, runs, config.frames, left_out, charts)
+    return _to_json(out, size, runs, left_out)
 
 
-def _runs_of(folder: Path) -> list[Path]:
-    """A run itself, or the finished arms of a study. Raises UsageError where it is neither."""
+def _find_runs(folder: Path) -> list[Path]:
+    """Return a run, or the finished arms of a study. Raises UsageError if the folder is neither."""
     if not folder.is_dir():
         raise UsageError("RUN", "a folder of drivesem attack or drivesem study", folder)
     if not (folder / _ARMS).is_dir():
@@ -79,10 +80,10 @@ def _runs_of(folder: Path) -> list[Path]:
     return arms
 
 
-def _data(out: Path, size: int, shown: list[ReportedRun], left_out: int) -> dict[str, Any]:
-    """What `--json` prints: fractions of 1."""
+def _to_json(out: Path, size: int, runs: Sequence[ReportedRun], left_out: int) -> dict[str, Any]:
+    """Return the JSON data; rates are fractions."""
     rows = []
-    for one in shown:
+    for one in runs:
         summary = one.summary.to_json()
         del summary["out"], summary["seconds"]
         rows.append(
@@ -98,23 +99,30 @@ def _data(out: Path, size: int, shown: list[ReportedRun], left_out: int) -> dict
         {
             "frame": results[0].identifier,
             "failures": {
-                one.name: [f.kind for f in result.failures] for one, result in zip(shown, results, strict=True)
+                one.name: [f.kind for f in result.failures] for one, result in zip(runs, results, strict=True)
             },
             "kinds": {
-                one.name: [f.error for f in result.failures] for one, result in zip(shown, results, strict=True)
+                one.name: [f.error for f in result.failures] for one, result in zip(runs, results, strict=True)
             },
             "grades": {
-                one.name: [f.grade for f in result.failures] for one, result in zip(shown, results, strict=True)
+                one.name: [f.grade for f in result.failures] for one, result in zip(runs, results, strict=True)
             },
         }
-        for results in zip(*(one.frames for one in shown), strict=True)
+        for results in zip(*(one.frames for one in runs), strict=True)
     ]
     return {"out": str(out), "bytes": size, "frames_left_out": left_out, "runs": rows, "frames": frames}
 
 
 def write_run_report(out: Path, config: AttackConfig, summary: RunSummary, results: Sequence[FrameResult]) -> None:
-    """`report.html` of one run in its folder."""
-    write_report(out / PAGE, [_shown(out.name, out, config, summary, results)])
+    """Write the report.html of one run.
+
+    Args:
+        out: The run's folder.
+        config: Its settings.
+        summary: Its summary.
+        results: Its frames.
+    """
+    write_report(out / PAGE, [_make_reported_run(out.name, out, config, summary, results)])
 
 
 def write_report(
@@ -124,43 +132,54 @@ def write_report(
     left_out: int = 0,
     charts: Sequence[ReportChart] = (),
 ) -> int:
-    """Write the page of runs on the same frames; how many bytes it has. frames: whose pictures are shown, worst
-    first, by default as many as PICTURES allow. charts: beside precision over recall.
+    """Write the page of runs on the same frames.
+
+    Args:
+        path: HTML file.
+        runs: The runs.
+        frames: Number of frames with pictures, worst first; by default as many as PICTURES allow.
+        left_out: Number of frames that not all runs have.
+        charts: Further charts.
+
+    Returns:
+        Size of the page in bytes.
     """
-    shown = frames or max(PICTURES // (1 + len(runs)), 1)
-    page = ReportPage(runs, [*precision_recall(runs), *charts], min(shown, len(runs[0].frames)), left_out)
+    gallery = frames or max(PICTURES // (1 + len(runs)), 1)
+    page = ReportPage(runs, [*precision_recall(runs), *charts], min(gallery, len(runs[0].frames)), left_out)
     text = render_report(page, path).encode("utf-8")
     files.write_bytes(path, text)
     return len(text)
 
 
 def load_reported_runs(folders: Sequence[str]) -> tuple[list[ReportedRun], int]:
-    """Finished runs, as far as their frames are in all of them, and how many frames are not. Figures are those of
-    `metrics.json` where all runs have the same frames, else computed again.
+    """Load finished runs on the frames that they have in common. Returns them, and the number of other frames.
 
-    Raises UsageError for folders that hold no finished run, runs that share no frame, and runs on different
-    photographs; FormatError for a damaged file.
+    Summaries are those of metrics.json if all runs have the same frames, and recomputed otherwise. Raises
+    UsageError for a folder without a finished run, runs without common frames, and runs on different photographs;
+    FormatError for a damaged file.
     """
     loaded = load_runs(folders, setting="RUN")
     names = [{frame.result.identifier for frame in run.frames} for run in loaded]
     shared, every = set.intersection(*names), set.union(*names)
     if not shared:
         raise UsageError("RUN", "runs that share frames", "none that is in all of them")
-    shown = []
+    reported = []
     for run in loaded:
         results = [frame.result for frame in run.frames if frame.result.identifier in shared]
-        summary = _summary(run.folder / METRICS)
+        summary = _load_summary(run.folder / METRICS)
         if len(shared) < len(every):
-            summary = _again(summary, results)
-        shown.append(_shown(run.name, run.folder, load_attack_config(run.folder, "RUN"), summary, results))
-    _check_photographs(shown)
-    return shown, len(every) - len(shared)
+            summary = _recompute_summary(summary, results)
+        reported.append(
+            _make_reported_run(run.name, run.folder, load_attack_config(run.folder, "RUN"), summary, results)
+        )
+    _check_photographs(reported)
+    return reported, len(every) - len(shared)
 
 
 def precision_recall(runs: Sequence[ReportedRun]) -> list[ReportChart]:
-    """Precision over recall of the headline's class at IoU 0.5; nothing where there is no object to find.
+    """Build the chart of precision over recall of the headline class at IoU 0.5, if it has any object.
 
-    Of one run by both label modes, of several by labels that moved.
+    One run is evaluated in both label modes, several runs with moved labels.
     """
     several = len(runs) > 1
     before: dict[str, ChartLine | None] = {}
@@ -169,48 +188,52 @@ def precision_recall(runs: Sequence[ReportedRun]) -> list[ReportChart]:
         detector = run.summary.detector
         if detector not in before:
             name = f"before, {detector}" if several else "before"
-            before[detector] = _curve(run, "benign", "benign", name)
-        after.append(_curve(run, "moved", "attacked", f"{run.name}, after" if several else "after, moved labels"))
+            before[detector] = _precision_recall_line(run, "benign", "benign", name)
+        after.append(
+            _precision_recall_line(
+                run, "moved", "attacked", f"{run.name}, after" if several else "after, moved labels"
+            )
+        )
         if not several:
-            after.append(_curve(run, "benign", "attacked", "after, benign labels (paper)"))
-    told, unchanged = ([line for line in lines if line is not None] for lines in (after, before.values()))
-    if not told:
+            after.append(_precision_recall_line(run, "benign", "attacked", "after, benign labels (paper)"))
+    changed, unchanged = ([line for line in lines if line is not None] for lines in (after, before.values()))
+    if not changed:
         return []
-    note = "Best precision at that recall or a higher one, as AP50 has it; dots: where detections from t* on end."
-    room = max(_MOST_LINES - len(unchanged), 1)
-    if len(told) > room:
-        note += f" The first {room} of {len(told)} runs."
+    note = "Best precision at this recall or a higher one, as in AP50. Dots: all detections with a score of at least t*."
+    room = max(_MAX_LINES - len(unchanged), 1)
+    if len(changed) > room:
+        note += f" The first {room} of {len(changed)} runs."
     # several runs come first, so that each has one colour in all charts
-    lines = [*told[:room], *unchanged] if several else [*unchanged, *told]
+    lines = [*changed[:room], *unchanged] if several else [*unchanged, *changed]
     headline = runs[0].summary.headline
     title = f"Precision over recall: {headline}, IoU 0.5"
     return [ReportChart(title, "recall, %", "precision, %", lines, note)]
 
 
 def query_curves(study: Path) -> list[ReportChart]:
-    """Frames broken after so many queries, where a study has these curves. Raises FormatError."""
-    found = files.read_json(study / _STUDY)
-    points = found.get("curves", []) if isinstance(found, dict) else []
+    """Build the chart of broken frames over queries, if the study has these curves. Raises FormatError."""
+    data = files.read_json(study / _STUDY)
+    points = data.get("curves", []) if isinstance(data, dict) else []
     if not points:
         return []
     try:
         # in the order in which the arms' folders are shown
-        lines = [_queries(name, points) for name in sorted({point["name"] for point in points})]
+        lines = [_query_line(name, points) for name in sorted({point["name"] for point in points})]
         most = max(int(point["queries"]) for point in points)
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(str(study / _STUDY), "curves of a study", error) from error
-    note = "A query is one gradient, or one judged render."
-    banded = [line.name for line in lines[:_MOST_LINES] if line.band]
+    note = "A query is one gradient, or one evaluated render."
+    banded = [line.name for line in lines[:_MAX_LINES] if line.band]
     if banded:
-        note += f" Band: 95 % of draws of frames, {banded[0]}."
-    if len(lines) > _MOST_LINES:
-        note += f" The first {_MOST_LINES} of {len(lines)} arms."
+        note += f" Band: 95 % bootstrap interval over frames, {banded[0]}."
+    if len(lines) > _MAX_LINES:
+        note += f" The first {_MAX_LINES} of {len(lines)} arms."
     return [
         ReportChart(
-            title="Frames broken after so many queries",
+            title="Frames broken by number of queries",
             x_label="queries",
             y_label="frames broken, %",
-            lines=lines[:_MOST_LINES],
+            lines=lines[:_MAX_LINES],
             note=note,
             x_range=(1.0, float(max(most, 2))),
             log2_x=True,
@@ -218,20 +241,20 @@ def query_curves(study: Path) -> list[ReportChart]:
     ]
 
 
-def _queries(name: str, points: Sequence[dict[str, Any]]) -> ChartLine:
-    mine = [p for p in points if p["name"] == name and p["share"] is not None]
+def _query_line(name: str, points: Sequence[dict[str, Any]]) -> ChartLine:
+    own = [p for p in points if p["name"] == name and p["share"] is not None]
     first = name == points[0]["name"]
-    bounded = [p for p in mine if first and p["low"] is not None and p["high"] is not None]
+    bounded = [p for p in own if first and p["low"] is not None and p["high"] is not None]
     return ChartLine(
         name=name,
-        points=tuple((float(p["queries"]), 100 * float(p["share"])) for p in mine),
-        mark=(float(mine[-1]["queries"]), 100 * float(mine[-1]["share"])) if mine else None,
+        points=tuple((float(p["queries"]), 100 * float(p["share"])) for p in own),
+        mark=(float(own[-1]["queries"]), 100 * float(own[-1]["share"])) if own else None,
         band=tuple((float(p["queries"]), 100 * float(p["low"]), 100 * float(p["high"])) for p in bounded),
         steps=True,
     )
 
 
-def _shown(
+def _make_reported_run(
     name: str, folder: Path, config: AttackConfig, summary: RunSummary, results: Sequence[FrameResult]
 ) -> ReportedRun:
     return ReportedRun(
@@ -240,39 +263,41 @@ def _shown(
         summary=summary,
         frames=tuple(sorted(results, key=lambda r: r.identifier)),
         method=config.method,
-        command=format_command_line("attack", config, _NOT_TOLD),
-        weathers=tuple(_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
-        grade_requirements=_asked(config),
-        paper=_paper(summary.params) if follows_paper(config) else None,
+        command=format_command_line("attack", config, _OMITTED_SETTINGS),
+        weathers=tuple(_find_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
+        grade_requirements=_grade_requirements(config),
+        paper=_paper_figure(summary.params) if follows_paper(config) else None,
     )
 
 
-def _asked(config: AttackConfig) -> GradeRequirements:
+def _grade_requirements(config: AttackConfig) -> GradeRequirements:
     rule = CertificateRule(config.draws)
     return GradeRequirements(
         rule.draws, rule.before, rule.after, config.confirm, config.confirm and config.second_detector != "off"
     )
 
 
-def _paper(params: tuple[str, ...]) -> PaperFigure | None:
-    """The paper's mAP for the same parameters, alone or as one of its combinations."""
-    known = {(str(one),): after for one, after in PAPER_SINGLE.items()}
-    known |= {tuple(str(p) for p in combo_parameters(number)): PAPER_COMBOS[number] for number in COMBO_NUMBERS}
-    return PaperFigure(PAPER_BENIGN, known[params]) if params in known else None
+def _paper_figure(params: tuple[str, ...]) -> PaperFigure | None:
+    """Return the paper's mAP for the same parameters, if it has one."""
+    published = {(str(one),): after for one, after in PAPER_SINGLE.items()}
+    published |= {
+        tuple(str(p) for p in combo_parameters(number)): PAPER_COMBOS[number] for number in COMBO_NUMBERS
+    }
+    return PaperFigure(PAPER_BENIGN, published[params]) if params in published else None
 
 
-def _weather(identifier: str) -> str | None:
-    """Virtual KITTI's variation in a frame's name, where it is weather."""
+def _find_weather(identifier: str) -> str | None:
+    """Return Virtual KITTI's weather in a frame's name, if there is one."""
     return next((word for word in identifier.replace("_", "/").split("/") if word in WEATHERS), None)
 
 
-def _curve(run: ReportedRun, labels: str, seen: str, name: str) -> ChartLine | None:
+def _precision_recall_line(run: ReportedRun, labels: str, seen: str, name: str) -> ChartLine | None:
     summary = run.summary
-    judged = _judged(summary)
-    if summary.headline not in judged.names or not run.frames:
+    classes = _evaluated_classes(summary)
+    if summary.headline not in classes.names or not run.frames:
         return None
-    targets, found = targets_and_detections(run.frames, judged, labels, seen)
-    outcome = MatchedClass.from_frames(targets, found, judged.names.index(summary.headline))
+    targets, found = targets_and_detections(run.frames, classes, labels, seen)
+    outcome = MatchedClass.from_frames(targets, found, classes.names.index(summary.headline))
     samples = sampled_curve(outcome.candidates.class_matches(outcome.match, 0))
     if not samples:
         return None
@@ -281,19 +306,21 @@ def _curve(run: ReportedRun, labels: str, seen: str, name: str) -> ChartLine | N
     return ChartLine(name, points, points[above[-1]] if above else None)
 
 
-def _judged(summary: RunSummary) -> EvaluatedClasses:
-    """Without the detector: a run's results hold none but judged classes."""
+def _evaluated_classes(summary: RunSummary) -> EvaluatedClasses:
+    """Return the evaluated classes, without loading the detector."""
     names = tuple(summary.benign.per_class)
     return EvaluatedClasses(names, names)
 
 
-def _again(summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
-    """The figures of some of a run's frames."""
-    return replace(summary, **summarise_frames(results, _judged(summary), summary.t_star, summary.headline))
+def _recompute_summary(summary: RunSummary, results: Sequence[FrameResult]) -> RunSummary:
+    """Recompute the summary for some of a run's frames."""
+    return replace(
+        summary, **summarise_frames(results, _evaluated_classes(summary), summary.t_star, summary.headline)
+    )
 
 
-def _summary(path: Path) -> RunSummary:
-    """The inverse of `RunSummary.to_json`. Raises FormatError naming the file and what is wrong."""
+def _load_summary(path: Path) -> RunSummary:
+    """Load a summary; the inverse of `RunSummary.to_json`. Raises FormatError for a damaged file."""
     data = files.read_json(path)
     try:
         plain = {
@@ -302,44 +329,34 @@ def _summary(path: Path) -> RunSummary:
         }
         plain |= {name: data[name] for name in ("frames_failed", "objects", "successes_paper", "successes_moved")}
         plain |= {name: data[name] for name in ("feasible_fraction", "queries", "seconds")}
-        plain |= {"params": data["params"]} | _grades(data)
-        plain |= {name: _scores(data[name]) for name in ("benign", "rerendered")}
-        plain |= {f"attacked_{mode}": _scores(data["attacked"][mode]) for mode in ("paper", "moved")}
+        plain |= {"params": data["params"]} | {name: data[name] for name in _GRADE_FIELDS}
+        plain |= {name: _parse_scores(data[name]) for name in ("benign", "rerendered")}
+        plain |= {f"attacked_{mode}": _parse_scores(data["attacked"][mode]) for mode in ("paper", "moved")}
         plain |= {name: data[f"{name}_by_class"] for name in ("lost_objects", "phantoms")}
     except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(str(path), "the figures of a run", error) from error
+        raise FormatError(str(path), "the metrics of a run", error) from error
     summary: RunSummary = from_json(RunSummary, plain, str(path))
     if summary.headline not in summary.benign.per_class:
         raise FormatError(f"{path}: headline", f"one of {', '.join(summary.benign.per_class)}", summary.headline)
     return summary
 
 
-def _grades(data: dict[str, Any]) -> dict[str, Any]:
-    """How sure the failures of a run are; of one that was written before anybody asked, that nobody knows."""
-    if "grades" in data:
-        return {name: data[name] for name in ("passes", "grades", "kinds", "frames_ungraded", "grade_notes")}
-    return count_grades([]) | {
-        "grades": {**count_grades([])["grades"], "threshold": data["lost_objects"] + data["phantoms"]},
-        "frames_ungraded": data["frames"],
-    }
-
-
-def _scores(data: dict[str, Any]) -> dict[str, Any]:
-    """The inverse of `Scores.to_json`, as plain objects."""
-    beside = {name: data[name] for name in ("overall", "per_class")}
-    return {"headline": {name: one for name, one in data.items() if name not in beside}} | beside
+def _parse_scores(data: dict[str, Any]) -> dict[str, Any]:
+    """Parse scores; the inverse of their `to_json`, as plain objects."""
+    others = {name: data[name] for name in ("overall", "per_class")}
+    return {"headline": {name: one for name, one in data.items() if name not in others}} | others
 
 
 def _check_photographs(runs: Sequence[ReportedRun]) -> None:
-    """Frames of the same name must be the same photograph."""
+    """Check that frames of the same name have the same photograph."""
     first, *others = runs
     for result in first.frames:
-        mine = _photograph(first, result.identifier)
+        expected = _read_photograph(first, result.identifier)
         for run in others:
-            if not np.array_equal(mine, _photograph(run, result.identifier)):
+            if not np.array_equal(expected, _read_photograph(run, result.identifier)):
                 found = f"another picture of frame {result.identifier} in {run.folder} than in {first.folder}"
                 raise UsageError("RUN", "runs on the same photographs", found)
 
 
-def _photograph(run: ReportedRun, identifier: str) -> np.ndarray:
+def _read_photograph(run: ReportedRun, identifier: str) -> np.ndarray:
     return np.frombuffer(files.read_bytes(run.folder / "frames" / identifier / "benign.png"), np.uint8)

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
-from drivesem.analysis.confirm.results import load
+from drivesem.analysis.confirm.comparison import ConfirmedFrame
 from drivesem.cli import main
-from drivesem.failures.second_renderer import screen
-from drivesem.failures.second_renderer.generator import GeneratorRedraw
+from drivesem.failures.second_renderer import opengl as screen
+from drivesem.failures.second_renderer.generator import GeneratorRenderer
+from drivesem.run.records import load_record
 from drivesem.run.results import load_frame
 from scene_ir import files
 
@@ -64,10 +65,10 @@ def test_vehicles_stand_where_the_compositor_put_them(run: Path) -> None:
     frame = run / "frames" / "demo-000"
     result, found = (
         load_frame(frame / "result.json"),
-        load(out / "frames" / "demo-000" / "confirmed.json"),
+        load_record(out / "frames" / "demo-000" / "confirmed.json", ConfirmedFrame, 2),
     )
     assert len(found.compositor) == len(result.failures)
-    assert [s.iou_benign for s in found.stands] == pytest.approx([1.0] * result.objects, abs=1e-4)
+    assert [s.iou_benign for s in found.objects] == pytest.approx([1.0] * result.objects, abs=1e-4)
     # The photograph is the same picture: the detector finds the same.
     assert [d.score for d in found.detections_benign] == pytest.approx([d.score for d in result.detections_benign])
     drawn, benign = (
@@ -93,8 +94,8 @@ def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
 ) -> None:
     before = json.loads((run / "confirm" / "confirm.json").read_text())
     draws: list[int] = []
-    draw = GeneratorRedraw.redraw
-    monkeypatch.setattr(GeneratorRedraw, "redraw", lambda self, scene: draws.append(1) or draw(self, scene))
+    draw = GeneratorRenderer.redraw
+    monkeypatch.setattr(GeneratorRenderer, "redraw", lambda self, scene: draws.append(1) or draw(self, scene))
     again = confirm(run)
     assert again == before | {"run": str(run)}
     assert draws == []
@@ -156,7 +157,7 @@ def test_photographs_are_drawn_by_pyrender(photographs: Path, confirm: Callable[
     assert (data["frames"], data["not_carried"]) == (1, {})
     assert data["box_iou"]["least"] > 0.99
     frame, out = photographs / "frames" / "demo-000", photographs / "confirm" / "frames" / "demo-000"
-    found = load(out / "confirmed.json")
+    found = load_record(out / "confirmed.json", ConfirmedFrame, 2)
     assert found.renderer == "pyrender"
     assert len(found.compositor) == len(load_frame(frame / "result.json").failures)
     drawn, benign, composed = (
@@ -171,9 +172,9 @@ def test_without_opengl_nothing_is_written(
 ) -> None:
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     monkeypatch.setattr(screen, "_LIBRARIES", {})
-    screen.shared_screen.cache_clear()
+    screen.shared_context.cache_clear()
     assert main(["confirm", "--run", str(photographs), "--workers", "1"]) == 2
-    screen.shared_screen.cache_clear()
+    screen.shared_context.cache_clear()
     (line,) = capsys.readouterr().err.splitlines()
     assert "install Debian's libegl1 or libosmesa6" in line
     assert not (photographs / "confirm").exists()

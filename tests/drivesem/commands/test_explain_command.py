@@ -17,22 +17,23 @@ import torch
 
 from detectors.base import Detector
 from detectors.types import CLASSES, Detections
-from drivesem.analysis.explain import run as explain_asking
 from drivesem.analysis.explain import run as explaining
-from drivesem.analysis.explain.results import read_explanation
+from drivesem.analysis.explain.results import SCHEMA, Explanation
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.methods.placebo import FixedTheta
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
+from drivesem.config.commands import AttackConfig
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
+from drivesem.run.attack import AttackWorker
 from drivesem.run.finished import rebuild_objective
-from drivesem.run.frame import FrameSettings, attack_scene, write_frame
+from drivesem.run.frame import write_frame
+from drivesem.run.records import load_record
 from drivesem.run.results import load_frame
 from scene_ir.exchange import remove_vehicle
 from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
 
@@ -158,7 +159,7 @@ def test_a_frame_explained(explained: Path) -> None:
     data = json.loads((out / "explain.json").read_text())
     assert (data["frames"], data["frames_of_run"], data["frames_failed"]) == (1, 1, {})
     folder = out / "frames" / "demo-000"
-    found = read_explanation(folder / "explain.json")
+    found = load_record(folder / "explain.json", Explanation, SCHEMA)
     result = load_frame(explained / "frames" / "demo-000" / "result.json")
     # what adds up: the loss, from the photograph's to the counterexample's, and failing, from no to yes
     assert found.found.loss == pytest.approx(result.loss_trace[-1], rel=1e-4)
@@ -180,7 +181,7 @@ def test_a_frame_explained(explained: Path) -> None:
 
 def test_the_least_change_fails_and_is_feasible(explained: Path) -> None:
     folder = explained / "explain" / "frames" / "demo-000"
-    least = read_explanation(folder / "explain.json").least
+    least = load_record(folder / "explain.json", Explanation, SCHEMA).least
     assert least.outcome.success
     assert not least.violations
     assert 0 < least.norm <= least.norm_whole <= least.norm_found
@@ -222,15 +223,15 @@ def test_a_second_call_explains_nothing_twice(
 ) -> None:
     first = explain("--run", run)
     assert json.loads((run / "explain" / "explain.json").read_text()) == first
-    looks: list[str] = []
-    real = explain_asking.explain_frame
-    monkeypatch.setattr(explain_asking, "explain_frame", lambda *w: looks.append("") or real(*w))
+    explained_frames: list[str] = []
+    real = explaining.ExplainAnalyser.analyse
+    monkeypatch.setattr(explaining.ExplainAnalyser, "analyse", lambda *w: explained_frames.append("") or real(*w))
     assert explain("--run", run) == first
-    assert not looks
+    assert not explained_frames
     result = run / "frames" / "demo-000" / "result.json"
     result.write_text(result.read_text() + "\n")  # made anew
     again = explain("--run", run)
-    assert len(looks) == 1
+    assert len(explained_frames) == 1
     assert again == first
     assert main(["explain", "--run", str(run), "--workers", "1", "--points", "5"]) == 2
 
@@ -242,7 +243,7 @@ def test_without_gradient(
     data = explain("--run", run, "--out", run / "other", "--least", "lost")
     assert data["rows"][0]["gradient_share"] is None
     folder = run / "other" / "frames" / "demo-000"
-    found = read_explanation(folder / "explain.json")
+    found = load_record(folder / "explain.json", Explanation, SCHEMA)
     assert found.sensitivity == {}
     assert {c.gradient for c in found.contributions} == {None}
     assert not (folder / "sensitivity.png").exists()
@@ -258,15 +259,9 @@ def exchanged(run: Path, name: str, share: float, scene: SceneIR) -> None:
     scene, params = remove_vehicle(scene, 0), parse_params("translate,rotate")
     space = ParameterSpace(scene, params)
     theta = share * space.step * (torch.arange(space.dim) >= space.dim - 1)
-    settings = FrameSettings(
-        attack=FixedTheta(theta),
-        params=params,
-        label_mode="moved",
-        term="objectness",
-        render=RenderSettings(),
-        seed=0,
-    )
-    result = write_frame(attack_scene(name, scene, Jumpy(), settings), run / "frames" / name)
+    config = AttackConfig(params="translate,rotate", grade=False, seed=0)
+    worker = replace(AttackWorker.from_config(config, Jumpy()), method=FixedTheta(theta))
+    result = write_frame(worker.attack_scene(name, scene), run / "frames" / name)
     assert result.success_moved
     manifest = json.loads((run / "manifest.json").read_text())
     manifest["frames"][name] = {}
@@ -286,7 +281,7 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(
     page = (run / "explain" / "explain.md").read_text()
     assert "the exchange of vehicles alone makes them fail: demo-001, demo-002." in page
     for name, theta in (("demo-001", 0), ("demo-002", 1)):
-        found = read_explanation(run / "explain" / "frames" / name / "explain.json")
+        found = load_record(run / "explain" / "frames" / name / "explain.json", Explanation, SCHEMA)
         assert found.benign.success
         assert len(found.sizes) == theta
         assert (found.contributions, found.least.theta, found.least.norm) == ((), (), 0)

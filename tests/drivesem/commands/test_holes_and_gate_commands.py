@@ -16,15 +16,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from detectors.planted import features
+from detectors.planted import compute_features
 from detectors.types import Detections
-from drivesem.analysis.gate import asking as gate_asking
-from drivesem.analysis.holes.results import load, load_inside
+from drivesem.analysis import gate as gate_asking
+from drivesem.analysis.holes.rules import FrameHoles, FrameRuleSamples
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run
+from drivesem.run.records import load_record
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
@@ -58,7 +59,7 @@ class Blind:
         self.boxes, self.band = boxes_xyxy, band
 
     def forward(self, images: Tensor) -> Tensor:
-        return features(images, self.boxes.expand(len(images), -1, -1), ("lightness",))[0]
+        return compute_features(images, self.boxes.expand(len(images), -1, -1), ("lightness",))[0]
 
     def decode(self, raw: Tensor) -> list[Detections]:
         found = []
@@ -103,7 +104,7 @@ def scene(street: Callable[..., SceneIR]) -> SceneIR:
 def blind(scene: SceneIR) -> Blind:
     labels = Labeller(scene, Compositor(scene).render(scene)).paper()
     cars = labels.targets.boxes_xyxy[: len(scene.objects)]
-    usual = float(features(scene.photograph[None], cars[None], ("lightness",)).min())
+    usual = float(compute_features(scene.photograph[None], cars[None], ("lightness",)).min())
     return Blind(cars, (usual - 0.02 - WIDE, usual - 0.02))
 
 
@@ -198,9 +199,14 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     assert again["probability"] >= 0.8
     assert again["interval"][0] <= again["probability"] <= again["interval"][1]
     assert again["holds"]
-    inside_first, inside_again = load_inside(fresh).inside, load_inside(checked).inside
-    for around, first, inside in zip(load(kept).around, inside_first, inside_again, strict=True):
-        known = {*around.asked.values, *around.near.values, *first.values}
+    inside_first, inside_again = (
+        load_record(fresh, FrameRuleSamples, 3).inside,
+        load_record(checked, FrameRuleSamples, 3).inside,
+    )
+    for around, first, inside in zip(
+        load_record(kept, FrameHoles, 3).around, inside_first, inside_again, strict=True
+    ):
+        known = {*around.samples.values, *around.near.values, *first.values}
         assert len(inside.values) == 16
         assert not known & set(inside.values)
     page, rows = (out / "holes.md").read_text(), (out / "holes.csv").read_text().splitlines()
@@ -214,13 +220,13 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     assert holes(words, capsys)["holes"][0]["recheck"] is None
 
 
-def test_cars_beside_are_shown_too(looked: Path) -> None:
+def test_other_cars_are_sampled_too(looked: Path) -> None:
     """By default four states of the frame, in which both cars change."""
-    kept = load(looked / "runs" / "0" / "frames" / "demo-000" / "holes.json")
-    (beside,) = kept.beside
-    assert (beside.label, len(beside.objects)) == ("Car", 8)
-    assert set(beside.by_object()) == {0, 1}
-    assert all(len(samples.margins) == 4 for samples in beside.by_object().values())
+    kept = load_record(looked / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3)
+    (contrast,) = kept.contrast
+    assert (contrast.label, len(contrast.objects)) == ("Car", 8)
+    assert set(contrast.by_object()) == {0, 1}
+    assert all(len(samples.margins) == 4 for samples in contrast.by_object().values())
 
 
 def test_without_contrast_there_are_none(
@@ -228,7 +234,10 @@ def test_without_contrast_there_are_none(
 ) -> None:
     words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--contrast", "0"]
     holes([*words, "--out", str(tmp_path / "out")], capsys)
-    assert load(tmp_path / "out" / "runs" / "0" / "frames" / "demo-000" / "holes.json").beside == ()
+    assert (
+        load_record(tmp_path / "out" / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3).contrast
+        == ()
+    )
 
 
 def test_an_answer_of_an_older_version_is_refused_in_one_line(
@@ -252,7 +261,11 @@ def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: py
     for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):
         words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--seed", seed]
         holes([*words, "--out", str(tmp_path / name)], capsys)
-        kept.append(load(tmp_path / name / "runs" / "0" / "frames" / "demo-000" / "holes.json").around)
+        kept.append(
+            load_record(
+                tmp_path / name / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3
+            ).around
+        )
     one, again, other = kept
     assert one == again != other
 
@@ -380,7 +393,7 @@ def test_other_classes_are_no_comparison(attacked: Path, said: Callable[..., str
 
 
 def test_a_gate_has_to_be_told_the_new_detector(attacked: Path, said: Callable[..., str]) -> None:
-    """The old one beside itself would pass for ever."""
+    """The old one contrast itself would pass for ever."""
     wanted = "the detector that is to take the place of --before"
     assert said(attacked) == f"--after: expected {wanted}, found nothing"
     assert not (attacked / "gate").exists()

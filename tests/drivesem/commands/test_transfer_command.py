@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from detectors.types import Detections
-from drivesem.analysis.transfer import asking
+from drivesem.analysis.transfer import run as transfer_run
 from drivesem.cli import main
-from drivesem.run import looking
+from drivesem.run import detection_cache as looking
 from drivesem.run.results import load_frame
 
 
@@ -153,16 +153,24 @@ def test_a_matrix_of_two_runs(run: Path, tmp_path: Path, transfer: Callable[...,
     ],
 )
 def test_detectors_are_told_apart(text: str, names: list[str]) -> None:
-    assert asking.detector_names(text) == names
+    assert transfer_run.parse_detector_names(text) == names
 
 
 def test_names_lose_their_folders_where_that_is_clear() -> None:
-    assert asking.short_names(["squeezedet", "onnx:a/b/n.onnx"]) == ["squeezedet", "onnx:n.onnx"]
-    assert asking.short_names(["onnx:c/a/n.onnx", "onnx:b/n.onnx"]) == ["onnx:a/n.onnx", "onnx:b/n.onnx"]
-    assert asking.short_names(["a/n.onnx", "c/a/n.onnx"]) == ["a/n.onnx", "c/a/n.onnx"]
+    assert transfer_run.shorten_detector_names(["squeezedet", "onnx:a/b/n.onnx"]) == ["squeezedet", "onnx:n.onnx"]
+    assert transfer_run.shorten_detector_names(["onnx:c/a/n.onnx", "onnx:b/n.onnx"]) == [
+        "onnx:a/n.onnx",
+        "onnx:b/n.onnx",
+    ]
+    assert transfer_run.shorten_detector_names(["a/n.onnx", "c/a/n.onnx"]) == ["a/n.onnx", "c/a/n.onnx"]
     runs = ["squeezedet", "onnx:d/n.onnx", "out/benign/r.safetensors", "out/worst/r.safetensors"]
-    assert asking.short_names(runs) == ["squeezedet", "onnx:n.onnx", "benign/r.safetensors", "worst/r.safetensors"]
-    assert asking.short_names(["darknet:x/c.cfg,x/c.weights"]) == ["darknet:c.cfg,c.weights"]
+    assert transfer_run.shorten_detector_names(runs) == [
+        "squeezedet",
+        "onnx:n.onnx",
+        "benign/r.safetensors",
+        "worst/r.safetensors",
+    ]
+    assert transfer_run.shorten_detector_names(["darknet:x/c.cfg,x/c.weights"]) == ["darknet:c.cfg,c.weights"]
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

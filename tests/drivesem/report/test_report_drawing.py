@@ -7,8 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report.drawing import TEXT_PX, Label, Labels, Spot, text_extent
-from drivesem.run.report.pictures import DETECTED_COLOUR, LOST_COLOUR, overlay
+from drivesem.report.drawing import (
+    DETECTED_COLOUR,
+    LOST_COLOUR,
+    TEXT_PX,
+    LabelLayout,
+    PixelRect,
+    TextLabel,
+    measure_text,
+)
+from drivesem.run.report.pictures import draw_overlay
 from drivesem.run.results import BoxRecord, Failure
 
 SIZE_WH = (640, 300)
@@ -25,22 +33,22 @@ amid = st.tuples(st.integers(250, 380), st.integers(120, 150), st.integers(4, 60
 texts = st.sampled_from(TEXTS)
 
 
-def spots(boxes: list[tuple[tuple[float, ...], str]], size_wh: tuple[int, int] = SIZE_WH) -> list[Spot]:
-    labels = Labels(size_wh)
+def spots(boxes: list[tuple[tuple[float, ...], str]], size_wh: tuple[int, int] = SIZE_WH) -> list[PixelRect]:
+    labels = LabelLayout(size_wh)
     for box, text in boxes:
-        labels.add(box, Label(text, RED))
+        labels.add(box, TextLabel(text, RED))
     return [spot for spot, _ in labels.placed]
 
 
-def apart(a: Spot, b: Spot) -> bool:
+def apart(a: PixelRect, b: PixelRect) -> bool:
     return a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
 
 
-def all_apart(found: list[Spot]) -> bool:
+def all_apart(found: list[PixelRect]) -> bool:
     return all(apart(a, b) for i, a in enumerate(found) for b in found[:i])
 
 
-def inside(spot: Spot, size_wh: tuple[int, int] = SIZE_WH) -> bool:
+def inside(spot: PixelRect, size_wh: tuple[int, int] = SIZE_WH) -> bool:
     return 0 <= spot[0] < spot[2] <= size_wh[0] and 0 <= spot[1] < spot[3] <= size_wh[1]
 
 
@@ -62,9 +70,9 @@ def test_two_labels_of_a_box_at_the_edge_are_apart_and_inside(box: tuple[int, ..
 
 
 def test_a_number_stands_in_the_middle_unless_that_is_taken():
-    labels = Labels(SIZE_WH)
+    labels = LabelLayout(SIZE_WH)
     for _ in range(2):
-        labels.add((100, 100, 300, 200), Label("[3]", RED, size_px=TEXT_PX), within=True)
+        labels.add((100, 100, 300, 200), TextLabel("[3]", RED, size_px=TEXT_PX), within=True)
     (middle, _), (other, _) = labels.placed
     assert abs(middle[0] + middle[2] - 400) <= 1
     assert abs(middle[1] + middle[3] - 300) <= 1
@@ -73,15 +81,15 @@ def test_a_number_stands_in_the_middle_unless_that_is_taken():
 
 def test_a_small_box_is_not_hidden_by_its_neighbours_label():
     near, far = (100, 100, 200, 200), (110, 86, 140, 98)
-    plain, careful = Labels(SIZE_WH), Labels(SIZE_WH, [far])
+    plain, careful = LabelLayout(SIZE_WH), LabelLayout(SIZE_WH, [far])
     for labels in (plain, careful):
-        labels.add(near, Label("Car 0.75", RED))
+        labels.add(near, TextLabel("Car 0.75", RED))
     assert not apart(plain.placed[0][0], far)
     assert apart(careful.placed[0][0], far)
 
 
 def test_where_no_place_is_free_least_is_hidden():
-    wide, high = text_extent("Car 0.75", TEXT_PX - 3)
+    wide, high = measure_text("Car 0.75", TEXT_PX - 3)
     size_wh = (wide + 4, 2 * high)
     found = spots([((0, 0, wide, high), "Car 0.75")] * 3, size_wh)
     assert apart(*found[:2])
@@ -94,7 +102,7 @@ def test_labels_are_inside_and_near_their_boxes(boxes: list[tuple[tuple[float, .
     assert found == spots(boxes)
     for (box, text), spot in zip(boxes, found, strict=True):
         assert inside(spot)
-        wide, high = text_extent(text, TEXT_PX - 3)
+        wide, high = measure_text(text, TEXT_PX - 3)
         assert (spot[2] - spot[0], spot[3] - spot[1]) == (wide, high)
         # a box that lies outside has its label at the edge next to it
         (x0, x1), (y0, y1) = (np.clip(box[i::2], 0, SIZE_WH[i]) for i in (0, 1))
@@ -112,14 +120,14 @@ def test_an_overlay_shows_the_whole_label_of_each_box_at_one_place():
     lost = Failure("lost", "Car", box, index=0, error="missed", grade="certain")
     found = BoxRecord(box, "Car", 0.75)
     alone, both = (
-        overlay(image, (BoxRecord(box, "Car", index=0),), found_there, failed, 0.5)
+        draw_overlay(image, (BoxRecord(box, "Car", index=0),), found_there, failed, 0.5)
         for found_there, failed in (((), (lost,)), ((found,), (lost,)))
     )
 
     def plates(picture: np.ndarray) -> int:
         return int((picture == 0).all(axis=2).sum())
 
-    only_found = overlay(image, (), (found,), (), 0.5)
+    only_found = draw_overlay(image, (), (found,), (), 0.5)
     assert plates(both) == plates(alone) + plates(only_found)
     for colour in (LOST_COLOUR, DETECTED_COLOUR):
         assert (both == colour).all(axis=2).any()

@@ -5,7 +5,7 @@ import io
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report.tables import Sheet, csv_text, number_of
+from drivesem.report.tables import ReportTable, format_count, rows_to_csv
 from drivesem.report.terminal import Console
 
 COLUMNS = ("arm", "where", "PSNR, dB", "perceptual distance", "FID")
@@ -13,26 +13,26 @@ ROWS = (
     ("combo-2-paper-s-protocol", "frame", "24.0 (21.7 to 27.1)", "0.0893 (0.0542 to 0.137)", "-"),
     ("photograph", "vehicles", "16.2", "0.577", "0.1"),
 )
-SHEET = Sheet("Far", COLUMNS, ROWS)
+SHEET = ReportTable("Far", COLUMNS, ROWS)
 
 
-def shown(sheet: Sheet, width: int, words: tuple[str, ...] = COLUMNS[:2]) -> str:
+def shown(sheet: ReportTable, width: int, words: tuple[str, ...] = COLUMNS[:2]) -> str:
     """What a terminal shows of it."""
     console = Console(file=io.StringIO(), width=width)
-    console.print(*sheet.tables(console, words), sep="\n")
+    console.print(*sheet.fit_to_console(console, words), sep="\n")
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
 
 def test_one_is_one_and_no_more() -> None:
-    assert [number_of(count, "frame") for count in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
-    assert [number_of(count, "query", "queries") for count in (1, 40)] == ["1 query", "40 queries"]
+    assert [format_count(count, "frame") for count in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
+    assert [format_count(count, "query", "queries") for count in (1, 40)] == ["1 query", "40 queries"]
 
 
 def test_a_column_that_the_first_row_lacks_is_in_the_csv() -> None:
     """Of searches, the first is not compared with itself."""
     rows = [{"name": "climb", "seconds": 1.5}, {"name": "halton", "seconds": 2, "ahead": 0.25}]
-    assert csv_text(rows) == "name,seconds,ahead\nclimb,1.5,\nhalton,2,0.25\n"
+    assert rows_to_csv(rows) == "name,seconds,ahead\nclimb,1.5,\nhalton,2,0.25\n"
 
 
 def test_a_table_that_fits_is_one() -> None:
@@ -52,7 +52,11 @@ def test_a_table_that_does_not_fit_goes_on_below_with_its_first_columns() -> Non
 
 
 def test_where_not_even_one_column_has_room_it_stays_one() -> None:
-    for sheet in (SHEET, Sheet("Far words", ("a", "b"), (("x" * 50, "y" * 50),)), Sheet("Far", ("a", "b"), ())):
+    for sheet in (
+        SHEET,
+        ReportTable("Far words", ("a", "b"), (("x" * 50, "y" * 50),)),
+        ReportTable("Far", ("a", "b"), ()),
+    ):
         text = shown(sheet, 40, (*COLUMNS[:2], "a", "b"))
         assert "further" not in text
         assert max(map(len, text.splitlines())) <= 40
@@ -75,7 +79,7 @@ def test_no_word_and_no_number_is_broken(
         *(f"{name}{i}" for i, name in enumerate(names)),
         *(f"{head}{i}" for i, (head, _) in enumerate(numbers)),
     )
-    sheet = Sheet("t", columns, ((*[sentence] * len(names), *(number for _, number in numbers)),))
+    sheet = ReportTable("t", columns, ((*[sentence] * len(names), *(number for _, number in numbers)),))
     text = shown(sheet, width, columns[: len(names)])
     assert max(map(len, text.splitlines())) <= width
     assert all(number in text for _, number in numbers)

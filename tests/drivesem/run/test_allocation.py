@@ -12,7 +12,7 @@ _KEPT = """
 import ctypes, sys
 import torch
 if sys.argv[1] == "kept":
-    from drivesem.run.allocation import keep_freed
+    from drivesem.run.jobs import keep_freed
     keep_freed()
 
 class Mallinfo2(ctypes.Structure):

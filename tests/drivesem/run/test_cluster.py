@@ -18,11 +18,11 @@ import pytest
 import ray
 
 from drivesem.cli import main
-from drivesem.config.blocks import Sharing
 from drivesem.config.errors import UsageError
+from drivesem.config.options import WorkerOptions
 from drivesem.run import cluster as clusters
-from drivesem.run.workers import outcomes
-from drivesem.store import place
+from drivesem.run.workers import run_jobs
+from drivesem.store import local_copy
 from scene_ir.errors import FormatError, SceneError
 from tests.drivesem.commands.test_attack_command import contents
 
@@ -58,8 +58,8 @@ def looking(folder: str) -> Callable[[int], tuple[int, str]]:
 
 
 def found_by(jobs: list[int], folder: Path, address: str) -> Iterator[tuple[int, Any]]:
-    config = Sharing(engine="ray", address=address)
-    for job, outcome in outcomes(look, partial(looking, str(folder)), jobs, config):
+    config = WorkerOptions(engine="ray", address=address)
+    for job, outcome in run_jobs(look, partial(looking, str(folder)), jobs, config):
         try:
             yield job, outcome()
         except SceneError as error:
@@ -126,9 +126,9 @@ def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     ray.shutdown()
-    config = Sharing(engine="ray", workers=1)
+    config = WorkerOptions(engine="ray", workers=1)
     try:
-        found = dict(outcomes(look, partial(looking, str(tmp_path)), [1, 2], config))
+        found = dict(run_jobs(look, partial(looking, str(tmp_path)), [1, 2], config))
         assert {job: outcome()[0] for job, outcome in found.items()} == {1: 1, 2: 4}
     finally:
         ray.shutdown()
@@ -139,7 +139,7 @@ def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.
     assert main(words) == 2
     assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
     with pytest.raises(UsageError, match="--address"):
-        Sharing(address="auto").check()
+        WorkerOptions(address="auto").check()
 
 
 Alike = Callable[..., None]
@@ -180,9 +180,9 @@ def test_frames_that_a_cluster_makes_and_looks_at_are_those_made_here(
     url = f"file://{tmp_path}/elsewhere/kitti"
     words = ["synth", "--frames", "2", "--seed", "5", "--engine", "ray", "--address", cluster.address]
     assert main([*words, "--out", url]) == 0
-    for made in (place(url), tmp_path / "kitti"):
+    for made in (local_copy(url), tmp_path / "kitti"):
         (made / ".lock").unlink(missing_ok=True)
-    assert contents(place(url)) == contents(tmp_path / "kitti")
+    assert contents(local_copy(url)) == contents(tmp_path / "kitti")
     assert not (tmp_path / "elsewhere" / "kitti" / ".lock").exists()
 
 

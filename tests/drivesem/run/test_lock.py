@@ -12,7 +12,7 @@ import pytest
 
 from drivesem.cli import main
 from drivesem.config.errors import UsageError
-from drivesem.run.lock import LOCK, held_elsewhere, hold, let_go
+from drivesem.run.lock import LOCK, acquire_folder_lock, is_locked_elsewhere, release_folder_locks
 
 OTHER = """
 import sys
@@ -50,17 +50,17 @@ def test_a_run_that_is_being_made_is_no_run_that_stopped(
     folder.mkdir()
     (folder / "config.yaml").write_text("detector: squeezedet\ndataset: demo\nparams: null\ncombo: null\n")
     with another_process(folder):
-        assert held_elsewhere(folder)
+        assert is_locked_elsewhere(folder)
         assert main(["explain", str(folder)]) == 2
         assert f"found {folder}, into which an attack is still writing" in capsys.readouterr().err
         (folder / "frames").mkdir()
         assert main(["runs", "list", str(tmp_path)]) == 0
         assert "run: 0 frames, being made now; combo 2 by si-fgsm" in capsys.readouterr().out
-    assert not held_elsewhere(folder)
+    assert not is_locked_elsewhere(folder)
     assert main(["explain", str(folder)]) == 2
     assert f"found {folder}, which stopped early" in capsys.readouterr().err
-    hold(folder)  # by this process: nobody else
-    assert not held_elsewhere(folder)
+    acquire_folder_lock(folder)  # by this process: nobody else
+    assert not is_locked_elsewhere(folder)
 
 
 COMMANDS = {
@@ -87,10 +87,10 @@ def test_a_second_command_is_one_line_and_writes_nothing(
 def test_a_killed_command_holds_nothing(tmp_path: Path) -> None:
     with another_process(tmp_path) as kill:
         with pytest.raises(UsageError, match="no other command writes"):
-            hold(tmp_path)
+            acquire_folder_lock(tmp_path)
         kill()
-        with let_go():
-            hold(tmp_path)
+        with release_folder_locks():
+            acquire_folder_lock(tmp_path)
 
 
 def test_what_was_begun_and_killed_at_once_is_a_new_folder(
@@ -105,10 +105,10 @@ def test_what_was_begun_and_killed_at_once_is_a_new_folder(
 
 
 def test_one_process_may_ask_again_and_lets_go_at_the_end(tmp_path: Path) -> None:
-    with let_go():
-        hold(tmp_path)
-        with let_go():
-            hold(tmp_path)
+    with release_folder_locks():
+        acquire_folder_lock(tmp_path)
+        with release_folder_locks():
+            acquire_folder_lock(tmp_path)
         with pytest.raises(subprocess.CalledProcessError):  # what was held outside stays held
             _by_another(tmp_path)
     _by_another(tmp_path)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivesem.attack.budgets import budget_of, written
-from drivesem.config.commands import Attack
+from drivesem.attack.budgets import format_budget, parse_budget
+from drivesem.config.commands import AttackConfig
 from drivesem.config.parsing import parse
 from drivesem.run.protocol import PROTOCOL, follows_paper
 
@@ -20,11 +20,11 @@ def test_the_preset_is_the_protocol() -> None:
     preset = yaml.safe_load(PRESET.read_text())
     assert {name: value for name, value in preset.items() if name not in ("for", "combo", "budget")} == PROTOCOL
     config = parse(["attack", "--config", str(PRESET)])
-    assert isinstance(config, Attack)
+    assert isinstance(config, AttackConfig)
     assert follows_paper(config)
     # as a finished run's config.yaml has it, and for other parameters and data
     other = replace(
-        config, budget=written(budget_of("paper")), combo=None, params="mesh", limit=3, draws=20, seed=5
+        config, budget=format_budget(parse_budget("paper")), combo=None, params="mesh", limit=3, draws=20, seed=5
     )
     assert follows_paper(other)
 
@@ -47,7 +47,7 @@ def test_the_preset_is_the_protocol() -> None:
     ],
 )
 def test_any_other_setting_is_another_protocol(changed: dict[str, object]) -> None:
-    theirs = Attack(**PROTOCOL)  # pyright: ignore[reportArgumentType]
+    theirs = AttackConfig(**PROTOCOL)  # pyright: ignore[reportArgumentType]
     assert follows_paper(theirs)
     assert not follows_paper(replace(theirs, **changed))  # pyright: ignore[reportArgumentType]
-    assert not follows_paper(Attack())
+    assert not follows_paper(AttackConfig())

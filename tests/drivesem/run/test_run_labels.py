@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drivesem.run.labels import frames_in
+from drivesem.run.labels import list_frames
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -20,23 +20,23 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_frames_of_a_run_that_is_not_finished_are_those_in_its_folder(run: Path) -> None:
-    assert frames_in(run) == ["000000", "000001", "Scene01/clone/00002"]
+    assert list_frames(run) == ["000000", "000001", "Scene01/clone/00002"]
 
 
 def test_frames_of_a_finished_run_are_those_of_its_manifest(run: Path) -> None:
     """The same command with a smaller --limit leaves the other frames where they are."""
     files.write_json(run / "manifest.json", {"frames": {"000001": {}, "000000": {}}})
-    assert frames_in(run) == ["000000", "000001"]
+    assert list_frames(run) == ["000000", "000001"]
 
 
 def test_a_damaged_manifest_is_told(run: Path) -> None:
     for frames in (["000000"], {"../other": {}}, None):
         files.write_json(run / "manifest.json", {"frames": frames})
         with pytest.raises(FormatError, match="frames"):
-            frames_in(run)
+            list_frames(run)
 
 
 def test_a_folder_without_frames_is_no_run(run: Path) -> None:
     shutil.rmtree(run / "frames")
     files.write_json(run / "manifest.json", {"frames": ["of a generator"]})
-    assert frames_in(run) == []
+    assert list_frames(run) == []

@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from drivesem.config.blocks import Sharing
 from drivesem.config.errors import UsageError
+from drivesem.config.options import WorkerOptions
 from drivesem.run.jobs import give_back
-from drivesem.run.workers import outcomes
+from drivesem.run.workers import run_jobs
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 from tools.hostile.trial import soon
 
@@ -36,9 +36,9 @@ def build(offset: int) -> Callable[[int], tuple[int, int]]:
     return partial(square, offset=offset)
 
 
-def in_order(jobs: list[int], config: Sharing) -> dict[int, tuple[int, int] | str]:
+def in_order(jobs: list[int], config: WorkerOptions) -> dict[int, tuple[int, int] | str]:
     found: dict[int, tuple[int, int] | str] = {}
-    for job, outcome in outcomes(square, partial(build, 100), jobs, config):
+    for job, outcome in run_jobs(square, partial(build, 100), jobs, config):
         try:
             found[job] = outcome()
         except SceneError as error:
@@ -47,14 +47,14 @@ def in_order(jobs: list[int], config: Sharing) -> dict[int, tuple[int, int] | st
 
 
 def test_one_process_does_it_here() -> None:
-    found = in_order([1, 2, 3], Sharing(workers=1))
+    found = in_order([1, 2, 3], WorkerOptions(workers=1))
     assert found == {1: (1, os.getpid()), 2: (4, os.getpid()), 3: "three: expected another number, found 3"}
-    assert in_order([2], Sharing(workers=4)) == {2: (4, os.getpid())}, "one job is not worth a process"
-    assert in_order([], Sharing(workers=4)) == {}
+    assert in_order([2], WorkerOptions(workers=4)) == {2: (4, os.getpid())}, "one job is not worth a process"
+    assert in_order([], WorkerOptions(workers=4)) == {}
 
 
 def test_processes_make_their_own_and_hand_errors_back() -> None:
-    found = in_order([1, 2, 3, 4], Sharing(workers=2))
+    found = in_order([1, 2, 3, 4], WorkerOptions(workers=2))
     assert found[3] == "three: expected another number, found 3"
     for job in (1, 2, 4):
         value = found[job]
@@ -64,7 +64,7 @@ def test_processes_make_their_own_and_hand_errors_back() -> None:
 
 
 def test_processes_begin_once_for_all_jobs() -> None:
-    found = in_order([job for job in range(20) if job != 3], Sharing(workers=2))
+    found = in_order([job for job in range(20) if job != 3], WorkerOptions(workers=2))
     processes = {value[1] for value in found.values() if isinstance(value, tuple)}
     assert len(processes) <= 2, "a start takes seconds; on a busy machine one is done before the other has begun"
 
@@ -84,7 +84,7 @@ def growing() -> Callable[[int], int]:
 
 
 def test_a_process_that_grows_is_replaced_without_a_word(recwarn: pytest.WarningsRecorder) -> None:
-    found = [outcome() for _, outcome in outcomes(grow, growing, list(range(6)), Sharing(workers=2))]
+    found = [outcome() for _, outcome in run_jobs(grow, growing, list(range(6)), WorkerOptions(workers=2))]
     assert len(found) == 6
     assert len(set(found)) > 2
     assert [str(one.message) for one in recwarn if "worker" in str(one.message)] == []
@@ -103,7 +103,7 @@ def test_threads_are_shared_among_processes_only_while_they_work(jobs: list[int]
     before, shared = torch.get_num_threads(), max((os.cpu_count() or 1) // 2, 1)
     try:
         torch.set_num_threads(shared + 1)
-        for _, outcome in outcomes(square, partial(build, 0), jobs, Sharing(workers=2)):
+        for _, outcome in run_jobs(square, partial(build, 0), jobs, WorkerOptions(workers=2)):
             outcome()
             assert torch.get_num_threads() == shared
         assert torch.get_num_threads() == shared + 1
@@ -115,7 +115,7 @@ def test_no_more_threads_are_taken_than_torch_was_left() -> None:
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)  # as OMP_NUM_THREADS=1 has it
-        for _ in outcomes(square, partial(build, 0), [1, 2], Sharing(workers=1)):
+        for _ in run_jobs(square, partial(build, 0), [1, 2], WorkerOptions(workers=1)):
             assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)
@@ -133,8 +133,8 @@ def stumbling() -> Callable[[int], int]:
 def test_a_defect_ends_the_work_unless_it_is_to_keep_going(workers: int) -> None:
     def found(*, keep_going: bool) -> dict[int, int | str]:
         results: dict[int, int | str] = {}
-        config = Sharing(workers=workers, keep_going=keep_going)
-        for job, outcome in outcomes(stumble, stumbling, [3, 0, 4], config):
+        config = WorkerOptions(workers=workers, keep_going=keep_going)
+        for job, outcome in run_jobs(stumble, stumbling, [3, 0, 4], config):
             try:
                 results[job] = outcome()
             except SceneError as error:
@@ -156,7 +156,7 @@ def test_bad_settings_end_it_in_any_case(keep_going: bool) -> None:
     def refuse(job: int) -> int:
         raise UsageError("--detector", "another", job)
 
-    ((_, outcome),) = outcomes(refuse, stumbling, [1], Sharing(workers=1, keep_going=keep_going))
+    ((_, outcome),) = run_jobs(refuse, stumbling, [1], WorkerOptions(workers=1, keep_going=keep_going))
     with pytest.raises(UsageError, match="--detector"):
         outcome()
 
@@ -175,7 +175,7 @@ def dying(folder: str) -> Callable[[int], int]:
 
 def test_a_job_whose_process_is_killed_is_tried_alone_and_then_listed(tmp_path: Path) -> None:
     found: dict[int, int | str] = {}
-    for job, outcome in outcomes(die, partial(dying, str(tmp_path)), [1, 2, 3, 4, 5], Sharing(workers=2)):
+    for job, outcome in run_jobs(die, partial(dying, str(tmp_path)), [1, 2, 3, 4, 5], WorkerOptions(workers=2)):
         try:
             found[job] = outcome()
         except SceneError as error:
@@ -200,7 +200,7 @@ import signal
 from functools import partial
 
 from drivesem.run.workers import outcomes
-from drivesem.config.blocks import Sharing
+from drivesem.config.options import Sharing
 from tests.drivesem.run.test_workers import lingering
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -292,7 +292,7 @@ def scatter(job: int) -> float:
 def test_memory_that_is_free_goes_back_after_each_job() -> None:
     give_back()  # what tests before this one let go of would be taken again
     before = resident_mb()
-    for _, outcome in outcomes(scatter, stumbling, [1, 2, 3], Sharing(workers=1)):
+    for _, outcome in run_jobs(scatter, stumbling, [1, 2, 3], WorkerOptions(workers=1)):
         assert outcome() > 150
         assert resident_mb() - before < 60
     _PINS.clear()

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.confirm.judge import findings, rows_of, stands
-from drivesem.attack.judging import JudgedClasses
-from drivesem.failures.second_renderer.base import Redrawn
+from drivesem.analysis.confirm.comparison import compare_failures, compare_objects, pair_targets
+from drivesem.attack.targets import EvaluatedClasses
+from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.run.results import BoxRecord, Failure
 
 T_STAR = 0.5
@@ -26,7 +26,7 @@ def beside(step: float) -> tuple[float, float, float, float]:
 
 def drawn(
     *boxes: tuple[float, ...], ignored: tuple[int, ...] = (), region: tuple[float, ...] | None = None
-) -> Redrawn:
+) -> SecondRender:
     """A picture with cars in these boxes, and one region for cars."""
     count = len(boxes)
     rows = [*boxes, *([region] if region else [])]
@@ -34,7 +34,7 @@ def drawn(
     targets = Targets(
         torch.tensor(rows, dtype=torch.float32).reshape(-1, 4), torch.full((len(rows),), CAR), torch.tensor(ignore)
     )
-    return Redrawn(torch.zeros(3, 4, 4), targets, torch.zeros(count, 4))
+    return SecondRender(torch.zeros(3, 4, 4), targets, torch.zeros(count, 4))
 
 
 def detections(*boxes: tuple[float, ...]) -> Detections:
@@ -49,7 +49,7 @@ def detections(*boxes: tuple[float, ...]) -> Detections:
 def test_rows_are_objects_then_regions_of_both_pictures() -> None:
     before = drawn(BOX, beside(300), beside(500), ignored=(0,), region=beside(700))
     after = drawn(BOX, beside(310), beside(500), ignored=(2,), region=beside(800))
-    rows = rows_of(before, after, 3)
+    rows = pair_targets(before, after, 3)
     for targets in (rows.benign, rows.changed):
         assert targets.ignore.tolist() == [True, False, True, True, True]
         assert targets.boxes_xyxy[3:].tolist() == [list(beside(700)), list(beside(800))]
@@ -60,10 +60,10 @@ def test_rows_are_objects_then_regions_of_both_pictures() -> None:
 def found(failures: list[Failure], after: Detections, *moved: tuple[float, ...]) -> Any:
     """Findings of two cars, both found before; `moved`: their boxes after the change."""
     before = drawn(BOX, beside(300))
-    rows = rows_of(before, drawn(*moved) if moved else before, 2)
+    rows = pair_targets(before, drawn(*moved) if moved else before, 2)
     result: Any = SimpleNamespace(failures=failures)
     seen = [detections(BOX, beside(300)), after]
-    return findings(result, rows, seen, JudgedClasses(CLASSES, CLASSES), T_STAR)
+    return compare_failures(result, rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR)
 
 
 def test_the_same_vehicle_is_lost_in_both() -> None:
@@ -79,10 +79,10 @@ def test_another_vehicle_is_another_failure() -> None:
 
 
 def test_what_is_ignored_is_not_lost() -> None:
-    rows = rows_of(drawn(BOX), drawn(NOTHING, ignored=(0,)), 1)
+    rows = pair_targets(drawn(BOX), drawn(NOTHING, ignored=(0,)), 1)
     result: Any = SimpleNamespace(failures=[Failure("lost", "Car", BOX, index=0)])
     seen = [detections(BOX), detections()]
-    ours, theirs = findings(result, rows, seen, JudgedClasses(CLASSES, CLASSES), T_STAR)
+    ours, theirs = compare_failures(result, rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR)
     assert [f.survives for f in ours] == [False]
     assert theirs == ()
 
@@ -104,7 +104,7 @@ def test_found_where_it_went_is_no_failure() -> None:
 
 
 def test_where_vehicles_stand() -> None:
-    rows = rows_of(drawn(BOX, beside(300), BOX), drawn(BOX, beside(312), NOTHING, ignored=(1, 2)), 3)
+    rows = pair_targets(drawn(BOX, beside(300), BOX), drawn(BOX, beside(312), NOTHING, ignored=(1, 2)), 3)
     record = [
         BoxRecord(BOX, "Car", index=0),
         BoxRecord(beside(300), "Car", index=1),
@@ -112,7 +112,7 @@ def test_where_vehicles_stand() -> None:
     ]
     moved = [BoxRecord(beside(20), "Car", index=0), BoxRecord(beside(312), "Car", index=1), record[2]]
     result: Any = SimpleNamespace(targets_benign=record, targets_moved=moved)
-    one, two, three = stands(result, rows, 3)
+    one, two, three = compare_objects(result, rows, 3)
     assert (one.index, one.judged, one.iou_benign, one.iou) == (0, True, 1.0, 0.5)
     assert (two.index, two.judged, two.iou_benign, two.iou) == (1, False, 1.0, 1.0)
     assert (three.judged, three.iou) == (False, None)

@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 from detectors.types import CLASSES
-from drivesem.analysis.confirm.judge import RendererFailure, Stand
-from drivesem.analysis.confirm.report import Share, answer_of, summarise
-from drivesem.analysis.confirm.results import Confirmed, dump, load
+from drivesem.analysis.confirm.comparison import ConfirmedFrame, ObjectComparison, RendererFailure
+from drivesem.analysis.confirm.report import SurvivalRate, build_confirm_report, summarise_confirmation
+from drivesem.analysis.confirm.run import ConfirmAnalyser
 from drivesem.evaluation.resampling import wilson
+from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import BoxRecord, FrameResult
 from scene_ir.errors import FormatError
 
@@ -29,14 +30,14 @@ def phantom(survives: bool) -> RendererFailure:
 
 def confirmed(
     name: str, ours: tuple[RendererFailure, ...] = (), theirs: tuple[RendererFailure, ...] = (), **changes: Any
-) -> Confirmed:
+) -> ConfirmedFrame:
     facts: dict[str, Any] = {
         "identifier": name,
         "source": "00",
         "renderer": "generator",
         "compositor": ours,
         "second": theirs,
-        "stands": (Stand(0, True, 1.0, 0.9), Stand(1, False, 1.0, 0.1)),
+        "objects": (ObjectComparison(0, True, 1.0, 0.9), ObjectComparison(1, False, 1.0, 0.1)),
         "targets_benign": (BoxRecord(BOX, "Car", index=1),),
         "targets_changed": (BoxRecord(BOX, "Car", index=1),),
         "detections_benign": (BoxRecord(BOX, "Car", score=0.9),),
@@ -44,7 +45,7 @@ def confirmed(
         "not_carried": (),
         "seconds": 1.0,
     }
-    return Confirmed(**facts | changes)
+    return ConfirmedFrame(**facts | changes)
 
 
 def result(name: str) -> FrameResult:
@@ -82,9 +83,9 @@ FRAMES = [
 
 
 def test_shares_by_hand() -> None:
-    report = summarise(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
+    report = summarise_confirmation(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
     assert report.frames == 5
-    assert report.left == {"f": ["objects[3]: no such vehicle"]}
+    assert report.not_carried == {"f": ["objects[3]: no such vehicle"]}
     assert [(s.name, s.survive, s.failures) for s in report.shares] == [
         ("frames", 2, 3),
         ("frames, same failure", 1, 3),
@@ -104,15 +105,15 @@ def test_shares_by_hand() -> None:
 
 
 def test_without_a_failure_there_is_no_share() -> None:
-    assert Share.of("frames", []) == Share("frames", 0, 0, None, None, None)
-    report = summarise([FRAMES[-1]], [result("f")], CLASSES, 0.5)
+    assert SurvivalRate.from_outcomes("frames", []) == SurvivalRate("frames", 0, 0, None, None, None)
+    report = summarise_confirmation([FRAMES[-1]], [result("f")], CLASSES, 0.5)
     assert (report.frames, report.scores, report.overlap) == (0, {}, None)
     assert report.to_json()["survive"] is None
 
 
 def test_files(tmp_path: Path) -> None:
-    report = summarise(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
-    answer_of(tmp_path, report, FRAMES, {}, {}).write()
+    report = summarise_confirmation(FRAMES, [result(f.identifier) for f in FRAMES], CLASSES, 0.5)
+    build_confirm_report(tmp_path, report, FRAMES, {}, {}).write()
     rows = list(csv.DictReader((tmp_path / "confirm.csv").read_text().splitlines()))
     assert [row["survives"] for row in rows] == ["True", "True", "False", "False", "False", "True"]
     assert (rows[0]["lost_both"], rows[0]["phantoms_compositor"], rows[0]["box_iou"]) == ("1", "1", "0.9")
@@ -125,11 +126,11 @@ def test_files(tmp_path: Path) -> None:
 
 def test_a_frame_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "confirmed.json"
-    path.write_text(dump(FRAMES[0]))
-    assert load(path) == FRAMES[0]
+    path.write_text(dump_record(FRAMES[0], ConfirmAnalyser.schema))
+    assert load_record(path, ConfirmedFrame, ConfirmAnalyser.schema) == FRAMES[0]
     path.write_text('{"schema": 2}')
     with pytest.raises(FormatError, match=r"confirmed\.json: identifier: expected a value"):
-        load(path)
+        load_record(path, ConfirmedFrame, ConfirmAnalyser.schema)
     path.write_text('{"schema": 0}')
     with pytest.raises(FormatError, match="schema"):
-        load(path)
+        load_record(path, ConfirmedFrame, ConfirmAnalyser.schema)

@@ -9,18 +9,23 @@ from pathlib import Path
 import cv2
 import pytest
 
-from drivesem.analysis.explain.players import Size
-from drivesem.analysis.explain.plots import write_waterfalls
-from drivesem.analysis.explain.report import answer_of, means, sheets, what_if
+from drivesem.analysis.explain.attribution import ChangeSize
+from drivesem.analysis.explain.report import (
+    build_explain_report,
+    build_explain_tables,
+    build_frame_table,
+    plot_waterfalls,
+    summarise_parameters,
+)
 from drivesem.analysis.explain.results import (
+    SCHEMA,
     Contribution,
     Explanation,
-    Least,
+    MinimalChange,
     PartOutcome,
-    Sensitivity,
-    read_explanation,
-    write_explanation,
+    PixelSensitivity,
 )
+from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import FormatError
 
@@ -34,11 +39,11 @@ def contribution(kind: str, name: str, loss: float, fails: float, error: float |
 
 def explanation(name: str, rotate: float = 0.5) -> Explanation:
     sizes = (
-        Size("rotate", 0, 2.0, "deg", 3.5),
-        Size("rotate", 2, 5.0, "deg", 8.7),
-        Size("mesh", 2, 0.1, "m", 1.0),
+        ChangeSize("rotate", 0, 2.0, "deg", 3.5),
+        ChangeSize("rotate", 2, 5.0, "deg", 8.7),
+        ChangeSize("mesh", 2, 0.1, "m", 1.0),
     )
-    least = Least(
+    least = MinimalChange(
         scan=(False, True, False, True),
         sign_changes=3,
         scale_whole=0.3,
@@ -49,7 +54,7 @@ def explanation(name: str, rotate: float = 0.5) -> Explanation:
         norm=2.0,
         outcome=replace(BAD, phantoms=0),
         violations=(),
-        sizes=(Size("rotate", 2, 2.5, "deg", 4.3),),
+        sizes=(ChangeSize("rotate", 2, 2.5, "deg", 4.3),),
         failures=(Failure("lost", "Car", (1.0, 2.0, 3.0, 4.0), index=2),),
         theta=(Coordinate("objects[2].yaw", "rad", 0.04, -0.35, 0.35, "2.5 deg"),),
     )
@@ -68,7 +73,7 @@ def explanation(name: str, rotate: float = 0.5) -> Explanation:
         exact=("parameter",),
         sizes=sizes,
         least=least,
-        sensitivity={"benign": Sensitivity((0.1, 0.2, 0.3), 0.4)},
+        sensitivity={"benign": PixelSensitivity((0.1, 0.2, 0.3), 0.4)},
         renders=99,
         seconds=1.5,
     )
@@ -76,15 +81,15 @@ def explanation(name: str, rotate: float = 0.5) -> Explanation:
 
 def test_back_from_json(tmp_path: Path) -> None:
     path, told = tmp_path / "explain.json", explanation("a")
-    write_explanation(path, told)
-    assert read_explanation(path) == told
+    path.write_text(dump_record(told, SCHEMA))
+    assert load_record(path, Explanation, SCHEMA) == told
     for broken in ("[]", "{}", '{"schema": 1}', path.read_text().replace('"sign_changes"', '"signs"')):
         (tmp_path / "broken.json").write_text(broken)
         with pytest.raises(FormatError, match=r"broken\.json: (schema|identifier|least)"):
-            read_explanation(tmp_path / "broken.json")
+            load_record(tmp_path / "broken.json", Explanation, SCHEMA)
     (tmp_path / "old.json").write_text('{"schema": 0}')
     with pytest.raises(FormatError, match="schema: expected 1"):
-        read_explanation(tmp_path / "old.json")
+        load_record(tmp_path / "old.json", Explanation, SCHEMA)
 
 
 def test_the_least_change_in_words() -> None:
@@ -95,7 +100,7 @@ def test_the_least_change_in_words() -> None:
 
 
 def test_means_over_frames() -> None:
-    rows = means([explanation("a", 0.5), explanation("b", 1.5)], 200, 0)
+    rows = summarise_parameters([explanation("a", 0.5), explanation("b", 1.5)], 200, 0)
     rotate, mesh = rows
     assert (rotate.name, rotate.loss.value, mesh.loss.value) == ("rotate", 1.0, 1.0)
     assert (rotate.loss.low, rotate.loss.high) == (0.5, 1.5)
@@ -104,7 +109,7 @@ def test_means_over_frames() -> None:
     assert (rotate.needed, mesh.needed) == (2, 0)
     assert (rotate.found, rotate.least, mesh.found, mesh.least) == (5.0, 2.5, 0.1, None)
     assert rotate.gradient_share == pytest.approx(0.5)
-    (lone, _) = means([explanation("a")], 0, 0)
+    (lone, _) = summarise_parameters([explanation("a")], 0, 0)
     assert (lone.loss.value, lone.loss.low, lone.loss.high) == (1.5, None, None)
     assert lone.to_json()["loss"] == 1.5
 
@@ -116,7 +121,7 @@ def test_a_parameter_that_some_frames_leave_alone() -> None:
         contributions=tuple(c for c in without.contributions if c.name != "mesh"),
         sizes=without.sizes[:2],
     )
-    _, mesh = means([explanation("a", 1.0), without], 0, 0)
+    _, mesh = summarise_parameters([explanation("a", 1.0), without], 0, 0)
     assert mesh.loss.value == 0.5
     assert (mesh.alone, mesh.without) == (0, 2)
     assert mesh.gradient_share == 0.5
@@ -124,13 +129,13 @@ def test_a_parameter_that_some_frames_leave_alone() -> None:
 
 def test_tables() -> None:
     frames = [explanation("a"), explanation("b")]
-    by_parameter, by_frame = sheets(frames, means(frames, 0, 0))
+    by_parameter, by_frame = build_explain_tables(frames, summarise_parameters(frames, 0, 0))
     assert by_parameter.rows[0] == ("rotate", "+1.50", "+75", "75", "2", "0", "2", "5 deg", "2.5 deg")
     row = dict(zip(by_frame.columns, by_frame.rows[0], strict=True))
     assert (row["loss"], row["failures"], row["still"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
     assert (row["enough, %"], row["needs"], row["cars"]) == ("25.0", "rotate", "2 of 3")
     assert row["most loss by"] == "[2] +2.50"
-    parts = {row[0]: row for row in what_if(frames[0]).rows}
+    parts = {row[0]: row for row in build_frame_table(frames[0]).rows}
     assert parts["everything"][4:6] == ("3.00", "1 + 2")
     assert parts["rotate"][1:4] == ("+1.50", "+75", "75")
     assert parts["objects[0]"][1] == "-0.50 ± 0.10"
@@ -139,7 +144,9 @@ def test_tables() -> None:
 
 def test_files(tmp_path: Path) -> None:
     frames = [explanation("a"), explanation("b", 1.5)]
-    answer_of(tmp_path, frames, means(frames, 20, 0), 20, {"frames_failed": {}, "frames_by_exchange": []}).write()
+    build_explain_report(
+        tmp_path, frames, summarise_parameters(frames, 20, 0), 20, {"frames_failed": {}, "frames_by_exchange": []}
+    ).write()
     rows = list(csv.DictReader((tmp_path / "explain.csv").read_text().splitlines()))
     assert [row["frame"] for row in rows] == ["a"] * 4 + ["b"] * 4
     assert (rows[0]["found"], rows[0]["least"], rows[0]["unit"]) == ("5.0", "2.5", "deg")
@@ -157,6 +164,6 @@ def test_waterfalls_grow_with_the_number_of_cars(tmp_path: Path) -> None:
     many = replace(many, contributions=many.of_kind("parameter") + cars)
     heights = []
     for told in (few, many):
-        write_waterfalls(tmp_path / "shapley.png", told)
+        plot_waterfalls(tmp_path / "shapley.png", told)
         heights.append(cv2.imread(str(tmp_path / "shapley.png")).shape[0])
     assert heights[1] > heights[0] + 10 * 40

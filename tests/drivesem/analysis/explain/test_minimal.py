@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.analysis.explain.minimal import LeastSearch, ThetaBlock, minimal
+from drivesem.analysis.explain.minimal import MinimalChangeSearch, ThetaBlock, find_minimal_change
 from scene_ir.errors import RangeError
 
 RESOLUTION = 1 / (16 * 32)
@@ -26,12 +26,12 @@ PAIRS = blocks(("a", (0, 1)), ("b", (2, 3)))
 
 
 def search(fails, project=lambda theta: theta, points=16):
-    return LeastSearch(project, fails, lambda theta: float(theta.norm()), points)
+    return MinimalChangeSearch(project, fails, lambda theta: float(theta.norm()), points)
 
 
 def test_what_is_not_needed_goes_and_the_rest_is_shortened():
     theta = torch.ones(4)
-    found = minimal(theta, PAIRS, search(lambda t: bool(t[2] > 0.3)))
+    found = find_minimal_change(theta, PAIRS, search(lambda t: bool(t[2] > 0.3)))
     assert found.dropped == ("a",)
     assert found.sign_changes == 1
     assert found.scan[:5] == (False,) * 5
@@ -44,7 +44,7 @@ def test_what_is_not_needed_goes_and_the_rest_is_shortened():
 
 def test_single_coordinates_go_where_they_are_offered():
     every = PAIRS + blocks(*((str(i), (i,)) for i in range(4)))
-    found = minimal(torch.ones(4), every, search(lambda t: bool(t[1] > 0.25) and bool(t[2] > 0.1)))
+    found = find_minimal_change(torch.ones(4), every, search(lambda t: bool(t[1] > 0.25) and bool(t[2] > 0.1)))
     assert found.dropped == ("0", "3")
     assert found.theta.nonzero()[:, 0].tolist() == [1, 2]
     assert 0.25 < found.scale < 0.25 + RESOLUTION
@@ -52,26 +52,26 @@ def test_single_coordinates_go_where_they_are_offered():
 
 def test_the_order_of_blocks_decides_between_two_that_would_each_do():
     fails = search(lambda t: bool(t[0] > 0.5) or bool(t[2] > 0.5))
-    assert minimal(torch.ones(4), PAIRS, fails).dropped == ("a",)
-    assert minimal(torch.ones(4), PAIRS[::-1], fails).dropped == ("b",)
+    assert find_minimal_change(torch.ones(4), PAIRS, fails).dropped == ("a",)
+    assert find_minimal_change(torch.ones(4), PAIRS[::-1], fails).dropped == ("b",)
 
 
 def test_nothing_goes_where_all_is_needed_or_the_rest_would_be_larger():
-    both = minimal(torch.ones(4), PAIRS, search(lambda t: bool(t.min() > 0.5)))
+    both = find_minimal_change(torch.ones(4), PAIRS, search(lambda t: bool(t.min() > 0.5)))
     assert both.dropped == ()
     assert torch.equal(both.theta, both.shortened)
     # alone, b would have to go to 0.9: longer than both of them at 0.5
     fails = search(lambda t: (bool(t[0] > 0.5) and bool(t[2] > 0.5)) or bool(t[2] > 0.9))
-    assert minimal(torch.ones(4), PAIRS, fails).dropped == ()
+    assert find_minimal_change(torch.ones(4), PAIRS, fails).dropped == ()
     # at 0.6 it is shorter, and a goes though the rest grows
     fails = search(lambda t: (bool(t[0] > 0.5) and bool(t[2] > 0.5)) or bool(t[2] > 0.6))
-    longer = minimal(torch.ones(4), PAIRS, fails)
+    longer = find_minimal_change(torch.ones(4), PAIRS, fails)
     assert longer.dropped == ("a",)
     assert 0.6 < longer.scale < 0.6 + RESOLUTION
 
 
 def test_the_first_of_several_intervals_is_taken_and_they_are_counted():
-    found = minimal(
+    found = find_minimal_change(
         torch.tensor([1.0, 0, 0, 0]), PAIRS, search(lambda t: 0.2 < float(t[0]) < 0.3 or float(t[0]) > 0.8)
     )
     assert found.sign_changes == 3
@@ -80,7 +80,7 @@ def test_the_first_of_several_intervals_is_taken_and_they_are_counted():
 
 def test_what_falls_between_two_points_of_the_grid_is_not_seen():
     narrow = search(lambda t: 0.26 < float(t[0]) < 0.29 or float(t[0]) > 0.8, points=4)
-    assert minimal(torch.tensor([1.0, 0, 0, 0]), PAIRS, narrow).scale > 0.8
+    assert find_minimal_change(torch.tensor([1.0, 0, 0, 0]), PAIRS, narrow).scale > 0.8
 
 
 def test_every_point_is_projected():
@@ -93,7 +93,7 @@ def test_every_point_is_projected():
         seen.append(theta)
         return bool(theta[0] >= 0.375)
 
-    found = minimal(torch.ones(4), PAIRS, search(fails, project))
+    found = find_minimal_change(torch.ones(4), PAIRS, search(fails, project))
     assert max(float(t.max()) for t in seen) <= 0.375
     assert found.dropped == ("b",)
     assert 0.375 <= found.scale < 0.375 + RESOLUTION
@@ -105,7 +105,7 @@ def test_a_projection_that_lengthens_does_not_pass_for_smaller():
     def project(theta):
         return theta if bool(theta[0] != 0) or not bool(theta.any()) else torch.tensor([0.0, 0, 9, 9])
 
-    found = minimal(torch.ones(4), PAIRS, search(lambda t: bool(t[2] > 0.5), project))
+    found = find_minimal_change(torch.ones(4), PAIRS, search(lambda t: bool(t[2] > 0.5), project))
     assert found.dropped == ()
 
 
@@ -118,7 +118,7 @@ def test_the_result_fails_and_is_no_larger_than_the_start(heights, seed):
         share = float((point * theta).sum() / (theta @ theta))
         return share > 0.999 or (share > 0 and heights[min(int(16 * share), 16)] > 0.7)
 
-    found = minimal(theta, PAIRS, search(fails))
+    found = find_minimal_change(theta, PAIRS, search(fails))
     assert fails(found.theta)
     assert float(found.theta.norm()) <= float(found.shortened.norm()) * (1 + 1e-4)
     assert float(found.shortened.norm()) <= float(theta.norm()) * (1 + 1e-6)
@@ -126,6 +126,6 @@ def test_the_result_fails_and_is_no_larger_than_the_start(heights, seed):
 
 def test_what_does_not_fail_is_refused():
     with pytest.raises(RangeError, match="expected a change that fails, found one that does not"):
-        minimal(torch.ones(4), PAIRS, search(lambda _: False))
+        find_minimal_change(torch.ones(4), PAIRS, search(lambda _: False))
     with pytest.raises(RangeError, match="found a failure without any change"):
-        minimal(torch.ones(4), PAIRS, search(lambda _: True))
+        find_minimal_change(torch.ones(4), PAIRS, search(lambda _: True))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.analysis.explain.frame import Judge, weigh
-from drivesem.analysis.explain.players import Player
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.theta import Projected
+from drivesem.analysis.explain.attribution import ThetaPart
+from drivesem.analysis.explain.run import PartialChangeEvaluator, compute_contributions
+from drivesem.attack.methods.base import ParameterGroup, Problem, Score
+from drivesem.attack.theta import ProjectedTheta
 
 THETA = torch.tensor([0.2, 0.4, 0.1, 0.3])
 
@@ -28,14 +28,14 @@ class Counter:
             step=torch.full((4,), 0.1),
             lower=-torch.ones(4),
             upper=torch.ones(4),
-            groups=(Group("a", slice(0, 2)), Group("b", slice(2, 4))),
+            groups=(ParameterGroup("a", slice(0, 2)), ParameterGroup("b", slice(2, 4))),
         )
 
     def project(self, theta):
         held = theta.clone()
         if not bool(theta[0]):
             held[3] = held[3].clamp(max=0.1)
-        return Projected(held, ())
+        return ProjectedTheta(held, ())
 
     def score(self, theta):
         self.asked += 1
@@ -47,7 +47,7 @@ class Counter:
 def player(name, *indices):
     mask = torch.zeros(4, dtype=torch.bool)
     mask[list(indices)] = True
-    return Player("parameter", name, mask)
+    return ThetaPart("parameter", name, mask)
 
 
 TEAM = [player("a", 0, 1), player("b", 2, 3)]
@@ -55,9 +55,9 @@ TEAM = [player("a", 0, 1), player("b", 2, 3)]
 
 def test_what_each_adds():
     counter = Counter()
-    judge = Judge(counter.problem())
+    judge = PartialChangeEvaluator(counter.problem())
     slope = torch.tensor([0.2, -0.1, 0.0, 0.1])
-    a, b = weigh(TEAM, THETA, judge, slope, 2, np.random.default_rng(0))
+    a, b = compute_contributions(TEAM, THETA, judge, slope, 2, np.random.default_rng(0))
     # by hand: nothing 1.0, a alone 1.2, b alone 1.0, both 1.6
     assert (a.loss, b.loss) == (pytest.approx(0.4), pytest.approx(0.2))
     assert a.loss + b.loss == pytest.approx(0.6)
@@ -73,12 +73,14 @@ def test_what_each_adds():
 
 def test_drawn_orders_carry_errors_and_no_gradient_is_no_share():
     team = [player(str(i), i % 4) for i in range(7)]  # some stand for the same coordinate
-    found = weigh(team, THETA, Judge(Counter().problem()), None, 8, np.random.default_rng(0))
+    found = compute_contributions(
+        team, THETA, PartialChangeEvaluator(Counter().problem()), None, 8, np.random.default_rng(0)
+    )
     assert sum(c.loss for c in found) == pytest.approx(0.6, abs=1e-6)
     assert all(c.loss_error is not None and c.gradient is None and c.gradient_share is None for c in found)
 
 
 def test_sizes_are_in_steps_of_each_group():
-    judge = Judge(Counter().problem())
+    judge = PartialChangeEvaluator(Counter().problem())
     assert judge.size(torch.tensor([0.3, 0.3, 0.0, 0.0])) == pytest.approx(3)
     assert judge.size(torch.tensor([0.3, 0.3, 0.4, -0.4])) == pytest.approx(5)

@@ -8,9 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.analysis.gate.report import answer_of, junit
-from drivesem.analysis.gate.results import Pair
-from drivesem.analysis.gate.rows import ALL, HOLE, KIND, PHANTOMS, rows_of
+from drivesem.analysis.gate import (
+    ALL,
+    HOLE,
+    KIND,
+    PHANTOMS,
+    PairedSamples,
+    build_gate_report,
+    compute_gate_rows,
+    format_junit,
+)
 
 DRAWS = 200
 
@@ -26,13 +33,13 @@ def pair(
     error: str = "missed",
     index: int = 0,
     phantoms: tuple[int, int] = (0, 0),
-) -> Pair:
+) -> PairedSamples:
     """The new detector fails in the samples in which the old one does, and in more or in fewer."""
-    return Pair(index, "Car", error, *(first(count, of) for count in (before, after, *phantoms)))
+    return PairedSamples(index, "Car", error, *(first(count, of) for count in (before, after, *phantoms)))
 
 
 def rows(found, tolerance: float = 0.05):
-    return rows_of(found, tolerance, DRAWS, 0)
+    return compute_gate_rows(found, tolerance, DRAWS, 0)
 
 
 def test_shares_and_order() -> None:
@@ -71,7 +78,7 @@ def test_phantoms_are_a_row_of_their_own() -> None:
     assert [row.hole for row in told if row.grew] == [PHANTOMS]
     row = told[-1]
     assert (row.before, row.after, row.samples, row.holes) == pytest.approx((2 / 40, 21 / 40, 40, 2))
-    case = ET.fromstring(junit(told, {})).find(f"testcase[@name='{PHANTOMS}']/failure")
+    case = ET.fromstring(format_junit(told, {})).find(f"testcase[@name='{PHANTOMS}']/failure")
     assert case is not None
     assert case.attrib["message"] == "phantoms in 5.0 % before, 52.5 % after"
 
@@ -79,7 +86,7 @@ def test_phantoms_are_a_row_of_their_own() -> None:
 def test_pairing_counts() -> None:
     """Both fail half of the time, the one where the other does not: as often, so nothing grew, but not alike."""
     even, never = tuple(i % 2 == 0 for i in range(20)), (False,) * 20
-    opposite = Pair(0, "Car", "missed", even, tuple(not one for one in even), never, never)
+    opposite = PairedSamples(0, "Car", "missed", even, tuple(not one for one in even), never, never)
     alike, other = rows({"a": [pair(10, 10)]})[0], rows({"a": [opposite]})[0]
     assert alike.low == alike.high == 0
     assert other.low is not None
@@ -104,7 +111,9 @@ def test_one_sample_tells_nothing() -> None:
     assert not any(row.grew for row in told)
 
 
-def seen(holes: int, samples: int, new_alone: float, old_alone: float, seed: int) -> dict[str, list[Pair]]:
+def seen(
+    holes: int, samples: int, new_alone: float, old_alone: float, seed: int
+) -> dict[str, list[PairedSamples]]:
     """Holes in which one half of the samples is lost, and in so large shares of all by one detector alone."""
     rng = np.random.default_rng(seed)
     found = []
@@ -112,12 +121,14 @@ def seen(holes: int, samples: int, new_alone: float, old_alone: float, seed: int
         lot, lost = rng.random(samples), rng.random(samples) < 0.5
         new, old = lot < new_alone, lot > 1 - old_alone
         before, after = (lost | old) & ~new, (lost | new) & ~old
-        found.append(Pair(index, "Car", "missed", *(tuple(one.tolist()) for one in (before, after))))
+        found.append(PairedSamples(index, "Car", "missed", *(tuple(one.tolist()) for one in (before, after))))
     return {"a": found}
 
 
 def share_not_passed(holes: int, samples: int, new_alone: float, old_alone: float, of: int) -> float:
-    told = (rows_of(seen(holes, samples, new_alone, old_alone, seed), 0.05, 40, seed) for seed in range(of))
+    told = (
+        compute_gate_rows(seen(holes, samples, new_alone, old_alone, seed), 0.05, 40, seed) for seed in range(of)
+    )
     return sum(any(row.grew for row in one) for one in told) / of
 
 
@@ -154,14 +165,16 @@ NONE = "nothing to compare"
         pytest.param({}, {}, True, True, id="no certain failure"),
         pytest.param({}, {"a": "no scene"}, False, False, id="all frames failed"),
         pytest.param({"b": [pair(5, 5)]}, {"a": "no scene"}, False, False, id="one of two frames failed"),
-        pytest.param({"a": [Pair(0, "Car", "missed", (), ())]}, {}, False, False, id="no sample counts"),
+        pytest.param({"a": [PairedSamples(0, "Car", "missed", (), ())]}, {}, False, False, id="no sample counts"),
         pytest.param({"b": [pair(5, 5)]}, {}, True, False, id="nothing grew"),
         pytest.param({"b": [pair(4, 14)]}, {}, False, False, id="a row grew"),
     ],
 )
 def test_the_verdict(found, failed, passed, says_none, tmp_path: Path) -> None:
     """A gate is passed where all that should be compared was compared, and no row grew."""
-    answer = answer_of(tmp_path, rows(found), sum(map(len, found.values())), {"before": "x", "after": "y"}, failed)
+    answer = build_gate_report(
+        tmp_path, rows(found), sum(map(len, found.values())), {"before": "x", "after": "y"}, failed
+    )
     assert answer.data["passed"] == passed
     assert answer.data["frames_failed"] == failed
     assert any(NONE in note for note in answer.notes) == says_none
@@ -175,13 +188,13 @@ def test_the_verdict(found, failed, passed, says_none, tmp_path: Path) -> None:
 
 def test_without_failures_there_is_nothing_to_say() -> None:
     assert rows({}) == []
-    assert rows({"a": [Pair(0, "Car", "missed", (), (), (), ())]}) == []
-    assert ET.fromstring(junit([], {})).attrib["tests"] == "0"
+    assert rows({"a": [PairedSamples(0, "Car", "missed", (), (), (), ())]}) == []
+    assert ET.fromstring(format_junit([], {})).attrib["tests"] == "0"
 
 
 def test_junit() -> None:
     told = rows({"a<b>": [pair(4, 14)], "c": [pair(5, 5)]})
-    suite = ET.fromstring(junit(told, {}))
+    suite = ET.fromstring(format_junit(told, {}))
     assert (suite.attrib["tests"], suite.attrib["failures"]) == (str(len(told)), str(sum(r.grew for r in told)))
     cases = {case.attrib["name"]: case for case in suite}
     failure = cases["a<b>: objects[0]"].find("failure")

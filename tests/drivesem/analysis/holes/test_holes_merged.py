@@ -7,39 +7,48 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivesem.analysis.holes.merged import Explained, Hole, of_kitti
-from drivesem.analysis.holes.merged import merged as merged_of
-from drivesem.analysis.holes.pooled import Told
-from drivesem.analysis.holes.results import Around, Samples
-from drivesem.failures.rare import Share
-from drivesem.failures.rules import fit
+from drivesem.analysis.holes.rules import (
+    FailureRule,
+    FailureSamples,
+    FailureWithRule,
+    FeatureSamples,
+    Hole,
+    kitti_shares,
+    merge_holes,
+)
+from drivesem.failures.failure_probability import FailureProbability
+from drivesem.failures.rules import fit_rule
 
 NAMES = ("height_px", "lightness")
-NOTHING = Samples((), (), ())
+NOTHING = FeatureSamples((), (), ())
 
 
-def samples(height: list[float], fails: list[bool]) -> Samples:
-    return Samples(NAMES, tuple((h, 0.5) for h in height), tuple(-1.0 if lost else 1.0 for lost in fails))
+def samples(height: list[float], fails: list[bool]) -> FeatureSamples:
+    return FeatureSamples(NAMES, tuple((h, 0.5) for h in height), tuple(-1.0 if lost else 1.0 for lost in fails))
 
 
-def merged(found: dict[str, list[Explained]], again: dict[tuple[str, int], Samples] | None = None) -> list[Hole]:
+def merge(
+    found: dict[str, list[FailureWithRule]], again: dict[tuple[str, int], FeatureSamples] | None = None
+) -> list[Hole]:
     """Of failures by frame, of object after object."""
-    return merged_of({(name, i): one for name, own in found.items() for i, one in enumerate(own)}, again)
+    return merge_holes({(name, i): one for name, own in found.items() for i, one in enumerate(own)}, again)
 
 
-def around(low: float, high: float, fresh_fails: int = 9, wide: float = 100.0, label: str = "Car") -> Explained:
+def around(
+    low: float, high: float, fresh_fails: int = 9, wide: float = 100.0, label: str = "Car"
+) -> FailureWithRule:
     """Fails where the height lies in a band, of 100 samples evenly from 0 to `wide`, and in some of 10 fresh."""
     heights = np.linspace(0, wide, 100).tolist()
     fresh = samples([(low + high) / 2] * 10, [i < fresh_fails for i in range(10)])
-    asked = samples(heights, [low <= h <= high for h in heights])
+    drawn_samples = samples(heights, [low <= h <= high for h in heights])
     size = (high - low) / wide
-    lost = Share(size, size / 2, size * 2, "samples", 0)
-    one = Around(0, label, "missed", "certain", asked, NOTHING, lost)
-    return Explained(one, Told({"height_px": (low, high)}, False), fresh)
+    lost = FailureProbability(size, size / 2, size * 2, "samples", 0)
+    one = FailureSamples(0, label, "missed", "certain", drawn_samples, NOTHING, lost)
+    return FailureWithRule(one, FailureRule({"height_px": (low, high)}, False), fresh)
 
 
 def test_bands_that_overlap_are_one_hole() -> None:
-    (hole,) = merged({"000001": [around(20, 40)], "000002": [around(22, 42, fresh_fails=7)]})
+    (hole,) = merge({"000001": [around(20, 40)], "000002": [around(22, 42, fresh_fails=7)]})
     assert hole.where["height_px"] == pytest.approx((21, 41))
     assert (hole.failures, hole.frames) == (("000001: objects[0]", "000002: objects[0]"), ("000001", "000002"))
     assert hole.count == 20
@@ -55,8 +64,8 @@ def test_bands_that_overlap_are_one_hole() -> None:
 def test_a_rule_of_many_stays_as_it_is() -> None:
     """What is much like it joins it, and does not move its bounds."""
     one = around(22, 42)
-    pooled = replace(one, told=Told({"height_px": (20.0, 45.0)}, True))
-    (hole,) = merged({"a": [around(25, 45)], "b": [pooled], "c": [pooled]})
+    pooled = replace(one, rule=FailureRule({"height_px": (20.0, 45.0)}, True))
+    (hole,) = merge({"a": [around(25, 45)], "b": [pooled], "c": [pooled]})
     assert hole.where == {"height_px": (20.0, 45.0)}
     assert hole.pooled
     assert hole.to_json()["pooled"]
@@ -66,24 +75,26 @@ def test_a_rule_of_many_stays_as_it_is() -> None:
 
 def test_other_bands_and_classes_are_others() -> None:
     found = {"a": [around(20, 40), around(60, 70)], "b": [around(20, 40, label="Van")]}
-    assert len(merged(found)) == 3
+    assert len(merge(found)) == 3
 
 
 def test_the_largest_first_and_copies_last() -> None:
     found = {"a": [around(0, 50)], "b": [around(60, 95)], "c": [around(10, 20, label="Van")]}
-    order = [(hole.label, hole.words) for hole in merged(found)]
+    order = [(hole.label, hole.words) for hole in merge(found)]
     assert order == [("Car", "height_px 0 to 50"), ("Van", "height_px 10 to 20"), ("Car", "height_px 60 to 95")]
 
 
 def test_a_rule_of_nothing_is_the_whole_neighbourhood() -> None:
     four = samples([1, 2, 3, 4], [True, True, False, True])
-    lost = Share(0.75, 0.3, 0.95, "samples", 0)
-    one = Explained(Around(0, "Car", "missed", "certain", four, NOTHING, lost), Told({}, False), NOTHING)
-    (hole,) = merged({"a": [one]})
+    lost = FailureProbability(0.75, 0.3, 0.95, "samples", 0)
+    one = FailureWithRule(
+        FailureSamples(0, "Car", "missed", "certain", four, NOTHING, lost), FailureRule({}, False), NOTHING
+    )
+    (hole,) = merge({"a": [one]})
     assert (hole.words, hole.probability, hole.outside, hole.lost) == ("anywhere", None, None, lost)
 
 
-def drawn(rng: np.random.Generator, count: int, low: float = 0.0, high: float = 100.0) -> Samples:
+def drawn(rng: np.random.Generator, count: int, low: float = 0.0, high: float = 100.0) -> FeatureSamples:
     """Of a field in which an object is lost in 70 % of the states of heights from 30 to 60, and in 5 % else."""
     heights = rng.uniform(low, high, count)
     lost = rng.random(count) < np.where((heights > 30) & (heights < 60), 0.7, 0.05)
@@ -91,75 +102,81 @@ def drawn(rng: np.random.Generator, count: int, low: float = 0.0, high: float = 
 
 
 @pytest.fixture(scope="module")
-def fields() -> list[tuple[Explained, Samples]]:
+def fields() -> list[tuple[FailureWithRule, FeatureSamples]]:
     """Rules of that field from samples, fresh ones inside of each, and those of a recheck."""
     found = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        asked = drawn(rng, 96)
-        where = fit(asked.columns(), asked.failing).where
+        drawn_samples = drawn(rng, 96)
+        where = fit_rule(drawn_samples.columns(), drawn_samples.failing).intervals
         low, high = where.get("height_px", (0.0, 100.0))
         plain = around(30, 60)
-        own = replace(plain.around, asked=asked)
-        one = Explained(own, Told(where, False), drawn(rng, 32, low, high))
+        own = replace(plain.failure, samples=drawn_samples)
+        one = FailureWithRule(own, FailureRule(where, False), drawn(rng, 32, low, high))
         found.append((one, drawn(rng, 150, low, high)))
     return found
 
 
-def test_a_probability_that_was_held_against_fresh_samples_holds(fields: list[tuple[Explained, Samples]]) -> None:
+def test_a_probability_that_was_held_against_fresh_samples_holds(
+    fields: list[tuple[FailureWithRule, FeatureSamples]],
+) -> None:
     held = 0
     for one, again in fields:
-        (hole,) = merged({"a": [one]}, {("a", 0): again})
+        (hole,) = merge({"a": [one]}, {("a", 0): again})
         assert hole.recheck is not None
-        told = hole.recheck.to_json()
-        assert (told["draws"], told["failures"]) == (150, int(again.failing.sum()))
-        assert told["probability"] == told["failures"] / 150
-        assert told["interval"][0] < told["probability"] < told["interval"][1]
-        assert told["holds"] == (told["difference"][0] <= 0 <= told["difference"][1])
-        held += told["holds"]
+        recheck = hole.recheck.to_json()
+        assert (recheck["draws"], recheck["failures"]) == (150, int(again.failing.sum()))
+        assert recheck["probability"] == recheck["failures"] / 150
+        assert recheck["interval"][0] < recheck["probability"] < recheck["interval"][1]
+        assert recheck["holds"] == (recheck["difference"][0] <= 0 <= recheck["difference"][1])
+        held += recheck["holds"]
     assert 0.92 <= held / len(fields) <= 0.99  # 95 %: chance alone makes some that do not
 
 
-def test_a_probability_of_another_place_does_not(fields: list[tuple[Explained, Samples]]) -> None:
+def test_a_probability_of_another_place_does_not(fields: list[tuple[FailureWithRule, FeatureSamples]]) -> None:
     """What is stated of samples anywhere, of which a third or so lie where the object is lost."""
     held = 0
     for one, again in fields:
-        asked = one.around.asked
-        anywhere = replace(asked, values=tuple((one.told.where["height_px"][0], 0.5) for _ in asked.values))
-        (hole,) = merged({"a": [replace(one, fresh=anywhere)]}, {("a", 0): again})
+        drawn_samples = one.failure.samples
+        anywhere = replace(
+            drawn_samples, values=tuple((one.rule.where["height_px"][0], 0.5) for _ in drawn_samples.values)
+        )
+        (hole,) = merge({"a": [replace(one, fresh=anywhere)]}, {("a", 0): again})
         assert hole.recheck is not None
         held += hole.recheck.holds
     assert held / len(fields) < 0.05
 
 
 def test_a_recheck_is_of_what_the_whole_hole_says() -> None:
-    """Of a hole of two failures, draws of both count where they lie inside of the rule that is told."""
+    """Of a hole of two failures, draws of both count where they lie inside of the rule that is recheck."""
     again = {("a", 0): samples([21.0, 30.0, 39.0], [True] * 3), ("b", 0): samples([25.0, 41.9], [False] * 2)}
-    (hole,) = merged({"a": [around(20, 40)], "b": [around(22, 42)]}, again)
+    (hole,) = merge({"a": [around(20, 40)], "b": [around(22, 42)]}, again)
     assert hole.recheck is not None
     assert hole.recheck.again == (3, 4)
     assert hole.recheck.stated == (18, 20)
 
 
 def test_nothing_to_check() -> None:
-    (plain,) = merged({"a": [around(20, 40)]})
+    (plain,) = merge({"a": [around(20, 40)]})
     assert plain.to_json()["recheck"] is None
-    (unsaid,) = merged({"a": [replace(around(20, 40), fresh=NOTHING)]}, {("a", 0): samples([30.0], [True])})
+    (unsaid,) = merge({"a": [replace(around(20, 40), fresh=NOTHING)]}, {("a", 0): samples([30.0], [True])})
     assert (unsaid.probability, unsaid.recheck) == (None, None)
 
 
 def test_kitti_knows_some_features() -> None:
-    assert of_kitti({"lightness": (0.0, 0.5)}) == {}
-    assert of_kitti({"distance_m": (0.0, 80.0)})["distance_m"] == pytest.approx(1.0)
-    near, far = of_kitti({"distance_m": (5.0, 25.0)}), of_kitti({"distance_m": (60.0, 80.0)})
+    assert kitti_shares({"lightness": (0.0, 0.5)}) == {}
+    assert kitti_shares({"distance_m": (0.0, 80.0)})["distance_m"] == pytest.approx(1.0)
+    near, far = kitti_shares({"distance_m": (5.0, 25.0)}), kitti_shares({"distance_m": (60.0, 80.0)})
     assert near["distance_m"] > 4 * far["distance_m"] > 0
-    assert of_kitti({"yaw_deg": (-180.0, 180.0)})["yaw_deg"] == pytest.approx(1.0, abs=0.02)
+    assert kitti_shares({"yaw_deg": (-180.0, 180.0)})["yaw_deg"] == pytest.approx(1.0, abs=0.02)
 
 
 def test_sizes_by_samples_and_by_simulation_are_told_together() -> None:
     one = around(22, 42)
-    rare = replace(one, around=replace(one.around, lost=Share(0.01, 0.002, 0.05, "subset simulation", 90)))
-    (hole,) = merged({"a": [around(20, 40), rare]})
+    rare = replace(
+        one, failure=replace(one.failure, lost=FailureProbability(0.01, 0.002, 0.05, "subset simulation", 90))
+    )
+    (hole,) = merge({"a": [around(20, 40), rare]})
     size = hole.to_json()["size"]
     assert [size["probability"], *size["interval"]] == pytest.approx([0.105, 0.051, 0.225])
-    assert (size["by"], hole.lost.asked) == ("samples and subset simulation", 90)
+    assert (size["by"], hole.lost.extra_samples) == ("samples and subset simulation", 90)

@@ -5,16 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivesem.analysis.holes.pooled import rules_of, single
-from drivesem.analysis.holes.results import Around, Beside, FrameHoles, Samples
-from drivesem.failures.rare import Share
+from drivesem.analysis.holes.rules import (
+    ContrastSamples,
+    FailureSamples,
+    FeatureSamples,
+    FrameHoles,
+    fit_failure_rule,
+    fit_rules,
+)
+from drivesem.failures.failure_probability import FailureProbability
 
 NAMES = ("height_px", "lightness", "moved_m")
 FAULT = {"height_px": (40.0, 60.0), "lightness": (0.2, 0.4)}
-NOTHING = Samples((), (), ())
+NOTHING = FeatureSamples((), (), ())
 
 
-def samples(rng: np.random.Generator, height: float, count: int, fault: dict[str, tuple[float, float]]) -> Samples:
+def samples(
+    rng: np.random.Generator, height: float, count: int, fault: dict[str, tuple[float, float]]
+) -> FeatureSamples:
     """Of a car of about one height, which its place hardly changes; its paint may become anything."""
     heights, shades = height + rng.uniform(-4, 4, count), rng.random(count)
     known = {"height_px": heights, "lightness": shades}
@@ -23,14 +31,20 @@ def samples(rng: np.random.Generator, height: float, count: int, fault: dict[str
         inside &= (known[name] >= low) & (known[name] <= high)
     lost = rng.random(count) < np.where(inside, 0.95, 0.02)
     rows = np.stack([heights, shades, rng.random(count)], 1)
-    return Samples(NAMES, tuple(map(tuple, rows.tolist())), tuple(-1.0 if one else 1.0 for one in lost))
+    return FeatureSamples(NAMES, tuple(map(tuple, rows.tolist())), tuple(-1.0 if one else 1.0 for one in lost))
 
 
 def frame(rng: np.random.Generator, failing: list[float], beside: list[float], label: str = "Car") -> FrameHoles:
     """Failures of cars of some heights, and others that were shown beside."""
     around = tuple(
-        Around(
-            i, label, "missed", "certain", samples(rng, h, 24, FAULT), NOTHING, Share(0.2, 0.1, 0.3, "samples", 0)
+        FailureSamples(
+            i,
+            label,
+            "missed",
+            "certain",
+            samples(rng, h, 24, FAULT),
+            NOTHING,
+            FailureProbability(0.2, 0.1, 0.3, "samples", 0),
         )
         for i, h in enumerate(failing)
     )
@@ -38,7 +52,9 @@ def frame(rng: np.random.Generator, failing: list[float], beside: list[float], l
     objects = tuple(len(failing) + i for i, one in enumerate(seen) for _ in one.margins)
     values = tuple(row for one in seen for row in one.values)
     margins = tuple(margin for one in seen for margin in one.margins)
-    return FrameHoles("x", "", around, (Beside(label, objects, Samples(NAMES, values, margins)),), 0, 0.0)
+    return FrameHoles(
+        "x", "", around, (ContrastSamples(label, objects, FeatureSamples(NAMES, values, margins)),), 0, 0.0
+    )
 
 
 @pytest.fixture
@@ -51,9 +67,9 @@ def found() -> dict[str, FrameHoles]:
 
 
 def test_many_cars_pin_both_bands_down(found: dict[str, FrameHoles]) -> None:
-    alone = [single(one) for holes in found.values() for one in holes.around]
+    alone = [fit_failure_rule(one) for holes in found.values() for one in holes.around]
     assert not any("height_px" in where for where in alone), "a car alone leaves its height open"
-    told = rules_of(found)
+    told = fit_rules(found)
     assert set(told) == {(name, 0) for name in found}
     (where,) = {tuple(sorted(one.where.items())) for one in told.values()}
     assert all(one.pooled for one in told.values())
@@ -66,23 +82,25 @@ def test_many_cars_pin_both_bands_down(found: dict[str, FrameHoles]) -> None:
 def test_without_contrast_heights_stay_open(found: dict[str, FrameHoles]) -> None:
     """All failing cars stand inside of the band: no sample says where it ends."""
     bare = {name: FrameHoles("x", "", holes.around, (), 0, 0.0) for name, holes in found.items()}
-    told = rules_of(bare)
+    told = fit_rules(bare)
     assert not any("height_px" in one.where for one in told.values())
 
 
 def test_another_class_keeps_its_own(found: dict[str, FrameHoles]) -> None:
     van = frame(np.random.default_rng(9), [50.0], [], "Van")
-    told = rules_of(found | {"van": van})
+    told = fit_rules(found | {"van": van})
     assert not told["van", 0].pooled
-    assert told["van", 0].where == single(van.around[0])
+    assert told["van", 0].where == fit_failure_rule(van.around[0])
     assert all(one.pooled for key, one in told.items() if key[0] != "van")
 
 
 def test_a_failure_that_no_rule_explains_keeps_its_own(found: dict[str, FrameHoles]) -> None:
     rng = np.random.default_rng(3)
     far = samples(rng, 110.0, 48, {"lightness": (0.7, 1.0)})
-    other = Around(5, "Car", "missed", "certain", far, NOTHING, Share(0.2, 0.1, 0.3, "samples", 0))
-    told = rules_of(found | {"other": FrameHoles("x", "", (other,), (), 0, 0.0)})
+    other = FailureSamples(
+        5, "Car", "missed", "certain", far, NOTHING, FailureProbability(0.2, 0.1, 0.3, "samples", 0)
+    )
+    told = fit_rules(found | {"other": FrameHoles("x", "", (other,), (), 0, 0.0)})
     assert not told["other", 5].pooled
     assert set(told["other", 5].where) == {"lightness"}
     assert told["other", 5].where["lightness"][0] == pytest.approx(0.7, abs=0.1)
@@ -90,11 +108,13 @@ def test_a_failure_that_no_rule_explains_keeps_its_own(found: dict[str, FrameHol
 
 def test_one_failure_is_not_pooled() -> None:
     rng = np.random.default_rng(1)
-    told = rules_of({"a": frame(rng, [50.0], [20.0, 90.0])})
+    told = fit_rules({"a": frame(rng, [50.0], [20.0, 90.0])})
     assert not told["a", 0].pooled
 
 
 def test_a_failure_without_samples_has_no_rule() -> None:
-    one = Around(0, "Car", "missed", "certain", NOTHING, NOTHING, Share(0.0, 0.0, 1.0, "samples", 0))
-    told = rules_of({"a": FrameHoles("x", "", (one,), (), 0, 0.0)})
+    one = FailureSamples(
+        0, "Car", "missed", "certain", NOTHING, NOTHING, FailureProbability(0.0, 0.0, 1.0, "samples", 0)
+    )
+    told = fit_rules({"a": FrameHoles("x", "", (one,), (), 0, 0.0)})
     assert (told["a", 0].where, told["a", 0].pooled) == ({}, False)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.commands import Attack
-from drivesem.config.text import to_yaml
+from drivesem.attack.targets import HEADLINE
+from drivesem.config.commands import AttackConfig
+from drivesem.config.options import to_yaml
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
 from scene_ir import files
 from tests.drivesem.counting import summary_of
@@ -71,9 +71,9 @@ def _frame(
     )
 
 
-def _run(folder: Path, results: Sequence[FrameResult], config: Attack | None = None, tone: int = 90) -> Path:
+def _run(folder: Path, results: Sequence[FrameResult], config: AttackConfig | None = None, tone: int = 90) -> Path:
     """Write a run's folder. tone: of the photographs."""
-    config = config or Attack()
+    config = config or AttackConfig()
     photograph = np.full((SIZE_WH[1], SIZE_WH[0], 3), tone, np.uint8)
     photograph[40:70, 40:90], photograph[40:70, 230:280] = (160, 30, 30), (30, 30, 160)
     for result in results:

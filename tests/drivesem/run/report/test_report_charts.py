@@ -7,12 +7,12 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from drivesem.run.report.charts import SERIES, Fall, curve_chart, fall_chart, key_of, trace
-from drivesem.run.report.page import Chart, Line
+from drivesem.run.report.charts import SERIES, MetricDrop, curve_chart, drop_chart, legend_key, loss_trace_chart
+from drivesem.run.report.page import ChartLine, ReportChart
 
 
-def chart(lines: list[Line], **of: object) -> ET.Element:
-    return ET.fromstring(curve_chart(Chart("A < B", "recall, %", "precision, %", lines, "", **of)))  # pyright: ignore
+def chart(lines: list[ChartLine], **of: object) -> ET.Element:
+    return ET.fromstring(curve_chart(ReportChart("A < B", "recall, %", "precision, %", lines, "", **of)))  # pyright: ignore
 
 
 def numbers(path: str) -> list[float]:
@@ -20,7 +20,7 @@ def numbers(path: str) -> list[float]:
 
 
 def test_places() -> None:
-    svg = chart([Line("one", ((0.0, 100.0), (50.0, 50.0), (100.0, 0.0)), mark=(50.0, 50.0))])
+    svg = chart([ChartLine("one", ((0.0, 100.0), (50.0, 50.0), (100.0, 0.0)), mark=(50.0, 50.0))])
     (line,) = (e for e in svg.iter("path") if e.get("class") == "line s0")
     x0, y0, x1, y1, x2, y2 = numbers(line.get("d", ""))
     assert x1 == pytest.approx((x0 + x2) / 2, abs=0.06)
@@ -36,7 +36,7 @@ def test_places() -> None:
 
 
 def test_steps_and_doubling() -> None:
-    line = Line(
+    line = ChartLine(
         "one", ((1.0, 10.0), (2.0, 40.0), (4.0, 40.0)), steps=True, band=((1.0, 5.0, 20.0), (4.0, 30.0, 50.0))
     )
     svg = chart([line], x_range=(1.0, 4.0), doubling=True)
@@ -51,13 +51,13 @@ def test_steps_and_doubling() -> None:
 
 
 def test_lines_differ_in_colour_or_dash() -> None:
-    signs = [str(key_of(place)).split("<path")[1] for place in range(2 * SERIES)]
+    signs = [str(legend_key(place)).split("<path")[1] for place in range(2 * SERIES)]
     assert len(set(signs)) == 2 * SERIES
 
 
 def test_falls() -> None:
     svg = ET.fromstring(
-        fall_chart([Fall("ours & <co>", 95.7, 89.9), Fall("theirs", 99.4, 65.9, theirs=True)], "AP50")
+        drop_chart([MetricDrop("ours & <co>", 95.7, 89.9), MetricDrop("theirs", 99.4, 65.9, theirs=True)], "AP50")
     )
     words = [e.text for e in svg.iter("text")]
     assert {"ours & <co>", "95.7", "89.9", "99.4", "65.9", "AP50, %"} <= set(words)
@@ -66,9 +66,11 @@ def test_falls() -> None:
     assert "ours & <co>: 95.7 to 89.9" in svg.get("aria-label", "")
 
 
-@pytest.mark.parametrize("fall", [Fall("all", 100.0, 0.0), Fall("up", 0.0, 100.0), Fall("none", 50.0, 50.0)])
-def test_every_fall_lies_in_the_picture(fall: Fall) -> None:
-    svg = ET.fromstring(fall_chart([fall], "AP50"))
+@pytest.mark.parametrize(
+    "fall", [MetricDrop("all", 100.0, 0.0), MetricDrop("up", 0.0, 100.0), MetricDrop("none", 50.0, 50.0)]
+)
+def test_every_fall_lies_in_the_picture(fall: MetricDrop) -> None:
+    svg = ET.fromstring(drop_chart([fall], "AP50"))
     width = float(svg.get("viewBox", "").split()[2])
     assert all(0 <= float(e.get("cx", "")) <= width for e in svg.iter("circle"))
     values = [e.text for e in svg.iter("text") if "value" in e.get("class", "")]
@@ -76,9 +78,9 @@ def test_every_fall_lies_in_the_picture(fall: Fall) -> None:
 
 
 def test_trace() -> None:
-    svg = ET.fromstring(trace([1.0, 3.0, 2.0]))
+    svg = ET.fromstring(loss_trace_chart([1.0, 3.0, 2.0]))
     (line,) = svg.iter("polyline")
     ys = numbers(line.get("points", ""))[1::2]
     assert ys[1] < ys[2] < ys[0]
     assert svg.get("aria-label") == "Loss by query: from 1 to 2, at most 3"
-    ET.fromstring(trace([1.0, 1.0]))
+    ET.fromstring(loss_trace_chart([1.0, 1.0]))

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from drivesem.cli import main
-from drivesem.config.commands import Attack
-from drivesem.evaluation.coco import ClassScores, Scores
-from drivesem.run.page import load_shown, query_curves, write_run
+from drivesem.config.commands import AttackConfig
+from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.run.protocol import PROTOCOL
-from drivesem.run.report.frames import cards_of
+from drivesem.run.report.frames import build_cards
+from drivesem.run.report.runs import load_reported_runs, query_curves, write_run_report
 from scene_ir import files
 
 
@@ -50,8 +50,8 @@ def test_the_same_run_gives_the_same_page(some_run: Path) -> None:
 
 
 def test_an_attack_writes_the_same_page(some_run: Path) -> None:
-    (shown,), _ = load_shown([str(some_run)])
-    write_run(some_run, Attack(), shown.summary, shown.frames)
+    (shown,), _ = load_reported_runs([str(some_run)])
+    write_run_report(some_run, AttackConfig(), shown.summary, shown.frames)
     written = (some_run / "report.html").read_bytes()
     assert main(["report", str(some_run)]) == 0
     assert (some_run / "report.html").read_bytes() == written
@@ -59,10 +59,10 @@ def test_an_attack_writes_the_same_page(some_run: Path) -> None:
 
 def test_an_attack_without_any_frame(some_run: Path) -> None:
     """Where none could be used, the page says which and why."""
-    (shown,), _ = load_shown([str(some_run)])
+    (shown,), _ = load_reported_runs([str(some_run)])
     failed = {"000009": "labels: expected a number, found x"}
     nothing = ClassScores(None, None, None, None, None, 0)
-    scores = Scores(nothing, nothing, dict.fromkeys(shown.summary.benign.per_class, nothing))
+    scores = CocoScores(nothing, nothing, dict.fromkeys(shown.summary.benign.per_class, nothing))
     summary = replace(
         shown.summary,
         frames=0,
@@ -76,7 +76,7 @@ def test_an_attack_without_any_frame(some_run: Path) -> None:
         feasible_fraction=None,
         successes_moved=0,
     )
-    write_run(some_run, Attack(), summary, [])
+    write_run_report(some_run, AttackConfig(), summary, [])
     text = (some_run / "report.html").read_text(encoding="utf-8")
     assert "000009 could not be used: labels: expected a number, found x" in text
     assert "– → –" in text
@@ -91,8 +91,8 @@ def test_runs_side_by_side(
 ) -> None:
     """Frames are matched by name; figures are of those that both have."""
     frames = [frame("1", lost=True), frame("2", lost=True), frame("only a", phantom=True)]
-    a = make_run(tmp_path / "a", frames, Attack(**PROTOCOL))  # pyright: ignore[reportArgumentType]
-    b = make_run(tmp_path / "b", [frame("2"), frame("1", phantom=True)], Attack(method="placebo", like="x"))
+    a = make_run(tmp_path / "a", frames, AttackConfig(**PROTOCOL))  # pyright: ignore[reportArgumentType]
+    b = make_run(tmp_path / "b", [frame("2"), frame("1", phantom=True)], AttackConfig(method="placebo", like="x"))
     out = tmp_path / "both.html"
     told = report([str(a), str(b), "--out", str(out)], capsys)
     assert told["frames_left_out"] == 1
@@ -172,8 +172,8 @@ def test_large_pictures_are_made_smaller(
 ) -> None:
     monkeypatch.setattr("drivesem.run.report.frames.LARGEST_PX", 100)
     run = make_run(tmp_path / "run", [frame("1", lost=True)])
-    shown, _ = load_shown([str(run)])
-    (card,) = cards_of(shown, 1)
+    shown, _ = load_reported_runs([str(run)])
+    (card,) = build_cards(shown, 1)
     assert (card.width, card.height) == (320, 96)  # boxes stay in the picture's own px
     assert len(card.layers[0].source) < 2000
 

@@ -11,15 +11,15 @@ from typing import Any
 import pytest
 
 from drivesem.cli import main
-from drivesem.failures.grades import Agreement, Count
-from drivesem.run.page import load_shown
-from drivesem.run.report import grading
-from drivesem.run.report.frames import cards_of
+from drivesem.failures.grades import Certificate, SecondOpinion
+from drivesem.run.report import page as grading
+from drivesem.run.report.frames import build_cards
+from drivesem.run.report.runs import load_reported_runs
 from drivesem.run.results import Failure, FrameResult
 
-CERTAIN = Count(16, 16, 15, 16, 1.42, -0.61)
-CHANCE = Count(9, 16, 12, 16)
-SECOND, PEER = Agreement("generator", 4, 4, 4), Agreement("yolov3-slim", 4, 1, 4)
+CERTAIN = Certificate(16, 16, 15, 16, 1.42, -0.61)
+CHANCE = Certificate(9, 16, 12, 16)
+SECOND, PEER = SecondOpinion("generator", 4, 4, 4), SecondOpinion("yolov3-slim", 4, 1, 4)
 
 
 def graded(frame: FrameResult, *grades: str, error: str = "missed") -> FrameResult:
@@ -86,15 +86,15 @@ def test_draws_and_who_else_says_so(run: Path, parse: Callable[[Path], Any]) -> 
 
 
 def test_the_table_of_kinds_adds_up(run: Path) -> None:
-    (shown,), _ = load_shown([str(run)])
-    rows = {row.name: row for row in grading.table(shown.frames)}
+    (shown,), _ = load_reported_runs([str(run)])
+    rows = {row.name: row for row in grading.tabulate_kinds(shown.frames)}
     # shared, confirmed, certain, threshold
     assert rows["missed"].counts == (0, 0, 1, 1)
     assert rows["badly placed"].counts == (0, 0, 1, 0)
     assert rows["on nothing"].counts == (0, 1, 1, 1)
     assert rows["none of a kind"].counts == (0, 0, 0, 1)
     assert sum(row.total for row in rows.values()) == shown.summary.grades["threshold"] == 7
-    (first, *_) = cards_of([shown], 1)
+    (first, *_) = build_cards([shown], 1)
     assert [mark.unsure for mark in first.layers[1].sets[0][1] if mark.kind in ("lost", "phantom")] == [
         True,
         False,
@@ -196,16 +196,16 @@ def test_runs_that_break_as_much_are_told_alike(
 @pytest.mark.parametrize(
     ("error", "count", "told"),
     [
-        ("missed", Count(16, 16, 15, 16), "found in 16/16 draws before → 1/16 after"),
-        ("missed", Count(0, 0, 4, 9), "found in 5/9 draws after"),
-        ("twice", Count(14, 16, 16, 16), "reported twice in 2/16 draws before → 16/16 after"),
-        ("background", Count(16, 16, 13, 16), "there in 0/16 draws before → 13/16 after"),
-        ("background", Count(), ""),
+        ("missed", Certificate(16, 16, 15, 16), "found in 16/16 draws before → 1/16 after"),
+        ("missed", Certificate(0, 0, 4, 9), "found in 5/9 draws after"),
+        ("twice", Certificate(14, 16, 16, 16), "reported twice in 2/16 draws before → 16/16 after"),
+        ("background", Certificate(16, 16, 13, 16), "there in 0/16 draws before → 13/16 after"),
+        ("background", Certificate(), ""),
         (None, None, ""),
     ],
 )
-def test_draws_in_words(error: str | None, count: Count | None, told: str) -> None:
-    assert grading.draws(Failure("lost", "Car", (0, 0, 1, 1), error=error, count=count)) == told
+def test_draws_in_words(error: str | None, count: Certificate | None, told: str) -> None:
+    assert grading.format_draws(Failure("lost", "Car", (0, 0, 1, 1), error=error, count=count)) == told
 
 
 def test_frames_can_be_filtered_by_grade(chromium: Any, run: Path) -> None:

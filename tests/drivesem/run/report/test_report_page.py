@@ -17,11 +17,11 @@ import pytest
 from PIL import Image
 
 from drivesem.cli import main
-from drivesem.config.commands import Attack
-from drivesem.report.plots import COLOURS
-from drivesem.run.page import load_shown
+from drivesem.config.commands import AttackConfig
+from drivesem.report.plots import PLOT_COLOURS
 from drivesem.run.protocol import PROTOCOL
-from drivesem.run.report.frames import cards_of
+from drivesem.run.report.frames import build_cards
+from drivesem.run.report.runs import load_reported_runs
 from drivesem.run.results import load_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -133,7 +133,7 @@ def test_the_papers_figures_stand_beside_its_protocol_only(
     text = parse(page).text
     assert "65.9" not in text
     assert "Ours, own protocol: not comparable" in text
-    theirs = make_run(tmp_path / "theirs", [frame("1", lost=True)], Attack(**PROTOCOL))  # pyright: ignore[reportArgumentType]
+    theirs = make_run(tmp_path / "theirs", [frame("1", lost=True)], AttackConfig(**PROTOCOL))  # pyright: ignore[reportArgumentType]
     assert main(["report", str(theirs)]) == 0
     text = parse(theirs / "report.html").text
     assert "99.4 → 65.9" in text
@@ -163,10 +163,10 @@ def test_a_cap_on_pictures_keeps_all_frames_in_the_table(some_run: Path, parse: 
 
 
 def test_a_missing_picture_is_named(some_run: Path) -> None:
-    shown, _ = load_shown([str(some_run)])
+    shown, _ = load_reported_runs([str(some_run)])
     (some_run / "frames" / "000002" / "benign.png").unlink()
     with pytest.raises(FormatError, match=r"000002/benign.png: expected a picture of the run, found none"):
-        cards_of(shown, 4)
+        build_cards(shown, 4)
 
 
 def test_a_hundred_frames_stay_small(
@@ -218,4 +218,4 @@ def test_colours_can_be_told_apart() -> None:
         assert all(_contrast(colours[f"s{i}"], colours["card"]) >= 3 for i in (0, 1, 2))
         for kind in ("true", "found", "lost", "phantom"):
             assert _contrast(colours[kind], "#000000") >= 4.5
-    assert [light[f"s{i}"].upper() for i in range(7)] == list(COLOURS)
+    assert [light[f"s{i}"].upper() for i in range(7)] == list(PLOT_COLOURS)
