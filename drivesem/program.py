@@ -29,7 +29,7 @@ _EXIT_INTERRUPTED = 130
 _EXIT_PIPE = 141
 _EXIT_TERMINATED = 143
 RUNS_CODE = re.compile(r"(?:^|[,@])(?:module|torchscript|export|ultralytics):([^,]+)")
-"""Detectors whose files are code (`detectors.registry.RUNS_CODE`, to which a test compares this)."""
+"""Detectors that run code from their files (as `detectors.registry.RUNS_CODE`; a test compares the two)."""
 _CLEANUP_SECONDS = 5.0
 """Seconds that an interrupted command has to clean up before Ctrl-C counts again."""
 _MAX_ERROR_LENGTH = 2000
@@ -97,9 +97,9 @@ class Program:
         _report_code(config)
 
         from drivesem.run.lock import release_folder_locks
-        from drivesem.store import stored
+        from drivesem.store import remote_output
 
-        with release_folder_locks(), stored(config) as config:
+        with release_folder_locks(), remote_output(config) as config:
             return self._load(words[0])(config)
 
     def _load(self, command: str) -> RunCommand:

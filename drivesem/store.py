@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from drivesem.config.blocks import Command, Output
+from drivesem.config.constraints import is_url
 from drivesem.config.errors import UsageError
-from drivesem.config.values import is_url
+from drivesem.config.options import CommandConfig, OutputOptions
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -36,19 +36,22 @@ _COMMIT = re.compile(r"(\d{6})-([0-9a-f]{16})\.json")
 _SHARE = 0.1
 """Of a command's time, for copies to the store while it works."""
 
-C = TypeVar("C", bound=Command)
+C = TypeVar("C", bound=CommandConfig)
 
 
 @dataclass(frozen=True, slots=True)
-class _Version:
-    """One state of a file: bytes, nanoseconds, SHA-256."""
+class FileVersion:
+    """One version of a file."""
 
     size: int
+    """Bytes."""
     time_ns: int
+    """Time of the last change, ns."""
     digest: str
+    """SHA-256, hexadecimal."""
 
 
-class Store:
+class RemoteFolder:
     """A folder of a store. setting: what named it on the command line; home: for its copy, by default the user's
     cache. In another process, or on another machine, the copy lies under the same name.
     """
@@ -62,35 +65,35 @@ class Store:
         self.folder = (
             self._home / "copy" / (re.sub(r"[^\w.-]", "_", self.url.rsplit("/", 1)[-1]).strip(".") or "_")
         )
-        self._known: dict[str, _Version | None] = {}
+        self._versions: dict[str, FileVersion | None] = {}
         self._read: set[str] = set()
         self._not_before = 0.0
 
-    def __reduce__(self) -> tuple[type[Store], tuple[str, str, Path]]:
+    def __reduce__(self) -> tuple[type[RemoteFolder], tuple[str, str, Path]]:
         return type(self), (self.url, self._setting, self._home)
 
     def fetch(self) -> None:
         """Bring here what the store has and the copy lacks. Raises UsageError for a store that cannot be read."""
-        with self._held():
-            commits = self._listed(_COMMITS)
+        with self._locked():
+            commits = self._list_marks(_COMMITS)
             if commits:
                 self._fetch_commits([name for name in commits if _COMMIT.fullmatch(name)])
             else:
                 self._mirror()
 
-    def keep(self, now: bool = False) -> None:
+    def upload(self, now: bool = False) -> None:
         """Copy to the store what is new here. now: whatever was copied last, else in a tenth of the time. Raises
         UsageError for a store that cannot be written.
         """
         begun = time.monotonic()
         if not now and begun < self._not_before:
             return
-        with self._held():
+        with self._locked():
             self._push()
         self._not_before = time.monotonic() + (time.monotonic() - begun) / _SHARE
 
     @contextmanager
-    def _held(self) -> Iterator[None]:
+    def _locked(self) -> Iterator[None]:
         """One process of this machine at a time looks after the copy."""
         from filelock import FileLock
 
@@ -110,7 +113,7 @@ class Store:
             raise UsageError(self._setting, expected, f"{self.url}: {error}") from error
 
     @contextmanager
-    def _asking(self, expected: str) -> Iterator[tuple[AbstractFileSystem, str]]:
+    def _store_errors(self, expected: str) -> Iterator[tuple[AbstractFileSystem, str]]:
         """The store and the folder in it. What its library raises is in one line: each has errors of its own."""
         opened = self._opened
         try:
@@ -121,7 +124,7 @@ class Store:
 
     def _get(self, name: str) -> bytes | None:
         """What an object of the folder holds; None where it is not there."""
-        with self._asking("a store that can be read") as (store, root):
+        with self._store_errors("a store that can be read") as (store, root):
             try:
                 data: Any = store.cat_file(f"{root}/{name}")
             except FileNotFoundError:
@@ -129,7 +132,7 @@ class Store:
         return data
 
     def _put(self, name: str, data: bytes) -> None:
-        with self._asking("a store that can be written") as (store, root):
+        with self._store_errors("a store that can be written") as (store, root):
             path = f"{root}/{name}"
             try:
                 store.pipe_file(path, data)
@@ -138,15 +141,15 @@ class Store:
                 store.pipe_file(path, data)
 
     def _remove(self, name: str) -> None:
-        with self._asking("a store that can be written") as (store, root):
+        with self._store_errors("a store that can be written") as (store, root):
             try:
                 store.rm_file(f"{root}/{name}")
             except FileNotFoundError:
                 return
 
-    def _listed(self, folder: str = "") -> dict[str, str]:
+    def _list_marks(self, folder: str = "") -> dict[str, str]:
         """What lies in a folder of this one, below it too: a mark of its state, by name."""
-        with self._asking("a store that can be read") as (store, root):
+        with self._store_errors("a store that can be read") as (store, root):
             store.invalidate_cache()
             path = f"{root}/{folder}".rstrip("/")
             try:
@@ -161,28 +164,28 @@ class Store:
     def _read_commits(self) -> None:
         for path in sorted((self._home / "commits").glob("*.json")):
             if path.name not in self._read:
-                self._known |= _versions(path)
+                self._versions |= _versions(path)
                 self._read.add(path.name)
 
     def _fetch_commits(self, names: Iterable[str]) -> None:
-        fresh: dict[str, dict[str, _Version | None]] = {}
+        fresh: dict[str, dict[str, FileVersion | None]] = {}
         for name in sorted(set(names) - self._read):
             data, path = self._get(f"{_COMMITS}/{name}") or b"", self._home / "commit"
             if hashlib.sha256(data).hexdigest()[:16] == name[7:23]:  # else it is half written
                 files.write_bytes(path, data)
                 fresh[name] = _versions(path)
-        wanted = dict(self._known)
+        wanted = dict(self._versions)
         for versions in fresh.values():
             wanted |= versions
         # Also what was here and is gone: it is not to be taken for something that a command removed.
-        lost = {name for name in _shown(wanted) if not self._bring(name, wanted[name])}
+        lost = {name for name in _shown(wanted) if not self._fetch_file(name, wanted[name])}
         for name, versions in fresh.items():
             self._note(name, {file: None if file in lost else v for file, v in versions.items()})
-        self._known |= dict.fromkeys(lost)
+        self._versions |= dict.fromkeys(lost)
 
-    def _bring(self, name: str, version: _Version | None) -> bool:
+    def _fetch_file(self, name: str, version: FileVersion | None) -> bool:
         """Make a file here as a commit names it. False where the store has other bytes in its place."""
-        path = files.below(self.folder, name)
+        path = files.resolve_inside(self.folder, name)
         if version is None:
             path.unlink(missing_ok=True)
             return True
@@ -200,7 +203,7 @@ class Store:
 
     def _push(self) -> None:
         here = {path.relative_to(self.folder).as_posix(): state for path, state in _files(self.folder)}
-        known = self._known
+        known = self._versions
         changed = [
             name for name, state in here.items() if (v := known.get(name)) is None or state != (v.size, v.time_ns)
         ]
@@ -209,7 +212,7 @@ class Store:
             return
         if not self._read:
             self._commit({})  # from now on, what no commit names is not there
-        written: dict[str, _Version | None] = dict.fromkeys(removed)
+        written: dict[str, FileVersion | None] = dict.fromkeys(removed)
         beside: dict[str, str] = {}
         for name in sorted(changed, key=lambda name: here[name][1]):
             data = _read(self.folder / name)
@@ -219,7 +222,7 @@ class Store:
             if known.get(name) is not None:
                 beside[name] = f"{_COMMITS}/{digest}"
             self._put(beside.get(name, name), data)
-            written[name] = _Version(len(data), here[name][1], digest)
+            written[name] = FileVersion(len(data), here[name][1], digest)
         self._commit(written)
         for name, place in beside.items():
             data = _read(self.folder / name)
@@ -229,7 +232,7 @@ class Store:
         for name in removed:
             self._remove(name)
 
-    def _commit(self, versions: Mapping[str, _Version | None]) -> None:
+    def _commit(self, versions: Mapping[str, FileVersion | None]) -> None:
         told = {name: v and [v.size, v.time_ns, v.digest] for name, v in versions.items()}
         data = json.dumps(told, ensure_ascii=False).encode()
         number = max((int(name[:6]) for name in self._read), default=-1) + 1
@@ -237,10 +240,10 @@ class Store:
         self._put(f"{_COMMITS}/{name}", data)
         self._note(name, versions)
 
-    def _note(self, name: str, versions: Mapping[str, _Version | None]) -> None:
+    def _note(self, name: str, versions: Mapping[str, FileVersion | None]) -> None:
         told = {file: v and [v.size, v.time_ns, v.digest] for file, v in versions.items()}
         files.write_json(self._home / "commits" / name, told)
-        self._known |= versions
+        self._versions |= versions
         self._read.add(name)
 
     # --- folders of others
@@ -249,16 +252,16 @@ class Store:
         record = self._home / "mirror.txt"
         lines = files.read_text(record).splitlines() if record.is_file() else []
         before = {name: mark for mark, _, name in (line.partition(" ") for line in lines)}
-        found = self._listed()
+        found = self._list_marks()
         with record.open("a", encoding="utf-8") as told:
             for name in _shown(name for name, mark in found.items() if before.get(name) != mark):
-                path, data = files.below(self.folder, name), self._get(name)
+                path, data = files.resolve_inside(self.folder, name), self._get(name)
                 if data is not None:
                     files.write_bytes(path, data)
                     told.write(f"{found[name]} {name}\n")
                     told.flush()
         for name in before.keys() - found:
-            files.below(self.folder, name).unlink(missing_ok=True)
+            files.resolve_inside(self.folder, name).unlink(missing_ok=True)
         files.write_text(record, "".join(f"{mark} {name}\n" for name, mark in found.items()))
 
 
@@ -272,11 +275,11 @@ def _shown(names: Iterable[str]) -> Iterable[str]:
     return track(names, "copying from the store", console=bar, transient=True, disable=not names)
 
 
-def _versions(path: Path) -> dict[str, _Version | None]:
+def _versions(path: Path) -> dict[str, FileVersion | None]:
     """What a commit names. FormatError where it is none."""
     told = files.read_json(path)
     try:
-        found = {name: v and _Version(int(v[0]), int(v[1]), str(v[2])) for name, v in told.items()}
+        found = {name: v and FileVersion(int(v[0]), int(v[1]), str(v[2])) for name, v in told.items()}
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise FormatError(str(path), "size, time and hash of each file, or null", error) from error
     return found
@@ -313,7 +316,7 @@ def _state(path: Path) -> tuple[int, int] | None:
     return found.st_size, found.st_mtime_ns
 
 
-def place(path: str | Path, setting: str = "--root") -> Path:
+def local_copy(path: str | Path, setting: str = "--root") -> Path:
     """A folder: the one of this name, or the copy of the one at this URL, compared with the store once in a
     process. Raises UsageError for a URL where nothing is.
     """
@@ -322,42 +325,42 @@ def place(path: str | Path, setting: str = "--root") -> Path:
 
 @functools.cache
 def _copy_of(url: str, setting: str) -> Path:
-    store = Store(url, setting)
+    store = RemoteFolder(url, setting)
     store.fetch()
     if not store.folder.is_dir():
         raise UsageError(setting, "a folder with files", f"{url}, where there are none")
     return store.folder
 
 
-_open: Store | None = None
+_open: RemoteFolder | None = None
 """Where this process' command writes, if that is elsewhere."""
 
 
 @contextmanager
-def stored(config: C) -> Iterator[C]:
+def remote_output(config: C) -> Iterator[C]:
     """The settings with a folder here in place of a URL in --out: what the store has is brought there first, and
     what the command makes is copied back, as it goes (`keep`) and at the end.
     """
     _copy_of.cache_clear()
-    if not isinstance(config, Output) or config.out is None or not is_url(config.out):
+    if not isinstance(config, OutputOptions) or config.out is None or not is_url(config.out):
         yield config
         return
-    store = Store(config.out, "--out")
-    write_to(store)
+    store = RemoteFolder(config.out, "--out")
+    set_output_store(store)
     try:
         store.fetch()
         yield replace(config, out=str(store.folder))
-        store.keep(now=True)
+        store.upload(now=True)
     finally:
-        write_to(None)
+        set_output_store(None)
 
 
-def write_to(store: Store | None) -> None:
+def set_output_store(store: RemoteFolder | None) -> None:
     """From now on this process' command writes there."""
     global _open
     _open = store
 
 
-def current() -> Store | None:
+def output_store() -> RemoteFolder | None:
     """Where this process' command writes, if that is elsewhere."""
     return _open

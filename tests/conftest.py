@@ -1,6 +1,4 @@
-"""What all tests share: property tests draw the same examples every time, and are not timed one by one. And data
-that takes seconds to make, made once.
-"""
+"""Shared by all tests: reproducible property tests, slow data made once, and the list of quick tests."""
 
 import os
 import resource
@@ -26,8 +24,7 @@ QUICK = [
     "scene_ir/raster/test_interpolate.py",
     "scene_ir/meshes/test_templates.py",
     "scene_ir/render/test_environment.py",
-    "scene_ir/derender/test_derender_matte.py",
-    "scene_ir/derender/test_derender_maps.py",
+    "scene_ir/derender/test_matte.py",
     "detectors/test_boxes.py",
     "detectors/test_quality.py",
     "detectors/adapters/test_formats.py",
@@ -51,7 +48,7 @@ QUICK = [
     "drivesem/commands/test_convert_command.py",
     "tools/test_fit_kitti_statistics.py",
 ]
-"""Tests of `pytest -m quick`: something of every package, in under a minute."""
+"""Tests of `pytest -m quick`: some of every package, in under a minute."""
 
 settings.register_profile("drivesem", deadline=None, derandomize=True, database=None)
 settings.load_profile("drivesem")
@@ -59,31 +56,31 @@ settings.load_profile("drivesem")
 
 @pytest.fixture
 def full_disk() -> Callable[[int], AbstractContextManager[None]]:
-    """While it lasts, no file grows beyond so many bytes, as the system itself says it.
+    """A context in which the system lets no file grow beyond a number of bytes.
 
-    It is held no longer than a test's own calls: what pytest prints may go to a file too.
+    Hold it only around the tested call: pytest's own output may go to a file too.
     """
 
     @contextmanager
-    def limited(most: int) -> Iterator[None]:
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+    def limit_files(max_bytes: int) -> Iterator[None]:
+        previous = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, previous[1]))
         try:
             yield
         finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+            resource.setrlimit(resource.RLIMIT_FSIZE, previous)
 
-    return limited
+    return limit_files
 
 
 @pytest.fixture(scope="session")
 def screen() -> Any:
-    """OpenGL without a window. Skipped by name where neither EGL nor OSMesa is: pip has none."""
+    """OpenGL without a window. Skips if neither EGL nor OSMesa is installed."""
     from drivesem.failures.second_renderer.base import NoSecondRendererError
-    from drivesem.failures.second_renderer.screen import shared_screen
+    from drivesem.failures.second_renderer.opengl import shared_context
 
     try:
-        return shared_screen()
+        return shared_context()
     except NoSecondRendererError as error:
         pytest.skip(str(error))
 
@@ -112,12 +109,11 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of QUICK."""
-    here = Path(__file__).parent
-    chosen = [here / name for name in QUICK]
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests of QUICK; `-m quick` fails if one of them does not exist."""
+    chosen = [Path(__file__).parent / name for name in QUICK]
     missing = [str(path) for path in chosen if not path.exists()]
-    assert not missing, f"quick tests that are not there: {', '.join(missing)}"
+    assert not (missing and config.option.markexpr == "quick"), f"no such tests: {', '.join(missing)}"
     for item in items:
         if any(item.path == path or path in item.path.parents for path in chosen) and "slow" not in item.keywords:
             item.add_marker(pytest.mark.quick)

@@ -1,1 +1,1 @@
-"""What a command may be told: options, ranges, presets. Nothing heavy is imported here."""
+"""Settings of the commands: options, constraints, presets, parsing, help."""

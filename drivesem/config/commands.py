@@ -124,7 +124,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     like: Annotated[str, OnlyWith("method", ("placebo",)), ExistingFolder("a run of drivesem attack")] | None = (
         None
     )
-    """Run whose counterexamples set the size of a placebo's edits."""
+    """Run that sets the size of a placebo's edits: that of its counterexamples."""
     range: Literal["bounds", "steps"] = "bounds"
     """Region in which gradient-free methods sample: all of the bounds, or what --steps steps can reach."""
     early_stop: Flag = False
@@ -138,7 +138,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     target_objects: str | None = None
     """Objects that count as failures when lost, such as 0,2; phantoms do not count then."""
     target_classes: str | None = None
-    """Classes whose lost objects and phantoms count as failures, such as Car,Pedestrian."""
+    """Classes in which lost objects and phantoms count as failures, such as Car,Pedestrian."""
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
 
@@ -191,7 +191,7 @@ class DriveConfig(TileOption, SearchOptions, FrameCommandConfig):
     keys: Count = 8
     """Frames per gradient step, evenly spread and different in each step."""
     certify: NotNegative = 6
-    """Frames with new misses, evenly spread, whose failures get certificates."""
+    """Frames with new misses, evenly spread, in which failures get certificates."""
     fit: bool = True
     """Fit each vehicle's shape in the photograph that shows it best."""
     limit: Count | None = None
@@ -326,7 +326,7 @@ class ReportConfig(CommandConfig):
     """Build the HTML report of one or more runs."""
 
     runs: RunFolders = ()
-    """Folders of runs of drivesem attack, or of an experiment, whose arms are its runs."""
+    """Folders of runs of drivesem attack, or of an experiment with several runs."""
     out: PictureFile = None
     """HTML file to write (default: report.html in the run's folder, or here for several runs)."""
     frames: Count | None = None
@@ -469,7 +469,7 @@ class BenchOptions(InferenceOptions, SceneOptions, FrameCommandConfig):
     detector: str = "squeezedet"
     """Detector: a shipped one, or a .safetensors file of one."""
     markdown: str | None = None
-    """Markdown file whose section on this benchmark is rewritten."""
+    """Markdown file in which the section on this benchmark is rewritten."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -484,7 +484,7 @@ class BenchConfig(BenchOptions):
     what: tyro.conf.Positional[Literal["step", "render", "night"]] = "step"
     """step: an attack step and the detector alone; render: both renderers; night: hours for all of --root."""
     boxes: Annotated[str, OnlyWith("what", ("step",))] | None = None
-    """Tar archive of KITTI's label_2 and calib, whose vehicles step measures."""
+    """Tar archive of KITTI's label_2 and calib with the vehicles that step measures."""
     frames: Count = 40
     """Frames of --boxes; a quarter of them with --quick."""
     limit: Count | None = None
@@ -596,7 +596,7 @@ class ConvertConfig(CommandConfig):
     scores: Flag = False
     """Read detections with scores, not labels."""
     images: str | None = None
-    """Folder of the images, whose sizes COCO and YOLO need (default: where SOURCE has them)."""
+    """Folder of the images, for their sizes in COCO and YOLO (default: where SOURCE has them)."""
     image_size: str | None = None
     """Size of all images, WIDTHxHEIGHT, px, instead of reading it from the files."""
     copy_images: Flag = False
@@ -645,7 +645,7 @@ class TrainConfig(TrainingOptions, FrameCommandConfig):
     validation: str | None = None
     """Folder of frames that select weights and t* instead of --held-out, which then only measures."""
     also: str | None = None
-    """Folder of further frames whose metrics go into the model card, in KITTI's layout."""
+    """Folder of further frames to evaluate for the model card, in KITTI's layout."""
     frames: Annotated[int, POSITIVE] = 1000
     """Frames to generate for training with --dataset synth."""
     held_out_frames: NotNegative = 100
@@ -788,7 +788,7 @@ class ClassifyConfig(FrameCommandConfig):
     objects: str | None = None
     """Folder of ShapeNetCore v2, or of meshes by class (default: 12 generated classes)."""
     split: Literal["train", "val", "test"] = "test"
-    """Split whose objects are attacked."""
+    """Split of the objects to attack."""
     views: str = "forward,top,left,right"
     """Camera views of each object, with commas."""
     backgrounds: Annotated[str, ExistingFolder("a folder of photographs")] | None = None

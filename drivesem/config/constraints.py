@@ -152,7 +152,16 @@ def parse_class_map(option: str, text: str | None) -> dict[str, str | None]:
 
 
 def parse_integers(option: str, text: str, minimum: int = 1) -> list[int]:
-    """The whole numbers of "1,4,8", each once, in order. UsageError naming the option."""
+    """The whole numbers of "1,4,8", each once, in order.
+
+    Args:
+        option: The option, for errors.
+        text: Its value.
+        minimum: The smallest allowed number.
+
+    Raises:
+        UsageError: For any other text.
+    """
     try:
         numbers = sorted({int(part) for part in text.split(",")})
     except ValueError:

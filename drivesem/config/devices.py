@@ -1,4 +1,4 @@
-"""What this machine has: torch devices, and memory."""
+"""Torch devices and memory of this machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drivesem.config.errors import UsageError
 
 
 def check_device(device: str) -> None:
-    """Raises UsageError naming --device where this machine has no such torch device."""
+    """Raise UsageError if this machine has no such torch device."""
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
@@ -19,7 +19,7 @@ def check_device(device: str) -> None:
 
 
 def memory_gb() -> float | None:
-    """Gigabytes (2^30 bytes) of memory that this machine has; None where its system does not tell."""
+    """Gigabytes (2^30 bytes) of memory of this machine; None if its system does not report it."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
     except (AttributeError, OSError, ValueError):

@@ -1,4 +1,4 @@
-"""What people write to change a scene: one grammar for generated streets, scene folders and the command line.
+"""Edits of a scene as text: one grammar for generated streets, scene folders and the command line.
 
 An edit of one frame, as YAML or as nested mappings:
 
@@ -44,33 +44,38 @@ WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
 }
-"""Weather by name, as codes; those not named are 0."""
+"""Weather codes by name; all others are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")
 FRAME_KEYS = ("objects", "weather", "foliage", "sun")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
 FRACTION_UNITS = {"%": 0.01}
 MAX_SIZE_CHANGE = 0.5
-"""Share by which an edit may make a vehicle larger or smaller: beyond it is no vehicle of its kind."""
+"""Largest growth or shrinkage of a vehicle, as a fraction."""
 _PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage|sun)\.(\w+)")
 _BOOLEANS = {"true": True, "false": False}
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectEdit:
-    """What happens to one vehicle. translate: (along, across), own lengths; translate_m: the same in metres; both
-    add up. rotate: rad; color: the texture code (5,); mesh: independent lattice offsets (96,), or none;
-    mesh_share: of the change of shape that a scene has already; size: share by which it grows.
-    """
+    """A change of one vehicle."""
 
     translate: tuple[float, float] = (0.0, 0.0)
+    """Shift along the heading and to the left, in own lengths."""
     translate_m: tuple[float, float] = (0.0, 0.0)
+    """The same in metres; both add up."""
     rotate: float = 0.0
+    """Turn about the ground centre, rad."""
     color: tuple[float, ...] = (0.0,) * TEXTURE_DIM
+    """The texture code (5,), in [-1, 1]."""
     mesh: tuple[float, ...] = ()
+    """Independent lattice offsets (96,), or none."""
     size: float = 0.0
+    """Growth, as a fraction."""
     remove: bool = False
+    """Whether the vehicle and its shadow are removed."""
     mesh_fraction: float = 0.0
+    """Fraction, 0 to 1, of the deformation that the scene already has."""
 
     def __post_init__(self) -> None:
         if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
@@ -78,21 +83,23 @@ class ObjectEdit:
         if len(self.mesh) not in (0, SYMMETRIC_DIM):
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
         if not abs(self.size) <= MAX_SIZE_CHANGE:
-            raise RangeError("edit size", f"a share of at most {MAX_SIZE_CHANGE:.0%} either way", self.size)
+            raise RangeError("edit size", f"a change of at most {MAX_SIZE_CHANGE:.0%} either way", self.size)
         if not 0 <= self.mesh_fraction <= 1:
-            raise RangeError("edit mesh", "a share from 0% to 100%", self.mesh_fraction)
+            raise RangeError("edit mesh", "a fraction from 0% to 100%", self.mesh_fraction)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameEdit:
-    """What happens to one frame. objects: by track (generated streets) or row (scenes), or "all"; weather (4,) in
-    [0, 1]; foliage (3,), sun (3,) in [-1, 1].
-    """
+    """A change of one frame."""
 
     objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
+    """Changes of vehicles by track (generated streets) or row (scenes), or of "all"."""
     weather: tuple[float, ...] = (0.0,) * len(WEATHER_CODES)
+    """Weather codes (4,), in [0, 1]."""
     foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_CODES)
+    """Foliage codes (3,), in [-1, 1]."""
     sun: tuple[float, ...] = (0.0,) * len(SUN_CODES)
+    """Sun codes (3,), in [-1, 1]."""
 
 
 Edits = Mapping[int | str, FrameEdit]
@@ -100,20 +107,20 @@ Edits = Mapping[int | str, FrameEdit]
 
 
 def read_edits(path: Path) -> Edits:
-    """The edits in a YAML file of many frames: `frames: {all: ..., 3: ...}`, each as in this module's text.
+    """The edits of a YAML file `frames: {all: ..., 3: ...}`, each in the form of this module.
 
-    FormatError naming the file and the place in it.
+    Raises FormatError with the file and the place in it.
     """
     frames = require_mapping(f"{path}", files.read_yaml(path), ("frames",)).get("frames", {})
-    found: dict[int | str, FrameEdit] = {}
+    edits: dict[int | str, FrameEdit] = {}
     for key, value in require_mapping(f"{path}: frames", frames).items():
         number = _number_or_all(f"{path}: frames", key)
-        found[number] = parse_frame_edit(f"{path}: frame {number}", value)
-    return found
+        edits[number] = parse_frame_edit(f"{path}: frame {number}", value)
+    return edits
 
 
 def read_frame_edit(path: Path) -> dict[str, Any]:
-    """The mappings of a YAML file of one frame's edit, checked. FormatError naming the file and the place."""
+    """The checked mappings of a YAML file of one frame's edit. Raises FormatError."""
     loaded = files.read_yaml(path)
     content = {} if loaded is None else require_mapping(str(path), loaded, FRAME_KEYS)
     parse_frame_edit(str(path), content)
@@ -121,9 +128,9 @@ def read_frame_edit(path: Path) -> dict[str, Any]:
 
 
 def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
-    """`objects[2].translate=0.5m,0m`, `weather=fog`, `foliage.hue=0.5`: the same as nested mappings, checked.
+    """`objects[2].translate=0.5m,0m`, `weather=fog`, `foliage.hue=0.5` as checked nested mappings.
 
-    FormatError naming `setting`, which is where the text was given.
+    Raises FormatError with `setting`, the option that gave the text.
     """
     place, equals, value = (part.strip() for part in text.partition("="))
     match = _PLACE.fullmatch(place)
@@ -134,16 +141,16 @@ def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
             "no value" if match is not None else "an unknown parameter",
         )
     row, parameter, weather, environment, code = match.groups()
-    found: dict[str, Any]
+    change: dict[str, Any]
     if weather is not None:
-        found = {weather: value}
+        change = {weather: value}
     elif environment is not None:
-        found = {environment: {code: value}}
+        change = {environment: {code: value}}
     else:
         number: int | str = int(row) if row.isascii() and row.isdigit() else row
-        found = {"objects": {number: {parameter: _split_value(parameter, value)}}}
-    parse_frame_edit(f"{setting} {text}", found)
-    return found
+        change = {"objects": {number: {parameter: _split_value(parameter, value)}}}
+    parse_frame_edit(f"{setting} {text}", change)
+    return change
 
 
 def _split_value(parameter: str, value: str) -> Any:
@@ -153,26 +160,26 @@ def _split_value(parameter: str, value: str) -> Any:
 
 
 def merge_edits(first: Mapping[Any, Any], second: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Two edits as mappings, one after the other: what the second says of the same thing counts."""
-    found = dict(first)
+    """Two edits as one mapping; the second overrides the first."""
+    edit = dict(first)
     for key, value in second.items():
-        before = found.get(key)
+        before = edit.get(key)
         if key == "weather":
             before, value = _weather(before), _weather(value)
         both = isinstance(before, Mapping) and isinstance(value, Mapping)
-        found[key] = merge_edits(before, value) if both and before is not None else value
-    return found
+        edit[key] = merge_edits(before, value) if both and before is not None else value
+    return edit
 
 
 def _weather(value: Any) -> Any:
-    """A weather's name as its codes; all codes, so that a name replaces what was there."""
+    """A weather's name as all its codes, so that they replace earlier ones."""
     if not isinstance(value, str) or value not in WEATHER_PRESETS:
         return value
     return {**dict.fromkeys(WEATHER_CODES, 0.0), **WEATHER_PRESETS[value]}
 
 
 def parse_frame_edit(where: str, value: Any) -> FrameEdit:
-    """The edit that nested mappings describe. FormatError: `where`, the place in them, expected, found."""
+    """The edit that nested mappings describe. Raises FormatError with `where` and the place in them."""
     entry = require_mapping(where, value, FRAME_KEYS)
     objects = require_mapping(f"{where}: objects", entry.get("objects") or {})
     weather = entry.get("weather")
@@ -220,7 +227,16 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
 
 
 def require_mapping(where: str, value: Any, known: Sequence[str] | None = None) -> dict[Any, Any]:
-    """`value`, a mapping with keys among `known`. FormatError."""
+    """Return a value that is a mapping.
+
+    Args:
+        where: File and place, for errors.
+        value: The value.
+        known: Its allowed keys; all if None.
+
+    Raises:
+        FormatError: For another type, or an unknown key.
+    """
     if not isinstance(value, dict):
         raise FormatError(where, "a mapping", type(value).__name__)
     for key in value:
@@ -240,7 +256,7 @@ def _floats(where: str, value: Any, length: int) -> tuple[float, ...]:
 
 
 def parse_finite_number(where: str, value: Any) -> float:
-    """`value` as a number. FormatError."""
+    """`value` as a finite number. Raises FormatError."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -265,7 +281,16 @@ def _fraction(where: str, value: Any) -> float:
 
 
 def parse_measure(where: str, text: str, units: Mapping[str, float]) -> float:
-    """Text with a unit, such as 10deg; 0 needs none. FormatError."""
+    """The value of a text with a unit, such as 10deg; 0 needs none.
+
+    Args:
+        where: File and place, for errors.
+        text: Number and unit.
+        units: Factor of each unit.
+
+    Raises:
+        FormatError: For another unit, or no number.
+    """
     for unit, factor in units.items():
         if text.strip().endswith(unit):
             return parse_finite_number(where, text.strip().removesuffix(unit)) * factor

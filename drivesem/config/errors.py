@@ -34,7 +34,7 @@ class UsageError(ValueError):
         Args:
             field: The option.
             expected: What the option takes.
-            error: The reason; its own `expected` and `found` are kept.
+            error: The reason, with its own `expected` and `found`.
         """
         match = _DETECTOR_ERROR.fullmatch(str(error))
         if match is None:

@@ -69,9 +69,9 @@ def print_help(prog: str, kind: type[CommandConfig], every_option: bool) -> NoRe
     every = [item for item in fields(kind) if str(item.type) != "CommandName"]
     basic = kind.basic or tuple(item.name for item in every if item.name not in ADVANCED)
     order = {name: position for position, name in enumerate(basic)}
-    shown = sorted(every, key=lambda item: order.get(item.name, len(order)))
-    shown = shown if every_option else shown[: len(order)]
-    options = [_help_field(item, hints[item.name], texts.get(item.name, "")) for item in shown]
+    listed = sorted(every, key=lambda item: order.get(item.name, len(order)))
+    listed = listed if every_option else listed[: len(order)]
+    options = [_help_field(item, hints[item.name], texts.get(item.name, "")) for item in listed]
     config = "Preset or YAML file of options; the command line wins over it; list prints the presets."
     options.append(("config", Annotated[str, _text(config)], field(default="")))
     if len(order) < len(every):
@@ -83,7 +83,7 @@ def print_help(prog: str, kind: type[CommandConfig], every_option: bool) -> NoRe
 
 
 def _help_field(item: Field[Any], hint: Any, text: str) -> tuple[str, Any, Any]:
-    """A field of the dataclass whose help tyro prints: name, type without None, default."""
+    """A field of the dataclass that tyro prints the help of: name, type without None, default."""
     default = ""
     if item.default is MISSING:
         default = "(required)"
@@ -107,7 +107,7 @@ def _without_none(hint: Any) -> Any:
 
 
 def _example(hint: Any) -> Any:
-    """A value of a type, with which tyro does not ask for one."""
+    """A value of a type, so that tyro does not require one."""
     while hasattr(hint, "__metadata__"):
         hint = get_args(hint)[0]
     return get_args(hint)[0] if get_origin(hint) is Literal else hint()

@@ -1,4 +1,4 @@
-"""Options that several commands share: each option's type, range, default and help text, said once.
+"""Options that several commands share: each option's type, range, default and help text, declared once.
 
 Blocks of options are base classes; a command's settings are one flat dataclass of its blocks' fields and its own
 (`drivesem.config.commands`). A function takes the narrowest block that it reads, as `open_source(config:
@@ -52,7 +52,7 @@ PHOTOGRAPHS, SCENES = "photographs", "scenes"
 SOURCES = (DEMO, *DATASETS, PHOTOGRAPHS, SCENES)
 """Values of --dataset: generated scenes, the readers, photographs without labels, and scene folders."""
 WITHOUT_CAMERA = ("coco", "yolo", PHOTOGRAPHS)
-"""Data sets whose photographs may lack a camera."""
+"""Data sets with photographs that may lack a camera."""
 
 DEFAULT_FINDER = "squeezedet"
 """The detector that finds vehicles in photographs without labels."""
@@ -390,7 +390,7 @@ class GradingOptions(Options):
     confirm: bool = True
     """Re-test certain failures with a second renderer."""
     reference_detector: str | None = None
-    """Detector whose detections in the photograph rule out phantoms."""
+    """Detector that rules out phantoms by its detections in the photograph."""
     second_detector: str = "auto"
     """Detector of another architecture that re-tests confirmed failures; auto: a shipped one; off."""
 

@@ -61,6 +61,11 @@ def resolve_preset(name: str) -> str:
 def expand_presets(command: str, words: list[str], commands: Commands) -> list[str]:
     """The words of a command line with the options of its presets, in front, in place of `--config NAME`.
 
+    Args:
+        command: Name of the command.
+        words: Its words.
+        commands: Settings classes by command name.
+
     Raises:
         UsageError: For a preset that does not exist, or cannot be used.
         SystemExit: With code 0 after `--config list`.
@@ -145,7 +150,7 @@ def _names_for(command: str) -> list[str]:
 
 
 def preset_commands(path: str) -> list[str]:
-    """The commands that a preset is for; empty if it does not say. Raises UsageError if it cannot be read."""
+    """The commands that a preset is for; empty if it names none. Raises UsageError if it cannot be read."""
     wanted = _read_mapping(path).get(_FOR, [])
     return [str(name) for name in wanted] if isinstance(wanted, list) else [str(wanted)]
 
