@@ -1,10 +1,9 @@
-"""Folders in a store elsewhere, named by a URL that fsspec opens (s3://, gs://, memory://), and their copies here.
+"""Remote folders (s3://, gs://, memory://: any URL of fsspec) and their local copies.
 
-A command works in the copy, as in any folder. What is new in it goes to the store, each time in the order in which
-it was written, and a commit comes last: an object that names the files, with their sizes, times and hashes. Only
-what a commit names is read back, so that no store has to rename anything, and what was cut off in the middle is
-not there. A file that changes lies beside its place until its commit is written. A folder without commits, such as
-somebody's data set, is read as it stands.
+A command works in the local copy. New files are uploaded in the order in which they were written, and a commit comes
+last: an object that lists files with their sizes, times and hashes. Only files that a commit lists are read back, so
+no store has to rename anything, and an interrupted upload is ignored. A file that changes is uploaded under another
+name until its commit is written. A folder without commits, such as somebody's data set, is read as it is.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
 _COMMITS = ".store"
-"""Folder of the commits: NUMBER-HASH.json, and of changed files by their hash, until they are in their places."""
+"""Folder of the commits, NUMBER-HASH.json, and of changed files, named by hash, before they replace the old ones."""
 _COMMIT = re.compile(r"(\d{6})-([0-9a-f]{16})\.json")
-_SHARE = 0.1
-"""Of a command's time, for copies to the store while it works."""
+_UPLOAD_FRACTION = 0.1
+"""Fraction of a command's time for uploads while it works."""
 
 C = TypeVar("C", bound=CommandConfig)
 
@@ -52,16 +51,21 @@ class FileVersion:
 
 
 class RemoteFolder:
-    """A folder of a store. setting: what named it on the command line; home: for its copy, by default the user's
-    cache. In another process, or on another machine, the copy lies under the same name.
-    """
+    """A remote folder and its local copy, which has the same name in every process and on every machine."""
 
     def __init__(self, url: str, setting: str, home: Path | None = None) -> None:
+        """Name the folder; nothing is read yet.
+
+        Args:
+            url: URL of the folder.
+            setting: The option that gave it, for errors.
+            home: Folder of the local copy (default: in the user's cache).
+        """
         self.url, self._setting = url.rstrip("/"), setting
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         name = hashlib.sha256(self.url.encode()).hexdigest()[:16]
         self._home = home or cache / "drivesem" / "stores" / name
-        # A run is called as its folder is.
+        # A run has the name of its folder.
         self.folder = (
             self._home / "copy" / (re.sub(r"[^\w.-]", "_", self.url.rsplit("/", 1)[-1]).strip(".") or "_")
         )
@@ -73,7 +77,7 @@ class RemoteFolder:
         return type(self), (self.url, self._setting, self._home)
 
     def fetch(self) -> None:
-        """Bring here what the store has and the copy lacks. Raises UsageError for a store that cannot be read."""
+        """Download what the local copy lacks. Raises UsageError for a store that cannot be read."""
         with self._locked():
             commits = self._list_marks(_COMMITS)
             if commits:
@@ -82,19 +86,20 @@ class RemoteFolder:
                 self._mirror()
 
     def upload(self, now: bool = False) -> None:
-        """Copy to the store what is new here. now: whatever was copied last, else in a tenth of the time. Raises
-        UsageError for a store that cannot be written.
+        """Upload what is new, if `now` or if uploads have taken less than a tenth of the time.
+
+        Raises UsageError for a store that cannot be written.
         """
         begun = time.monotonic()
         if not now and begun < self._not_before:
             return
         with self._locked():
             self._push()
-        self._not_before = time.monotonic() + (time.monotonic() - begun) / _SHARE
+        self._not_before = time.monotonic() + (time.monotonic() - begun) / _UPLOAD_FRACTION
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """One process of this machine at a time looks after the copy."""
+        """Hold the copy: one process of this machine at a time reads or writes commits."""
         from filelock import FileLock
 
         (self._home / "commits").mkdir(parents=True, exist_ok=True)
@@ -109,21 +114,21 @@ class RemoteFolder:
 
             return url_to_fs(self.url)
         except (ImportError, ValueError) as error:
-            expected = "a folder, or a URL whose library is here (pip install 'drivesem[remote]')"
+            expected = "a folder, or a URL with a library that is installed (pip install 'drivesem[remote]')"
             raise UsageError(self._setting, expected, f"{self.url}: {error}") from error
 
     @contextmanager
     def _store_errors(self, expected: str) -> Iterator[tuple[AbstractFileSystem, str]]:
-        """The store and the folder in it. What its library raises is in one line: each has errors of its own."""
+        """The store and the path in it; any error of its library becomes a UsageError."""
         opened = self._opened
         try:
             yield opened
         except Exception as error:
-            found = f"{self.url}: {type(error).__name__}: {error} (what was made is kept in {self.folder})"
+            found = f"{self.url}: {type(error).__name__}: {error} (the results are in {self.folder})"
             raise UsageError(self._setting, expected, found) from error
 
     def _get(self, name: str) -> bytes | None:
-        """What an object of the folder holds; None where it is not there."""
+        """The content of an object; None if it does not exist."""
         with self._store_errors("a store that can be read") as (store, root):
             try:
                 data: Any = store.cat_file(f"{root}/{name}")
@@ -148,7 +153,7 @@ class RemoteFolder:
                 return
 
     def _list_marks(self, folder: str = "") -> dict[str, str]:
-        """What lies in a folder of this one, below it too: a mark of its state, by name."""
+        """Every object in a subfolder, at any depth: a mark of its state, by name."""
         with self._store_errors("a store that can be read") as (store, root):
             store.invalidate_cache()
             path = f"{root}/{folder}".rstrip("/")
@@ -164,7 +169,7 @@ class RemoteFolder:
     def _read_commits(self) -> None:
         for path in sorted((self._home / "commits").glob("*.json")):
             if path.name not in self._read:
-                self._versions |= _versions(path)
+                self._versions |= _read_versions(path)
                 self._read.add(path.name)
 
     def _fetch_commits(self, names: Iterable[str]) -> None:
@@ -173,25 +178,25 @@ class RemoteFolder:
             data, path = self._get(f"{_COMMITS}/{name}") or b"", self._home / "commit"
             if hashlib.sha256(data).hexdigest()[:16] == name[7:23]:  # else it is half written
                 files.write_bytes(path, data)
-                fresh[name] = _versions(path)
+                fresh[name] = _read_versions(path)
         wanted = dict(self._versions)
         for versions in fresh.values():
             wanted |= versions
-        # Also what was here and is gone: it is not to be taken for something that a command removed.
-        lost = {name for name in _shown(wanted) if not self._fetch_file(name, wanted[name])}
+        # Includes files that have vanished from the copy: no command removed them.
+        lost = {name for name in _track_progress(wanted) if not self._fetch_file(name, wanted[name])}
         for name, versions in fresh.items():
-            self._note(name, {file: None if file in lost else v for file, v in versions.items()})
+            self._record(name, {file: None if file in lost else v for file, v in versions.items()})
         self._versions |= dict.fromkeys(lost)
 
     def _fetch_file(self, name: str, version: FileVersion | None) -> bool:
-        """Make a file here as a commit names it. False where the store has other bytes in its place."""
+        """Make a local file as a commit lists it. False if the store has other content in its place."""
         path = files.resolve_inside(self.folder, name)
         if version is None:
             path.unlink(missing_ok=True)
             return True
         if _state(path) == (version.size, version.time_ns):
             return True
-        # Beside its place while it changes; in its place again where that ended in between.
+        # Under its hash while it changes, or in its place if the change ended in between.
         for place in (name, f"{_COMMITS}/{version.digest}", name):
             data = self._get(place)
             if data is not None and hashlib.sha256(data).hexdigest() == version.digest:
@@ -202,70 +207,72 @@ class RemoteFolder:
         return False
 
     def _push(self) -> None:
-        here = {path.relative_to(self.folder).as_posix(): state for path, state in _files(self.folder)}
+        local = {path.relative_to(self.folder).as_posix(): state for path, state in _files(self.folder)}
         known = self._versions
         changed = [
-            name for name, state in here.items() if (v := known.get(name)) is None or state != (v.size, v.time_ns)
+            name for name, state in local.items() if (v := known.get(name)) is None or state != (v.size, v.time_ns)
         ]
-        removed = [name for name, version in known.items() if version is not None and name not in here]
+        removed = [name for name, version in known.items() if version is not None and name not in local]
         if not changed and not removed:
             return
         if not self._read:
-            self._commit({})  # from now on, what no commit names is not there
+            self._commit({})  # from now on, only listed files count
         written: dict[str, FileVersion | None] = dict.fromkeys(removed)
-        beside: dict[str, str] = {}
-        for name in sorted(changed, key=lambda name: here[name][1]):
+        temporary: dict[str, str] = {}
+        for name in sorted(changed, key=lambda name: local[name][1]):
             data = _read(self.folder / name)
             if data is None:
                 continue
             digest = hashlib.sha256(data).hexdigest()
             if known.get(name) is not None:
-                beside[name] = f"{_COMMITS}/{digest}"
-            self._put(beside.get(name, name), data)
-            written[name] = FileVersion(len(data), here[name][1], digest)
+                temporary[name] = f"{_COMMITS}/{digest}"
+            self._put(temporary.get(name, name), data)
+            written[name] = FileVersion(len(data), local[name][1], digest)
         self._commit(written)
-        for name, place in beside.items():
+        for name, place in temporary.items():
             data = _read(self.folder / name)
-            if data is not None and place.endswith(hashlib.sha256(data).hexdigest()):  # else it has changed again
+            if data is not None and place.endswith(
+                hashlib.sha256(data).hexdigest()
+            ):  # otherwise it has changed again
                 self._put(name, data)
                 self._remove(place)
         for name in removed:
             self._remove(name)
 
     def _commit(self, versions: Mapping[str, FileVersion | None]) -> None:
-        told = {name: v and [v.size, v.time_ns, v.digest] for name, v in versions.items()}
-        data = json.dumps(told, ensure_ascii=False).encode()
+        listed = {name: v and [v.size, v.time_ns, v.digest] for name, v in versions.items()}
+        data = json.dumps(listed, ensure_ascii=False).encode()
         number = max((int(name[:6]) for name in self._read), default=-1) + 1
         name = f"{number:06d}-{hashlib.sha256(data).hexdigest()[:16]}.json"
         self._put(f"{_COMMITS}/{name}", data)
-        self._note(name, versions)
+        self._record(name, versions)
 
-    def _note(self, name: str, versions: Mapping[str, FileVersion | None]) -> None:
-        told = {file: v and [v.size, v.time_ns, v.digest] for file, v in versions.items()}
-        files.write_json(self._home / "commits" / name, told)
+    def _record(self, name: str, versions: Mapping[str, FileVersion | None]) -> None:
+        listed = {file: v and [v.size, v.time_ns, v.digest] for file, v in versions.items()}
+        files.write_json(self._home / "commits" / name, listed)
         self._versions |= versions
         self._read.add(name)
 
-    # --- folders of others
+    # --- folders without commits
 
     def _mirror(self) -> None:
         record = self._home / "mirror.txt"
         lines = files.read_text(record).splitlines() if record.is_file() else []
         before = {name: mark for mark, _, name in (line.partition(" ") for line in lines)}
-        found = self._list_marks()
-        with record.open("a", encoding="utf-8") as told:
-            for name in _shown(name for name, mark in found.items() if before.get(name) != mark):
+        marks = self._list_marks()
+        with record.open("a", encoding="utf-8") as record_file:
+            for name in _track_progress(name for name, mark in marks.items() if before.get(name) != mark):
                 path, data = files.resolve_inside(self.folder, name), self._get(name)
                 if data is not None:
                     files.write_bytes(path, data)
-                    told.write(f"{found[name]} {name}\n")
-                    told.flush()
-        for name in before.keys() - found:
+                    record_file.write(f"{marks[name]} {name}\n")
+                    record_file.flush()
+        for name in before.keys() - marks:
             files.resolve_inside(self.folder, name).unlink(missing_ok=True)
-        files.write_text(record, "".join(f"{mark} {name}\n" for name, mark in found.items()))
+        files.write_text(record, "".join(f"{mark} {name}\n" for name, mark in marks.items()))
 
 
-def _shown(names: Iterable[str]) -> Iterable[str]:
+def _track_progress(names: Iterable[str]) -> Iterable[str]:
     from rich.progress import track
 
     from drivesem.report.terminal import Console
@@ -275,31 +282,31 @@ def _shown(names: Iterable[str]) -> Iterable[str]:
     return track(names, "copying from the store", console=bar, transient=True, disable=not names)
 
 
-def _versions(path: Path) -> dict[str, FileVersion | None]:
-    """What a commit names. FormatError where it is none."""
-    told = files.read_json(path)
+def _read_versions(path: Path) -> dict[str, FileVersion | None]:
+    """The files of a commit; None for a removed one. Raises FormatError."""
+    listed = files.read_json(path)
     try:
-        found = {name: v and FileVersion(int(v[0]), int(v[1]), str(v[2])) for name, v in told.items()}
+        return {name: v and FileVersion(int(v[0]), int(v[1]), str(v[2])) for name, v in listed.items()}
     except (AttributeError, TypeError, ValueError, LookupError) as error:
         raise FormatError(str(path), "size, time and hash of each file, or null", error) from error
-    return found
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, tuple[int, int]]]:
-    """Files that are whole, with their states, whatever other processes write meanwhile. Hidden ones at the top,
-    such as a lock, are this machine's own.
+    """Complete files with their states, while other processes may write.
+
+    Hidden files at the top, such as a lock, belong to this machine and are left out.
     """
     for root, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not files.is_leftover(name)]
         for path in (Path(root, name) for name in names):
-            own = files.is_leftover(path.name) or (path.parent == folder and path.name.startswith("."))
-            state = None if own else _state(path)
+            local = files.is_leftover(path.name) or (path.parent == folder and path.name.startswith("."))
+            state = None if local else _state(path)
             if state is not None:
                 yield path, state
 
 
 def _read(path: Path) -> bytes | None:
-    """None for a file that is gone since it was listed: the next copy tells so."""
+    """The content; None if the file is gone since it was listed, which the next upload notices."""
     try:
         return files.read_bytes(path)
     except FormatError:
@@ -309,16 +316,18 @@ def _read(path: Path) -> bytes | None:
 
 
 def _state(path: Path) -> tuple[int, int] | None:
+    """Size and time of the last change, ns; None for no file."""
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return None
-    return found.st_size, found.st_mtime_ns
+    return status.st_size, status.st_mtime_ns
 
 
 def local_copy(path: str | Path, setting: str = "--root") -> Path:
-    """A folder: the one of this name, or the copy of the one at this URL, compared with the store once in a
-    process. Raises UsageError for a URL where nothing is.
+    """The folder of a path, or the local copy of a URL, which is updated once per process.
+
+    Raises UsageError for a URL without files.
     """
     return _copy_of(path, setting) if isinstance(path, str) and is_url(path) else Path(path)
 
@@ -328,18 +337,19 @@ def _copy_of(url: str, setting: str) -> Path:
     store = RemoteFolder(url, setting)
     store.fetch()
     if not store.folder.is_dir():
-        raise UsageError(setting, "a folder with files", f"{url}, where there are none")
+        raise UsageError(setting, "a folder with files", f"{url}, which is empty")
     return store.folder
 
 
 _open: RemoteFolder | None = None
-"""Where this process' command writes, if that is elsewhere."""
+"""The remote folder that this process writes to, if any."""
 
 
 @contextmanager
 def remote_output(config: C) -> Iterator[C]:
-    """The settings with a folder here in place of a URL in --out: what the store has is brought there first, and
-    what the command makes is copied back, as it goes (`keep`) and at the end.
+    """The settings with a local folder in place of a URL in --out.
+
+    The folder is downloaded first; what the command writes is uploaded as it goes (`upload`) and at the end.
     """
     _copy_of.cache_clear()
     if not isinstance(config, OutputOptions) or config.out is None or not is_url(config.out):
@@ -356,11 +366,11 @@ def remote_output(config: C) -> Iterator[C]:
 
 
 def set_output_store(store: RemoteFolder | None) -> None:
-    """From now on this process' command writes there."""
+    """Set the remote folder that this process writes to."""
     global _open
     _open = store
 
 
 def output_store() -> RemoteFolder | None:
-    """Where this process' command writes, if that is elsewhere."""
+    """The remote folder that this process writes to, if any."""
     return _open

@@ -19,11 +19,11 @@ from drivesem import store
 from drivesem.cli import main
 from drivesem.config.errors import UsageError
 from drivesem.data.registry import open_dataset
-from drivesem.store import Store, place
+from drivesem.store import RemoteFolder, local_copy
 from scene_ir.errors import FormatError
 from tests.drivesem.commands.test_attack_command import contents, without_times
 
-ATTACK = ["attack", "--params", "color", "--method", "fgsm", "--peer", "off", "--no-confirm", "--workers", "1"]
+ATTACK = ["attack", "--params", "color", "--method", "fgsm", "--second-detector", "off", "--no-confirm", "--workers", "1"]
 
 
 class Plain(LocalFileSystem):
@@ -72,7 +72,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     Plain.writes_left, Plain.raised = float("inf"), KeyboardInterrupt
     MemoryFileSystem.store.clear()
     yield another
-    store.write_to(None)
+    store.set_output_store(None)
 
 
 def write(folder: Path, told: dict[str, str]) -> None:
@@ -88,15 +88,15 @@ def texts(folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize("kind", ["memory", "plain"])
 def test_a_folder_is_elsewhere_what_it_was_here(kind: str, tmp_path: Path, machine: Any) -> None:
     url = f"{kind}://{tmp_path}/bucket/run a"
-    one = Store(url, "--out")
+    one = RemoteFolder(url, "--out")
     one.fetch()
     first = {"config.yaml": "a", "frames/0/result.json": "{}", "frames/0/ä é.png": "p", "empty": ""}
     write(one.folder, {**first, ".lock": "", "frames/.1.0123abcd.tmp/half": "-"})
-    one.keep(now=True)
-    plain = {name for name in one._listed() if not name.startswith(".store/")}
+    one.upload(now=True)
+    plain = {name for name in one._list_marks() if not name.startswith(".store/")}
     assert plain == set(first), "what is not whole, and a lock, stay here"
     machine()
-    other = Store(url, "--out")
+    other = RemoteFolder(url, "--out")
     other.fetch()
     assert texts(other.folder) == first
     assert other.folder.name == "run_a"
@@ -104,38 +104,38 @@ def test_a_folder_is_elsewhere_what_it_was_here(kind: str, tmp_path: Path, machi
     del changed["empty"]
     write(other.folder, changed)
     (other.folder / "empty").unlink()
-    other.keep(now=True)
+    other.upload(now=True)
     machine()
-    third = Store(url, "--out")
+    third = RemoteFolder(url, "--out")
     third.fetch()
     assert texts(third.folder) == changed
-    assert texts(place(url)) == changed
-    plain = {name: third._get(name) for name in third._listed() if not name.startswith(".store/")}
+    assert texts(local_copy(url)) == changed
+    plain = {name: third._get(name) for name in third._list_marks() if not name.startswith(".store/")}
     assert plain == {name: text.encode() for name, text in changed.items()}, "others read it too"
 
 
 def test_nothing_is_copied_twice_and_what_is_gone_here_comes_back(tmp_path: Path, machine: Any) -> None:
-    one = Store(f"plain://{tmp_path}/run", "--out")
+    one = RemoteFolder(f"plain://{tmp_path}/run", "--out")
     one.fetch()
     write(one.folder, {"a": "1", "b": "2"})
-    one.keep(now=True)
+    one.upload(now=True)
     Plain.writes_left = 0
-    again = Store(one.url, "--out")
+    again = RemoteFolder(one.url, "--out")
     shutil.rmtree(again.folder)
     again.fetch()
     assert texts(again.folder) == {"a": "1", "b": "2"}
-    again.keep(now=True)
-    one.keep(now=True)
+    again.upload(now=True)
+    one.upload(now=True)
 
 
 def test_a_copy_bears_what_is_written_meanwhile(
     tmp_path: Path, machine: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Folders that begin while files are listed stay here; files that are gone when they are read are missing."""
-    one = Store(f"plain://{tmp_path}/run", "--out")
+    one = RemoteFolder(f"plain://{tmp_path}/run", "--out")
     one.fetch()
     write(one.folder, {"a": "1", "b": "1"})
-    one.keep(now=True)
+    one.upload(now=True)
     write(one.folder, {"a": "two", "b": "two", "c": "two"})
     walk, put = os.walk, one._put
 
@@ -151,13 +151,13 @@ def test_a_copy_bears_what_is_written_meanwhile(
     with monkeypatch.context() as meanwhile:
         meanwhile.setattr(os, "walk", begun)
         meanwhile.setattr(one, "_put", without)
-        one.keep(now=True)
-    one.keep(now=True)
+        one.upload(now=True)
+    one.upload(now=True)
     shutil.rmtree(one.folder / "frames")
     assert texts(one.folder) == {"b": "two"}
     machine()
-    assert texts(place(one.url)) == {"b": "two"}
-    assert not [name for name in one._listed() if ".tmp" in name]
+    assert texts(local_copy(one.url)) == {"b": "two"}
+    assert not [name for name in one._list_marks() if ".tmp" in name]
 
 
 def test_between_commits_there_is_what_was_there_at_one(tmp_path: Path, machine: Any) -> None:
@@ -177,27 +177,27 @@ def test_between_commits_there_is_what_was_there_at_one(tmp_path: Path, machine:
     for cut in range(40):
         Plain.writes_left = cut
         machine()
-        one = Store(f"plain://{tmp_path}/run{cut}", "--out")
+        one = RemoteFolder(f"plain://{tmp_path}/run{cut}", "--out")
         reached = -1
         try:
             one.fetch()
             for number, state in enumerate(states):
                 shutil.rmtree(one.folder, ignore_errors=True)
                 write(one.folder, state)
-                one.keep(now=True)
+                one.upload(now=True)
                 reached = number
         except KeyboardInterrupt:
             pass
         Plain.writes_left = float("inf")
         machine()
-        other = Store(one.url, "--out")
+        other = RemoteFolder(one.url, "--out")
         other.fetch()
         seen = texts(other.folder) if other.folder.exists() else {}
         assert seen in ([{}] if reached < 0 else [states[reached]]) + states[reached + 1 : reached + 2], cut
         write(other.folder, states[2])
-        other.keep(now=True)
+        other.upload(now=True)
         machine()
-        third = Store(one.url, "--out")
+        third = RemoteFolder(one.url, "--out")
         third.fetch()
         assert texts(third.folder) == seen | states[2], "it goes on"
         if reached == 2:
@@ -207,27 +207,27 @@ def test_between_commits_there_is_what_was_there_at_one(tmp_path: Path, machine:
 
 
 def test_on_another_machine_the_copy_lies_under_the_same_name(tmp_path: Path, machine: Any) -> None:
-    one = Store(f"plain://{tmp_path}/run", "--out")
+    one = RemoteFolder(f"plain://{tmp_path}/run", "--out")
     machine()
     other = pickle.loads(pickle.dumps(one))
     assert (other.url, other.folder) == (one.url, one.folder)
-    assert Store(one.url, "--out").folder != one.folder
+    assert RemoteFolder(one.url, "--out").folder != one.folder
 
 
 def test_damaged_files_are_not_there_and_names_stay_in_the_folder(tmp_path: Path, machine: Any) -> None:
-    one = Store(f"plain://{tmp_path}/run", "--out")
+    one = RemoteFolder(f"plain://{tmp_path}/run", "--out")
     one.fetch()
     write(one.folder, {"a": "1", "b": "2"})
-    one.keep(now=True)
+    one.upload(now=True)
     (tmp_path / "run" / "a").write_text("another")
     machine()
-    other = Store(one.url, "--out")
+    other = RemoteFolder(one.url, "--out")
     other.fetch()
     assert texts(other.folder) == {"b": "2"}
     write(other.folder, {"a": "made anew"})
-    other.keep(now=True)
+    other.upload(now=True)
     machine()
-    assert texts(place(one.url)) == {"a": "made anew", "b": "2"}
+    assert texts(local_copy(one.url)) == {"a": "made anew", "b": "2"}
     for told in ({"../a": [1, 0, "0"]}, {"/etc/a": None}, {"a": [1]}, [1], {"a": 5}):
         data = json.dumps(told).encode()
         name = f"000099-{store.hashlib.sha256(data).hexdigest()[:16]}.json"
@@ -235,7 +235,7 @@ def test_damaged_files_are_not_there_and_names_stay_in_the_folder(tmp_path: Path
         path.write_bytes(data)
         machine()
         with pytest.raises(FormatError):
-            place(one.url)
+            local_copy(one.url)
         path.unlink()
 
 
@@ -243,22 +243,22 @@ def test_a_folder_of_others_is_compared_by_what_the_store_says_of_it(tmp_path: P
     files = fsspec.filesystem("memory")
     for name, text in {"a": b"1", "deep/b": b"2", "c": b"3"}.items():
         files.pipe_file(f"/data/{name}", text)
-    assert texts(place("memory://data")) == {"a": "1", "deep/b": "2", "c": "3"}
+    assert texts(local_copy("memory://data")) == {"a": "1", "deep/b": "2", "c": "3"}
     files.pipe_file("/data/a", b"one")
     files.rm_file("/data/c")
-    (place("memory://data") / "deep" / "b").write_text("not fetched again")
+    (local_copy("memory://data") / "deep" / "b").write_text("not fetched again")
     store._copy_of.cache_clear()
-    assert texts(place("memory://data")) == {"a": "one", "deep/b": "not fetched again"}
-    assert place(tmp_path) == place(str(tmp_path)) == tmp_path
+    assert texts(local_copy("memory://data")) == {"a": "one", "deep/b": "not fetched again"}
+    assert local_copy(tmp_path) == local_copy(str(tmp_path)) == tmp_path
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["confirm", "--run", "s3://bucket/run"], "--run: expected what is on this machine"),
-        (["report", "memory://run"], "--runs: expected what is on this machine"),
-        (["train", "--root", "gs://bucket/kitti"], "--root: expected what is on this machine"),
-        (["runs", "prune", "memory://run"], "FOLDER: expected a folder of this machine, to prune"),
+        (["confirm", "--run", "s3://bucket/run"], "--run: expected a path on this machine"),
+        (["report", "memory://run"], "--runs: expected a path on this machine"),
+        (["train", "--root", "gs://bucket/kitti"], "--root: expected a path on this machine"),
+        (["runs", "prune", "memory://run"], "FOLDER: expected a folder on this machine, to prune"),
         (["attack", "--out", "nothing://bucket"], "--out: expected a folder, or a URL whose library is here"),
         (["attack", "--dataset", "kitti", "--root", "memory://none"], "--root: expected a folder with files"),
         (["runs", "show", "memory://none"], "FOLDER: expected a folder with files"),
@@ -292,8 +292,8 @@ def test_an_attack_is_elsewhere_what_it_is_here(
     assert main([*ATTACK, "--limit", "1", "--out", url]) == 0
     assert (kept / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == begun, "nothing is made twice"
     machine()
-    assert contents(place(url) / "frames") == contents(tmp_path / "here" / "frames")
-    figures = [json.loads((run / "metrics.json").read_text()) for run in (place(url), tmp_path / "here")]
+    assert contents(local_copy(url) / "frames") == contents(tmp_path / "here" / "frames")
+    figures = [json.loads((run / "metrics.json").read_text()) for run in (local_copy(url), tmp_path / "here")]
     assert without_times(figures[0]) == without_times(figures[1])
     capsys.readouterr()
     assert main(["runs", "show", url, "--json"]) == 0
@@ -314,7 +314,7 @@ def test_generated_frames_are_written_and_read_elsewhere(tmp_path: Path, machine
     assert main([*words, url]) == 0
     machine()
     (tmp_path / "here" / ".lock").unlink()
-    assert contents(place(url)) == contents(tmp_path / "here")
+    assert contents(local_copy(url)) == contents(tmp_path / "here")
     assert open_dataset("kitti", url).identifiers == ("000000",)
     out = f"memory://{tmp_path.name}/scenes"
     taken = [
@@ -332,8 +332,8 @@ def test_generated_frames_are_written_and_read_elsewhere(tmp_path: Path, machine
     ]
     assert main([*taken, url]) == 0
     machine()
-    assert (place(out) / "000000" / "scene.json").is_file()
+    assert (local_copy(out) / "000000" / "scene.json").is_file()
     looked = ["eval", "--detector", "squeezedet", "--limit", "1", "--out", str(tmp_path / "figures"), "--root"]
     assert main([*looked, url]) == 0
     with pytest.raises(UsageError, match="--gt"):
-        place("memory://nothing", "--gt")
+        local_copy("memory://nothing", "--gt")

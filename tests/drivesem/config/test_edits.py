@@ -65,7 +65,7 @@ def test_settings_of_the_scene() -> None:
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_CODES)
 
 
-def test_a_share_of_a_shape_needs_a_shape(street: Street) -> None:
+def test_a_fraction_of_a_deformation_needs_one(street: Street) -> None:
     scene = street()
     offsets = torch.zeros_like(scene.objects.ffd)
     offsets[2, 5] = torch.tensor([0.1, -0.05, 0.02])
@@ -78,7 +78,7 @@ def test_a_share_of_a_shape_needs_a_shape(street: Street) -> None:
     with pytest.raises(RangeError, match=message):
         apply_changes(scene, edit)
     for text in ("101%", "-1%"):
-        with pytest.raises(FormatError, match="expected a share from 0% to 100%"):
+        with pytest.raises(FormatError, match="expected a fraction from 0% to 100%"):
             edit_of(f"objects[2].mesh={text}")
     with pytest.raises(FormatError, match=r"expected a unit: 0\.5%"):
         parse_frame_edit("edit", {"objects": {2: {"mesh": "0.5"}}})
