@@ -10,15 +10,13 @@ _MAX_CHARS = 500
 
 
 def make_printable(text: object, max_chars: int = _MAX_CHARS) -> str:
-    """A text as part of a line that people read: what no terminal prints is written as Python writes it, and of
-    more than `most` characters the middle is left out.
-    """
-    told = str(text)
-    if len(told) > max_chars:
-        told = f"{told[: max_chars // 2]} ... {told[-(max_chars // 4) :]} ({len(told):,} characters)"
-    if told.isprintable():
-        return told
-    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in told)
+    """`text` for a message: control characters escaped, the middle of more than `max_chars` characters cut out."""
+    message = str(text)
+    if len(message) > max_chars:
+        message = f"{message[: max_chars // 2]} ... {message[-(max_chars // 4) :]} ({len(message):,} characters)"
+    if message.isprintable():
+        return message
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in message)
 
 
 class SceneError(ValueError):

@@ -1,7 +1,7 @@
-"""Vehicles exchanged, added and taken away, as they are in streets from one day to the next.
+"""Exchange, add and remove vehicles in a scene, as streets change from one day to the next.
 
-The scene before goes along (`SceneIR.before`) with the same objects, row by row. A vehicle that is in one of the
-two only stands behind the camera in the other, where no picture, label or constraint meets it.
+The previous scene stays available as `SceneIR.before` with the same objects, row by row. A vehicle that is in only
+one of the two stands behind the camera in the other, out of reach of pictures, labels and constraints.
 """
 
 from __future__ import annotations
@@ -33,38 +33,43 @@ from scene_ir.types import (
 )
 
 AWAY_M = 60.0
-"""How far behind the camera vehicles stand that are not in a scene."""
+"""Distance behind the camera of vehicles that are not in a scene, m."""
 CHANGE_KEY = "change"
-"""Where a scene's provenance says what was done to it."""
+"""Provenance key of a scene's description of its change."""
 _NEUTRAL = 0.8
-"""Of the templates' paint."""
+"""Grey value of the templates' paint."""
 _INFLATION_M = 0.05
 _STREET_SHADOW = 0.7
-_DARKEST = 0.3
-"""Least that a box's shadow is taken to be dark where it is darkest; of many that are cut, only a rim is seen."""
-_LENS_PX = 0.5
-"""Standard deviation of what a camera makes of an edge."""
-_MOST_GAIN = 2.0
+_MIN_BOX_DARKNESS = 0.3
+"""Least maximum darkness assumed of a box's shadow: only a rim of a clipped one is visible."""
+_LENS_BLUR_PX = 0.5
+"""Standard deviation of the blur of a camera."""
+_MAX_GAIN = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """One that the photograph does not show. translation (3,) m, the bottom-face centre; yaw () rad; size_lhw
-    (3,) m; paint: (3,) RGB in [0, 1] in place of the mesh's own, None to keep it.
-    """
+    """A vehicle that the photograph does not show."""
 
     mesh: Mesh
+    """Mesh in the unit box."""
     category: Category
+    """Its category."""
     translation: Tensor
+    """(3,) m, bottom-face centre."""
     yaw: Tensor
+    """() rad."""
     size_lhw: Tensor
+    """(3,) m, length, height, width."""
     paint: tuple[float, float, float] | None = None
+    """RGB in [0, 1] in place of the mesh's paint, or None."""
 
 
 def remove_vehicle(scene: SceneIR, row: int) -> SceneIR:
-    """The scene with the vehicle in `row` and its shadow gone: background shows, and what it hid of others is
-    completed (`scene_ir.removal`). Raises RangeError for a row that the scene does not have, or sources that it
-    lacks.
+    """The scene without the vehicle in `row` and its shadow; what it hid of others is completed
+    (`scene_ir.removal`).
+
+    Raises RangeError for an unknown row or missing sources.
     """
     _check_exchangeable(scene, row)
     objects = scene.objects
@@ -80,42 +85,67 @@ def remove_vehicle(scene: SceneIR, row: int) -> SceneIR:
 
 @torch.no_grad()
 def add_vehicle(scene: SceneIR, vehicle: Vehicle) -> SceneIR:
-    """The scene with one vehicle more, in a last row, in the scene's light and with a shadow. In the scene before
-    it, that row stands behind the camera. Raises RangeError for sources that the scene lacks.
+    """The scene with one more vehicle in a last row, in the scene's light and with a shadow.
+
+    In the previous scene that row stands behind the camera. Raises RangeError for missing sources.
     """
     _check_exchangeable(scene, None)
-    here, mesh = _render_vehicle(scene, vehicle), len(scene.meshes)
+    vehicle_render, mesh = _render_vehicle(scene, vehicle), len(scene.meshes)
     place = _away_position(scene, scene.objects.translation)
-    padded = replace(scene, meshes=(*scene.meshes, here.mesh))
+    padded = replace(scene, meshes=(*scene.meshes, vehicle_render.mesh))
     there = replace(
-        _object_row(here, mesh, padded), translation=place[None], source=(_hidden_source(here.source, place),)
+        _object_row(vehicle_render, mesh, padded),
+        translation=place[None],
+        source=(_hidden_source(vehicle_render.source, place),),
     )
     before = replace(padded, objects=_concatenate(scene.objects, there))
-    objects = _concatenate(scene.objects, _object_row(here, mesh, padded))
+    objects = _concatenate(scene.objects, _object_row(vehicle_render, mesh, padded))
     return record_exchange(padded, before, objects, f"{vehicle.mesh.name} parks as objects[{len(scene.objects)}]")
 
 
 @torch.no_grad()
 def replace_vehicle(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
-    """The scene with another vehicle in the place of the one in `row`, which it keeps. Raises as `without`."""
+    """The scene with another vehicle in the place of the one in a row.
+
+    Args:
+        scene: A scene in which nothing was exchanged yet.
+        row: The object to replace.
+        vehicle: Its replacement, which takes over the row.
+
+    Returns:
+        The changed scene.
+
+    Raises:
+        RangeError: An unknown row or missing sources.
+    """
     _check_exchangeable(scene, row)
-    here = _render_vehicle(scene, vehicle)
-    new = _object_row(here, len(scene.meshes), scene)
+    vehicle_render = _render_vehicle(scene, vehicle)
+    new = _object_row(vehicle_render, len(scene.meshes), scene)
     sources = list(complete_uncovered_sources(scene, {row}))
-    sources[row] = here.source
+    sources[row] = vehicle_render.source
     own = {}
     for name in _TENSORS:
         own[name] = getattr(scene.objects, name).clone()
         own[name][row] = getattr(new, name)[0]
     objects = replace(scene.objects, source=tuple(sources), **own)
-    wider = replace(scene, meshes=(*scene.meshes, here.mesh))
+    wider = replace(scene, meshes=(*scene.meshes, vehicle_render.mesh))
     return record_exchange(wider, scene, objects, f"{vehicle.mesh.name} in the place of objects[{row}]")
 
 
 @torch.no_grad()
 def add_roof_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
-    """The scene with a load on the roof of the vehicle in `row`, of which the photograph shows all else. load: a
-    mesh in the unit box of that vehicle, and above it; it moves and bends with the vehicle. Raises as `without`.
+    """The scene with a load on the roof of a photographed vehicle.
+
+    Args:
+        scene: A scene in which nothing was exchanged yet.
+        row: The vehicle.
+        load: A mesh in and above that vehicle's unit box; it moves and deforms with the vehicle.
+
+    Returns:
+        The changed scene.
+
+    Raises:
+        RangeError: An unknown row or missing sources.
     """
     _check_exchangeable(scene, row)
     objects, source = scene.objects, scene.objects.source[row]
@@ -136,14 +166,24 @@ def add_roof_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
     index = objects.mesh_index.clone()
     index[row] = len(scene.meshes)
     loaded = replace(scene, meshes=(*scene.meshes, _merge_meshes(own, load)))
-    words = f"{load.name} on the roof of objects[{row}]"
-    return record_exchange(loaded, scene, replace(objects, mesh_index=index, source=tuple(sources)), words)
+    description = f"{load.name} on the roof of objects[{row}]"
+    return record_exchange(loaded, scene, replace(objects, mesh_index=index, source=tuple(sources)), description)
 
 
-def record_exchange(scene: SceneIR, before: SceneIR, objects: Objects, words: str) -> SceneIR:
-    """`scene` with other objects, after `before`. words: what was done, for people."""
-    said = {**scene.provenance, CHANGE_KEY: words}
-    return replace(scene, objects=objects, before=before, provenance=said)
+def record_exchange(scene: SceneIR, before: SceneIR, objects: Objects, description: str) -> SceneIR:
+    """A changed scene with its history.
+
+    Args:
+        scene: The scene to change.
+        before: The previous scene.
+        objects: The new objects.
+        description: The change, for display.
+
+    Returns:
+        The changed scene.
+    """
+    provenance = {**scene.provenance, CHANGE_KEY: description}
+    return replace(scene, objects=objects, before=before, provenance=provenance)
 
 
 _TENSORS = tuple(entry.name for entry in fields(Objects) if entry.name != "source")
@@ -151,16 +191,16 @@ _TENSORS = tuple(entry.name for entry in fields(Objects) if entry.name != "sourc
 
 @dataclass(frozen=True, slots=True)
 class _RenderedVehicle:
-    """A vehicle as the scene shows it. mesh: in its own paint."""
+    """A vehicle with its mesh in its own paint, and its source in the scene."""
 
     vehicle: Vehicle
     mesh: Mesh
     source: Source
 
 
-def _object_row(here: _RenderedVehicle, mesh: int, scene: SceneIR) -> Objects:
-    """The one row of a vehicle. Its label is made where labels are (`drivesem.attack.labels`): nothing yet."""
-    vehicle, like = here.vehicle, scene.objects.translation
+def _object_row(vehicle_render: _RenderedVehicle, mesh: int, scene: SceneIR) -> Objects:
+    """A vehicle's row of objects. Its label (`drivesem.attack.labels`) is empty at first."""
+    vehicle, like = vehicle_render.vehicle, scene.objects.translation
     return Objects(
         mesh_index=torch.tensor([mesh]),
         translation=vehicle.translation.to(like)[None],
@@ -172,7 +212,7 @@ def _object_row(here: _RenderedVehicle, mesh: int, scene: SceneIR) -> Objects:
         box2d=scene.objects.box2d.new_zeros(1, 4),
         truncation=scene.objects.truncation.new_zeros(1),
         occlusion=scene.objects.occlusion.new_zeros(1),
-        source=(here.source,),
+        source=(vehicle_render.source,),
     )
 
 
@@ -182,26 +222,26 @@ def _concatenate(first: Objects, then: Objects) -> Objects:
 
 
 def _render_vehicle(scene: SceneIR, vehicle: Vehicle) -> _RenderedVehicle:
-    """A vehicle in the scene's light, as if it had been photographed: in the finish and the sunlight of the
-    others, with a shadow as dark as theirs.
-    """
+    """Render a vehicle as if photographed: in the others' finish and sunlight, with a shadow as dark as theirs."""
     mesh, sources = _apply_paint(vehicle.mesh, vehicle.paint), scene.objects.source
-    here = _RenderedVehicle(vehicle, mesh, _blank_source(vehicle, mesh, _sunlight(scene)))
-    row = replace(_object_row(here, 0, scene), source=())
+    vehicle_render = _RenderedVehicle(vehicle, mesh, _blank_source(vehicle, mesh, _sunlight(scene)))
+    row = replace(_object_row(vehicle_render, 0, scene), source=())
     alone = _render_object(scene, row, mesh)
     shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))[0]
     nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
     dark = 1.0 - shadow.values
     if dark.numel():
-        dark = dark * (_shadow_darkness([sources[i] for i in nearest]) / dark.max().clamp(min=_DARKEST))
-    source = replace(here.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark.clamp(0.0, 1.0)))
-    return replace(here, source=source)
+        dark = dark * (_shadow_darkness([sources[i] for i in nearest]) / dark.max().clamp(min=_MIN_BOX_DARKNESS))
+    source = replace(
+        vehicle_render.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark.clamp(0.0, 1.0))
+    )
+    return replace(vehicle_render, source=source)
 
 
 @dataclass(frozen=True, slots=True)
 class _ObjectLayer:
-    """One object drawn by itself. rgba: Crop (4, h, w), premultiplied; nearness: Crop (1, h, w), 1 / m, 0 beside
-    it.
+    """One object rendered alone: Crop (4, h, w), premultiplied RGBA, and Crop (1, h, w), 1 / depth in 1 / m, 0
+    outside it.
     """
 
     rgba: Crop
@@ -209,7 +249,7 @@ class _ObjectLayer:
 
 
 def _render_object(scene: SceneIR, row: Objects, mesh: Mesh) -> _ObjectLayer:
-    """`row`, one object of `mesh` that no photograph shows, in the scene's light."""
+    """Render `row`, one object of `mesh` without a photograph, in the scene's light."""
     compositor = Compositor(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))
     compositor.sunlight.fill_(_sunlight(scene))
     layers = compositor.draw_layers(compositor.scene.objects)
@@ -220,8 +260,10 @@ def _render_object(scene: SceneIR, row: Objects, mesh: Mesh) -> _ObjectLayer:
     colour = texture.apply_finish(light, light.new_tensor([gain] * 3), light.new_tensor([lift])) * opacity
     values = torch.cat([colour, opacity, 1.0 / layers.depth[packed, None]], dim=1).T.reshape(5, *size)
     values = values.to(scene.background).contiguous()
-    if values.numel():  # else it stands beside the picture
-        values[:4] = kornia.filters.gaussian_blur2d(values[None, :4], (5, 5), (_LENS_PX, _LENS_PX), "replicate")[0]
+    if values.numel():  # else it is outside the picture
+        values[:4] = kornia.filters.gaussian_blur2d(
+            values[None, :4], (5, 5), (_LENS_BLUR_PX, _LENS_BLUR_PX), "replicate"
+        )[0]
     return _ObjectLayer(Crop(values[:4], x0, y0), Crop(values[4:], x0, y0))
 
 
@@ -230,16 +272,16 @@ def _sunlight(scene: SceneIR) -> float:
 
 
 def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, float]:
-    """Gain and lift as of `finish.estimate_exposure`: the medians of the others, of the gain as large a multiple
-    of what the road shows where each stands, which differs along a street, in the shade of a house.
+    """Gain and lift as of `finish.exposure`: the others' medians.
+
+    Gains are relative to the brightness of the road at each vehicle, which varies along a street, as in a house's
+    shade.
     """
     if not len(scene.objects):
         return 1.0, 0.0
     objects, whole = scene.objects, Compositor(scene.unperturbed())
     gains, lifts = [], []
-    for i, (surface, samples) in enumerate(
-        zip(whole.surfaces.templates, whole.sample_photograph(), strict=True)
-    ):
+    for i, (surface, samples) in enumerate(zip(whole.surfaces.templates, whole.sample_photograph(), strict=True)):
         found = finish.estimate_exposure(surface, samples)
         if found is not None:
             gains.append(found[0] / _road_light(scene, objects.translation[i], objects.size_lhw[i]))
@@ -247,21 +289,19 @@ def _exposure(scene: SceneIR, place: Tensor, size_lhw: Tensor) -> tuple[float, f
     if not gains:
         return 1.0, 0.0
     gain = float(np.median(gains)) * _road_light(scene, place, size_lhw)
-    return min(gain, _MOST_GAIN), float(np.median(lifts))
+    return min(gain, _MAX_GAIN), float(np.median(lifts))
 
 
 def _road_light(scene: SceneIR, translation: Tensor, size_lhw: Tensor) -> float:
-    """The light that the ground shows without vehicles, at a place (3,) and around it as far as a vehicle is
-    wide.
-    """
+    """Brightness of the ground without vehicles, around a place (3,) as far as a vehicle is wide."""
     steps = torch.linspace(-0.5, 0.5, 9) * size_lhw[2]
     x, z = torch.meshgrid(steps, steps, indexing="ij")
     points = translation + torch.stack([x, torch.zeros_like(x), z], dim=-1).reshape(-1, 3)
     clip = to_clip(points.to(scene.camera.matrix), scene.camera.matrix)
     pixels = (clip[:, :2] / clip[:, 2:].clamp(min=1.0)).round().long()
     column, row = pixels[:, 0].clamp(0, scene.camera.width - 1), pixels[:, 1].clamp(0, scene.camera.height - 1)
-    shown = scene.background[:, row, column].mean(dim=0).double().numpy()
-    return float(finish.display_to_light(shown).mean())
+    colours = scene.background[:, row, column].mean(dim=0).double().numpy()
+    return float(finish.display_to_light(colours).mean())
 
 
 def _blank_source(vehicle: Vehicle, mesh: Mesh, sunlight: float) -> Source:
@@ -272,9 +312,7 @@ def _blank_source(vehicle: Vehicle, mesh: Mesh, sunlight: float) -> Source:
 
 
 def _shadow_darkness(sources: Sequence[Source]) -> float:
-    """How dark the shadow of the first that has one is where it is darkest, as a share; a plain street's where
-    none has.
-    """
+    """Maximum darkness of the first shadow, as a share; a typical one if there is none."""
     shadows = (source.shadow.values for source in sources if source.shadow is not None)
     return next((float((1.0 - s).mean(dim=0).max()) for s in shadows if s.numel()), _STREET_SHADOW)
 
@@ -316,7 +354,7 @@ def _check_exchangeable(scene: SceneIR, row: int | None) -> None:
 
 
 def _away_position(scene: SceneIR, like: Tensor) -> Tensor:
-    """Where (3,) vehicles stand that are not in a scene: on its ground, behind the camera."""
+    """Position (3,) of vehicles that are not in a scene: on its ground, behind the camera."""
     ground = scene.environment.ground.to(like)
     return torch.stack(
         [ground.new_zeros(()), (ground[2] * AWAY_M - ground[3]) / ground[1], ground.new_tensor(-AWAY_M)]
@@ -324,6 +362,6 @@ def _away_position(scene: SceneIR, like: Tensor) -> Tensor:
 
 
 def _hidden_source(source: Source, place: Tensor) -> Source:
-    """The source of a vehicle that the picture does not show, since it stands at `place` (3,)."""
+    """The source of a vehicle that is out of the picture, at `place` (3,)."""
     nothing = Crop(source.foreground.values.new_zeros(4, 1, 1), 0, 0)
     return replace(source, translation=place, foreground=nothing, shadow=None, region=None)

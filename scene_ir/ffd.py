@@ -74,7 +74,7 @@ def low_order_modes() -> Tensor:
     x, y, z = (torch.linspace(-1, 1, n) for n in LATTICE)
     x, y, z = (axis.reshape(-1) for axis in torch.meshgrid(x, y, z, indexing="ij"))
     along_and_up = (x, y, x * x, x * y, y * y)
-    across = (z, z * x, z * y, z * x * x, z * y * y)  # odd in z, so that left and right mirror each other
+    across = (z, z * x, z * y, z * x * x, z * y * y)  # odd in z
     modes = []
     for axis, terms in enumerate((along_and_up, along_and_up, across)):
         for term in terms:

@@ -1,7 +1,7 @@
-"""Files that appear whole or not at all, and are read with errors that name them. Light: needs no torch.
+"""Atomic writes, and reads with errors that name the file. Imports no torch.
 
-What is read may come from anywhere: only regular files are, up to a size, and what they say of the size of what
-is in them is looked at before anything is made of it.
+Files may come from anywhere: only regular files up to a size limit are read, and sizes that a file declares are
+checked before anything is allocated.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 _NPZ_LEVEL = 1
-"""zlib level: float maps shrink hardly further at higher ones, and take several times as long."""
+"""zlib level: higher ones hardly shrink float maps and take several times as long."""
 
 _MAX_BYTES = 1 << 30
-"""Of a file that is read whole, and of all arrays of an NPZ."""
+"""Size limit of a file that is read whole, and of all arrays of an NPZ."""
 _CHUNK_BYTES = 1 << 24
-"""Bytes of a file that turns out longer than it said."""
+"""Bytes per read of a file that is longer than its reported size."""
 _MAX_PIXELS = 1 << 26
-"""Of an image: 8192 x 8192."""
+"""Size limit of an image: 8192 x 8192."""
 _MAX_YAML_BYTES = 1 << 18
-"""Bytes of a YAML file: settings are short, and reading is slow."""
+"""Size limit of a YAML file: configurations are short, and parsing is slow."""
 _INTEGER_LIMIT = 1 << 63
-"""Integers lie below it, as in the arrays that are made of them."""
+"""Integers must fit int64 arrays."""
 _INTEGER_DIGITS = len(str(_INTEGER_LIMIT))
 _MAX_YAML_DIGITS = 200
-"""Characters of an integer in YAML, which may be binary, with underscores."""
+"""Length limit of an integer in YAML, which may be binary, with underscores."""
 _INVALID_ESCAPE = re.compile(r"\\u(?:[dD][89a-fA-F]|0000)")
-"""What JSON writes of half a character, and of NUL: neither can be in a name or be written again."""
+"""JSON escapes of half a surrogate pair and of NUL: neither is valid in a name or can be written again."""
 
 
 _LEFTOVER_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
 
 
 def _temporary_path(path: Path) -> Path:
-    """A free hidden name beside `path`, on the same file system, so that a rename is atomic."""
+    """An unused hidden name in the folder of `path`, on the same file system, so that a rename is atomic."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
 
 
@@ -69,21 +69,20 @@ def is_leftover(name: str) -> bool:
 
 
 def find_leftovers(folder: Path) -> list[Path]:
-    """Files and folders below `folder` that a process was writing when it was killed, the outermost of them; of
-    processes that write now, too, which may end meanwhile.
+    """Temporary files and folders below `folder`, outermost only.
+
+    Processes that are writing now have some too, which may vanish meanwhile.
     """
-    found: list[Path] = []
+    leftovers: list[Path] = []
     for place, folders, names in os.walk(folder):
-        found += [Path(place, name) for name in (*folders, *names) if is_leftover(name)]
+        leftovers += [Path(place, name) for name in (*folders, *names) if is_leftover(name)]
         folders[:] = [name for name in folders if not is_leftover(name)]
-    return sorted(found)
+    return sorted(leftovers)
 
 
 @contextmanager
 def name_write_errors(path: Path) -> Iterator[None]:
-    """Inside, what the system says against writing `path` becomes a WriteError that names it, as it would be
-    called in the end.
-    """
+    """Convert OSErrors while writing `path` to WriteErrors that name its final path."""
     try:
         yield
     except WriteError:
@@ -94,9 +93,7 @@ def name_write_errors(path: Path) -> Iterator[None]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that a reader sees the old file or the new one, never a part. Makes the folder.
-    Raises WriteError; so do all that write here.
-    """
+    """Write `data` to `path` atomically, and make its folder. Raises WriteError, as all writers here do."""
     temporary = _temporary_path(path)
     with name_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,9 +105,10 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def hardlink_duplicates(folder: Path, other: Path) -> None:
-    """Let files below `folder` that equal those of the same name below `other` take no room of their own: hard
-    links, where the file system has them. Files of this project are replaced and never written into, so that a
-    change of one stays away from the other.
+    """Replace files below `folder` by hard links to equal files of the same name below `other`, if supported.
+
+    Files of this project are replaced and never modified in place, so that a change of one does not affect the
+    other.
     """
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         twin = other / path.relative_to(folder)
@@ -120,7 +118,7 @@ def hardlink_duplicates(folder: Path, other: Path) -> None:
         try:
             os.link(twin, temporary)
             os.replace(temporary, path)
-        except OSError:  # another file system, or one without links: two copies are as good
+        except OSError:  # another file system, or one without links
             return
         finally:
             temporary.unlink(missing_ok=True)
@@ -132,13 +130,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, atomically. Floats round trip; ValueError where one is not finite."""
+    """Write `value` as indented JSON, atomically. Floats round-trip; ValueError if one is not finite."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def write_png(path: Path, image: np.ndarray, compression: int | None = None) -> None:
-    """Write an image as PNG, atomically. image: (H, W, 3) RGB or (H, W), uint8 or uint16. compression: zlib's
-    level, 0 to 9, None for OpenCV's choice; 1 is several times as fast as 9 and about 15 % larger.
+    """Write an image as PNG, atomically.
+
+    Args:
+        path: The file.
+        image: (H, W, 3) RGB or (H, W), uint8 or uint16.
+        compression: zlib level, 0 to 9; None for OpenCV's default. 1 is several times as fast as 9 and about 15 %
+            larger.
     """
     import cv2
 
@@ -165,7 +168,7 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder` that takes its name and place when the block ends without error."""
+    """A temporary folder that replaces `folder` when the block ends without error."""
     temporary = _temporary_path(folder)
     with name_write_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -179,8 +182,9 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 
 def _replace_folder(temporary: Path, folder: Path) -> None:
-    """`temporary` in the place of what has the name of `folder`, which is there again where that fails. Of two
-    processes that do so at once, the later one's stays.
+    """Move `temporary` to `folder`, which is restored if that fails.
+
+    Of two processes that do so at once, the later one's folder remains.
     """
     done = False
     while not done:
@@ -191,7 +195,7 @@ def _replace_folder(temporary: Path, folder: Path) -> None:
             os.replace(temporary, folder)
             done = True
         except OSError:
-            if not os.path.lexists(folder):  # and no other's that came between
+            if not os.path.lexists(folder):  # and no other process came between
                 if os.path.lexists(old):
                     os.replace(old, folder)
                 raise
@@ -200,7 +204,7 @@ def _replace_folder(temporary: Path, folder: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    """A folder with all that is in it; a file or a link."""
+    """Delete a folder with its contents, a file or a link."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -208,22 +212,22 @@ def _remove(path: Path) -> None:
 
 
 def sha256_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal. FormatError where it is missing or cannot be read."""
+    """SHA-256 of a file's bytes, hexadecimal. Raises FormatError if it cannot be read."""
     return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def check_model_card(path: Path, data: bytes) -> None:
-    """FormatError for weights, `data`, that are not those whose SHA-256 the model card beside them names."""
+    """Raise FormatError unless the weights `data` have the SHA-256 of the model card next to `path`."""
     card = path.with_suffix(".md")
-    said, found = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card)), hashlib.sha256(data).hexdigest()
-    if said is None or said[1] != found:
-        raise FormatError(str(path), f"the SHA-256 of {card.name}, {said[1] if said else 'which has none'}", found)
+    expected = re.search(r"SHA-256: `([0-9a-f]{64})`", read_text(card))
+    found = hashlib.sha256(data).hexdigest()
+    if expected is None or expected[1] != found:
+        digest = expected[1] if expected else "which has none"
+        raise FormatError(str(path), f"the SHA-256 of {card.name}, {digest}", found)
 
 
 def resolve_inside(folder: Path, name: str) -> Path:
-    """The path of what another file names in `folder`. FormatError where it leads out of it: by an absolute name,
-    `..`, or a link.
-    """
+    """The path of `name` in `folder`. Raises FormatError if it leads out: by an absolute name, `..`, or a link."""
     parts = Path(name).parts
     if not parts or Path(name).is_absolute() or ".." in parts or "\0" in name:
         raise FormatError(str(folder), "names of what is in there", repr(name))
@@ -234,7 +238,7 @@ def resolve_inside(folder: Path, name: str) -> Path:
 
 
 def check_links(folder: Path) -> None:
-    """FormatError for a link in `folder`, or in a folder in it, that leads out of it."""
+    """Raise FormatError for a link in `folder`, or in a folder in it, that leads out of it."""
     for place, folders, names in os.walk(folder):
         for name in (*folders, *names):
             path = Path(place, name)
@@ -243,9 +247,7 @@ def check_links(folder: Path) -> None:
 
 
 def check_regular_file(path: Path | str, max_bytes: int = _MAX_BYTES) -> int:
-    """FormatError for what is missing, no regular file (a device never ends), or larger than `most` bytes.
-    Its size.
-    """
+    """Size of a file. Raises FormatError unless it is a regular file (a device never ends) of at most `max_bytes`."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:  # ValueError: a NUL, or half a character, in the name
@@ -261,16 +263,16 @@ def check_regular_file(path: Path | str, max_bytes: int = _MAX_BYTES) -> int:
 
 
 def read_bytes(path: Path | str, max_bytes: int = _MAX_BYTES) -> bytes:
-    """The bytes of a file. FormatError as `check_regular`, and where it cannot be read.
+    """The bytes of a file. Raises FormatError as `check_regular_file`, and if it cannot be read.
 
-    Calls the system as seldom as can be: tens of thousands of small files are read at once.
+    Makes as few system calls as possible: tens of thousands of small files are read at once.
     """
     size = check_regular_file(path, max_bytes)
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
             data = os.read(descriptor, size + 1)
-            if len(data) != size:  # it changed meanwhile, or is longer than one call reads
+            if len(data) != size:  # it changed meanwhile, or is longer than one call can read
                 parts = [data]
                 while parts[-1]:
                     parts.append(os.read(descriptor, _CHUNK_BYTES))
@@ -283,12 +285,12 @@ def read_bytes(path: Path | str, max_bytes: int = _MAX_BYTES) -> bytes:
 
 
 def read_text(path: Path | str, max_bytes: int = _MAX_BYTES) -> str:
-    """The text of a UTF-8 file. FormatError as `read_bytes`, and where it is no text."""
+    """The text of a UTF-8 file. Raises FormatError as `read_bytes`, and if it is no text."""
     return decode_utf8(read_bytes(path, max_bytes), path)
 
 
 def read_gzip(path: Path, max_bytes: int = _MAX_BYTES) -> bytes:
-    """What a gzip file holds. FormatError as `read_bytes`, where it is none, or holds more than `most` bytes."""
+    """The content of a gzip file. Raises FormatError as `read_bytes`, if it is none, or beyond `max_bytes`."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(read_bytes(path, max_bytes))) as stream:
             data = stream.read(max_bytes + 1)
@@ -300,7 +302,7 @@ def read_gzip(path: Path, max_bytes: int = _MAX_BYTES) -> bytes:
 
 
 def decode_utf8(data: bytes, path: Path | str) -> str:
-    """UTF-8 text. FormatError naming the file where it is none."""
+    """UTF-8 text. Raises FormatError naming the file if it is none."""
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -310,14 +312,15 @@ def decode_utf8(data: bytes, path: Path | str) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file. FormatError naming line and column where it is none; for deep nesting, integers
-    beyond 64 bits, NUL and half characters.
+    """The value in a JSON file. Raises FormatError with line and column.
+
+    Deep nesting, integers beyond 64 bits, NUL and unpaired surrogates are rejected too.
     """
     return parse_json(read_text(path), str(path))
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value of JSON text. where: the file. FormatError as `read_json`."""
+    """The value of JSON text from the file `where`. Raises FormatError as `read_json`."""
     try:
         value = json.loads(text, parse_int=_parse_integer if _has_long_numbers(text) else None)
         if _INVALID_ESCAPE.search(text):
@@ -336,8 +339,9 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def _has_long_numbers(text: str) -> bool:
-    """Whether there are as many digits in a row as an integer beyond 64 bits has: then each is looked at, which
-    takes as long as all the rest of the reading.
+    """Whether the text has as many digits in a row as an integer beyond 64 bits.
+
+    Only then is each integer checked, which takes as long as the rest of the parsing.
     """
     digits = np.frombuffer(text.encode("utf-8", "surrogatepass"), np.uint8) - np.uint8(ord("0")) < 10
     run = 1
@@ -355,7 +359,7 @@ def _parse_integer(text: str) -> int:
 
 
 def _check_texts(value: Any) -> None:
-    """ValueError for texts, keys too, with a NUL or half a character."""
+    """Raise ValueError for texts or keys with NUL or an unpaired surrogate."""
     written = json.dumps(value, ensure_ascii=False)
     written.encode("utf-8")
     if "\\u0000" in written:
@@ -363,7 +367,7 @@ def _check_texts(value: Any) -> None:
 
 
 class _SafeYamlLoader(yaml.SafeLoader):
-    """YAML without aliases, a few of which stand for gigabytes, and with integers that fit 64 bits."""
+    """YAML without aliases, a few of which expand to gigabytes, and with integers of at most 64 bits."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -372,7 +376,7 @@ class _SafeYamlLoader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def integer(self, node: Any) -> int:
-        """What the text of a node says."""
+        """The integer of a node."""
         if len(node.value) > _MAX_YAML_DIGITS:
             raise ValueError(f"an integer of {len(node.value)} digits, too large for 64 bits")
         return _parse_integer(str(self.construct_yaml_int(node)))
@@ -382,7 +386,9 @@ _SafeYamlLoader.add_constructor("tag:yaml.org,2002:int", _SafeYamlLoader.integer
 
 
 def read_yaml(path: Path) -> Any:
-    """The value in a YAML file. FormatError where it is none, or has aliases, deep nesting or huge integers."""
+    """The value in a YAML file. Raises FormatError if it is none, or has aliases, deep nesting or huge
+    integers.
+    """
     text = read_text(path, _MAX_YAML_BYTES)
     try:
         return yaml.load(text, _SafeYamlLoader)  # a subclass of SafeLoader
@@ -394,8 +400,10 @@ def read_yaml(path: Path) -> Any:
 
 @contextmanager
 def open_image(path: Path, data: bytes | None = None) -> Iterator[Image]:
-    """Pillow's view of an image file, of which the header alone is read as yet. data: what is in it, where that is
-    known. FormatError for no image, for one that would not fit, and for what Pillow raises inside.
+    """Open an image file with Pillow, which reads only its header at first.
+
+    `data` is the content if known. Raises FormatError for no image, one beyond the size limit, and errors of
+    Pillow inside the block.
     """
     from PIL import Image
 
@@ -414,20 +422,20 @@ def open_image(path: Path, data: bytes | None = None) -> Iterator[Image]:
         raise
     except Image.DecompressionBombError as error:
         raise FormatError(str(path), f"an image of at most {_MAX_PIXELS:,} px", "one of more") from error
-    # its readers of damaged headers, EXIF among them, raise what their parts do
+    # readers of damaged headers, such as EXIF, raise many types
     except (OSError, ValueError, SyntaxError, ArithmeticError, LookupError, TypeError, struct.error) as error:
         found = f"{path.stat().st_size if data is None else len(data)} bytes that do not decode"
         raise FormatError(str(path), "an image", found) from error
 
 
 def read_image_size(path: Path, data: bytes) -> tuple[int, int]:
-    """Width and height that an image's header says. FormatError as `opened_image`."""
+    """Width and height in an image's header. Raises FormatError as `open_image`."""
     with open_image(path, data) as image:
         return image.size
 
 
 def check_utf8(field: str, text: str) -> None:
-    """FormatError naming the field for text that UTF-8 does not hold, as the names of some old files are."""
+    """Raise FormatError naming the field for text that is invalid in UTF-8, such as some old file names."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -435,8 +443,9 @@ def check_utf8(field: str, text: str) -> None:
 
 
 def _is_whole(data: bytes) -> bool:
-    """Whether a PNG or JPEG goes on to its end, whatever phones write behind that; of others True. The decoder
-    fills what is missing with grey, without a word.
+    """Whether a PNG or JPEG has its end marker; True for other formats.
+
+    Phones append data after it. OpenCV silently fills missing rows with grey.
     """
     if data.startswith(b"\x89PNG"):
         place = 8
@@ -457,7 +466,7 @@ def _is_whole(data: bytes) -> bool:
 
 
 def _decode(path: Path) -> np.ndarray:
-    """The values of an image file as OpenCV has them, unchanged. FormatError where it is missing or no image."""
+    """The values of an image file, unchanged, by OpenCV. Raises FormatError if it is missing or no image."""
     import cv2
 
     data = read_bytes(path)
@@ -481,8 +490,8 @@ def _check_size(path: Path, image: np.ndarray, size_hw: tuple[int, int] | None) 
 def read_image(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
     """An 8-bit colour image as (H, W, 3) RGB uint8.
 
-    FormatError where the file is missing, is cut short, does not decode, is not 8-bit with three channels, or is
-    not of `size_hw` (height, width) where that is given.
+    Raises FormatError if the file is missing, truncated, no image, not 8-bit with three channels, or not of
+    `size_hw`.
     """
     image = _decode(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
@@ -493,7 +502,7 @@ def read_image(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray
 
 
 def read_uint16(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
-    """A 16-bit image of one channel as (H, W) uint16. FormatError as `read_image`."""
+    """A 16-bit image of one channel as (H, W) uint16. Raises FormatError as `read_image`."""
     image = _decode(path)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = image.shape[2] if image.ndim == 3 else 1
@@ -503,9 +512,7 @@ def read_uint16(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ. FormatError where it is none, holds pickled objects, or arrays of another size than
-    they say.
-    """
+    """The arrays of an NPZ. Raises FormatError if it is none, has pickled objects, or arrays of a wrong size."""
     data = read_bytes(path)
     if data.startswith(np.lib.format.MAGIC_PREFIX):
         raise FormatError(str(path), "an NPZ archive of arrays", "a single array")
@@ -520,25 +527,25 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
             }
     except FormatError:
         raise
-    # zipfile says by RuntimeError and its kin that it lacks a password, or the way in which a member is packed
+    # zipfile raises RuntimeError and its subclasses for a missing password or an unknown compression
     except (
         *(zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, OSError, RuntimeError),
-        *(tokenize.TokenError, SyntaxError, TypeError, OverflowError),  # of a header, which is Python's text
+        *(tokenize.TokenError, SyntaxError, TypeError, OverflowError),  # from a header, which is Python text
     ) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise FormatError(str(path), "an NPZ archive of arrays", reason) from error
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytearray:
-    """The bytes of a member, of which no more are unpacked than the archive's list says that there are."""
+    """The bytes of a member, at most as many as the archive lists."""
     with archive.open(member) as stream:
         data = bytearray(stream.read(member.file_size))
-        stream.read(1)  # to the end, where the checksum is looked at
+        stream.read(1)  # to the end, so that the checksum is verified
     return data
 
 
 def _parse_npy(data: bytearray) -> np.ndarray:
-    """An array of its NPY file, in the same memory. ValueError where it is none, or of another size."""
+    """The array of an NPY file, in the same memory. Raises ValueError if it is none, or of another size."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -547,8 +554,9 @@ def _parse_npy(data: bytearray) -> np.ndarray:
     shape, columns_first, dtype = read_header[version](stream)
     if dtype.hasobject:
         raise ValueError("objects, which are pickles (allow_pickle is off)")
-    there = len(data) - stream.tell()
-    if dtype.itemsize * math.prod(shape) != there or min(shape, default=0) < 0:
-        raise ValueError(f"an array of shape {shape} and {dtype} in {there} bytes")
-    flat = np.frombuffer(data, dtype, math.prod(shape), stream.tell())
+    offset = stream.seek(0, io.SEEK_CUR)
+    size = len(data) - offset
+    if dtype.itemsize * math.prod(shape) != size or min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape} and {dtype} in {size} bytes")
+    flat = np.frombuffer(data, dtype, math.prod(shape), offset)
     return flat.reshape(shape, order="F" if columns_first else "C")

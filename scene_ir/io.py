@@ -1,13 +1,13 @@
-"""A scene as a folder on disk: `scene.json`, images, arrays, meshes. No pickle; load(save(x)) == x, to the bit.
+"""Save and load a scene as a folder: `scene.json`, images, arrays, meshes. Without pickle, and exact to the bit.
 
-    scene.json        schema version, camera, objects, sources, what stands in front, environment, provenance
-    photograph.png    8-bit RGB, where the tensor holds exactly k / 255; else in arrays.npz
+    scene.json        schema version, camera, objects, sources, occluders, environment, provenance
+    photograph.png    8-bit RGB if the tensor holds exactly k / 255; else in arrays.npz
     background.png    likewise
-    arrays.npz        depth, maps, and the crops of what the photograph saw of each object, and in front of them
+    arrays.npz        depth, maps, and the crops of sources and occluders
     meshes/0.glb      see `scene_ir.meshes.load`: opens in any viewer, keeps every bit of float32
-    before/           `SceneIR.before`, where there is one, in the same form
+    before/           `SceneIR.before`, if there is one, in the same form
 
-A folder that was written by another version of the schema is refused, not guessed at.
+A folder of another schema version is rejected.
 """
 
 from __future__ import annotations
@@ -45,9 +45,7 @@ from scene_ir.types import (
 
 SCHEMA = "drivesem.scene"
 VERSION = 4
-"""Raise it with every change that an older reader would misread."""
-_READ = (2, 3, VERSION)
-"""Versions that are read; before the third, no sun was moved, before the fourth, no vehicle was exchanged."""
+"""Increment it with every change that an older reader would misread."""
 
 _T = TypeVar("_T")
 _DTYPES = {str(d).removeprefix("torch."): d for d in (torch.float32, torch.float64, torch.int64, torch.int32)}
@@ -92,7 +90,7 @@ _INTEGERS = ("mesh_index", "category", "occlusion")
 
 
 def save_scene(scene: SceneIR, folder: Path) -> None:
-    """Write `scene` as `folder`, whole or not at all, in place of what was there. Gradients are not kept."""
+    """Write `scene` as `folder`, atomically, in place of an older one. Gradients are lost."""
     with files.atomic_folder(Path(folder)) as temporary:
         arrays = {"depth": _array(scene.depth)}
         arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
@@ -118,7 +116,7 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
             "meshes": len(scene.meshes),
             "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
             "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
-            "front": [_front_record(i, front, arrays) for i, front in enumerate(scene.occluders)],
+            "front": [_occluder_record(i, occluder, arrays) for i, occluder in enumerate(scene.occluders)],
             "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
             "ignore": _numbers(scene.ignore),
             "others": None if scene.other_labels is None else _labels_record(scene.other_labels),
@@ -137,13 +135,13 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
 def load_scene(folder: Path) -> SceneIR:
     """The scene that was saved as `folder`, on the CPU.
 
-    Raises FormatError naming file and key: a missing file or key, another version, a wrong shape or type.
+    Raises FormatError naming file and key: missing, of another version, shape or type.
     """
     return _load(Path(folder), with_before=True)
 
 
 def _load(folder: Path, with_before: bool) -> SceneIR:
-    """with_before: whether it may be what became of another scene."""
+    """Load a scene; unless `with_before`, it must have no scene before it."""
     if not folder.is_dir():
         raise FormatError(str(folder), "a folder with a scene", "no such folder")
     root = _record(folder)
@@ -152,7 +150,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
     arrays = _NpzArrays(folder / "arrays.npz")
     images = {name: _load_image(folder, root["images"][name], arrays, size, name) for name in _IMAGES}
     sources = tuple(_load_source(i, node, arrays) for i, node in enumerate(root["sources"].items()))
-    front = tuple(_load_front(i, node, arrays) for i, node in enumerate(root["front"].items()))
+    occluders = tuple(_load_occluder(i, node, arrays) for i, node in enumerate(root["front"].items()))
     objects_node, environment_node = root["objects"], root["environment"]
     count = objects_node["translation"].rows()
     objects = objects_node.build(
@@ -164,22 +162,19 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             source=sources,
         )
     )
-    known = {
-        name: width for name, width in _ENVIRONMENT_FIELDS.items() if name != "light" or root["version"].value > 2
-    }
     environment = environment_node.build(
         lambda: Environment(
-            **{name: environment_node[name].tensor(width) for name, width in known.items()},
+            **{name: environment_node[name].tensor(width) for name, width in _ENVIRONMENT_FIELDS.items()},
             **{name: arrays.tensor(name, *size) for name in _MAPS},
         )
     )
     meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))
     ignore = root["ignore"]
     provenance = {key: root["provenance"][key].text() for key in root["provenance"].mapping()}
-    changed = root["version"].value > 3 and root["before"].flag()
-    if changed and not with_before:
+    exchanged = root["before"].flag()
+    if exchanged and not with_before:
         raise FormatError(f"{root['before'].where}", "false, in the scene before another", "true")
-    before = _load(files.resolve_inside(folder, "before"), with_before=False) if changed else None
+    before = _load(files.resolve_inside(folder, "before"), with_before=False) if exchanged else None
     return root.build(
         lambda: SceneIR(
             camera=camera,
@@ -191,15 +186,15 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             depth=arrays.tensor("depth", *size),
             ignore=ignore.tensor(ignore.rows(), 4),
             provenance=provenance,
-            occluders=front,
+            occluders=occluders,
             before=before,
-            other_labels=_others(root),
+            other_labels=_other_labels(root),
         )
     )
 
 
 def load_camera(folder: Path) -> Camera:
-    """The camera of the scene in `folder`, from its record alone. FormatError naming file and key."""
+    """The camera of the scene in `folder`, from its record alone. Raises FormatError."""
     return _camera(_record(Path(folder))["camera"])
 
 
@@ -215,18 +210,18 @@ def _camera(node: _JsonNode) -> Camera:
 
 
 def count_objects(folder: Path) -> int:
-    """How many objects the scene in `folder` has, from its record alone. FormatError naming file and key."""
+    """The number of objects of the scene in `folder`, from its record alone. Raises FormatError."""
     root = _record(Path(folder))
     return root["objects"]["translation"].rows()
 
 
 def load_other_labels(folder: Path) -> Labels | None:
-    """`SceneIR.others` of the scene in `folder`, from its record alone. FormatError naming file and key."""
-    return _others(_record(Path(folder)))
+    """`SceneIR.other_labels` of the scene in `folder`, from its record alone. Raises FormatError."""
+    return _other_labels(_record(Path(folder)))
 
 
-def _others(root: _JsonNode) -> Labels | None:
-    if "others" not in root.mapping() or root["others"].value is None:  # earlier scenes have no such key
+def _other_labels(root: _JsonNode) -> Labels | None:
+    if root["others"].value is None:
         return None
     node = root["others"]
     kinds = tuple(kind.text() for kind in node["kind"].items())
@@ -244,12 +239,13 @@ def _labels_record(labels: Labels) -> dict[str, Any]:
 
 
 def _record(folder: Path) -> _JsonNode:
-    """The record of a scene in this version of the schema."""
+    """The record of a scene."""
     path = folder / "scene.json"
     root = _JsonNode(str(path), files.read_json(path))
     root.expect("schema", SCHEMA)
-    if root["version"].value not in _READ:
-        raise FormatError(f"{root.where}: version", f"one of {', '.join(map(str, _READ))}", root["version"].value)
+    if root["version"].value != VERSION:
+        found = f"version {root['version'].value!r}, of another drivesem"
+        raise FormatError(f"{root.where}: version", f"version {VERSION}", found)
     return root
 
 
@@ -260,7 +256,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _check_mesh(index: int, mesh: Mesh) -> None:
-    """Refuse what a GLB does not hold exactly."""
+    """Reject what a GLB does not hold exactly."""
     for name, dtype in _MESH_DTYPES.items():
         tensor = getattr(mesh, name)
         if tensor is not None and tensor.dtype != dtype:
@@ -268,7 +264,7 @@ def _check_mesh(index: int, mesh: Mesh) -> None:
 
 
 def _as_bytes(image: Tensor) -> np.ndarray | None:
-    """The image (3, H, W) as (H, W, 3) uint8 where that is the very same; else None."""
+    """The image (3, H, W) as (H, W, 3) uint8 if that is exact, else None."""
     if image.dtype != torch.float32:
         return None
     rounded = (image * 255).round().nan_to_num(0).clamp(0, 255).to(torch.uint8)
@@ -278,7 +274,7 @@ def _as_bytes(image: Tensor) -> np.ndarray | None:
 
 
 def _numbers(tensor: Tensor) -> Any:
-    """A tensor as JSON: nested lists, which hold float32 and int64 exactly; another dtype is named beside them."""
+    """A tensor as JSON: nested lists, which hold float32 and int64 exactly, or an object with another dtype."""
     values = _finite(_array(tensor).tolist())
     if tensor.dtype in (torch.float32, torch.int64):
         return values
@@ -286,7 +282,7 @@ def _numbers(tensor: Tensor) -> Any:
 
 
 def _finite(value: Any) -> Any:
-    """What JSON cannot say as a number (nan, inf, -inf) as a string."""
+    """Values with those that JSON cannot hold as numbers (nan, inf, -inf) as text."""
     if isinstance(value, list):
         return [_finite(v) for v in value]
     return value if math.isfinite(value) else str(value)
@@ -301,7 +297,7 @@ def _provenance(provenance: Mapping[str, str]) -> dict[str, str]:
 
 
 def _source_record(index: int, source: Source, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The JSON part of one source; its crops go into `arrays`."""
+    """The JSON part of one source; its crops are added to `arrays`."""
     arrays[f"source.{index}.foreground"] = _array(source.foreground.values)
     record: dict[str, Any] = {name: _numbers(getattr(source, name)) for name in _SOURCE_FIELDS}
     record["inflation"] = source.inflation
@@ -315,15 +311,15 @@ def _source_record(index: int, source: Source, arrays: dict[str, np.ndarray]) ->
     return record
 
 
-def _front_record(index: int, front: Occluder, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The JSON part of one thing in front; its crop goes into `arrays`."""
-    arrays[f"front.{index}.foreground"] = _array(front.foreground.values)
-    return {"depth_m": front.depth_m, "x0": front.foreground.x0, "y0": front.foreground.y0}
+def _occluder_record(index: int, occluder: Occluder, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The JSON part of one occluder; its crop is added to `arrays`."""
+    arrays[f"front.{index}.foreground"] = _array(occluder.foreground.values)
+    return {"depth_m": occluder.depth_m, "x0": occluder.foreground.x0, "y0": occluder.foreground.y0}
 
 
 @dataclass(frozen=True, slots=True)
 class _JsonNode:
-    """A value inside a JSON file that knows where it stands."""
+    """A value in a JSON file, with its location for messages."""
 
     where: str
     value: Any
@@ -371,7 +367,7 @@ class _JsonNode:
         return self["values"].value, _DTYPES[name]
 
     def rows(self) -> int:
-        """How many entries a tensor has along its first axis."""
+        """Size of a tensor's first axis."""
         return len(_JsonNode(self.where, self._values()[0]).items())
 
     def tensor(self, *shape: int, integer: bool = False) -> Tensor:
@@ -380,7 +376,7 @@ class _JsonNode:
         dtype = dtype or (torch.int64 if integer else torch.float32)
         flat: list[float] = []
         found = _flatten(nested, flat, self.where)
-        # an empty list says nothing of the axes behind it
+        # an empty list has no information about further axes
         if found != shape and not (math.prod(shape) == 0 and found == (0,) and shape[0] == 0):
             raise FormatError(self.where, f"shape {shape}", found)
         if not dtype.is_floating_point and not all(isinstance(v, int) for v in flat):
@@ -392,7 +388,7 @@ class _JsonNode:
         return torch.tensor(flat, dtype=dtype).reshape(shape)
 
     def build(self, make: Callable[[], _T]) -> _T:
-        """What `make` gives; what the types refuse is said of this place in the file."""
+        """The result of `make`; errors of the types are raised as FormatErrors at this location."""
         try:
             return make()
         except FormatError:
@@ -402,7 +398,7 @@ class _JsonNode:
 
 
 def _flatten(value: Any, flat: list[float], where: str) -> tuple[int, ...]:
-    """Append the leaves of nested lists to `flat`; their shape. FormatError for ragged lists and no numbers."""
+    """Append the leaves of nested lists to `flat` and return their shape. Raises FormatError for ragged lists."""
     if isinstance(value, list):
         shapes = {_flatten(v, flat, where) for v in value}
         if len(shapes) > 1:
@@ -427,7 +423,7 @@ class _NpzArrays:
         return name in self._arrays
 
     def tensor(self, name: str, *shape: int | None, integer: bool = False) -> Tensor:
-        """The array `name` as a tensor of `shape` (None: any size). FormatError naming file and key."""
+        """The array `name` as a tensor of `shape` (None: any size). Raises FormatError naming file and key."""
         where = f"{self.path}: {name}"
         if name not in self:
             raise FormatError(where, "an array", f"no such key (has {', '.join(self._arrays)})")
@@ -467,7 +463,7 @@ def _load_source(index: int, node: _JsonNode, arrays: _NpzArrays) -> Source:
     )
 
 
-def _load_front(index: int, node: _JsonNode, arrays: _NpzArrays) -> Occluder:
+def _load_occluder(index: int, node: _JsonNode, arrays: _NpzArrays) -> Occluder:
     values = arrays.tensor(f"front.{index}.foreground", 4, None, None)
     return node.build(
         lambda: Occluder(Crop(values, node["x0"].integer(), node["y0"].integer()), node["depth_m"].number())
@@ -484,10 +480,10 @@ def to_uint8(image: Tensor) -> np.ndarray:
 
 
 def round_to_8bit(image: Tensor) -> Tensor:
-    """A picture with values in [0, 1] on the 8-bit grid, as it is once it is written and read."""
+    """A picture rounded to the 8-bit grid, in [0, 1], as if written and read again."""
     return (image.clamp(0, 1) * 255).round() / 255
 
 
 def to_tensor(picture: np.ndarray) -> Tensor:
-    """A picture (H, W, 3) uint8 as (3, H, W) float32 in [0, 1]; `to_uint8` gives it back."""
+    """A picture (H, W, 3) uint8 as (3, H, W) float32 in [0, 1]; the inverse of `to_uint8`."""
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).to(torch.float32) / 255

@@ -1,4 +1,4 @@
-"""Taking vehicles out of a scene: background shows where they stood, and what they hid of others is completed."""
+"""Remove vehicles from a scene: show the background behind them, and complete what they hid of other vehicles."""
 
 from __future__ import annotations
 
@@ -19,51 +19,73 @@ _ROW = re.compile(r"objects\[(\d+)\](.*)", re.DOTALL)
 
 
 def remove_objects(scene: SceneIR, rows: Collection[int], settings: RenderSettings | None = None) -> SceneIR:
-    """The scene without the vehicles in `rows` and without their shadows; the others move up, in order.
+    """Remove vehicles and their shadows from a scene; the others move up, in order.
 
-    What a removed vehicle hid of a farther one was known to be unseen because the nearer one's matte said so. That
-    matte goes, so the farther one's foreground takes up what is drawn there today: the mirrored side or the
-    template. Sources that nothing removed stood before keep every bit, as do photograph, background and maps.
-    Of a scene after an exchange (`scene_ir.exchange`), what was before it is left behind. Raises RangeError for a
-    row that the scene does not have.
+    The parts of a farther vehicle that a removed one hid are filled from its mirrored side or its template.
+    Sources that nothing removed was in front of stay equal to the bit, as do photograph, background and maps.
+    `SceneIR.before` is dropped.
+
+    Args:
+        scene: The scene.
+        rows: Objects to remove.
+        settings: Of the renderer.
+
+    Returns:
+        The scene without them.
+
+    Raises:
+        RangeError: A row does not exist.
     """
     count = len(scene.objects)
     for row in rows:
         if not 0 <= row < count:
             raise RangeError("objects", f"a row from 0 to {count - 1}" if count else "no row of none", row)
-    kept = [row for row in range(count) if row not in rows]
-    if len(kept) == count:
+    remaining = [row for row in range(count) if row not in rows]
+    if len(remaining) == count:
         return scene
     sources = scene.objects.source
     if sources:
         sources = complete_uncovered_sources(scene, rows, settings)
-    objects = _select_objects(scene.objects, kept, tuple(sources[row] for row in kept) if sources else ())
-    return replace(scene, objects=objects, provenance=_renumber_provenance(scene.provenance, kept), before=None)
+    objects = _select_objects(
+        scene.objects, remaining, tuple(sources[row] for row in remaining) if sources else ()
+    )
+    return replace(
+        scene, objects=objects, provenance=_renumber_provenance(scene.provenance, remaining), before=None
+    )
 
 
-def _select_objects(objects: Objects, kept: Sequence[int], source: tuple[Source, ...]) -> Objects:
+def _select_objects(objects: Objects, remaining: Sequence[int], source: tuple[Source, ...]) -> Objects:
     tensors = [f.name for f in fields(Objects) if f.name != "source"]
-    return replace(objects, source=source, **{name: getattr(objects, name)[list(kept)] for name in tensors})
+    return replace(objects, source=source, **{name: getattr(objects, name)[list(remaining)] for name in tensors})
 
 
-def _renumber_provenance(provenance: Mapping[str, str], kept: Sequence[int]) -> dict[str, str]:
-    """What is told of `objects[i]` goes along with its object."""
-    place = {row: i for i, row in enumerate(kept)}
-    found = {}
+def _renumber_provenance(provenance: Mapping[str, str], remaining: Sequence[int]) -> dict[str, str]:
+    """The provenance with the keys `objects[i]` of the remaining objects renumbered."""
+    place = {row: i for i, row in enumerate(remaining)}
+    renumbered = {}
     for key, value in provenance.items():
         match = _ROW.fullmatch(key)
         if match is None:
-            found[key] = value
+            renumbered[key] = value
         elif int(match[1]) in place:
-            found[f"objects[{place[int(match[1])]}]{match[2]}"] = value
-    return found
+            renumbered[f"objects[{place[int(match[1])]}]{match[2]}"] = value
+    return renumbered
 
 
 @torch.no_grad()
 def complete_uncovered_sources(
     scene: SceneIR, removed: Collection[int], settings: RenderSettings | None = None
 ) -> tuple[Source, ...]:
-    """The sources of all objects, those behind a removed one completed where it stood."""
+    """Complete the sources of objects behind removed ones.
+
+    Args:
+        scene: The scene.
+        removed: Rows of the removed objects.
+        settings: Of the renderer.
+
+    Returns:
+        The sources of all objects.
+    """
     photographed = scene.unperturbed()
     objects, sources = photographed.objects, scene.objects.source
     order = blend.paint_order(
@@ -87,7 +109,7 @@ def complete_uncovered_sources(
 
 
 def _opaque_mask(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tensor:
-    """(H, W) bool: where any of the foregrounds, Crops (4, h, w), is not wholly transparent."""
+    """(H, W) bool: where any of the foregrounds, Crops (4, h, w), is not fully transparent."""
     mask = torch.zeros(frame_hw, dtype=torch.bool)
     for crop in foregrounds:
         _window(mask[None], crop).logical_or_(crop.values[3:].cpu() > 0)
@@ -95,7 +117,7 @@ def _opaque_mask(foregrounds: Sequence[Crop], frame_hw: tuple[int, int]) -> Tens
 
 
 def _complete_source(source: Source, layers: ObjectLayers, row: int, hidden: Tensor) -> Source:
-    """The source with its foreground as `layers` draw it where `hidden` (H, W), as it was elsewhere."""
+    """The source with its foreground as rendered in `layers` where `hidden` (H, W), unchanged elsewhere."""
     old = source.foreground
     packed, size = layers.layout.spans()[row]
     x0, y0 = layers.layout.rects[row, :2].tolist()
@@ -106,12 +128,12 @@ def _complete_source(source: Source, layers: ObjectLayers, row: int, hidden: Ten
     _window(canvas, old)[:] = old.values
     _window(used[None], old)[:] = True
     new = Crop(drawn, x0, y0)
-    here = _window(canvas, new)
-    taken = _window(hidden[None], new)
-    if not bool((taken & ((drawn[3:] > 0) | (here[3:] > 0))).any()):
+    target = _window(canvas, new)
+    completed = _window(hidden[None], new)
+    if not bool((completed & ((drawn[3:] > 0) | (target[3:] > 0))).any()):
         return source
-    here.copy_(torch.where(taken, drawn, here))
-    _window(used[None], new).logical_or_(taken & (drawn[3:] > 0))
+    target.copy_(torch.where(completed, drawn, target))
+    _window(used[None], new).logical_or_(completed & (drawn[3:] > 0))
     rows, columns = used.any(dim=1).nonzero()[:, 0], used.any(dim=0).nonzero()[:, 0]
     left, top = int(columns[0]), int(rows[0])
     values = canvas[:, top : int(rows[-1]) + 1, left : int(columns[-1]) + 1].contiguous()
@@ -119,6 +141,6 @@ def _complete_source(source: Source, layers: ObjectLayers, row: int, hidden: Ten
 
 
 def _window(frame: Tensor, crop: Crop) -> Tensor:
-    """The view of a frame (C, H, W) that a crop lies on."""
+    """View of the part of a frame (C, H, W) that a crop covers."""
     h, w = crop.values.shape[1:]
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scene_ir.derender.silhouette import LabelBoxes, Placement
-from scene_ir.meshes.lod import detail
+from scene_ir.meshes.lod import level_of_detail
 from scene_ir.types import Camera, Mesh
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ class _MeshShape:
 
     @classmethod
     def from_mesh(cls, mesh: Mesh) -> _MeshShape:
-        vertices, light = mesh.vertices.double().numpy(), detail(mesh, _DETAIL_PX)
+        vertices, light = mesh.vertices.double().numpy(), level_of_detail(mesh, _DETAIL_PX)
         faces = light.faces.numpy()
         edges = np.concatenate([faces[:, :2], faces[:, 1:]])
         return cls(light.vertices.double().numpy(), edges, vertices[ConvexHull(vertices).vertices])

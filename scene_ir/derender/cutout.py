@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from scene_ir.derender.pose import PoseBlock, crop_boxes
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
-from scene_ir.meshes.lod import detail
+from scene_ir.meshes.lod import level_of_detail
 from scene_ir.raster import verbs
 from scene_ir.types import Camera
 from scene_ir.weights import load_frozen
@@ -247,7 +247,7 @@ def render_guides(
 
 def _with_coarse_mesh(placement: Placement) -> Placement:
     """The placement with the mesh's level of detail for crops."""
-    return replace(placement, mesh=detail(placement.mesh, _DETAIL_PX))
+    return replace(placement, mesh=level_of_detail(placement.mesh, _DETAIL_PX))
 
 
 def _footprint_nearness(placement: Placement, ground: Tensor, camera: Camera) -> Array:

@@ -18,7 +18,7 @@ from torch import Tensor
 from scene_ir import ffd as lattice
 from scene_ir.derender import edge_matching
 from scene_ir.geometry import place_vertices, to_clip
-from scene_ir.meshes.lod import detail
+from scene_ir.meshes.lod import level_of_detail
 from scene_ir.meshes.templates import template
 from scene_ir.raster import verbs
 from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh
@@ -432,7 +432,7 @@ def fit_silhouettes(
 
 def _with_coarse_meshes(placements: Sequence[Placement]) -> list[Placement]:
     """The placements with the meshes' level of detail for windows."""
-    return [replace(p, mesh=detail(p.mesh, _DETAIL_PX)) for p in placements]
+    return [replace(p, mesh=level_of_detail(p.mesh, _DETAIL_PX)) for p in placements]
 
 
 def measure_edge_distances(

@@ -1,4 +1,4 @@
-"""The main bodies of vehicles: skins with wheel arches, bowed ends and named grid lines; the wheels beneath."""
+"""Main bodies of vehicles: skins with wheel arches, bowed ends and named grid lines, and their wheels."""
 
 from __future__ import annotations
 
@@ -7,51 +7,65 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene_ir.meshes.solids import Material, Solid, coons, mirrored, revolve
+from scene_ir.meshes.solids import TemplateSolid, VehicleMaterial, coons, mirror_solid, revolve
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """What the body's skin is made of. Levels run from the lower edge (0) to the shoulder (1)."""
+    """Shape of a body's skin. Levels run from the lower edge (0) to the shoulder (1)."""
 
     length: float
+    """m."""
     half_width: float
+    """m."""
     clearance: float
+    """Height of the lower edge above the ground, m."""
     front_levels: np.ndarray
-    """(K + 1,) heights at the front as fractions of the height between lower edge and top."""
+    """(K + 1,) heights at the front, fractions of the height between lower edge and top."""
     rear_levels: np.ndarray
+    """The same at the rear."""
     front_recess: np.ndarray
-    """(K + 1,) m, how far behind the foremost point each level is."""
+    """(K + 1,) m, distance of each level behind the foremost point."""
     rear_recess: np.ndarray
+    """The same at the rear."""
     side_inset: np.ndarray
-    """(K + 1,) m, how far inside the half width each level is along the side."""
+    """(K + 1,) m, distance of each level inside the half width along the side."""
     top: Callable[[np.ndarray], np.ndarray]
-    """Height of the shoulder line over x (m from the middle, front is positive)."""
+    """Height of the shoulder line over x (m from the middle, front positive)."""
     crown: float
+    """Rise of the lid in the middle over its sides, m."""
     nose_bow: float
+    """Bow of the front in plan, m."""
     tail_bow: float
+    """Bow of the rear in plan, m."""
     corner: float
     """Half width of front and rear at their corners, as a fraction of `half_width`."""
     front_columns: np.ndarray
     """(m + 1,) fractions of the corner's half width."""
     rear_columns: np.ndarray
+    """The same at the rear."""
     axles: tuple[float, ...]
+    """x of the axles, m."""
     arch_radius: float
+    """Radius of the wheel arches, m."""
     hub: float
+    """Height of the axles, m."""
     stations: np.ndarray
     """x of further stations along the side, m."""
     tyre_width: float
+    """m."""
     ease: float = 0.9
     """Length over which the plan narrows towards both ends, m."""
     side_levels: np.ndarray | None = None
-    """(K + 1,) fractions along the side; else they go over from the front's to the rear's."""
+    """(K + 1,) fractions along the side; interpolated from front to rear by default."""
     arch_steps: int = 8
+    """Segments of an arch."""
     arch_reach: float = 1.0
     """Levels at this fraction and above do not bend over the arches."""
 
 
 def _side_stations(body: Body) -> np.ndarray:
-    """x (n + 1,) of the stations along the side, front to rear, corners left out at both ends."""
+    """x (n + 1,) of the stations along the side, front to rear, without the corners."""
     stations = [body.stations]
     for axle in body.axles:
         arc = axle + body.arch_radius * np.cos(np.linspace(0.0, np.pi, body.arch_steps + 1))
@@ -62,7 +76,7 @@ def _side_stations(body: Body) -> np.ndarray:
 
 
 def _lower_edge(body: Body, x: np.ndarray) -> np.ndarray:
-    """Height of the side's lower edge over x: the clearance, and the arches above the wheels."""
+    """Height of the side's lower edge over x: the clearance, and the arches."""
     edge = np.full_like(x, body.clearance)
     for axle in body.axles:
         d = x - axle
@@ -73,7 +87,7 @@ def _lower_edge(body: Body, x: np.ndarray) -> np.ndarray:
 
 
 def body_grid(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Wall, lid and floor of the body's skin, and the side stations' x."""
+    """Wall, lid and floor of the body's skin, and the x of the side stations."""
     inner = _side_stations(body)
     levels, m, n = len(body.front_levels), len(body.front_columns) - 1, len(inner) + 1
     half_length = body.length / 2
@@ -120,8 +134,19 @@ def body_grid(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
     return wall, lid, floor, inner
 
 
-def wheels(x: float, z_outer: float, radius: float, tyre_width: float, spokes: int = 5) -> list[Solid]:
-    """A wheel and its twin on the other side; it stands on y = 0, its outer face at `z_outer` m."""
+def wheels(x: float, z_outer: float, radius: float, tyre_width: float, spokes: int = 5) -> list[TemplateSolid]:
+    """Make a wheel and its mirror image, standing on y = 0.
+
+    Args:
+        x: Position of the axle, m.
+        z_outer: Position of the outer face, m.
+        radius: m.
+        tyre_width: m.
+        spokes: Number of spokes.
+
+    Returns:
+        Both wheels.
+    """
     r, w = radius, tyre_width
     profile = np.array(
         [
@@ -137,10 +162,10 @@ def wheels(x: float, z_outer: float, radius: float, tyre_width: float, spokes: i
         ]
     )
     sectors = 20 if spokes != 6 else 24
-    strip = np.full((8, sectors), int(Material.TYRE))
-    strip[0] = int(Material.UNDERBODY)
-    strip[5], strip[7] = int(Material.RIM), int(Material.RIM)
+    strip = np.full((8, sectors), int(VehicleMaterial.TYRE))
+    strip[0] = int(VehicleMaterial.UNDERBODY)
+    strip[5], strip[7] = int(VehicleMaterial.RIM), int(VehicleMaterial.RIM)
     gap = np.arange(sectors) % (sectors // spokes) >= (sectors // spokes + 1) // 2
-    strip[6] = np.where(gap, int(Material.RIM_GAP), int(Material.RIM))
+    strip[6] = np.where(gap, int(VehicleMaterial.RIM_GAP), int(VehicleMaterial.RIM))
     wheel = revolve(profile, strip, (x, r, z_outer))
-    return [wheel, mirrored(wheel)]
+    return [wheel, mirror_solid(wheel)]

@@ -1,4 +1,4 @@
-"""Meshes from files: import of OBJ, GLB, PLY (whatever trimesh reads), and our own GLB, which keeps every bit."""
+"""Read meshes from OBJ, GLB, GLTF and PLY files, and write GLB files that keep every bit."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from scene_ir.types import Mesh, Part
 _Number = TypeVar("_Number", np.float32, np.float64)
 _VERSION = 1
 _KEY = "drivesem_mesh"
-"""Key of the GLB mesh's `extras` that marks files of `save_mesh`."""
+"""Key in the GLB mesh's `extras` that marks files of `save_mesh`."""
 _SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif")
-_MOST_BYTES = 1 << 27
-"""Of a file: text takes ten times as much room in memory."""
-_MOST_FACES = 2_000_000
-"""Of all that a file places: vehicles made by hand have some thousand, scans some hundred thousand."""
-_MOST_CLAIMED = 20_000_000
-"""Of all that a header says there is: a face may have vertices, normals and more of its own."""
-_MOST_COORDINATE = 1e9
-"""In a file's own units: a car in micrometres has less."""
-_MOST_NODES = 10_000
-_MOST_TEXELS = 1 << 26
+_MAX_BYTES = 1 << 27
+"""Size limit of a file: text takes ten times as much memory."""
+_MAX_FACES = 2_000_000
+"""Limit of faces placed by a file: hand-made vehicles have thousands, scans hundreds of thousands."""
+_MAX_DECLARED = 20_000_000
+"""Limit of the elements that a header declares: a face may have its own vertices, normals and more."""
+_MAX_COORDINATE = 1e9
+"""Limit of coordinates in a file's own units: a car in micrometres is smaller."""
+_MAX_NODES = 10_000
+_MAX_TEXELS = 1 << 26
 _PLY_HEAD = 1 << 16
-_DIGITS = 18
-"""Python makes no number of thousands."""
+_MAX_DIGITS = 18
+"""Length limit of a number in a header."""
 _AXES = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
@@ -49,13 +49,13 @@ _AXES = {
     "-z": (0.0, 0.0, -1.0),
 }
 _UP = {"y": "+y", "z": "+z", "-y": "-y"}
-_PAINTED = "_COLOR0"
-"""glTF's vertex colours, by a name as long as theirs under which trimesh leaves them as they are."""
+_VERTEX_COLOURS = "_COLOR0"
+"""Name of glTF's vertex colours under which trimesh leaves them unchanged."""
 _GLB_HEAD = 20
-"""Bytes before the JSON of a GLB."""
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Node transform of our GLBs: glTF's y points up, ours down, so that viewers show the mesh upright."""
-_NAMES = (
+"""Bytes before a GLB's JSON."""
+_GLTF_TRANSFORM = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Node transform of our GLBs: glTF's y points up, ours down."""
+_PART_PATTERNS = (
     (
         Part.LIGHT,
         r"(head|tail|brake|fog|turn|stop)[ _-]?light|lights?\b|lights?[_-](front|rear|back|left|right|[lr]\b|\d)"
@@ -74,30 +74,45 @@ _NAMES = (
         r"|(first|second|main|car)[ _-]?colou?r",
     ),
 )
-"""What material and mesh names say of a part; the first that is found counts."""
+"""Parts by patterns of material and mesh names; the first match counts."""
 _DEFAULT_COLOUR = 0.8
-_CAB = 0.2
-"""Windows whose centre is farther than this from the middle, in lengths, are those of a cab."""
+_CAB_OFFSET = 0.2
+"""Distance of the windows' centre from the middle, in lengths, beyond which they are a cab's."""
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
-    """A mesh in the unit box, and the proportions it had: size_lhw, length, height, width in m."""
+class ImportedMesh:
+    """A mesh in the unit box with its original size."""
 
     mesh: Mesh
+    """The mesh."""
     size_lhw: tuple[float, float, float]
+    """Length, height, width, m."""
 
 
-def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_per_unit: float = 1.0) -> Imported:
-    """Read a mesh file and turn it into the unit box: front along +x, y down, sides at z = -0.5 and 0.5.
+def import_mesh(
+    path: str | Path, *, up: str = "y", front: str = "auto", metres_per_unit: float = 1.0
+) -> ImportedMesh:
+    """Read a mesh file and transform it to the unit box: front along +x, y down, sides at z = -0.5 and 0.5.
 
-    up: the file's axis that points up, "y", "z" or "-y". front: the file's axis that the vehicle looks along,
-    "+x" ... "-z", or "auto": the longest horizontal axis, towards parts named front, else to the end where all
-    windows are (of lorries), else away from the roof's centre (bonnets are longer than boots). The scene graph is
-    flattened; materials and textures become vertex colours (a texture is read at the vertices: palettes come out
-    exactly, photographs coarsely); parts are guessed from material and mesh names. Files of `save_mesh` come back
-    as they were saved, whatever the options.
-    Raises FormatError naming the file where it cannot be read or has no faces, RangeError for an unknown axis.
+    The scene graph is flattened. Materials and textures become vertex colours: a texture is sampled at the vertices,
+    which is exact for palettes and coarse for photographs. Parts are guessed from material and mesh names. Files of
+    `save_mesh` are returned as saved, regardless of the options.
+
+    Args:
+        path: An OBJ, GLB, GLTF or PLY file.
+        up: The file's axis that points up: "y", "z" or "-y".
+        front: The file's axis that the vehicle faces, "+x" ... "-z", or "auto": the longest horizontal axis, towards
+            parts named front, else towards the end with all windows (lorries), else away from the roof's centre
+            (bonnets are longer than boots).
+        metres_per_unit: Scale of the file.
+
+    Returns:
+        The mesh and its size.
+
+    Raises:
+        FormatError: The file cannot be read or has no faces.
+        RangeError: An unknown axis.
     """
     file = Path(path)
     if up not in _UP:
@@ -107,12 +122,12 @@ def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_
     if not metres_per_unit > 0:
         raise RangeError("metres_per_unit", "a positive number", metres_per_unit)
     scene = read_scene(file)
-    own = _own(scene, file)
+    own = _saved_mesh(scene, file)
     if own is not None:
         extent = own.vertices.amax(dim=0) - own.vertices.amin(dim=0)
-        return Imported(own, (float(extent[0]), float(extent[1]), float(extent[2])))
+        return ImportedMesh(own, (float(extent[0]), float(extent[1]), float(extent[2])))
     soup = _flatten(scene, file)
-    turned = soup.vertices @ _axes(soup, _AXES[_UP[up]], front).T
+    turned = soup.vertices @ _file_rotation(soup, _AXES[_UP[up]], front).T
     low, high = turned.min(axis=0), turned.max(axis=0)
     extent = high - low
     if not np.all(extent > 0):
@@ -131,18 +146,27 @@ def import_mesh(path: str | Path, *, up: str = "y", front: str = "auto", metres_
         uv=None if soup.uv is None else torch.from_numpy(soup.uv.astype(np.float32)),
     )
     length, height, width = (float(e) * metres_per_unit for e in extent)
-    return Imported(mesh, (length, height, width))
+    return ImportedMesh(mesh, (length, height, width))
 
 
 def load_mesh(path: str | Path, *, up: str = "y", front: str = "auto") -> Mesh:
-    """The mesh of `import_mesh`; of a file written by `save_mesh`, the very mesh that was saved."""
+    """The mesh of `import_mesh`.
+
+    Args:
+        path: An OBJ, GLB, GLTF or PLY file.
+        up: The file's axis that points up.
+        front: The file's axis that the vehicle faces, or "auto".
+
+    Returns:
+        The mesh; for a file of `save_mesh`, exactly the saved one.
+    """
     return import_mesh(path, up=up, front=front).mesh
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Write a GLB that `load_mesh` reads back equal to the bit (float32) and that viewers show in its colours.
+    """Write a GLB that `load_mesh` reads back exactly (float32), and that viewers show in its colours.
 
-    Raises FormatError for another suffix than .glb, or where the mesh has no faces (glTF knows no empty mesh).
+    Raises FormatError for another suffix than .glb, or a mesh without faces (glTF has no empty meshes).
     """
     file = Path(path)
     if file.suffix.lower() != ".glb":
@@ -157,111 +181,121 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     )
     if mesh.colours is not None:
         colours = mesh.colours.detach().cpu().numpy().astype(np.float32)
-        shown = np.round(linear(colours.clip(0, 1)) * 255).astype(np.uint8)
-        shape.visual = ColorVisuals(shape, vertex_colors=shown)
+        colours_8bit = np.round(srgb_to_linear(colours.clip(0, 1)) * 255).astype(np.uint8)
+        shape.visual = ColorVisuals(shape, vertex_colors=colours_8bit)
         shape.vertex_attributes["_rgb"] = colours
     if mesh.uv is not None:
         shape.vertex_attributes["_uv"] = mesh.uv.detach().cpu().numpy().astype(np.float32)
     scene = trimesh.Scene()
-    scene.add_geometry(shape, geom_name="mesh", node_name="vehicle", transform=_FLIP)
+    scene.add_geometry(shape, geom_name="mesh", node_name="vehicle", transform=_GLTF_TRANSFORM)
     content = scene.export(file_type="glb", include_normals=False)
     assert isinstance(content, bytes)
     files.write_bytes(file, content)
 
 
-def read_scene(file: Path, root: Path | None = None, most: int = _MOST_BYTES) -> trimesh.Scene:
-    """The scene in a mesh file. root: the folder below which materials and textures may lie, the file's own where
-    none is given; most: bytes of any file. Raises FormatError for a file that is missing, too large, or no mesh.
+def read_scene(file: Path, root: Path | None = None, max_bytes: int = _MAX_BYTES) -> trimesh.Scene:
+    """Read the scene in a mesh file.
+
+    Args:
+        file: An OBJ, GLB, GLTF or PLY file.
+        root: Folder that materials and textures must be in; the file's own by default.
+        max_bytes: Size limit of each file.
+
+    Returns:
+        The scene.
+
+    Raises:
+        FormatError: The file is missing, too large, or no mesh.
     """
     if file.suffix.lower() not in _SUFFIXES:
         raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
     if not file.is_file():
         raise FormatError(str(file), "a mesh file", "no such file")
-    data, kind = files.read_bytes(file, most), file.suffix.lower().removeprefix(".")
-    _check_claims(file, kind, data)
+    data, kind = files.read_bytes(file, max_bytes), file.suffix.lower().removeprefix(".")
+    _check_declared_sizes(file, kind, data)
     if kind in ("glb", "gltf"):
-        said = len(data) if kind == "gltf" else _GLB_HEAD + _glb_json(data)
-        data = data[:said].replace(b'"COLOR_0"', b'"%b"' % _PAINTED.encode()) + data[said:]
-    beside = _Beside(file.parent, root or file.parent, most)
+        end = len(data) if kind == "gltf" else _GLB_HEAD + _glb_json_length(data)
+        data = data[:end].replace(b'"COLOR_0"', b'"%b"' % _VERTEX_COLOURS.encode()) + data[end:]
+    resolver = _MeshFiles(file.parent, root or file.parent, max_bytes)
     try:
-        return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=beside, process=False)
+        return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     except FormatError:
         raise
-    except Exception as error:  # the parsers behind trimesh raise whatever goes wrong in them
+    except Exception as error:  # the parsers behind trimesh raise many types
         reason = next(iter(f"{type(error).__name__}: {error}".splitlines()))
         raise FormatError(str(file), "a readable mesh", reason) from None
 
 
-class _Beside(Resolver):
-    """Files that a mesh file names, such as materials and textures: regular ones below `root`, of `most` bytes,
-    and images that fit. A name that leads elsewhere is looked for in `folder` by its last part, as packs need it.
+class _MeshFiles(Resolver):
+    """Files that a mesh file refers to, such as materials and textures.
+
+    They must be regular files below `root` of at most `most` bytes, and images within the size limit. A name that
+    leads elsewhere is looked up in `folder` by its last part, as asset packs need it.
     """
 
     def __init__(self, folder: Path, root: Path, most: int) -> None:
         self._folder, self._root, self._most = folder, root, most
 
     def get(self, key: str) -> bytes:
-        """What is in the file. Raises FormatError, and FileNotFoundError where there is none."""
+        """The content of a file. Raises FormatError, and FileNotFoundError if there is none."""
         name = key.strip().replace("\\", "/")
         for candidate in dict.fromkeys((name, unquote(name), name.rpartition("/")[2])):  # glTF's are quoted
             path = self._folder / candidate
             if path.resolve().is_relative_to(self._root.resolve()) and path.is_file():
                 data = files.read_bytes(path, self._most)
                 if path.suffix.lower() in _IMAGES:
-                    files.check_pixels(path, data)
+                    files.read_image_size(path, data)
                 return data
         raise FileNotFoundError(key)
 
     def keys(self) -> list[str]:
-        """No names: files are asked for one by one."""
+        """No names: files are requested one by one."""
         return []
 
-    def namespaced(self, namespace: str) -> _Beside:
-        """Files below a folder beside the mesh."""
-        return _Beside(self._folder / namespace, self._root, self._most)
+    def namespaced(self, namespace: str) -> _MeshFiles:
+        """Files in a subfolder."""
+        return _MeshFiles(self._folder / namespace, self._root, self._most)
 
     def write(self, name: str, data: str | bytes) -> None:
-        """Raises FormatError: nothing is written when a mesh is read."""
+        """Raises FormatError: reading a mesh writes nothing."""
         raise FormatError(str(self._folder / name), "a mesh that is read", "one that is written")
 
 
-def _glb_json(data: bytes) -> int:
-    """Bytes of a GLB's JSON."""
+def _glb_json_length(data: bytes) -> int:
+    """Length of a GLB's JSON, bytes."""
     return int.from_bytes(data[12:16], "little")
 
 
-def _check_claims(file: Path, kind: str, data: bytes) -> None:
-    """FormatError for a file that says that it holds more than a vehicle has: what it says is believed before what
-    it holds is looked at.
-    """
-    claims: list[Any] = []
+def _check_declared_sizes(file: Path, kind: str, data: bytes) -> None:
+    """Raise FormatError for a file that declares more elements than a vehicle has, before it is parsed."""
+    counts: list[Any] = []
     if kind in ("glb", "gltf"):
         if kind == "glb":
-            data = data[_GLB_HEAD : _GLB_HEAD + _glb_json(data)]
+            data = data[_GLB_HEAD : _GLB_HEAD + _glb_json_length(data)]
         try:
-            told = files.parse_json(data.decode("utf-8"), str(file))
+            header = files.parse_json(data.decode("utf-8"), str(file))
         except (UnicodeDecodeError, FormatError) as error:
             found = error.actual if isinstance(error, FormatError) else "bytes that are no text"
             raise FormatError(str(file), "a readable mesh", found) from error
-        lists = told if isinstance(told, dict) else {}
+        lists = header if isinstance(header, dict) else {}
         accessors, nodes = (
             lists[key] if isinstance(lists.get(key), list) else [] for key in ("accessors", "nodes")
         )
-        claims = [one.get("count", 0) for one in accessors if isinstance(one, dict)]
-        if len(nodes) > _MOST_NODES:
-            raise FormatError(f"{file}: nodes", f"at most {_MOST_NODES:,}", f"{len(nodes):,}")
+        counts = [one.get("count", 0) for one in accessors if isinstance(one, dict)]
+        if len(nodes) > _MAX_NODES:
+            raise FormatError(f"{file}: nodes", f"at most {_MAX_NODES:,}", f"{len(nodes):,}")
     elif kind == "ply":
         head = data[:_PLY_HEAD].partition(b"end_header")[0].decode("latin-1")
-        claims = [int(count[:_DIGITS]) for count in re.findall(r"element\s+\S+\s+(\d+)", head)]
-    whole = [count for count in claims if type(count) is int]
-    if sum(whole) > _MOST_CLAIMED:
+        counts = [int(count[:_MAX_DIGITS]) for count in re.findall(r"element\s+\S+\s+(\d+)", head)]
+    whole = [count for count in counts if type(count) is int]
+    if sum(whole) > _MAX_DECLARED:
         raise FormatError(
-            str(file), f"at most {_MOST_CLAIMED:,} vertices, faces and their values", f"{sum(whole):,}"
+            str(file), f"at most {_MAX_DECLARED:,} vertices, faces and their values", f"{sum(whole):,}"
         )
 
 
-def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
-    """The mesh as `save_mesh` wrote it, or None for a file from elsewhere."""
+def _saved_mesh(scene: trimesh.Scene, file: Path) -> Mesh | None:
+    """The mesh as `save_mesh` wrote it, or None for another file."""
     shapes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh) and _KEY in g.metadata]
     if not shapes:
         return None
@@ -288,10 +322,7 @@ def _own(scene: trimesh.Scene, file: Path) -> Mesh | None:
 
 @dataclass(frozen=True, slots=True)
 class _Soup:
-    """All geometry of a file in its scene's frame. vertices (V, 3), faces (F, 3), part (F,), colours (V, 3), uv.
-
-    forward (3,): from the nodes named back or rear to those named front; zero where names do not tell.
-    """
+    """A file's geometry in its scene's frame."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
@@ -310,8 +341,8 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
         if not isinstance(shape, trimesh.Trimesh) or len(shape.faces) == 0:
             continue
         total += len(shape.faces)
-        if total > _MOST_FACES:
-            raise FormatError(f"{file}: faces", f"at most {_MOST_FACES:,}", "more")
+        if total > _MAX_FACES:
+            raise FormatError(f"{file}: faces", f"at most {_MAX_FACES:,}", "more")
         if shape.vertices.shape[1] != 3:
             raise FormatError(f"{file}: vertices", "three coordinates each", shape.vertices.shape[1])
         placed = trimesh.transform_points(shape.vertices, transform)
@@ -338,8 +369,8 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
     everything = np.concatenate(vertices)
     if not np.isfinite(everything).all():
         raise FormatError(f"{file}: vertices", "finite coordinates", "NaN or infinity")
-    if (most := float(np.abs(everything).max())) > _MOST_COORDINATE:
-        raise FormatError(f"{file}: vertices", f"coordinates up to {_MOST_COORDINATE:g}", f"{most:g}")
+    if (most := float(np.abs(everything).max())) > _MAX_COORDINATE:
+        raise FormatError(f"{file}: vertices", f"coordinates up to {_MAX_COORDINATE:g}", f"{most:g}")
     forward = np.zeros(3)
     if {sign for sign, _ in sides} == {1.0, -1.0}:
         for sign in (1.0, -1.0):
@@ -353,7 +384,9 @@ def _parts(names: list[tuple[str, str, int]]) -> NDArray[np.int64]:
     found = []
     for material, mesh, _ in names:
         texts = (material.lower(), mesh.lower())
-        found.append(next((p for text in texts for p, pattern in _NAMES if re.search(pattern, text)), None))
+        found.append(
+            next((p for text in texts for p, pattern in _PART_PATTERNS if re.search(pattern, text)), None)
+        )
     unnamed = Part.OTHER if Part.PAINT in found else Part.PAINT
     counts = [count for _, _, count in names]
     return np.repeat([int(unnamed if p is None else p) for p in found], counts).astype(np.int64)
@@ -371,7 +404,7 @@ def _vertex_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64]:
 
 def painted(shape: trimesh.Trimesh) -> NDArray[np.float64] | None:
     """What glTF's vertex colours multiply a surface's with: linear RGB (V, 3) in [0, 1]; None without any."""
-    values = shape.vertex_attributes.get(_PAINTED)
+    values = shape.vertex_attributes.get(_VERTEX_COLOURS)
     if values is None or len(values) != len(shape.vertices):
         return None
     share = np.asarray(values)[:, :3]
@@ -380,7 +413,7 @@ def painted(shape: trimesh.Trimesh) -> NDArray[np.float64] | None:
 
 
 def _surface_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64] | None:
-    """The same of what trimesh makes of a file; None where it says nothing."""
+    """Vertex colours (V, 3) of trimesh's materials and textures; None if there are none."""
     count = len(shape.vertices)
     visual = shape.visual
     if isinstance(visual, ColorVisuals):
@@ -399,22 +432,35 @@ def _surface_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64] 
             tint = np.asarray(material.main_color, dtype=float)[:3] / 255.0
     if image is None or uv is None or len(uv) != count:
         return None if tint is None else np.tile(tint, (count, 1))
-    return texels(image, uv[:, :2], file) * (1.0 if tint is None else tint)
+    return sample_texture(image, uv[:, :2], file) * (1.0 if tint is None else tint)
 
 
-def texels(image: Any, uv: NDArray[np.float64], file: Path, most_px: int | None = None) -> NDArray[np.float64]:
-    """sRGB (..., 3) in [0, 1] of a texture at coordinates (..., 2), v upwards. most_px: a larger one is averaged
-    down to so many first. Raises FormatError naming the file of the mesh.
+def sample_texture(
+    image: Any, uv: NDArray[np.float64], file: Path, max_side_px: int | None = None
+) -> NDArray[np.float64]:
+    """Sample a texture at coordinates.
+
+    Args:
+        image: A Pillow image.
+        uv: Coordinates (..., 2), v upwards.
+        file: The mesh's file, for messages.
+        max_side_px: A larger image is averaged down to this size first.
+
+    Returns:
+        sRGB (..., 3) in [0, 1].
+
+    Raises:
+        FormatError: The image is too large or damaged.
     """
-    if image.width * image.height > _MOST_TEXELS:
+    if image.width * image.height > _MAX_TEXELS:
         found = f"{image.width}x{image.height}"
-        raise FormatError(f"{file}: texture", f"at most {_MOST_TEXELS:,} px", found)
+        raise FormatError(f"{file}: texture", f"at most {_MAX_TEXELS:,} px", found)
     try:
         image = image.convert("RGB")
     except (OSError, ValueError, SyntaxError) as error:  # Pillow reads pixels only now
         raise FormatError(f"{file}: texture", "an image", str(error).splitlines()[0]) from error
-    if most_px is not None:
-        image.thumbnail((most_px, most_px))
+    if max_side_px is not None:
+        image.thumbnail((max_side_px, max_side_px))
     pixels = np.asarray(image)
     height, width = pixels.shape[:2]
     places = np.nan_to_num(uv, posinf=0.0, neginf=0.0)
@@ -430,13 +476,13 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(1e-9) ** (1 / 2.4) - 0.055)
 
 
-def linear(srgb: NDArray[_Number]) -> NDArray[_Number]:
+def srgb_to_linear(srgb: NDArray[_Number]) -> NDArray[_Number]:
     """sRGB to linear light, in [0, 1] (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def _axes(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np.float64]:
-    """Rotation (3, 3) from the file's axes to ours: rows are our x (front), y (down), z."""
+def _file_rotation(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np.float64]:
+    """Rotation (3, 3) from the file's axes to ours; its rows are our x (front), y (down), z."""
     down = -np.asarray(up)
     if front != "auto":
         forward = np.asarray(_AXES[front])
@@ -455,9 +501,9 @@ def _axes(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np
 
 
 def _window_side(soup: _Soup, forward: NDArray[np.float64]) -> float:
-    """Where along `forward` the windows' surface lies, from the middle, in lengths; 0 unless it is near one end.
+    """Centre of the windows' surface along `forward`, from the middle, in lengths; 0 unless near one end.
 
-    Of cars it lies within 0.1 of the middle, of lorries and panel vans beyond 0.25.
+    It is within 0.1 of the middle for cars, and beyond 0.25 for lorries and panel vans.
     """
     corners = soup.vertices[soup.faces[soup.part == int(Part.GLASS)]]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -467,13 +513,13 @@ def _window_side(soup: _Soup, forward: NDArray[np.float64]) -> float:
     middle = (along.min() + along.max()) / 2
     centre = float((corners.mean(axis=1) @ forward * area).sum() / area.sum())
     lead = (centre - middle) / float(np.ptp(along))
-    return lead if abs(lead) > _CAB else 0.0
+    return lead if abs(lead) > _CAB_OFFSET else 0.0
 
 
 def _bonnet_side(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], forward: NDArray[np.float64], up: NDArray[np.float64]
 ) -> float:
-    """Positive where the upper third's surface lies behind the middle, seen along `forward`."""
+    """Positive if the upper third's surface lies behind the middle along `forward`."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     centre = corners.mean(axis=1)

@@ -1,4 +1,4 @@
-"""Levels of detail: fewer triangles of the same surface, chosen by a vehicle's size in pixels."""
+"""Levels of detail: fewer triangles of the same surface, by a vehicle's size in pixels."""
 
 from __future__ import annotations
 
@@ -22,44 +22,44 @@ Array = NDArray[np.float64]
 _PROPORTION = np.array([2.7, 1.0, 1.15])
 """Length and width of a typical car in units of its height: errors are the car's, not its unit box's."""
 _SEAM = 0.1
-"""Weight of borders between parts or colours against the surface's own shape. At 4, a car of 800 triangles has an
-outline off by 0.28 % of its height in the mean, at 0.1 by 0.18 %; windows and lights still keep their shape."""
+"""Weight of borders between parts or colours against the surface's shape. At 4, the outline of a car of 800 triangles
+is off by 0.28 % of its height on average, at 0.1 by 0.18 %; windows and lights still keep their shape."""
 _TRIANGLES_PER_PX = 16
-"""Triangles for each pixel of a vehicle's height: outlines are then off by less than 0.1 px in the mean, and 99 %
-of an outline by less than about 0.5 px. `tools/measure_detail.py` prints by how much, for kinds and heights."""
-_FEWEST = 256
+"""Triangles per pixel of height: outlines are then off by less than 0.1 px on average, and 99 % of an outline by less
+than about 0.5 px. `tools/measure_detail.py` measures this."""
+_MIN_TRIANGLES = 256
 """Coarser levels lose wheels and mirrors."""
-_LONGEST = 1.0
-"""Longest edge, in heights of the car. Deformed by 0.05 of its box, a bus of 1,000 triangles has its outline off
-by two thirds of what it is without a limit; cars lose nothing by it, as they do by shorter ones."""
+_MAX_EDGE = 1.0
+"""Longest edge, in heights. Deformed by 0.05 of its box, a bus of 1,000 triangles has two thirds of the outline error
+that it has without a limit; cars gain nothing, and lose by shorter ones."""
 
 
-def detail(mesh: Mesh, height_px: float) -> Mesh:
-    """The mesh with as many triangles as a vehicle that is `height_px` pixels high in the image needs.
+def level_of_detail(mesh: Mesh, height_px: float) -> Mesh:
+    """The mesh with as many triangles as a vehicle of `height_px` pixels in the image needs.
 
-    The mesh itself where it has no more than that; else one of few levels, each a factor of 1.4 from the next,
-    kept while few others are asked for: meshes of equal content give the same object. See `simplify` for what
-    of the mesh stays. Raises RangeError where the height is negative or not a number.
+    The mesh itself if it has no more than that; else one of few levels, a factor of 1.4 apart. Recent levels are
+    cached: meshes of equal content give the same object. See `simplify` for what is preserved. Raises RangeError if
+    the height is negative or not a number.
     """
     if not height_px >= 0:
         raise RangeError("height_px", "at least 0", height_px)
     count = mesh.faces.shape[0]
-    wanted = max(_TRIANGLES_PER_PX * height_px, float(_FEWEST))
+    wanted = max(_TRIANGLES_PER_PX * height_px, float(_MIN_TRIANGLES))
     if count <= wanted:
         return mesh
     level = math.ceil(2 ** (math.ceil(2 * math.log2(wanted)) / 2))
-    return mesh if count <= level else _level(_Content(_digest(mesh), mesh), level)
+    return mesh if count <= level else _cached_level(_HashedMesh(_mesh_digest(mesh), mesh), level)
 
 
 @dataclass(frozen=True, slots=True)
-class _Content:
+class _HashedMesh:
     """A mesh that equals others of the same digest."""
 
     digest: bytes
     mesh: Mesh = field(compare=False)
 
 
-def _digest(mesh: Mesh) -> bytes:
+def _mesh_digest(mesh: Mesh) -> bytes:
     known = hashlib.blake2b(mesh.name.encode(), digest_size=16)
     for values in (mesh.vertices, mesh.faces, mesh.part, mesh.colours, mesh.uv):
         if values is None:
@@ -71,17 +71,27 @@ def _digest(mesh: Mesh) -> bytes:
 
 
 @lru_cache(maxsize=256)
-def _level(content: _Content, triangles: int) -> Mesh:
-    return simplify(content.mesh, triangles, _LONGEST)
+def _cached_level(content: _HashedMesh, triangles: int) -> Mesh:
+    return simplify(content.mesh, triangles, _MAX_EDGE)
 
 
 def simplify(mesh: Mesh, triangles: int, longest: float = math.inf) -> Mesh:
-    """The mesh with about `triangles` faces (at most, as far as its topology allows), deterministic.
+    """Simplify a mesh, deterministically.
 
-    Closed surfaces stay closed, two faces an edge; every face keeps its part, and corners the colours and uv of
-    corners of that part; the bounds of the surface stay. longest: no edge longer than this is made, in heights of
-    a typical car, so that large panels can still bend. A mesh that is small enough, or all of whose faces are
-    degenerate, comes back as it is. Raises RangeError for triangles < 4 or longest <= 0.
+    Closed surfaces stay closed, two faces per edge; faces preserve their parts, and corners the colours and uv of
+    corners of that part; the bounds stay. A mesh that is small enough, or has degenerate faces only, is returned
+    unchanged.
+
+    Args:
+        mesh: The mesh.
+        triangles: Number of faces to reach, as far as the topology allows; at least 4.
+        longest: No longer edge is created, in heights of a typical car, so that large panels can still bend.
+
+    Returns:
+        The simplified mesh.
+
+    Raises:
+        RangeError: `triangles` or `longest` is too small.
     """
     if triangles < 4:
         raise RangeError("triangles", "at least 4", triangles)
@@ -89,19 +99,19 @@ def simplify(mesh: Mesh, triangles: int, longest: float = math.inf) -> Mesh:
         raise RangeError("longest", "more than 0", longest)
     if mesh.faces.shape[0] <= triangles:
         return mesh
-    columns = _columns(mesh.vertices)
+    columns = _column_arrays(mesh.vertices)
     corners = mesh.faces.cpu().numpy()
-    first, point = _distinct(columns)
+    first, point = _unique_rows(columns)
     faces = point[corners]
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
     if not proper.any():
         return mesh
     points = np.stack(columns, axis=1)[first]
-    # corners look alike where part, colour and uv are the same
-    attributes = [c for values in (mesh.colours, mesh.uv) if values is not None for c in _columns(values)]
-    example, look = _distinct(attributes or [np.zeros(len(point))])
+    # corners appearance alike where part, colour and uv are the same
+    attributes = [c for values in (mesh.colours, mesh.uv) if values is not None for c in _column_arrays(values)]
+    example, appearance = _unique_rows(attributes or [np.zeros(len(point))])
     parts, part = np.unique(mesh.part.cpu().numpy(), return_inverse=True)
-    labels = look[corners] * len(parts) + part[:, None]
+    labels = appearance[corners] * len(parts) + part[:, None]
     used = np.zeros(len(points), dtype=bool)
     used[faces[proper]] = True
     bounds = np.stack([points[used].min(axis=0), points[used].max(axis=0)])
@@ -113,21 +123,21 @@ def simplify(mesh: Mesh, triangles: int, longest: float = math.inf) -> Mesh:
     # to the bit, which dividing again would not give
     moved = np.where(moved == scaled[0], bounds[0], np.where(moved == scaled[1], bounds[1], moved / _PROPORTION))
     source = torch.from_numpy(example[pairs % count // len(parts)])
-    kept = torch.from_numpy(np.flatnonzero(proper)[done.kept])
+    faces_left = torch.from_numpy(np.flatnonzero(proper)[done.faces_left])
     return Mesh(
         vertices=torch.from_numpy(moved).to(mesh.vertices),
         faces=torch.from_numpy(vertex.reshape(-1, 3)).to(mesh.faces),
-        part=mesh.part[kept.to(mesh.part.device)],
+        part=mesh.part[faces_left.to(mesh.part.device)],
         name=mesh.name,
         colours=None if mesh.colours is None else mesh.colours.detach()[source.to(mesh.colours.device)],
         uv=None if mesh.uv is None else mesh.uv.detach()[source.to(mesh.uv.device)],
     )
 
 
-def _distinct(columns: Sequence[Array]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of a table given by its columns (n,): a row of each distinct kind (K,), and each row's kind (n,).
+def _unique_rows(columns: Sequence[Array]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Index of one row of each distinct kind (K,), and each row's kind (n,), of a table given by its columns (n,).
 
-    What numpy's unique does along an axis, several times as fast.
+    As numpy.unique along an axis, but several times as fast.
     """
     order = np.lexsort(columns)
     new = np.zeros(len(order), dtype=bool)
@@ -140,5 +150,5 @@ def _distinct(columns: Sequence[Array]) -> tuple[NDArray[np.int64], NDArray[np.i
     return order[new], kind
 
 
-def _columns(values: Tensor) -> list[Array]:
+def _column_arrays(values: Tensor) -> list[Array]:
     return list(values.detach().cpu().double().numpy().T)

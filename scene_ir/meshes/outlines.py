@@ -1,28 +1,36 @@
-"""Outlines of the vehicle templates: measures in metres, canonical ones and a family of variants around each."""
+"""Outlines of the vehicle templates: measures in metres, canonical ones and variants of each."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from scene_ir.meshes.solids import Material
+from scene_ir.meshes.solids import VehicleMaterial
 
 KINDS = ("sedan", "hatchback", "estate", "suv", "van", "pickup", "bus", "truck")
-"""Kinds of template."""
+"""Kinds of templates."""
 
 
 @dataclass(frozen=True, slots=True)
 class CarOutline:
-    """Outline of a car, van or pickup in metres; lengths count from the front unless said otherwise."""
+    """Outline of a car, van or pickup. Metres; lengths count from the front unless noted."""
 
     length: float
+    """Overall length."""
     height: float
+    """Overall height."""
     width: float
+    """Overall width, with mirrors."""
     wheelbase: float
+    """Distance of the axles."""
     front_overhang: float
+    """Front to front axle."""
     wheel_radius: float
+    """Radius of the wheels."""
     clearance: float
+    """Height of the lower edge above the ground."""
     nose: float
     """Height of the bonnet's leading edge."""
     cowl: float
@@ -34,6 +42,7 @@ class CarOutline:
     screen_base: float
     """Foot of the windscreen."""
     roof_front: float
+    """Front end of the roof."""
     roof_rear: float
     """Rear end of the roof, from the rear."""
     rear_base: float
@@ -47,7 +56,9 @@ class CarOutline:
     glass_top: float = 0.86
     """Upper edge of the windows, as a fraction of the height between window line and roof."""
     nose_bow: float = 0.16
+    """Bow of the front in plan."""
     tail_bow: float = 0.10
+    """Bow of the rear in plan."""
     tail_slope: float = 1.0
     """How far the tail leans forward towards its top, against a usual car's."""
     shoulder: float = 0.075
@@ -59,6 +70,7 @@ class CarOutline:
     light_inner: float = 0.60
     """Inner edge of the head lights, as a fraction of the half width."""
     tail_inner: float = 0.66
+    """Inner edge of the tail lights, as a fraction of the half width."""
     pillar_lights: bool = False
     """Tail lights that climb the rear pillars."""
     cladding: bool = False
@@ -68,25 +80,35 @@ class CarOutline:
     rails: bool = False
     """Rails on the roof."""
     spokes: int = 5
+    """Spokes of a wheel."""
     intake: int = 4
     """Half width of the lower air intake, in columns of the front's grid."""
-    grille: Material = Material.TRIM
+    grille: VehicleMaterial = VehicleMaterial.TRIM
+    """Material of the grille."""
     indicators: bool = False
-    """Head lights whose outer end is amber."""
-    handles: Material = Material.TRIM
+    """Amber outer ends of the head lights."""
+    handles: VehicleMaterial = VehicleMaterial.TRIM
+    """Material of the door handles."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusOutline:
-    """Outline of a bus in metres; heights above the ground."""
+    """Outline of a bus. Metres; heights above the ground."""
 
     length: float = 11.4
+    """Overall length."""
     height: float = 3.05
+    """Overall height."""
     width: float = 2.55
+    """Overall width, with mirrors."""
     front_overhang: float = 2.65
+    """Front to front axle."""
     rear_overhang: float = 3.25
+    """Rear to rear axle."""
     wheel_radius: float = 0.48
+    """Radius of the wheels."""
     clearance: float = 0.30
+    """Height of the lower edge."""
     sill: float = 1.25
     """Lower edge of the side windows."""
     screen_sill: float = 1.05
@@ -94,9 +116,13 @@ class BusOutline:
     header: float = 2.55
     """Upper edge of the side windows."""
     rear_sill: float = 1.75
+    """Lower edge of the rear window."""
     panes: int = 7
+    """Panes of a side."""
     bow: float = 0.14
+    """Bow of the front in plan."""
     third_axle: bool = False
+    """A second rear axle."""
     pod: bool = True
     """A box for the air conditioning on the roof."""
 
@@ -106,164 +132,81 @@ class TruckOutline:
     """Outline of a lorry with its cab over the engine, in metres."""
 
     length: float = 8.2
+    """Overall length."""
     height: float = 3.30
+    """Height of the load."""
     width: float = 2.50
+    """Overall width."""
     cab_length: float = 1.95
+    """Length of the cab."""
     cab_height: float = 2.75
+    """Height of the cab."""
     cab_width: float = 2.36
+    """Width of the cab."""
     sill: float = 1.62
     """Lower edge of the windscreen above the ground."""
     wheel_radius: float = 0.48
+    """Radius of the wheels."""
     floor: float = 1.08
     """Underside of the load."""
     front_overhang: float = 1.20
+    """Front to front axle."""
     rear_overhang: float = 2.05
+    """Rear to last axle."""
     third_axle: bool = False
+    """A second rear axle."""
     skirts: bool = False
     """Panels between the axles instead of tank and beam."""
-    load: Material = Material.CARGO
+    load: VehicleMaterial = VehicleMaterial.CARGO
+    """Material of the load's box."""
 
 
 Outline = CarOutline | BusOutline | TruckOutline
 
-CARS: dict[str, CarOutline] = {
-    "sedan": CarOutline(
-        length=4.55,
-        height=1.44,
-        width=1.78,
-        wheelbase=2.7,
-        front_overhang=0.88,
-        wheel_radius=0.315,
-        clearance=0.17,
-        nose=0.7,
-        cowl=0.93,
-        belt_rear=0.97,
-        deck=0.98,
-        screen_base=1.32,
-        roof_front=2.1,
-        roof_rear=1.28,
-        rear_base=0.62,
-        tumblehome=0.16,
-        pillars=((0.47, 0.07), (0.83, 0.04)),
-    ),
-    "hatchback": CarOutline(
-        length=3.9,
-        height=1.47,
-        width=1.7,
-        wheelbase=2.5,
-        front_overhang=0.8,
-        wheel_radius=0.3,
-        clearance=0.16,
-        nose=0.72,
-        cowl=0.95,
-        belt_rear=1.02,
-        deck=0.95,
-        screen_base=1.02,
-        roof_front=1.72,
-        roof_rear=0.56,
-        rear_base=0.15,
-        tumblehome=0.14,
-        pillars=((0.46, 0.07), (0.8, 0.05)),
-        nose_bow=0.18,
-        tail_span=(0.72, 0.95),
-    ),
-    "estate": CarOutline(
-        length=4.65,
-        height=1.47,
-        width=1.79,
-        wheelbase=2.72,
-        front_overhang=0.9,
-        wheel_radius=0.315,
-        clearance=0.16,
-        nose=0.7,
-        cowl=0.93,
-        belt_rear=0.99,
-        deck=0.95,
-        screen_base=1.3,
-        roof_front=2.05,
-        roof_rear=0.4,
-        rear_base=0.14,
-        tumblehome=0.15,
-        pillars=((0.36, 0.07), (0.66, 0.06)),
-        tail_span=(0.74, 0.95),
-        pillar_lights=True,
-        rails=True,
-    ),
-    "suv": CarOutline(
-        length=4.5,
-        height=1.69,
-        width=1.85,
-        wheelbase=2.68,
-        front_overhang=0.9,
-        wheel_radius=0.36,
-        clearance=0.22,
-        nose=0.88,
-        cowl=1.08,
-        belt_rear=1.14,
-        deck=1.08,
-        screen_base=1.22,
-        roof_front=1.88,
-        roof_rear=0.42,
-        rear_base=0.14,
-        tumblehome=0.13,
-        pillars=((0.42, 0.08), (0.74, 0.06)),
-        nose_bow=0.13,
-        tail_span=(0.7, 0.93),
-        cladding=True,
-        rails=True,
-    ),
-    "van": CarOutline(
-        length=4.95,
-        height=1.96,
-        width=1.92,
-        wheelbase=3.05,
-        front_overhang=0.92,
-        wheel_radius=0.33,
-        clearance=0.19,
-        nose=0.86,
-        cowl=1.1,
-        belt_rear=1.14,
-        deck=1.12,
-        screen_base=0.78,
-        roof_front=1.55,
-        roof_rear=0.11,
-        rear_base=0.06,
-        tumblehome=0.1,
-        pillars=((0.3, 0.1), (0.66, 0.1)),
-        tail_bow=0.05,
-        tail_slope=0.4,
-        shoulder=0.05,
-        tail_span=(0.62, 0.97),
-    ),
-    "pickup": CarOutline(
-        length=5.25,
-        height=1.79,
-        width=1.87,
-        wheelbase=3.15,
-        front_overhang=0.92,
-        wheel_radius=0.38,
-        clearance=0.24,
-        nose=0.92,
-        cowl=1.1,
-        belt_rear=1.13,
-        deck=1.08,
-        screen_base=1.3,
-        roof_front=1.95,
-        roof_rear=1.98,
-        rear_base=1.72,
-        tumblehome=0.13,
-        pillars=((0.52, 0.08),),
-        nose_bow=0.1,
-        tail_bow=0.03,
-        tail_span=(0.55, 0.95),
-        cladding=True,
-        bed=True,
+_CAR_KINDS = ("sedan", "hatchback", "estate", "suv", "van", "pickup")
+_MEASURES = {
+    "length": (4.55, 3.9, 4.65, 4.5, 4.95, 5.25),
+    "height": (1.44, 1.47, 1.47, 1.69, 1.96, 1.79),
+    "width": (1.78, 1.7, 1.79, 1.85, 1.92, 1.87),
+    "wheelbase": (2.7, 2.5, 2.72, 2.68, 3.05, 3.15),
+    "front_overhang": (0.88, 0.8, 0.9, 0.9, 0.92, 0.92),
+    "wheel_radius": (0.315, 0.3, 0.315, 0.36, 0.33, 0.38),
+    "clearance": (0.17, 0.16, 0.16, 0.22, 0.19, 0.24),
+    "nose": (0.7, 0.72, 0.7, 0.88, 0.86, 0.92),
+    "cowl": (0.93, 0.95, 0.93, 1.08, 1.1, 1.1),
+    "belt_rear": (0.97, 1.02, 0.99, 1.14, 1.14, 1.13),
+    "deck": (0.98, 0.95, 0.95, 1.08, 1.12, 1.08),
+    "screen_base": (1.32, 1.02, 1.3, 1.22, 0.78, 1.3),
+    "roof_front": (2.1, 1.72, 2.05, 1.88, 1.55, 1.95),
+    "roof_rear": (1.28, 0.56, 0.4, 0.42, 0.11, 1.98),
+    "rear_base": (0.62, 0.15, 0.14, 0.14, 0.06, 1.72),
+    "tumblehome": (0.16, 0.14, 0.15, 0.13, 0.1, 0.13),
+    "pillars": (
+        ((0.47, 0.07), (0.83, 0.04)),
+        ((0.46, 0.07), (0.8, 0.05)),
+        ((0.36, 0.07), (0.66, 0.06)),
+        ((0.42, 0.08), (0.74, 0.06)),
+        ((0.3, 0.1), (0.66, 0.1)),
+        ((0.52, 0.08),),
     ),
 }
-"""The canonical outlines (variant 0): measures of common European cars of about 2000 to 2012, KITTI's streets."""
+"""Measures of the `_CAR_KINDS`, in their order."""
+_DETAILS: dict[str, dict[str, Any]] = {
+    "sedan": {},
+    "hatchback": {"nose_bow": 0.18, "tail_span": (0.72, 0.95)},
+    "estate": {"tail_span": (0.74, 0.95), "pillar_lights": True, "rails": True},
+    "suv": {"nose_bow": 0.13, "tail_span": (0.7, 0.93), "cladding": True, "rails": True},
+    "van": {"tail_bow": 0.05, "tail_slope": 0.4, "shoulder": 0.05, "tail_span": (0.62, 0.97)},
+    "pickup": {"nose_bow": 0.1, "tail_bow": 0.03, "tail_span": (0.55, 0.95), "cladding": True, "bed": True},
+}
+CARS = {
+    kind: CarOutline(**{name: row[i] for name, row in _MEASURES.items()}, **_DETAILS[kind])
+    for i, kind in enumerate(_CAR_KINDS)
+}
+"""Canonical outlines (variant 0): measures of common European cars of about 2000 to 2012, as on KITTI's streets."""
 
 
-def outline(kind: str, variant: int) -> Outline:
+def make_outline(kind: str, variant: int) -> Outline:
     """The outline of one of the KINDS; variant 0 is the canonical one, others vary it within plausible bounds."""
     if kind == "bus":
         return _vary_bus(variant)
@@ -327,9 +270,9 @@ def _vary_car(kind: str, variant: int) -> CarOutline:
         rails=car.rails and bool(rng.random() < 0.6),
         spokes=int(rng.choice([5, 6, 10])),
         intake=int(rng.integers(3, 6)),
-        grille=Material.CHROME if rng.random() < 0.2 else Material.TRIM,
+        grille=VehicleMaterial.CHROME if rng.random() < 0.2 else VehicleMaterial.TRIM,
         indicators=bool(rng.random() < 0.3),
-        handles=Material.PAINT if rng.random() < 0.5 else Material.TRIM,
+        handles=VehicleMaterial.PAINT if rng.random() < 0.5 else VehicleMaterial.TRIM,
     )
 
 
@@ -389,5 +332,5 @@ def _vary_truck(variant: int) -> TruckOutline:
         rear_overhang=float(rng.uniform(0.22, 0.28)) * length,
         third_axle=bool(length > 8.8),
         skirts=bool(rng.random() < 0.4),
-        load=Material.PAINT if rng.random() < 0.4 else Material.CARGO,
+        load=VehicleMaterial.PAINT if rng.random() < 0.4 else VehicleMaterial.CARGO,
     )

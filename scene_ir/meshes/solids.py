@@ -1,7 +1,7 @@
 """Closed solids that vehicle templates consist of: boxes on a grid with named lines, wheels, plain boxes.
 
-Everything here is in metres, axes x forward, y up, z to the car's left (a left-handed look at the unit box's axes,
-turned over once at the very end by `assemble`). Solids are symmetric to z = 0 or come in mirrored pairs.
+In metres, axes x forward, y up, z to the car's left (left-handed; `assemble` flips y at the end). Solids are symmetric
+about z = 0 or come in mirrored pairs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scene_ir.types import Mesh, Part
 
 
-class Material(IntEnum):
+class VehicleMaterial(IntEnum):
     """Surfaces of a template; each has a part and a colour."""
 
     PAINT = 0
@@ -36,40 +36,43 @@ class Material(IntEnum):
 
 
 PART = {
-    Material.PAINT: Part.PAINT,
-    Material.GLASS: Part.GLASS,
-    Material.TYRE: Part.TYRE,
-    Material.HEADLIGHT: Part.LIGHT,
-    Material.TAIL_LIGHT: Part.LIGHT,
-    Material.INDICATOR: Part.LIGHT,
+    VehicleMaterial.PAINT: Part.PAINT,
+    VehicleMaterial.GLASS: Part.GLASS,
+    VehicleMaterial.TYRE: Part.TYRE,
+    VehicleMaterial.HEADLIGHT: Part.LIGHT,
+    VehicleMaterial.TAIL_LIGHT: Part.LIGHT,
+    VehicleMaterial.INDICATOR: Part.LIGHT,
 }
-"""Part of each material; those not named are OTHER."""
+"""Part of each material; others are OTHER."""
 
 COLOUR = {
-    Material.PAINT: (0.80, 0.80, 0.80),
-    Material.GLASS: (0.07, 0.09, 0.12),
-    Material.TYRE: (0.055, 0.055, 0.06),
-    Material.RIM: (0.62, 0.63, 0.65),
-    Material.RIM_GAP: (0.14, 0.14, 0.15),
-    Material.HEADLIGHT: (0.90, 0.92, 0.93),
-    Material.TAIL_LIGHT: (0.62, 0.05, 0.05),
-    Material.INDICATOR: (0.90, 0.48, 0.10),
-    Material.PLATE: (0.90, 0.90, 0.86),
-    Material.TRIM: (0.10, 0.10, 0.11),
-    Material.UNDERBODY: (0.05, 0.05, 0.05),
-    Material.CHROME: (0.46, 0.47, 0.49),
-    Material.CARGO: (0.86, 0.86, 0.86),
+    VehicleMaterial.PAINT: (0.80, 0.80, 0.80),
+    VehicleMaterial.GLASS: (0.07, 0.09, 0.12),
+    VehicleMaterial.TYRE: (0.055, 0.055, 0.06),
+    VehicleMaterial.RIM: (0.62, 0.63, 0.65),
+    VehicleMaterial.RIM_GAP: (0.14, 0.14, 0.15),
+    VehicleMaterial.HEADLIGHT: (0.90, 0.92, 0.93),
+    VehicleMaterial.TAIL_LIGHT: (0.62, 0.05, 0.05),
+    VehicleMaterial.INDICATOR: (0.90, 0.48, 0.10),
+    VehicleMaterial.PLATE: (0.90, 0.90, 0.86),
+    VehicleMaterial.TRIM: (0.10, 0.10, 0.11),
+    VehicleMaterial.UNDERBODY: (0.05, 0.05, 0.05),
+    VehicleMaterial.CHROME: (0.46, 0.47, 0.49),
+    VehicleMaterial.CARGO: (0.86, 0.86, 0.86),
 }
 """RGB of each material. PAINT is a neutral light grey, for a paint colour to multiply."""
 
 
 @dataclass(frozen=True, slots=True)
-class Solid:
-    """A closed triangle soup. vertices (V, 3) float64 m; faces (F, 3) int64; material (F,) int64, a `Material`."""
+class TemplateSolid:
+    """A closed triangle mesh."""
 
     vertices: np.ndarray
+    """(V, 3) float64 m."""
     faces: np.ndarray
+    """(F, 3) int64."""
     material: np.ndarray
+    """(F,) int64, a `VehicleMaterial`."""
 
 
 def quad_faces(quads: np.ndarray, vertices: np.ndarray) -> np.ndarray:
@@ -90,8 +93,17 @@ def grid_quads(grid: np.ndarray) -> np.ndarray:
     return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], -1).reshape(-1, 4)
 
 
-def cleaned(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> Solid:
-    """Merge coincident vertices (to 1 um), drop collapsed faces, turn the winding outwards (y up: see module)."""
+def clean_solid(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> TemplateSolid:
+    """Merge coincident vertices (to 1 um), drop collapsed faces and wind the others outwards.
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3).
+        material: (F,), a `VehicleMaterial`.
+
+    Returns:
+        The solid.
+    """
     # a stable sort by rows: np.unique over rows takes five times as long
     key = np.rint(vertices.T * 1e6).astype(np.int64)
     order = np.lexsort(key[::-1])
@@ -105,7 +117,7 @@ def cleaned(vertices: np.ndarray, faces: np.ndarray, material: np.ndarray) -> So
     faces, material = faces[keep], material[keep]
     if _volume(merged, faces) < 0:
         faces = faces[:, ::-1]
-    return Solid(merged, faces, material)
+    return TemplateSolid(merged, faces, material)
 
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -115,20 +127,20 @@ def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(a[0] @ x + a[1] @ y + a[2] @ z)
 
 
-def mirrored(solid: Solid) -> Solid:
-    """The solid on the other side of z = 0."""
-    return Solid(solid.vertices * np.array([1.0, 1.0, -1.0]), solid.faces[:, ::-1], solid.material)
+def mirror_solid(solid: TemplateSolid) -> TemplateSolid:
+    """The solid mirrored at z = 0."""
+    return TemplateSolid(solid.vertices * np.array([1.0, 1.0, -1.0]), solid.faces[:, ::-1], solid.material)
 
 
-def moved(solid: Solid, offset: ArrayLike) -> Solid:
-    """The solid elsewhere, by an offset (3,) in m."""
+def translate_solid(solid: TemplateSolid, offset: ArrayLike) -> TemplateSolid:
+    """The solid moved by an offset (3,) m."""
     return replace(solid, vertices=solid.vertices + np.asarray(offset, float))
 
 
-def joined(solids: Sequence[Solid]) -> Solid:
-    """Solids, overlapping as they may, as one."""
+def join_solids(solids: Sequence[TemplateSolid]) -> TemplateSolid:
+    """Possibly overlapping solids as one."""
     starts = np.cumsum([0] + [len(s.vertices) for s in solids])
-    return Solid(
+    return TemplateSolid(
         np.concatenate([s.vertices for s in solids]),
         np.concatenate([s.faces + start for s, start in zip(solids, starts[:-1], strict=True)]),
         np.concatenate([s.material for s in solids]),
@@ -137,22 +149,23 @@ def joined(solids: Sequence[Solid]) -> Solid:
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """Half (z >= 0) of a box-like surface on a grid: a wall around it, a lid, a floor.
-
-    wall (K + 1, 2 m + n + 1, 3): levels from bottom to top; along each level from the front's middle (z = 0) over
-    m steps to the front corner, n steps along the side, m steps to the rear's middle (z = 0).
-    lid, floor (m + 1, n + 1, 3): from z = 0 to the side, from front to rear; their rims are the wall's.
-    wall_material (K, 2 m + n), lid_material (m, n), floor_material (m, n): a `Material` a cell.
-    """
+    """Half (z >= 0) of a box-like surface on a grid: a wall around it, a lid, a floor."""
 
     wall: np.ndarray
+    """(K + 1, 2 m + n + 1, 3) m, levels from bottom to top; along each, m steps from the front's middle (z = 0) to the
+    front corner, n along the side, m to the rear's middle."""
     lid: np.ndarray
+    """(m + 1, n + 1, 3) m, from z = 0 to the side, from front to rear; its rim is the wall's."""
     floor: np.ndarray
+    """Likewise."""
     wall_material: np.ndarray
+    """(K, 2 m + n), a `VehicleMaterial` per cell."""
     lid_material: np.ndarray
+    """(m, n), likewise."""
     floor_material: np.ndarray
+    """(m, n), likewise."""
 
-    def solid(self) -> Solid:
+    def solid(self) -> TemplateSolid:
         """Both halves as one closed solid."""
         blocks = [self.wall.reshape(-1, 3), self.lid.reshape(-1, 3), self.floor.reshape(-1, 3)]
         starts = np.cumsum([0] + [len(b) for b in blocks])
@@ -173,13 +186,19 @@ class Skin:
         faces = quad_faces(quads, vertices)
         both = np.concatenate([vertices, vertices * np.array([1.0, 1.0, -1.0])])
         faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
-        return cleaned(both, faces, np.concatenate([material, material]))
+        return clean_solid(both, faces, np.concatenate([material, material]))
 
 
 def coons(rim: np.ndarray, m: int, n: int) -> np.ndarray:
-    """A grid spanned inside a half rim (2 m + n + 1, 3) as `Skin.wall` has it -> (m + 1, n + 1, 3).
+    """Span a grid inside a half rim, with a straight middle line (z = 0) from front to rear.
 
-    The middle line (z = 0) runs straight from the front's middle to the rear's, in the side's steps.
+    Args:
+        rim: (2 m + n + 1, 3) m, as a level of `Skin.wall`.
+        m: Steps from the middle to a corner.
+        n: Steps along the side.
+
+    Returns:
+        (m + 1, n + 1, 3) m.
     """
     front, side, rear = rim[: m + 1], rim[m : m + n + 1], rim[m + n :][::-1]
     span = side[:, 0] - side[0, 0]
@@ -198,11 +217,16 @@ def coons(rim: np.ndarray, m: int, n: int) -> np.ndarray:
     return grid
 
 
-def revolve(profile: np.ndarray, material: np.ndarray, centre: Sequence[float]) -> Solid:
-    """A solid of revolution about the z axis through `centre` (3,) m.
+def revolve(profile: np.ndarray, material: np.ndarray, centre: Sequence[float]) -> TemplateSolid:
+    """Make a solid of revolution about the z axis.
 
-    profile (R, 2): radius and z offset in m, first and last on the axis; material (R - 1, S): a `Material` for
-    each strip and each of S sectors. A vertex of each ring lies straight below the axis.
+    Args:
+        profile: (R, 2) m, radius and z offset; the first and last are on the axis.
+        material: (R - 1, S), a `VehicleMaterial` for each strip and sector.
+        centre: (3,) m.
+
+    Returns:
+        The solid; a vertex of each ring is straight below the axis.
     """
     sectors = material.shape[1]
     angle = -np.pi / 2 + 2 * np.pi * np.arange(sectors) / sectors
@@ -211,19 +235,31 @@ def revolve(profile: np.ndarray, material: np.ndarray, centre: Sequence[float]) 
     vertices = np.stack([x, y, np.broadcast_to(z, x.shape)], -1) + np.asarray(centre)
     quads = grid_quads(np.pad(np.arange(x.size).reshape(x.shape), ((0, 0), (0, 1)), mode="wrap"))
     flat = vertices.reshape(-1, 3)
-    return cleaned(flat, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), material.reshape(-1).repeat(2))
+    return clean_solid(flat, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), material.reshape(-1).repeat(2))
 
 
 def box(
     low: Sequence[float],
     high: Sequence[float],
-    material: Material,
+    material: VehicleMaterial,
     *,
     bevel: float = 0.0,
-    front: Material | None = None,
-    rear: Material | None = None,
-) -> Solid:
-    """An upright box between two corners (3,) m, its long edges cut by `bevel` m; other materials for its ends."""
+    front: VehicleMaterial | None = None,
+    rear: VehicleMaterial | None = None,
+) -> TemplateSolid:
+    """Make an upright box.
+
+    Args:
+        low: Lowest corner (3,) m.
+        high: Highest corner (3,) m.
+        material: Of its faces.
+        bevel: Width of the cut along its long edges, m.
+        front: Another material for its front.
+        rear: Another material for its rear.
+
+    Returns:
+        The solid.
+    """
     lo, hi = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     b = bevel
     ring = np.array(
@@ -245,12 +281,12 @@ def box(
     vertices = np.concatenate([np.column_stack([np.full(8, x), yz]) for x, yz in layers])
     quads = grid_quads(np.pad(np.arange(len(vertices)).reshape(-1, 8), ((0, 0), (0, 1)), mode="wrap"))
     strip = np.array([rear or material, material, material, material, front or material])
-    return cleaned(vertices, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), strip.repeat(8).repeat(2))
+    return clean_solid(vertices, quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3), strip.repeat(8).repeat(2))
 
 
-def assemble(solids: Sequence[Solid], name: str) -> Mesh:
-    """Solids, overlapping as they may, as one mesh in the unit box (float32), vertices split between materials."""
-    whole = joined(solids)
+def assemble(solids: Sequence[TemplateSolid], name: str) -> Mesh:
+    """Possibly overlapping solids as one mesh in the unit box (float32), with vertices split between materials."""
+    whole = join_solids(solids)
     vertices, faces, material = whole.vertices, whole.faces, whole.material
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = high - low
@@ -265,13 +301,13 @@ def assemble(solids: Sequence[Solid], name: str) -> Mesh:
         axis=1,
     )
     # pairs of vertex and material as numbers from a small range: ticked off rather than sorted
-    pairs = (faces[:, ::-1] * len(Material) + material[:, None]).reshape(-1)
-    found = np.zeros(len(vertices) * len(Material), bool)
+    pairs = (faces[:, ::-1] * len(VehicleMaterial) + material[:, None]).reshape(-1)
+    found = np.zeros(len(vertices) * len(VehicleMaterial), bool)
     found[pairs] = True
     inverse = (np.cumsum(found) - 1)[pairs]
-    vertex, surface = np.divmod(np.flatnonzero(found), len(Material))
-    part = np.array([PART.get(Material(m), Part.OTHER) for m in range(len(Material))])
-    colour = np.array([COLOUR[Material(m)] for m in range(len(Material))])
+    vertex, surface = np.divmod(np.flatnonzero(found), len(VehicleMaterial))
+    part = np.array([PART.get(VehicleMaterial(m), Part.OTHER) for m in range(len(VehicleMaterial))])
+    colour = np.array([COLOUR[VehicleMaterial(m)] for m in range(len(VehicleMaterial))])
     return Mesh(
         vertices=torch.from_numpy(unit[vertex].astype(np.float32) + np.float32(0)),
         faces=torch.from_numpy(inverse.reshape(-1, 3).astype(np.int64)),

@@ -1,17 +1,31 @@
-"""Vehicle templates made by code: closed, labelled meshes of eight kinds, each a family of plausible outlines."""
+"""Vehicle templates made by code: closed, labelled meshes of eight kinds, each a family of plausible outlines, and
+roof loads.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+import torch
 from scipy.interpolate import PchipInterpolator
+from torch import Tensor
 
 from scene_ir.errors import RangeError
 from scene_ir.meshes.bodies import Body, body_grid, wheels
-from scene_ir.meshes.outlines import KINDS, BusOutline, CarOutline, TruckOutline, outline
-from scene_ir.meshes.solids import Material, Skin, Solid, assemble, box, coons, mirrored, moved
+from scene_ir.meshes.outlines import KINDS, BusOutline, CarOutline, TruckOutline, make_outline
+from scene_ir.meshes.solids import (
+    Skin,
+    TemplateSolid,
+    VehicleMaterial,
+    assemble,
+    box,
+    coons,
+    mirror_solid,
+    translate_solid,
+)
 from scene_ir.types import Mesh
 
 _M = 6
@@ -24,7 +38,7 @@ _GAP = 0.014
 """Width of the gaps around doors, m."""
 
 
-def _greenhouse(car: CarOutline, top: Callable[[np.ndarray], np.ndarray], half_width: float) -> Solid:
+def _greenhouse(car: CarOutline, top: Callable[[np.ndarray], np.ndarray], half_width: float) -> TemplateSolid:
     """The cabin above the window line: screens, side windows, pillars, roof."""
     half = car.length / 2
     m = 4
@@ -86,23 +100,23 @@ def _greenhouse(car: CarOutline, top: Callable[[np.ndarray], np.ndarray], half_w
     lid[inside][..., 1] = rim_y + (roof - rim_y) * (1 - (lid[inside][..., 2] / lid[m, 1:n, 2]) ** 2)
     lid[0, [0, -1], 1] = wall[-1, [0, -1], 1]
     material = _greenhouse_material(car, m, n)
-    lid_material = np.full((m, n), int(Material.PAINT))
-    floor_material = np.full((m, n), int(Material.UNDERBODY))
+    lid_material = np.full((m, n), int(VehicleMaterial.PAINT))
+    floor_material = np.full((m, n), int(VehicleMaterial.UNDERBODY))
     return Skin(wall, lid, coons(wall[0], m, n), material, lid_material, floor_material).solid()
 
 
 def _greenhouse_material(car: CarOutline, m: int, n: int) -> np.ndarray:
     """Materials (5, 2 m + n) of the cabin's wall: glass between the pillars, in its second and third row."""
-    material = np.full((5, 2 * m + n), int(Material.PAINT))
+    material = np.full((5, 2 * m + n), int(VehicleMaterial.PAINT))
     glass = slice(1, 3)
-    material[glass, : m - 1] = Material.GLASS
-    material[glass, m + n + 1 :] = Material.PAINT if car.blind else Material.GLASS
+    material[glass, : m - 1] = VehicleMaterial.GLASS
+    material[glass, m + n + 1 :] = VehicleMaterial.PAINT if car.blind else VehicleMaterial.GLASS
     for step in range(1, n - 1):
         # odd steps are panes, even ones the pillars behind them
         if (step - 1) // 2 not in car.blind:
-            material[glass, m + step] = Material.GLASS if step % 2 else Material.TRIM
+            material[glass, m + step] = VehicleMaterial.GLASS if step % 2 else VehicleMaterial.TRIM
     if car.pillar_lights:
-        material[glass, m + n - 1 : m + n + 1] = Material.TAIL_LIGHT
+        material[glass, m + n - 1 : m + n + 1] = VehicleMaterial.TAIL_LIGHT
     return material
 
 
@@ -140,24 +154,24 @@ def _car(car: CarOutline, name: str) -> Mesh:
     mirror = box(
         (mirror_x - 0.05, mirror_y, half_width - car.shoulder - 0.03),
         (mirror_x + 0.07, mirror_y + 0.13 + 0.6 * max(car.cowl - 1.0, 0.0), car.width / 2),
-        Material.PAINT,
+        VehicleMaterial.PAINT,
         bevel=0.03,
-        rear=Material.TRIM,
+        rear=VehicleMaterial.TRIM,
     )
-    solids += [mirror, mirrored(mirror)]
+    solids += [mirror, mirror_solid(mirror)]
     for gap in doors[1:]:
         y = float(top(np.array([gap]))[0]) - 0.15
         handle = box((gap + 0.05, y, half_width - 0.08), (gap + 0.24, y + 0.035, half_width + 0.012), car.handles)
-        solids += [handle, mirrored(handle)]
+        solids += [handle, mirror_solid(handle)]
     if car.rails:
         rail_z = half_width - car.shoulder - car.tumblehome * 1.25 - 0.03
         rail = box(
             (-half + car.roof_rear + 0.25, car.height - 0.07, rail_z - 0.02),
             (half - car.roof_front - 0.3, car.height, rail_z + 0.02),
-            Material.TRIM,
+            VehicleMaterial.TRIM,
             bevel=0.008,
         )
-        solids += [rail, mirrored(rail)]
+        solids += [rail, mirror_solid(rail)]
     return assemble(solids, name)
 
 
@@ -178,7 +192,7 @@ def _car_body(
     axles: tuple[float, ...],
     arch_radius: float,
     doors: np.ndarray,
-) -> Solid:
+) -> TemplateSolid:
     """Everything below the window line: bonnet, doors, boot or bed, bumpers, lights, plates."""
     half, half_width = car.length / 2, car.width / 2 - _MIRROR
     base_rear = -half + car.rear_base
@@ -218,23 +232,23 @@ def _car_body(
     )
     wall, lid, floor, inner = body_grid(body)
     m, n = _M, len(inner) + 1
-    material = np.full((wall.shape[0] - 1, wall.shape[1] - 1), int(Material.PAINT))
+    material = np.full((wall.shape[0] - 1, wall.shape[1] - 1), int(VehicleMaterial.PAINT))
     middle = (inner[:-1] + inner[1:]) / 2
     gaps = m + 1 + np.nonzero(np.min(np.abs(middle[:, None] - doors), axis=1) < 1e-6)[0]
-    material[1:, gaps] = Material.TRIM
-    material[0] = Material.TRIM
-    material[1, : car.intake] = Material.TRIM
-    material[1, -car.intake :] = Material.TRIM
+    material[1:, gaps] = VehicleMaterial.TRIM
+    material[0] = VehicleMaterial.TRIM
+    material[1, : car.intake] = VehicleMaterial.TRIM
+    material[1, -car.intake :] = VehicleMaterial.TRIM
     if car.cladding:
-        material[1] = Material.TRIM
+        material[1] = VehicleMaterial.TRIM
     material[4, :4] = car.grille
-    material[4, 4 : m + 1] = Material.HEADLIGHT
+    material[4, 4 : m + 1] = VehicleMaterial.HEADLIGHT
     if car.indicators:
-        material[4, m] = Material.INDICATOR
-    material[4, m + n - 1 : m + n + 2] = Material.TAIL_LIGHT
-    material[2, :1] = Material.PLATE
-    material[3, -1:] = Material.PLATE
-    lid_material = np.full((m, n), int(Material.PAINT))
+        material[4, m] = VehicleMaterial.INDICATOR
+    material[4, m + n - 1 : m + n + 2] = VehicleMaterial.TAIL_LIGHT
+    material[2, :1] = VehicleMaterial.PLATE
+    material[3, -1:] = VehicleMaterial.PLATE
+    lid_material = np.full((m, n), int(VehicleMaterial.PAINT))
     if car.bed:
         columns = np.nonzero((inner < bed[0] - 0.01) & (inner > bed[1] + 0.01))[0] + 1
         lid[m - 1, columns, 2] = lid[m, columns, 2] - 0.06
@@ -242,8 +256,8 @@ def _car_body(
         for c in range(m - 1):
             lid[c, columns, 1] = car.belt_rear - 0.45
             lid[c, columns, 2] = lid[m - 2, columns, 2] * c / (m - 2)
-        lid_material[: m - 1, columns[0] - 1 : columns[-1] + 1] = Material.TRIM
-    return Skin(wall, lid, floor, material, lid_material, np.full((m, n), int(Material.UNDERBODY))).solid()
+        lid_material[: m - 1, columns[0] - 1 : columns[-1] + 1] = VehicleMaterial.TRIM
+    return Skin(wall, lid, floor, material, lid_material, np.full((m, n), int(VehicleMaterial.UNDERBODY))).solid()
 
 
 def _bus(bus: BusOutline, name: str) -> Mesh:
@@ -294,27 +308,27 @@ def _bus(bus: BusOutline, name: str) -> Mesh:
     )
     wall, lid, floor, inner = body_grid(body)
     m, n = _M, len(inner) + 1
-    material = np.full((len(front) - 1, 2 * m + n), int(Material.PAINT))
-    material[0] = Material.TRIM
+    material = np.full((len(front) - 1, 2 * m + n), int(VehicleMaterial.PAINT))
+    material[0] = VehicleMaterial.TRIM
     centre = (inner[:-1] + inner[1:]) / 2
     pane = (centre < pillars[0] + 0.03) & (centre > pillars[-1] - 0.03)
     post = np.min(np.abs(centre[:, None] - pillars[None]), axis=1) < 0.034
     material[4, m + 1 : m + n - 1] = np.where(
-        pane, np.where(post, int(Material.TRIM), int(Material.GLASS)), int(Material.PAINT)
+        pane, np.where(post, int(VehicleMaterial.TRIM), int(VehicleMaterial.GLASS)), int(VehicleMaterial.PAINT)
     )
     # the driver's window reaches from the screen to the first pillar
-    material[4, m : m + 1 + int(np.sum(centre > pillars[0]))] = Material.GLASS
-    material[4, :m] = Material.GLASS
-    material[4, m + n + 1 :] = Material.GLASS
-    material[5, : m - 1] = Material.TRIM
-    material[2, 4:m] = Material.HEADLIGHT
-    material[1, :2] = Material.PLATE
-    material[2, :2] = Material.TRIM
-    material[2:4, m + n : m + n + 2] = Material.TAIL_LIGHT
-    material[1, -1:] = Material.PLATE
-    material[2, m + n + 3 :] = Material.TRIM
-    lid_material = np.full((m, n), int(Material.PAINT))
-    floor_material = np.full((m, n), int(Material.UNDERBODY))
+    material[4, m : m + 1 + int(np.sum(centre > pillars[0]))] = VehicleMaterial.GLASS
+    material[4, :m] = VehicleMaterial.GLASS
+    material[4, m + n + 1 :] = VehicleMaterial.GLASS
+    material[5, : m - 1] = VehicleMaterial.TRIM
+    material[2, 4:m] = VehicleMaterial.HEADLIGHT
+    material[1, :2] = VehicleMaterial.PLATE
+    material[2, :2] = VehicleMaterial.TRIM
+    material[2:4, m + n : m + n + 2] = VehicleMaterial.TAIL_LIGHT
+    material[1, -1:] = VehicleMaterial.PLATE
+    material[2, m + n + 3 :] = VehicleMaterial.TRIM
+    lid_material = np.full((m, n), int(VehicleMaterial.PAINT))
+    floor_material = np.full((m, n), int(VehicleMaterial.UNDERBODY))
     solids = [Skin(wall, lid, floor, material, lid_material, floor_material).solid()]
     for axle in axles:
         solids += wheels(axle, half_width - 0.03, bus.wheel_radius, 0.30, 10)
@@ -322,18 +336,21 @@ def _bus(bus: BusOutline, name: str) -> Mesh:
         pod = box(
             (-0.18 * bus.length, roof - 0.10, -0.75),
             (0.10 * bus.length, bus.height, 0.75),
-            Material.PAINT,
+            VehicleMaterial.PAINT,
             bevel=0.08,
         )
         solids.append(pod)
     mirror = box(
-        (half - 0.42, 1.75, half_width - 0.12), (half - 0.25, 2.15, bus.width / 2), Material.TRIM, bevel=0.03
+        (half - 0.42, 1.75, half_width - 0.12),
+        (half - 0.25, 2.15, bus.width / 2),
+        VehicleMaterial.TRIM,
+        bevel=0.03,
     )
-    solids += [mirror, mirrored(mirror)]
+    solids += [mirror, mirror_solid(mirror)]
     return assemble(solids, name)
 
 
-def _truck_cab(truck: TruckOutline) -> Solid:
+def _truck_cab(truck: TruckOutline) -> TemplateSolid:
     """A lorry's cab over its front axle."""
     half, clearance = truck.length / 2, _CAB_CLEARANCE
     span = truck.cab_height - clearance
@@ -372,21 +389,21 @@ def _truck_cab(truck: TruckOutline) -> Solid:
     )
     wall, lid, floor, inner = body_grid(cab)
     m, n = _M, len(inner) + 1
-    material = np.full((len(levels) - 1, 2 * m + n), int(Material.PAINT))
-    material[0] = Material.TRIM
-    material[1, : m + 1] = Material.TRIM
-    material[4, : m - 1] = Material.GLASS
+    material = np.full((len(levels) - 1, 2 * m + n), int(VehicleMaterial.PAINT))
+    material[0] = VehicleMaterial.TRIM
+    material[1, : m + 1] = VehicleMaterial.TRIM
+    material[4, : m - 1] = VehicleMaterial.GLASS
     centre = (inner[:-1] + inner[1:]) / 2
     window = (centre < door - 0.05) & (centre > -truck.cab_length / 2 + 0.41)
-    material[4, m + 1 : m + n - 1] = np.where(window, int(Material.GLASS), int(Material.PAINT))
-    material[5, : m - 1] = Material.TRIM
-    material[2, 4:m] = Material.HEADLIGHT
-    material[2, :4] = Material.TRIM
-    material[3, :3] = Material.TRIM
-    material[1, :1] = Material.PLATE
-    lid_material = np.full((m, n), int(Material.PAINT))
-    floor_material = np.full((m, n), int(Material.UNDERBODY))
-    return moved(Skin(wall, lid, floor, material, lid_material, floor_material).solid(), (middle, 0, 0))
+    material[4, m + 1 : m + n - 1] = np.where(window, int(VehicleMaterial.GLASS), int(VehicleMaterial.PAINT))
+    material[5, : m - 1] = VehicleMaterial.TRIM
+    material[2, 4:m] = VehicleMaterial.HEADLIGHT
+    material[2, :4] = VehicleMaterial.TRIM
+    material[3, :3] = VehicleMaterial.TRIM
+    material[1, :1] = VehicleMaterial.PLATE
+    lid_material = np.full((m, n), int(VehicleMaterial.PAINT))
+    floor_material = np.full((m, n), int(VehicleMaterial.UNDERBODY))
+    return translate_solid(Skin(wall, lid, floor, material, lid_material, floor_material).solid(), (middle, 0, 0))
 
 
 def _truck(truck: TruckOutline, name: str) -> Mesh:
@@ -399,16 +416,20 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
     solids.append(
         box((-half + 0.02, truck.floor, -width), (load_front, truck.height, width), truck.load, bevel=0.03)
     )
-    solids.append(box((-half + 0.25, 0.62, -0.45), (half - 0.5, truck.floor + 0.02, 0.45), Material.UNDERBODY))
-    bumper = -half + 0.10
-    solids.append(box((bumper, 0.45, -0.95 * width), (bumper + 0.12, 0.60, 0.95 * width), Material.TRIM))
     solids.append(
-        box((-half, truck.floor - 0.13, -width), (-half + 0.10, truck.floor + 0.02, width), Material.TRIM)
+        box((-half + 0.25, 0.62, -0.45), (half - 0.5, truck.floor + 0.02, 0.45), VehicleMaterial.UNDERBODY)
     )
-    light = box((-half + 0.05, 0.72, 0.62 * width), (-half + 0.16, 0.90, 0.96 * width), Material.TAIL_LIGHT)
-    post = box((-half + 0.10, 0.45, 0.55 * width), (-half + 0.30, truck.floor + 0.02, 0.60 * width), Material.TRIM)
-    solids += [light, mirrored(light), post, mirrored(post)]
-    solids.append(box((bumper - 0.02, 0.66, -0.26), (bumper + 0.1, 0.78, 0.26), Material.PLATE))
+    bumper = -half + 0.10
+    solids.append(box((bumper, 0.45, -0.95 * width), (bumper + 0.12, 0.60, 0.95 * width), VehicleMaterial.TRIM))
+    solids.append(
+        box((-half, truck.floor - 0.13, -width), (-half + 0.10, truck.floor + 0.02, width), VehicleMaterial.TRIM)
+    )
+    light = box((-half + 0.05, 0.72, 0.62 * width), (-half + 0.16, 0.90, 0.96 * width), VehicleMaterial.TAIL_LIGHT)
+    post = box(
+        (-half + 0.10, 0.45, 0.55 * width), (-half + 0.30, truck.floor + 0.02, 0.60 * width), VehicleMaterial.TRIM
+    )
+    solids += [light, mirror_solid(light), post, mirror_solid(post)]
+    solids.append(box((bumper - 0.02, 0.66, -0.26), (bumper + 0.1, 0.78, 0.26), VehicleMaterial.PLATE))
     rear_axles = [-half + truck.rear_overhang]
     if truck.third_axle:
         rear_axles.append(rear_axles[0] + 1.32)
@@ -417,9 +438,9 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
         guard = box(
             (x - radius - 0.05, truck.floor - 0.10, width - 0.62),
             (x + radius + 0.05, truck.floor + 0.02, width - 0.03),
-            Material.TRIM,
+            VehicleMaterial.TRIM,
         )
-        solids += [guard, mirrored(guard)]
+        solids += [guard, mirror_solid(guard)]
     solids += wheels(axle, cab_half - 0.03, truck.wheel_radius, 0.30, 10)
     gap = (max(rear_axles) + radius + 0.15, axle - radius - 0.35)
     if truck.skirts:
@@ -428,31 +449,31 @@ def _truck(truck: TruckOutline, name: str) -> Mesh:
         panel = box(
             (gap[1] - 1.0, 0.50, width - 0.65),
             (gap[1] - 0.05, truck.floor - 0.12, width - 0.08),
-            Material.CHROME,
+            VehicleMaterial.CHROME,
             bevel=0.05,
         )
-        beam = box((gap[0], 0.62, width - 0.10), (gap[1] - 1.05, 0.76, width - 0.05), Material.TRIM)
-        solids += [beam, mirrored(beam)]
-    solids += [panel, mirrored(panel)]
+        beam = box((gap[0], 0.62, width - 0.10), (gap[1] - 1.05, 0.76, width - 0.05), VehicleMaterial.TRIM)
+        solids += [beam, mirror_solid(beam)]
+    solids += [panel, mirror_solid(panel)]
     mirror = box(
         (half - 0.45, truck.sill + 0.1, cab_half - 0.12),
         (half - 0.30, truck.sill + 0.65, width),
-        Material.TRIM,
+        VehicleMaterial.TRIM,
         bevel=0.03,
     )
-    solids += [mirror, mirrored(mirror)]
+    solids += [mirror, mirror_solid(mirror)]
     return assemble(solids, name)
 
 
 @lru_cache(maxsize=64)
 def template(kind: str, variant: int = 0) -> Mesh:
-    """A vehicle of one of the KINDS; each `variant` (>= 0) is another outline of its family, 0 the canonical one.
+    """A vehicle of one of the KINDS; `variant` 0 is its canonical outline, others vary it.
 
-    The mesh is closed, symmetric to z = 0, fills the unit box, has 1,500 to 5,000 triangles and colours in which
-    paint is a neutral light grey. Raises RangeError for an unknown kind or a negative variant.
+    The mesh is closed, symmetric about z = 0, fills the unit box, has 1,500 to 5,000 triangles and vertex colours with
+    paint as a neutral light grey. Raises RangeError for an unknown kind or a negative variant.
     """
     _check(kind, variant)
-    shape = outline(kind, variant)
+    shape = make_outline(kind, variant)
     name = f"{kind}-{variant}"
     if isinstance(shape, BusOutline):
         return _bus(shape, name)
@@ -463,9 +484,9 @@ def template(kind: str, variant: int = 0) -> Mesh:
 
 @lru_cache(maxsize=4096)
 def typical_size_lhw(kind: str, variant: int = 0) -> tuple[float, float, float]:
-    """Length, height, width (m) that this variant's outline was drawn with: plausible for its kind."""
+    """Length, height, width (m) of a variant's outline."""
     _check(kind, variant)
-    shape = outline(kind, variant)
+    shape = make_outline(kind, variant)
     return shape.length, shape.height, shape.width
 
 
@@ -474,3 +495,69 @@ def _check(kind: str, variant: int) -> None:
         raise RangeError("template kind", " or ".join(KINDS), kind)
     if variant < 0:
         raise RangeError("template variant", "an integer of at least 0", variant)
+
+
+ROOF_LOADS = ("roof box", "cases", "crate")
+"""Kinds of roof loads."""
+_BARS_M = 0.05
+"""Height of the bars above the roof."""
+_SUNK_M = 0.09
+"""Depth of their feet in the roof, which is arched."""
+_ROOF_HEIGHT = 0.9
+"""Height above which a car's mesh is roof, as a fraction of its own."""
+
+
+def make_roof_load(kind: str, car: Mesh, size_lhw: Sequence[float] | Tensor) -> Mesh:
+    """Make a roof load: boxes on bars, in the unit box of the car and above it.
+
+    Args:
+        kind: One of `ROOF_LOADS`.
+        car: The car's mesh.
+        size_lhw: The car's length, height, width, m.
+
+    Returns:
+        The load's mesh.
+    """
+    length, height, width = (float(side) for side in size_lhw)
+    roof = car.vertices[car.vertices[:, 1] < -_ROOF_HEIGHT]
+    ends = roof[:, 0].aminmax()
+    middle, half = 0.5 * float(ends.min + ends.max) * length, 0.5 * float(ends.max - ends.min) * length
+    reach = 0.36 * width
+    solids: list[TemplateSolid] = []
+    for x in (-0.6 * half, 0.6 * half):
+        solids.append(box((x - 0.03, 0.5 * _BARS_M, -reach), (x + 0.03, _BARS_M, reach), VehicleMaterial.CHROME))
+        for z in (-reach, reach - 0.08):
+            solids.append(box((x - 0.04, -_SUNK_M, z), (x + 0.04, _BARS_M, z + 0.08), VehicleMaterial.TRIM))
+    solids += _load_boxes(kind, half, width)
+    low = torch.tensor([min(solid.vertices[:, axis].min() for solid in solids) for axis in range(3)])
+    high = torch.tensor([max(solid.vertices[:, axis].max() for solid in solids) for axis in range(3)])
+    made = assemble(solids, kind)
+    # Out of the load's own unit box, y down, to the car's: its roof is at y = -1.
+    size, top = (high - low).to(made.vertices), made.vertices.new_tensor([length, height, width])
+    centre = torch.tensor([middle + 0.5 * float(low[0] + high[0]), -float(low[1]) - height, 0.0])
+    return replace(made, vertices=(made.vertices * size + centre.to(size)) / top)
+
+
+def _load_boxes(kind: str, half: float, width: float) -> list[TemplateSolid]:
+    """Boxes in metres above the roof, y up, about the roof's middle; `half` is half its length."""
+    if kind == "roof box":
+        return [box((-0.95, _BARS_M, -0.36), (0.95, _BARS_M + 0.36, 0.36), VehicleMaterial.TRIM, bevel=0.1)]
+    if kind == "cases":
+        rows = [
+            (-0.95, -0.35, 0.42, VehicleMaterial.CARGO),
+            (-0.32, 0.2, 0.3, VehicleMaterial.TRIM),
+            (0.23, 0.8, 0.36, VehicleMaterial.RIM),
+        ]
+        reach = 0.3 * width
+        return [
+            box((a * half, _BARS_M, -reach), (b * half, _BARS_M + up, reach), m, bevel=0.03)
+            for a, b, up, m in rows
+        ]
+    return [
+        box(
+            (-0.8 * half, _BARS_M, -0.38 * width),
+            (0.9 * half, _BARS_M + 0.4, 0.38 * width),
+            VehicleMaterial.CARGO,
+            bevel=0.02,
+        )
+    ]

@@ -10,8 +10,7 @@ from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.exchange import CHANGE_KEY, Vehicle, add_roof_load, add_vehicle, remove_vehicle, replace_vehicle
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene
-from scene_ir.meshes.loads import LOADS, load
-from scene_ir.meshes.templates import template
+from scene_ir.meshes.templates import ROOF_LOADS, make_roof_load, template
 from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
@@ -209,7 +208,7 @@ def test_what_cannot_be_changed_is_refused(scene: SceneIR) -> None:
 
 def test_a_load_stands_on_its_car_and_nothing_else_changes(scene: SceneIR) -> None:
     row = 1
-    box = load("crate", scene.meshes[row], scene.objects.size_lhw[row])
+    box = make_roof_load("crate", scene.meshes[row], scene.objects.size_lhw[row])
     loaded = add_roof_load(scene, row, box)
     before, after = (Compositor(s).render(s) for s in (scene, loaded))
     changed = (before.image - after.image).abs().amax(0) > 1e-3
@@ -227,7 +226,7 @@ def test_a_load_stands_on_its_car_and_nothing_else_changes(scene: SceneIR) -> No
 
 
 def test_a_load_goes_where_its_car_goes(scene: SceneIR) -> None:
-    loaded = add_roof_load(scene, 1, load("roof box", scene.meshes[1], scene.objects.size_lhw[1]))
+    loaded = add_roof_load(scene, 1, make_roof_load("roof box", scene.meshes[1], scene.objects.size_lhw[1]))
     step = torch.zeros(3, 3)
     step[1, 0] = 0.5
     tops = []
@@ -237,9 +236,9 @@ def test_a_load_goes_where_its_car_goes(scene: SceneIR) -> None:
     assert 3 < float(tops[1] - tops[0]) < 8  # 0.5 m at 10.5 m and 110 px
 
 
-@pytest.mark.parametrize("kind", LOADS)
+@pytest.mark.parametrize("kind", ROOF_LOADS)
 def test_a_load_is_above_the_roof_and_within_the_car(kind: str) -> None:
-    made = load(kind, template("sedan"), (4.5, 1.45, 1.8))
+    made = make_roof_load(kind, template("sedan"), (4.5, 1.45, 1.8))
     low, high = made.vertices.amin(0), made.vertices.amax(0)
     assert -1.5 < float(low[1]) < -1.15
     assert -1 < float(high[1]) < -0.9

@@ -113,7 +113,8 @@ def float64_camera() -> Camera:
         pytest.param(rich_scene(count=0), id="no-objects"),
         pytest.param(rich_scene(camera=float64_camera()), id="float64-no-projection"),
         pytest.param(
-            rich_scene(ignore=torch.zeros(0, 4), other_labels=None, meshes=rich_scene().meshes[::-1]), id="no-ignore"
+            rich_scene(ignore=torch.zeros(0, 4), other_labels=None, meshes=rich_scene().meshes[::-1]),
+            id="no-ignore",
         ),
         pytest.param(
             rich_scene().with_objects(box2d=torch.tensor([[torch.nan] * 4, [-torch.inf, 0, 1, 2]])), id="nan"
@@ -268,7 +269,7 @@ BAD = [
     ("damaged", damaged, r"arrays\.npz: expected an NPZ"),
     ("list", lambda f: (f / "scene.json").write_text("[]"), r"scene\.json: expected an object, found list"),
     ("schema", edit("schema", value="other"), r"scene\.json: schema: expected 'drivesem\.scene', found 'other'"),
-    ("version", edit("version", value=99), r"scene\.json: version: expected one of 2, 3, 4, found 99"),
+    ("version", edit("version", value=99), r"scene\.json: version: expected version 4, found version 99"),
     (
         "missing",
         edit("camera", "intrinsics"),

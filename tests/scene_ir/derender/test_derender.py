@@ -91,7 +91,7 @@ def test_a_car_that_the_fit_leads_out_of_sight_stays_where_its_label_says(street
     def fit(placements: list[Placement], *_: object) -> list[Placement]:
         return [replace(p, translation=p.translation + torch.tensor([80.0, 0.0, 0.0])) for p in placements]
 
-    monkeypatch.setattr(silhouette, "fit", fit)
+    monkeypatch.setattr(silhouette, "fit_silhouettes", fit)
     masks = torch.from_numpy(street.mask)[None].float() if masked else None
     scene = derender(replace(street.frame, masks=masks))
     assert scene.objects.translation[0].tolist() == pytest.approx([0.6, 1.65, 11.0], abs=0.35)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from torch import Tensor
 
 from scene_ir.errors import RangeError
-from scene_ir.meshes.lod import detail, simplify
+from scene_ir.meshes.lod import level_of_detail, simplify
 from scene_ir.meshes.templates import template
 from scene_ir.types import Mesh
 
@@ -232,24 +232,24 @@ def test_senseless_targets_are_refused() -> None:
 @pytest.mark.parametrize("height_px", [-1.0, math.nan])
 def test_senseless_heights_are_refused(height_px: float) -> None:
     with pytest.raises(RangeError, match="height_px"):
-        detail(template("sedan", 0), height_px)
+        level_of_detail(template("sedan", 0), height_px)
 
 
 def test_detail_grows_with_the_height_in_few_steps() -> None:
     mesh = template("sedan", 0)
     heights = [0.0, 5.0, 12.0, 25.0, 40.0, 60.0, 100.0, 150.0, 250.0, 400.0, math.inf]
-    counts = [detail(mesh, h).faces.shape[0] for h in heights]
+    counts = [level_of_detail(mesh, h).faces.shape[0] for h in heights]
     assert counts == sorted(counts)
     assert 200 <= counts[0] <= 300
     assert counts[-1] == counts[-2] == mesh.faces.shape[0]
-    assert detail(mesh, 400.0) is mesh
-    assert len({id(detail(mesh, float(h))) for h in range(500)}) <= 10
+    assert level_of_detail(mesh, 400.0) is mesh
+    assert len({id(level_of_detail(mesh, float(h))) for h in range(500)}) <= 10
 
 
 def test_equal_meshes_share_their_levels() -> None:
     mesh = template("hatchback", 3)
     again = replace(mesh, vertices=mesh.vertices.clone(), faces=mesh.faces.clone())
     painted = replace(mesh, colours=mesh.colours * 0.5)
-    assert detail(again, 60.0) is detail(mesh, 60.0)
-    assert detail(painted, 60.0) is not detail(mesh, 60.0)
-    assert not torch.equal(detail(painted, 60.0).colours, detail(mesh, 60.0).colours)
+    assert level_of_detail(again, 60.0) is level_of_detail(mesh, 60.0)
+    assert level_of_detail(painted, 60.0) is not level_of_detail(mesh, 60.0)
+    assert not torch.equal(level_of_detail(painted, 60.0).colours, level_of_detail(mesh, 60.0).colours)

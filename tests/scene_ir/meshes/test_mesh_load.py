@@ -398,7 +398,7 @@ def test_many_places_of_one_mesh_and_faces_without_vertices(
         )
     (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
     load_mesh(tmp_path / "a.glb")
-    monkeypatch.setattr(load, "_MOST_FACES", 12)
+    monkeypatch.setattr(load, "_MAX_FACES", 12)
     with pytest.raises(FormatError, match=r"a\.glb: faces: expected at most 12, found more"):
         load_mesh(tmp_path / "a.glb")
     monkeypatch.undo()

@@ -8,6 +8,7 @@ import torch
 
 from scene_ir.derender import shadow, silhouette
 from scene_ir.geometry import project
+from scene_ir.image_filters import push_pull
 from scene_ir.render.surfaces import shadow_density, shadow_offset
 from scene_ir.types import Camera
 
@@ -41,6 +42,15 @@ def shaded(sun: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     image = np.full((200, 480, 3), 0.6, np.float32) * factor[..., None]
     image[vehicle()] = (0.5, 0.1, 0.1)
     return image.astype(np.float32), factor
+
+
+def lit_ground(image: np.ndarray) -> shadow.GroundLight:
+    """Brightness with the road continued smoothly."""
+
+    def continue_street(unknown: np.ndarray) -> np.ndarray:
+        return push_pull(image, ((ROAD > 0.5) & ~unknown).astype(np.float32))
+
+    return shadow.estimate_ground_light(image, vehicle(), [view()], continue_street)
 
 
 def test_ground_view_knows_the_footprints_corners_and_middle():
@@ -84,7 +94,7 @@ def found_in(
 
 def test_a_shadow_is_found_and_the_lit_road_is_not():
     image, factor = shaded(toward(0.6, 0.0))
-    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
+    light = lit_ground(image)
     found = found_in(light, toward(0.6, 0.0))
     visible = ~vehicle() & (view().distance < 2.4)
     assert found[visible & (factor < 0.5)].mean() > 0.95
@@ -96,7 +106,7 @@ def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
     image, _ = shaded(toward(0.0, 0.0))
     image[:, :260] *= 0.4
     image[92:110] *= 2.5
-    light = shadow.estimate_ground_light(np.clip(image, 0, 1), ROAD, vehicle(), [view()])
+    light = lit_ground(np.clip(image, 0, 1))
     found = found_in(light, toward(0.0, 0.0))
     shade = (view().distance > 1.2) & (view().distance < 2.0) & ~vehicle()
     shade[:, 250:] = False
@@ -106,7 +116,7 @@ def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
 @pytest.mark.parametrize("direction", [(0.8, 0.0), (-0.8, 0.1)])
 def test_the_sun_is_on_the_other_side_of_the_shadow(direction):
     image, _ = shaded(toward(*direction))
-    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
+    light = lit_ground(image)
     sun = shadow.estimate_sun(light, vehicle(), [CAR], [view()], toward(0.0, 0.0))
     assert float(sun[0]) * direction[0] > 0.2
     assert float(sun.norm()) == pytest.approx(1.0, abs=1e-5)
@@ -115,7 +125,7 @@ def test_the_sun_is_on_the_other_side_of_the_shadow(direction):
 def test_without_shadows_the_assumed_sun_stays():
     image = np.full((200, 480, 3), 0.6, np.float32)
     assumed = toward(0.1, -0.3)
-    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
+    light = lit_ground(image)
     assert torch.equal(shadow.estimate_sun(light, vehicle(), [CAR], [view()], assumed), assumed)
 
 
@@ -129,7 +139,7 @@ def test_reach_of_the_renderers_patch():
 def test_a_low_suns_shadow_is_found_to_its_end():
     sun = toward(-1.7, 0.3)
     image, factor = shaded(sun)
-    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
+    light = lit_ground(image)
     estimate = shadow.estimate_sun(light, vehicle(), [CAR], [view()], toward(0.0, 0.0))
     azimuths = [float(torch.atan2(s[2], s[0])) for s in (estimate, sun)]
     assert abs(np.remainder(azimuths[0] - azimuths[1] + np.pi, 2 * np.pi) - np.pi) < 0.2
@@ -142,7 +152,7 @@ def test_a_low_suns_shadow_is_found_to_its_end():
 def test_dark_ground_beyond_reach_counts_and_vanishes_with_longer_shadows():
     sun = toward(-1.8, 0.0)
     image, _ = shaded(sun)
-    light = shadow.estimate_ground_light(image, ROAD, vehicle(), [view()])
+    light = lit_ground(image)
     beyond = []
     for factor in (0.15, 1.0):
         lower = shadow.lengthen_shadows(sun, factor)
@@ -174,18 +184,16 @@ def test_factors_darken_only_in_their_region():
     assert (factor[2:] == 1).all()
 
 
-def test_what_is_known_to_be_behind_a_car_tells_a_dark_strip_from_its_shadow():
+def test_a_dark_strip_of_road_is_no_shadow_with_the_street_continued():
     image, factor = shaded(toward(0.6, 0.0))
     strip = np.where(np.abs(view().local[..., 0] - 2.5) < 0.4, 0.6, 1.0).astype(np.float32)
     empty = np.full_like(image, 0.6) * strip[..., None]
     photograph = np.where(vehicle()[..., None], image, image * strip[..., None])
-    plain, told = (
-        shadow.estimate_ground_light(photograph, ROAD, vehicle(), [view()], behind=behind)
-        for behind in (None, lambda _: empty)
-    )
+    smooth = lit_ground(photograph)
+    continued = shadow.estimate_ground_light(photograph, vehicle(), [view()], lambda _: empty)
     dark = (strip < 1) & (factor > 0.98) & ~vehicle() & (view().distance < 2.4)
     assert np.count_nonzero(dark) > 50
-    wrong, right = (found_in(light, toward(0.6, 0.0)) for light in (plain, told))
+    wrong, right = (found_in(light, toward(0.6, 0.0)) for light in (smooth, continued))
     assert right[dark].mean() < 0.1 < wrong[dark].mean()
 
 

@@ -42,11 +42,7 @@ def test_a_smaller_camera_sees_the_same(street, shrink: int) -> None:
         # where pixels' edges are whole numbers, sizes are shares of the image's
         pixels.append((clip[:, :2] / clip[:, 2:] + 0.5) / torch.tensor([camera.width, camera.height]))
     torch.testing.assert_close(pixels[0], pixels[1])
-    assert (
-        smaller.excluded.shape
-        == smaller.segmentation.ground.shape
-        == (smaller.camera.height, smaller.camera.width)
-    )
+    assert smaller.excluded.shape == smaller.maps.ground.shape == (smaller.camera.height, smaller.camera.width)
     assert smaller.horizon == pytest.approx((88.0 + 0.5) * smaller.camera.height / around.camera.height - 0.5)
 
 
@@ -67,7 +63,7 @@ def test_one_is_the_photographs_own_size(street) -> None:
     around = surroundings(street).scaled_down(1)
     assert isinstance(around.camera, Camera)
     torch.testing.assert_close(around.camera.matrix, street.frame.camera.matrix)
-    assert np.array_equal(around.segmentation.ground, surroundings(street).segmentation.ground)
+    assert np.array_equal(around.maps.ground, surroundings(street).maps.ground)
 
 
 def test_fast_scenes_render_the_photograph(street) -> None:

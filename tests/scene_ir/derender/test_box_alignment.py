@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import box_alignment as settle_module
-from scene_ir.derender import silhouette
+from scene_ir.derender import box_alignment, silhouette
 from scene_ir.derender.box_alignment import BoxAlignmentSettings, align_to_boxes
 from scene_ir.derender.silhouette import LabelBoxes, Placement
 from scene_ir.types import Camera
@@ -29,7 +28,7 @@ def box_of(mask: np.ndarray) -> list[float]:
 
 
 def settled(start: Placement, box: list[float], trust: tuple[float, ...]) -> Placement:
-    return align_to_boxes([start], LabelBoxes(torch.tensor([box]), torch.tensor([trust])), CAMERA)[0][0]
+    return align_to_boxes([start], LabelBoxes(torch.tensor([box]), torch.tensor([trust])), CAMERA)[0]
 
 
 def test_a_label_that_is_off_comes_to_fill_its_box():
@@ -66,7 +65,7 @@ def test_what_lies_beyond_the_border_is_cut_off_and_not_squeezed(where: str):
     clip = CAMERA.matrix.double().numpy() @ np.concatenate([corners.T, np.ones((1, len(corners)))])
     faces = placement.mesh.faces.numpy()
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    found = settle_module._extent(clip, edges, CAMERA, np.zeros(4))
+    found = box_alignment._clipped_bounds(clip, edges, CAMERA, np.zeros(4))
     shown = np.array(box_of(seen(placement)))
     assert np.abs(found - np.clip(shown, 0, [479, 199, 479, 199])).max() <= 1.5
     assert ((found >= -1e-6) & (found <= np.array([479, 199, 479, 199]) + 1e-6)).all()
@@ -94,11 +93,3 @@ def test_a_car_out_of_sight_stays():
     start = car(60.0, 11.0, 0.6)
     found = settled(start, [10.0, 80.0, 60.0, 110.0], (1.0, 1.0, 1.0, 1.0))
     assert torch.allclose(found.translation, start.translation)
-
-
-def test_cost_tells_how_far_the_box_is_from_the_label():
-    truth, start = car(0.5, 11.0, 0.6), car(0.75, 11.0, 0.6)
-    boxes = LabelBoxes(torch.tensor([box_of(seen(truth))]).expand(2, 4), torch.ones(2, 4))
-    _, costs = align_to_boxes([truth, start], boxes, CAMERA)
-    assert costs[0] < 0.2
-    assert costs[1] > costs[0] + 0.5

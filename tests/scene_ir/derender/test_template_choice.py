@@ -79,8 +79,8 @@ def test_what_hardly_shows_keeps_its_heading():
     hidden = NOTHING.copy()
     hidden[:, 225:] = True
     view = replace(view_of(truth), hidden=hidden)
-    assert 0 < stand.visible_share(truth, view) < stand.MIN_VISIBLE_SHARE
-    assert stand.visible_share(truth, view_of(truth)) == 1
+    assert 0 < view.visible_share(truth) < stand.MIN_VISIBLE_SHARE
+    assert view_of(truth).visible_share(truth) == 1
     found, _ = stand.choose_pose([start], None, view)
     assert torch.equal(found[0].yaw, start.yaw)
 
