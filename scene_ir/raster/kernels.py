@@ -220,7 +220,7 @@ def _face_edges(corner: wp.vec3i, clip: Vec3fs, cull: int):
     c0 = wp.vec3d(clip[corner[0]])
     c1 = wp.vec3d(clip[corner[1]])
     c2 = wp.vec3d(clip[corner[2]])
-    found = TriangleEdges()
+    edges = TriangleEdges()
     n0 = wp.cross(c1, c2)
     det = (c0[0] * n0[0] + c0[1] * n0[1]) + c0[2] * n0[2]
     if cull == 0 or det < ZERO:
@@ -228,11 +228,11 @@ def _face_edges(corner: wp.vec3i, clip: Vec3fs, cull: int):
             sign = ONE
             if det < ZERO:
                 sign = -ONE
-            found.n0 = n0 * sign
-            found.n1 = wp.cross(c2, c0) * sign
-            found.n2 = wp.cross(c0, c1) * sign
-            found.det = det * sign
-    return found
+            edges.n0 = n0 * sign
+            edges.n1 = wp.cross(c2, c0) * sign
+            edges.n2 = wp.cross(c0, c1) * sign
+            edges.det = det * sign
+    return edges
 
 
 @wp.func
@@ -377,6 +377,13 @@ def _rasterize_kernel(
 
 @wp.kernel
 def unpack_kernel(start: int, keys: Longs, face: Ints, depth: Floats):
+    """Split the keys of pixels into face and depth.
+
+    Args:
+        start: First index.
+        keys: (depth bits << 32 | face) of each pixel.
+        face, depth: Receive the parts.
+    """
     i = start + wp.tid()
     key = keys[i]
     face[i] = wp.int32(key & wp.int64(0xFFFFFFFF))
@@ -734,9 +741,9 @@ def _record_outline(
     """
     beyond = value - wp.float64(s)
     if s >= low and s + 1 < high and beyond > -SNAP_PX and beyond < ONE + SNAP_PX:
-        here = face[pixel] >= 0
-        after = face[pixel + step] >= 0
-        if here != after and here == is_end:
+        is_hit = face[pixel] >= 0
+        next_is_hit = face[pixel + step] >= 0
+        if is_hit != next_is_hit and is_hit == is_end:
             t = beyond
             if not is_end:
                 t = wp.float64(s) + ONE - value
@@ -929,10 +936,10 @@ def _scan_line(
     `code` is 3 * face; `origin` the packed index of pixel 0 of the line; `step` leads to the next pixel.
     """
     other = 1 - axis
-    at = wp.float64(line)
-    b0 = e.n0[other] * at + e.n0[2]
-    b1 = e.n1[other] * at + e.n1[2]
-    b2 = e.n2[other] * at + e.n2[2]
+    line_px = wp.float64(line)
+    b0 = e.n0[other] * line_px + e.n0[2]
+    b1 = e.n1[other] * line_px + e.n1[2]
+    b2 = e.n2[other] * line_px + e.n2[2]
     span = wp.vec4d(-FAR, FAR, ZERO, ZERO)
     span = _clip_interval(span, e.n0[axis], b0, ZERO)
     span = _clip_interval(span, e.n1[axis], b1, ONE)
@@ -1032,26 +1039,26 @@ class OutlineCrossing:
 @wp.func
 def _find_crossing(axis: int, x: int, y: int, first_is_hit: bool, code: int, clip: Vec3fs, faces: Vec3is):
     """The outline on edge `code` = face * 3 + edge between pixel (x, y) and the next one along `axis`."""
-    found = OutlineCrossing()
+    crossing = OutlineCrossing()
     p = wp.vec3d(wp.float64(x), wp.float64(y), ONE)
     q = p + wp.vec3d(wp.float64(1 - axis), wp.float64(axis), ZERO)
     if first_is_hit:
-        found.p_hit = p
-        found.p_empty = q
+        crossing.p_hit = p
+        crossing.p_empty = q
     else:
-        found.p_hit = q
-        found.p_empty = p
+        crossing.p_hit = q
+        crossing.p_empty = p
     f = code // 3
     corner = faces[f]
-    found.ia = corner[(code - 3 * f + 1) % 3]
-    found.ib = corner[(code - 3 * f + 2) % 3]
-    n = wp.cross(wp.vec3d(clip[found.ia]), wp.vec3d(clip[found.ib]))
-    found.e_hit = (n[0] * found.p_hit[0] + n[1] * found.p_hit[1]) + n[2]
-    found.e_empty = (n[0] * found.p_empty[0] + n[1] * found.p_empty[1]) + n[2]
-    found.t = found.e_hit / (found.e_hit - found.e_empty)
-    if (found.t < HALF) != first_is_hit:
-        found.changes = 1
-    return found
+    crossing.ia = corner[(code - 3 * f + 1) % 3]
+    crossing.ib = corner[(code - 3 * f + 2) % 3]
+    n = wp.cross(wp.vec3d(clip[crossing.ia]), wp.vec3d(clip[crossing.ib]))
+    crossing.e_hit = (n[0] * crossing.p_hit[0] + n[1] * crossing.p_hit[1]) + n[2]
+    crossing.e_empty = (n[0] * crossing.p_empty[0] + n[1] * crossing.p_empty[1]) + n[2]
+    crossing.t = crossing.e_hit / (crossing.e_hit - crossing.e_empty)
+    if (crossing.t < HALF) != first_is_hit:
+        crossing.changes = 1
+    return crossing
 
 
 @wp.kernel

@@ -188,10 +188,10 @@ def _outline_edges(
                 s = first.to(torch.int64)
                 ok = usable & (s >= rect[:, axis]) & (s + 1 < rect[:, 2 + axis])
                 xy = (s, line) if axis == 0 else (line, s)
-                at = torch.where(ok, jobs.pixel(job, *xy), 0)
-                pair = slot[at] if slot.shape[0] else at
+                packed = torch.where(ok, jobs.pixel(job, *xy), 0)
+                pair = slot[packed] if slot.shape[0] else packed
                 ok = ok & (pair >= 0) & ((nearest - first) > -SNAP_PX) & ((nearest - first) < 1 + SNAP_PX)
-                ok = ok & (hit[at] == upper) if hit.shape[0] else ok
+                ok = ok & (hit[packed] == upper) if hit.shape[0] else ok
                 t = (nearest - first) if upper else (first + 1 - nearest)
                 t = t.clamp(0, 1).to(torch.float32)[ok]
                 key = (jobs.face[job] * 3 + edge)[ok]

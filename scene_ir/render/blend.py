@@ -110,7 +110,7 @@ def visible_background(opacity: Tensor, plan: BlendPlan, frame_hw: tuple[int, in
 def composite(
     canvas: Tensor,
     depth: Tensor,
-    what: tuple[Tensor, Tensor, Tensor, Tensor],
+    layer_data: tuple[Tensor, Tensor, Tensor, Tensor],
     plan: BlendPlan,
     clamped: bool,
     backend: Backend = "reference",
@@ -122,7 +122,7 @@ def composite(
     Args:
         canvas: (C, H, W), RGB and, with C = 4, 1 / depth.
         depth: (H, W) m behind all layers.
-        what: Shadow factors (Ts, 3); premultiplied RGB and opacity / depth (T, 4); opacity (T,); depth (T,) m.
+        layer_data: Shadow factors (Ts, 3); premultiplied RGB and opacity / depth (T, 4); opacity (T,); depth (T,) m.
         plan: Positions and order.
         clamped: Whether RGB is clamped to [0, 1].
         backend: Implementation.
@@ -131,7 +131,7 @@ def composite(
         Picture (C, H, W); depth (H, W) m; (H, W) int64, i + 1 for the front-most object i that is at least half
         opaque.
     """
-    factor, colour, opacity, z = what
+    factor, colour, opacity, z = layer_data
     if backend == "warp":
         from scene_ir.render.kernels import blending
 
@@ -269,10 +269,10 @@ def _insert_occluders(order: list[int], corners: np.ndarray, standing: np.ndarra
     slots: list[list[int]] = [[] for _ in range(count + 1)]
     for k in np.argsort(-near, kind="stable"):
         slots[int(after[k]) + 1].append(count + int(k))
-    found = list(slots[0])
+    full_order = list(slots[0])
     for i, there in zip(order, slots[1:], strict=True):
-        found += [i, *there]
-    return found
+        full_order += [i, *there]
+    return full_order
 
 
 def occluder_footprints(front: Sequence[Occluder], matrix: Tensor) -> np.ndarray:
@@ -296,11 +296,11 @@ def _in_front(a: np.ndarray, b: np.ndarray, eye: np.ndarray, farther: np.ndarray
     axes = np.concatenate([corners[:, 1:3] - corners[:, 0:2] for corners in (a, b)], axis=1)
     axes = axes / np.maximum(np.linalg.norm(axes, axis=2, keepdims=True), 1e-9)
     pa, pb = (np.einsum("pkc,pac->pak", corners, axes) for corners in (a, b))
-    at = axes @ eye
+    eye_along = axes @ eye
     # Along each axis, then against it.
     low = np.stack([pa.max(axis=2), -pa.min(axis=2)], axis=2).reshape(len(a), 8)
     high = np.stack([pb.min(axis=2), -pb.max(axis=2)], axis=2).reshape(len(a), 8)
-    where = np.stack([at, -at], axis=2).reshape(len(a), 8)
+    where = np.stack([eye_along, -eye_along], axis=2).reshape(len(a), 8)
     gaps = high - low
     signs = np.where(where <= low, 1, np.where(where >= high, -1, 0))
     best, pair = gaps.argmax(axis=1), np.arange(len(a))

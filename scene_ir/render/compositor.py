@@ -96,8 +96,8 @@ class Compositor(PreparedScene):
             factors = layers.shadow
             sun = self.perturbed_sun(environment)
             if sun is not None:
-                own = self.shadow_is_own[layers.shadow_layout.draw_index()]
-                factors = (factors - (1.0 - factors) * own * (sun.shade - 1.0)).clamp(min=0.0)
+                is_own = self.shadow_is_own[layers.shadow_layout.draw_index()]
+                factors = (factors - (1.0 - factors) * is_own * (sun.shade - 1.0)).clamp(min=0.0)
             if weather:
                 factors = 1.0 - (1.0 - factors) * shadow_softening(environment.weather.to(self.like))
             order = blend.paint_order(
@@ -109,8 +109,10 @@ class Compositor(PreparedScene):
                     shaded = blend.visible_rects(layers.shadow_layout, layers.shadow != 1)
                 drawn = torch.cat([visible, shaded])
             plan = blend.BlendPlan.from_layouts(layers.layout, layers.shadow_layout, order)
-            what = (factors, layers.colour, layers.opacity, layers.depth)
-            canvas, depth, number = blend.composite(canvas, self.scene.depth, what, plan, not weather, backend)
+            layer_data = (factors, layers.colour, layers.opacity, layers.depth)
+            canvas, depth, number = blend.composite(
+                canvas, self.scene.depth, layer_data, plan, not weather, backend
+            )
             number = number if self.occluders is None else number.masked_fill(number > len(objects), 0)
             if weather:  # objects are not part of the sky or the road behind them
                 shows = blend.visible_background(layers.opacity, plan, self.frame_hw)

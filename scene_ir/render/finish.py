@@ -116,17 +116,17 @@ def estimate_sunlight(
     for (surface, samples), strength in zip(seen, expected, strict=True):
         clear = (surface.part.cpu().numpy()[samples.vertex] == Part.PAINT).all(axis=1)
         weight = samples.weight * clear
-        own = np.zeros_like(cost)
+        vehicle_cost = np.zeros_like(cost)
         if weight.sum() >= _MIN_SAMPLES:
             level = np.log(display_to_light(samples.photograph.mean(axis=1)))
             rest = level - np.log(samples.sky + _STRENGTHS[:, None] * samples.direct)
             mean = (rest * weight).sum(axis=1, keepdims=True) / weight.sum()
             apart = (np.square(rest - mean) * weight).sum(axis=1) / weight.sum()
-            own += _PAINT_SAMPLES * apart / _PAINT_SCATTER**2
+            vehicle_cost += _PAINT_SAMPLES * apart / _PAINT_SCATTER**2
         if strength is not None:
-            own += np.square((_STRENGTHS - np.clip(strength, 0.0, _STRENGTHS[-1])) / _STRENGTH_SCATTER)
+            vehicle_cost += np.square((_STRENGTHS - np.clip(strength, 0.0, _STRENGTHS[-1])) / _STRENGTH_SCATTER)
         evidence = (weight.sum() + _MIN_SAMPLES) / (weight.sum() + _HALF_EVIDENCE_PX)
-        cost = cost + evidence * np.minimum(own - own.min(), _MAX_COST)
+        cost = cost + evidence * np.minimum(vehicle_cost - vehicle_cost.min(), _MAX_COST)
     return float(_STRENGTHS[int(cost.argmin())])
 
 
@@ -169,8 +169,8 @@ def fit_finish(surface: TemplateSurface, samples: FinishSamples) -> Array:
     solver = scipy.sparse.linalg.splu(
         matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
-    found = np.exp(solver.solve(known))[web.node]
-    return np.concatenate([found, lift[web.node, None]], axis=1)
+    gains = np.exp(solver.solve(known))[web.node]
+    return np.concatenate([gains, lift[web.node, None]], axis=1)
 
 
 def _sum_at_nodes(node: NDArray[np.int64], values: Array, count: int) -> Array:
@@ -189,8 +189,10 @@ def _estimate_lift(surface: TemplateSurface, samples: FinishSamples) -> float:
     clear = (samples.weight > 0.5) & (part != Part.PAINT)
     if np.count_nonzero(clear) < _MIN_SAMPLES:
         return 0.0
-    dark, own = (np.quantile(v[clear].mean(axis=1), _DARK_SHARE) for v in (samples.photograph, samples.template))
-    return float(np.clip((dark - own) / (1.0 - own), 0.0, _MAX_LIFT))
+    dark, template_dark = (
+        np.quantile(v[clear].mean(axis=1), _DARK_SHARE) for v in (samples.photograph, samples.template)
+    )
+    return float(np.clip((dark - template_dark) / (1.0 - template_dark), 0.0, _MAX_LIFT))
 
 
 def _prior_gains(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
@@ -198,15 +200,15 @@ def _prior_gains(part: NDArray[np.int64], total: Array, mean: Array) -> Array:
     out = np.zeros((len(part), 3))
     rest = _weighted_median(mean, total * (part != Part.PAINT))
     for kind in np.unique(part):
-        mine = part == kind
-        own = total * mine
-        if own.sum() >= _MIN_SAMPLES:
-            out[mine] = _weighted_median(mean, own)
+        is_part = part == kind
+        part_weight = total * is_part
+        if part_weight.sum() >= _MIN_SAMPLES:
+            out[is_part] = _weighted_median(mean, part_weight)
         elif kind == Part.PAINT:
-            out[mine] = _weighted_median(mean, total)
+            out[is_part] = _weighted_median(mean, total)
         else:
             # No colour of its own: as dark or bright as the rest.
-            out[mine] = rest.mean()
+            out[is_part] = rest.mean()
     return out
 
 
@@ -232,9 +234,11 @@ def _build_graph(weld: Tensor, faces: Tensor, part: Tensor, unit: Tensor) -> _Ve
     points = unit.double().cpu().numpy()[first]
     twins = []
     for kind in np.unique(kinds):
-        mine = np.flatnonzero(kinds[first] == kind)
-        tree = scipy.spatial.KDTree(points[mine])
-        twins.append(np.stack([mine, mine[tree.query(points[mine] * [1.0, 1.0, -1.0])[1]]], axis=1))
+        part_nodes = np.flatnonzero(kinds[first] == kind)
+        tree = scipy.spatial.KDTree(points[part_nodes])
+        twins.append(
+            np.stack([part_nodes, part_nodes[tree.query(points[part_nodes] * [1.0, 1.0, -1.0])[1]]], axis=1)
+        )
     pairs = np.concatenate([edges, *twins])
     bond = np.concatenate([np.ones(len(edges)), np.full(len(pairs) - len(edges), 0.5 * _TWIN_BOND)])
     proper = pairs[:, 0] != pairs[:, 1]

@@ -148,8 +148,8 @@ class LitMesh:
         samples = PixelSamples.from_fragments(fragments, samples_per_side)
         blend = _ShadedSamples.from_samples(self, samples, clip, coverage, backend)
         colour = self._colours(blend.face, blend.at, clip, vertices, lights, backend)
-        own = samples.pixel, colour[: len(samples.face)] * samples.share[:, None].to(colour)
-        amounts = [own, *blend.strip_changes(samples, colour)]
+        group_amounts = samples.pixel, colour[: len(samples.face)] * samples.share[:, None].to(colour)
+        amounts = [group_amounts, *blend.strip_changes(samples, colour)]
         total = colour.new_zeros((y1 - y0) * (x1 - x0), 3)
         # At once: a sum out of place copies the whole picture.
         total.index_add_(0, *(torch.cat(parts) for parts in zip(*amounts, strict=True)))
@@ -165,10 +165,10 @@ class LitMesh:
         corners, normals, _ = self.corners(vertices)
         attributes = torch.cat([corners.reshape(-1, 3), normals], dim=1)
         flat = torch.arange(3 * len(self.faces)).reshape(-1, 3)
-        own = clip.index_select(0, self.faces.reshape(-1)) * clip.new_tensor([GRID_SCALE, GRID_SCALE, 1.0])
+        corner_clip = clip.index_select(0, self.faces.reshape(-1)) * clip.new_tensor([GRID_SCALE, GRID_SCALE, 1.0])
         layout = PixelLayout.from_pixels((GRID_SCALE * at.to(torch.float64)).round())
         fragments = Fragments(layout, face.to(torch.int32), at[:, 0], torch.tensor([[0, len(self.faces)]]), 0.0)
-        point, normal = verbs.interpolate(fragments, own, flat, attributes, backend).split(3, dim=1)
+        point, normal = verbs.interpolate(fragments, corner_clip, flat, attributes, backend).split(3, dim=1)
         materials = self.materials
         light = shade_phong(
             point,
@@ -272,8 +272,8 @@ def _smoothing_pairs(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     other = order[begins[welded[corner]] + within] // 3
     sides = vertices[faces]
     normal = _unit(torch.linalg.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]))
-    own = corner // 3
-    alike = ((normal[own] * normal[other]).sum(dim=1) >= _CREASE_COS) | (own == other)
+    corner_face = corner // 3
+    alike = ((normal[corner_face] * normal[other]).sum(dim=1) >= _CREASE_COS) | (corner_face == other)
     return corner[alike], other[alike]
 
 
@@ -389,7 +389,7 @@ class _ShadedSamples:
         gathered = iter(_gather_all(colour, [group for strip in self.strips for group in strip.groups]))
         for strip in self.strips:
             change = reduce(torch.sub, islice(gathered, len(strip.groups)))
-            yield samples.pixel_of(strip.sample), (strip.amount.to(colour) / samples.count**2)[:, None] * change
+            yield samples.pixel_at(strip.sample), (strip.amount.to(colour) / samples.count**2)[:, None] * change
 
 
 def _gather_all(values: Tensor, places: Sequence[Tensor]) -> Sequence[Tensor]:

@@ -82,7 +82,7 @@ class PixelSamples:
         """Samples per row."""
         return int(self.fragments.layout.rects[0, 2] - self.fragments.layout.rects[0, 0])
 
-    def pixel_of(self, sample: Tensor) -> Tensor:
+    def pixel_at(self, sample: Tensor) -> Tensor:
         """Pixels (P,) of samples (P,)."""
         return (
             sample // self.row_length // self.count * (self.row_length // self.count)

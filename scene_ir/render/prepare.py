@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_ir.meshes.lod import detail
+from scene_ir.meshes.lod import level_of_detail
 from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
 from scene_ir.render.environment import PerturbedSun, compute_crown_maps, sky_colour
@@ -207,7 +207,7 @@ class PreparedScene:
         meshes = [self.scene.meshes[int(i)] for i in objects.mesh_index]
         if self.settings.lod:
             heights = self._heights_px(base)
-            meshes = [detail(mesh, height) for mesh, height in zip(meshes, heights, strict=True)]
+            meshes = [level_of_detail(mesh, height) for mesh, height in zip(meshes, heights, strict=True)]
         picked = [TemplateSurface.from_mesh(mesh, self.like.dtype) for mesh in meshes]
         self.surfaces = ObjectSurfaces.from_surfaces(picked, self.like)
         local = self.surfaces.local_vertices(base.ffd, base.size_lhw)
@@ -483,8 +483,8 @@ class PreparedScene:
 
     def completion_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.OWN): `template_attributes`, and what completes a photographed vehicle."""
-        own = self.template_attributes(normals, depth)
-        return torch.cat([own, self.mirror_clip, self.mirror_cos[:, None], self.finish], dim=1)
+        template = self.template_attributes(normals, depth)
+        return torch.cat([template, self.mirror_clip, self.mirror_cos[:, None], self.finish], dim=1)
 
     def rotated_normals(self, objects: Objects) -> Tensor:
         """Unit normals (V, 3) with sharp edges, in camera axes."""
@@ -552,31 +552,33 @@ class PreparedScene:
         owner, xy = layout.draw_index()[pixel], layout.pixel_xy()[pixel].to(self.like)
         assert self.texels is not None
         counts = torch.bincount(owner, minlength=2 * count)
-        seen = self.texels.sample(xy, counts, self.backend, "clamp")
-        weight = smoothstep(seen[:, channels.ALPHA], 0.9, 0.99)
-        for part in (seen[:, channels.HIDDEN], texture.outline_share(seen[:, channels.INSET])):
+        texels = self.texels.sample(xy, counts, self.backend, "clamp")
+        weight = smoothstep(texels[:, channels.ALPHA], 0.9, 0.99)
+        for part in (texels[:, channels.HIDDEN], texture.outline_share(texels[:, channels.INSET])):
             weight = weight * (1.0 - smoothstep(part, 0.0, 1.0))
         plain = (weight > 0.0).nonzero()[:, 0]
         # By position within the object, so that other objects have no influence.
         size = torch.bincount(owner[plain], minlength=count)
         place = torch.arange(len(plain), device=plain.device) - (size.cumsum(0) - size)[owner[plain]]
         chosen = plain[(place.double() * _GOLDEN) % 1.0 < (_MAX_SAMPLES / size.clamp(min=1))[owner[plain]]]
-        pixel, owner, xy, seen, weight = (v[chosen] for v in (pixel, owner, xy, seen, weight))
+        pixel, owner, xy, texels, weight = (v[chosen] for v in (pixel, owner, xy, texels, weight))
         corner = self.surfaces.faces[drawn.mesh.face[pixel].long()]
         share = surfaces.perspective_weights(drawn.geometry.clip[corner], xy).to(self.like)
         template_appearance = self.template_attributes(self.rotated_normals(objects), drawn.geometry.clip[:, 2])
-        own = torch.cat([template_appearance, drawn.geometry.facing_cos[:, None]], dim=1)
-        own = (own[corner] * share[..., None]).sum(dim=1)
-        weight = weight * smoothstep(own[:, channels.PLAIN], *model.SQUARE)
-        template = self.shade_template(xy, owner, own)
-        normal = torch.nn.functional.normalize(own[:, channels.NORMAL : channels.OWN_PAINT], dim=-1, eps=1e-6)
+        attributes = torch.cat([template_appearance, drawn.geometry.facing_cos[:, None]], dim=1)
+        attributes = (attributes[corner] * share[..., None]).sum(dim=1)
+        weight = weight * smoothstep(attributes[:, channels.PLAIN], *model.SQUARE)
+        template = self.shade_template(xy, owner, attributes)
+        normal = torch.nn.functional.normalize(
+            attributes[:, channels.NORMAL : channels.OWN_PAINT], dim=-1, eps=1e-6
+        )
         sun = self.scene.environment.sun.to(self.like)
         sky, lit = (texture.daylight(normal, sun, strength) for strength in (0.0, 1.0))
-        columns = (corner, share, template, seen[:, : channels.ALPHA], sky, lit - sky, weight)
+        columns = (corner, share, template, texels[:, : channels.ALPHA], sky, lit - sky, weight)
         out = []
         for i, (start, _) in enumerate(self.surfaces.vertex_ranges.tolist()):
-            mine = (owner == i) & (weight > 0.0)
-            vertex, *values = (c[mine].cpu().numpy() for c in columns)
+            is_own = (owner == i) & (weight > 0.0)
+            vertex, *values = (c[is_own].cpu().numpy() for c in columns)
             out.append(finish.FinishSamples(vertex - start, *(v.astype(np.float64) for v in values)))
         return out
 

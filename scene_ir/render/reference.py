@@ -192,9 +192,9 @@ def _average_attributes(
     total = clip.new_zeros(len(hit), attributes.shape[1])
     for place in model.SUBPIXELS:
         xy = centre + clip.new_tensor(place) / 16.0
-        found = _walk_mesh(start, xy, clip.detach(), meshes.faces, meshes.neighbours)
-        xy = torch.where(found[:, None] < 0, centre, xy)
-        corner = meshes.faces[torch.where(found < 0, start, found)]
+        reached = _walk_mesh(start, xy, clip.detach(), meshes.faces, meshes.neighbours)
+        xy = torch.where(reached[:, None] < 0, centre, xy)
+        corner = meshes.faces[torch.where(reached < 0, start, reached)]
         share = surfaces.perspective_weights(clip[corner], xy)
         total = total + (share[..., None] * attributes.double()[corner]).sum(dim=1)
     mean = clip.new_zeros(len(face), attributes.shape[1]).index_copy(0, hit, total / len(model.SUBPIXELS))
@@ -205,20 +205,20 @@ def _walk_mesh(face: Tensor, xy: Tensor, clip: Tensor, faces: Tensor, neighbours
     """Faces (K,) at positions xy (K, 2) px, reached from `face` (K,) over the mesh's edges; -1 where the surface
     ends or turns away before, or after more than `model.WALK` faces.
     """
-    found, here = torch.full_like(face, -1), face
+    reached, current = torch.full_like(face, -1), face
     first = clip.new_zeros(len(face))
     for passed in range(model.WALK):
-        corner = clip[faces[here.clamp(min=0)]]
+        corner = clip[faces[current.clamp(min=0)]]
         normals = torch.stack([torch.linalg.cross(corner[:, k - 2], corner[:, k - 1]) for k in range(3)], dim=1)
         det = (corner[:, 0] * normals[:, 0]).sum(dim=1)
         first = det if passed == 0 else first
         edge = (normals[..., :2] * xy[:, None]).sum(dim=2) + normals[..., 2]
         least, nearest = (edge * det.sign()[:, None]).min(dim=1)
-        walks = (here >= 0) & (found < 0) & (det * first > 0.0)
-        found = torch.where(walks & (least >= 0.0), here, found)
-        across = neighbours[here.clamp(min=0)].gather(1, nearest[:, None])[:, 0]
-        here = torch.where(walks, across, torch.full_like(here, -1))
-    return found
+        walks = (current >= 0) & (reached < 0) & (det * first > 0.0)
+        reached = torch.where(walks & (least >= 0.0), current, reached)
+        across = neighbours[current.clamp(min=0)].gather(1, nearest[:, None])[:, 0]
+        current = torch.where(walks, across, torch.full_like(current, -1))
+    return reached
 
 
 def _shade_photographed(
@@ -281,8 +281,8 @@ def _shade_photographed(
     assert prepared.regions is not None
     if is_active(objects.texture_code) and bool(prepared.regions.known.any()):
         unseen = torch.cat([fill, torch.zeros_like(alpha[m:])])
-        found = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.backend)[:, 0]
-        paint = texture.paint_share(paint, found, unseen, prepared.regions.known[rows.owner])
+        region = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.backend)[:, 0]
+        paint = texture.paint_share(paint, region, unseen, prepared.regions.known[rows.owner])
     return _ShadedRows(colour, opacity, z_now, paint, height)
 
 
@@ -299,12 +299,12 @@ def _complete_unseen(
     in the car's own finish. cos_now: (Rm,) towards the camera.
     """
     attributes = prepared.completion_attributes(prepared.rotated_normals(objects), drawn.geometry.clip[:, 2])
-    own = _average_attributes(prepared, drawn, rows, attributes)[unseen]
-    gain, lift = own[:, channels.GAIN : channels.LIFT], own[:, channels.LIFT :]
+    completion = _average_attributes(prepared, drawn, rows, attributes)[unseen]
+    gain, lift = completion[:, channels.GAIN : channels.LIFT], completion[:, channels.LIFT :]
     colour = texture.apply_finish(
-        prepared.shade_template(rows.xy[unseen], rows.owner[unseen], own, sun), gain, lift
+        prepared.shade_template(rows.xy[unseen], rows.owner[unseen], completion, sun), gain, lift
     )
-    clip, cos_then = own[:, channels.MIRROR : channels.MIRROR_COS], own[:, channels.MIRROR_COS]
+    clip, cos_then = completion[:, channels.MIRROR : channels.MIRROR_COS], completion[:, channels.MIRROR_COS]
     z = clip[:, 2]
     safe = z.clamp(min=model.NEAREST_MIRRORED_M)
     uv = clip[:, :2] / safe[:, None]
@@ -317,7 +317,7 @@ def _complete_unseen(
         * (1.0 - smoothstep(texels[:, channels.HIDDEN], 0.0, 1.0))
         * smoothstep(texels[:, channels.ALPHA], *model.SOLID_ALPHA)
         * (1.0 - smoothstep(z - texels[:, channels.DEPTH], *model.DEPTH_TOLERANCE_M))
-        * texture.facing_weight(cos_now[unseen] - cos_then, cos_then, own[:, channels.OWN_PAINT])
+        * texture.facing_weight(cos_now[unseen] - cos_then, cos_then, completion[:, channels.OWN_PAINT])
         * smoothstep(cos_then, *model.MIRRORED_COS)
         * (1.0 - smoothstep(texture.outline_share(texels[:, channels.INSET]), *model.MIRRORED_RIM))
     )

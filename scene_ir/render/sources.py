@@ -350,14 +350,14 @@ def _balance_background(image: Tensor, background: Tensor, factors: list[Crop], 
         lowest[better] = mean[better]
     failed = torch.zeros_like(covered)
     for i, factor in enumerate(factors):
-        mine = ((_crop_view(chosen[None], factor)[0] == i) & _crop_view(free[None], factor)[0])[None]
+        is_darkest = ((_crop_view(chosen[None], factor)[0] == i) & _crop_view(free[None], factor)[0])[None]
         below, goal = _crop_view(out, factor), _crop_view(image, factor)
         others = _crop_view(product, factor) / factor.values.clamp(min=1e-6)
         wanted = goal / (below * others).clamp(min=1e-6)
-        below.copy_(torch.where(mine & (wanted > 1.0), goal / others, below))
-        factor.values.copy_(torch.where(mine, wanted.clamp(max=1.0), factor.values))
+        below.copy_(torch.where(is_darkest & (wanted > 1.0), goal / others, below))
+        factor.values.copy_(torch.where(is_darkest, wanted.clamp(max=1.0), factor.values))
         exact = (below * others * factor.values - goal).abs().amax(dim=0) < 1e-6
-        _crop_view(failed[None], factor)[0] |= mine[0] & ((below > 1.0).any(dim=0) | ~exact)
+        _crop_view(failed[None], factor)[0] |= is_darkest[0] & ((below > 1.0).any(dim=0) | ~exact)
     for factor in factors:
         factor.values.masked_fill_(_crop_view(failed[None], factor), 1.0)
     return torch.where(failed, image, out)
@@ -425,5 +425,5 @@ def _composite_object(alone: Compositor) -> Tensor:
     layers = alone.draw_layers(objects)
     no_shadow = PixelLayout.from_rects(layers.shadow_layout.rects * 0)
     plan = blend.BlendPlan.from_layouts(layers.layout, no_shadow, range(len(objects)))
-    what = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
-    return blend.composite(background, alone.scene.depth, what, plan, False, alone.backend)[0]
+    layer_data = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
+    return blend.composite(background, alone.scene.depth, layer_data, plan, False, alone.backend)[0]

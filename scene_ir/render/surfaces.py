@@ -405,9 +405,9 @@ def place_with_kernels(
     """
     from scene_ir.render.kernels.placement import PlaceVertices
 
-    found = PlaceVertices.apply(ffd, size_lhw, yaw, translation, lights, placement)
-    assert isinstance(found, tuple)
-    return found
+    placed = PlaceVertices.apply(ffd, size_lhw, yaw, translation, lights, placement)
+    assert isinstance(placed, tuple)
+    return placed
 
 
 def place_patches(
@@ -428,9 +428,9 @@ def place_patches(
     """
     from scene_ir.render.kernels.shadow_patches import PlacePatches
 
-    found = PlacePatches.apply(yaw, translation, size_lhw, lights, fixed)
-    assert isinstance(found, tuple)
-    return found
+    placed = PlacePatches.apply(yaw, translation, size_lhw, lights, fixed)
+    assert isinstance(placed, tuple)
+    return placed
 
 
 def place_vertices(

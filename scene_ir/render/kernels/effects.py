@@ -528,7 +528,7 @@ class _WetRows:
     radius: int
 
     @classmethod
-    def of(cls, road: Tensor) -> _WetRows:
+    def from_road(cls, road: Tensor) -> _WetRows:
         height = road.shape[0]
         radius = model.mirror_reach(height) // 2
         if road.is_cuda:  # finding the road would make the CPU wait
@@ -583,7 +583,7 @@ class _Weather(torch.autograd.Function):
         streaks: Tensor,
     ) -> Tensor:
         height, width = image.shape[1:]
-        plane, wet = height * width, _WetRows.of(road)
+        plane, wet = height * width, _WetRows.from_road(road)
         first, last = wet.top * width, wet.bottom * width
         wet_pixels = last - first
         settings, out = image.new_empty(SETTINGS), image.new_empty(image.shape)

@@ -40,7 +40,7 @@ class Crowd:
         matrix = torch.cat([self.intrinsics, torch.zeros(3, 1)], dim=1)
         return to_clip(torch.cat(self.points), matrix), faces
 
-    def drawn(self, cull: bool) -> NDArray[np.float32]:
+    def render_depth(self, cull: bool) -> NDArray[np.float32]:
         """Depth (H, W) m by the fast backend, inf where nothing is hit."""
         clip, faces = self.packed()
         layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, WIDTH, HEIGHT]]))
@@ -53,7 +53,7 @@ def crowd() -> Callable[[int], Crowd]:
     """Six vehicles for a seed: they hide one another, are cut by the border, and one stands next to the camera."""
     meshes = [simplify(template(kind), 1500) for kind in KINDS]
 
-    def of(seed: int) -> Crowd:
+    def build(seed: int) -> Crowd:
         generator = torch.Generator().manual_seed(seed)
         points = []
         for i, (kind, mesh) in enumerate(zip(KINDS, meshes, strict=True)):
@@ -69,7 +69,7 @@ def crowd() -> Callable[[int], Crowd]:
         intrinsics = torch.tensor([[FOCAL, 0, WIDTH / 2 - 0.3], [0, FOCAL, HEIGHT * 0.4], [0, 0, 1]])
         return Crowd(tuple(points), tuple(m.faces for m in meshes), intrinsics)
 
-    return of
+    return build
 
 
 def near_outlines(depth: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -35,7 +35,7 @@ def test_depth_and_silhouettes_agree_up_to_one_pixel_at_outlines(
     seed: int,
 ) -> None:
     scene = crowd(seed)
-    ours = scene.drawn(cull=False)
+    ours = scene.render_depth(cull=False)
     theirs = cast(scene, *ours.shape)
     band = outlines(theirs)
     inner = inner_pixels(ours, theirs, band)

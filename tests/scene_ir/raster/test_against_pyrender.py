@@ -38,7 +38,7 @@ def screen() -> Iterator[tuple[Any, Any]]:
             os.environ.pop(PLATFORM, None)
 
 
-def drawn_by(screen: tuple[Any, Any], crowd: Any) -> NDArray[np.float32]:
+def render_with_pyrender(screen: tuple[Any, Any], crowd: Any) -> NDArray[np.float32]:
     """Depth (H, W) m, inf where nothing is hit."""
     pyrender, image = screen
     back = np.array([1.0, -1.0, -1.0], np.float32)  # OpenGL looks along -z with y up
@@ -66,7 +66,7 @@ def test_depth_and_silhouettes_agree_up_to_one_pixel_at_outlines(
     seed: int,
 ) -> None:
     scene = crowd(seed)
-    ours, theirs = scene.drawn(cull=False), drawn_by(screen, scene)
+    ours, theirs = scene.render_depth(cull=False), render_with_pyrender(screen, scene)
     band = outlines(ours)
     inner = inner_pixels(ours, theirs, band)
     # pyrender reads one of four samples of a pixel, not its centre: the depth is that of somewhere within it.

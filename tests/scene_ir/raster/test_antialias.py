@@ -10,7 +10,7 @@ from scene_ir.raster import verbs
 BOTH = pytest.mark.parametrize("backend", ["reference", "warp"])
 
 
-def coverage_of(uvw, faces, backend="reference", size=(12, 14), near=verbs.NEAR_M):
+def compute_coverage(uvw, faces, backend="reference", size=(12, 14), near=verbs.NEAR_M):
     clip = torch.cat([uvw[:, :2] * uvw[:, 2:], uvw[:, 2:]], dim=1)
     layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, size[1], size[0]]]))
     faces = torch.as_tensor(faces)
@@ -43,7 +43,7 @@ def sphere(triangles, centre, radius, dtype=torch.float64):
 @BOTH
 @pytest.mark.parametrize("shift", [0.0, 0.25, 0.4999, 0.5, 0.75, 0.999])
 def test_straight_outlines_cover_exact_areas(backend, shift):
-    coverage = coverage_of(rectangle(2.5 + shift, 3.5 - shift, 9.5 + shift, 8.5), QUAD, backend)
+    coverage = compute_coverage(rectangle(2.5 + shift, 3.5 - shift, 9.5 + shift, 8.5), QUAD, backend)
     row = coverage[6]
     expected = torch.zeros(14)
     expected[3] = 1 - shift
@@ -58,14 +58,14 @@ def test_straight_outlines_cover_exact_areas(backend, shift):
 
 @BOTH
 def test_an_outline_through_pixel_centres_covers_half(backend):
-    coverage = coverage_of(rectangle(3.0, 2.0, 9.0, 8.0, w=(1.0, 1.0, 1.0, 1.0)), QUAD, backend)
+    coverage = compute_coverage(rectangle(3.0, 2.0, 9.0, 8.0, w=(1.0, 1.0, 1.0, 1.0)), QUAD, backend)
     assert coverage[5].tolist() == [0, 0, 0, 0.5, 1, 1, 1, 1, 1, 0.5, 0, 0, 0, 0]
     assert coverage[:, 6].tolist() == [0, 0, 0.5, 1, 1, 1, 1, 1, 0.5, 0, 0, 0]
 
 
 @BOTH
 def test_the_nearer_side_of_a_strip_narrower_than_a_pixel_counts(backend):
-    coverage = coverage_of(rectangle(4.8, 1.0, 5.3, 10.0), QUAD, backend)
+    coverage = compute_coverage(rectangle(4.8, 1.0, 5.3, 10.0), QUAD, backend)
     assert float(coverage[5, 5]) == pytest.approx(0.7, abs=1e-5)
     assert float(coverage[5].sum()) == pytest.approx(0.7, abs=1e-5)
 
@@ -75,21 +75,21 @@ def test_edges_inside_a_surface_do_not_matter(backend):
     outline = rectangle(2.3, 2.6, 10.1, 8.2, w=(3.0, 3.0, 3.0, 3.0))
     # The same rectangle as a fan around a point that lies less than a pixel inside its right side.
     fan = torch.cat([outline, torch.tensor([[9.8, 5.1, 3.0]])])
-    fans = coverage_of(fan, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], backend)
-    torch.testing.assert_close(fans, coverage_of(outline, QUAD, backend), rtol=0, atol=1e-5)
+    fans = compute_coverage(fan, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], backend)
+    torch.testing.assert_close(fans, compute_coverage(outline, QUAD, backend), rtol=0, atol=1e-5)
 
 
 @BOTH
 def test_duplicate_vertices_make_no_seam(backend):
     outline = rectangle(2.3, 2.6, 10.1, 8.2)
     split = torch.cat([outline[[0, 1, 2]], outline[[0, 2, 3]]])
-    coverage = coverage_of(split, [[0, 1, 2], [3, 4, 5]], backend)
-    assert torch.equal(coverage, coverage_of(outline, QUAD, backend))
+    coverage = compute_coverage(split, [[0, 1, 2], [3, 4, 5]], backend)
+    assert torch.equal(coverage, compute_coverage(outline, QUAD, backend))
 
 
 @BOTH
 def test_nothing_is_blended_at_the_border_of_a_draw(backend):
-    coverage = coverage_of(rectangle(-5.3, -4.0, 20.0, 30.0), QUAD, backend)
+    coverage = compute_coverage(rectangle(-5.3, -4.0, 20.0, 30.0), QUAD, backend)
     assert torch.equal(coverage, torch.ones(12, 14))
 
 
@@ -111,7 +111,7 @@ def test_near_plane_is_no_outline(backend):
 @pytest.mark.parametrize("triangles", [200, 5000])
 def test_coverage_of_a_ball_matches_supersampling(triangles):
     uvw, faces = sphere(triangles, (20.3, 15.7), (13.2, 9.6))
-    coverage = coverage_of(uvw, faces, size=(32, 42))
+    coverage = compute_coverage(uvw, faces, size=(32, 42))
     factor = 16
     fine = torch.cat([(uvw[:, :2] + 0.5) * factor - 0.5, uvw[:, 2:]], dim=1)
     clip = torch.cat([fine[:, :2] * fine[:, 2:], fine[:, 2:]], dim=1).float()
@@ -128,7 +128,7 @@ def test_coverage_of_a_ball_matches_supersampling(triangles):
 def test_coverage_changes_continuously_while_a_ball_moves():
     uvw, faces = sphere(800, (10.0, 8.0), (6.3, 5.1))
     step = torch.tensor([0.02, 0.013, 0.0], dtype=torch.float64)
-    frames = torch.stack([coverage_of(uvw + i * step, faces, size=(18, 24)) for i in range(40)])
+    frames = torch.stack([compute_coverage(uvw + i * step, faces, size=(18, 24)) for i in range(40)])
     # An outline that crosses 0.02 px a frame changes no pixel by more than a few times that.
     assert float(frames.diff(dim=0).abs().max()) < 0.08
     assert 0 <= float(frames.min()) <= float(frames.max()) <= 1
@@ -136,7 +136,7 @@ def test_coverage_changes_continuously_while_a_ball_moves():
 
 def test_the_gradient_of_area_is_the_length_of_the_side():
     uvw = rectangle(2.2, 2.6, 10.1, 8.3, dtype=torch.float64).requires_grad_()
-    coverage = coverage_of(uvw, QUAD)
+    coverage = compute_coverage(uvw, QUAD)
     grad = torch.autograd.grad(coverage[4:7].sum(), uvw)[0]
     # Moving the right side by 1 px covers one pixel more in each of the three rows.
     assert float(grad[[1, 2], 0].sum()) == pytest.approx(3.0, abs=1e-9)
@@ -150,11 +150,11 @@ def test_reference_gradients_match_central_differences(seed):
     weights = torch.randn(18, 22, dtype=torch.float64, generator=generator)
     uvw = uvw + 0.3 * torch.randn(uvw.shape, dtype=torch.float64, generator=generator)
     uvw.requires_grad_()
-    grad = torch.autograd.grad((coverage_of(uvw, faces, size=(18, 22)) * weights).sum(), uvw)[0]
+    grad = torch.autograd.grad((compute_coverage(uvw, faces, size=(18, 22)) * weights).sum(), uvw)[0]
     step = 1e-6
     for _ in range(4):
         way = torch.randn(uvw.shape, dtype=torch.float64, generator=generator)
         with torch.no_grad():
-            ends = [(coverage_of(uvw + s * way, faces, size=(18, 22)) * weights).sum() for s in (step, -step)]
+            ends = [(compute_coverage(uvw + s * way, faces, size=(18, 22)) * weights).sum() for s in (step, -step)]
         difference = float(ends[0] - ends[1]) / (2 * step)
         assert float((grad * way).sum()) == pytest.approx(difference, rel=1e-4, abs=1e-4)

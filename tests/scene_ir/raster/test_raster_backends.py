@@ -275,8 +275,8 @@ def _width(parts: list[list[int]], first: int) -> int:
 @pytest.mark.parametrize("backend", ["reference", "warp"])
 @pytest.mark.parametrize("distance_m", [0.5, 5.0, 50.0, 200.0])
 def test_close_surfaces_do_not_flicker_when_the_camera_moves(backend: verbs.Backend, distance_m: float) -> None:
-    """With float32 depth, the nearer of two surfaces 1/20,000 of their distance apart (1 cm at 200 m) is visible at every
-    pixel, also slanted and for any camera position."""
+    """With float32 depth, the nearer of two surfaces 1/20,000 of their distance apart (1 cm at 200 m) is visible at
+    every pixel, also slanted and for any camera position."""
     gap = distance_m * 5e-5
     n = 7
     grid = torch.linspace(-0.25, 0.25, n, dtype=torch.float64)

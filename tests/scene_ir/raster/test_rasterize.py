@@ -81,13 +81,13 @@ def test_near_plane_clipping_matches_the_analytic_polygon(backend):
     z = torch.tensor([-1.0, -1.0, 9.0, 9.0])
     x = torch.tensor([-1.0, 1.0, 1.0, -1.0])
 
-    def clip_of(x, z):
+    def strip_clip(x, z):
         return torch.stack([10.3 * x + 20.2 * z, torch.full_like(z, 10.0) + 5 * z, z], dim=1)
 
     layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 41, 40]]))
     faces, ranges = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0, 2]])
-    whole = verbs.rasterize(clip_of(x, z), faces, ranges, layout, backend, near)
-    cut = clip_of(x, z.clamp(min=near))
+    whole = verbs.rasterize(strip_clip(x, z), faces, ranges, layout, backend, near)
+    cut = strip_clip(x, z.clamp(min=near))
     clipped = verbs.rasterize(cut, faces, ranges, layout, backend, near)
     assert torch.equal(whole.face >= 0, clipped.face >= 0)
     assert 100 < int((whole.face >= 0).sum()) < 1000

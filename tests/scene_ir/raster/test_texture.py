@@ -13,7 +13,7 @@ BOTH = pytest.mark.parametrize("backend", BACKENDS)
 BORDERS = pytest.mark.parametrize("border", ["clamp", "zero"])
 
 
-def image_of(height, width, channels=3, dtype=torch.float32, seed=0):
+def random_image(height, width, channels=3, dtype=torch.float32, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(channels, height, width, dtype=dtype, generator=generator)
 
@@ -26,7 +26,7 @@ def grid(height, width, dtype=torch.float32):
 @BOTH
 @BORDERS
 def test_integer_positions_return_the_exact_pixels(backend, border):
-    image = image_of(5, 7)
+    image = random_image(5, 7)
     sampled = verbs.texture(image, grid(5, 7), backend, border)
     assert torch.equal(sampled, image.flatten(1).T)
 
@@ -44,7 +44,7 @@ def test_quadratics_are_reproduced(backend):
 
 @BOTH
 def test_outside(backend):
-    image = image_of(4, 6)
+    image = random_image(4, 6)
     far = torch.tensor([[-5.0, 1.0], [1e9, 2.0], [3.0, -1e9], [-70.0, 90.0]])
     assert torch.equal(verbs.texture(image, far, backend, "zero"), torch.zeros(4, 3))
     expected = image[:, [1, 2, 0, 3], [0, 5, 3, 0]].T
@@ -62,7 +62,7 @@ def test_backends_agree_in_values_and_gradients(backend, border, seed):
     weights = torch.randn(200, 4, generator=generator)
     results = []
     for which in (backend, "reference"):
-        image, place = image_of(6, 9, 4, seed=seed).requires_grad_(), uv.clone().requires_grad_()
+        image, place = random_image(6, 9, 4, seed=seed).requires_grad_(), uv.clone().requires_grad_()
         value = verbs.texture(image, place, which, border)
         (value * weights).sum().backward()
         results.append((value.detach(), place.grad, image.grad))
@@ -72,7 +72,7 @@ def test_backends_agree_in_values_and_gradients(backend, border, seed):
 
 @BORDERS
 def test_reference_gradients_match_central_differences(border):
-    image = image_of(4, 5, 2, torch.float64).requires_grad_()
+    image = random_image(4, 5, 2, torch.float64).requires_grad_()
     uv = torch.rand(12, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 7 - 1
     uv[:4] = uv[:4].round()  # where a bilinear lookup has its kinks
 
@@ -82,7 +82,7 @@ def test_reference_gradients_match_central_differences(border):
     assert torch.autograd.gradcheck(values, (image, uv.requires_grad_()), eps=1e-6, atol=1e-5)
 
 
-def crops_of(rects, channels=4, seed=0):
+def random_crops(rects, channels=4, seed=0):
     layout = verbs.PixelLayout.from_rects(rects)
     generator = torch.Generator().manual_seed(seed)
     return layout, torch.rand(layout.size, channels, generator=generator)
@@ -91,7 +91,7 @@ def crops_of(rects, channels=4, seed=0):
 @BOTH
 @BORDERS
 def test_packed_crops_equal_single_textures(backend, border):
-    crops, values = crops_of(torch.tensor([[3, 2, 9, 6], [0, 0, 1, 1], [10, 4, 13, 12]]))
+    crops, values = random_crops(torch.tensor([[3, 2, 9, 6], [0, 0, 1, 1], [10, 4, 13, 12]]))
     layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, 8, 5], [0, 0, 3, 3], [8, 0, 14, 12]]))
     uv = layout.pixel_xy() + torch.rand(layout.size, 2, generator=torch.Generator().manual_seed(1)) - 0.5
     sampled = verbs.texture_packed(values, crops.rects, crops.offsets, layout, uv, backend, border)
@@ -104,7 +104,7 @@ def test_packed_crops_equal_single_textures(backend, border):
 @BOTH
 def test_packed_identity_is_exact_and_empty_crops_are_zero(backend):
     rects = torch.tensor([[3, 2, 9, 6], [5, 5, 5, 5], [10, 4, 13, 12]])
-    crops, values = crops_of(rects)
+    crops, values = random_crops(rects)
     layout = verbs.PixelLayout.from_rects(torch.tensor([[3, 2, 9, 6], [0, 0, 2, 2], [10, 4, 13, 12]]))
     sampled = verbs.texture_packed(values, rects, crops.offsets, layout, layout.pixel_xy().float(), backend)
     filled_rows = layout.draw_index() != 1
@@ -114,7 +114,7 @@ def test_packed_identity_is_exact_and_empty_crops_are_zero(backend):
 
 def test_packed_gradients_agree():
     rects = torch.tensor([[3, 2, 9, 6], [5, 5, 5, 5], [10, 4, 13, 12]])
-    crops, values = crops_of(rects)
+    crops, values = random_crops(rects)
     layout = verbs.PixelLayout.from_rects(torch.tensor([[2, 2, 9, 7], [0, 0, 2, 2], [10, 4, 13, 12]]))
     generator = torch.Generator().manual_seed(2)
     uv = layout.pixel_xy() + torch.rand(layout.size, 2, generator=generator)
@@ -131,14 +131,14 @@ def test_packed_gradients_agree():
 
 @BOTH
 def test_nothing_to_sample(backend):
-    assert verbs.texture(image_of(2, 2), torch.zeros(0, 2), backend).shape == (0, 3)
+    assert verbs.texture(random_image(2, 2), torch.zeros(0, 2), backend).shape == (0, 3)
     none = verbs.PixelLayout.from_rects(torch.zeros(0, 4, dtype=torch.int64))
     sampled = verbs.texture_packed(torch.zeros(0, 4), none.rects, none.offsets, none, torch.zeros(0, 2), backend)
     assert sampled.shape == (0, 4)
 
 
 def test_errors():
-    image, uv = image_of(3, 3), torch.zeros(2, 2)
+    image, uv = random_image(3, 3), torch.zeros(2, 2)
     with pytest.raises(RangeError, match=r"raster\.border"):
         verbs.texture(image, uv, border="wrap")
     with pytest.raises(ShapeError, match="float32 with backend warp"):
