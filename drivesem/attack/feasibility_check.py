@@ -5,7 +5,7 @@ Shares no code with `drivesem.attack.feasible`: it sees no theta, only the scene
 wider by what the two ways may differ.
 
 Open3D needs libusb and loads slowly: it is imported when the first scene is checked, and where it cannot be, the
-meshes' convex outlines stand for the meshes. `judge_at_hand` says which of the two it is here.
+meshes' convex outlines stand for the meshes. `available_check_method` says which of the two it is here.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scene_ir.types import SceneIR, scene_to
+from scene_ir.types import SceneIR, convert_scene
 
 Array = NDArray[np.float64]
-JudgeName = Literal["open3d", "outlines"]
+CheckMethod = Literal["open3d", "outlines"]
 """What tells whether cars show and whether their meshes meet: rays at the meshes, or their convex outlines."""
 
 STRAIN = (0.7, 1.4)
@@ -80,7 +80,7 @@ JUDGED_PX = 25.0
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class ChangeLimits:
     """How far a change may go at most: by default as far as the paper's budget. translate: own lengths, along and
     across; translate_m: the same in m; across_m: m, across; of_distance: share of the distance from the camera;
     partly: own lengths, of a car that is hidden in part or cut by the picture's border; rotate: rad; mesh: unit
@@ -96,17 +96,17 @@ class Reach:
     weather: float = 1.0
     foliage: float = 1.0
     across_m: float = math.inf
-    of_distance: float = math.inf
-    partly: float = math.inf
+    distance_share: float = math.inf
+    partly_visible: float = math.inf
     size: float = 0.0
     sun: float = 0.0
     roi: bool = False
 
 
-PAPERS = Reach()
+PAPERS = ChangeLimits()
 
 
-def check_reach(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
+def check_limits(base: SceneIR, perturbed: SceneIR, reach: ChangeLimits) -> list[str]:
     """What goes further than `reach`, one line each, such as `objects[3]: turned by 0.100 rad`. Both scenes have
     the same objects.
     """
@@ -120,7 +120,7 @@ def check_reach(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
     return found
 
 
-def judge_at_hand() -> JudgeName:
+def available_check_method() -> CheckMethod:
     """Who judges here: `open3d` where it can be imported, which takes a second or two, or else `outlines`."""
     return "outlines" if _open3d() is None else "open3d"
 
@@ -128,22 +128,22 @@ def judge_at_hand() -> JudgeName:
 def check_scene(
     base: SceneIR,
     perturbed: SceneIR,
-    by: JudgeName | None = None,
+    by: CheckMethod | None = None,
     joint_weather: bool = True,
-    reach: Reach = PAPERS,
+    reach: ChangeLimits = PAPERS,
 ) -> list[str]:
     """What is violated, one line each, such as `objects[3]: collision with objects[1], 0.52 m2 (0.00 before)`.
 
-    by: whose judgement counts, by default that of `judge_at_hand`, which also stands in where Open3D is asked for
-    and missing. joint_weather: whether weather is looked at beyond its bounds: what comes together, and whom it
-    hides. reach: how far the change may go, by the budget that it was made in. Nothing counts that was as bad in
-    `base`. Empty where the change is feasible.
+    by: whose judgement counts, by default that of `available_check_method`, which also stands in where Open3D is
+    asked for and missing. joint_weather: whether weather is looked at beyond its bounds: what comes together, and
+    whom it hides. reach: how far the change may go, by the budget that it was made in. Nothing counts that was as
+    bad in `base`. Empty where the change is feasible.
     """
     judge = _Outlines() if by == "outlines" else _judge()
-    base, perturbed = (scene_to(scene, None, "cpu") for scene in (base, perturbed))
+    base, perturbed = (convert_scene(scene, None, "cpu") for scene in (base, perturbed))
     if len(base.objects) != len(perturbed.objects):
         return [f"objects: {len(base.objects)} before, {len(perturbed.objects)} after"]
-    found = _unchanged(base, perturbed) + check_reach(base, perturbed, reach)
+    found = _unchanged(base, perturbed) + check_limits(base, perturbed, reach)
     before = [_Car(base, i) for i in range(len(base.objects))]
     after = [_Car(perturbed, i) for i in range(len(base.objects))]
     road = base.environment.road.numpy().astype(np.float64)
@@ -156,7 +156,7 @@ def check_scene(
     return found + (_weather(base, perturbed) + _unseen(base, perturbed, after) if joint_weather else [])
 
 
-def check_exchange(scene: SceneIR, by: JudgeName | None = None) -> list[str]:
+def check_exchange(scene: SceneIR, by: CheckMethod | None = None) -> list[str]:
     """What is wrong with the vehicles that were exchanged, added or taken away, before anything else changed;
     lines as of `check_scene`, nothing where none was. What there is stands on the road, or as far on it as what
     stood there before, in no other car and hides none that was seen.
@@ -164,7 +164,7 @@ def check_exchange(scene: SceneIR, by: JudgeName | None = None) -> list[str]:
     if scene.before is None:
         return []
     judge = _Outlines() if by == "outlines" else _judge()
-    base, rest = (scene_to(state.at_rest(), None, "cpu") for state in (scene.before, scene))
+    base, rest = (convert_scene(state.unperturbed(), None, "cpu") for state in (scene.before, scene))
     rows = range(len(rest.objects))
     before, after = ([_Car(state, i) for i in rows] for state in (base, rest))
     road = base.environment.road.numpy().astype(np.float64)
@@ -188,7 +188,7 @@ def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list
     What only an attack is bound to, how far a car may go and turn, is not looked at. Outlines judge, on every
     machine: an edit waits for no library, and a scene drawn at random is the same everywhere.
     """
-    base, perturbed = (scene_to(scene, None, "cpu") for scene in (base, perturbed))
+    base, perturbed = (convert_scene(scene, None, "cpu") for scene in (base, perturbed))
     before = {i: _Car(base, i) for i in rows}
     after = {i: _Car(perturbed, i) for i in before}
     road = base.environment.road.numpy().astype(np.float64)
@@ -301,7 +301,7 @@ def _unchanged(base: SceneIR, perturbed: SceneIR) -> list[str]:
     return [f"{name}: changed" for name, (a, b) in pairs.items() if a.shape != b.shape or not bool((a == b).all())]
 
 
-def _codes(base: SceneIR, perturbed: SceneIR, reach: Reach) -> list[str]:
+def _codes(base: SceneIR, perturbed: SceneIR, reach: ChangeLimits) -> list[str]:
     (old, before), (new, after) = ((scene.objects, scene.environment) for scene in (base, perturbed))
     ranges = {
         "objects.texture_code": (old.texture_code, new.texture_code, -reach.color, reach.color),
@@ -382,7 +382,7 @@ def _height(base: SceneIR, old: _Car, new: _Car) -> list[str]:
     return [f"off the ground by {rise:.3f} m"] if abs(rise) > HEIGHT_TOLERANCE_M else []
 
 
-def _in_region(base: SceneIR, i: int, old: _Pose, new: _Pose, reach: Reach) -> list[str]:
+def _in_region(base: SceneIR, i: int, old: _Pose, new: _Pose, reach: ChangeLimits) -> list[str]:
     """By how much the middle of a car's box moved, in sizes of its label in the picture and in the logarithm of
     the squared distance, where that is more than `reach`.
     """
@@ -399,14 +399,14 @@ def _in_region(base: SceneIR, i: int, old: _Pose, new: _Pose, reach: Reach) -> l
     return [f"moved by {shares[0]:.3f}, {shares[1]:.3f} of its box and {depth:.3f} in log depth"]
 
 
-def _on_ground(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
+def _on_ground(old: _Pose, new: _Pose, reach: ChangeLimits) -> list[str]:
     """By how much a car moved along and across, where that is more than `reach`."""
     found = []
     metres = old.axes @ (new.position - old.position)
     along, across = metres[0] / old.size[0], metres[2] / old.size[0]
-    most_m = min(reach.translate_m, reach.of_distance * math.hypot(*old.position))
+    most_m = min(reach.translate_m, reach.distance_share * math.hypot(*old.position))
     across_m = min(most_m, reach.across_m)
-    most = reach.translate if old.whole else min(reach.translate, reach.partly)
+    most = reach.translate if old.whole else min(reach.translate, reach.partly_visible)
     if max(abs(along), abs(across)) > most + REACH_TOLERANCE:
         found.append(f"moved by {along:.3f}, {across:.3f} own lengths")
     elif abs(metres[0]) > most_m + REACH_TOLERANCE or abs(metres[2]) > across_m + REACH_TOLERANCE:
@@ -414,7 +414,7 @@ def _on_ground(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
     return found
 
 
-def _rest(old: _Pose, new: _Pose, reach: Reach) -> list[str]:
+def _rest(old: _Pose, new: _Pose, reach: ChangeLimits) -> list[str]:
     """By how much a car turned, was bent and grew, where that is more than `reach`."""
     found = []
     turned = math.remainder(new.yaw - old.yaw, 2 * math.pi)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.types import CLASSES, Targets
-from drivesem.attack.contrast import LEAST_CONTRAST, contrasts
+from drivesem.attack.visibility import MIN_CONTRAST, compute_contrasts
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.geometry import place, to_clip, yaw_matrix
+from scene_ir.geometry import place_vertices, to_clip, yaw_matrix
 from scene_ir.types import LATTICE, Category, Labels, Mesh, Render, SceneIR
 
 Array = NDArray[np.float64]
@@ -51,11 +51,11 @@ class Difficulty:
     min_height_px: float = 25.0
     max_occlusion: int = 1
     max_truncation: float = 0.3
-    min_contrast: float = LEAST_CONTRAST
+    min_contrast: float = MIN_CONTRAST
 
 
 @dataclass(frozen=True, slots=True)
-class MovedLabels:
+class SceneLabels:
     """Labels of one scene in one mode, object by object (the i-th row is object i).
 
     boxes_xyxy (N, 4) px; category (N,) int64; truncation (N,) in [0, 1]; occlusion (N,) int64, 0 to 3;
@@ -118,7 +118,7 @@ class Labeller:
         self._lowest = np.minimum(self._box2d, 0)
         self._highest = np.maximum(self._limit.astype(self._box2d.dtype), self._box2d)
         ignore = torch.from_numpy(self._ignore).to(objects.translation.device)
-        self._paper = MovedLabels(
+        self._paper = SceneLabels(
             mode="paper",
             boxes_xyxy=objects.box2d.detach(),
             category=objects.category,
@@ -132,11 +132,11 @@ class Labeller:
             in_view=torch.from_numpy(_any_area(self._boxes)).to(objects.translation.device),
         )
 
-    def paper(self) -> MovedLabels:
+    def paper(self) -> SceneLabels:
         """The benign labels."""
         return self._paper
 
-    def moved(self, perturbed: SceneIR, render: Render | None = None) -> MovedLabels:
+    def moved(self, perturbed: SceneIR, render: Render | None = None) -> SceneLabels:
         """Labels that went along with the cars. Raises ShapeError where `perturbed` has other objects."""
         if len(perturbed.objects) != len(self.base.objects):
             raise ShapeError("perturbed.objects", f"{len(self.base.objects)} objects", len(perturbed.objects))
@@ -159,7 +159,7 @@ class Labeller:
             out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS) & in_view
         hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render) | ~in_view
         device = self._paper.boxes_xyxy.device
-        return MovedLabels(
+        return SceneLabels(
             mode="moved",
             boxes_xyxy=torch.from_numpy(boxes).to(device),
             category=perturbed.objects.category,
@@ -173,7 +173,7 @@ class Labeller:
             in_view=torch.from_numpy(in_view).to(device),
         )
 
-    def labels(self, mode: LabelMode, perturbed: SceneIR, render: Render | None = None) -> MovedLabels:
+    def labels(self, mode: LabelMode, perturbed: SceneIR, render: Render | None = None) -> SceneLabels:
         """`paper` or `moved` labels. Raises RangeError on another mode."""
         if mode not in LABEL_MODES:
             raise RangeError("label mode", f"one of {', '.join(LABEL_MODES)}", repr(mode))
@@ -197,7 +197,7 @@ class Labeller:
         """(N,) bool: what a person can hardly see in a render."""
         if self._hidden is None or render is None or self.difficulty.min_contrast == 0:
             return np.zeros(len(self._box2d), np.bool_)
-        return contrasts(render) < self.difficulty.min_contrast
+        return compute_contrasts(render) < self.difficulty.min_contrast
 
     def _outline(self, mesh: Mesh) -> _Outline:
         # Kept beside its mesh, whose number would else be given to another one.
@@ -211,7 +211,7 @@ class Labeller:
         parts = (objects.ffd, objects.size_lhw, objects.yaw, objects.translation, scene.camera.matrix)
         offsets, size, yaw, translation, matrix = (t.detach().cpu().double() for t in parts)
         # Placing and projecting are affine: done to the lattice, they are done to all that it carries.
-        control = to_clip(place(_LATTICE_AT_REST + offsets, size, yaw, translation), matrix)
+        control = to_clip(place_vertices(_LATTICE_AT_REST + offsets, size, yaw, translation), matrix)
         nets = control.transpose(1, 2).contiguous().numpy()
         meshes = [scene.meshes[index] for index in objects.mesh_index.tolist()]
         boxes = [self._outline(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
@@ -225,7 +225,7 @@ def targets(
     base_render: Render | None = None,
     render: Render | None = None,
     difficulty: Difficulty | None = None,
-) -> MovedLabels:
+) -> SceneLabels:
     """Labels of a perturbed scene, for a single call; keep a `Labeller` where one scene is labelled more often.
 
     Not differentiable. Without the two renders occlusion is taken as unchanged, and all is taken to be seen.
@@ -233,12 +233,12 @@ def targets(
     return Labeller(base_scene, base_render, difficulty).labels(mode, perturbed_scene, render)
 
 
-def hidden_share(render: Render) -> Tensor:
+def hidden_shares(render: Render) -> Tensor:
     """Share (N,) float64 of each object's own pixels that are not its own in the image; 1 where it has none."""
     return torch.from_numpy(_hidden_shares(render)).to(render.object_id.device)
 
 
-def shown_boxes(render: Render) -> Tensor:
+def visible_boxes(render: Render) -> Tensor:
     """The box (N, 4) px of what shows of each object; zeros where nothing does."""
     ids = render.object_id.cpu().numpy()
     boxes = np.zeros((len(render.opacity), 4), dtype=np.float32)
@@ -265,7 +265,7 @@ def _hidden_shares(render: Render) -> Array:
 
 
 def to_kitti_labels(
-    labels: MovedLabels, base: SceneIR, perturbed: SceneIR, kinds: Sequence[str] | None = None
+    labels: SceneLabels, base: SceneIR, perturbed: SceneIR, kinds: Sequence[str] | None = None
 ) -> Labels:
     """Labels of one mode as a KITTI file holds them: `paper` with the base's 3D boxes, `moved` with the new ones,
     of objects that are in view.
@@ -299,7 +299,7 @@ def to_kitti_labels(
     )
 
 
-def with_others(labels: Labels, others: Labels | None) -> Labels:
+def append_other_labels(labels: Labels, others: Labels | None) -> Labels:
     """Labels of a scene's vehicles, and of what it leaves as it is (`SceneIR.others`: people, trams), as objects.
 
     `to_kitti_labels` and a run's files tell of these as regions, after those of the labels. None, of scenes that

@@ -15,7 +15,7 @@ from drivesem.attack.space import Budget, ground_axes
 from drivesem.config.edits import ALL, FrameEdit, ObjectEdit
 from scene_ir import ffd
 from scene_ir.errors import RangeError
-from scene_ir.removal import without_objects
+from scene_ir.removal import remove_objects
 from scene_ir.types import SceneIR
 
 REMOVED = "removed"
@@ -33,18 +33,18 @@ class EditedScene:
     notes: tuple[str, ...]
 
 
-def edited(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> EditedScene:
+def apply_edit(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> EditedScene:
     """The scene after an edit. bent: as of `moved`. Raises as `moved` does."""
     removed = [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
-    changed = moved(scene, edit, bent)
+    changed = apply_changes(scene, edit, bent)
     notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in removed))
-    left = without_objects(changed, removed)
+    left = remove_objects(changed, removed)
     if removed:
         left = replace(left, provenance={**left.provenance, REMOVED: "vehicles, by an edit"})
     return EditedScene(left, tuple(removed), tuple(notes))
 
 
-def moved(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> SceneIR:
+def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> SceneIR:
     """The scene after an edit, with the vehicles that it removes still there (`scene_ir.removal` takes them out).
 
     What is said of all objects and of one adds up, and all of it adds to what the scene has: moves on the ground
@@ -91,7 +91,7 @@ def moved(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> Scene
 def _shares(scene: SceneIR, changes: list[list[ObjectEdit]], bent: SceneIR | None) -> Tensor:
     """Lattice offsets (N, P, 3) by shares of the shapes of `bent`."""
     ffds = scene.objects.ffd
-    share = ffds.new_tensor([sum((c.mesh_share for c in row), 0.0) for row in changes])
+    share = ffds.new_tensor([sum((c.mesh_fraction for c in row), 0.0) for row in changes])
     if bent is None:
         for row, value in enumerate(share.tolist()):
             if value:

@@ -1,7 +1,8 @@
-"""What an attack may move: the parameters, their units and bounds, and theta, the flat vector of all of them.
+"""The parameters of a scene that an attack moves, their units and bounds, and theta, the flat vector of all of
+them.
 
-theta is flat for the attack and readable for people: every coordinate has a name, a unit and bounds. The scene as
-photographed is theta = 0. What is *feasible* inside the bounds is decided by `drivesem.attack.feasible`.
+theta is flat for the attack and readable for people: every coordinate has a name, a unit and bounds. theta = 0 is
+the photographed scene. What is *feasible* inside the bounds is decided by `drivesem.attack.feasible`.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.regions import ROI_DIM, Regions
-from drivesem.attack.theta import ParameterSpec, ThetaSpace, lattice_names, parameters_of
+from drivesem.attack.roi import ROI_DIM, RegionsOfInterest
+from drivesem.attack.theta import ParameterSpec, ThetaSpace, lattice_names, select_parameters
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
-from scene_ir.geometry import kept_within, yaw_matrix
+from scene_ir.geometry import clamp_inclusive, yaw_matrix
 from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR
 
 
 class Parameter(StrEnum):
-    """What can be moved, in the order in which theta holds it."""
+    """Parameters of a scene, in the order of their blocks in theta."""
 
     COLOR = "color"
     WEATHER = "weather"
@@ -36,12 +37,12 @@ class Parameter(StrEnum):
     SUN = "sun"
 
 
-SIX = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
-"""The paper's parameters. The others need a budget that goes beyond the paper's."""
+PAPER_PARAMETERS = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
+"""The paper's parameters. The others need a budget beyond the paper's."""
 
 
-_HALF = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
-"""Of the lattice: the other half mirrors it."""
+_HALF_LATTICE = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
+"""Independent half of the lattice; the other half mirrors it."""
 
 SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.COLOR: ParameterSpec(
@@ -55,7 +56,7 @@ SPECS: dict[Parameter, ParameterSpec] = {
     ),
     Parameter.TRANSLATE: ParameterSpec(2, True, "own lengths", ("translate.along", "translate.across")),
     Parameter.ROTATE: ParameterSpec(1, True, "rad", ("yaw",)),
-    Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", lattice_names("ffd", _HALF)),
+    Parameter.MESH: ParameterSpec(ffd.SYMMETRIC_DIM, True, "unit boxes", lattice_names("ffd", _HALF_LATTICE)),
     Parameter.SIZE: ParameterSpec(1, True, "share of its own", ("size",)),
     Parameter.SUN: ParameterSpec(
         LIGHT_DIM, False, "code", tuple(f"sun.{n}" for n in ("azimuth", "elevation", "strength"))
@@ -63,8 +64,8 @@ SPECS: dict[Parameter, ParameterSpec] = {
 }
 
 Parametrisation = Literal["ground", "roi"]
-"""What `translate` counts: own lengths along and across, on the ground; or as 3D-SDN does (`attack.regions`)."""
-_IN_REGIONS = ParameterSpec(
+"""Unit of `translate`: own lengths along and across, on the ground; or 3D-SDN's image offsets (`attack.roi`)."""
+_ROI_TRANSLATE = ParameterSpec(
     ROI_DIM, True, "of its box, log depth", tuple(f"translate.{n}" for n in ("right", "down", "log_depth"))
 )
 
@@ -77,43 +78,49 @@ COMBOS: dict[int, tuple[Parameter, ...]] = {
 """The paper's combinations for detection."""
 
 
-_HARDLY_CUT = 0.1
-"""Truncation up to which moved cars were held against the truth (`python -m tools.bench moves`)."""
+_MAX_TRUNCATION = 0.1
+"""Truncation up to which moved vehicles were compared with the truth (`python -m tools.bench moves`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How far each parameter may go from the photograph, at most. Codes end at these values whatever they start
-    from; the others are distances from the photographed scene, and of several bounds the nearest binds. translate:
-    own lengths; translate_m: metres, the same for long and short cars; across_m: metres, across alone;
-    of_distance: share of the car's distance from the camera; partly: own lengths, of cars that the photograph does
-    not show whole (`shown_whole`); rotate: rad; mesh: unit boxes (the bound on strain in
-    `drivesem.attack.feasible` is the one that binds); size: share of a car's own, larger or smaller, 0 where
-    sizes are held, as they are of cars that are not shown whole; sun: codes, 0 where it is held.
+    """Limits of the change. Codes are bounded in value, whatever they start from; other limits are distances from
+    the photographed scene. Where several limits apply, the tightest binds.
     """
 
     color: float = 1.0
+    """Code, absolute."""
     weather: float = 1.0
+    """Code."""
     foliage: float = 1.0
+    """Code, absolute."""
     translate: float = 0.25
+    """Own lengths, along and across."""
     rotate: float = 0.35
+    """rad."""
     mesh: float = 0.25
+    """Unit boxes; the bound on strain (`drivesem.attack.feasible`) is usually tighter."""
     size: float = 0.0
+    """Share of a vehicle's own size, larger or smaller; 0 fixes it. Vehicles that are not fully visible keep
+    theirs."""
     sun: float = 0.0
+    """Code, absolute; 0 fixes it."""
     translate_m: float = math.inf
+    """Metres, along and across, the same for long and short vehicles."""
     across_m: float = math.inf
-    of_distance: float = math.inf
-    partly: float = math.inf
+    """Metres, across alone."""
+    distance_share: float = math.inf
+    """Share of the vehicle's distance from the camera."""
+    partly_visible: float = math.inf
+    """Own lengths, for vehicles that are not `fully_visible` in the photograph."""
 
     def __post_init__(self) -> None:
-        unbounded = ("translate_m", "across_m", "of_distance", "partly")
-        _check_positive("budget", self, unbounded, may_be_held=("size", "sun"))
+        unbounded = ("translate_m", "across_m", "distance_share", "partly_visible")
+        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun"))
 
     def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
-        """FormatError where one of the parameters is held by this budget, or bounded in metres, which `roi` has
-        none of.
-        """
-        metres = (self.translate_m, self.across_m, self.of_distance, self.partly)
+        """Raise FormatError for a parameter that this budget fixes, or for a budget in metres with `roi`."""
+        metres = (self.translate_m, self.across_m, self.distance_share, self.partly_visible)
         if parametrisation == "roi" and min(metres) < math.inf:
             expected = "a budget without metres, such as paper or translate=0.1, with --parametrisation roi"
             raise FormatError("budget", expected, "one with metres")
@@ -125,8 +132,9 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class StepSizes:
-    """The step alpha for each parameter, in theta's units: the paper's, of sizes as long as that of places, of the
-    sun as that of leaves."""
+    """The step alpha of each parameter, in theta's units: the paper's; size steps like translate, sun like
+    foliage.
+    """
 
     color: float = 0.05
     weather: float = 0.25
@@ -142,50 +150,54 @@ class StepSizes:
 
 
 def _check_positive(
-    what: str, values: Budget | StepSizes, unbounded: Collection[str] = (), may_be_held: Collection[str] = ()
+    what: str, values: Budget | StepSizes, unbounded: Collection[str] = (), zero_allowed: Collection[str] = ()
 ) -> None:
     for entry in fields(values):
         value = getattr(values, entry.name)
-        positive = value > 0 or (value == 0 and entry.name in may_be_held)
+        positive = value > 0 or (value == 0 and entry.name in zero_allowed)
         if not (positive and (math.isfinite(value) or entry.name in unbounded)):
             raise RangeError(f"{what}.{entry.name}", "a positive number", value)
 
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
-    """theta by parameter; None where a parameter is held. color (N, 5), weather (4,), foliage (3,),
-    translate (N, 2), of `roi` (N, 3), rotate (N, 1), mesh (N, 96), size (N, 1), sun (3,): changes from the
-    photographed scene.
-    """
+    """theta by parameter, as changes from the photographed scene; None for a fixed parameter."""
 
     color: Tensor | None = None
+    """(N, 5), codes."""
     weather: Tensor | None = None
+    """(4,), codes."""
     foliage: Tensor | None = None
+    """(3,), codes."""
     translate: Tensor | None = None
+    """(N, 2) own lengths, with `roi` (N, 3)."""
     rotate: Tensor | None = None
+    """(N, 1) rad."""
     mesh: Tensor | None = None
+    """(N, 96) unit boxes."""
     size: Tensor | None = None
+    """(N, 1), share of the own size."""
     sun: Tensor | None = None
+    """(3,), codes."""
 
 
 def parse_params(text: str) -> tuple[Parameter, ...]:
     """Parameters from "translate,rotate,mesh". Raises FormatError naming the unknown one and the known ones."""
-    return parameters_of(Parameter, (part for part in text.split(",") if part.strip()))
+    return select_parameters(Parameter, (part for part in text.split(",") if part.strip()))
 
 
-def combo(number: int) -> tuple[Parameter, ...]:
-    """The paper's combination by number. Raises RangeError on an unknown one."""
+def combo_parameters(number: int) -> tuple[Parameter, ...]:
+    """The parameters of one of the paper's combinations. Raises RangeError on an unknown number."""
     if number not in COMBOS:
         raise RangeError("combo", f"one of {', '.join(map(str, COMBOS))}", number)
     return COMBOS[number]
 
 
 class ParameterSpace(ThetaSpace[Parameter]):
-    """The vector theta (D,) of one scene: names, bounds, steps, and the way from theta to a perturbed scene.
+    """The vector theta (D,) of one scene: names, bounds, steps, and the perturbed scene at theta.
 
-    Blocks follow each other in the order of `Parameter`; a block of a parameter of cars is (N, size), row-major.
-    dtype and device are those of the scene. parametrisation: of translate; of `roi` the budget's bound and the
-    step count for each of its three numbers. Raises FormatError for a parameter that the budget holds.
+    Blocks follow each other in the order of `Parameter`; a block of a vehicle parameter is (N, size), row-major.
+    dtype and device are those of the scene.
     """
 
     def __init__(
@@ -196,16 +208,30 @@ class ParameterSpace(ThetaSpace[Parameter]):
         steps: StepSizes | None = None,
         parametrisation: Parametrisation = "ground",
     ) -> None:
-        specs = SPECS | {Parameter.TRANSLATE: _IN_REGIONS} if parametrisation == "roi" else SPECS
-        super().__init__(parameters_of(Parameter, params), specs, len(scene.objects), scene.objects.translation)
+        """Lay out theta.
+
+        Args:
+            scene: the photographed scene.
+            params: what theta moves.
+            budget: limits of the change.
+            steps: the step alpha of each parameter.
+            parametrisation: of translate; with `roi` limit and step apply to each of its three numbers.
+
+        Raises:
+            FormatError: the budget fixes one of the parameters.
+        """
+        specs = SPECS | {Parameter.TRANSLATE: _ROI_TRANSLATE} if parametrisation == "roi" else SPECS
+        super().__init__(
+            select_parameters(Parameter, params), specs, len(scene.objects), scene.objects.translation
+        )
         self.scene = scene
         self.parametrisation: Parametrisation = parametrisation
         self.budget = budget or Budget()
         self.budget.check(self.params, parametrisation)
         self.steps = steps or StepSizes()
-        # Constant, as nobody asks for a gradient to the photographed scene.
-        self._axes = _ground_axes_of(scene).detach()
-        self.regions = Regions.of(scene) if parametrisation == "roi" else None
+        # Constant: no gradient flows to the photographed scene.
+        self._axes = _scene_ground_axes(scene).detach()
+        self.regions = RegionsOfInterest.from_scene(scene) if parametrisation == "roi" else None
         for parameter, where in self._slices.items():
             low, high = self._bounds(parameter)
             self.lower[where] = low
@@ -229,7 +255,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
             where = self._slices.get(parameter)
             if where is None:
                 if value is not None:
-                    raise ShapeError(f"perturbation.{parameter.value}", "None (it is held)", tuple(value.shape))
+                    raise ShapeError(f"perturbation.{parameter.value}", "None (it is fixed)", tuple(value.shape))
                 continue
             spec = self.specs[parameter]
             shape = (self.count, spec.size) if spec.per_object else (spec.size,)
@@ -243,19 +269,19 @@ class ParameterSpace(ThetaSpace[Parameter]):
         return torch.cat(parts) if parts else self.theta0
 
     def apply(self, scene: SceneIR, theta: Tensor) -> SceneIR:
-        """The scene at theta (D,); differentiable to theta. At theta = 0 all tensors equal the originals exactly.
+        """The scene at theta (D,); differentiable in theta. At theta = 0 all tensors equal the originals exactly.
 
-        A translation is a fraction of the car's own length, along and across its photographed heading, and the car
-        keeps its height above the ground plane; or it is what `Regions` says. A size grows from its bottom face:
-        the wheels stay where they are. Mesh offsets are symmetric left to right, added to the source's.
-        Raises ShapeError, and RangeError naming a coordinate that is not finite.
+        A translation is a share of the vehicle's own length, along and across its photographed heading, at constant
+        height above the ground plane; with `roi` see `RegionsOfInterest`. Sizes scale about the bottom face, so that
+        wheels stay in place. Mesh offsets are symmetric left to right and added to the source's. Raises ShapeError,
+        and RangeError naming a coordinate that is not finite.
         """
         self.check(theta)
         part = self.unflatten(theta)
         objects, environment = scene.objects, scene.environment
         changes: dict[str, Tensor] = {}
         if part.translate is not None:
-            changes["translation"] = objects.translation + self._shift(scene, part.translate)
+            changes["translation"] = objects.translation + self._shift_m(scene, part.translate)
         if part.rotate is not None:
             changes["yaw"] = objects.yaw + part.rotate[:, 0]
         if part.mesh is not None:
@@ -263,42 +289,42 @@ class ParameterSpace(ThetaSpace[Parameter]):
         if part.size is not None:
             changes["size_lhw"] = objects.size_lhw * (1 + part.size)
         if part.color is not None:
-            changes["texture_code"] = _within(
+            changes["texture_code"] = _clamp_code(
                 objects.texture_code, part.color, -self.budget.color, self.budget.color
             )
         if changes:
             scene = scene.with_objects(**changes)
         codes: dict[str, Tensor] = {}
         if part.weather is not None:
-            codes["weather"] = _within(environment.weather, part.weather, 0.0, self.budget.weather)
+            codes["weather"] = _clamp_code(environment.weather, part.weather, 0.0, self.budget.weather)
         if part.foliage is not None:
             limit = self.budget.foliage
-            codes["foliage"] = _within(environment.foliage, part.foliage, -limit, limit)
+            codes["foliage"] = _clamp_code(environment.foliage, part.foliage, -limit, limit)
         if part.sun is not None:
             light = environment.light.to(part.sun)
-            codes["light"] = _within(light, part.sun, -self.budget.sun, self.budget.sun)
+            codes["light"] = _clamp_code(light, part.sun, -self.budget.sun, self.budget.sun)
         return scene.with_environment(**codes) if codes else scene
 
-    def _shift(self, scene: SceneIR, translate: Tensor) -> Tensor:
-        """What translate's block moves, (N, 3) m."""
+    def _shift_m(self, scene: SceneIR, translate: Tensor) -> Tensor:
+        """Shift (N, 3) m caused by translate's block."""
         if self.regions is not None:
-            return (self.regions if scene is self.scene else Regions.of(scene)).shift(translate)
-        axes = self._axes if scene is self.scene else _ground_axes_of(scene)
+            return (self.regions if scene is self.scene else RegionsOfInterest.from_scene(scene)).shift(translate)
+        axes = self._axes if scene is self.scene else _scene_ground_axes(scene)
         return (translate[:, None] @ axes)[:, 0]
 
-    def carried(self, other: ParameterSpace, theta: Tensor) -> Tensor:
-        """theta (D',) of another space of the same parameters, as one (D,) of this one, whose scene has the same
-        vehicles, and perhaps more after them.
+    def convert_theta(self, other: ParameterSpace, theta: Tensor) -> Tensor:
+        """theta (D,) of this space with the values of theta (D',) of another space of the same parameters. This
+        scene has the other's vehicles, possibly followed by more.
         """
         other.unflatten(theta)
-        here = self.theta0.clone()
+        converted = self.theta0.clone()
         for parameter, where in other.blocks.items():
             start = self.blocks[parameter].start
-            here[start : start + where.stop - where.start] = theta[where]
-        return here
+            converted[start : start + where.stop - where.start] = theta[where]
+        return converted
 
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
-        """`value` of coordinate `i` in metres ("m"), degrees ("deg") or percent ("%"); None for a bare code."""
+        """`value` of coordinate `i` in metres ("m"), degrees ("deg") or percent ("%"); None for a code."""
         parameter, owner, k = self._locate(i)
         size_lhw = self.scene.objects.size_lhw
         if parameter is Parameter.TRANSLATE and self.regions is not None:
@@ -314,7 +340,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
         return None
 
     def _bounds(self, parameter: Parameter) -> tuple[Tensor | float, Tensor | float]:
-        """Bounds of theta's block of `parameter`; they always hold 0."""
+        """Bounds of theta's block of `parameter`; they always include 0."""
         limit = getattr(self.budget, parameter.value)
         if parameter is Parameter.COLOR:
             start, low = self.scene.objects.texture_code.reshape(-1), -limit
@@ -327,15 +353,15 @@ class ParameterSpace(ThetaSpace[Parameter]):
         elif parameter is Parameter.TRANSLATE and self.parametrisation == "ground":
             budget, objects = self.budget, self.scene.objects
             length_m, place = objects.size_lhw[:, :1].detach(), objects.translation.detach()
-            most_m = length_m.new_tensor([budget.translate_m, min(budget.translate_m, budget.across_m)])
-            most_m = torch.minimum(most_m, budget.of_distance * place.norm(dim=1, keepdim=True))
-            reach = (most_m / length_m).clamp(max=limit)
-            partly = ~shown_whole(self.scene)
-            reach[partly] = reach[partly].clamp(max=budget.partly)
+            limit_m = length_m.new_tensor([budget.translate_m, min(budget.translate_m, budget.across_m)])
+            limit_m = torch.minimum(limit_m, budget.distance_share * place.norm(dim=1, keepdim=True))
+            reach = (limit_m / length_m).clamp(max=limit)
+            hidden = ~fully_visible(self.scene)
+            reach[hidden] = reach[hidden].clamp(max=budget.partly_visible)
             return -reach.reshape(-1), reach.reshape(-1)
         elif parameter is Parameter.SIZE:
-            grown = torch.where(shown_whole(self.scene), limit, 0.0)
-            return -grown, grown
+            growth = torch.where(fully_visible(self.scene), limit, 0.0)
+            return -growth, growth
         else:
             return -limit, limit
         start = start.detach()
@@ -343,33 +369,38 @@ class ParameterSpace(ThetaSpace[Parameter]):
 
 
 def behind_camera(scene: SceneIR) -> Tensor:
-    """(N,) bool: the vehicles that are not in the scene (`scene_ir.exchange`), which nothing moves."""
+    """(N,) bool, vehicles behind the camera: placeholders that are not in the scene (`scene_ir.exchange`)."""
     return scene.objects.translation[:, 2] < 0
 
 
-def shown_whole(scene: SceneIR) -> Tensor:
-    """(N,) bool: the cars that nothing hides, and that the picture's border hardly cuts. Of others a long way
-    shows what no photograph did.
+def fully_visible(scene: SceneIR) -> Tensor:
+    """(N,) bool, vehicles that nothing hides and that the picture's border hardly cuts. Moving others far would
+    show surfaces that the photograph does not.
     """
-    return (scene.objects.occlusion == 0) & (scene.objects.truncation <= _HARDLY_CUT)
+    return (scene.objects.occlusion == 0) & (scene.objects.truncation <= _MAX_TRUNCATION)
 
 
 def ground_axes(yaw: Tensor, length_m: Tensor, ground: Tensor) -> Tensor:
-    """Shifts (N, 2, 3) m of cars on the ground plane: by one own length along the heading, and by one across it
-    (towards +z of their own frame). yaw (N,) rad; length_m (N,); ground (4,): n.x + d = 0.
+    """Shifts of vehicles on the ground plane by one own length along and across their heading, at constant height.
 
-    The horizontal part follows heading; y follows the plane, so the height above it is kept.
+    Args:
+        yaw: (N,) rad.
+        length_m: (N,) m.
+        ground: (4,), the plane n.x + d = 0.
+
+    Returns:
+        (N, 2, 3) m: along, and across towards +z of the vehicle's frame.
     """
     flat = yaw_matrix(yaw).transpose(-1, -2)[:, ::2]
     y = -(ground[0] * flat[..., 0] + ground[2] * flat[..., 2]) / ground[1]
     return torch.stack([flat[..., 0], y, flat[..., 2]], dim=-1) * length_m[:, None, None]
 
 
-def _ground_axes_of(scene: SceneIR) -> Tensor:
+def _scene_ground_axes(scene: SceneIR) -> Tensor:
     objects = scene.objects
     return ground_axes(objects.yaw, objects.size_lhw[:, 0], scene.environment.ground)
 
 
-def _within(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
-    """start + change within [low, high], or up to `start` where that lies outside: 0 changes nothing."""
-    return kept_within(start + change, start.clamp(max=low), start.clamp(min=high))
+def _clamp_code(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
+    """start + change within [low, high], or up to `start` where that lies outside, so that 0 changes nothing."""
+    return clamp_inclusive(start + change, start.clamp(max=low), start.clamp(min=high))

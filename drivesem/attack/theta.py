@@ -1,7 +1,8 @@
-"""theta, the flat vector of all that an attack moves: its blocks; the name, unit and bounds of each coordinate.
+"""theta, the flat vector of parameters that an attack moves: its blocks, and each coordinate's name, unit and
+bounds.
 
-What the parameters are, and what they do to a scene, its subclasses say: of streets in `drivesem.attack.space`, of
-objects before a classifier in `drivesem.classify.space`.
+Subclasses define the parameters and their effect: `drivesem.attack.space` for street scenes,
+`drivesem.classify.space` for objects in front of a classifier.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from scene_ir.types import check_finite
 P = TypeVar("P", bound=StrEnum)
 
 
-def parameters_of(kind: type[P], names: Iterable[str]) -> tuple[P, ...]:
+def select_parameters(kind: type[P], names: Iterable[str]) -> tuple[P, ...]:
     """Parameters by name, in theta's order. Raises FormatError on an unknown, a repeated or no parameter."""
     known = [str(p) for p in kind]
-    asked = [name.strip() for name in names]
-    for name in asked:
+    selected = [name.strip() for name in names]
+    for name in selected:
         if name not in known:
             raise FormatError("params", f"names among {', '.join(known)}", repr(name))
-    if not asked:
+    if not selected:
         raise FormatError("params", f"at least one of {', '.join(known)}", "none")
-    if len(set(asked)) != len(asked):
-        raise FormatError("params", "each parameter once", ",".join(asked))
-    return tuple(p for p in kind if p.value in asked)
+    if len(set(selected)) != len(selected):
+        raise FormatError("params", "each parameter once", ",".join(selected))
+    return tuple(p for p in kind if p.value in selected)
 
 
 def lattice_names(word: str, shape: Sequence[int]) -> tuple[str, ...]:
@@ -43,32 +44,51 @@ def lattice_names(word: str, shape: Sequence[int]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
-    """Facts of one parameter. size: coordinates an owner (`per_object`) or a scene; unit: of theta, for people;
-    names: of the coordinates, after `objects[i].` where it belongs to an owner; owner: the word for these.
-    """
+    """Facts about one parameter."""
 
     size: int
+    """Number of coordinates, per owner or per scene."""
     per_object: bool
+    """Whether each owner has its own."""
     unit: str
+    """Unit of theta, for people."""
     names: tuple[str, ...]
+    """Names of the coordinates, after `objects[i].` if they belong to an owner."""
     owner: str = "objects"
+    """Name of the owners."""
 
 
 @dataclass(frozen=True, slots=True)
-class Projected:
-    """theta (D,) in the feasible set, and the constraints that held it back, such as `objects[3]: collision`."""
+class ProjectedTheta:
+    """theta projected onto the feasible set."""
 
     theta: Tensor
+    """(D,)."""
     active: tuple[str, ...]
+    """Active constraints, such as `objects[3]: collision`."""
 
 
 class ThetaSpace(ABC, Generic[P]):
-    """The layout of theta (D,): blocks follow each other in the order of `params`; a block of a parameter with
-    owners is (N, size), row-major. theta0, lower, upper, step (D,): where it starts, its bounds, the step alpha of
-    each coordinate; they have `like`'s dtype and device. count: N, how many owners there are.
+    """The layout of theta (D,): blocks in the order of `params`; a block of a parameter with owners is (N, size),
+    row-major.
+
+    Attributes:
+        theta0: (D,), where attacks start.
+        lower: (D,), lower bounds.
+        upper: (D,), upper bounds.
+        step: (D,), the step alpha of each coordinate.
+        count: N, number of owners.
     """
 
     def __init__(self, params: Sequence[P], specs: Mapping[P, ParameterSpec], count: int, like: Tensor) -> None:
+        """Lay out the blocks.
+
+        Args:
+            params: the parameters, in theta's order.
+            specs: facts about each parameter.
+            count: number of owners.
+            like: its dtype and device are theta's.
+        """
         self.params = tuple(params)
         self.specs = specs
         self.count = count
@@ -84,19 +104,15 @@ class ThetaSpace(ABC, Generic[P]):
 
     @property
     def blocks(self) -> Mapping[P, slice]:
-        """Where theta holds each of its parameters, in its order."""
+        """The slice of theta of each parameter, in theta's order."""
         return self._slices
 
-    def owners(self, parameter: P) -> int:
-        """How many owners a parameter has: 0 where it is a scene's."""
+    def owner_count(self, parameter: P) -> int:
+        """Number of owners of a parameter; 0 for one of the scene."""
         return self.count if self.specs[parameter].per_object else 0
 
-    def slice_of(self, parameter: P) -> slice | None:
-        """Where theta holds `parameter`, or None where it is held."""
-        return self._slices.get(parameter)
-
     def name(self, i: int) -> str:
-        """The name of coordinate `i`, for instance `objects[3].yaw`."""
+        """The name of coordinate `i`, such as `objects[3].yaw`."""
         parameter, owner, k = self._locate(i)
         spec = self.specs[parameter]
         return f"{spec.owner}[{owner}].{spec.names[k]}" if spec.per_object else spec.names[k]
@@ -107,8 +123,8 @@ class ThetaSpace(ABC, Generic[P]):
         return f"{self.name(i)}, {unit}, [{float(self.lower[i]):g}, {float(self.upper[i]):g}]"
 
     def block(self, theta: Tensor, parameter: P) -> Tensor | None:
-        """theta's (D,) block of a parameter, a view of it: (N, size), or (size,) of a scene; None where it is
-        held.
+        """The block of a parameter, a view of theta (D,): (N, size), or (size,) for one of the scene; None where
+        it is fixed.
         """
         where, spec = self._slices.get(parameter), self.specs[parameter]
         if where is None:
@@ -116,7 +132,7 @@ class ThetaSpace(ABC, Generic[P]):
         return theta[where].reshape((self.count, spec.size) if spec.per_object else (spec.size,))
 
     def check(self, theta: Tensor) -> None:
-        """ShapeError for another shape than (D,), RangeError naming a coordinate that is not finite."""
+        """Raise ShapeError for another shape than (D,), RangeError naming a coordinate that is not finite."""
         if tuple(theta.shape) != (self.dim,):
             raise ShapeError("theta", f"shape ({self.dim},)", tuple(theta.shape))
         finite = theta.isfinite()
@@ -125,18 +141,18 @@ class ThetaSpace(ABC, Generic[P]):
             raise RangeError(f"theta: {self.name(i)}", "a finite value", float(theta[i]))
 
     def check_gradient(self, gradient: Tensor) -> None:
-        """RangeError naming the coordinate of a gradient (D,) that is not finite."""
-        bad = (~gradient.isfinite()).nonzero()
-        if len(bad):
-            i = int(bad[0])
+        """Raise RangeError naming a coordinate of a gradient (D,) that is not finite."""
+        not_finite = (~gradient.isfinite()).nonzero()
+        if len(not_finite):
+            i = int(not_finite[0])
             raise RangeError(f"gradient of {self.name(i)}", "a finite value", float(gradient[i]))
 
     @abstractmethod
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
-        """`value` of coordinate `i` in a unit that people use, such as "m" or "deg"; None for a bare number."""
+        """`value` of coordinate `i` in a common unit, such as "m" or "deg"; None for a bare number."""
 
     def display(self, i: int, value: float) -> str:
-        """`value` of coordinate `i` as people write it: `0.21 m`, `5.7 deg`, `3 %`, `0.25`."""
+        """`value` of coordinate `i` for people: `0.21 m`, `5.7 deg`, `3 %`, `0.25`."""
         physical = self.physical(i, value)
         return f"{value:.3g}" if physical is None else f"{physical[0]:.3g} {physical[1]}"
 
@@ -158,7 +174,7 @@ class ThetaSpace(ABC, Generic[P]):
         }
 
     def _locate(self, i: int) -> tuple[P, int, int]:
-        """Parameter, owner (0 for a scene's parameter) and place within them of coordinate `i`."""
+        """Parameter, owner (0 for one of the scene) and index within them of coordinate `i`."""
         if not 0 <= i < self.dim:
             raise RangeError("theta coordinate", f"an index in [0, {self.dim})", i)
         for parameter, where in self._slices.items():

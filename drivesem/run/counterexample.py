@@ -148,7 +148,7 @@ def _describe_failure(failure: Failure) -> str:
     score = "" if failure.score is None else f"score {failure.score:.2f}"
     opinions = (page.format_second_opinion(failure, agreement) for agreement in (failure.second, failure.peer))
     evidence = [text for text in (score, page.format_draws(failure), *opinions) if text]
-    return "; ".join((f"{failure.grade}: {page.what(failure)}{which} at {place} px", *evidence))
+    return "; ".join((f"{failure.grade}: {page.describe_failure(failure)}{which} at {place} px", *evidence))
 
 
 def run_attack(scene: Scene | SceneIR, detector: str | Predictor = "squeezedet", **options: Any) -> Counterexample:

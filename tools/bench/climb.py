@@ -10,17 +10,16 @@ from functools import partial
 import torch
 
 from detectors.base import Detector
-from drivesem.attack.methods.climb import Climb
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace
-from drivesem.bench.scenes import bench_scene
+from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
+from drivesem.config.commands import AttackConfig
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.run.frame import FrameSettings, attack_scene
+from drivesem.run.attack import AttackWorker
 from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR, convert_scene
 
 TITLE = "A search by climb"
@@ -70,11 +69,12 @@ def measure(
 ) -> Iterator[ClimbRow]:
     """A row for each number of cars and each of `detectors`, which are named by what they compute in."""
     for count in cars:
-        scene = convert_scene(bench_scene(count, _TRIANGLES, seed).scene, torch.float32, "cpu")
+        scene = convert_scene(build_bench_scene(count, _TRIANGLES, seed).scene, torch.float32, "cpu")
         for precision, detector in detectors.items():
             parts = _parts(scene, params, repetitions, detector, seed)
-            settings = FrameSettings(Climb(passes), params, "moved", "objectness", RenderSettings(), seed)
-            milliseconds = _ms(partial(attack_scene, "bench", scene, detector, settings))
+            config = AttackConfig(method="climb", params=",".join(params), passes=passes, grade=False, seed=seed)
+            worker = AttackWorker.from_config(config, detector)
+            milliseconds = _ms(partial(worker.attack_scene, "bench", scene))
             yield ClimbRow(
                 cars=count,
                 params=",".join(params),
@@ -82,7 +82,7 @@ def measure(
                 precision=precision,
                 search_s=round(milliseconds / 1e3, 2),
                 repetitions=repetitions,
-                **{name: round(Spread.of(times).median, 1) for name, times in parts.items()},
+                **{name: round(Spread.from_values(times).median, 1) for name, times in parts.items()},
             )
 
 

@@ -102,15 +102,15 @@ def _attack(order: ProbeOrder) -> Resident:
 
     from detectors.registry import load_detector
     from drivesem.attack.feasible.projection import FeasibleSet
-    from drivesem.attack.objective import Objective
-    from drivesem.attack.space import ParameterSpace, combo
+    from drivesem.attack.objective import Objective, compute_gradients
+    from drivesem.attack.space import ParameterSpace, combo_parameters
     from scene_ir.io import load_scene
     from scene_ir.render.compositor import Compositor
 
     torch.set_num_threads(order.threads)
     libraries = _resident_kb()
     scene = load_scene(Path(str(order.scene)))
-    space = ParameterSpace(scene, combo(2))
+    space = ParameterSpace(scene, combo_parameters(2))
     objective = Objective(Compositor(scene), space, load_detector(order.detector))
     feasible = FeasibleSet(space)
     generator = torch.Generator().manual_seed(order.seed)
@@ -121,7 +121,7 @@ def _attack(order: ProbeOrder) -> Resident:
         if order.batch == 1:
             gradients = [objective.loss_and_grad(thetas[0])[1]]
         else:
-            gradients = objective.loss_and_grad_many(torch.stack(thetas))[1]
+            gradients = [gradient for _, gradient in compute_gradients([objective] * len(thetas), thetas)]
         thetas[:] = [
             feasible.project(theta + space.step * torch.sign(gradient)).theta
             for theta, gradient in zip(thetas, gradients, strict=True)
@@ -157,10 +157,10 @@ def _peak_kb() -> int:
 
 def main(words: list[str]) -> None:
     """Run what the words ask for and leave the result in the file."""
-    from drivesem.run.jobs import keep_freed
+    from drivesem.run.jobs import keep_freed_memory
     from scene_ir.files import write_json
 
-    keep_freed()
+    keep_freed_memory()
     what, order, path = words
     run: dict[str, Callable[[ProbeOrder], Any]] = {"detector": _detector_alone, "attack": _attack}
     write_json(Path(path), asdict(run[what](ProbeOrder(**json.loads(order)))))

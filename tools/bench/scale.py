@@ -12,16 +12,15 @@ from typing import Literal
 
 from detectors.base import Detector
 from detectors.registry import load_detector
-from drivesem.attack.methods.fgsm import FGSM
-from drivesem.attack.space import Parameter
-from drivesem.bench.scenes import bench_scene
+from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
+from drivesem.config.commands import AttackConfig
+from drivesem.run.attack import AttackWorker
 from drivesem.run.finished import PICTURES
-from drivesem.run.frame import FrameSettings, attack_scene, write_frame
+from drivesem.run.frame import write_frame
 from drivesem.run.workers import run_jobs
 from scene_ir import files
-from scene_ir.render.prepare import RenderSettings
 from tools.bench.settings import DetectorBenchConfig
 
 Engine = Literal["local", "ray"]
@@ -99,15 +98,15 @@ def measure(config: DetectorBenchConfig) -> Iterator[Row]:
     same = sum(told["local"][number] == told["ray"][number] for number in told["local"])
     for engine in engines:
         times = rounds[engine]
-        frame = Spread.of([one.frame_ms for one in times])
-        own = Spread.of([ms for one in times for ms in one.own_ms])
+        frame = Spread.from_values([one.frame_ms for one in times])
+        own = Spread.from_values([ms for one in times for ms in one.own_ms])
         mean = sum(sum(one.own_ms) for one in times) / sum(len(one.own_ms) for one in times)
         yield Row(
             engine=engine,
             processes=processes,
             frames=count * a_round,
             first_s=round(first[engine].start_s, 2),
-            start_s=round(Spread.of([one.start_s for one in times]).median, 2),
+            start_s=round(Spread.from_values([one.start_s for one in times]).median, 2),
             frame_ms=round(frame.median, 1),
             frame_iqr=round(frame.iqr, 1),
             own_ms=round(own.median, 1),
@@ -142,10 +141,9 @@ def _worker(name: str) -> Callable[[int], tuple[float, str]]:
 def _frame(number: int, detector: Detector) -> tuple[float, str]:
     """Seconds that a frame takes, and its picture's hash."""
     begun = time.perf_counter()
-    scene = bench_scene(_CARS, _TRIANGLES, number, _SCALE).scene
-    params = (Parameter.TRANSLATE, Parameter.ROTATE)
-    settings = FrameSettings(FGSM(1), params, "moved", "objectness", RenderSettings(), number)
-    attacked = attack_scene(f"bench-{number}", scene, detector, settings)
+    scene = build_bench_scene(_CARS, _TRIANGLES, number, _SCALE).scene
+    config = AttackConfig(method="fgsm", params="translate,rotate", steps=1, grade=False, seed=number)
+    attacked = AttackWorker.from_config(config, detector).attack_scene(f"bench-{number}", scene)
     with tempfile.TemporaryDirectory(prefix="drivesem-scale-") as folder:
         write_frame(attacked, Path(folder) / "frame")
         told = files.sha256_digest(Path(folder) / "frame" / PICTURES["attacked"])

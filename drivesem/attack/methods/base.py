@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, final
 
 import torch
 from torch import Tensor
 
-from drivesem.attack.theta import Projected
+from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import RangeError
 
 GRADIENT_PASSES = 3
 """What a gradient counts, where a forward pass of the network counts 1."""
-LOOKED_AT = 5
+MAX_RESCORED = 5
 """Of the iterates that a gradient pass saw, so many of the most promising are rendered and judged."""
 _TINY = 1e-30
 """Keeps a division defined where its result is not used."""
@@ -66,7 +66,7 @@ def _unseen(theta: Tensor) -> Score | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class ParameterGroup:
     """A block of theta that belongs together: one parameter of the scene, or of all its cars. where: its
     coordinates; owners: how many objects it holds, one after the other, 0 for a parameter of the scene; modes:
     (K, M) directions in an object's M coordinates along which to look where there are too many of these, None for
@@ -80,7 +80,7 @@ class Group:
     smooth: bool = True
 
 
-class Views(Protocol):
+class MarginOracle(Protocol):
     """Margins of a scene's objects, in logits, in what a camera sees of it from time to time.
 
     number: of the view; the same number sees different thetas alike. passes: of the detector so far.
@@ -91,7 +91,7 @@ class Views(Protocol):
     def differentiable(self) -> bool: ...
 
     @property
-    def judged(self) -> Tensor:
+    def counted_objects(self) -> Tensor:
         """(N,) bool: objects that are found as photographed, and count."""
         ...
 
@@ -121,15 +121,15 @@ class Problem:
     """
 
     loss_and_grad: Callable[[Tensor], tuple[float, Tensor]]
-    project: Callable[[Tensor], Projected]
+    project: Callable[[Tensor], ProjectedTheta]
     score: Callable[[Tensor], Score]
     step: Tensor
     lower: Tensor
     upper: Tensor
-    groups: tuple[Group, ...] = (Group("theta", slice(None)),)
+    groups: tuple[ParameterGroup, ...] = (ParameterGroup("theta", slice(None)),)
     preview: Callable[[Tensor], Score | None] = _unseen
     keep_last: bool = False
-    views: Views | None = None
+    margin_oracle: MarginOracle | None = None
 
     def in_steps(self, theta: Tensor) -> Tensor:
         """theta (D,) in steps alpha; 0 where a coordinate is held. Differentiable."""
@@ -146,10 +146,6 @@ class Problem:
             block = weight[group.where]
             block.fill_(max(len(block), 1) ** (-1 / p))
         return torch.linalg.vector_norm(weight * self.in_steps(theta), p)
-
-    def moved(self, theta: Tensor) -> tuple[Group, ...]:
-        """The groups that theta (D,) changes."""
-        return tuple(group for group in self.groups if bool((theta[group.where] != 0).any()))
 
     def box(self, theta0: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
         """Where a search may look: lower and upper (D,), so many steps around theta0, within the bounds; the whole
@@ -172,17 +168,6 @@ class Proposals:
     losses: tuple[float | None, ...]
     queries: int
     active_constraints: tuple[str, ...] = ()
-
-    @classmethod
-    def joined(cls, runs: Iterable[Proposals]) -> Proposals:
-        """What several runs propose, one after the other."""
-        runs = tuple(runs)
-        return cls(
-            thetas=tuple(theta for run in runs for theta in run.thetas),
-            losses=tuple(loss for run in runs for loss in run.losses),
-            queries=sum(run.queries for run in runs),
-            active_constraints=tuple(name for run in runs for name in run.active_constraints),
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,13 +210,13 @@ class Attack(ABC):
         """Run from theta0 (D,). Of theta0 and the proposals, projected and scored anew, the one that ranks highest
         (`_rank`) wins; of equals the first. What its render shows not to be feasible ranks below all others.
 
-        Scored are all that no gradient pass saw, and of the others the LOOKED_AT that rank highest by what it saw:
-        failures, and not the loss alone, which says only roughly what is lost. A score takes no gradient and
+        Scored are all that no gradient pass saw, and of the others the MAX_RESCORED that rank highest by what it
+        saw: failures, and not the loss alone, which says only roughly what is lost. A score takes no gradient and
         counts as no query.
         """
         generator = torch.Generator(device="cpu").manual_seed(seed)
         proposals = self._propose(problem, theta0, generator)
-        projected: list[Projected] = []
+        projected: list[ProjectedTheta] = []
         candidates = (theta0, *proposals.thetas)
         for candidate in candidates[-1:] if problem.keep_last else candidates:
             feasible = problem.project(candidate.detach())
@@ -261,12 +246,12 @@ class Attack(ABC):
     def _order(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         return (float(not score.violations), *self._rank(problem, theta, score))
 
-    def _promising(self, problem: Problem, projected: list[Projected]) -> list[Projected]:
+    def _promising(self, problem: Problem, projected: list[ProjectedTheta]) -> list[ProjectedTheta]:
         """What is worth a render, in its order; the first, where the attack began, always is."""
         seen: dict[int, tuple[float, ...]] = {}
         for i, candidate in enumerate(projected[1:], start=1):
             preview = problem.preview(candidate.theta)
             if preview is not None:
                 seen[i] = self._order(problem, candidate.theta, preview)
-        best = sorted(seen, key=lambda i: (seen[i], -i), reverse=True)[:LOOKED_AT]
+        best = sorted(seen, key=lambda i: (seen[i], -i), reverse=True)[:MAX_RESCORED]
         return [candidate for i, candidate in enumerate(projected) if i not in seen or i in best]

@@ -15,8 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.corners import corners
-from drivesem.attack.methods.margin_search import FAR, FINAL_PASSES, SURE, MarginSearch, OfMargins
+from drivesem.attack.methods.margin_search import (
+    FAR,
+    FINAL_PASSES,
+    SURE,
+    MarginSearch,
+    MarginSearchState,
+    balanced_corners,
+)
 
 _SCOUTS = 0.4
 """Share of the passes that look around."""
@@ -31,17 +37,17 @@ _KEPT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Climb(OfMargins):
+class Climb(MarginSearch):
     """gradient: whether to ask for gradients at all; a detector without one is searched by differences alone."""
 
     gradient: bool = True
 
-    def _found(self, search: MarginSearch) -> Tensor:
+    def _found(self, search: MarginSearchState) -> Tensor:
         place = _look_around(search, max(int(_SCOUTS * self.passes), 1))
         return _Descent(search, self.gradient and search.views.differentiable).descend(place)
 
 
-def _look_around(search: MarginSearch, count: int) -> Tensor:
+def _look_around(search: MarginSearchState, count: int) -> Tensor:
     """Where to begin, u (K,): of `count` places, and of what the best of each object make together, the one with
     the lowest margins.
     """
@@ -51,14 +57,14 @@ def _look_around(search: MarginSearch, count: int) -> Tensor:
     return starts[min(range(len(starts)), key=tried.__getitem__)]
 
 
-def _scouts(search: MarginSearch, count: int) -> Tensor:
+def _scouts(search: MarginSearchState, count: int) -> Tensor:
     """Places (count, K): balanced corners and a scrambled Halton sequence in turn."""
     from scipy.stats import qmc  # on use: it takes a third of a second to load
 
     at = search.at
     rng = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
     places = torch.from_numpy(qmc.Halton(len(at.owner), scramble=True, rng=rng).random(count))
-    places[::2] = corners(at.owner, (count + 1) // 2, search.generator)
+    places[::2] = balanced_corners(at.owner, (count + 1) // 2, search.generator)
     return places.to(at.start)
 
 
@@ -66,7 +72,7 @@ def _scouts(search: MarginSearch, count: int) -> Tensor:
 class _Descent:
     """The way downhill. gradient: whether to ask for gradients."""
 
-    search: MarginSearch
+    search: MarginSearchState
     gradient: bool
 
     def descend(self, place: Tensor) -> Tensor:
@@ -79,7 +85,7 @@ class _Descent:
         steps = max((search.left - FINAL_PASSES) // cost, 0)
         slope = torch.zeros_like(place)
         track: list[Tensor] = []
-        margins = torch.full((len(search.views.judged),), FAR, device=place.device)
+        margins = torch.full((len(search.views.counted_objects),), FAR, device=place.device)
         for step in range(steps):
             number, part = search.number(), torch.zeros_like(place)
             if bool((~wide).any()):

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
+from scipy.linalg import hadamard
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, Views, check_counts
-from drivesem.attack.methods.unit_box import UnitBox
+from drivesem.attack.methods.base import Attack, MarginOracle, Problem, Proposals, check_counts
 from scene_ir.errors import RangeError
 
 LEAST_PASSES = 24
@@ -30,22 +30,22 @@ _OTHERWISE = 4
 """Passes that the benign pictures and the judging of what is found take."""
 _POOL = 8
 """Draws that the search goes round in."""
-FRESH = _POOL + _FINAL_DRAWS
+FIRST_HELD_OUT_SAMPLE = _POOL + _FINAL_DRAWS
 """The first draw that no search looks at."""
 
 
-def value_of(margins: Tensor, judged: Tensor) -> float:
+def margin_objective(margins: Tensor, judged: Tensor) -> float:
     """What a search lowers, of margins (N,) of objects of which judged (N,) count."""
     known = margins[judged.to(margins.device)].clamp(SURE, FAR)
     return float(torch.tanh(2 * known).sum() + 0.1 * known.sum())
 
 
 @dataclass
-class MarginSearch:
+class MarginSearchState:
     """A search of the unit box within a number of passes. limit: passes in all."""
 
     problem: Problem
-    views: Views
+    views: MarginOracle
     at: UnitBox
     generator: torch.Generator
     limit: int
@@ -57,15 +57,17 @@ class MarginSearch:
         self._spent_before = self.views.passes
 
     @classmethod
-    def of(cls, problem: Problem, theta0: Tensor, generator: torch.Generator, passes: int) -> MarginSearch | None:
+    def of(
+        cls, problem: Problem, theta0: Tensor, generator: torch.Generator, passes: int
+    ) -> MarginSearchState | None:
         """Within so many passes, the benign pictures and the final judgement included; None where there is nothing
         to lose. RangeError for a problem without views.
         """
-        if problem.views is None:
+        if problem.margin_oracle is None:
             raise RangeError("problem", "one with views of its objects", "none")
-        if not bool(problem.views.judged.any()):
+        if not bool(problem.margin_oracle.counted_objects.any()):
             return None
-        return cls(problem, problem.views, UnitBox(problem, theta0), generator, passes - _OTHERWISE)
+        return cls(problem, problem.margin_oracle, UnitBox(problem, theta0), generator, passes - _OTHERWISE)
 
     @property
     def spent(self) -> int:
@@ -94,7 +96,7 @@ class MarginSearch:
 
     def value(self, margins: Tensor) -> float:
         """What is to be low: a step a lost object, and beyond that the margins themselves."""
-        return value_of(margins, self.views.judged)
+        return margin_objective(margins, self.views.counted_objects)
 
     def candidates(self, places: Tensor) -> list[Tensor]:
         """Of places (C, K), each seen in another draw: the best, and what the best of each object make together,
@@ -127,7 +129,7 @@ class MarginSearch:
 
 
 @dataclass(frozen=True, slots=True)
-class OfMargins(Attack):
+class MarginSearch(Attack):
     """A search on margins, which proposes one place. passes: of the detector in all, a gradient counted as 3.
     RangeError for fewer than LEAST_PASSES, and for a problem without views.
     """
@@ -140,12 +142,95 @@ class OfMargins(Attack):
         check_counts(LEAST_PASSES, passes=self.passes)
 
     @abstractmethod
-    def _found(self, search: MarginSearch) -> Tensor:
-        """The place u (K,) that is proposed; the last comparison (`MarginSearch.best`) takes FINAL_PASSES."""
+    def _found(self, search: MarginSearchState) -> Tensor:
+        """The place u (K,) that is proposed; the last comparison (`MarginSearchState.best`) takes FINAL_PASSES."""
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
-        search = MarginSearch.of(problem, theta0, generator, self.passes)
+        search = MarginSearchState.of(problem, theta0, generator, self.passes)
         if search is None:
             return Proposals((), (), 0)
         theta, active = search.theta(self._found(search))
         return Proposals((theta,), (None,), search.spent, active)
+
+
+class UnitBox:
+    """Places u (K,) in the unit box as thetas (D,): the bounds of each coordinate, or, in groups with modes, how
+    much of each mode. owner: (K,) the object that each belongs to, -1 for the scene; holder: (D,) the same of
+    theta's coordinates; wide: (K,) bool, where a gradient at a point says little; start: (K,) theta0's place.
+    """
+
+    def __init__(self, problem: Problem, theta0: Tensor) -> None:
+        self._problem = problem
+        blocks: list[Tensor] = []
+        owners: list[Tensor] = []
+        holders: list[Tensor] = []
+        wide: list[Tensor] = []
+        start: list[Tensor] = []
+        span = problem.upper - problem.lower
+        for group in problem.groups:
+            lower, width = problem.lower[group.where], span[group.where]
+            size, count = len(width), max(group.owners, 1)
+            if group.modes is None:
+                block = torch.diag(width)
+                at = (theta0[group.where] - lower) / width.clamp_min(1e-12)
+            else:
+                half = 0.5 * width.reshape(count, -1)
+                block = torch.block_diag(*(2 * group.modes.to(half) * row for row in half))
+                at = torch.full((len(block),), 0.5).to(block)
+            first = torch.zeros(len(block), len(theta0)).to(block)
+            first[:, group.where] = block
+            blocks.append(first)
+            start.append(at)
+            own = (torch.arange(count) if group.owners else torch.tensor([-1])).to(block.device)
+            owners.append(own.repeat_interleave(len(block) // count))
+            holders.append(own.repeat_interleave(size // count))
+            wide.append(torch.full((len(block),), not group.smooth, device=block.device))
+        self._matrix = torch.cat(blocks)
+        self.start = torch.cat(start)
+        self._offset = theta0 - self.start @ self._matrix
+        self.owner, self.holder, self.wide = torch.cat(owners), torch.cat(holders), torch.cat(wide)
+
+    def theta(self, place: Tensor) -> Tensor:
+        """theta (D,) at u (K,), within the bounds; feasible or not."""
+        theta = self._offset + place @ self._matrix
+        return torch.minimum(torch.maximum(theta, self._problem.lower), self._problem.upper)
+
+    def slope(self, gradient: Tensor) -> Tensor:
+        """Of a gradient (D,) to theta, that to u (K,)."""
+        return self._matrix @ gradient
+
+
+@dataclass(frozen=True, slots=True)
+class Corners(MarginSearch):
+    """Sees objects at corners of the bounds, each in another draw, and puts the worst corner of each together.
+
+    Proposed is the best of these and of the best corner, in draws of their own. What is not feasible is projected,
+    as everything is.
+    """
+
+    def _found(self, search: MarginSearchState) -> Tensor:
+        places = balanced_corners(search.at.owner, search.left - FINAL_PASSES, search.generator).to(
+            search.at.start
+        )
+        return search.best(search.candidates(places))
+
+
+def balanced_corners(owner: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Corners (count, K) of the unit box: rows of a Hadamard matrix, the first of which has all the scene's
+    coordinates at their upper end.
+
+    owner (K,): the object of each coordinate, -1 for the scene. Over all rows any two coordinates of one owner
+    stand at each of their four ends equally often; of `count` rows, drawn at random, nearly so.
+    """
+    owners = owner.unique().tolist()
+    most = max(int((owner == one).sum()) for one in owners)
+    size = 1 << max(count - 1, most).bit_length()
+    matrix = torch.from_numpy(hadamard(size) > 0)
+    ends = torch.empty(size, len(owner), dtype=torch.bool)
+    for one in owners:
+        own = (owner == one).cpu().nonzero()[:, 0]
+        columns = 1 + torch.randperm(size - 1, generator=generator)[: len(own)]  # the first is constant
+        turned = torch.randint(2, (len(own),), generator=generator).bool() & (one >= 0)
+        ends[:, own] = matrix[:, columns] ^ turned
+    rows = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(size - 1, generator=generator)])
+    return ends[rows[:count]].to(owner.device)

@@ -12,7 +12,7 @@ from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
 from scene_ir.errors import ShapeError
 
 if TYPE_CHECKING:
-    from drivesem.attack.theta import Projected
+    from drivesem.attack.theta import ProjectedTheta
 
 _DRAWS = 8
 """At most; after that nothing is changed."""
@@ -43,7 +43,7 @@ class Placebo(Attack):
             draws += 1
         return Proposals(thetas=(edit.theta,), losses=(None,), queries=draws, active_constraints=edit.active)
 
-    def _edit(self, problem: Problem, theta0: Tensor, like: Tensor, generator: torch.Generator) -> Projected:
+    def _edit(self, problem: Problem, theta0: Tensor, like: Tensor, generator: torch.Generator) -> ProjectedTheta:
         change = like.clone()
         for group in problem.groups:
             block = change[group.where]
@@ -56,3 +56,19 @@ class Placebo(Attack):
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         # The edit stands whatever it does: the better of it and none would be an attack.
         return (float(bool((theta != 0).any())),)
+
+
+@dataclass(frozen=True, slots=True)
+class FixedTheta(Attack):
+    """theta: (D,)."""
+
+    theta: Tensor
+
+    needs_gradient: ClassVar[bool] = False
+
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        return Proposals((self.theta,), (None,), 0)
+
+    def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
+        # It stands, unless it cannot be.
+        return (float(torch.equal(theta, self.theta)),)

@@ -485,7 +485,12 @@ def _after(one: FrameOutcome, size: tuple[int, int]) -> tuple[BoxMark, ...]:
     result, threshold = one.result, one.run.summary.t_star
     failures = tuple(
         replace(
-            _mark(f.kind, f.xyxy, f"{grading.what(f)}{f': {f.grade}' if grading.is_sure(f) else ''}", size),
+            _mark(
+                f.kind,
+                f.xyxy,
+                f"{grading.describe_failure(f)}{f': {f.grade}' if grading.is_certain(f) else ''}",
+                size,
+            ),
             unsure=f.grade is not None and not grading.is_certain(f),
         )
         # the highest grade is drawn last, over the others

@@ -51,7 +51,9 @@ def draw_overlay(
     labels.protected_boxes = [box.xyxy for box in (*failures, *targets)]
     for failure in failures:
         grade = f": {failure.grade}" if failure.grade else ""
-        labels.add(failure.xyxy, TextLabel(f"{grading.what(failure)}{grade}", _failure_colour(failure)))
+        labels.add(
+            failure.xyxy, TextLabel(f"{grading.describe_failure(failure)}{grade}", _failure_colour(failure))
+        )
     for box in targets:
         _draw_box(canvas, box.xyxy, IGNORED_COLOUR if box.ignore else TRUE_COLOUR, 1)
     for box in detections:

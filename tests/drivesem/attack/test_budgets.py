@@ -11,28 +11,28 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS, budget_of, reach_of, written
+from drivesem.attack.budgets import PRESETS, change_limits, format_budget, parse_budget
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import SIX, Budget, Parameter, ParameterSpace
+from drivesem.attack.space import PAPER_PARAMETERS, Budget, Parameter, ParameterSpace
 from drivesem.config.errors import UsageError
 from scene_ir.errors import FormatError, RangeError
 
 
 def test_presets():
-    assert budget_of("paper") == Budget()
-    parking = budget_of("parking")
+    assert parse_budget("paper") == Budget()
+    parking = parse_budget("parking")
     assert parking == Budget(translate_m=0.5, rotate=math.radians(5))
 
 
 def test_a_file_says_what_is_tighter_than_the_papers(tmp_path: Path):
     path = tmp_path / "own.yaml"
     path.write_text("translate: 0.1\nrotate: 5deg\nmesh: 0.05\n")
-    assert budget_of(str(path)) == Budget(translate=0.1, rotate=math.radians(5), mesh=0.05)
+    assert parse_budget(str(path)) == Budget(translate=0.1, rotate=math.radians(5), mesh=0.05)
     path.write_text("translate: 0.3m\nrotate: 0.2\n")
-    assert budget_of(str(path)) == Budget(translate_m=0.3, rotate=0.2)
+    assert parse_budget(str(path)) == Budget(translate_m=0.3, rotate=0.2)
     path.write_text("# nothing\n")
-    assert budget_of(str(path)) == Budget()
+    assert parse_budget(str(path)) == Budget()
 
 
 @pytest.mark.parametrize(
@@ -55,46 +55,46 @@ def test_a_bad_file_is_one_line(tmp_path: Path, text: str, message: str):
     path = tmp_path / "own.yaml"
     path.write_text(text)
     with pytest.raises(FormatError, match=message) as caught:
-        budget_of(str(path))
+        parse_budget(str(path))
     assert "\n" not in str(caught.value)
 
 
 def test_what_is_no_budget_is_named(tmp_path: Path):
     with pytest.raises(UsageError, match="--budget: expected paper, parking, street, a YAML file, or NAME=VALUE"):
-        budget_of("generous")
+        parse_budget("generous")
     with pytest.raises(FormatError, match=r"nowhere\.yaml: expected a readable file"):
-        budget_of(str(tmp_path / "nowhere.yaml"))
+        parse_budget(str(tmp_path / "nowhere.yaml"))
     with pytest.raises(UsageError, match=r"--budget: expected paper, parking, street, .*found 'street,'"):
-        budget_of("street,")
+        parse_budget("street,")
     with pytest.raises(FormatError, match="--budget: rotate: expected each parameter once"):
-        budget_of("rotate=5deg,rotate=6deg")
+        parse_budget("rotate=5deg,rotate=6deg")
 
 
 def test_a_preset_can_be_narrowed_and_not_widened():
-    assert budget_of("street,translate=2m,rotate=5deg") == replace(
+    assert parse_budget("street,translate=2m,rotate=5deg") == replace(
         PRESETS["street"], translate_m=2.0, rotate=math.radians(5)
     )
-    assert budget_of("street,translate=0.1") == replace(PRESETS["street"], translate=0.1)
-    assert budget_of("parking,rotate=2deg") == replace(PRESETS["parking"], rotate=math.radians(2))
+    assert parse_budget("street,translate=0.1") == replace(PRESETS["street"], translate=0.1)
+    assert parse_budget("parking,rotate=2deg") == replace(PRESETS["parking"], rotate=math.radians(2))
     for text in ("street,translate=50m", "street,translate=50", "parking,translate=0.6m", "street,rotate=0.36"):
         with pytest.raises(FormatError, match=r"--budget: .*: expected a positive number of at most"):
-            budget_of(text)
+            parse_budget(text)
 
 
 def test_sizes_and_the_sun_change_in_street_alone():
-    assert budget_of("street").size == 0.1
-    assert budget_of("paper").size == budget_of("parking").size == 0
-    assert (budget_of("street").sun, budget_of("paper").sun) == (1, 0)
-    assert budget_of("street,sun=0.5") == replace(PRESETS["street"], sun=0.5)
+    assert parse_budget("street").size == 0.1
+    assert parse_budget("paper").size == parse_budget("parking").size == 0
+    assert (parse_budget("street").sun, parse_budget("paper").sun) == (1, 0)
+    assert parse_budget("street,sun=0.5") == replace(PRESETS["street"], sun=0.5)
     with pytest.raises(FormatError, match=r"--budget: sun: expected street,sun=0.5, since only street lets it"):
-        budget_of("sun=0.5")
-    narrowed = budget_of("street,size=5%")
-    assert narrowed == replace(PRESETS["street"], size=0.05) == budget_of(written(narrowed))
-    assert written(narrowed) == "street,size=0.05"
+        parse_budget("sun=0.5")
+    narrowed = parse_budget("street,size=5%")
+    assert narrowed == replace(PRESETS["street"], size=0.05) == parse_budget(format_budget(narrowed))
+    assert format_budget(narrowed) == "street,size=0.05"
     with pytest.raises(FormatError, match=r"--budget: size: expected street,size=5%, since only street lets it"):
-        budget_of("size=5%")
+        parse_budget("size=5%")
     with pytest.raises(FormatError, match=r"--budget: size: expected a positive number of at most 0.1, found 20%"):
-        budget_of("street,size=20%")
+        parse_budget("street,size=20%")
 
 
 @given(
@@ -109,24 +109,24 @@ def test_what_is_written_reads_back(preset: str, shares: dict[Parameter, float],
     if metres is not None:
         limits["translate"] = f"{metres!r}m"
     narrowed = [f"{name}={limit}" for name, limit in limits.items() if float(limit.rstrip("m"))]
-    budget = budget_of(",".join([preset, *narrowed]) if narrowed else preset)
-    assert budget_of(written(budget)) == budget
+    budget = parse_budget(",".join([preset, *narrowed]) if narrowed else preset)
+    assert parse_budget(format_budget(budget)) == budget
 
 
 def test_own_lengths_beside_the_metres_of_parking_are_written() -> None:
-    budget = budget_of("parking,translate=0.01")
+    budget = parse_budget("parking,translate=0.01")
     assert (budget.translate, budget.translate_m) == (0.01, 0.5)
-    assert written(budget) == "parking,translate=0.01"
-    assert budget_of(written(budget)) == budget
+    assert format_budget(budget) == "parking,translate=0.01"
+    assert parse_budget(format_budget(budget)) == budget
     # As runs from before have it, which a second run must be able to go on with.
-    assert written(budget_of("parking,rotate=2deg")).startswith("rotate=0.0349")
+    assert format_budget(parse_budget("parking,rotate=2deg")).startswith("rotate=0.0349")
 
 
 def test_metres_are_the_same_for_long_and_short_cars(street):
     scene = street()
     length_m = torch.tensor([4.0, 12.0, 1.6, 5.0])
     scene = scene.with_objects(size_lhw=torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1))
-    space = ParameterSpace(scene, ("translate", "rotate"), budget_of("parking"))
+    space = ParameterSpace(scene, ("translate", "rotate"), parse_budget("parking"))
     reach_m = (space.upper[:8].reshape(4, 2) * length_m[:, None]).tolist()
     # A quarter of the third car's own length is less than half a metre.
     assert reach_m == [pytest.approx([m, m]) for m in (0.5, 0.5, 0.4, 0.5)]
@@ -142,17 +142,17 @@ def test_a_street_is_longer_along_than_across(street):
     scene = street()
     length_m = torch.tensor([4.0, 12.0, 1.6, 5.0])
     scene = scene.with_objects(size_lhw=torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1))
-    budget = budget_of("street")
+    budget = parse_budget("street")
     space = ParameterSpace(scene, tuple(Parameter), budget)
-    where = space.slice_of(Parameter.TRANSLATE)
+    where = space.blocks.get(Parameter.TRANSLATE)
     along_m, across_m = (space.upper[where].reshape(4, 2) * length_m[:, None]).T.tolist()
-    away_m = budget.of_distance * scene.objects.translation.norm(dim=1)
+    away_m = budget.distance_share * scene.objects.translation.norm(dim=1)
     assert 2.5 < away_m[0] < 3 < away_m[1] < 4 < away_m[2]
     assert along_m == pytest.approx([float(away_m[0]), float(away_m[1]), budget.translate * 1.6, 4.0])
     assert across_m == pytest.approx([1.0] * 4)
     # All else goes as far as the paper's.
-    papers = ParameterSpace(scene, SIX)
-    size = space.slice_of(Parameter.SIZE)
+    papers = ParameterSpace(scene, PAPER_PARAMETERS)
+    size = space.blocks.get(Parameter.SIZE)
     assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
     assert space.upper[size.stop :].tolist() == [1.0] * 3  # the sun's
     wider = papers.upper != space.upper[: size.start]
@@ -163,15 +163,17 @@ def test_a_car_that_is_partly_shown_goes_no_farther_than_the_papers(street):
     scene = street().with_objects(
         occlusion=torch.tensor([0, 1, 0, 0]), truncation=torch.tensor([0.0, 0.0, 0.3, 0.1])
     )
-    space = ParameterSpace(scene, ("translate",), budget_of("street"))
+    space = ParameterSpace(scene, ("translate",), parse_budget("street"))
     along = space.upper.reshape(4, 2)[:, 0].tolist()
     assert along[1] == along[2] == 0.25
     assert 0.5 < along[0] < along[3]
     # Its size is held: what grows out of its hiding place was not photographed.
-    assert ParameterSpace(scene, ("size",), budget_of("street")).upper.tolist() == pytest.approx([0.1, 0, 0, 0.1])
+    assert ParameterSpace(scene, ("size",), parse_budget("street")).upper.tolist() == pytest.approx(
+        [0.1, 0, 0, 0.1]
+    )
     sizes = scene.objects.size_lhw.clone()
     sizes[1] *= 1.05
-    found = check_scene(scene, scene.with_objects(size_lhw=sizes), reach=reach_of(budget_of("street")))
+    found = check_scene(scene, scene.with_objects(size_lhw=sizes), reach=change_limits(parse_budget("street")))
     assert found == ["objects[1]: size changed by 5.0 %"]
     # In the paper's budget it makes no difference.
     assert ParameterSpace(scene, ("translate",)).upper.tolist() == [0.25] * 8

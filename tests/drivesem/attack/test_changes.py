@@ -12,10 +12,10 @@ from drivesem.attack.changes import (
     Changes,
     _labelled,
     affordable,
-    parse_changes,
+    load_vehicle_mesh,
+    parse_vehicle_changes,
     passes_of,
     proposals,
-    vehicle_mesh,
 )
 from drivesem.attack.feasibility_check import check_exchange, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
@@ -23,11 +23,10 @@ from drivesem.attack.labels import Labeller, to_kitti_labels
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.synth.demo import demo_scene
 from scene_ir.errors import FormatError
-from scene_ir.exchange import CHANGE, Vehicle, with_load, with_other, with_vehicle, without
+from scene_ir.exchange import CHANGE_KEY, Vehicle, add_roof_load, add_vehicle, remove_vehicle, replace_vehicle
 from scene_ir.meshes.load import save_mesh
-from scene_ir.meshes.loads import load
-from scene_ir.meshes.templates import template
-from scene_ir.removal import without_objects
+from scene_ir.meshes.templates import make_roof_load, template
+from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, SceneIR
 
@@ -41,7 +40,7 @@ def scene() -> SceneIR:
 
 def beside(scene: SceneIR, place: torch.Tensor) -> SceneIR:
     vehicle = Vehicle(template("suv"), Category.CAR, place, scene.objects.yaw[0], SIZE)
-    return with_vehicle(scene, vehicle)
+    return add_vehicle(scene, vehicle)
 
 
 def labels_of(changed: SceneIR):
@@ -56,13 +55,13 @@ def proposed(scene: SceneIR) -> list[SceneIR]:
 
 
 def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR]) -> None:
-    words = [made.provenance[CHANGE] for made in proposed]
+    words = [made.provenance[CHANGE_KEY] for made in proposed]
     wanted = ("is gone", "parks as", "in the place of", "on the roof")
     assert all(word in text for word, text in zip(wanted, words, strict=True))
     for made in proposed:
         assert made.origin.photograph is scene.photograph
         assert check_exchange(made) == []
-        assert check_scene(made.at_rest(), made) == []
+        assert check_scene(made.unperturbed(), made) == []
         labels = labels_of(made)[1]
         assert torch.equal(made.objects.box2d, labels.boxes_xyxy)
         assert torch.equal(made.objects.occlusion, labels.occlusion)
@@ -87,7 +86,7 @@ def test_labels_follow(scene: SceneIR) -> None:
     van = Vehicle(
         template("van"), Category.TRUCK, scene.objects.translation[row], scene.objects.yaw[row], 1.3 * SIZE
     )
-    _, labels = labels_of(with_other(scene, row, van))
+    _, labels = labels_of(replace_vehicle(scene, row, van))
     assert int(labels.category[row]) == int(Category.TRUCK)
     higher = (labels.boxes_xyxy - scene.objects.box2d)[row]
     assert higher[1] < -5  # its roof is
@@ -99,7 +98,7 @@ def test_labels_follow(scene: SceneIR) -> None:
 def test_a_load_on_the_roof_is_part_of_its_cars_label(scene: SceneIR) -> None:
     row = 5
     car = scene.meshes[int(scene.objects.mesh_index[row])]
-    loaded = with_load(scene, row, load("crate", car, scene.objects.size_lhw[row]))
+    loaded = add_roof_load(scene, row, make_roof_load("crate", car, scene.objects.size_lhw[row]))
     _, labels = labels_of(loaded)
     grown = (labels.boxes_xyxy - scene.objects.box2d)[row]
     assert grown[1] < -8
@@ -110,7 +109,7 @@ def test_a_load_on_the_roof_is_part_of_its_cars_label(scene: SceneIR) -> None:
 
 
 def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
-    left = without(scene, 6)
+    left = remove_vehicle(scene, 6)
     labeller, labels = labels_of(left)
     assert labels.ignore[6]
     assert not labels.out_of_sight.any()
@@ -120,7 +119,7 @@ def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
 
 
 def test_what_is_not_there_is_not_moved_and_violates_nothing(scene: SceneIR) -> None:
-    space = ParameterSpace(without(scene, 6), ("translate", "rotate"), PRESETS["street"])
+    space = ParameterSpace(remove_vehicle(scene, 6), ("translate", "rotate"), PRESETS["street"])
     for name in ("translate", "rotate"):
         upper = space.upper[space.blocks[Parameter(name)]].view(7, -1)
         assert (upper[6] == 0).all()
@@ -134,7 +133,7 @@ def test_theta_is_carried_over_to_a_scene_with_one_more(scene: SceneIR) -> None:
     place = scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0])
     less, more = (ParameterSpace(s, params, PRESETS["street"]) for s in (scene, beside(scene, place)))
     theta = torch.linspace(-0.1, 0.1, less.dim)
-    here = more.carried(less, theta)
+    here = more.convert_theta(less, theta)
     for parameter in map(Parameter, params):
         block = here[more.blocks[parameter]]
         kept = theta[less.blocks[parameter]]
@@ -159,13 +158,13 @@ def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
 def test_labels_say_how_much_shows_of_one_more(column: float, level: int) -> None:
     """Half of it beyond the border, or behind the only other car, which stands at 11 m in the middle."""
     scene = demo_scene(0, 0)
-    scene = without_objects(scene, range(1, len(scene.objects)))
+    scene = remove_objects(scene, range(1, len(scene.objects)))
     (across, _, middle, _), *_ = scene.camera.matrix.tolist()
     ground = scene.environment.ground.tolist()
     x, z = (column - middle) / across * 12, 12.0
     y = -(ground[3] + ground[0] * x + ground[2] * z) / ground[1]
     vehicle = Vehicle(template("sedan"), Category.CAR, torch.tensor([x, y, z]), torch.tensor(1.57), SIZE)
-    made = _labelled(with_vehicle(scene, vehicle), None)
+    made = _labelled(add_vehicle(scene, vehicle), None)
     expected = 0.0 if column == 600 else 0.57
     assert float(made.objects.truncation[-1]) == pytest.approx(expected, abs=0.03)
     assert int(made.objects.occlusion[-1]) == level
@@ -194,7 +193,7 @@ def test_what_cannot_be_is_said(scene: SceneIR, shift: tuple[float, float, float
     assert any(said in line for line in found)
     assert all(line.startswith("exchange: objects[") for line in found)
     changed = beside(scene, place)
-    assert set(found) <= set(check_scene(changed.at_rest(), changed))
+    assert set(found) <= set(check_scene(changed.unperturbed(), changed))
 
 
 def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
@@ -208,24 +207,24 @@ def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
 @pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])
 def test_what_is_no_change_is_named(text: str) -> None:
     with pytest.raises(FormatError, match="--changes: expected each at most once of leave, park, swap, load"):
-        parse_changes(text)
+        parse_vehicle_changes(text)
 
 
 def test_changes_by_name() -> None:
-    assert parse_changes("swap, leave") == (Change.LEAVE, Change.SWAP)
+    assert parse_vehicle_changes("swap, leave") == (Change.LEAVE, Change.SWAP)
 
 
 def test_a_mesh_of_ones_own_parks_and_must_be_as_large_as_a_vehicle(scene: SceneIR, tmp_path: Path) -> None:
     small = template("sedan")
     save_mesh(small, tmp_path / "unit.glb")
     with pytest.raises(FormatError, match=r"unit.glb: length: expected a vehicle's in metres, 1.5 to 20, found 1"):
-        vehicle_mesh(str(tmp_path / "unit.glb"))
+        load_vehicle_mesh(str(tmp_path / "unit.glb"))
     obj = tmp_path / "block.obj"
     corners = [(x, y, z) for x in (0, 4) for y in (0, 1.5) for z in (0, 1.8)]
     quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
     lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {' '.join(map(str, q))}" for q in quads]
     obj.write_text("\n".join(lines))
-    own = vehicle_mesh(str(obj))
+    own = load_vehicle_mesh(str(obj))
     made = proposals(scene, Changes((Change.PARK,), own), 1, 0)
     assert made[0].meshes[-1].name == "block"
     assert made[0].objects.size_lhw[-1].tolist() == pytest.approx([4.0, 1.5, 1.8])

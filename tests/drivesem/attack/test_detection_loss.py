@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from detectors.types import Detections, Targets
-from drivesem.attack import detection_loss
+from drivesem.attack import losses
 
 CAR, TRUCK = 0, 1
 OBJECTS = torch.tensor([[0.0, 0, 20, 20], [40, 0, 60, 20], [80, 0, 100, 20]])
@@ -20,8 +20,8 @@ def found(*rows: tuple[list[float], int, float]) -> Detections:
 
 
 def test_nothing_found_costs_one_an_object():
-    assert detection_loss.objectness(truth(), found()) == 3
-    assert detection_loss.objectness(truth((True, False, True)), found()) == 1
+    assert losses.detection_objectness(truth(), found()) == 3
+    assert losses.detection_objectness(truth((True, False, True)), found()) == 1
 
 
 def test_by_hand():
@@ -32,17 +32,17 @@ def test_by_hand():
         ([80, 0, 100, 20], CAR, 0.2),  # a truck is no car
     )
     expected = (0.1**2 + 1 + 1) + (0.4**2 + 0.7**2 + 0.2**2)
-    assert detection_loss.objectness(truth(), detections) == pytest.approx(expected, abs=1e-6)
+    assert losses.detection_objectness(truth(), detections) == pytest.approx(expected, abs=1e-6)
 
 
 def test_what_lies_on_an_ignored_object_is_no_false_alarm():
     on_ignored = found(([2, 2, 10, 10], CAR, 0.8))
-    assert detection_loss.objectness(truth((True, True, True)), on_ignored) == 0
+    assert losses.detection_objectness(truth((True, True, True)), on_ignored) == 0
 
 
 def test_it_rises_as_an_object_fades():
     losses = [
-        detection_loss.objectness(truth((False, True, True)), found(([0, 0, 20, 20], CAR, score)))
+        losses.detection_objectness(truth((False, True, True)), found(([0, 0, 20, 20], CAR, score)))
         for score in (0.9, 0.6, 0.3)
     ]
     assert losses == sorted(losses)

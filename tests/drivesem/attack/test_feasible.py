@@ -10,22 +10,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import drivesem.attack.feasibility_check
-from drivesem.attack.budgets import PRESETS, reach_of
+from drivesem.attack.budgets import PRESETS, change_limits
 from drivesem.attack.feasibility_check import (
     PAPERS,
-    Reach,
+    ChangeLimits,
     _Car,
     _collisions,
     _Outlines,
-    check_reach,
+    available_check_method,
+    check_limits,
     check_scene,
-    judge_at_hand,
     overlap_area,
 )
-from drivesem.attack.feasible.bounds import Limits
-from drivesem.attack.feasible.cars import Cars
-from drivesem.attack.feasible.collisions import gap_between, shared_ground
+from drivesem.attack.feasible.constraints import FeasibilityLimits, footprint_gaps, footprint_overlaps
 from drivesem.attack.feasible.projection import FeasibleSet
+from drivesem.attack.feasible.vehicles import VehicleBoxes
 from drivesem.attack.space import COMBOS, Budget, ParameterSpace, ground_axes
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
@@ -224,8 +223,8 @@ def test_limits_are_settings(street):
     scene = street()
     space = ParameterSpace(scene, ("mesh",))
     theta = 0.1 * torch.randn(space.dim, generator=torch.Generator().manual_seed(4))
-    loose = FeasibleSet(space, Limits(strain=(0.5, 2.0))).project(theta)
-    tight = FeasibleSet(space, Limits(strain=(0.95, 1.05))).project(theta)
+    loose = FeasibleSet(space, FeasibilityLimits(strain=(0.5, 2.0))).project(theta)
+    tight = FeasibleSet(space, FeasibilityLimits(strain=(0.95, 1.05))).project(theta)
     assert float(tight.theta.norm()) < 0.5 * float(loose.theta.norm())
 
 
@@ -293,7 +292,7 @@ def test_the_second_check_finds_collisions_roads_and_hiding(street):
     assert any("objects[1]: hidden" in line for line in check_scene(pair, hidden))
 
 
-STREET = reach_of(PRESETS["street"])
+STREET = change_limits(PRESETS["street"])
 
 
 @pytest.mark.parametrize(
@@ -317,7 +316,9 @@ def test_the_second_check_bounds_the_sun_by_the_budget(street):
     moved = scene.with_environment(light=torch.tensor([1.0, -1.0, 0.5]))
     assert check_scene(scene, moved, reach=STREET) == []
     assert check_scene(scene, moved) == ["environment.light: outside [-0, 0]"]
-    assert check_scene(scene, moved, reach=reach_of(Budget(sun=0.6))) == ["environment.light: outside [-0.6, 0.6]"]
+    assert check_scene(scene, moved, reach=change_limits(Budget(sun=0.6))) == [
+        "environment.light: outside [-0.6, 0.6]"
+    ]
     other = scene.with_environment(sun=torch.tensor([0.6, -0.8, 0.0]))
     assert check_scene(scene, other, reach=STREET) == ["sun: changed"]
 
@@ -333,7 +334,7 @@ def test_a_car_grows_until_it_meets_another(street):
     assert feasible.violations(once.theta) == ()
     assert float(once.theta.max()) < 0.3
     grown = feasible.space.apply(scene, once.theta)
-    assert check_scene(scene, grown, reach=reach_of(budget)) == []
+    assert check_scene(scene, grown, reach=change_limits(budget)) == []
     assert feasible.project(torch.tensor([0.1, 0.1])).theta.tolist() == pytest.approx([0.1, 0.1])
 
 
@@ -410,10 +411,10 @@ def test_a_car_may_grow_by_a_tenth_through_its_lattice(street):
 
 def test_codes_beyond_the_budget_from_the_start_may_stay(street):
     foggy = street().with_environment(weather=torch.tensor([0.4, 0.0, 0.0, 0.0]))
-    reach = Reach(weather=0.2)
-    assert check_reach(foggy, foggy, reach) == []
+    reach = ChangeLimits(weather=0.2)
+    assert check_limits(foggy, foggy, reach) == []
     thicker = foggy.with_environment(weather=torch.tensor([0.5, 0.0, 0.0, 0.0]))
-    assert check_reach(foggy, thicker, reach) == ["environment.weather: outside [0, 0.2]"]
+    assert check_limits(foggy, thicker, reach) == ["environment.weather: outside [0, 0.2]"]
 
 
 def test_the_second_check_looks_at_meshes_where_boxes_overlap_already(street):
@@ -486,7 +487,7 @@ def test_without_open3d_outlines_judge(street, monkeypatch, asked):
     monkeypatch.setitem(sys.modules, "open3d", None)
     drivesem.attack.feasibility_check._open3d.cache_clear()
     try:
-        assert judge_at_hand() == "outlines"
+        assert available_check_method() == "outlines"
         pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
         pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
         moved = pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]])
@@ -513,11 +514,11 @@ def test_both_ways_agree_on_gap_and_overlap(seed):
     yaw = draw.uniform(-3, 3, 2)
     cos, sin = np.cos(yaw), np.sin(yaw)
     low, size, at = draw.uniform(-3, 0, (2, 3)), draw.uniform(1, 5, (2, 3)), draw.uniform(-2.5, 2.5, (2, 3))
-    cars = Cars.of(low, low + size, yaw, at)
+    cars = VehicleBoxes.of(low, low + size, yaw, at)
     corners = np.array([[1, 0], [1, 1], [0, 1], [0, 0]]) * size[:, None, ::2] + low[:, None, ::2]
     rotation = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=1)
     footprints = corners @ rotation + at[:, None, ::2]
-    gap, area = gap_between(cars, np.arange(2)), shared_ground(cars, np.array([0, 1]), np.array([1, 0]))
+    gap, area = footprint_gaps(cars, np.arange(2)), footprint_overlaps(cars, np.array([0, 1]), np.array([1, 0]))
 
     def ccw(p):
         x, z = p.T

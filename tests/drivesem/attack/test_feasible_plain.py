@@ -9,12 +9,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivesem.attack.feasibility_check import overlap_area
-from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.feasible.constraints import FeasibilityLimits
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.feasible.surfaces import surface_points
+from drivesem.attack.feasible.vehicles import extreme_points
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
 from scene_ir import ffd
-from scene_ir.geometry import place, to_clip, yaw_matrix
+from scene_ir.geometry import place_vertices, to_clip, yaw_matrix
 
 SLACK = 1e-6
 CROWDED = ((-2.2, 8.0), (-2.2, 12.9), (0.2, 8.3), (2.4, 10.0), (2.4, 15.2), (0.1, 14.0))
@@ -27,7 +27,7 @@ class PlainCar:
     def __init__(self, scene, i):
         objects, camera = scene.objects, scene.camera
         mesh = scene.meshes[int(objects.mesh_index[i])]
-        unit = torch.from_numpy(surface_points(mesh))
+        unit = torch.from_numpy(extreme_points(mesh))
         self.size = objects.size_lhw[i].double()
         self.yaw, self.translation = objects.yaw[i].double(), objects.translation[i].double()
         local = ffd.deform(unit, ffd.lattice_weights(unit), objects.ffd[i].double()) * self.size
@@ -48,14 +48,16 @@ class PlainCar:
 
     def at(self, share):
         """Camera-space points at shares (P, 3) between the bounds."""
-        return place(self.low + share * (self.high - self.low), torch.ones(3).double(), self.yaw, self.translation)
+        return place_vertices(
+            self.low + share * (self.high - self.low), torch.ones(3).double(), self.yaw, self.translation
+        )
 
     def road_share(self, scene, matrix):
         along, across = (torch.arange(10) + 0.5) / 10, (torch.arange(16) + 0.5) / 16
         share = torch.cartesian_prod(along.double(), across.double())
         flat = self.low[[0, 2]] + share * (self.high - self.low)[[0, 2]]
         local = torch.stack([flat[:, 0], torch.zeros(160).double(), flat[:, 1]], dim=1)
-        clip = to_clip(place(local, torch.ones(3).double(), self.yaw, self.translation), matrix)
+        clip = to_clip(place_vertices(local, torch.ones(3).double(), self.yaw, self.translation), matrix)
         road, total, count = scene.environment.road.double().numpy(), 0.0, 0
         height, width = road.shape
         for u, v, w in clip.tolist():
@@ -131,7 +133,7 @@ class PlainProjection:
     """The same search as `FeasibleSet.project`, with nothing kept from one trial to the next."""
 
     def __init__(self, space):
-        self.space, self.limits, self.scene = space, Limits(), space.scene.with_objects()
+        self.space, self.limits, self.scene = space, FeasibilityLimits(), space.scene.with_objects()
         doubled = {n: getattr(space.scene.objects, n).double() for n in ("translation", "yaw", "ffd", "size_lhw")}
         self.scene = space.scene.with_objects(**doubled)
         self.start = self.measured(torch.zeros_like(space.theta0))
@@ -177,7 +179,9 @@ class PlainProjection:
         mesh, low, high = self.block(theta, Parameter.MESH), self.limits.strain[0], self.limits.strain[1]
         wrong = []
         for code, source, at_rest in zip(mesh, self.space.scene.objects.ffd, self.strain0, strict=True):
-            least, most, volume, lowest = _strain(source.double() + ffd.from_symmetric(code.double()))
+            least, most, volume, lowest = _strain(
+                source.double() + ffd.from_symmetric(code.double())
+            )
             wrong.append(
                 least < min(low, at_rest[0]) - SLACK
                 or most > max(high, at_rest[1]) + SLACK
@@ -187,7 +191,7 @@ class PlainProjection:
         return np.array(wrong)
 
     def block(self, theta, parameter):
-        where = self.space.slice_of(parameter)
+        where = self.space.blocks.get(parameter)
         return None if where is None else theta[where].reshape(self.space.count, -1)
 
     def project(self, theta):
@@ -208,7 +212,7 @@ class PlainProjection:
             return theta
         blocks = [(p, None) for p in (Parameter.MESH, Parameter.ROTATE)]
         blocks += [(Parameter.TRANSLATE, 0), (Parameter.TRANSLATE, 1)]
-        blocks = [b for b in blocks if self.space.slice_of(b[0]) is not None]
+        blocks = [b for b in blocks if self.space.blocks.get(b[0]) is not None]
         while True:
             theta = wanted.clone()
             for parameter, _ in blocks:

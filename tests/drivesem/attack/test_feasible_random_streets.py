@@ -7,7 +7,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS, reach_of
+from drivesem.attack.budgets import PRESETS, change_limits
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import COMBOS, Parameter, ParameterSpace
@@ -41,7 +41,7 @@ def test_projection_is_idempotent_inside_and_feasible(street, seed, count, names
     assert torch.equal(twice.theta, once.theta)
     assert twice.active == ()
     changed = space.apply(scene, once.theta)
-    assert check_scene(scene, changed, reach=reach_of(PRESETS[budget])) == []
+    assert check_scene(scene, changed, reach=change_limits(PRESETS[budget])) == []
 
 
 @pytest.mark.parametrize(

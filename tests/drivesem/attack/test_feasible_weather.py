@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible.bounds import Limits
+from drivesem.attack.feasible.constraints import FeasibilityLimits
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.feasible.weather import MOST, TOGETHER
+from drivesem.attack.feasible.weather import CODE_SUM_LIMITS, CODE_SUMS
 from drivesem.attack.space import Budget, ParameterSpace
 
 EXACT = 2e-3
@@ -40,14 +40,14 @@ def _projected(street, theta, start=(0.0, 0.0, 0.0, 0.0), **budget) -> np.ndarra
 @example(point=[2.0, 2.0, -0.5, -0.5])
 def test_the_projection_is_the_nearest_point(street, point):
     found, asked = _projected(street, point), np.array(point)
-    assert (TOGETHER @ found <= MOST + ROUNDING).all()
+    assert (CODE_SUMS @ found <= CODE_SUM_LIMITS + ROUNDING).all()
     assert ((found >= 0) & (found <= 1)).all()
     least = minimize(
         lambda code: ((code - asked) ** 2).sum(),
         np.full(4, 0.2),
         jac=lambda code: 2 * (code - asked),
         bounds=[(0, 1)] * 4,
-        constraints=LinearConstraint(TOGETHER, -np.inf, MOST),
+        constraints=LinearConstraint(CODE_SUMS, -np.inf, CODE_SUM_LIMITS),
         method="SLSQP",
     )
     assert least.success
@@ -109,8 +109,8 @@ def test_a_scene_that_has_such_weather_already_may_keep_it(street, start, change
     assert torch.equal(feasible.project(space.theta0).theta, space.theta0)
     once = feasible.project(torch.tensor(change))
     changed = space.apply(space.scene, once.theta)
-    before, after = (TOGETHER @ s.environment.weather.double().numpy() for s in (space.scene, changed))
-    assert (after <= np.maximum(MOST, before) + ROUNDING).all()
+    before, after = (CODE_SUMS @ s.environment.weather.double().numpy() for s in (space.scene, changed))
+    assert (after <= np.maximum(CODE_SUM_LIMITS, before) + ROUNDING).all()
     assert check_scene(space.scene, changed, "outlines") == []
 
 
@@ -119,7 +119,7 @@ def test_a_scene_that_has_such_weather_already_may_keep_it(street, start, change
 def test_both_checks_say_the_same_of_any_weather(street, code):
     space = _space(street)
     theta = torch.tensor(code, dtype=torch.float32)
-    beyond = (TOGETHER @ np.array(code) - MOST).max()
+    beyond = (CODE_SUMS @ np.array(code) - CODE_SUM_LIMITS).max()
     found = check_scene(space.scene, space.apply(space.scene, theta), "outlines")
     if beyond > 0.03:
         assert FeasibleSet(space).violations(theta)
@@ -131,7 +131,7 @@ def test_both_checks_say_the_same_of_any_weather(street, code):
 
 def test_bounding_together_is_a_limit(street):
     space, everything = _space(street), torch.ones(4)
-    free = FeasibleSet(space, Limits(joint_weather=False)).project(everything)
+    free = FeasibleSet(space, FeasibilityLimits(joint_weather=False)).project(everything)
     assert torch.equal(free.theta, everything)
     assert free.active == ()
     changed = space.apply(space.scene, everything)

@@ -7,11 +7,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from detectors.types import CLASSES
-from drivesem.attack.labels import Difficulty, Labeller, hidden_share, targets, to_kitti_labels
+from drivesem.attack.labels import Difficulty, Labeller, hidden_shares, targets, to_kitti_labels
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.geometry import place, project_boxes, to_clip
+from scene_ir.geometry import place_vertices, project_boxes, to_clip
 from scene_ir.types import Crop, Render
 
 EASY = Difficulty(min_height_px=1.0, max_occlusion=3, max_truncation=1.0)
@@ -130,7 +130,7 @@ def test_a_car_that_reaches_behind_the_camera_has_a_finite_box(street):
 
 def test_occlusion_follows_the_visible_share(street):
     scene = street(positions_xz=((0.0, 8.0), (2.0, 12.0)))
-    assert hidden_share(_two_cars(scene, 5)).tolist() == pytest.approx([0.0, 0.25])
+    assert hidden_shares(_two_cars(scene, 5)).tolist() == pytest.approx([0.0, 0.25])
     labeller = Labeller(scene, _two_cars(scene, 0))
     levels = {h: int(labeller.moved(scene, _two_cars(scene, h)).occlusion[1]) for h in (0, 1, 5, 10, 15)}
     assert levels == {0: 0, 1: 0, 5: 1, 10: 2, 15: 2}
@@ -224,7 +224,7 @@ def _plain_box(scene, i):
     unit = mesh.vertices.double()
     unit = ffd.deform(unit, ffd.lattice_weights(unit), objects.ffd[i].double())
     pose = (t[i].double() for t in (objects.size_lhw, objects.yaw, objects.translation))
-    clip = to_clip(place(unit, *pose), scene.camera.matrix.double())
+    clip = to_clip(place_vertices(unit, *pose), scene.camera.matrix.double())
     points = [p for p in clip if p[2] >= 0.1]
     for face in mesh.faces.tolist() if len(points) < len(clip) else []:
         for a, b in ((face[0], face[1]), (face[1], face[2]), (face[2], face[0])):
@@ -277,5 +277,5 @@ def test_hidden_shares_are_those_of_the_whole_frame(street, seed):
     image = torch.zeros(3, *ids.shape)
     seen = torch.bincount(ids.reshape(-1), minlength=5)[1:].double()
     expected = torch.where(torch.tensor(own) > 0, 1 - seen / torch.tensor(own).clamp(min=1), 1.0).double()
-    found = hidden_share(Render(image=image, depth=image[0], object_id=ids, opacity=tuple(crops)))
+    found = hidden_shares(Render(image=image, depth=image[0], object_id=ids, opacity=tuple(crops)))
     torch.testing.assert_close(found, expected)

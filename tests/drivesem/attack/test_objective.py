@@ -3,15 +3,15 @@ import math
 import pytest
 import torch
 
-from detectors.base import Detector, RawPredictions
+from detectors.base import AnchorPredictions, Detector
 from detectors.squeezedet import SqueezeDet
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty
-from drivesem.attack.methods.sampling import Sampling
-from drivesem.attack.methods.si_fgsm import SiFGSM
-from drivesem.attack.objective import BatchObjective, Objective
+from drivesem.attack.methods.gradient_ascent import SiFGSM
+from drivesem.attack.methods.gradient_free import Sampling
+from drivesem.attack.objective import Objective, compute_gradients
 from drivesem.attack.space import ParameterSpace
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.render.compositor import Compositor
@@ -19,7 +19,7 @@ from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Crop, Render
 
 NEAR = ((-2.0, 9.0), (2.4, 13.0))
-EVERYTHING = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1, min_contrast=0)
+ALL_TARGETS = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1, min_contrast=0)
 
 
 class StubCompositor:
@@ -51,7 +51,7 @@ class StubDetector(Detector):
         n = len(self.boxes_xyxy)
         mean = images.mean().expand(1, n)
         boxes = self.boxes_xyxy[None]
-        return RawPredictions(boxes, boxes, mean[..., None].expand(1, n, len(CLASSES)), mean, (2, 2))
+        return AnchorPredictions(boxes, boxes, mean[..., None].expand(1, n, len(CLASSES)), mean, (2, 2))
 
     def loss(self, raw, targets):
         self.aimed_at.append(targets[0].boxes_xyxy)
@@ -64,7 +64,7 @@ class StubDetector(Detector):
 
 def _objective(scene, detector, mode="moved", **settings):
     space = ParameterSpace(scene, ("translate",))
-    settings = {"term": "confidence", "difficulty": EVERYTHING, **settings}
+    settings = {"term": "confidence", "difficulty": ALL_TARGETS, **settings}
     return Objective(StubCompositor(), space, detector, mode, **settings)
 
 
@@ -175,7 +175,7 @@ class Spotter:
 def test_a_detector_without_gradient_is_judged_by_its_detections(street):
     scene = street(positions_xz=NEAR)
     objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness")
-    assert objective.judged.names == ("Car",)
+    assert objective.classes.names == ("Car",)
     assert objective.t_star == 0.3
     # mean 0.22 of the image, rounded to 8 bits: both cars are found with a score of 0.44
     score = 2 * round(0.22 * 255) / 255
@@ -294,7 +294,7 @@ def _pattern_objectives(street, detector, sizes) -> list[Objective]:
         # Scenes of one, two, three objects: a mean over the batch's objects would mix them.
         scene = street(positions_xz=[(-2.0, 9.0 + i), (2.4, 13.0), (-2.0, 19.0)][: i + 1], dtype=torch.float64)
         space = ParameterSpace(scene, ("translate",))
-        found.append(Objective(PatternCompositor(height, width), space, detector, difficulty=EVERYTHING))
+        found.append(Objective(PatternCompositor(height, width), space, detector, difficulty=ALL_TARGETS))
     return found
 
 
@@ -303,7 +303,7 @@ def test_several_scenes_at_once_are_each_by_itself(street):
     objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
     generator = torch.Generator().manual_seed(3)
     thetas = [torch.randn(o.space.dim, generator=generator, dtype=torch.float64) / 10 for o in objectives]
-    batch = BatchObjective(objectives).loss_and_grad(thetas)
+    batch = compute_gradients(objectives, thetas)
     single = [o.loss_and_grad(theta) for o, theta in zip(objectives, thetas, strict=True)]
     assert len({round(loss, 3) for loss, _ in single}) == 3
     for (loss, gradient), (expected_loss, expected) in zip(batch, single, strict=True):
@@ -317,37 +317,30 @@ def test_images_of_one_size_share_a_call_of_the_detector(street):
     objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
     seen = []
     detector.register_forward_hook(lambda _module, inputs, _output: seen.append(tuple(inputs[0].shape)))
-    BatchObjective(objectives).loss_and_grad([o.space.theta0 for o in objectives])
+    compute_gradients(objectives, [o.space.theta0 for o in objectives])
     assert seen == [(2, 3, 64, 96), (1, 3, 48, 80)]
 
 
-def test_restarts_at_once_are_each_by_itself(street):
+def test_several_thetas_at_once_are_independent(street):
     objective = _real(street(positions_xz=NEAR, dtype=torch.float64), ("translate", "color"))
     space = objective.space
     noise = torch.randn(3, space.dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     thetas = space.theta0 + 0.5 * space.step * noise
-    losses, gradients = objective.loss_and_grad_many(thetas)
-    assert losses.shape == (3,)
-    assert gradients.shape == (3, space.dim)
-    for i, theta in enumerate(thetas):
-        loss, gradient = objective.loss_and_grad(theta)
-        assert float(losses[i]) == pytest.approx(loss, rel=1e-6)
-        assert float((gradients[i] - gradient).norm()) <= 1e-4 * float(gradient.norm())
+    for theta, (loss, gradient) in zip(thetas, compute_gradients([objective] * 3, thetas), strict=True):
+        expected_loss, expected = objective.loss_and_grad(theta)
+        assert float(loss) == pytest.approx(expected_loss, rel=1e-6)
+        assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm())
 
 
 def test_batches_that_do_not_fit_are_refused(street):
     scene = street(positions_xz=NEAR)
     first, second = (_objective(scene, StubDetector(scene.objects.box2d)) for _ in range(2))
     with pytest.raises(RangeError, match="objectives: expected one detector for all, found 2 detectors"):
-        BatchObjective([first, second])
+        compute_gradients([first, second], [first.space.theta0] * 2)
     with pytest.raises(RangeError, match="objectives: expected one detector for all, found 0 detectors"):
-        BatchObjective([])
-    with pytest.raises(ShapeError, match=r"thetas: expected 1, one for each scene, found 2"):
-        BatchObjective([first]).loss_and_grad([first.space.theta0] * 2)
-    with pytest.raises(ShapeError, match=r"thetas: expected \(B, 4\)"):
-        first.loss_and_grad_many(first.space.theta0)
-    with pytest.raises(ShapeError, match=r"thetas: expected \(B, 4\)"):
-        first.loss_and_grad_many(torch.zeros(0, 4))
+        compute_gradients([], [])
+    with pytest.raises(ShapeError, match=r"thetas: expected 1, one for each objective, found 2"):
+        compute_gradients([first], [first.space.theta0] * 2)
 
 
 def test_a_gradient_pass_previews_what_the_score_will_say(street):

@@ -6,7 +6,16 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.space import COMBOS, SIX, Budget, Parameter, ParameterSpace, Perturbation, combo, parse_params
+from drivesem.attack.space import (
+    COMBOS,
+    PAPER_PARAMETERS,
+    Budget,
+    Parameter,
+    ParameterSpace,
+    Perturbation,
+    combo_parameters,
+    parse_params,
+)
 from scene_ir.errors import FormatError, RangeError, ShapeError
 
 ALL = tuple(Parameter)
@@ -37,7 +46,7 @@ def test_parse_params_names_what_is_wrong(text, said):
 
 def test_unknown_combo_and_budget():
     with pytest.raises(RangeError, match="combo: expected one of 1, 2, 3, 4, found 5"):
-        combo(5)
+        combo_parameters(5)
     with pytest.raises(RangeError, match=r"budget\.rotate"):
         Budget(rotate=0.0)
     with pytest.raises(RangeError, match=r"budget\.mesh"):
@@ -51,10 +60,10 @@ def test_cardinality_bounds_and_steps(street):
         assert tuple(tensor.shape) == (space.dim,)
     assert bool((space.lower <= 0).all())
     assert bool((space.upper >= 0).all())
-    weather = space.slice_of(Parameter.WEATHER)
+    weather = space.blocks.get(Parameter.WEATHER)
     assert space.lower[weather].tolist() == [0.0] * 4
     assert space.upper[weather].tolist() == [1.0] * 4
-    steps = {p.value: float(space.step[space.slice_of(p)][0]) for p in ALL}
+    steps = {p.value: float(space.step[space.blocks.get(p)][0]) for p in ALL}
     assert steps == pytest.approx(
         {"color": 0.05, "weather": 0.25, "foliage": 0.1, "translate": 0.01, "rotate": 0.01, "mesh": 0.025}
         | {"size": 0.01, "sun": 0.1}
@@ -79,7 +88,7 @@ def test_every_coordinate_has_a_name_a_unit_and_bounds(street):
     space = ParameterSpace(street(), ALL, WIDE)
     names = [space.name(i) for i in range(space.dim)]
     assert len(set(names)) == space.dim
-    yaw3 = space.slice_of(Parameter.ROTATE).start + 3
+    yaw3 = space.blocks.get(Parameter.ROTATE).start + 3
     assert space.describe(yaw3) == "objects[3].yaw, rad, [-0.35, 0.35]"
     assert space.describe(20) == "weather.fog, code, [0, 1]"
     with pytest.raises(RangeError, match="theta coordinate"):
@@ -240,9 +249,9 @@ def test_what_a_budget_holds_is_refused(street):
         ParameterSpace(street(), ("rotate", "size"))
     with pytest.raises(FormatError, match="params: sun: expected a budget in which sun may change"):
         ParameterSpace(street(), ("sun",))
-    assert Parameter.SIZE not in SIX
-    assert Parameter.SUN not in SIX
-    assert len(SIX) == 6
+    assert Parameter.SIZE not in PAPER_PARAMETERS
+    assert Parameter.SUN not in PAPER_PARAMETERS
+    assert len(PAPER_PARAMETERS) == 6
 
 
 def test_gradient_passes_at_a_bound(street):

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from detectors.squeezedet.squeezedet import SqueezeDet
+from detectors.squeezedet import SqueezeDet
 from drivesem.cli import main
 
 MAX_DEPTH = 14

@@ -14,13 +14,13 @@ import numpy as np
 from detectors.base import Detector, DetectorError
 from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
-from drivesem.analysis.holes.results import Samples
+from drivesem.analysis.holes.rules import FeatureSamples
 from drivesem.attack.budgets import parse_budget
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
-from drivesem.config.blocks import SceneOptions, shared_options
 from drivesem.config.errors import UsageError
-from drivesem.run.attack import Worker, build_grader
+from drivesem.config.options import SceneOptions, shared_options
+from drivesem.run.attack import AttackWorker, build_grader
 from drivesem.run.records import dump_record, load_record
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
@@ -76,7 +76,7 @@ class Looked:
     """Samples around a failure of one object."""
 
     index: int
-    around: Samples
+    around: FeatureSamples
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +196,7 @@ class Across:
 
     config: DetectorBenchConfig
     detector: Detector
-    workers: dict[str, Worker]
+    workers: dict[str, AttackWorker]
     kept: Path | None
     faults: tuple[str, ...] = ()
 
@@ -209,9 +209,9 @@ class Across:
         try:
             detector = load_detector(config.detector, config.device)
         except DetectorError as error:
-            raise UsageError.of("--detector", "a detector with gradients", error) from error
-        first = Worker.of(attack_settings(config, methods[0]), detector)
-        workers = {method: first.beside(attack_settings(config, method)) for method in methods}
+            raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
+        first = AttackWorker.from_config(attack_settings(config, methods[0]), detector)
+        workers = {method: first.with_config(attack_settings(config, method)) for method in methods}
         kept = None if config.out is None or config.out.endswith(".json") else Path(config.out)
         return cls(config, detector, workers, kept, faults)
 
@@ -277,7 +277,7 @@ class Across:
     def _attempt(self, name: str, scene: SceneIR, fault: str, method: str, inner: Remembering) -> AcrossAttempt:
         worker = self.workers[method]
         detector = PlantedDetector(inner, PlantedFault.parse(fault)).requires_grad_(False) if fault else inner
-        attacked = replace(worker, detector=detector, grader=build_grader(worker.config, detector)).search(
+        attacked = replace(worker, detector=detector, grader=build_grader(worker.config, detector)).attack_scene(
             name, scene
         )
         certain = certain_of(attacked)

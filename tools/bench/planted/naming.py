@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from detectors.planted import Band, PlantedFault
-from drivesem.analysis.holes.frame import samples_around
-from drivesem.analysis.holes.results import Samples
+from drivesem.analysis.holes.rules import FeatureSamples
+from drivesem.analysis.holes.run import draw_samples_around
 from drivesem.failures.neighbourhood import Neighbourhood
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.rules import fit_rule, overlap
@@ -24,12 +24,12 @@ def told_of(attacked: AttackedScene, index: int, samples: int, seed: int) -> tup
     return fit_rule(around.columns(), around.failing).intervals if around.margins else {}, len(around.margins)
 
 
-def looked_around(attacked: AttackedScene, index: int, samples: int, seed: int) -> Samples:
+def looked_around(attacked: AttackedScene, index: int, samples: int, seed: int) -> FeatureSamples:
     """So many samples around the failure of one object, half of them close to it. Each costs a pass."""
     objective, nuisances = attacked.objective, Nuisances()
     name = f"{attacked.identifier}:{index}:{seed}"
     near = Neighbourhood(objective, objective.feasible_set(), attacked.search.theta, index, nuisances, name)
-    return samples_around(near, samples)
+    return draw_samples_around(near, samples)
 
 
 def agrees(where: Where, fault: PlantedFault, bands: Sequence[Band]) -> tuple[bool, bool]:

@@ -16,7 +16,7 @@ from detectors.base import lower_probability
 from detectors.planted import BLIND_TO, FEATURES, Band, PlantedFault, compute_features, group_cars
 from detectors.types import CLASSES
 from drivesem.attack.objective import Objective
-from drivesem.evaluation.failures import IOU
+from drivesem.evaluation.failures import MATCH_IOU
 from drivesem.failures.neighbourhood import ObjectSample, SceneSampler
 from drivesem.failures.nuisances import Nuisances
 
@@ -155,7 +155,7 @@ def _seen(
     found = []
     for index, sample in samples.items():
         truth = torch.stack([exposure.targets.boxes_xyxy[index], exposure.visible_xyxy[index]]).to(placed)
-        meets = (boxes.iou_matrix(truth, placed[cars.rows]) >= IOU).any(0)
+        meets = (boxes.iou_matrix(truth, placed[cars.rows]) >= MATCH_IOU).any(0)
         groups = []
         for car in cars.car[meets].unique().tolist():
             best = float(scores[cars.rows][meets & (cars.car == car)].max())

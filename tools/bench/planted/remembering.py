@@ -8,8 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from detectors.base import Detector
-from detectors.wrapping import DetectorWrapper
+from detectors.base import Detector, DetectorWrapper
 
 _MOST = 96
 """Pictures whose predictions are kept, half a megabyte each: those that searches of one frame share."""

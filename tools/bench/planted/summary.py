@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.bench.tables import Columns
-from drivesem.evaluation.resampling import DRAWS, intervals, rate
+from drivesem.evaluation.resampling import DRAWS, bootstrap_intervals, ratio_metric
 from drivesem.failures.rules import format_rule
 from tools.bench.planted.yardstick import NO_FAULT, JudgedFrame
 
@@ -95,8 +95,8 @@ def _row(judged: Sequence[JudgedFrame], method: str, rarity: str, seed: int) -> 
     def counted(name: str) -> np.ndarray:
         return np.array([sum(getattr(attempt, name) for attempt in frame) for frame in by_frame], np.float64)
 
-    figure = rate("found", counted("found"), counted("passes") / 100)
-    (interval,) = intervals([figure], len(by_frame), DRAWS, np.random.default_rng(seed))
+    figure = ratio_metric("found", counted("found"), counted("passes") / 100)
+    (interval,) = bootstrap_intervals([figure], len(by_frame), DRAWS, np.random.default_rng(seed))
     found = sum(attempt.found for attempt in own)
     return {
         "method": method,

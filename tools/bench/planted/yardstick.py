@@ -16,13 +16,13 @@ from detectors.registry import load_detector
 from drivesem.attack.budgets import parse_budget
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
-from drivesem.config.blocks import SceneOptions, shared_options
 from drivesem.config.commands import AttackConfig, HolesConfig
 from drivesem.config.errors import UsageError
+from drivesem.config.options import SceneOptions, shared_options
 from drivesem.evaluation import failures
 from drivesem.failures.grades import Grade
 from drivesem.failures.rules import format_rule
-from drivesem.run.attack import Worker, build_grader
+from drivesem.run.attack import AttackWorker, build_grader
 from drivesem.run.frame import AttackedScene
 from drivesem.scenes.sources import NoVehicleError
 from scene_ir import files
@@ -112,7 +112,7 @@ def attack_settings(config: DetectorBenchConfig, method: str) -> AttackConfig:
         detector=config.detector,
         device=config.device,
         confirm=False,
-        peer="off",
+        second_detector="off",
         workers=1,
     )
     settings.check()
@@ -127,7 +127,7 @@ class Yardstick:
 
     config: DetectorBenchConfig
     detector: Detector
-    workers: Mapping[str, Worker]
+    workers: Mapping[str, AttackWorker]
     kinds: tuple[FaultKind, ...]
     named: tuple[str, ...]
     kept: Path | None
@@ -140,9 +140,9 @@ class Yardstick:
         try:
             detector = load_detector(config.detector, config.device)
         except DetectorError as error:
-            raise UsageError.of("--detector", "a detector with gradients", error) from error
-        first = Worker.of(attack_settings(config, methods[0]), detector)
-        workers = {method: first.beside(attack_settings(config, method)) for method in methods}
+            raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
+        first = AttackWorker.from_config(attack_settings(config, methods[0]), detector)
+        workers = {method: first.with_config(attack_settings(config, method)) for method in methods}
         kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
         return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, naming_of(config), kept)
 
@@ -183,10 +183,10 @@ class Yardstick:
             detector = PlantedDetector(self.detector, planting.fault).requires_grad_(False)
             for method, worker in self.workers.items():
                 grader = build_grader(worker.config, detector)
-                attacked = replace(worker, detector=detector, grader=grader).search(name, scene)
+                attacked = replace(worker, detector=detector, grader=grader).attack_scene(name, scene)
                 attempts.append(self._attempt(name, method, planting, survey, attacked))
         attempts += [
-            self._control(name, method, self.workers[method].search(name, scene)) for method in self.named
+            self._control(name, method, self.workers[method].attack_scene(name, scene)) for method in self.named
         ]
         return JudgedFrame(name, tuple(attempts), tuple(unplanted))
 
@@ -264,6 +264,8 @@ def certain_of(attacked: AttackedScene) -> list[int]:
 def seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:
     """Objects that a detector finds in an attacked scene's picture."""
     objective, rendered = attacked.objective, attacked.rendered
-    detections = objective.judged.detections(predict(detector, rendered.render.image[None])[0])
-    judgement = failures.judge(objective.judged.targets(rendered.moved.targets), detections, objective.t_star)
-    return tuple(judgement.found.nonzero()[:, 0].tolist())
+    detections = objective.classes.map_detections(predict(detector, rendered.render.image[None])[0])
+    judgement = failures.match_detections(
+        objective.classes.map_targets(rendered.moved.targets), detections, objective.t_star
+    )
+    return tuple(judgement.detected.nonzero()[:, 0].tolist())

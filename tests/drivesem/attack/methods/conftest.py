@@ -8,10 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.theta import Projected
+from drivesem.attack.methods.base import ParameterGroup, Problem, Score
+from drivesem.attack.theta import ProjectedTheta
 
-GROUPS = (Group("near", slice(0, 2)), Group("wide", slice(2, 5)), Group("code", slice(5, 6)))
+GROUPS = (
+    ParameterGroup("near", slice(0, 2)),
+    ParameterGroup("wide", slice(2, 5)),
+    ParameterGroup("code", slice(5, 6)),
+)
 STEP = torch.tensor([0.1, 0.1, 0.02, 0.02, 0.02, 0.25])
 LOWER = torch.tensor([-0.5, -0.5, -1.0, -1.0, -1.0, 0.0])
 UPPER = torch.tensor([0.5, 0.5, 1.0, 1.0, 1.0, 1.0])
@@ -39,17 +43,17 @@ class Slope:
         self.gradients.append(theta.clone())
         return float(self.loss(theta)), SLOPE / STEP
 
-    def project(self, theta: Tensor) -> Projected:
+    def project(self, theta: Tensor) -> ProjectedTheta:
         inside = torch.minimum(torch.maximum(theta, LOWER), UPPER)
         active = () if torch.equal(inside, theta) else ("bounds",)
         if float(inside[:2].sum()) > self.fence + 1e-6:
             inside[:2] *= self.fence / inside[:2].sum()
             active = (*active, "fence")
-        return Projected(inside, active)
+        return ProjectedTheta(inside, active)
 
     def score(self, theta: Tensor) -> Score:
         self.scored.append(theta.clone())
-        moved = {group.name for group in self.problem.moved(theta)}
+        moved = {group.name for group in GROUPS if bool((theta[group.where] != 0).any())}
         lost = int(float(self.loss(theta)) > self.need and moved.issuperset(self.together))
         violations = ("objects[0]: visibility",) if float(self.loss(theta)) > self.sight else ()
         return Score(float(self.loss(theta)), lost, 0, bool(lost) and not violations, False, violations)
@@ -57,7 +61,9 @@ class Slope:
     @property
     def problem(self) -> Problem:
         views = SlopeViews(self)
-        return Problem(self.loss_and_grad, self.project, self.score, STEP, LOWER, UPPER, GROUPS, views=views)
+        return Problem(
+            self.loss_and_grad, self.project, self.score, STEP, LOWER, UPPER, GROUPS, margin_oracle=views
+        )
 
 
 class SlopeViews:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Group, Problem, Score
-from drivesem.attack.theta import Projected
+from drivesem.attack.methods.base import ParameterGroup, Problem, Score
+from drivesem.attack.theta import ProjectedTheta
 
 CARS = 4
 PLACE, PAINT, WEATHER = slice(0, 2 * CARS), slice(2 * CARS, 3 * CARS), slice(3 * CARS, 3 * CARS + 2)
@@ -57,15 +57,15 @@ class Street:
 
         return Problem(
             loss_and_grad=lambda theta: (0.0, torch.zeros_like(theta)),
-            project=lambda theta: Projected(theta.clamp(lower, upper), ()),
+            project=lambda theta: ProjectedTheta(theta.clamp(lower, upper), ()),
             score=score,
             step=torch.full((DIM,), 0.1),
             lower=lower,
             upper=upper,
             groups=(
-                Group("place", PLACE, CARS, None, smooth_place),
-                Group("paint", PAINT, CARS),
-                Group("weather", WEATHER),
+                ParameterGroup("place", PLACE, CARS, None, smooth_place),
+                ParameterGroup("paint", PAINT, CARS),
+                ParameterGroup("weather", WEATHER),
             ),
-            views=self,
+            margin_oracle=self,
         )

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Group
+from drivesem.attack.methods.base import ParameterGroup
 from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.margin_search import LEAST_PASSES
 from drivesem.config import commands
@@ -116,7 +116,7 @@ def test_modes_are_what_is_searched() -> None:
     modes = torch.tensor([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
     street = Street()
     base = street.problem()
-    groups = (Group("bent", slice(0, 8), 2, modes), Group("rest", slice(8, DIM)))
+    groups = (ParameterGroup("bent", slice(0, 8), 2, modes), ParameterGroup("rest", slice(8, DIM)))
     result = Climb(PASSES)(replace(base, groups=groups), torch.zeros(DIM), 0)
     bent = result.theta[:8].reshape(2, 4)
     assert bool(bent.any())
@@ -126,7 +126,7 @@ def test_modes_are_what_is_searched() -> None:
 
 def test_the_least_of_passes_is_the_command_lines() -> None:
     """Written twice: options load no torch, and searches know no options."""
-    assert commands.LEAST_PASSES == LEAST_PASSES
+    assert commands.MIN_PASSES == LEAST_PASSES
 
 
 def test_what_cannot_be() -> None:

@@ -1,4 +1,4 @@
-"""sGD, momentum and restarts on a loss known in full; what attacks share."""
+"""Gradient attacks on a loss known in full, and what all attacks share."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivesem.attack.methods.apgd import APGD
-from drivesem.attack.methods.base import LOOKED_AT, Attack, Group, Problem, Proposals, Score
+from drivesem.attack.methods.base import MAX_RESCORED, Attack, ParameterGroup, Problem, Proposals, Score
 from drivesem.attack.methods.fgsm import FGSM
-from drivesem.attack.methods.restarts import Restarted
+from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
 from drivesem.attack.methods.scw import SCW
-from drivesem.attack.methods.sgd import SGD
-from drivesem.attack.methods.si_fgsm import SiFGSM
-from drivesem.attack.methods.subsets import Subsets
-from drivesem.attack.theta import Projected
+from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import RangeError
 
 START = torch.zeros(6)
@@ -29,13 +26,10 @@ METHODS = {
     "sgd raw": SGD(form="raw", rate=0.2, momentum=0.5),
     "scw": SCW(queries=15, steps=5),
     "scw 1": SCW(queries=15, steps=5, norm=1),
-    "subsets": Subsets(queries=30),
-    "restarts": Restarted(SiFGSM(4), 2),
-    "restarts of scw": Restarted(SCW(queries=8, steps=4), 2, steps=None),
 }
 
 
-BOTH = (Group("both", slice(0, 2)),)
+BOTH = (ParameterGroup("both", slice(0, 2)),)
 
 
 class Hill:
@@ -56,7 +50,7 @@ class Hill:
         limit = torch.full((len(self.step),), 100.0)
         return Problem(
             self.loss_and_grad,
-            lambda theta: Projected(theta.clone(), ()),
+            lambda theta: ProjectedTheta(theta.clone(), ()),
             lambda theta: Score(float(self.loss(theta)), 0, 0, False, False),
             self.step,
             -limit,
@@ -117,7 +111,7 @@ def test_momentum_of_each_group_by_itself():
         )
 
     together = Hill(loss)
-    apart = Hill(loss, groups=(Group("one", slice(0, 1)), Group("two", slice(1, 2))))
+    apart = Hill(loss, groups=(ParameterGroup("one", slice(0, 1)), ParameterGroup("two", slice(1, 2))))
     ends = [
         SiFGSM(steps=3, momentum=1.0)._propose(hill.problem, torch.zeros(2), torch.Generator()).thetas[-1].tolist()
         for hill in (together, apart)
@@ -133,43 +127,6 @@ def test_raw_momentum_is_a_heavy_ball():
     )
     # 0.1 * 3 * (1, 1.5, 1.75), added up
     assert [float(t[0]) for t in proposals.thetas] == pytest.approx([0.0, 0.3, 0.75, 1.275])
-
-
-def test_restarts_are_near_feasible_and_one_after_the_other(slope):
-    world = slope(need=math.inf, fence=0.02)
-    result = Restarted(SiFGSM(steps=2), 5, steps=8)(world.problem, START, seed=3)
-    assert result.queries == len(world.gradients) == 12
-    starts = torch.stack(world.gradients[::2])
-    assert torch.equal(starts[0], START)
-    assert float(starts[:, :2].sum(dim=1).max()) <= 0.02 + 1e-6
-    _, upper = world.problem.box(START, 8)
-    assert bool((starts.abs() <= upper / 4 + 1e-6).all())
-    assert float((starts[1:, 2:].abs() / upper[2:]).max()) > 0.2
-    assert len({tuple(start.tolist()) for start in starts}) == 6
-
-
-def test_restarts_find_what_one_start_does_not():
-    # Two hills: the one at theta0 is low, and its gradient leads away from the other.
-    def loss(theta):
-        return 1 - (theta[0] + 0.1) ** 2 if float(theta[0].detach()) < 0.05 else 2 - (theta[0] - 0.4) ** 2
-
-    def best(attack):
-        hill = Hill(lambda theta: loss(theta) + 0 * theta[1])
-        return attack(hill.problem, torch.zeros(2)).score.loss
-
-    assert best(SiFGSM(steps=4)) == pytest.approx(1.0, abs=0.02)
-    assert best(Restarted(SiFGSM(steps=4), 3, steps=10)) > 1.9
-
-
-def test_early_stop_ends_restarts_after_a_success(slope):
-    # Two steps suffice from theta0.
-    world = slope(need=7.0)
-    stopped = Restarted(SiFGSM(steps=4, early_stop=True), 5, early_stop=True)(world.problem, START)
-    assert stopped.queries == 2
-    assert Restarted(SiFGSM(steps=4, early_stop=True), 5)(world.problem, START).queries > 2
-    fruitless = slope(need=math.inf)
-    every = Restarted(SiFGSM(steps=2, early_stop=True), 3, early_stop=True)
-    assert every(fruitless.problem, START).queries == 8
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
@@ -208,13 +165,12 @@ def test_size_is_in_sign_steps_whatever_the_group(slope):
     theta[5] = 1.0
     assert float(problem.size(theta)) == pytest.approx(5)
     assert float(problem.size(theta, 1)) == pytest.approx(7)
-    assert [group.name for group in problem.moved(theta)] == ["wide", "code"]
 
 
 def test_size_has_a_gradient_everywhere_and_leaves_out_what_is_held():
     step = torch.tensor([0.1, 0.0])
     limit = torch.ones(2)
-    problem = Problem(lambda t: (0.0, t), lambda t: Projected(t, ()), lambda t: None, step, -limit, limit)
+    problem = Problem(lambda t: (0.0, t), lambda t: ProjectedTheta(t, ()), lambda t: None, step, -limit, limit)
     for p in (1, 2):
         theta = torch.zeros(2, requires_grad=True)
         (gradient,) = torch.autograd.grad(problem.size(theta, p), theta)
@@ -236,7 +192,7 @@ def test_an_attack_may_rank_otherwise_but_not_judge():
     limit = torch.ones(2)
     problem = Problem(
         lambda theta: (0.0, theta),
-        lambda theta: Projected(theta, ()),
+        lambda theta: ProjectedTheta(theta, ()),
         lambda theta: Score(float(theta[0]), round(float(theta[0]) * 5), 0, float(theta[0]) > 0.1, False),
         limit,
         -limit,
@@ -245,7 +201,6 @@ def test_an_attack_may_rank_otherwise_but_not_judge():
     result = Sizes()(problem, torch.zeros(2))
     assert result.theta.tolist() == pytest.approx([0.2, 0.0])
     assert result.score.lost == 1
-    assert Restarted(Sizes(), 1)(problem, torch.zeros(2)).score.lost == 1
 
 
 @pytest.mark.parametrize(
@@ -254,14 +209,10 @@ def test_an_attack_may_rank_otherwise_but_not_judge():
         (lambda: SGD(steps=0), "steps: expected at least 1, found 0"),
         (lambda: SGD(rate=0.0), "rate: expected a positive number, found 0.0"),
         (lambda: SiFGSM(momentum=1.5), r"momentum: expected a number in \[0, 1\], found 1.5"),
-        (lambda: Restarted(FGSM(), 0), "restarts: expected at least 1, found 0"),
-        (lambda: Restarted(FGSM(), 1, steps=0), "steps: expected at least 1, found 0"),
         (lambda: SCW(queries=0), "queries: expected at least 1, found 0"),
         (lambda: SCW(steps=0), "steps: expected at least 1, found 0"),
         (lambda: SCW(norm=3), "norm: expected 1 or 2, found 3"),
         (lambda: SCW(rate=math.nan), "rate: expected a positive number, found nan"),
-        (lambda: Subsets(queries=1), "queries: expected at least 2, found 1"),
-        (lambda: Subsets(steps=0), "steps: expected at least 1, found 0"),
     ],
 )
 def test_settings_that_cannot_be(make, message):
@@ -317,9 +268,15 @@ def test_of_what_was_seen_only_the_most_promising_is_judged():
         return None if k == 20 else Score(float(k), int(k == 4), 0, k == 4, False)
 
     problem = Problem(
-        lambda t: (0.0, torch.ones(1)), lambda t: Projected(t, ()), score, step, -limit, limit, preview=preview
+        lambda t: (0.0, torch.ones(1)),
+        lambda t: ProjectedTheta(t, ()),
+        score,
+        step,
+        -limit,
+        limit,
+        preview=preview,
     )
     result = SiFGSM(steps=20)(problem, torch.zeros(1))
     assert sorted(judged) == [0, 4, 16, 17, 18, 19, 20]
-    assert len(judged) == LOOKED_AT + 2
+    assert len(judged) == MAX_RESCORED + 2
     assert float(result.theta) == 20

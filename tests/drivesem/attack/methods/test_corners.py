@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.corners import Corners, corners
-from drivesem.attack.methods.margin_search import LEAST_PASSES
-from drivesem.attack.methods.sampling import Sampling
-from drivesem.attack.theta import Projected
+from drivesem.attack.methods.gradient_free import Sampling
+from drivesem.attack.methods.margin_search import LEAST_PASSES, Corners, balanced_corners
+from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import RangeError
 from tests.drivesem.attack.methods.street import BLIND_AT, CARS, DIM, PAINT, PLACE, WEATHER, Street
 
@@ -19,7 +18,7 @@ OWNER = torch.tensor([0, 0, 0, -1, -1, -1, -1, 1, 1, 1])
 
 
 def drawn(count: int, seed: int = 0) -> Tensor:
-    return corners(OWNER, count, torch.Generator().manual_seed(seed))
+    return balanced_corners(OWNER, count, torch.Generator().manual_seed(seed))
 
 
 def test_any_two_coordinates_of_one_owner_meet_at_all_of_their_ends() -> None:
@@ -78,12 +77,12 @@ def test_corners_are_projected_like_all_that_is_proposed() -> None:
     street = Street()
     base = street.problem()
 
-    def project(theta: Tensor) -> Projected:
+    def project(theta: Tensor) -> ProjectedTheta:
         inside = base.project(theta).theta
         over = float(inside[WEATHER].sum()) - 1.0
         if over > 1e-6:
             inside[WEATHER] -= over / 2
-        return Projected(inside, ("weather",) if over > 1e-6 else ())
+        return ProjectedTheta(inside, ("weather",) if over > 1e-6 else ())
 
     seen: list[Tensor] = []
     known = street.margins

@@ -11,24 +11,24 @@ from hypothesis import strategies as st
 
 from drivesem.attack.methods.base import Attack
 from drivesem.attack.methods.placebo import Placebo
-from drivesem.config.commands import COUNTED, RESTARTED
-from drivesem.config.commands import Attack as Config
-from drivesem.run.attack import attack_method
+from drivesem.config.commands import QUERY_METHODS
+from drivesem.config.commands import AttackConfig as Config
+from drivesem.run.attack import build_attack
 
 START = torch.zeros(6)
 LIKE = (0.1, -0.3, 0.02, 0.0, 0.5, 0.25)
 """What a placebo is as large as."""
 
 
-def method_of(name: str, restarts: int = 0) -> Attack:
-    queries = 12 if name in COUNTED else None
+def method_of(name: str) -> Attack:
+    queries = 12 if name in QUERY_METHODS else None
     if name == "placebo":
         return Placebo(LIKE)
-    return attack_method(Config(method=name, steps=4, queries=queries, restarts=restarts))  # pyright: ignore
+    return build_attack(Config(method=name, steps=4, queries=queries))  # pyright: ignore
 
 
 NAMES = get_args(get_type_hints(Config)["method"])
-METHODS = {name: method_of(name) for name in NAMES} | {f"{n} again": method_of(n, 2) for n in RESTARTED}
+METHODS = {name: method_of(name) for name in NAMES}
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)

@@ -5,15 +5,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from drivesem.attack.methods.base import Group, Problem, Score
+from drivesem.attack.methods.base import ParameterGroup, Problem, Score
 from drivesem.attack.methods.placebo import Placebo
-from drivesem.attack.theta import Projected
+from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import ShapeError
 
 START = torch.zeros(6)
 LOWER = torch.tensor([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0])
 UPPER = torch.ones(6)
-GROUPS = (Group("rotate", slice(0, 2)), Group("mesh", slice(2, 4)), Group("weather", slice(4, 6)))
+GROUPS = (
+    ParameterGroup("rotate", slice(0, 2)),
+    ParameterGroup("mesh", slice(2, 4)),
+    ParameterGroup("weather", slice(4, 6)),
+)
 LIKE = (0.1, -0.3, 0.02, 0.0, 0.5, 0.25)
 
 
@@ -21,7 +25,7 @@ def problem(limit: float = 1.0) -> Problem:
     """Every change lowers the loss and breaks nothing; coordinates of more than `limit` are not feasible."""
     return Problem(
         loss_and_grad=lambda theta: pytest.fail("a placebo takes no gradient"),
-        project=lambda theta: Projected(
+        project=lambda theta: ProjectedTheta(
             theta.clamp(-limit, limit), ("limit",) if theta.abs().max() > limit else ()
         ),
         score=lambda theta: Score(-float(theta.abs().sum()), 0, 0, False, False),

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from drivesem.attack.methods.base import Problem, Score
+from drivesem.attack.methods.gradient_ascent import SiFGSM
 from drivesem.attack.methods.scw import SCW
-from drivesem.attack.methods.si_fgsm import SiFGSM
-from drivesem.attack.theta import Projected
+from drivesem.attack.theta import ProjectedTheta
 
 START = torch.zeros(6)
 
@@ -92,7 +92,7 @@ def test_what_cannot_move_stays_and_a_flat_loss_is_no_error():
     step, upper = torch.tensor([0.1, 0.0, 0.1]), torch.tensor([0.5, 0.5, 0.0])
     problem = Problem(
         lambda theta: (0.0, torch.zeros(3)),
-        lambda theta: Projected(theta, ()),
+        lambda theta: ProjectedTheta(theta, ()),
         lambda theta: Score(0.0, 0, 0, False, False),
         step,
         -upper,

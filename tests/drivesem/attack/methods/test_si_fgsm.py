@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from drivesem.attack.methods.base import Attack, Problem, Proposals, Score
-from drivesem.attack.methods.si_fgsm import SiFGSM
-from drivesem.attack.theta import Projected
+from drivesem.attack.methods.gradient_ascent import SiFGSM
+from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import RangeError
 
 STEP = torch.tensor([0.1, 0.2, 0.3])
@@ -31,7 +31,7 @@ class Analytic:
 
     def project(self, theta):
         inside = theta.clamp(-0.5, 0.5)
-        return Projected(inside, tuple(f"{i}: bounds" for i in (inside != theta).nonzero()[:, 0].tolist()))
+        return ProjectedTheta(inside, tuple(f"{i}: bounds" for i in (inside != theta).nonzero()[:, 0].tolist()))
 
     def score(self, theta):
         self.scored.append(theta)

@@ -7,15 +7,15 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS, reach_of
-from drivesem.attack.feasibility_check import check_reach, check_scene
+from drivesem.attack.budgets import PRESETS, change_limits
+from drivesem.attack.feasibility_check import check_limits, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.regions import Regions
+from drivesem.attack.roi import RegionsOfInterest
 from drivesem.attack.space import COMBOS, Budget, ParameterSpace
 from scene_ir.errors import FormatError
 
 NEAR = ((-2.0, 9.0), (2.4, 13.0), (0.4, 24.0))
-ROI = reach_of(Budget(), "roi")
+ROI = change_limits(Budget(), "roi")
 
 
 def _space(scene, params=("translate",), **settings) -> ParameterSpace:
@@ -113,8 +113,8 @@ def test_second_check_measures_in_the_picture(street):
     far = space.apply(scene, theta)
     metres = float((far.objects.translation - scene.objects.translation)[2].norm())
     assert metres > 0.25 * float(scene.objects.size_lhw[2, 0])  # more than ours allows
-    assert check_reach(scene, far, reach_of(space.budget, "roi")) == []
-    (line,) = check_reach(scene, far, reach_of(Budget(translate=0.05), "roi"))
+    assert check_limits(scene, far, change_limits(space.budget, "roi")) == []
+    (line,) = check_limits(scene, far, change_limits(Budget(translate=0.05), "roi"))
     assert line.startswith("objects[2]: moved by ")
     assert line.endswith("of its box and 0.100 in log depth")
 
@@ -131,22 +131,22 @@ def test_a_gradient_on_the_ground_is_that_of_the_projected_way(street):
     theta = feasible.project(torch.tensor([0.02, 0, 0.03] * 3, dtype=torch.float64)).theta
     leaf = theta.clone().requires_grad_(True)
     (gradient,) = torch.autograd.grad(value(leaf), leaf)
-    along = feasible.along(theta, gradient)
+    along = feasible.project_gradient(theta, gradient)
     for i in (0, 2, 3, 5, 6, 8):
         step = torch.zeros_like(theta)
         step[i] = 1e-6
         there, back = (feasible.project(theta + sign * step).theta for sign in (1, -1))
         assert float(along[i]) == pytest.approx(float(value(there) - value(back)) / 2e-6, rel=1e-5, abs=1e-6)
     assert along[1::3].tolist() == [0, 0, 0]
-    assert torch.equal(FeasibleSet(space, only_bounds=True).along(theta, gradient), gradient)
+    assert torch.equal(FeasibleSet(space, only_bounds=True).project_gradient(theta, gradient), gradient)
 
 
 def test_a_way_to_the_ground_that_is_too_long_is_shortened(street):
     scene = street(positions_xz=NEAR, dtype=torch.float64)
-    regions = Regions.of(scene)
+    regions = RegionsOfInterest.from_scene(scene)
     far = torch.tensor([[0.0, 0.0, 2.0]] * 3, dtype=torch.float64)
     most = torch.tensor([0.02, 1e-9, 10.0], dtype=torch.float64)
-    found = regions.grounded(far, most)
+    found = regions.project_to_ground(far, most)
     assert 0 < float(found[0, 2]) < 2.0
     assert found[1].tolist() == [0, 0, 0]
     assert float(found[2, 2]) == 2.0

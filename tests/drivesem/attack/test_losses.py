@@ -9,7 +9,7 @@ from detectors.base import Candidates, Detector, DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack import goals
+from drivesem.attack import losses
 
 CAR, TRUCK, PERSON = 0, 1, 2
 ALL = tuple(range(len(CLASSES)))
@@ -35,7 +35,7 @@ def candidates(*rows: tuple[list[float], int, float]) -> Candidates:
 
 
 def of(name: str, found: Candidates, targets: Targets, known=ALL) -> float:
-    return float(goals.goal(name, found, targets, T_STAR, known))
+    return float(losses.goal_loss(name, found, targets, T_STAR, known))
 
 
 SEEN = candidates(
@@ -47,22 +47,22 @@ SEEN = candidates(
 
 
 def test_hide_counts_the_best_score_that_meets_each_object():
-    assert of("hide", SEEN, truth()) == pytest.approx(-logit(0.95) + goals.CERTAIN + goals.CERTAIN, abs=1e-5)
+    assert of("hide", SEEN, truth()) == pytest.approx(-logit(0.95) + losses.MAX_MARGIN + losses.MAX_MARGIN, abs=1e-5)
     assert of("hide", SEEN, truth((False, True, True))) == pytest.approx(-logit(0.95), abs=1e-5)
     assert of("hide", SEEN, truth((True, True, True))) == 0
 
 
 def test_the_highest_threshold_has_a_logit():
-    assert goals.logit_of(0.3) == math.log(0.3) - math.log1p(-0.3)
-    assert 16 < goals.logit_of(1.0) < 17
-    assert math.isfinite(float(goals.goal("failure", SEEN, truth(), 1.0, ALL)))
+    assert losses.threshold_logit(0.3) == math.log(0.3) - math.log1p(-0.3)
+    assert 16 < losses.threshold_logit(1.0) < 17
+    assert math.isfinite(float(losses.goal_loss("failure", SEEN, truth(), 1.0, ALL)))
 
 
 def test_hiding_what_is_hidden_gains_nothing():
     lone = truth((False, True, True))
     faint = [of("hide", candidates(([0, 0, 20, 20], CAR, score)), lone) for score in (0.4, 0.01, 0.001)]
     assert faint[0] == pytest.approx(logit(0.6), abs=1e-5)
-    assert faint[1:] == [goals.CERTAIN] * 2
+    assert faint[1:] == [losses.MAX_MARGIN] * 2
 
 
 def test_phantom_is_the_mean_of_the_best_false_alarms():
@@ -71,13 +71,13 @@ def test_phantom_is_the_mean_of_the_best_false_alarms():
     cars = of("phantom", SEEN, truth((False, False, True)), known=(CAR,))
     assert cars == pytest.approx(expected / 2, abs=1e-5)
     # Of the other classes every candidate is silent, so of all of them eight count.
-    rest = goals.ALARMS - 2
-    assert of("phantom", SEEN, truth()) == pytest.approx((expected + rest * logit(1e-9)) / goals.ALARMS, rel=1e-3)
+    rest = losses.MAX_PHANTOMS - 2
+    assert of("phantom", SEEN, truth()) == pytest.approx((expected + rest * logit(1e-9)) / losses.MAX_PHANTOMS, rel=1e-3)
 
 
 def test_what_lies_on_an_ignored_object_of_its_class_is_no_phantom():
     on_ignored = candidates(([2, 2, 10, 10], CAR, 0.8))
-    assert of("phantom", on_ignored, truth((True, True, True)), known=(CAR,)) == -goals.CERTAIN
+    assert of("phantom", on_ignored, truth((True, True, True)), known=(CAR,)) == -losses.MAX_MARGIN
     assert of("phantom", on_ignored, truth(), known=(CAR,)) == pytest.approx(logit(0.8), abs=1e-5)
 
 
@@ -97,7 +97,7 @@ def test_failure_is_hide_and_phantom():
     assert of("failure", SEEN, truth()) == pytest.approx(both, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", goals.GOALS)
+@pytest.mark.parametrize("name", losses.GOALS)
 def test_gradients_are_differences(name):
     generator = torch.Generator().manual_seed(3)
     rough = torch.rand(6, 4, generator=generator, dtype=torch.float64)
@@ -106,17 +106,17 @@ def test_gradients_are_differences(name):
     live = [boxes.requires_grad_(True), logs.requires_grad_(True)]
 
     def value(placed, scores):
-        return goals.goal(name, Candidates(placed, scores), truth(), 0.4, ALL)
+        return losses.goal_loss(name, Candidates(placed, scores), truth(), 0.4, ALL)
 
     assert torch.autograd.gradcheck(value, live, eps=1e-6, atol=1e-6)
     gradients = torch.autograd.grad(value(*live), live, allow_unused=True)
     assert any(gradient is not None and bool(gradient.any()) for gradient in gradients)
 
 
-@pytest.mark.parametrize("name", goals.GOALS)
+@pytest.mark.parametrize("name", losses.GOALS)
 def test_where_nothing_can_fail_the_gradient_is_zero(name):
     boxes, logs = torch.rand(2, 1, 4, requires_grad=True), torch.full((2, len(CLASSES)), -3.0, requires_grad=True)
-    value = goals.goal(name, Candidates(boxes, logs), truth((True, True, True)), T_STAR, known=())
+    value = losses.goal_loss(name, Candidates(boxes, logs), truth((True, True, True)), T_STAR, known=())
     gradient, _ = torch.autograd.grad(value, [logs, boxes], allow_unused=True)
     assert gradient is not None
     assert not bool(gradient.any())
@@ -124,8 +124,8 @@ def test_where_nothing_can_fail_the_gradient_is_zero(name):
 
 def test_detections_are_candidates_without_a_gradient():
     found = Detections(OBJECTS[:2], torch.tensor([CAR, TRUCK]), torch.tensor([0.9, 0.3]))
-    told = goals.of_detections(found, len(CLASSES))
-    assert told.boxes_of(TRUCK).tolist() == OBJECTS[:2].tolist()
+    told = losses.candidates_from_detections(found, len(CLASSES))
+    assert told.boxes_for_class(TRUCK).tolist() == OBJECTS[:2].tolist()
     assert of("hide", told, truth((False, True, True))) == pytest.approx(-logit(0.9), abs=1e-5)
 
 
@@ -137,7 +137,7 @@ def test_candidates_are_what_is_decoded(name):
     limit = torch.tensor([width - 1.0, height - 1.0] * 2)
     with torch.no_grad():
         raw = detector(image)
-        raws = [raw, raw.planted(torch.tensor([10.0, 20, 60, 70]), CAR)]
+        raws = [raw, raw.inject(torch.tensor([10.0, 20, 60, 70]), CAR)]
         told = [detector.candidates(one) for one in raws]
     found = [detector.decode(one)[0] for one in raws]
     assert len(found[1]) == 1
@@ -146,7 +146,7 @@ def test_candidates_are_what_is_decoded(name):
             detections.boxes_xyxy, detections.labels.tolist(), detections.scores, strict=True
         ):
             same = (one.log_scores[:, label].exp() - score).abs() < 1e-5
-            placed = torch.minimum(one.boxes_of(label)[same].clamp(min=0), limit)
+            placed = torch.minimum(one.boxes_for_class(label)[same].clamp(min=0), limit)
             assert bool(((placed - box).abs() < 0.1).all(1).any())
 
 
@@ -167,6 +167,6 @@ def test_the_loss_of_an_untrained_detector_is_finite():
     detector = SqueezeDet()
     detector.requires_grad_(False)
     image = torch.rand(1, 3, 64, 96, requires_grad=True)
-    for name in goals.GOALS:
-        value = goals.goal(name, detector.candidates(detector(image)), truth(), 0.4, ALL)
+    for name in losses.GOALS:
+        value = losses.goal_loss(name, detector.candidates(detector(image)), truth(), 0.4, ALL)
         assert bool(torch.isfinite(value))

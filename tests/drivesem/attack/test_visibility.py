@@ -8,8 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.contrast import FLARE, LEAST_CONTRAST, contrast_between, contrasts, luminance
-from drivesem.attack.fading import Fading
+from drivesem.attack.visibility import FLARE, MIN_CONTRAST, VisibilityUnderWeather, contrast_between, compute_contrasts, luminance
 from scene_ir.render.environment import apply_weather
 from scene_ir.types import Crop, Environment, Render
 
@@ -55,7 +54,7 @@ def _in_weather(render: Render, weather: torch.Tensor) -> Render:
 
 def test_a_uniform_car_has_its_weber_contrast():
     car, road = 0.30, 0.20
-    found = contrasts(_seen(_display(car), _display(road)))
+    found = compute_contrasts(_seen(_display(car), _display(road)))
     assert found == pytest.approx([(car - road) / (0.5 * (car + road) + FLARE)], rel=0.03)  # of 8 bits
 
 
@@ -72,12 +71,12 @@ def test_a_uniform_car_has_its_weber_contrast():
     ],
 )
 def test_who_is_seen(car, road, windows, seen):
-    assert (contrasts(_seen(car, road, windows))[0] >= LEAST_CONTRAST) == seen
+    assert (compute_contrasts(_seen(car, road, windows))[0] >= MIN_CONTRAST) == seen
 
 
 def test_an_object_that_shows_nowhere_has_none():
     render = _seen(0.1, 0.5)
-    assert contrasts(Render(render.image, render.depth, render.object_id * 0, render.opacity)).tolist() == [0.0]
+    assert compute_contrasts(Render(render.image, render.depth, render.object_id * 0, render.opacity)).tolist() == [0.0]
     assert contrast_between(np.array([0.5]), np.array([])) == 0.0
 
 
@@ -85,14 +84,14 @@ def test_what_covers_less_than_a_tenth_is_no_contrast():
     image = _seen(0.5, 0.5).image.clone()
     image[:, TOP : TOP + 3] = 1.0  # a streak of light over car and road
     render = _seen(0.5, 0.5)
-    assert contrasts(Render(image, render.depth, render.object_id, render.opacity))[0] < LEAST_CONTRAST
+    assert compute_contrasts(Render(image, render.depth, render.object_id, render.opacity))[0] < MIN_CONTRAST
 
 
 def test_a_black_car_in_fog_is_seen_near_and_not_far():
     fog = torch.tensor([1.0, 0.0, 0.0, 0.0])
     near, far = (_in_weather(_seen(0.15, 0.5, away_m=away), fog) for away in (10.0, 120.0))
-    assert contrasts(near)[0] > 4 * LEAST_CONTRAST
-    assert contrasts(far)[0] < LEAST_CONTRAST
+    assert compute_contrasts(near)[0] > 4 * MIN_CONTRAST
+    assert compute_contrasts(far)[0] < MIN_CONTRAST
 
 
 LIGHT = st.lists(st.floats(0, 1), min_size=1, max_size=30).map(np.array)
@@ -108,7 +107,7 @@ def test_a_veil_of_bright_air_only_takes_contrast(own, around, veils):
 def test_the_more_fog_the_less_is_seen():
     render = _seen(0.3, 0.6, away_m=60.0)
     fogs = [torch.tensor([fog, 0.0, 0.0, 0.0]) for fog in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    found = [contrasts(_in_weather(render, fog))[0] for fog in fogs]
+    found = [compute_contrasts(_in_weather(render, fog))[0] for fog in fogs]
     assert found == sorted(found, reverse=True)
 
 
@@ -124,30 +123,30 @@ def test_luminance_is_that_of_srgb():
 @pytest.mark.parametrize("away_m", [10.0, 40.0, 80.0, 120.0])
 def test_fading_says_of_a_car_what_its_picture_says(weather, away_m):
     render, codes = _seen(0.15, 0.5, 0.3, away_m), torch.tensor(weather)
-    fading = Fading(render, _environment(CLEAR), AIR, np.array([True]), LEAST_CONTRAST)
-    seen = contrasts(_in_weather(render, codes))[0]
-    if not 0.9 < seen / (1.25 * LEAST_CONTRAST) < 1.1:  # some pixels are not all
-        assert bool(fading(codes.double().numpy())[0]) == (seen < 1.25 * LEAST_CONTRAST)
+    find_invisible = VisibilityUnderWeather(render, _environment(CLEAR), AIR, np.array([True]), MIN_CONTRAST)
+    seen = compute_contrasts(_in_weather(render, codes))[0]
+    if not 0.9 < seen / (1.25 * MIN_CONTRAST) < 1.1:  # some pixels are not all
+        assert bool(find_invisible(codes.double().numpy())[0]) == (seen < 1.25 * MIN_CONTRAST)
 
 
 def test_who_is_not_asked_for_does_not_fade():
     thick = np.array([1.0, 0, 0, 0])
     render = _seen(0.15, 0.5, away_m=120.0)
     for asked in (True, False):
-        fading = Fading(render, _environment(CLEAR), AIR, np.array([asked]), LEAST_CONTRAST)
-        assert fading(thick).tolist() == [asked]
-        assert not fading(np.zeros(4)).any()
+        find_invisible = VisibilityUnderWeather(render, _environment(CLEAR), AIR, np.array([asked]), MIN_CONTRAST)
+        assert find_invisible(thick).tolist() == [asked]
+        assert not find_invisible(np.zeros(4)).any()
 
 
 def test_who_is_faint_from_the_start_may_stay_so():
     render = _seen(0.51, 0.5, away_m=30.0)
-    fading = Fading(render, _environment(CLEAR), AIR, np.array([True]), LEAST_CONTRAST)
-    assert contrasts(render)[0] < LEAST_CONTRAST
-    assert not fading(np.zeros(4)).any()
-    assert fading(np.array([0.5, 0, 0, 0])).all()
+    find_invisible = VisibilityUnderWeather(render, _environment(CLEAR), AIR, np.array([True]), MIN_CONTRAST)
+    assert compute_contrasts(render)[0] < MIN_CONTRAST
+    assert not find_invisible(np.zeros(4)).any()
+    assert find_invisible(np.array([0.5, 0, 0, 0])).all()
 
 
 def test_contrast_is_of_the_picture_as_written():
     render = _seen(0.5 + 0.4 / 255, 0.5)
-    assert contrasts(render)[0] == 0.0
-    assert math.isclose(contrasts(_seen(0.6, 0.5))[0], contrasts(_seen(round(0.6 * 255) / 255, 0.5))[0])
+    assert compute_contrasts(render)[0] == 0.0
+    assert math.isclose(compute_contrasts(_seen(0.6, 0.5))[0], compute_contrasts(_seen(round(0.6 * 255) / 255, 0.5))[0])

@@ -1,0 +1,155 @@
+"""Vehicles as the constraints see them: posed boxes around deformed meshes, and the mesh points that span them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+
+from scene_ir import ffd
+from scene_ir.types import LATTICE, LATTICE_POINTS, Mesh, SceneIR
+
+Array = NDArray[np.float64]
+Values = NDArray[np.floating[Any]]
+"""In theta's own dtype, float32 or float64."""
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+Turns = NDArray[np.complex128]
+TOLERANCE = 1e-6
+"""Slack of every comparison (m, m2, shares, strain): far above rounding, far below what matters."""
+
+
+@dataclass(slots=True)
+class VehicleBoxes:
+    """Posed boxes of N vehicles, changed in place. `CameraProjection.project` fills the last three fields."""
+
+    low: Array
+    """(N, 3) m, lower bounds of the deformed mesh in the vehicle's frame."""
+    high: Array
+    """(N, 3) m, upper bounds."""
+    turn: Turns
+    """(N,), cos(yaw) + i sin(yaw)."""
+    translation: Array
+    """(N, 3) m."""
+    box: Array
+    """(N, 4) px, image box, clipped to the picture."""
+    near: Array
+    """(N,) m, smallest distance of a corner from the camera plane."""
+    far: Array
+    """(N,) m, largest distance of a corner from the camera plane."""
+
+    @classmethod
+    def from_poses(cls, low: Array, high: Array, yaw: Array, translation: Array) -> VehicleBoxes:
+        """Boxes with bounds low, high (N, 3) m at yaw (N,) rad and translation (N, 3) m."""
+        n = len(yaw)
+        return cls(low, high, unit_complex(yaw), translation, np.zeros((n, 4)), np.zeros(n), np.zeros(n))
+
+
+def unit_complex(yaw: Array) -> Turns:
+    """cos(yaw) + i sin(yaw): multiplying x + i z by it turns camera axes into vehicle axes, its conjugate back."""
+    return np.cos(yaw) + 1j * np.sin(yaw)
+
+
+def footprint_centres(cars: VehicleBoxes) -> Turns:
+    """Centres of the footprints, x + i z (N,) m."""
+    middle = 0.5 * (cars.low + cars.high)
+    place = cars.translation[:, 0] + 1j * cars.translation[:, 2]
+    return place + cars.turn.conj() * (middle[:, 0] + 1j * middle[:, 2])
+
+
+def cell_centres(along: int, across: int) -> Array:
+    """Centres (2, along * across) of the cells of a unit square, `across` fastest."""
+    first, second = (np.arange(along) + 0.5) / along, (np.arange(across) + 0.5) / across
+    return np.stack([a.reshape(-1) for a in np.meshgrid(first, second, indexing="ij")])
+
+
+def to_float64_array(tensor: Tensor) -> Array:
+    """A tensor as a float64 array, without its gradient."""
+    return tensor.detach().cpu().double().numpy()
+
+
+_SURFACE_POINTS = 160
+"""Maximum number of mesh vertices, besides those of the convex hull, that span a mesh."""
+_SLICE = LATTICE[1] * LATTICE[2]
+"""Lattice points in a slice across the length."""
+
+
+class VehicleSurfaces:
+    """Points on N vehicles' meshes that span their extents, in metres of each vehicle's frame.
+
+    Attributes:
+        offsets: (N, 64, 3), lattice offsets of the photographed scene, in unit boxes.
+        rest: (N, 3, K) m, the points at these offsets.
+    """
+
+    def __init__(self, scene: SceneIR) -> None:
+        points_by_mesh = {
+            index: extreme_points(scene.meshes[index]) for index in set(scene.objects.mesh_index.tolist())
+        }
+        point_count = max(len(points) for points in points_by_mesh.values())
+        unit_points: dict[int, Array] = {}
+        along: dict[int, Array] = {}
+        across: dict[int, Array] = {}
+        for index, points in points_by_mesh.items():
+            # Padded to one length with the last point, which changes no extents.
+            padded = np.concatenate([points, np.repeat(points[-1:], point_count - len(points), axis=0)])
+            weights = (
+                ffd.lattice_weights(torch.from_numpy(padded)).numpy().reshape(point_count, LATTICE[0], _SLICE)
+            )
+            # Each factor of the weights sums to 1. Stored separately they take a third of the memory and time.
+            unit_points[index], along[index], across[index] = (
+                padded.T,
+                weights.sum(axis=2).T,
+                weights.sum(axis=1).T,
+            )
+        owners = scene.objects.mesh_index.tolist()
+        # `stack` keeps the transposed order, with which the products take three times as long.
+        self._unit, self._along, self._across = (
+            np.ascontiguousarray(np.stack([part[i] for i in owners])) for part in (unit_points, along, across)
+        )
+        self._size = to_float64_array(scene.objects.size_lhw)[:, :, None]
+        self.offsets = to_float64_array(scene.objects.ffd)
+        self.rest = self._apply_offsets(self.offsets, slice(None))
+
+    def deform(self, mesh: Values, rows: Indices | slice = slice(None)) -> Array:
+        """The points (M, 3, K) m of vehicles `rows` under mesh codes (M, 96)."""
+        return self._apply_offsets(self.offsets[rows] + _offsets(mesh), rows)
+
+    def _apply_offsets(self, offsets: Array, rows: Indices | slice) -> Array:
+        slices = offsets.swapaxes(1, 2).reshape(len(offsets), -1, _SLICE) @ self._across[rows]
+        slices = slices.reshape(len(offsets), 3, LATTICE[0], -1)
+        shift = np.einsum("ncik,nik->nck", slices, self._along[rows])
+        return (self._unit[rows] + shift) * self._size[rows]
+
+
+def extreme_points(mesh: Mesh) -> Array:
+    """Vertices (K, 3), in unit boxes, that span a mesh's extents."""
+    vertices = mesh.vertices.detach().cpu().double().numpy()
+    try:
+        hull = set(ConvexHull(vertices).vertices.tolist())
+    except QhullError:  # a flat mesh has no hull with a volume
+        hull = set()
+    stride = max(1, -(-len(vertices) // _SURFACE_POINTS))
+    return vertices[sorted(hull | set(range(0, len(vertices), stride)))]
+
+
+def extents(surface: Array) -> tuple[Array, Array]:
+    """Lower and upper bounds (N, 3) of points (N, 3, K)."""
+    return surface.min(axis=2), surface.max(axis=2)
+
+
+def _offsets(mesh: Values) -> Array:
+    """Lattice offsets (N, 64, 3) from symmetric codes (N, 96): `ffd.from_symmetric` in numpy."""
+    half = mesh.astype(np.float64).reshape(len(mesh), LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)
+    mirror = half[:, :, :, ::-1] * [1.0, 1.0, -1.0]
+    return np.concatenate([half, mirror], axis=3).reshape(len(mesh), LATTICE_POINTS, 3)
+
+
+def lowest_layer_heights(mesh: Values) -> Values:
+    """Vertical offsets (N, 4, 2) of the lowest lattice layer, a view into symmetric codes (N, 96)."""
+    return mesh.reshape(len(mesh), LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)[:, :, -1, :, 1]
