@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from detectors.squeezedet import BGR_MEAN, Fire, SqueezeDet
 from drivesem.classify.networks.base import Classifier
-from tools.experiments.realism import networks
 
 _FIRES = dict(list(SqueezeDet.layout.fires.items())[:8])
 """Up to fire9: what SqueezeDet has after that is its own."""
@@ -48,6 +47,19 @@ class SqueezeNet(Classifier):
         return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)
 
 
+def vgg16_convolutions() -> list[nn.Module]:
+    """The layers of VGG-16 up to relu5_3, in torchvision's order."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, count in zip((64, 128, 256, 512, 512), (2, 2, 3, 3, 3), strict=True):
+        if layers:
+            layers.append(nn.MaxPool2d(2, 2))
+        for _ in range(count):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+            channels = width
+    return layers
+
+
 class VGG16(Classifier):
     """The published network."""
 
@@ -56,7 +68,7 @@ class VGG16(Classifier):
 
     def __init__(self, classes: Sequence[str]) -> None:
         super().__init__(classes)
-        self.features = nn.Sequential(*networks.vgg16().features, nn.MaxPool2d(2, 2))
+        self.features = nn.Sequential(*vgg16_convolutions(), nn.MaxPool2d(2, 2))
         wide = [nn.Linear(512 * 7 * 7, 4096), nn.ReLU(inplace=True), nn.Dropout()]
         deep = [nn.Linear(4096, 4096), nn.ReLU(inplace=True), nn.Dropout()]
         self.classifier = nn.Sequential(*wide, *deep, nn.Linear(4096, len(self.classes)))
@@ -76,7 +88,7 @@ class PooledVGG16(Classifier):
 
     def __init__(self, classes: Sequence[str]) -> None:
         super().__init__(classes)
-        self.features = nn.Sequential(*networks.vgg16().features, nn.MaxPool2d(2, 2))
+        self.features = nn.Sequential(*vgg16_convolutions(), nn.MaxPool2d(2, 2))
         self.classifier = nn.Linear(2 * 512, len(self.classes))
 
     def encode(self, prepared: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.cli import main
-from drivesem.config.commands import Attack
-from drivesem.config.text import to_yaml
+from tools.experiments.__main__ import main
+from drivesem.config.commands import AttackConfig
+from drivesem.config.options import to_yaml
 from drivesem.data.kitti import write_labels
 from drivesem.run.results import Coordinate, FrameResult, dump_frame
 from scene_ir import files
@@ -60,7 +60,7 @@ def run(tmp_path: Path) -> Path:
     """Two frames: in the first, two cars that turn; in the second, one alone that stays."""
     folder = tmp_path / "run"
     frames = {"a": (labels(YAW, 20, 30), labels(TURNED, 20, 30)), "b": (labels(YAW, 25), labels(YAW, 25))}
-    files.write_text(folder / "config.yaml", to_yaml(Attack(out=str(folder))))
+    files.write_text(folder / "config.yaml", to_yaml(AttackConfig(out=str(folder))))
     files.write_json(folder / "metrics.json", {"params": ["rotate"], "t_star": 0.5})
     files.write_json(folder / "manifest.json", {"frames": {name: {} for name in frames}})
     for name, (before, after) in frames.items():

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivesem.cli import main
+from tools.experiments.__main__ import main
 from drivesem.evaluation.resampling import Interval
 from drivesem.run.results import dump_frame, load_frame
 from scene_ir import files
 from scene_ir.errors import ShapeError
 from tools.experiments.realism import comparison
-from tools.experiments.realism.comparison import rectangle_around, vehicles, window
+from tools.experiments.realism.comparison import crop_window, enclosing_rectangle, vehicle_boxes
 from tools.experiments.realism.measures import LEAST_PX
 
 
@@ -103,31 +103,35 @@ def test_a_table_for_people(
 
 
 def test_windows() -> None:
-    rows, columns = window([(10, 20, 30.5, 40)], 200, 300)
+    rows, columns = crop_window([(10, 20, 30.5, 40)], 200, 300)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (LEAST_PX, LEAST_PX)
     assert rows.start <= 20 < 40 <= rows.stop
     assert columns.start == 0
-    both = window([(10, 20, 90, 40), (100.2, 10, 190.4, 150.6)], 200, 300)
+    both = crop_window([(10, 20, 90, 40), (100.2, 10, 190.4, 150.6)], 200, 300)
     assert both == (slice(10, 151), slice(10, 191))
-    outside = window([(290, 190, 400, 300)], 200, 300)
+    outside = crop_window([(290, 190, 400, 300)], 200, 300)
     assert outside == (slice(200 - LEAST_PX, 200), slice(300 - LEAST_PX, 300))
     with pytest.raises(ShapeError, match="at least 64 px"):
-        window([(0, 0, 1, 1)], 63, 300)
+        crop_window([(0, 0, 1, 1)], 63, 300)
 
 
 def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
     write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]
 ) -> None:
     nowhere, box = (0.0, 0.0, 0.0, 0.0), (210.0, 120.0, 290.0, 190.0)
-    assert window([box, nowhere], 200, 300) == window([nowhere, box], 200, 300) == window([box], 200, 300)
-    assert rectangle_around([nowhere, box]) == box
+    assert (
+        crop_window([box, nowhere], 200, 300)
+        == crop_window([nowhere, box], 200, 300)
+        == crop_window([box], 200, 300)
+    )
+    assert enclosing_rectangle([nowhere, box]) == box
     run = write_run(tmp_path / "run")
     path = run / "frames" / "a" / "result.json"
     result = load_frame(path)
     benign, moved = result.targets_benign, result.targets_moved
     left = (replace(moved[0], xyxy=nowhere, ignore=True), moved[1])
     files.write_text(path, dump_frame(replace(result, targets_moved=left)))
-    assert vehicles(load_frame(path)) == list(zip(benign, left, strict=True))
+    assert vehicle_boxes(load_frame(path)) == list(zip(benign, left, strict=True))
     assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 6
     never = (replace(benign[0], xyxy=nowhere, ignore=True), benign[1])
     files.write_text(path, dump_frame(replace(result, targets_benign=never, targets_moved=left)))
@@ -137,8 +141,8 @@ def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
 def test_bounds_of_psnr_swap_with_those_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """A small error is a large PSNR, and no error an infinite one."""
     monkeypatch.setattr(comparison, "intervals", lambda *_: [Interval("", 25.0, 0.0, 100.0)])
-    part = comparison.Part(None, "", {"psnr": dict.fromkeys(comparison.PAIRS, 25.0)}, {})
-    row = comparison.rows([comparison.FrameParts("a", (part,))], ["psnr"], 1, 0)[0]
+    part = comparison.PictureRegion(None, "", {"psnr": dict.fromkeys(comparison.PAIRS, 25.0)}, {})
+    row = comparison.realism_rows([comparison.FrameRegions("a", (part,))], ["psnr"], 1, 0)[0]
     assert (row.low, row.high) == (pytest.approx(20 * np.log10(25.5)), None)
 
 

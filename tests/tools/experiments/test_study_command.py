@@ -13,14 +13,14 @@ import cv2
 import pytest
 import yaml
 
-from drivesem.cli import main
-from drivesem.config.commands import Study
+from tools.experiments.__main__ import main
 from drivesem.failures.second_renderer.base import NoSecondRendererError
 from drivesem.synth.write import Order, synthesise
 from tools.experiments.detection import asking as study_asking
-from tools.experiments.detection.arms import Arm, arms_of
+from tools.experiments.detection.arms import AttackArm, build_arms
+from tools.experiments.settings import StudyConfig
 
-WORDS = ["study", "multi", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
+WORDS = ["multi", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
 ASKED = (
     *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
     *("recall_moved", "reference"),
@@ -28,9 +28,9 @@ ASKED = (
 """What other programs read of a row."""
 
 
-def first_arm(config: Study, out: Path) -> list[Arm]:
+def first_arm(config: StudyConfig, out: Path) -> list[AttackArm]:
     """Combination 1 and its controls."""
-    return arms_of(config, out)[:3]
+    return build_arms(config, out)[:3]
 
 
 def study(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def test_tables_come_again_from_what_is_kept(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rows, intervals and p values to the last bit; and other draws give other intervals."""
-    words = ["study", "multi", "--from", str(finished / "kept"), "--json"]
+    words = ["multi", "--from", str(finished / "results"), "--json"]
     assert study(words, capsys) == json.loads((finished / "study.json").read_text())
     assert study([*words, "--out", str(tmp_path / "again")], capsys)["bootstrap"] == 5
     again = {path.name: path.read_bytes() for path in (tmp_path / "again").iterdir()}
@@ -86,18 +86,18 @@ def test_tables_come_again_from_what_is_kept(
     assert all(data == (finished / name).read_bytes() for name, data in again.items())
     (row,) = study([*words, "--bootstrap", "0"], capsys)["rows"]
     assert (row["drop_moved_low"], row["p"]) == (None, None)
-    assert main(["study", "multi", "--kept", str(finished / "kept")]) == 0
+    assert main(["multi", "--results", str(finished / "results")]) == 0
     assert "combo 1" in capsys.readouterr().out
 
 
 def test_labels_come_again_from_what_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(study_asking, "arms_of", lambda config, out: arms_of(config, out)[:1])
+    monkeypatch.setattr(study_asking, "arms_of", lambda config, out: build_arms(config, out)[:1])
     out = tmp_path / "labels"
-    data = study(["study", "labels", *WORDS[2:], "--out", str(out), "--json"], capsys)
+    data = study(["labels", *WORDS[1:], "--out", str(out), "--json"], capsys)
     assert data["label_sets"][0]["objects"] > 0
-    assert study(["study", "labels", "--from", str(out / "kept"), "--json"], capsys) == data
+    assert study(["labels", "--from", str(out / "results"), "--json"], capsys) == data
 
 
 @pytest.mark.parametrize(
@@ -105,22 +105,22 @@ def test_labels_come_again_from_what_is_kept(
     [
         (["classification"], "settings.name: expected classification, found multi"),
         (["single"], "settings.name: expected single, found multi"),
-        (["multi", "--steps", "7"], "--steps: expected none beside --kept, which has the study's own settings"),
+        (["multi", "--steps", "7"], "--steps: expected none beside --results, which has the study's own settings"),
     ],
 )
 def test_what_cannot_be_told_again(
     words: list[str], message: str, finished: Path, refused: Callable[..., str]
 ) -> None:
-    assert message in refused("study", *words, "--from", str(finished / "kept"))
+    assert message in refused(*words, "--from", str(finished / "results"))
 
 
 @pytest.mark.parametrize(
-    ("folder", "message"), [(".", "study.json: expected a readable"), ("none", "--kept: expected")]
+    ("folder", "message"), [(".", "study.json: expected a readable"), ("none", "--results: expected")]
 )
 def test_a_folder_that_keeps_nothing(
     folder: str, message: str, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
-    assert message in refused("study", "multi", "--from", str(tmp_path / folder))
+    assert message in refused("multi", "--from", str(tmp_path / folder))
 
 
 def test_what_arms_have_in_common_takes_room_once(finished: Path) -> None:
@@ -141,7 +141,7 @@ def test_the_generator_draws_again_on_request(
     assert row["survive_share"] == drawn["survive"]
     assert row["survive_failures"] == drawn["rows"][0]["failures"]
     assert "| combo 1 |" in (out / "study.md").read_text().split("Failures that survive")[1]
-    assert study(["study", "multi", "--from", str(out / "kept"), "--json"], capsys)["rows"] == [row]
+    assert study(["multi", "--from", str(out / "results"), "--json"], capsys)["rows"] == [row]
 
 
 def test_without_a_second_renderer_nothing_is_attacked(
@@ -150,11 +150,11 @@ def test_without_a_second_renderer_nothing_is_attacked(
     def nothing() -> None:
         raise NoSecondRendererError("pyrender", "EGL or OSMesa", "neither")
 
-    monkeypatch.setattr("drivesem.failures.second_renderer.choose.shared_screen", nothing)
+    monkeypatch.setattr("drivesem.failures.second_renderer.selection.shared_screen", nothing)
     for _ in synthesise(Order(tmp_path / "data", 1, seed=3, split="heldout")):
         pass
     (tmp_path / "data" / "manifest.json").unlink()  # now nobody knows that they were generated
-    words = ["study", "multi", "--confirm", "--dataset", "kitti", "--root", str(tmp_path / "data")]
+    words = ["multi", "--confirm", "--dataset", "kitti", "--root", str(tmp_path / "data")]
     assert "expected EGL or OSMesa, found neither" in refused(*words, "--out", str(tmp_path / "out"))
     assert not (tmp_path / "out" / "arms").exists()
 
@@ -216,14 +216,14 @@ def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture
     ],
 )
 def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
-    line = refused("study", *words)
+    line = refused(*words)
     assert any(part in line for part in message.split("|"))
 
 
 @pytest.mark.slow
 def test_searches_of_one_parameter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first three arms: a search, its baseline and a gradient, within the passes that were asked for."""
-    words = ["study", "searches", "--params", "color", "--passes", "24", "--limit", "1", "--workers", "1"]
+    words = ["searches", "--params", "color", "--passes", "24", "--limit", "1", "--workers", "1"]
     found = study([*words, "--bootstrap", "5", "--json", "--out", str(tmp_path / "a")], capsys)
     assert [row["name"] for row in found["searches"]] == ["climb", "corners", "si-fgsm"]
     assert all(row["passes"] <= 24 for row in found["grades"])
@@ -231,7 +231,7 @@ def test_searches_of_one_parameter(tmp_path: Path, capsys: pytest.CaptureFixture
         row["objects"] for row in found["standing"] if row["name"].startswith("distance")
     )
     assert (tmp_path / "a" / "standing.csv").is_file()
-    assert study(["study", "searches", "--from", str(tmp_path / "a" / "kept"), "--json"], capsys) == found
+    assert study(["searches", "--from", str(tmp_path / "a" / "results"), "--json"], capsys) == found
 
 
 @pytest.mark.slow
@@ -239,7 +239,7 @@ def test_attribution_sums_to_the_difference_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "attribution"
-    words = ["study", "attribution", *WORDS[2:], "--json", "--out", str(out)]
+    words = ["attribution", *WORDS[1:], "--json", "--out", str(out)]
     data = study(words, capsys)
     *factors, labels, total = data["rows"]
     assert sum(row["points"] for row in factors) == pytest.approx(data["papers"] - data["ours"], abs=1e-9)
@@ -252,4 +252,4 @@ def test_attribution_sums_to_the_difference_and_goes_on(
     assert len(done) == len(data["arms"]) == 13
     assert study(words, capsys) == data
     assert {path: path.stat().st_mtime_ns for path in done} == done
-    assert study(["study", "attribution", "--from", str(out / "kept"), "--json"], capsys) == data
+    assert study(["attribution", "--from", str(out / "results"), "--json"], capsys) == data

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivesem.cli import main
+from tools.experiments.__main__ import main
 from drivesem.run.finished import load_run
 from drivesem.run.results import BoxRecord, dump_frame, load_frame
 from scene_ir.errors import ShapeError

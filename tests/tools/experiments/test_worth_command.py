@@ -14,9 +14,9 @@ import torch
 
 from detectors.base import Predictor
 from detectors.types import Detections
-from drivesem.cli import main
-from drivesem.run import looking
-from drivesem.training.retraining import WEIGHTS
+from tools.experiments.__main__ import main
+from drivesem.run import detection_cache as looking
+from drivesem.training.retrain import WEIGHTS
 from scene_ir import files
 
 CARS = [[13.0, 20.0, 63.0, 50.0], [73.0, 10.0, 128.0, 60.0]]
@@ -125,9 +125,9 @@ def test_gain_of_a_second_detector(
 @pytest.fixture
 def fingerprints(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The detectors whose weights were read for a fingerprint, each time anew."""
-    real, found = looking.fingerprint, []
+    real, found = looking.detector_fingerprint, []
 
-    def read(order: looking.Order, predictor: Predictor) -> str:
+    def read(order: looking.DetectorSpec, predictor: Predictor) -> str:
         found.append(order.detector)
         return real(order, predictor)
 

@@ -1,4 +1,4 @@
-"""What the study attacks: strategies, their settings, and who is attacked on which pictures."""
+"""The attacks of the study: strategies, their settings in the paper, and runs of all arms."""
 
 from __future__ import annotations
 
@@ -19,88 +19,117 @@ from drivesem.run.frame import RESULT
 from scene_ir import files
 from tools.experiments.settings import StudyConfig
 
-GRADIENT = ("si-fgsm", "sgd", "scw")
+GRADIENT_STRATEGIES = ("si-fgsm", "sgd", "scw")
 _SAMPLES: dict[str, dict[str, Any]] = {
     f"{method}-{name}": {"method": method, "params": "pose", "within_pose": within}
     for method in ("random", "halton")
     for name, within in (("large", 0.75), ("small", 0.3))
 }
-STRATEGIES = (*GRADIENT, *_SAMPLES)
-"""In the order of tables."""
-NAMES = {
+STRATEGIES = (*GRADIENT_STRATEGIES, *_SAMPLES)
+"""All strategies, in the order of tables."""
+STRATEGY_NAMES = {
     "benign": "benign",
-    "benign-on": "benign, trained on",
+    "benign-on": "benign, retrained",
     "si-fgsm": "si-FGSM",
     "sgd": "sGD",
     "scw": "sCW",
     **{f"{m}-{n}": f"{m.title()} ({n})" for m in ("random", "halton") for n in ("large", "small")},
 }
-"""For people."""
+"""Names in tables."""
+
+BENIGN, BENIGN_RETRAINED = "benign", "benign-on"
+"""The original network, and the one retrained on benign pictures alone."""
+SINGLE_PARAMS = ("vertex", "pose", "lighting", "vertex,pose,lighting")
+"""Parameter sets of the table of parameters, besides `pose,vertex`, which all other tables have."""
+
+RETRAINED_TABLES = ("retraining", "robustness", "worth")
+"""Tables of retrained networks."""
 
 
 @dataclass(frozen=True, slots=True)
-class Arm:
-    """One attack. config: its settings, with its folder; shown: its pictures."""
+class ClassificationArm:
+    """One attack on some pictures."""
 
     config: ClassifyConfig
-    shown: tuple[Shown, ...]
+    """Its settings, with its folder."""
+    views: tuple[Shown, ...]
+    """Its pictures."""
 
     @property
     def out(self) -> Path:
+        """Its folder."""
         return Path(self.config.out or "")
 
-    def frames(self, kept: Sequence[Shown]) -> list[ClassifiedFrame]:
-        """What came of some of its pictures."""
-        return frames_of(self.out, kept)
+    def frames(self, views: Sequence[Shown]) -> list[ClassifiedFrame]:
+        """Results of some of its pictures."""
+        return frames_of(self.out, views)
 
 
 @cache
-def preset(network: str, strategy: str) -> Mapping[str, Any]:
-    """The paper's settings of a strategy for one of its networks; samples have the same for both."""
+def paper_preset(network: str, strategy: str) -> Mapping[str, Any]:
+    """The paper's settings of a strategy for one of its networks; those of samples do not depend on it."""
     if strategy in _SAMPLES:
         return _SAMPLES[strategy]
     settings = files.read_yaml(find_presets()[f"classify-{network}-{strategy}"])
     return {key: value for key, value in settings.items() if key != "for"}
 
 
-def attack_of(study: StudyConfig, out: Path, name: str, network: str, **settings: Any) -> ClassifyConfig:
-    """The settings of an arm. network: the shipped one's name, or a file."""
+def arm_config(study: StudyConfig, out: Path, name: str, network: str, **settings: Any) -> ClassifyConfig:
+    """The settings of an arm.
+
+    Args:
+        study: Settings of the study.
+        out: Its folder.
+        name: Name of the arm's folder.
+        network: Name of the shipped network, or a file.
+        settings: Further settings of the attack.
+    """
     shared = {one: getattr(study, one) for one in ("objects", "backgrounds", "seed", "device", *SHARING)}
     config = ClassifyConfig(what="attack", out=str(out / ARMS / name), network=network, grade=False, **shared)
     return replace(config, **settings)
 
 
-class _Attackers:
-    """Attacks pictures in one process; of networks and objects, what arms share is loaded once."""
+class _ArmAttackers:
+    """Attacks pictures in one process; arms share loaded networks and objects."""
 
-    def __init__(self, arms: Sequence[Arm]) -> None:
+    def __init__(self, arms: Sequence[ClassificationArm]) -> None:
         self._arms = arms
-        self._kept: dict[int, Attacker] = {}
+        self._attackers: dict[int, Attacker] = {}
 
     def __call__(self, job: tuple[int, Shown]) -> None:
-        place, shown = job
+        place, view = job
         arm = self._arms[place]
-        if place not in self._kept:
-            # One that attacks the same network, or else any.
-            others = sorted(self._kept.values(), key=lambda one: one.config.network != arm.config.network)
-            self._kept[place] = Attacker.of(arm.config, next(iter(others), None))
-        self._kept[place].attack(shown, arm.out)
+        if place not in self._attackers:
+            # share with one on the same network, or else with any
+            others = sorted(self._attackers.values(), key=lambda one: one.config.network != arm.config.network)
+            self._attackers[place] = Attacker.of(arm.config, next(iter(others), None))
+        self._attackers[place].attack(view, arm.out)
 
 
-def run_arms(arms: Sequence[Arm], study: StudyConfig, title: str) -> dict[str, str]:
-    """Attack all pictures of all arms, as far as that is not done: those that could not be, and why.
+def run_classification_arms(arms: Sequence[ClassificationArm], study: StudyConfig, title: str) -> dict[str, str]:
+    """Run or continue all arms.
 
-    Raises UsageError or SceneError.
+    Args:
+        arms: The arms.
+        study: Settings of the study.
+        title: Title of the progress bar.
+
+    Returns:
+        Reason by picture that could not be attacked.
+
+    Raises:
+        UsageError: Settings that do not fit a run that is there.
+        SceneError: A picture that cannot be attacked, without --keep-going.
     """
     for arm in arms:
         claim_folder(arm.out, arm.config, WRITTEN)
     jobs = [
         (i, one)
         for i, arm in enumerate(arms)
-        for one in arm.shown
+        for one in arm.views
         if not (arm.out / FRAMES / one.identifier / RESULT).is_file()
     ]
-    build = partial(_Attackers, tuple(arms))
+    build = partial(_ArmAttackers, tuple(arms))
     return run_frame_jobs(
         jobs, build(), build, study, ProgressSettings(title, show_remaining=True), lambda job: job[1].identifier
     ).failed

@@ -1,7 +1,8 @@
-"""The study's tables: rows of numbers by name, the paper's beside them, and how people read them."""
+"""The tables of the study: our rows, the paper's, and how they are printed."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
@@ -13,28 +14,36 @@ from drivesem.classify.objects.types import CLASSES, SPLITS
 from drivesem.classify.paper import NETWORKS, REMARKS, figures
 from drivesem.evaluation.resampling import Interval
 from drivesem.report.tables import ReportTable
-from tools.experiments.classification import pixels
-from tools.experiments.classification.arms import GRADIENT, NAMES, STRATEGIES, preset
-from tools.experiments.classification.figures import Predictions, judge_order
-from tools.experiments.classification.lab import BENIGN, ONWARD, SINGLE
-from tools.experiments.classification.results import OVERALL, StudyNetwork, ClassificationResults
-from tools.experiments.realism.measures import METRICS
-from tools.experiments.worth.measures import MEMBERSHIPS, Setting, gain_of, realism, worth_of
+from tools.experiments.classification.arms import (
+    BENIGN,
+    BENIGN_RETRAINED,
+    GRADIENT_STRATEGIES,
+    RETRAINED_TABLES,
+    SINGLE_PARAMS,
+    STRATEGIES,
+    STRATEGY_NAMES,
+    paper_preset,
+)
+from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT
+from tools.experiments.classification.results import OVERALL, ClassificationResults, Predictions, StudyNetwork
+from tools.experiments.realism.metrics import METRICS
+from tools.experiments.tables import interval_columns
+from tools.experiments.worth.measures import MEMBERSHIPS, WorthSettings, information_gain, realism, worth_interval
 
 Row = dict[str, Any]
-TESTS = (BENIGN, *GRADIENT)
-"""Columns of what retrained networks are judged on."""
+TESTS = (BENIGN, *GRADIENT_STRATEGIES)
+"""Pictures that retrained networks are tested on, by columns."""
 ORDERS = "orders"
 _BOTH = "pose,vertex"
 _COMPARED = ("vertex", "pose", _BOTH)
-"""What the paper's table of parameters has."""
+"""Parameter sets of the paper's table."""
 _HEADS = {
     "trained_on": "trained on",
     "params": "parameters",
     "at_paper_sizes": "at the paper's class sizes",
     "weighted": "realism weight",
     "source": "made against",
-    "target": "asked",
+    "target": "tested on",
     "verdict": "the paper's order",
     "ours": "first less than second, ours",
     "paper": "in the paper",
@@ -45,30 +54,36 @@ _HEADS = {
 }
 _SETTINGS = ("step_vertex", "step_pose", "within_vertex", "within_pose", "steps")
 _PLAIN = ("pictures", "certain", "worth", "gain", "distance", *_SETTINGS)
-"""Columns of numbers that are no shares."""
+"""Columns of numbers that are not shares."""
 
 
 @dataclass(frozen=True)
-class Table:
-    """rows, reference: ours and the paper's, of the same columns; columns: what people are shown, in order; notes:
-    with the paper's own errors; orders: whether the paper's hold; plain: whether all its numbers are no shares.
-    """
+class ResultTable:
+    """One table of the study."""
 
     name: str
+    """Name of its CSV file."""
     title: str
+    """Title."""
     columns: tuple[str, ...]
+    """Columns to print, in order."""
     rows: Sequence[Row]
+    """Our rows."""
     reference: Sequence[Row]
+    """The paper's rows, with the same columns."""
     notes: tuple[str, ...] = ()
+    """Notes, among them the paper's own errors."""
     orders: Sequence[Row] = ()
+    """Whether orders of two of the paper's numbers hold here."""
     plain: bool = False
+    """Whether no number is a share."""
 
-    def sheet(self, classes: bool = True) -> ReportTable:
-        """For people. classes: whether each class has its column."""
+    def report_table(self, classes: bool = True) -> ReportTable:
+        """The table to print, with or without a column for each class."""
         columns = [name for name in self.columns if classes or name not in CLASSES]
         lines = [tuple(self._cell(row, name) for name in columns) for row in (*self.rows, *self.reference)]
         return ReportTable(
-            self.title, tuple(_HEADS.get(name, NAMES.get(name, name)) for name in columns), tuple(lines)
+            self.title, tuple(_HEADS.get(name, STRATEGY_NAMES.get(name, name)) for name in columns), tuple(lines)
         )
 
     def _cell(self, row: Row, name: str) -> str:
@@ -78,7 +93,7 @@ class Table:
         if isinstance(value, bool):
             return "yes" if value else "no"
         if isinstance(value, str):
-            return NAMES.get(value, value)
+            return STRATEGY_NAMES.get(value, value)
 
         def number(one: float) -> str:
             if not (self.plain or name in _PLAIN):
@@ -90,23 +105,18 @@ class Table:
         return number(value) + ends
 
 
-def _bounded(name: str, one: Interval) -> Row:
-    found = {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
-    return {key: _rounded(value) for key, value in found.items()}
-
-
-def tables_of(lab: ClassificationResults) -> list[Table]:
-    """All that are wanted, and what they say of orders."""
-    found = [_BUILDERS[name](lab) for name in lab.facts.tables]
+def build_tables(results: ClassificationResults) -> list[ResultTable]:
+    """The tables of the study, and whether the paper's orders hold."""
+    found = [_BUILDERS[name](results) for name in results.facts.tables]
     orders = [row for table in found for row in table.orders]
     if orders:
-        held, turned = (sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed"))
+        held, reversed_ = (sum(row["verdict"] == one for row in orders) for one in ("holds", "reversed"))
         note = (
-            f"Of {len(orders)} orders of two of the paper's figures: {held} hold here, reversed: {turned}, "
-            f"undecided: {len(orders) - held - turned}."
+            f"Of {len(orders)} orders of two of the paper's numbers, {held} hold here, {reversed_} are reversed, and "
+            f"{len(orders) - held - reversed_} are undecided."
         )
         columns = ("network", "table", "first", "second", "paper", "ours", "verdict")
-        found.append(Table(ORDERS, "Does the paper's order hold?", columns, orders, (), (note,)))
+        found.append(ResultTable(ORDERS, "Does the paper's order hold?", columns, orders, (), (note,)))
     return found
 
 
@@ -114,21 +124,24 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 5)
 
 
-def _overall(lab: ClassificationResults, answers: Predictions) -> Row:
-    found = {"pictures": len(answers.correct), **_bounded("overall", answers.overall(lab.bootstrap))}
-    if lab.facts.classes == CLASSES:
+def _overall(results: ClassificationResults, answers: Predictions) -> Row:
+    found = {
+        "pictures": len(answers.correct),
+        **interval_columns("overall", answers.overall(results.bootstrap), 5),
+    }
+    if results.facts.classes == CLASSES:
         sizes = [counts[0] for counts in figures()["sizes"].values()]
-        found |= _bounded("at_paper_sizes", answers.overall(lab.bootstrap, sizes))
+        found |= interval_columns("at_paper_sizes", answers.overall(results.bootstrap, sizes), 5)
     return found
 
 
-def _with_classes(lab: ClassificationResults, answers: Predictions) -> Row:
-    own = zip(lab.facts.classes, answers.by_class(len(lab.facts.classes)), strict=True)
-    return _overall(lab, answers) | {name: _rounded(share) for name, share in own}
+def _with_classes(results: ClassificationResults, answers: Predictions) -> Row:
+    own = zip(results.facts.classes, answers.by_class(len(results.facts.classes)), strict=True)
+    return _overall(results, answers) | {name: _rounded(share) for name, share in own}
 
 
 def _paper(table: str, *names: str) -> Iterator[tuple[Row, Any]]:
-    """The figures of one of the paper's tables, or lists of them, and of what: a network, and what `names` are."""
+    """The numbers of one of the paper's tables, or lists of them, each with its network and what `names` are."""
 
     def walk(node: Any, keys: tuple[str, ...]) -> Iterator[tuple[Row, Any]]:
         if isinstance(node, dict):
@@ -144,170 +157,195 @@ def _by_class(values: Sequence[float]) -> Row:
     return dict(zip((*CLASSES, "overall"), values, strict=False))
 
 
-def _degradation(lab: ClassificationResults) -> Table:
+def _degradation(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
     orders: list[Row] = []
-    for eyes in lab.facts.networks:
-        ours = {one: lab.predictions("attacked", eyes, one) for one in (BENIGN, *STRATEGIES)}
+    for network in results.facts.networks:
+        ours = {one: results.predictions("attacked", network, one) for one in (BENIGN, *STRATEGIES)}
         for one, answers in ours.items():
-            row = {"network": eyes.name, "strategy": one, **_with_classes(lab, answers)}
-            rows.append(row | {"certain": None if one == BENIGN else lab.certain_of(eyes, one)})
-        theirs = {one: figures()["degradation"][eyes.paper_network][one][-1] for one in STRATEGIES}
-        orders += _order(lab, "degradation", eyes, theirs, ours)
+            row = {"network": network.name, "strategy": one, **_with_classes(results, answers)}
+            rows.append(row | {"certain": None if one == BENIGN else results.count_certain(network, one)})
+        paper = {one: figures()["degradation"][network.paper_network][one][-1] for one in STRATEGIES}
+        orders += _order(results, "degradation", network, paper, ours)
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
-    columns = ("network", "strategy", *lab.facts.classes, "overall", "at_paper_sizes", "certain")
+    columns = ("network", "strategy", *results.facts.classes, "overall", "at_paper_sizes", "certain")
     title, notes = "Accuracy by class and strategy, %", REMARKS["degradation"]
-    return Table("degradation", title, columns, rows, reference, notes, orders)
+    return ResultTable("degradation", title, columns, rows, reference, notes, orders)
 
 
-def _parameters(lab: ClassificationResults) -> Table:
+def _parameters(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
     orders: list[Row] = []
-    moved = (*SINGLE[:3], _BOTH, SINGLE[3])
-    for eyes, strategy in product(lab.slow_networks, GRADIENT):
-        ours = {one: lab.predictions("attacked", eyes, strategy, "test" if one == _BOTH else one) for one in moved}
-        row = {"network": eyes.name, "strategy": strategy}
-        rows += [row | {"params": params, **_overall(lab, one)} for params, one in ours.items()]
-        theirs: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
-        orders += _order(lab, f"parameters, {NAMES[strategy]}", eyes, theirs, ours)
+    moved = (*SINGLE_PARAMS[:3], _BOTH, SINGLE_PARAMS[3])
+    for network, strategy in product(results.slow_networks, GRADIENT_STRATEGIES):
+        ours = {
+            one: results.predictions("attacked", network, strategy, "test" if one == _BOTH else one)
+            for one in moved
+        }
+        row = {"network": network.name, "strategy": strategy}
+        rows += [row | {"params": params, **_overall(results, one)} for params, one in ours.items()]
+        paper: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
+        orders += _order(results, f"parameters, {STRATEGY_NAMES[strategy]}", network, paper, ours)
     reference = [
         row | {"params": params, "overall": value}
         for row, values in _paper("parameters", "strategy")
         for params, value in zip(_COMPARED, values, strict=True)
     ]
-    note = "The paper says that light does not matter, without figures."
+    note = "The paper states that light does not matter, without numbers."
     columns = ("network", "strategy", "params", "overall", "at_paper_sizes")
-    return Table("parameters", "Accuracy by what is moved, %", columns, rows, reference, (note,), orders)
+    return ResultTable("parameters", "Accuracy by what is moved, %", columns, rows, reference, (note,), orders)
 
 
-def _hyperparameters(lab: ClassificationResults) -> Table:
+def _hyperparameters(results: ClassificationResults) -> ResultTable:
     rows, reference = [], []
-    for network, strategy in product(NETWORKS, GRADIENT):
-        settings = {"strategy": strategy, "settings": NETWORKS[network]}
-        settings |= {key: preset(network, strategy).get(key) for key in _SETTINGS}
-        for eyes in lab.slow_networks:
-            answers = lab.predictions("attacked", eyes, strategy, "test" if network == eyes.paper_network else network)
-            rows.append({"network": eyes.name, **settings, **_overall(lab, answers)})
-        value = figures()["degradation"][network][strategy][-1]
-        reference.append({"network": NETWORKS[network], **settings, "overall": value})
+    for paper_network, strategy in product(NETWORKS, GRADIENT_STRATEGIES):
+        settings = {"strategy": strategy, "settings": NETWORKS[paper_network]}
+        settings |= {key: paper_preset(paper_network, strategy).get(key) for key in _SETTINGS}
+        for network in results.slow_networks:
+            arms = "test" if paper_network == network.paper_network else paper_network
+            answers = results.predictions("attacked", network, strategy, arms)
+            rows.append({"network": network.name, **settings, **_overall(results, answers)})
+        value = figures()["degradation"][paper_network][strategy][-1]
+        reference.append({"network": NETWORKS[paper_network], **settings, "overall": value})
     columns = ("network", "strategy", "settings", *_SETTINGS, "overall")
     notes = REMARKS["hyperparameters"]
-    return Table("hyperparameters", "Accuracy by settings, %", columns, rows, reference, notes)
+    return ResultTable("hyperparameters", "Accuracy by settings, %", columns, rows, reference, notes)
 
 
-def _learners(lab: ClassificationResults, table: str, title: str, trained: Sequence[str], what: str) -> Table:
-    """Networks that were trained so, on each of TESTS. what: as of `Results.answers`."""
+def _learners(
+    results: ClassificationResults, table: str, title: str, trained: Sequence[str], what: str
+) -> ResultTable:
+    """Networks that were trained so, on each of TESTS; `what` as in `ClassificationResults.predictions`."""
     rows: list[Row] = []
     orders: list[Row] = []
-    for eyes in lab.slow_networks:
+    for network in results.slow_networks:
         for one in (BENIGN, *trained):
-            row: Row = {"network": eyes.name, "trained_on": one}
+            row: Row = {"network": network.name, "trained_on": one}
             for test in TESTS:
-                row |= _bounded(test, lab.predictions(what, eyes, test, one).overall(lab.bootstrap))
-            rows.append(row | {"pictures": len(lab.predictions(what, eyes, BENIGN, one).correct)})
+                row |= interval_columns(
+                    test, results.predictions(what, network, test, one).overall(results.bootstrap), 5
+                )
+            rows.append(row | {"pictures": len(results.predictions(what, network, BENIGN, one).correct)})
         for i, test in enumerate(TESTS):
-            theirs = {one: figures()[table][eyes.paper_network][one][i] for one in (BENIGN, *GRADIENT)}
-            ours = {one: lab.predictions(what, eyes, test, one) for one in theirs}
-            pairs = _order(lab, f"{table}, on {NAMES[test]}", eyes, theirs, ours)
+            paper = {
+                one: figures()[table][network.paper_network][one][i] for one in (BENIGN, *GRADIENT_STRATEGIES)
+            }
+            ours = {one: results.predictions(what, network, test, one) for one in paper}
+            pairs = _order(results, f"{table}, on {STRATEGY_NAMES[test]}", network, paper, ours)
             # Is a retrained network better than the benign one?
             orders += [pair for pair in pairs if pair["first"] == BENIGN]
     reference = [row | dict(zip(TESTS, values, strict=True)) for row, values in _paper(table, "trained_on")]
     columns = ("network", "trained_on", *TESTS, "pictures")
-    return Table(table, title, columns, rows, reference, REMARKS.get(table, ()), orders)
+    return ResultTable(table, title, columns, rows, reference, REMARKS.get(table, ()), orders)
 
 
-def _retraining(lab: ClassificationResults) -> Table:
+def _retraining(results: ClassificationResults) -> ResultTable:
     title = "Retrained networks on pictures made against the benign one, %"
-    return _learners(lab, "retraining", title, (ONWARD, *GRADIENT), "known")
+    return _learners(results, "retraining", title, (BENIGN_RETRAINED, *GRADIENT_STRATEGIES), "known")
 
 
-def _robustness(lab: ClassificationResults) -> Table:
+def _robustness(results: ClassificationResults) -> ResultTable:
     title = "Retrained networks on pictures made against themselves, %"
-    return _learners(lab, "robustness", title, GRADIENT, "fresh")
+    return _learners(results, "robustness", title, GRADIENT_STRATEGIES, "fresh")
 
 
-def _worth(lab: ClassificationResults) -> Table:
+def _is_retrained(results: ClassificationResults, network: StudyNetwork, strategy: str) -> bool:
+    """Whether the network was retrained on this attack's counterexamples."""
+    made = any(name in results.facts.tables for name in RETRAINED_TABLES)
+    return network.in_slow_tables and strategy in GRADIENT_STRATEGIES and made
+
+
+def _worth(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
-    distance = lab.facts.distance
-    for eyes in lab.facts.networks:
-        far = {one: lab.picture_distances(eyes, one, distance) for one in STRATEGIES}
+    distance = results.facts.distance
+    for network in results.facts.networks:
+        far = {one: results.picture_distances(network, one, distance) for one in STRATEGIES}
         largest = max(float(distances.max(initial=0)) for distances in far.values())
         for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
-            rho = np.ones(len(lab.labels)) if strategy == BENIGN else realism(far[strategy], largest)
-            setting = Setting(kind, weighted)
-            row: Row = {"network": eyes.name, "strategy": strategy, "membership": kind, "weighted": weighted}
-            before = lab.points(eyes, strategy, rho)
-            row |= _bounded("worth", worth_of(before, setting))
-            if lab.is_retrained(eyes, strategy):
-                after = lab.points(eyes, strategy, rho, trained=strategy)
-                row |= _bounded("gain", gain_of(before, after, setting))
+            rho = np.ones(len(results.labels)) if strategy == BENIGN else realism(far[strategy], largest)
+            setting = WorthSettings(kind, weighted)
+            row: Row = {"network": network.name, "strategy": strategy, "membership": kind, "weighted": weighted}
+            before = results.points(network, strategy, rho)
+            row |= interval_columns("worth", worth_interval(before, setting), 5)
+            if _is_retrained(results, network, strategy):
+                after = results.points(network, strategy, rho, trained=strategy)
+                row |= interval_columns("gain", information_gain(before, after, setting), 5)
             rows.append(row)
     reference = [
         row | {"weighted": True, "worth": value} for row, value in _paper("worth", "membership", "strategy")
     ]
     note = (
-        f"Natural logarithm. Realism by {METRICS[distance].name}, over the largest distance of a network's "
-        "counterexamples. Gain: the worth before the network less that before the one retrained on such pictures."
+        f"Natural logarithm. Realism by {METRICS[distance].name}, relative to the largest distance of a network's "
+        "counterexamples. Gain: the worth under the network less that under the one retrained on such pictures."
     )
     columns = ("network", "strategy", "membership", "weighted", "worth", "gain")
-    return Table("worth", "Information worth", columns, rows, reference, (note, *REMARKS["worth"]))
+    return ResultTable("worth", "Information worth", columns, rows, reference, (note, *REMARKS["worth"]))
 
 
-def _realism(lab: ClassificationResults) -> Table:
+def _realism(results: ClassificationResults) -> ResultTable:
     rows = []
-    for eyes, strategy, metric in product(lab.facts.networks, STRATEGIES, lab.facts.measures):
+    for network, strategy, metric in product(results.facts.networks, STRATEGIES, results.facts.measures):
         name = f"{METRICS[metric].name}{', dB' if METRICS[metric].unit else ''}"
-        row: Row = {"network": eyes.name, "strategy": strategy, "metric": name}
-        kinds = (*lab.facts.classes, OVERALL)
-        rows.append(row | {kind: _rounded(lab.mean(eyes, strategy, metric, kind)) for kind in kinds})
+        row: Row = {"network": network.name, "strategy": strategy, "metric": name}
+        kinds = (*results.facts.classes, OVERALL)
+        rows.append(
+            row | {kind: _rounded(results.mean_distance(network, strategy, metric, kind)) for kind in kinds}
+        )
     reference = [
         row | {"metric": row["metric"].upper(), **_by_class(values)}
         for row, values in _paper("realism", "metric", "strategy")
     ]
-    absent = [METRICS[name].name for name in METRICS if name not in lab.facts.measures]
+    absent = [METRICS[name].name for name in METRICS if name not in results.facts.measures]
     note = (
-        "Pictures that were right before, and what became of them. A Frechet distance of few pictures ranks, and "
-        "does not compare with the paper's. "
-        + (f"Without weights on disk: {', '.join(absent)}." if absent else "")
+        "Of pictures that were correct before the attack. A Frechet distance of few pictures ranks, and is not "
+        "comparable with the paper's. " + (f"Without weights on disk: {', '.join(absent)}." if absent else "")
     )
-    columns = ("network", "strategy", "metric", *lab.facts.classes, "overall")
-    return Table("realism", "Distances to the pictures before", columns, rows, reference, (note,), plain=True)
+    columns = ("network", "strategy", "metric", *results.facts.classes, "overall")
+    return ResultTable(
+        "realism", "Distances to the pictures before", columns, rows, reference, (note,), plain=True
+    )
 
 
-def _transfer(lab: ClassificationResults) -> Table:
+def _transfer(results: ClassificationResults) -> ResultTable:
     rows = []
-    for source, target in product(lab.facts.networks, lab.facts.networks):
-        for strategy in (BENIGN, *GRADIENT) if source is not target else ():
+    for source, target in product(results.facts.networks, results.facts.networks):
+        for strategy in (BENIGN, *GRADIENT_STRATEGIES) if source is not target else ():
             row = {"source": source.name, "target": target.name, "strategy": strategy}
-            rows.append(row | _with_classes(lab, lab.predictions("crossed", source, strategy, target.name)))
+            rows.append(
+                row | _with_classes(results, results.predictions("crossed", source, strategy, target.name))
+            )
     other = dict(zip(NETWORKS.values(), reversed(NETWORKS.values()), strict=True))
     reference = [
         row | {"source": row["network"], "target": other[row["network"]], **_by_class(values)}
         for row, values in _paper("transfer", "strategy")
     ]
-    note = () if rows else ("Two networks are needed: --networks squeezenet,FILE.",)
-    columns = ("source", "target", "strategy", *lab.facts.classes, "overall", "at_paper_sizes")
-    return Table("transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note)
+    note = () if rows else ("This table needs two networks: --networks squeezenet,FILE.",)
+    columns = ("source", "target", "strategy", *results.facts.classes, "overall", "at_paper_sizes")
+    return ResultTable(
+        "transfer", "Accuracy on another network's counterexamples, %", columns, rows, reference, note
+    )
 
 
-def _pixels(lab: ClassificationResults) -> Table:
+def _pixels(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
-    for eyes, attack in product(lab.slow_networks if lab.facts.toolbox else (), pixels.ATTACKS):
-        row: Row = {"network": eyes.name, "strategy": attack}
-        row |= _overall(lab, lab.predictions("pixels", eyes, attack, ""))
-        rows.append(row | {"distance": round(float(lab.picture_distances(eyes, attack, "", "pixels").mean()), 5)})
+    for network, attack in product(results.slow_networks if results.facts.toolbox else (), PIXEL_ATTACKS):
+        row: Row = {"network": network.name, "strategy": attack}
+        row |= _overall(results, results.predictions("pixels", network, attack, ""))
+        rows.append(
+            row | {"distance": round(float(results.picture_distances(network, attack, "", "pixels").mean()), 5)}
+        )
     note = f"Distance: {METRICS['perceptual'].name}, as in the table of realism."
-    notes = (note,) if rows else (f"Attacks on pixels need another library: {pixels.NEEDS}.",)
+    notes = (note,) if rows else (f"Attacks on pixels need a library: {PIXELS_HINT}.",)
     columns = ("network", "strategy", "pictures", "overall", "distance")
-    return Table("pixels", "Accuracy after attacks on pixels, for comparison, %", columns, rows, (), notes)
+    return ResultTable("pixels", "Accuracy after attacks on pixels, for comparison, %", columns, rows, (), notes)
 
 
-def _sizes(lab: ClassificationResults) -> Table:
-    objects, used = lab.facts.objects, lab.facts.used
+def _sizes(results: ClassificationResults) -> ResultTable:
+    objects, used = results.facts.objects, results.facts.used
     rows = [
         {"class": one, **{f"{split} objects": objects[split][one] for split in SPLITS}}
         | {f"{split} pictures": used[split][one] for split in used}
-        for one in lab.facts.classes
+        for one in results.facts.classes
     ]
     reference = [
         {"class": f"{one} (paper)"}
@@ -315,22 +353,30 @@ def _sizes(lab: ClassificationResults) -> Table:
         for one, counts in figures()["sizes"].items()
     ]
     columns = ("class", *(f"{split} objects" for split in SPLITS), "train pictures", "test pictures")
-    return Table("sizes", "Sizes", columns, rows, reference, plain=True)
+    return ResultTable("sizes", "Sizes", columns, rows, reference, plain=True)
 
 
 def _order(
-    lab: ClassificationResults, table: str, eyes: StudyNetwork, theirs: Mapping[str, float], ours: Mapping[str, Predictions]
+    results: ClassificationResults,
+    table: str,
+    network: StudyNetwork,
+    paper: Mapping[str, float],
+    ours: Mapping[str, Predictions],
 ) -> Iterator[Row]:
-    """Each two of the paper's figures that differ, and whether ours differ alike, paired over pictures."""
-    for first, second in combinations(theirs, 2):
-        apart = theirs[second] - theirs[first]
-        if apart:
-            one = ours[first].accuracy_drop(ours[second], lab.bootstrap)
-            row: Row = {"network": eyes.name, "table": table, "first": first, "second": second}
-            yield row | {"paper": round(apart, 4), **_bounded("ours", one), "verdict": judge_order(apart, one)}
+    """Each two of the paper's numbers that differ, and whether ours differ in the same direction, paired over pictures."""
+    for first, second in combinations(paper, 2):
+        difference = paper[second] - paper[first]
+        if difference:
+            one = ours[first].accuracy_drop(ours[second], results.bootstrap)
+            row: Row = {"network": network.name, "table": table, "first": first, "second": second}
+            yield row | {
+                "paper": round(difference, 4),
+                **interval_columns("ours", one, 5),
+                "verdict": _judge_order(difference, one),
+            }
 
 
-_BUILDERS: dict[str, Callable[[ClassificationResults], Table]] = {
+_BUILDERS: dict[str, Callable[[ClassificationResults], ResultTable]] = {
     "degradation": _degradation,
     "worth": _worth,
     "realism": _realism,
@@ -342,3 +388,13 @@ _BUILDERS: dict[str, Callable[[ClassificationResults], Table]] = {
     "pixels": _pixels,
     "sizes": _sizes,
 }
+
+
+def _judge_order(paper: float, ours: Interval) -> str:
+    """Whether two numbers are ordered as in the paper; undecided if our interval contains 0.
+
+    Both arguments state how much lower the first number is than the second.
+    """
+    if ours.value is None or ours.low is None or ours.high is None or ours.low <= 0 <= ours.high:
+        return "undecided"
+    return "holds" if math.copysign(1, paper) == math.copysign(1, ours.value) else "reversed"

@@ -279,7 +279,7 @@ def _sample_arms(base: AttackConfig, study: StudyConfig) -> list[AttackArm]:
         _arm("apgd", replace(base, method="apgd", early_stop=True)),
         _arm("fgsm", replace(base, method="fgsm")),
     ]
-    for method in ("random", "halton", "sobol", "cma-es"):
+    for method in ("random", "halton", "cma-es"):
         search = replace(base, method=method, queries=study.queries, early_stop=True)
         arms.append(_arm(method, replace(search, range="steps")))
         if not study.quick:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.evaluation.coco import IOU_50, IOU_70, IOU_THRESHOLDS
-from drivesem.evaluation.matches import ThresholdMatches
+from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.evaluation.resampling import (
     Interval,
     NamedMetric,

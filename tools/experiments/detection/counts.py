@@ -9,7 +9,7 @@ import numpy as np
 
 from detectors.types import CLASSES
 from drivesem.attack.targets import HEADLINE
-from drivesem.evaluation.matches import ThresholdMatches
+from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult
 from tools.experiments.detection.arms import ArmRun, AttackArm, StudyArms

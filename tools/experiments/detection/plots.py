@@ -41,8 +41,8 @@ _HATCHES = ("", "///", "...")
 """Hatches of bars for each round of colours."""
 _GROUP_WIDTH = 0.8
 """Width of a group of bars, in units of the distance between groups."""
-_MAX_CHANGES = 10
-_PICTURE_WIDTH_PX = 800
+MAX_CHANGES = 10
+PICTURE_WIDTH_PX = 800
 _LINE_PX = TEXT_PX + 8
 
 
@@ -207,7 +207,7 @@ def find_largest_changes(runs: Sequence[ArmRun], out: Path) -> list[LargeChange]
             known = largest.get(result.identifier)
             if change.size > 0 and (known is None or change.size > known.size):
                 largest[result.identifier] = change
-    return sorted(largest.values(), key=lambda c: (-c.size, c.result.identifier))[:_MAX_CHANGES]
+    return sorted(largest.values(), key=lambda c: (-c.size, c.result.identifier))[:MAX_CHANGES]
 
 
 def write_largest_changes(path: Path, changes: Sequence[LargeChange]) -> None:
@@ -228,17 +228,17 @@ def _draw_change(change: LargeChange) -> np.ndarray:
     names = ("benign.png", "counterexample.png")
     pictures = [_fit_width(files.read_image(change.folder / name)) for name in names]
     height = max(map(len, pictures)) + _LINE_PX
-    row = np.empty((height, 2 * _PICTURE_WIDTH_PX + 3 * MARGIN_PX, 3), np.uint8)
+    row = np.empty((height, 2 * PICTURE_WIDTH_PX + 3 * MARGIN_PX, 3), np.uint8)
     row[:] = PAPER_COLOUR
     result = change.result
     lost = sum(failure.kind == "lost" for failure in result.failures)
     text = f"{lost} lost, {format_count(len(result.failures) - lost, 'phantom')}"
     write_text(row, (MARGIN_PX, 0), f"{result.identifier}, {change.arm}: size {change.size:.2f}, {text}")
     for column, picture in enumerate(pictures):
-        paste(row, (MARGIN_PX + column * (_PICTURE_WIDTH_PX + MARGIN_PX), _LINE_PX), picture)
+        paste(row, (MARGIN_PX + column * (PICTURE_WIDTH_PX + MARGIN_PX), _LINE_PX), picture)
     return row
 
 
 def _fit_width(picture: np.ndarray) -> np.ndarray:
-    height = round(_PICTURE_WIDTH_PX * picture.shape[0] / picture.shape[1])
-    return cv2.resize(picture, (_PICTURE_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    height = round(PICTURE_WIDTH_PX * picture.shape[0] / picture.shape[1])
+    return cv2.resize(picture, (PICTURE_WIDTH_PX, height), interpolation=cv2.INTER_AREA)

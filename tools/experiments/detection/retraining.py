@@ -17,7 +17,7 @@ from drivesem.analysis.transfer.run import evaluate_pairs, load_target_detectors
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.targets import HEADLINE, resolve_t_star
 from drivesem.config.errors import UsageError
-from drivesem.evaluation.matches import ThresholdMatches
+from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.terminal import Console
 from drivesem.run.attack import AttackWorker, select_frames
@@ -26,11 +26,11 @@ from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS, RETRAINED
 from drivesem.run.frame import detection_records, detections_from_records
 from drivesem.run.results import BoxRecord
-from drivesem.scenes.label_free import detect_in_store
-from drivesem.training.attacked import AttackedFrame
+from drivesem.training.validation import detect_in_store
 from drivesem.training.frames import FrameStore
-from drivesem.training.judging import score_detections
-from drivesem.training.retraining import discard_stale_run, load_start
+from drivesem.training.retrain import discard_stale_run, load_start
+from drivesem.training.samples import AttackedFrame
+from drivesem.training.validation import score_detections
 from scene_ir import files
 from tools.experiments.detection.arms import ArmRun, AttackArm, AttackTotals, build_workers, run_arms
 from tools.experiments.detection.counts import ArmCounts

@@ -26,11 +26,15 @@ from drivesem.run.folder import ARMS, HELD_OUT, RETRAINED
 from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, follows_paper
 from drivesem.run.workers import make_parallel_map
 from drivesem.scenes.sources import SceneSource
-from drivesem.training.around import ConsistencyLoss, FailureNeighbourhoods, WorstCaseLoss, list_failures
-from drivesem.training.attacked import AttackedFrame, AttackedSamples, GeneratorSamples, Stage
+from drivesem.training.failure_neighbourhoods import (
+    ConsistencyLoss,
+    FailureNeighbourhoods,
+    WorstCaseLoss,
+    list_failures,
+)
 from drivesem.training.frames import FrameStore
-from drivesem.training.mixture import TrainingMixture
-from drivesem.training.retraining import WEIGHTS, fine_tune, load_start, mixture_shares, select_counterexamples
+from drivesem.training.retrain import WEIGHTS, fine_tune, load_start, mixture_shares, select_counterexamples
+from drivesem.training.samples import AttackedFrame, AttackedSamples, GeneratorSamples, Stage, TrainingMixture
 from scene_ir.types import SceneIR
 from tools.experiments.detection.arms import PLACEBO, AttackArm, base_attack
 from tools.experiments.settings import StudyConfig

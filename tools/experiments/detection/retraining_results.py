@@ -19,7 +19,7 @@ from drivesem.analysis.transfer.matrix import (
 )
 from drivesem.attack.targets import HEADLINE
 from drivesem.evaluation.coco import ClassScores
-from drivesem.evaluation.matches import ThresholdMatches
+from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.evaluation.resampling import Interval, NamedMetric, bootstrap_intervals, paired_differences
 from tools.experiments.detection.arms import AttackTotals, bootstrap_draws, feasible_share
 from tools.experiments.detection.comparison import MODES, ArmComparison, ArmMetrics, compare_arms

@@ -26,7 +26,7 @@ from drivesem.analysis.transfer.matrix import (
 )
 from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.instances import Booleans
-from drivesem.evaluation.matches import ThresholdMatches
+from drivesem.evaluation.matched_class import ThresholdMatches
 from scene_ir import files
 from scene_ir.errors import FormatError
 from tools.experiments.detection.arms import AttackArm, AttackTotals

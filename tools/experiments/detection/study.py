@@ -14,7 +14,7 @@ from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.tables import AnalysisReport
 from drivesem.report.terminal import Console
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
-from drivesem.training.known import warn_about_overlaps
+from drivesem.training.card import warn_about_overlaps
 from tools.experiments.detection.arms import STUDY_JSON, StudyArms, build_arms, build_workers, run_arms
 from tools.experiments.detection.attribution import AttributionPlan, attribute_drop, attribution_report
 from tools.experiments.detection.counts import StudyCounts

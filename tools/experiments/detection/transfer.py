@@ -219,7 +219,7 @@ def _paper_reference(attack: AttackConfig, target: TargetDetector) -> tuple[floa
     """The paper's mAP under its own protocol: of the attacked SqueezeDet, and of a full YOLOv3."""
     if not follows_paper(attack):
         return None
-    if target.order.detector == attack.detector:
+    if target.spec.detector == attack.detector:
         return PAPER_BENIGN, PAPER_COMBOS[DEFAULT_COMBO]
     return PAPER_TRANSFER if type(target.predictor) is YoloV3 else None
 

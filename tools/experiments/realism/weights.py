@@ -1,4 +1,4 @@
-"""Where weights of perceptual networks lie: a folder of the user's, torch's own cache, or an installed package."""
+"""Weights of perceptual networks, from a folder, torch's own cache, or an installed package."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from detectors.files import read_state
 from scene_ir.errors import FormatError
 
 _COUNTER = "num_batches_tracked"
-"""Files from before torch 0.4.1 lack it; nothing here uses it."""
+"""Missing in files from before torch 0.4.1, and unused here."""
 
 
 @dataclass(frozen=True, slots=True)
 class WeightFile:
-    """pattern: of the file's name (publishers add a hash); url: where it comes from, with the hash in the name;
-    package: an importable package and the file inside, for those that ship it; hint: how to get it.
-    """
+    """A file of published weights."""
 
     pattern: str
+    """Pattern of the file's name; publishers add a hash."""
     url: str | None = None
+    """Where it can be downloaded, with the hash in the name."""
     package: tuple[str, str] | None = None
+    """A package that ships it, and the file inside."""
     hint: str = "--fetch downloads it"
+    """How to get it."""
 
 
 _TORCHVISION = "https://download.pytorch.org/models/"
-FILES: dict[str, WeightFile] = {
+WEIGHT_FILES: dict[str, WeightFile] = {
     "alex": WeightFile("alexnet-owt-*.pth", f"{_TORCHVISION}alexnet-owt-7be5be79.pth"),
     "vgg": WeightFile("vgg16-*.pth", f"{_TORCHVISION}vgg16-397923af.pth"),
     "squeeze": WeightFile("squeezenet1_1-*.pth", f"{_TORCHVISION}squeezenet1_1-b8a52dc0.pth"),
@@ -53,11 +55,18 @@ FILES: dict[str, WeightFile] = {
 }
 
 
-def find(name: str, folder: Path | None = None, fetch: bool = False) -> Path:
-    """The file of one of FILES: in `folder`, in torch's cache (TORCH_HOME), in its package; else downloaded where
-    `fetch` allows it. Raises FormatError, one line with how to get it.
+def find_weights(name: str, folder: Path | None = None, fetch: bool = False) -> Path:
+    """Find one of WEIGHT_FILES.
+
+    Args:
+        name: Name of the file.
+        folder: Folder that is searched before torch's cache (TORCH_HOME) and the file's package.
+        fetch: Download it if it is nowhere.
+
+    Raises:
+        FormatError: One line that says how to get it.
     """
-    wanted = FILES[name]
+    wanted = WEIGHT_FILES[name]
     places = [Path(torch.hub.get_dir()) / "checkpoints"]
     if folder is not None:
         places.insert(0, folder)
@@ -66,7 +75,7 @@ def find(name: str, folder: Path | None = None, fetch: bool = False) -> Path:
         if found:
             return found[-1]
     if wanted.package is not None:
-        # Looked up, not imported: the package may need what is not installed.
+        # found without an import: the package may need what is not installed
         package = importlib.util.find_spec(wanted.package[0])
         for root in (package.submodule_search_locations or ()) if package is not None else ():
             if (path := Path(root) / wanted.package[1]).is_file():
@@ -88,8 +97,8 @@ def _download(url: str, place: Path) -> Path:
     return path
 
 
-def read(path: Path) -> Mapping[str, Tensor]:
-    """The tensors of a .pth, .pt or .safetensors file, by name. Raises FormatError naming the file."""
+def read_weights(path: Path) -> Mapping[str, Tensor]:
+    """Read the tensors of a .pth, .pt or .safetensors file by name. Raises FormatError."""
     try:
         state = load_file(path) if path.suffix == ".safetensors" else read_state(path, "a file of weights")
     except DetectorError as error:
@@ -101,9 +110,17 @@ def read(path: Path) -> Mapping[str, Tensor]:
     return state
 
 
-def fill(net: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
-    """Put weights into a network, to evaluate; what the network does not have, such as a classifier, is left out.
-    Raises FormatError naming what is missing or has another shape."""
+def load_weights(net: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
+    """Load weights into a network for inference; those that it does not have, such as a classifier's, are ignored.
+
+    Args:
+        net: The network.
+        state: Tensors by name.
+        path: Their file, for errors.
+
+    Raises:
+        FormatError: A tensor that is missing or has another shape.
+    """
     wanted = {name: t for name, t in net.state_dict().items() if not name.endswith(_COUNTER)}
     for name, tensor in wanted.items():
         if name not in state:

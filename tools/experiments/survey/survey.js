@@ -3,7 +3,7 @@ const survey = JSON.parse(document.getElementById("data").textContent);
 const columns = survey.columns;
 const part = (id) => document.getElementById(id);
 const rows = [];
-let person = "", order = [], place = 0, named = "", began = 0, kept = true;
+let person = "", order = [], place = 0, named = "", began = 0, saved = true;
 
 function show(section, form) {
   for (const id of ["start", "question", "end"]) part(id).hidden = id !== section;
@@ -20,7 +20,7 @@ function shuffled(list) {
   }
   return mixed;
 }
-function ask() {
+function showQuestion() {
   const one = order[place];
   part("progress").value = place;
   if (!one) { part("progress").value = place; show("end"); return; }
@@ -39,8 +39,8 @@ part("begin").addEventListener("submit", (event) => {
   person = part("name").value.trim();
   if (!person) { part("name").value = ""; part("name").reportValidity(); return; }
   order = shuffled(survey.items);
-  kept = false;
-  ask();
+  saved = false;
+  showQuestion();
 });
 part("naming").addEventListener("submit", (event) => {
   event.preventDefault();
@@ -52,7 +52,7 @@ part("rating").addEventListener("submit", (event) => {
   rows.push({ survey: survey.survey, participant: person, item: order[place].item, position: place + 1, named,
     realism: new FormData(event.target).get("realism"), seconds: ((performance.now() - began) / 1000).toFixed(1) });
   place += 1;
-  ask();
+  showQuestion();
 });
 const cell = (value) => /[",\n\r]/.test(value) ? '"' + String(value).replaceAll('"', '""') + '"' : String(value);
 part("save").addEventListener("click", () => {
@@ -62,8 +62,8 @@ part("save").addEventListener("click", () => {
   link.href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
   link.download = "answers-" + person.replace(/[^\p{L}\p{N}]+/gu, "-") + ".csv";
   link.click();
-  kept = true;
+  saved = true;
   part("saved").textContent = "Saved as " + link.download + ".";
 });
-addEventListener("beforeunload", (event) => { if (!kept) event.preventDefault(); });
+addEventListener("beforeunload", (event) => { if (!saved) event.preventDefault(); });
 show("start");

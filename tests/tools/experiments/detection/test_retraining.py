@@ -1,4 +1,4 @@
-"""`drivesem study retrain`: how detectors are judged, what is said of them, and the whole on embedded frames."""
+"""The study `retrain`: results, report, and the whole on embedded frames."""
 
 from __future__ import annotations
 
@@ -19,23 +19,40 @@ from rich.console import Console
 
 from detectors.registry import load_detector, save_detector
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.transfer.matrix import CERTAIN, THRESHOLD, TRANSFER, PairCounts, ShownRun, Target, row_of
+from drivesem.analysis.transfer.matrix import (
+    CERTAIN,
+    THRESHOLD,
+    TRANSFER,
+    SourceRun,
+    TransferCounts,
+    TransferTarget,
+    compute_transfer_row,
+)
 from drivesem.analysis.transfer.report import sheets as transfer_sheets
 from drivesem.attack.methods.base import Attack
-from drivesem.cli import main
-from drivesem.config.commands import Study
-from drivesem.evaluation.matches import Matches
+from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.evaluation.resampling import Interval
-from drivesem.run.frame import as_detections
+from drivesem.run.frame import detections_from_records
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.results import Failure, FrameResult
-from tools.experiments.detection import lessons, retrain, retrain_report
+from scene_ir import files
+from tools.experiments.__main__ import main
+from tools.experiments.detection import retraining, retraining_arms
+from tools.experiments.detection import retraining_report as retraining_report_file
+from tools.experiments.detection.arms import AttackTotals
 from tools.experiments.detection.counts import ArmCounts
-from tools.experiments.detection.lessons import BENIGN, lessons_of, reference_of
-from tools.experiments.detection.report import OWN_PROTOCOL, answer_of
-from tools.experiments.detection.robust import KINDS, RobustRow
-from tools.experiments.detection.running import AttackFacts
-from tools.experiments.detection.taught import RetrainCounts, SeenBenign, Taught, taught
+from tools.experiments.detection.report import OWN_PROTOCOL
+from tools.experiments.detection.retraining import cached_detections, set_threshold
+from tools.experiments.detection.retraining_arms import BENIGN, build_retraining_arms, paper_reference
+from tools.experiments.detection.retraining_report import retraining_report, write_retraining_plot
+from tools.experiments.detection.retraining_results import (
+    BenignMatches,
+    RetrainingCounts,
+    RetrainingResults,
+    summarise_retraining,
+)
+from tools.experiments.detection.robustness import KINDS, RobustnessRow
+from tools.experiments.settings import StudyConfig
 
 FRAMES, DRAWS = 8, 40
 THEIRS = {name: value for name, value in PROTOCOL.items() if name != "early_stop"}
@@ -56,24 +73,24 @@ def benign_frames(missed: Sequence[int]) -> tuple[list[Detections], list[Targets
     return [none if i in missed else hit for i in range(FRAMES)], wanted
 
 
-def seen(missed: Sequence[int] = ()) -> SeenBenign:
+def seen(missed: Sequence[int] = ()) -> BenignMatches:
     found, wanted = benign_frames(missed)
-    return SeenBenign(Matches.of(wanted, found, 0), 0.5)
+    return BenignMatches(ThresholdMatches.from_frames(wanted, found, 0), 0.5)
 
 
-def known(name: str, results: Sequence[FrameResult], kept: int) -> PairCounts:
+def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferCounts:
     """A detector that finds the first car of the attacked picture in the first `kept` frames, others always."""
-    source = ShownRun(BENIGN, "squeezedet", "si-fgsm", "rotate")
-    target = Target(name, name, CLASSES, 0.5)
+    source = SourceRun(BENIGN, "squeezedet", "si-fgsm", "rotate")
+    target = TransferTarget(name, name, CLASSES, 0.5)
     found = {
-        "benign": [as_detections(r.detections_benign, CLASSES) for r in results],
-        "rerendered": [as_detections(r.detections_benign, CLASSES) for r in results],
+        "benign": [detections_from_records(r.detections_benign, CLASSES) for r in results],
+        "rerendered": [detections_from_records(r.detections_benign, CLASSES) for r in results],
         "attacked": [
-            as_detections(r.detections_benign if i < kept else r.detections_attacked, CLASSES)
+            detections_from_records(r.detections_benign if i < kept else r.detections_attacked, CLASSES)
             for i, r in enumerate(results)
         ],
     }
-    return PairCounts.of(source, target, results, found)
+    return TransferCounts.from_detections(source, target, results, found)
 
 
 def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult]) -> None:
@@ -83,41 +100,43 @@ def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult
         replace(frame(str(i), found=False, success=True), failures=(replace(lost, grade=grade),))
         for i, grade in enumerate(("threshold", "threshold", "threshold", "confirmed"))
     ]
-    told = row_of(known("target", results, 3), DRAWS, 0)
-    assert told.counts[CERTAIN] == (1, 1)
-    assert told.counts[THRESHOLD] == (0, 3)
-    assert told.counts[TRANSFER] == (1, 4)
-    assert told.flat()["certain_rate"] == 1.0
-    shares = transfer_sheets([told])[1]
+    row = compute_transfer_row(known("target", results, 3), DRAWS, 0)
+    assert row.counts[CERTAIN] == (1, 1)
+    assert row.counts[THRESHOLD] == (0, 3)
+    assert row.counts[TRANSFER] == (1, 4)
+    assert row.to_row()["certain_rate"] == 1.0
+    shares = transfer_sheets([row])[1]
     assert [cell.split("\n")[-1] for cell in shares.rows[0][5:7]] == ["1 of 1", "0 of 3"]
 
 
 @pytest.fixture
-def found(frame: Callable[..., FrameResult], arm_run: Callable[..., Any], arm: Callable[..., Any]) -> Taught:
+def found(
+    frame: Callable[..., FrameResult], arm_run: Callable[..., Any], arm: Callable[..., Any]
+) -> RetrainingResults:
     """Four frames: the detector as it was loses a car in all of them; the retrained ones in half."""
-    study = Study(name="retrain", quick=True, bootstrap=DRAWS, **THEIRS)  # pyright: ignore[reportArgumentType]
-    plan = lessons_of(study)
+    study = StudyConfig(name="retrain", quick=True, bootstrap=DRAWS, **THEIRS)  # pyright: ignore[reportArgumentType]
+    plan = build_retraining_arms(study)
     lost = [frame(str(i), found=False, success=True) for i in range(4)]
     half = [frame(str(i), found=i < 2, success=i >= 2) for i in range(4)]
     names = [BENIGN, *(lesson.name for lesson in plan)]
     runs = [arm_run(arm(name), lost if name == BENIGN else half) for name in names]
-    counts = RetrainCounts(
+    counts = RetrainingCounts(
         attack="combo 2",
-        learned=AttackFacts(4, 4, 4, 1, {}),
-        judged=AttackFacts(4, 4 * len(names), 4 * len(names), 0, {"9": "no camera"}),
-        shown={lesson.name: 4 for lesson in plan},
-        benign=4,
+        training_attacks=AttackTotals(4, 4, 4, 1, {}),
+        test_attacks=AttackTotals(4, 4 * len(names), 4 * len(names), 0, {"9": "no camera"}),
+        counterexamples={lesson.name: 4 for lesson in plan},
+        benign_training_frames=4,
         benign_frames=tuple(f"{i:03d}" for i in range(FRAMES)),
-        seen={name: seen() if name == BENIGN else seen([0]) for name in names},
+        benign_matches={name: seen() if name == BENIGN else seen([0]) for name in names},
         known=[known(name, lost, 0 if name == BENIGN else 2) for name in names],
-        fresh=[ArmCounts.of(run) for run in runs],
+        fresh=[ArmCounts.from_run(run) for run in runs],
     )
-    return taught(study, counts)
+    return summarise_retraining(study, counts)
 
 
-def test_the_drop_is_paired_over_frames(found: Taught) -> None:
+def test_the_drop_is_paired_over_frames(found: RetrainingResults) -> None:
     """One car a frame, the first missed: at weights w the recall is 1 - w0 / n, and precision 1 up to it."""
-    flat = found.rows[1].flat()
+    flat = found.rows[1].to_row()
     weights = np.random.default_rng(0).multinomial(FRAMES, np.full(FRAMES, 1 / FRAMES), size=DRAWS)
     falls = 1 - (np.floor(100 * (1 - weights[:, 0] / FRAMES) + 1e-9) + 1) / 101
     assert flat["benign_drop"] == pytest.approx(1 - (np.floor(100 * 7 / 8) + 1) / 101)
@@ -125,12 +144,12 @@ def test_the_drop_is_paired_over_frames(found: Taught) -> None:
     assert flat["benign_drop_high"] == pytest.approx(np.quantile(falls, 0.975))
     assert flat["benign_recall_drop"] == pytest.approx(1 / 8)
     assert flat["benign_ap50"] == pytest.approx(1 - flat["benign_drop"])
-    first = found.rows[0].flat()
+    first = found.rows[0].to_row()
     assert (first["benign_drop"], first["benign_drop_low"], first["benign_drop_high"]) == (0.0, 0.0, 0.0)
 
 
-def test_gains_are_over_the_detector_as_it_was(found: Taught) -> None:
-    before, after = (r.flat() for r in found.rows[:2])
+def test_gains_are_over_the_detector_as_it_was(found: RetrainingResults) -> None:
+    before, after = (r.to_row() for r in found.rows[:2])
     assert (before["gain_moved"], before["fresh_gain_moved"]) == (0.0, 0.0)
     for prefix in ("", "fresh_"):
         rise = after[f"{prefix}moved_ap50"] - before[f"{prefix}moved_ap50"]
@@ -142,19 +161,19 @@ def test_gains_are_over_the_detector_as_it_was(found: Taught) -> None:
     assert after["drop_moved"] == pytest.approx(after["photographs_ap50"] - after["moved_ap50"])
 
 
-def test_the_papers_figures_stand_beside_its_protocol_only(found: Taught) -> None:
-    study = Study(name="retrain", **THEIRS)  # pyright: ignore[reportArgumentType]
-    plan = lessons_of(study)
-    assert reference_of("retrained, paper's protocol", plan, study) == (0.7276, 0.8473)
-    own = Study(name="retrain")
-    assert {reference_of(lesson.name, plan, own) for lesson in plan} == {None}
+def test_the_papers_figures_stand_beside_its_protocol_only(found: RetrainingResults) -> None:
+    study = StudyConfig(name="retrain", **THEIRS)  # pyright: ignore[reportArgumentType]
+    plan = build_retraining_arms(study)
+    assert paper_reference("retrained, paper's protocol", plan, study) == (0.7276, 0.8473)
+    own = StudyConfig(name="retrain")
+    assert {paper_reference(lesson.name, plan, own) for lesson in plan} == {None}
     rows = [replace(row, reference=None) for row in found.rows]
-    told = retrain_report.told(replace(found, rows=rows))
-    assert OWN_PROTOCOL in told.notes
-    assert not any("there" in column for sheet in told.sheets for column in sheet.columns)
+    report = retraining_report(replace(found, rows=rows), Path("out"))
+    assert OWN_PROTOCOL in report.notes
+    assert not any("paper" in column for table in report.tables for column in table.columns)
 
 
-def test_what_is_told(found: Taught, tmp_path: Path) -> None:
+def test_what_is_told(found: RetrainingResults, tmp_path: Path) -> None:
     data = found.to_json()
     json.dumps(data, allow_nan=False)
     assert [set(ASKED) - set(r) for r in data["rows"]] == [set()] * 3
@@ -167,36 +186,43 @@ def test_what_is_told(found: Taught, tmp_path: Path) -> None:
     shown = {name: (t["pictures"], t["labels"]) for name, t in data["training"].items()}
     assert shown["retrained, ours"] == ("counterexample", "moved")
     assert shown["retrained on benign re-rendered images"] == ("rerender", "benign")
-    told = retrain_report.told(found)
-    answer_of(told, tmp_path, {}, "drivesem study retrain", None).write()
+    report = retraining_report(found, tmp_path)
+    report.write()
     text = (tmp_path / "study.md").read_text()
-    assert all(f"## {sheet.title}" in text for sheet in told.sheets)
-    for part in ("65.90", "99.40", "92.97", "Frame 9 could not be used: no camera", "1 frame without vehicles"):
+    assert all(f"## {table.title}" in text for table in report.tables)
+    for part in (
+        "65.90",
+        "99.40",
+        "92.97",
+        "Frame 9 could not be used: no camera",
+        "Skipped: 1 frame without vehicles",
+    ):
         assert part in text
     lines = list(csv.DictReader((tmp_path / "study.csv").read_text().splitlines()))
     assert [line["name"] for line in lines] == [r.name for r in found.rows]
     stream = io.StringIO()
-    answer_of(told, tmp_path, {}, "", None).print(Console(file=stream, width=100))
+    report.print(Console(file=stream, width=100))
     assert "retrained, ours" in stream.getvalue()
-    retrain_report.write_plot(tmp_path / "study.png", found)
     assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
 
 
 def test_the_picture_is_of_failures_where_states_were_shown(
-    found: Taught, monkeypatch: pytest.MonkeyPatch
+    found: RetrainingResults, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Groups without any bar are left out; AP50 has no groups of states."""
     drawn: list[dict[str, list[Interval | None]]] = []
-    draw = retrain_report.bars
-    monkeypatch.setattr(retrain_report, "bars", lambda axes, series: (drawn.append(series), draw(axes, series)))
-    monkeypatch.setattr(retrain_report.files, "write_bytes", lambda *_: None)
+    draw = retraining_report_file.draw_bars
+    monkeypatch.setattr(
+        retraining_report_file, "draw_bars", lambda axes, series: (drawn.append(series), draw(axes, series))
+    )
+    monkeypatch.setattr(files, "write_bytes", lambda *_: None)
     told = Interval("", 0.2, 0.1, 0.3)
-    row = RobustRow("certain", "ours", dict.fromkeys(KINDS, told), {}, replace(told, value=0.5), None, None)
-    retrain_report.write_plot(Path("a.png"), replace(found, chances=[row]))
+    row = RobustnessRow("certain", "ours", dict.fromkeys(KINDS, told), {}, replace(told, value=0.5), None, None)
+    write_retraining_plot(Path("a.png"), replace(found, robustness=[row]))
     assert [one.value for one in drawn[0]["ours"] if one] == [0.2, 0.2, 0.2, 0.5]
-    retrain_report.write_plot(Path("a.png"), found)
+    write_retraining_plot(Path("a.png"), found)
     once = replace(found, rows=[found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])])
-    retrain_report.write_plot(Path("a.png"), once)
+    write_retraining_plot(Path("a.png"), once)
     assert [len(series[BENIGN]) for series in drawn[1:]] == [3, 2]
 
 
@@ -214,21 +240,21 @@ def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.Mo
         looks.append(len(indices))
         return benign_frames([1])[0][: len(indices)]
 
-    monkeypatch.setattr(retrain, "detect", detect)
+    monkeypatch.setattr(retraining, "detect_in_store", detect)
     detector, store, path = load_detector("squeezedet"), Store(), tmp_path / "seen.json"
-    first = retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
-    again = retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    first = cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    again = cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     assert looks == [2]
     assert [len(one) for one in again] == [len(one) for one in first] == [1, 0]
     assert torch.equal(again[0].boxes_xyxy, first[0].boxes_xyxy)
     assert torch.equal(again[0].scores, first[0].scores)
     with torch.no_grad():
         next(iter(detector.parameters())).add_(1.0)
-    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     store.names = ("a",)  # pyright: ignore[reportAttributeAccessIssue]
-    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     store.digest = "of others"  # pyright: ignore[reportAttributeAccessIssue]
-    retrain.look_at(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
+    cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     assert looks == [2, 2, 1, 1], "other weights, other frames, other pictures"
 
 
@@ -236,10 +262,10 @@ def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
     weights = tmp_path / "w.safetensors"
     detector = load_detector("squeezedet")
     save_detector(detector, weights, {"retrained_from": "squeezedet", "steps": "2"})
-    retrain.set_threshold(detector, weights, 0.123456789)
+    set_threshold(detector, weights, 0.123456789)
     assert load_detector(weights).t_star == detector.t_star == 0.123457
     written = weights.stat().st_mtime_ns
-    retrain.set_threshold(load_detector(weights), weights, 0.123456789)
+    set_threshold(load_detector(weights), weights, 0.123456789)
     assert weights.stat().st_mtime_ns == written
 
 
@@ -257,19 +283,19 @@ def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
-    assert message in refused("study", "retrain", *words)
+    assert message in refused("retrain", *words)
 
 
-def test_without_new_attacks_there_is_no_table_of_them(found: Taught) -> None:
+def test_without_new_attacks_there_is_no_table_of_them(found: RetrainingResults) -> None:
     rows = [found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])]
     counts = replace(found.counts, left_out={"the same, consistently": "no failure"})
     less = replace(found, rows=rows, counts=counts)
     assert less.to_json()["left_out"] == {"the same, consistently": "no failure"}
-    assert less.rows[1].flat()["fresh_moved_ap50"] is None
-    told = retrain_report.told(less)
-    assert not any("Fresh" in sheet.title for sheet in told.sheets)
-    assert any("Fresh" in sheet.title for sheet in retrain_report.told(found).sheets)
-    assert "Left out: the same, consistently: no failure." in told.notes
+    assert less.rows[1].to_row()["fresh_moved_ap50"] is None
+    report = retraining_report(less, Path("out"))
+    assert not any("Fresh" in table.title for table in report.tables)
+    assert any("Fresh" in table.title for table in retraining_report(found, Path("out")).tables)
+    assert "Left out: the same, consistently: no failure." in report.notes
 
 
 @pytest.mark.slow
@@ -277,7 +303,7 @@ def test_the_whole_study_and_going_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    words = ["study", "retrain", "--quick", "--limit", "2", "--fresh", "1", "--benign-frames", "2", "--steps", "3"]
+    words = ["retrain", "--quick", "--limit", "2", "--fresh", "1", "--benign-frames", "2", "--steps", "3"]
     words += ["--train-steps", "2", "--workers", "1", "--bootstrap", "5", "--out", str(out), "--json"]
     words += ["--states", "2"]
     assert main(words) == 0
@@ -305,12 +331,12 @@ def test_the_whole_study_and_going_on(
 
     (out / "study.json").unlink()
     with monkeypatch.context() as patch:
-        for place, name in ((lessons, "train_on"), (retrain, "detect"), (Attack, "__call__")):
+        for place, name in ((retraining_arms, "fine_tune"), (retraining, "detect_in_store"), (Attack, "__call__")):
             patch.setattr(place, name, never)
         assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == data
-    kept = shutil.copytree(out / "kept", tmp_path / "kept")
-    assert main(["study", "retrain", "--from", str(kept), "--out", str(tmp_path / "again"), "--json"]) == 0
+    results = shutil.copytree(out / "results", tmp_path / "results")
+    assert main(["retrain", "--from", str(results), "--out", str(tmp_path / "again"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == data
     for name in ("study.md", "study.csv", "robust.csv", "study.png"):
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()

@@ -1,16 +1,18 @@
-"""A study's table: what falls, by which labels, and beyond the controls."""
+"""Metrics of an arm: drops, by which labels, and beyond the controls."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from drivesem.config.commands import Attack
+from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.resampling import holm
-from drivesem.report.paper import PAPER_BENIGN
+from drivesem.run.protocol import PAPER_BENIGN
 from tools.experiments.detection.arms import PLACEBO, RANDOM
+from tools.experiments.detection.comparison import compare_arms, relative_size
 from tools.experiments.detection.counts import ArmCounts, FrameCounts
-from tools.experiments.detection.rows import relative_size, rows_of
 
 FRAMES = 8
 FAR = 40.0
@@ -34,8 +36,8 @@ def runs(frame, counted, arm):
 
 
 def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
-    (row,) = rows_of(runs, draws=50, seed=0)
-    flat = row.flat()
+    (row,) = compare_arms(runs, draws=50, seed=0)
+    flat = row.to_row()
     assert (flat["name"], flat["reference"], flat["frames"], flat["objects"]) == ("rotate", 0.982, 8, 16)
     assert flat["reference_drop"] == pytest.approx(PAPER_BENIGN - 0.982)
     assert flat["benign_ap50"] == 1.0
@@ -55,7 +57,7 @@ def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
 def test_figures_are_those_of_pycocotools(frame, arm_run, arm) -> None:
     """As the run itself tells them, of detections that are true at some overlaps and false at others."""
     run = arm_run(arm("a"), [frame(f"{i}", moved_by=4.0 * i, found=i != 3) for i in range(FRAMES)])
-    (row,) = rows_of([ArmCounts.of(run)], draws=0, seed=0)
+    (row,) = compare_arms([ArmCounts.from_run(run)], draws=0, seed=0)
     sides = {
         "benign": run.summary.benign,
         "paper": run.summary.attacked_paper,
@@ -65,12 +67,12 @@ def test_figures_are_those_of_pycocotools(frame, arm_run, arm) -> None:
         for key in ("ap50", "ap70", "ap", "recall"):
             expected = getattr(scores.headline, key)
             assert getattr(getattr(row, side), key) == pytest.approx(expected, abs=1e-12), (side, key)
-    assert row.flat()["objects"] == run.summary.benign.headline.objects
+    assert row.to_row()["objects"] == run.summary.benign.headline.objects
 
 
 def test_drops_are_those_of_the_figures(runs) -> None:
-    (row,) = rows_of(runs, draws=0, seed=0)
-    flat = row.flat()
+    (row,) = compare_arms(runs, draws=0, seed=0)
+    flat = row.to_row()
     for mode in ("paper", "moved"):
         for key in ("ap50", "ap70", "ap", "recall"):
             drop = flat[f"drop_{mode}" if key == "ap50" else f"drop_{mode}_{key}"]
@@ -80,8 +82,8 @@ def test_drops_are_those_of_the_figures(runs) -> None:
 
 
 def test_the_controls_stand_beside(runs) -> None:
-    (row,) = rows_of(runs, draws=50, seed=0)
-    flat = row.flat()
+    (row,) = compare_arms(runs, draws=50, seed=0)
+    flat = row.to_row()
     assert flat["placebo_drop_moved"] == 0
     assert flat["over_placebo_moved"] == pytest.approx(flat["drop_moved"])
     assert flat["over_placebo_moved_low"] <= flat["over_placebo_moved"] <= flat["over_placebo_moved_high"]
@@ -94,8 +96,8 @@ def test_the_controls_stand_beside(runs) -> None:
 
 
 def test_sizes_are_compared_frame_by_frame(frame) -> None:
-    attack = [FrameCounts.of(frame("a", yaw=yaw), ()) for yaw in (0.2, 0.1, 0.0)]
-    control = [FrameCounts.of(frame("a", yaw=yaw), ()) for yaw in (-0.2, 0.05, 0.3)]
+    attack = [FrameCounts.from_result(frame("a", yaw=yaw), ()) for yaw in (0.2, 0.1, 0.0)]
+    control = [FrameCounts.from_result(frame("a", yaw=yaw), ()) for yaw in (-0.2, 0.05, 0.3)]
     assert relative_size(control, attack) == pytest.approx(np.mean([1.0, 0.5]))
     assert relative_size([control[2]], [attack[2]]) is None
 
@@ -103,7 +105,7 @@ def test_sizes_are_compared_frame_by_frame(frame) -> None:
 def test_equal_arms_have_no_effect_and_no_spread(frame, counted, arm) -> None:
     results = [frame(f"{i}", found=i % 2 == 0) for i in range(4)]
     runs = [counted(arm("one"), results), counted(arm("two", control=(PLACEBO, "one")), results)]
-    (row,) = rows_of(runs, draws=20, seed=3)
+    (row,) = compare_arms(runs, draws=20, seed=3)
     effect = row.effects[PLACEBO]["moved"]
     assert (effect.difference, effect.low, effect.high, effect.p) == (0.0, 0.0, 0.0, 1.0)
     assert row.drops["moved"]["ap50"].value == pytest.approx(25 / 101)
@@ -116,8 +118,8 @@ def test_seeds_of_a_control_count_as_their_mean(runs, frame, counted, arm) -> No
         arm("rotate random 2", control=(RANDOM, "rotate"), seed=1),
         [frame(n, moved_by=5.0, found=False, success=True, yaw=0.1) for n in names],
     )
-    (one,), (two,) = (rows_of(these, draws=20, seed=0) for these in (runs, [*runs, lost]))
-    alone, both = one.flat(), two.flat()
+    (one,), (two,) = (compare_arms(these, draws=20, seed=0) for these in (runs, [*runs, lost]))
+    alone, both = one.to_row(), two.to_row()
     # one of two cars: precision is 1 up to a recall of 0.5
     drop = 1 - 51 / 101
     assert both["random_drop_moved"] == pytest.approx(drop / 2)
@@ -131,14 +133,21 @@ def test_seeds_of_a_control_count_as_their_mean(runs, frame, counted, arm) -> No
 def test_the_effect_is_beside_the_control_with_as_many_chances(runs) -> None:
     """Random where the best is kept, the placebo where the last is; p is Holm's over the rows."""
     kept_last = [
-        replace(run, arm=replace(run.arm, name=f"last {run.arm.name}", of=run.arm.of and f"last {run.arm.of}"))
+        replace(
+            run,
+            arm=replace(
+                run.arm,
+                name=f"last {run.arm.name}",
+                control_of=run.arm.control_of and f"last {run.arm.control_of}",
+            ),
+        )
         for run in runs
     ]
-    kept_last[0] = replace(kept_last[0], arm=replace(kept_last[0].arm, config=Attack(keep="last")))
-    best, last = rows_of([*runs, *kept_last], draws=30, seed=0)
-    assert (best.matching, last.matching) == (RANDOM, PLACEBO)
+    kept_last[0] = replace(kept_last[0], arm=replace(kept_last[0].arm, config=AttackConfig(keep="last")))
+    best, last = compare_arms([*runs, *kept_last], draws=30, seed=0)
+    assert (best.matching_control, last.matching_control) == (RANDOM, PLACEBO)
     ps = [best.effects[RANDOM]["moved"].p, last.effects[PLACEBO]["moved"].p]
     assert [best.p, last.p] == holm(ps)
     assert best.p >= ps[0]
-    (alone,) = rows_of(runs[:1], draws=20, seed=0)
-    assert (alone.matching, alone.p, alone.flat()["control"]) == (None, None, None)
+    (alone,) = compare_arms(runs[:1], draws=20, seed=0)
+    assert (alone.matching_control, alone.p, alone.to_row()["control"]) == (None, None, None)

@@ -1,4 +1,4 @@
-"""`drivesem study transfer`: attacked once, then asked; what stands beside, and what it says of the paper."""
+"""The study `transfer` on an embedded frame."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ import torch
 
 from detectors.types import Detections
 from drivesem.attack.methods.base import Attack
-from drivesem.cli import main
-from drivesem.config.commands import Study
-from drivesem.report.paper import PAPER_BENIGN, PAPER_COMBOS
-from drivesem.run import looking
-from tools.experiments.detection import transfer
-from tools.experiments.detection.arms import PLACEBO, arms_of
+from drivesem.run import detection_cache as looking
+from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS
+from tools.experiments.__main__ import main
+from tools.experiments.detection.arms import PLACEBO, build_arms
 from tools.experiments.detection.report import OWN_PROTOCOL
+from tools.experiments.settings import StudyConfig
 
-WORDS = ["study", "transfer", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
+WORDS = ["transfer", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
 ASKED = (
     *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
     *("recall_moved", "reference"),
@@ -107,12 +106,11 @@ def test_asked_again_nothing_is_attacked_or_looked_at(
 def test_what_is_kept_tells_the_same_without_a_run(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also of a study that an earlier version finished: the same command keeps it."""
     before = (finished / "study.json").read_bytes()
-    shutil.rmtree(finished / "kept")
+    shutil.rmtree(finished / "results")
     studied(capsys, "--out", finished)
-    kept = Path(shutil.move(finished / "kept", tmp_path / "kept"))
-    assert main(["study", "transfer", "--from", str(kept), "--out", str(tmp_path / "again")]) == 0
+    results = Path(shutil.move(finished / "results", tmp_path / "results"))
+    assert main(["transfer", "--from", str(results), "--out", str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "study.json").read_bytes() == before
     for name in ("study.md", "study.csv", "study.png"):
         assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes()
@@ -143,8 +141,8 @@ def test_a_detector_that_finds_nothing_has_nothing_to_lose(
 
 
 def test_each_source_has_an_arm_and_its_placebo() -> None:
-    study = Study(name="transfer", sources="squeezedet,yolov3-slim", steps=3)
-    arms = arms_of(study, Path("out"))
+    study = StudyConfig(name="transfer", sources="squeezedet,yolov3-slim", steps=3)
+    arms = build_arms(study, Path("out"))
     assert [arm.folder for arm in arms] == [
         "combo-2",
         "combo-2-placebo",
@@ -153,7 +151,7 @@ def test_each_source_has_an_arm_and_its_placebo() -> None:
     ]
     assert [arm.config.detector for arm in arms] == ["squeezedet"] * 2 + ["yolov3-slim"] * 2
     assert arms[3].config.like == "out/arms/combo-2-yolov3-slim"
-    assert len(arms_of(Study(name="transfer", controls=False), Path("out"))) == 1
+    assert len(build_arms(StudyConfig(name="transfer", controls=False), Path("out"))) == 1
 
 
 @pytest.mark.slow
@@ -183,4 +181,4 @@ def test_two_sources_make_a_matrix(finished: Path, capsys: pytest.CaptureFixture
     ],
 )
 def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
-    assert message in refused("study", "transfer", *words)
+    assert message in refused("transfer", *words)

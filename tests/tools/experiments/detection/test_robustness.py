@@ -1,4 +1,4 @@
-"""How likely arms fail a car: shares and what they are short of, on hand-made counts."""
+"""How likely arms miss a car, from hand-made counts."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.config.commands import Study
 from drivesem.run.finished import load_runs
-from drivesem.run.folder import attack_of
-from tools.experiments.detection.robust import (
+from drivesem.run.folder import load_attack_config
+from tools.experiments.detection.robustness import (
     ANYWHERE,
     AROUND,
     CONTROLS,
     REDRAWN,
-    Counted,
-    FrameStates,
-    Judge,
-    redrawn_of,
-    rows_of,
-    states_of,
+    FailureCounts,
+    FrameStateCounts,
+    StateEvaluator,
+    compare_robustness,
+    evaluate_states,
+    redrawn_count,
 )
+from tools.experiments.settings import StudyConfig
 
 ARMS = [
     ("benign detector", "benign detector"),
@@ -31,19 +31,19 @@ ARMS = [
     ("random", "on random"),
     ("certain", "ours"),
 ]
-FALLS = {"benign detector": [0.0], "benign": [0.001], "random": [0.0], "certain": [0.004]}
+DROPS = {"benign detector": [0.0], "benign": [0.001], "random": [0.0], "certain": [0.004]}
 DRAWS, CARS = 200, 40
 
 
-def frames(lost: dict[str, tuple[int, ...]], count: int = 12) -> list[FrameStates]:
+def frames(lost: dict[str, tuple[int, ...]], count: int = 12) -> list[FrameStateCounts]:
     """Frames of 40 cars in 10 pictures; each detector loses so many in a frame, one more in each second one."""
     columns = len(next(iter(lost.values())))
     return [
-        FrameStates(
+        FrameStateCounts(
             str(i),
             "",
             {
-                kind: Counted(CARS, tuple(n + (n > 0) * (i % 2) for n in own), 10, (1,) * columns)
+                kind: FailureCounts(CARS, tuple(n + (n > 0) * (i % 2) for n in own), 10, (1,) * columns)
                 for kind, own in lost.items()
             },
             "",
@@ -52,12 +52,12 @@ def frames(lost: dict[str, tuple[int, ...]], count: int = 12) -> list[FrameState
     ]
 
 
-def by_arm(lost: tuple[int, ...], arms=ARMS, falls=FALLS):
-    return rows_by_arm(frames({ANYWHERE: lost}), arms, falls)
+def by_arm(lost: tuple[int, ...], arms=ARMS, drops=DROPS):
+    return rows_by_arm(frames({ANYWHERE: lost}), arms, drops)
 
 
-def rows_by_arm(seen: list[FrameStates], arms=ARMS, falls=FALLS):
-    return {row.arm: row for row in rows_of(seen, arms, falls, DRAWS, 0)}
+def rows_by_arm(seen: list[FrameStateCounts], arms=ARMS, drops=DROPS):
+    return {row.arm: row for row in compare_robustness(seen, arms, drops, DRAWS, 0)}
 
 
 def test_shares_are_of_cars_and_paired() -> None:
@@ -72,11 +72,11 @@ def test_shares_are_of_cars_and_paired() -> None:
     assert certain.failures[AROUND].value is None
     assert certain.phantoms.value == pytest.approx(0.1)
     assert set(rows["random"].fewer) == {(kind, "benign") for kind in (ANYWHERE, REDRAWN, AROUND)}
-    json.dumps([row.flat() for row in rows.values()], allow_nan=False)
+    json.dumps([row.to_row() for row in rows.values()], allow_nan=False)
 
 
 @pytest.mark.parametrize(
-    ("lost", "falls", "short_of"),
+    ("lost", "drop", "short_of"),
     [
         ((20, 16, 16, 8), 0.004, ()),
         ((20, 16, 16, 12), 0.004, ("third",)),
@@ -86,10 +86,10 @@ def test_shares_are_of_cars_and_paired() -> None:
     ],
     ids=["met", "too little", "too dear", "random does it too", "nothing"],
 )
-def test_what_the_goal_is_short_of(lost: tuple[int, ...], falls: float, short_of: tuple[str, ...]) -> None:
-    rows = by_arm(lost, falls=FALLS | {"certain": [falls, falls]})
+def test_what_the_goal_is_short_of(lost: tuple[int, ...], drop: float, short_of: tuple[str, ...]) -> None:
+    rows = by_arm(lost, drops=DROPS | {"certain": [drop, drop]})
     assert rows["certain"].short_of == short_of
-    assert rows["certain"].flat()["goal"] is (not short_of)
+    assert rows["certain"].to_row()["goal"] is (not short_of)
     assert {rows[name].short_of for name in (*CONTROLS, "benign detector")} == {None}
 
 
@@ -104,10 +104,10 @@ def test_failures_bought_with_phantoms_do_not_count(phantoms: int, short_of: tup
 
 def test_seeds_count_together() -> None:
     arms = [*ARMS, ("certain", "ours, seed 1")]
-    falls = FALLS | {"certain": [0.0, 0.008]}
-    row = by_arm((20, 16, 16, 6, 10), arms, falls)["certain"]
+    drops = DROPS | {"certain": [0.0, 0.008]}
+    row = by_arm((20, 16, 16, 6, 10), arms, drops)["certain"]
     assert row.failures[ANYWHERE].value == pytest.approx(8.5 / CARS)
-    assert row.ap50_falls == pytest.approx(0.004)
+    assert row.ap50_drop == pytest.approx(0.004)
     assert row.title == "ours"
 
 
@@ -115,7 +115,7 @@ def test_without_the_controls_no_goal_is_told() -> None:
     arms = [ARMS[0], ARMS[3]]
     rows = by_arm((20, 8), arms)
     assert rows["certain"].short_of is None
-    assert rows["certain"].flat()["goal"] is None
+    assert rows["certain"].to_row()["goal"] is None
     assert rows["certain"].fewer == {}
 
 
@@ -129,7 +129,7 @@ def test_what_nobody_loses_has_no_share_of_it() -> None:
 def test_frames_without_a_second_renderer_are_left_out_of_its_share_alone() -> None:
     both = frames({ANYWHERE: (4, 4, 4, 4), REDRAWN: (10, 10, 10, 10)})
     some = [one if i < 6 else replace(one, counts={ANYWHERE: one.counts[ANYWHERE]}) for i, one in enumerate(both)]
-    rows = {row.arm: row for row in rows_of(some, ARMS, FALLS, DRAWS, 0)}
+    rows = {row.arm: row for row in compare_robustness(some, ARMS, DROPS, DRAWS, 0)}
     assert rows["certain"].failures[REDRAWN].value == pytest.approx(10.5 / CARS)
     assert np.isfinite(rows["certain"].failures[REDRAWN].high or np.nan)
 
@@ -137,10 +137,10 @@ def test_frames_without_a_second_renderer_are_left_out_of_its_share_alone() -> N
 @pytest.mark.slow
 def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> None:
     """The same detector twice loses the same cars; going on asks nothing again."""
-    study, attack = Study(name="retrain", states=4, workers=1), attack_of(small_run)
+    study, attack = StudyConfig(name="retrain", states=4, workers=1), load_attack_config(small_run)
     (run,) = load_runs([str(small_run)])
     asked = ["squeezedet", "squeezedet", "yolov3-slim"]
-    (one,), failed = states_of(run, attack, asked, study, tmp_path)
+    (one,), failed = evaluate_states(run, attack, asked, study, tmp_path)
     assert not failed
     assert one.note == ""
     anywhere, redrawn = one.counts[ANYWHERE], one.counts[REDRAWN]
@@ -150,11 +150,11 @@ def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> N
     assert redrawn.lost[0] == redrawn.lost[1]
     assert len(anywhere.lost) == len(anywhere.phantoms) == 3
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Judge, "__call__", None)
-        assert states_of(run, attack, asked, study, tmp_path)[0] == [one]
+        patch.setattr(StateEvaluator, "analyse", None)
+        assert evaluate_states(run, attack, asked, study, tmp_path)[0] == [one]
         with pytest.raises(TypeError):
-            states_of(run, attack, asked[:2], study, tmp_path)
+            evaluate_states(run, attack, asked[:2], study, tmp_path)
 
 
 def test_as_many_are_drawn_again_as_grading_has_drawn() -> None:
-    assert [redrawn_of(n) for n in (16, 32, 4, 1)] == [4, 8, 1, 1]
+    assert [redrawn_count(n) for n in (16, 32, 4, 1)] == [4, 8, 1, 1]

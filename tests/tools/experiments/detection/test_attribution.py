@@ -1,4 +1,4 @@
-"""Which factor takes how many points: arms of both ways, sums that are exact, and a waterfall."""
+"""Points of each factor of the protocol."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from typing import Any
 import cv2
 import pytest
 
-from drivesem.config.commands import Attack, Study
+from drivesem.config.commands import AttackConfig
 from drivesem.config.parsing import parse
 from drivesem.run.protocol import follows_paper
-from tools.experiments.detection.arms import PAPERS, attack_of
+from tools.experiments.detection.arms import PAPER_PROTOCOL
 from tools.experiments.detection.attribution import (
-    COUNTED,
+    COUNTED_LABELS,
     OURS,
     Attribution,
-    Plan,
-    attributed,
-    told,
+    AttributionPlan,
+    attribute_drop,
+    attribution_report,
     write_waterfall,
 )
 from tools.experiments.detection.counts import StudyCounts
+from tools.experiments.settings import StudyConfig
 
 FRAMES, DRAWS = 6, 10
 
 
-def plan_of(**settings: Any) -> Plan:
-    study = Study(name="attribution", **settings)
-    return Plan.of(study, attack_of(study))
+def plan_of(**settings: Any) -> AttributionPlan:
+    study = StudyConfig(name="attribution", **settings)
+    return AttributionPlan.from_study(study)
 
 
 @pytest.mark.parametrize(("other", "count"), [(None, 13), ("yolov3-slim", 16)])
@@ -44,22 +45,22 @@ def test_each_attack_is_an_arm_once(other: str | None, count: int, tmp_path: Pat
         arm.config.check()
         assert not arm.config.grade
     named = {arm.name: arm.config for arm in arms}
-    default = Attack(combo=2, limit=200, grade=False)
+    default = AttackConfig(combo=2, limit=200, grade=False)
     assert named[OURS] == default
-    assert follows_paper(named[PAPERS]) == (other is None)
-    assert named[PAPERS].detector == (other or default.detector)
+    assert follows_paper(named[PAPER_PROTOCOL]) == (other is None)
+    assert named[PAPER_PROTOCOL].detector == (other or default.detector)
 
 
 def test_a_way_changes_one_factor_at_a_time_and_the_factors_start_as_ours() -> None:
     plan = plan_of(objective="total", keep="last", parametrisation="roi", other_detector="other")
     assert plan.config(frozenset()) == plan_of().config(frozenset())
-    for way in plan.ways():
+    for way in plan.paths():
         assert (way[0], way[-1]) == (frozenset(), {*plan.factors})
         for one, other in pairwise(way):
             (factor,) = other - one
             changed = [k for k, v in vars(plan.config(one)).items() if v != vars(plan.config(other))[k]]
-            assert len(changed) == (factor != COUNTED)
-    assert plan.ways()[1] != plan.ways()[0]
+            assert len(changed) == (factor != COUNTED_LABELS)
+    assert plan.paths()[1] != plan.paths()[0]
 
 
 @pytest.fixture
@@ -70,21 +71,22 @@ def found(frame: Callable[..., Any], counted: Callable[..., Any]) -> Attribution
         lost = 2 if arm.config.objective_labels == "paper" else 0
         by = 40.0 if arm.config.project == "bounds" else 0.0
         runs.append(counted(arm, [frame(f"{i}", moved_by=by, found=i >= lost) for i in range(FRAMES)]))
-    return attributed(Study(name="attribution"), plan, StudyCounts(tuple(runs), 1, {"000009": "no camera"}), DRAWS)
+    counts = StudyCounts(tuple(runs), 1, {"000009": "no camera"})
+    return attribute_drop(StudyConfig(name="attribution", bootstrap=DRAWS), counts)
 
 
 def test_points_sum_to_the_difference_on_both_ways_and_in_the_mean(found: Attribution) -> None:
     assert found.ours == 0
     difference = found.papers - found.ours
     assert difference > 0.4
-    assert sum(share.points.value for share in found.shares) == pytest.approx(difference, abs=1e-12)
-    assert found.total.points.value == pytest.approx(difference, abs=1e-12)
+    assert sum(share.points.value for share in found.shares[:-2]) == pytest.approx(difference, abs=1e-12)
+    assert found.shares[-1].points.value == pytest.approx(difference, abs=1e-12)
     for way in range(2):
-        assert sum(share.ways[way] for share in found.shares) == pytest.approx(difference, abs=1e-12)
+        assert sum(share.path_points[way] for share in found.shares[:-2]) == pytest.approx(difference, abs=1e-12)
     both = sum(share.points.value for share in found.shares[:2])
-    assert found.labels.points.value == pytest.approx(both, abs=1e-12)
-    for share in found.rows():
-        assert share.points.value == pytest.approx(sum(share.ways) / 2, abs=1e-12)
+    assert found.shares[-2].points.value == pytest.approx(both, abs=1e-12)
+    for share in found.shares:
+        assert share.points.value == pytest.approx(sum(share.path_points) / 2, abs=1e-12)
         assert share.points.low <= share.points.value <= share.points.high
 
 
@@ -93,8 +95,8 @@ def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
     for name in ("loss", "iterate kept", "parametrisation"):
         assert (shares[name].points.value, shares[name].points.low, shares[name].p) == (0, 0, 1)
     # by labels that move a car that drove away is found; by labels that stay it is lost, and a false one beside
-    assert shares["projection"].ways[1] == 0 < shares["projection"].ways[0]
-    assert shares[COUNTED].ways[0] == 0 < shares[COUNTED].ways[1]
+    assert shares["projection"].path_points[1] == 0 < shares["projection"].path_points[0]
+    assert shares[COUNTED_LABELS].path_points[0] == 0 < shares[COUNTED_LABELS].path_points[1]
     assert shares["projection"].alone.value == 0
     # ten of twelve cars are found, nothing else: precision is 1 up to a recall of 10 / 12
     assert shares["labels aimed at"].alone.value == pytest.approx(1 - 84 / 101)
@@ -113,24 +115,27 @@ def test_a_detector_counts_with_what_its_fall_begins_from(
             results[0] = replace(results[0], detections_benign=one, detections_attacked=one)
             results[1] = replace(results[1], detections_attacked=one)
         runs.append(counted(arm, results))
-    found = attributed(Study(name="attribution"), plan, StudyCounts(tuple(runs), 0, {}), DRAWS)
-    assert found.shares[-1].name == "detector"
+    study = StudyConfig(name="attribution", bootstrap=DRAWS, other_detector="other")
+    found = attribute_drop(study, StudyCounts(tuple(runs), 0, {}))
+    *factors, detector, _, _ = found.shares
+    assert detector.name == "detector"
     # 11 of 12 cars are found before, 10 after, nothing else: precision is 1 up to these recalls
     assert (found.ours, found.papers) == (0, pytest.approx((92 - 84) / 101))
-    assert found.shares[-1].points.value == pytest.approx(found.papers, abs=1e-12)
-    assert [share.points.value for share in found.shares[:-1]] == [0] * 6
+    assert detector.points.value == pytest.approx(found.papers, abs=1e-12)
+    assert [share.points.value for share in factors] == [0] * 6
 
 
 def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:
-    text = told(found)
-    first = text.sheets[0]
-    assert [row[0] for row in first.rows] == [*(share.name for share in found.shares), "labels, both", "all"]
+    report = attribution_report(found, tmp_path)
+    first = report.tables[0]
+    assert [row[0] for row in first.rows] == [share.name for share in found.shares]
+    assert first.rows[-2][0] == "labels, both"
     assert first.title.endswith(f"from 0.00, ours, to {100 * found.papers:.2f}, the paper's protocol")
     data = found.to_json()
     assert (data["frames"], data["papers"], len(data["arms"])) == (FRAMES, found.papers, 13)
-    assert data["rows"][0]["name"] == COUNTED
+    assert data["rows"][0]["name"] == COUNTED_LABELS
     assert data["rows"][0]["points_low"] <= data["rows"][0]["points"]
-    assert any("000009" in note for note in text.notes)
+    assert any("000009" in note for note in report.notes)
     write_waterfall(tmp_path / "a.png", found)
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture is not None
@@ -141,4 +146,4 @@ def test_the_other_detector_is_of_this_study_alone(refused: Callable[..., str]) 
     assert "--other-detector: expected study attribution" in refused(
         "study", "multi", "--other-detector", "yolov3"
     )
-    assert parse(["study", "attribution", "--other-detector", "yolov3-slim"]).other_detector == "yolov3-slim"
+    assert parse(["attribution", "--other-detector", "yolov3-slim"]).other_detector == "yolov3-slim"

@@ -1,5 +1,7 @@
 """Which attacks a study compares."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -7,24 +9,22 @@ from typing import Any
 
 import pytest
 
-from drivesem.config.commands import Study
-from drivesem.report.paper import PAPER_COMBOS, PAPER_SINGLE
-from drivesem.run.protocol import PROTOCOL, follows_paper
+from drivesem.run.protocol import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
 from scene_ir.errors import FormatError
 from tools.experiments.detection.arms import (
-    FIGURES,
-    FRAMES,
-    PAPERS,
+    PAPER_PROTOCOL,
     PLACEBO,
-    QUICK_FRAMES,
     RANDOM,
-    SEARCHES,
-    Arm,
-    arms_of,
-    matching,
+    SEARCH_METHODS,
+    STUDY_JSON,
+    AttackArm,
+    build_arms,
+    matching_control,
 )
+from tools.experiments.settings import StudyConfig
 
 OUT = Path("out")
+FRAMES, QUICK_FRAMES = 200, 6
 THEIRS: dict[str, Any] = {k: v for k, v in PROTOCOL.items() if k != "early_stop"}
 NAMES = ("single", "multi", "samples", "steps", "labels")
 
@@ -32,7 +32,7 @@ NAMES = ("single", "multi", "samples", "steps", "labels")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("quick", [True, False])
 def test_arms_are_attacks_that_the_command_takes(name: str, quick: bool, tmp_path: Path) -> None:
-    arms = arms_of(Study(name=name, quick=quick), tmp_path)
+    arms = build_arms(StudyConfig(name=name, quick=quick), tmp_path)
     assert len({arm.folder for arm in arms}) == len(arms)
     for arm in arms:
         if arm.config.like is not None:
@@ -44,7 +44,7 @@ def test_arms_are_attacks_that_the_command_takes(name: str, quick: bool, tmp_pat
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_full_study_goes_on_where_the_quick_one_stopped(name: str) -> None:
-    quick, full = ({a.folder: a for a in arms_of(Study(name=name, quick=q), OUT)} for q in (True, False))
+    quick, full = ({a.folder: a for a in build_arms(StudyConfig(name=name, quick=q), OUT)} for q in (True, False))
     assert set(quick) <= set(full)
     for folder, arm in quick.items():
         assert replace(arm.config, limit=FRAMES) == full[folder].config
@@ -53,14 +53,14 @@ def test_the_full_study_goes_on_where_the_quick_one_stopped(name: str) -> None:
 @pytest.mark.parametrize(("name", "count"), [("single", 6), ("multi", 4)])
 def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> None:
     """Ours have random samples and placebos; those of the paper's protocol, which keeps the last, placebos."""
-    arms = {arm.name: arm for arm in arms_of(Study(name=name, steps=7, seeds=2), OUT)}
+    arms = {arm.name: arm for arm in build_arms(StudyConfig(name=name, steps=7, seeds=2), OUT)}
     longer = name == "multi"
     assert len(arms) == 5 * (count + longer) + 3 * count
     for arm in [a for a in arms.values() if a.control is None]:
-        theirs = arm.name.endswith(PAPERS)
+        theirs = arm.name.endswith(PAPER_PROTOCOL)
         assert (arm.reference is not None) == theirs
-        assert matching(arm.config) == (PLACEBO if theirs else RANDOM)
-        beside = [other for other in arms.values() if other.of == arm.name]
+        assert matching_control(arm.config) == (PLACEBO if theirs else RANDOM)
+        beside = [other for other in arms.values() if other.control_of == arm.name]
         assert [other.config.seed for other in beside] == ([0, 1] if theirs else [0, 1, 0, 1])
         for control in beside:
             assert (control.config.params, control.config.combo) == (arm.config.params, arm.config.combo)
@@ -71,16 +71,16 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
                 ("placebo", "bounds", None, f"out/arms/{arm.folder}"),
             )
             assert control.control == control.config.method
-    assert len(arms_of(Study(name=name, controls=False, paper_protocol=False), OUT)) == count + longer
-    first = [arm.folder for arm in arms_of(Study(name=name, seeds=1), OUT)]
-    assert set(first) < {arm.folder for arm in arms_of(Study(name=name), OUT)}  # three by default
+    assert len(build_arms(StudyConfig(name=name, controls=False, paper_protocol=False), OUT)) == count + longer
+    first = [arm.folder for arm in build_arms(StudyConfig(name=name, seeds=1), OUT)]
+    assert set(first) < {arm.folder for arm in build_arms(StudyConfig(name=name), OUT)}  # three by default
 
 
 @pytest.mark.parametrize("name", ["single", "multi"])
 def test_the_papers_protocol_stands_beside_where_the_detector_has_its_loss(name: str) -> None:
-    def theirs(**settings: Any) -> list[Arm]:
-        arms = arms_of(Study(name=name, controls=False, **settings), OUT)
-        return [arm for arm in arms if arm.name.endswith(PAPERS)]
+    def theirs(**settings: Any) -> list[AttackArm]:
+        arms = build_arms(StudyConfig(name=name, controls=False, **settings), OUT)
+        return [arm for arm in arms if arm.name.endswith(PAPER_PROTOCOL)]
 
     assert all(follows_paper(arm.config) for arm in theirs(method="apgd", steps=7))
     assert [arm.reference for arm in theirs()] == list(
@@ -92,75 +92,77 @@ def test_the_papers_protocol_stands_beside_where_the_detector_has_its_loss(name:
 
 def test_the_papers_figures_stand_beside_its_own_protocol_only() -> None:
     theirs = THEIRS | {"controls": False, "paper_protocol": False}
-    multi = arms_of(Study(name="multi", **theirs), OUT)  # pyright: ignore[reportArgumentType]
+    multi = build_arms(StudyConfig(name="multi", **theirs), OUT)  # pyright: ignore[reportArgumentType]
     assert [arm.reference for arm in multi] == [*PAPER_COMBOS.values(), None]  # the last is Auto-PGD's
-    single = arms_of(Study(name="single", **theirs), OUT)  # pyright: ignore[reportArgumentType]
+    single = build_arms(StudyConfig(name="single", **theirs), OUT)  # pyright: ignore[reportArgumentType]
     assert [arm.reference for arm in single] == list(PAPER_SINGLE.values())
     for other in ({"detector": "yolov3-slim"}, {"steps": 7}, {"keep": "best"}, {"budget": "parking"}):
-        arms = arms_of(Study(name="multi", **theirs | other), OUT)  # pyright: ignore[reportArgumentType]
+        arms = build_arms(StudyConfig(name="multi", **theirs | other), OUT)  # pyright: ignore[reportArgumentType]
         assert {arm.reference for arm in arms} == {None}
 
 
 def test_several_parameters_are_attacked_as_in_the_paper_and_by_shorter_steps() -> None:
-    arms = arms_of(Study(name="multi", steps=7, controls=False, paper_protocol=False), OUT)
+    arms = build_arms(StudyConfig(name="multi", steps=7, controls=False, paper_protocol=False), OUT)
     assert [(arm.config.method, arm.config.steps) for arm in arms] == [("si-fgsm", 7)] * 4 + [("apgd", 28)]
     assert arms[-1].config.combo == 2
-    alone = arms_of(Study(name="multi", method="apgd", controls=False, paper_protocol=False), OUT)
+    alone = build_arms(StudyConfig(name="multi", method="apgd", controls=False, paper_protocol=False), OUT)
     assert [(arm.config.method, arm.config.combo) for arm in alone] == [("apgd", k) for k in (1, 2, 3, 4)]
 
 
 def test_grades_compare_methods_at_the_same_cost() -> None:
-    arms = {arm.name: arm for arm in arms_of(Study(name="grades", steps=7), OUT)}
+    arms = {arm.name: arm for arm in build_arms(StudyConfig(name="grades", steps=7), OUT)}
     assert len(arms) == 15
     for name in ("combo 2", "weather", "all six"):
         gradient, longer, samples = (arms[key].config for key in (name, f"{name}, apgd", f"{name}, halton"))
         assert (gradient.steps, longer.steps, samples.queries) == (7, 28, 21)
         assert gradient.params == longer.params == samples.params
-        assert arms[f"{name}, apgd placebo"].of == f"{name}, apgd"
+        assert arms[f"{name}, apgd placebo"].control_of == f"{name}, apgd"
     assert all(arm.config.confirm for arm in arms.values())
 
 
 def test_searches_take_as_many_passes_each() -> None:
-    arms = arms_of(Study(name="searches", passes=40, params="color"), OUT)
-    assert [arm.name for arm in arms] == [*SEARCHES, "climb placebo"]
-    assert [arm.config.method for arm in arms] == [*SEARCHES, "placebo"]
+    arms = build_arms(StudyConfig(name="searches", passes=40, params="color"), OUT)
+    assert [arm.name for arm in arms] == [*SEARCH_METHODS, "climb placebo"]
+    assert [arm.config.method for arm in arms] == [*SEARCH_METHODS, "placebo"]
     assert {arm.config.passes for arm in arms[:-1]} == {40}
     assert {(arm.config.params, arm.config.combo) for arm in arms} == {("color", None)}
-    assert {arm.config.combo for arm in arms_of(Study(name="searches"), OUT)} == {2}
+    assert {arm.config.combo for arm in build_arms(StudyConfig(name="searches"), OUT)} == {2}
 
 
 def test_searches_take_as_many_seconds_each(tmp_path: Path) -> None:
     """Twice as many passes where a method took half as long as the slowest."""
-    rows = [{"name": name, "seconds": 10.0 if name == "apgd" else 20.0} for name in (*SEARCHES, "climb placebo")]
-    (tmp_path / FIGURES).write_text(json.dumps({"searches": rows}))
-    arms = arms_of(Study(name="searches", passes=40, pace=str(tmp_path)), OUT)
+    rows = [
+        {"name": name, "seconds": 10.0 if name == "apgd" else 20.0} for name in (*SEARCH_METHODS, "climb placebo")
+    ]
+    (tmp_path / STUDY_JSON).write_text(json.dumps({"searches": rows}))
+    arms = build_arms(StudyConfig(name="searches", passes=40, pace=str(tmp_path)), OUT)
     passes = {arm.name: arm.config.passes for arm in arms[:-1]}
-    assert passes == dict.fromkeys(SEARCHES, 40) | {"apgd": 80}
+    assert passes == dict.fromkeys(SEARCH_METHODS, 40) | {"apgd": 80}
 
 
 @pytest.mark.parametrize(
-    "told",
+    "text",
     [
         "[]",
         "{}",
         '{"searches": [3]}',
         '{"searches": [{"name": "climb", "seconds": 2.0}]}',
-        json.dumps({"searches": [{"name": name, "seconds": 0} for name in SEARCHES]}),
+        json.dumps({"searches": [{"name": name, "seconds": 0} for name in SEARCH_METHODS]}),
     ],
 )
-def test_a_pace_without_seconds_is_refused(told: str, tmp_path: Path) -> None:
-    (tmp_path / FIGURES).write_text(told)
+def test_a_pace_without_seconds_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / STUDY_JSON).write_text(text)
     with pytest.raises(FormatError, match=r"study\.json: searches: expected"):
-        arms_of(Study(name="searches", pace=str(tmp_path)), OUT)
+        build_arms(StudyConfig(name="searches", pace=str(tmp_path)), OUT)
 
 
 @pytest.mark.parametrize("name", ["samples", "steps", "grades", "searches"])
 def test_these_name_their_own_methods(name: str) -> None:
-    assert arms_of(Study(name=name), OUT) == arms_of(Study(name=name, method="apgd"), OUT)
+    assert build_arms(StudyConfig(name=name), OUT) == build_arms(StudyConfig(name=name, method="apgd"), OUT)
 
 
 def test_samples_end_at_the_first_success() -> None:
-    arms = arms_of(Study(name="samples", queries=9), OUT)
+    arms = build_arms(StudyConfig(name="samples", queries=9), OUT)
     assert all(arm.config.early_stop or arm.config.method == "fgsm" for arm in arms)
     searches = [arm.config for arm in arms if arm.config.queries]
     assert {config.queries for config in searches} == {9}

@@ -1,8 +1,10 @@
-"""Labels that stay behind: how far, and which failures are theirs alone."""
+"""Benign and moved labels of attacked frames."""
+
+from __future__ import annotations
 
 import pytest
 
-from tools.experiments.detection.labels import LabelSets, label_frames, label_sets
+from tools.experiments.detection.labels import LabelComparison, compare_frame_labels, compare_labels
 
 
 def iou(shift: float) -> float:
@@ -10,8 +12,8 @@ def iou(shift: float) -> float:
     return (50 - shift) / (50 + shift)
 
 
-def sets_of(run) -> LabelSets:
-    return label_sets(run.arm.name, label_frames(run))
+def sets_of(run) -> LabelComparison:
+    return compare_labels(run.arm.name, compare_frame_labels(run))
 
 
 def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
@@ -22,17 +24,17 @@ def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
     assert found.iou["least"] == pytest.approx(iou(40))
     assert found.iou["median"] == 1.0
     assert found.below == {0.5: 2 / 8, 0.7: 3 / 8}
-    half, strict = found.counted[0.5], found.counted[0.7]
+    half, strict = found.counts[0.5], found.counts[0.7]
     assert (half.paper, half.moved, half.only_unmoved) == (2, 0, 2)
     assert (strict.paper, strict.moved, strict.only_unmoved) == (3, 0, 3)
     assert (half.lost_paper, half.lost_only_unmoved) == (2, 2)
-    flat = found.flat()
+    flat = found.to_row()
     assert flat["only_unmoved_at_0.7"] == 3
     assert flat["below_0.5"] == 0.25
 
 
 def test_a_car_that_is_really_lost_is_lost_by_both(frame, arm_run, arm) -> None:
-    one = sets_of(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counted[0.5]
+    one = sets_of(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counts[0.5]
     assert (one.paper, one.moved, one.only_unmoved) == (1, 1, 0)
     assert (one.lost_paper, one.lost_only_unmoved) == (1, 0)
 
