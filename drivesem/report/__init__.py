@@ -1,1 +1,1 @@
-"""How things are shown: words and bars in a terminal, tables, plots, drawn pictures, one question's answer."""
+"""Tables, plots, pictures, HTML pages and terminal output."""

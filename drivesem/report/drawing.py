@@ -26,7 +26,7 @@ UNKNOWN_COLOUR = (120, 120, 120)
 """Sky in depth maps, and pixels of no object."""
 NEAR_M, FAR_M = 3.0, 200.0
 """Ends of the logarithmic depth scale, m."""
-# Okabe and Ito's palette, which colour-blind people can tell apart.
+# Okabe and Ito's palette, which colour-blind people can distinguish.
 TRUE_COLOUR = (0, 158, 115)
 DETECTED_COLOUR = (240, 228, 66)
 LOST_COLOUR = (213, 94, 0)
@@ -42,7 +42,7 @@ PixelRect = tuple[int, int, int, int]
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write a picture (h, w, 3) uint8 RGB atomically, as JPEG if the suffix says so, otherwise as PNG."""
+    """Write a picture (h, w, 3) uint8 RGB atomically, as JPEG for such a suffix, otherwise as PNG."""
     if path.suffix.lower() not in (".jpg", ".jpeg"):
         files.write_png(path, picture)
         return
@@ -89,7 +89,13 @@ def colourise_objects(instances: np.ndarray, image: np.ndarray) -> np.ndarray:
 
 
 def paste(canvas: np.ndarray, corner: tuple[int, int], picture: np.ndarray) -> None:
-    """Copy a picture into `canvas` with its top left corner at `corner` (x, y) px."""
+    """Copy a picture into a canvas.
+
+    Args:
+        canvas: Picture (h, w, 3), changed in place.
+        corner: Top left corner (x, y), px.
+        picture: Picture that fits.
+    """
     x, y = corner
     canvas[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
 

@@ -1,4 +1,4 @@
-"""Plots as PNG, in colours that colour-blind people can tell apart."""
+"""Plots as PNG, in colours that colour-blind people can distinguish."""
 
 from __future__ import annotations
 
@@ -33,7 +33,13 @@ PLOT_STYLE: Mapping[str, Any] = {
 
 
 def write_curves(path: Path, title: str, curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> None:
-    """Plot precision over recall. curves: recall and precision in [0, 1], by name."""
+    """Plot precision over recall.
+
+    Args:
+        path: PNG file.
+        title: Title of the plot.
+        curves: Recall and precision in [0, 1], by name.
+    """
     figure, axes = _create_axes(title)
     for i, (name, (recall, precision)) in enumerate(curves.items()):
         axes.plot(

@@ -215,7 +215,13 @@ def rows_to_csv(rows: Sequence[Mapping[str, Any]], line_end: str = "\n") -> str:
 
 
 def cells_to_csv(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end: str = "\n") -> str:
-    """Return a heading and rows of cells as CSV."""
+    """Return CSV text.
+
+    Args:
+        columns: The heading.
+        rows: Cells of each row.
+        line_end: End of each line.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator=line_end)
     writer.writerow(columns)
@@ -224,7 +230,13 @@ def cells_to_csv(columns: Sequence[str], rows: Iterable[Iterable[Any]], line_end
 
 
 def format_count(number: int, noun: str, plural: str | None = None) -> str:
-    """Format a number with its noun: 1 frame, 2 frames. The plural defaults to the noun with an s."""
+    """Format a number with its noun, such as 1 frame, 2 frames.
+
+    Args:
+        number: The number.
+        noun: Singular of the noun.
+        plural: Plural; the noun with an s by default.
+    """
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 

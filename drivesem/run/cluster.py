@@ -99,7 +99,7 @@ def _connect(ray: ModuleType, address: str | None) -> None:
         if host and port.isdecimal():  # Ray itself would retry for minutes
             socket.create_connection((host, int(port)), _PATIENCE_S).close()
         # without an address, Ray would connect to the last cluster of this machine
-        expected = "a Ray cluster (which may ask for RAY_AUTH_MODE=token)"
+        expected = "a Ray cluster (which may need RAY_AUTH_MODE=token)"
         ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR")
     except OSError as error:
         raise UsageError("--address", expected, f"{address}: {error}") from error

@@ -177,7 +177,7 @@ def analyse_runs(
 
     Args:
         frames_by_run: The runs, each with the names of the frames to analyse.
-        make_analyser: Makes the analyser of a run, whose results go into the given folder; can be pickled.
+        make_analyser: Makes the analyser of a run with the folder of its results; can be pickled.
         out: Folder of all results; each run gets a folder with its number.
         config: Number of workers, engine, and whether to keep going.
         title: Text in front of each progress bar, followed by the name of the run.

@@ -194,7 +194,7 @@ def _load_run(folder: Path, name: str, limit: int | None, setting: str) -> Attac
         name=name,
         folder=folder,
         detector=from_json(str, settings["detector"], f"{folder / CONFIG}: detector"),
-        method=str(settings["method"]),
+        method=from_json(str, settings.get("method"), f"{folder / CONFIG}: method"),
         params=params,
         frames=tuple(_load_run_frame(folder / "frames" / identifier) for identifier in identifiers[:limit]),
     )

@@ -185,7 +185,7 @@ def load_run_detector(attack: AttackConfig, device: str, setting: str = "--run")
         detector = load_predictor(attack.detector, device, attack.tiles)
         EvaluatedClasses.from_detector(detector)
     except DetectorError as error:
-        raise UsageError.from_detector_error(setting, "a run whose detector can be had", error) from error
+        raise UsageError.from_detector_error(setting, "a run with a detector that can be loaded", error) from error
     return detector
 
 

@@ -24,7 +24,7 @@ STEP_PX = 4
 FARTHEST_M = 120.0
 """The sky is as far."""
 _TORN = 1.25
-"""Neighbours whose distances differ by more than this factor are not joined."""
+"""Neighbours with distances that differ by more than this factor are not joined."""
 _TO_GLTF = np.array([1.0, -1.0, -1.0], np.float32)
 """From camera axes: x right, y down, z forward."""
 

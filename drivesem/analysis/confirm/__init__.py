@@ -1,1 +1,1 @@
-"""Counterexamples drawn again by a second renderer."""
+"""Re-tests counterexamples with a second renderer."""

@@ -92,7 +92,13 @@ class RendererTargets:
 
 
 def pair_targets(before: SecondRender, after: SecondRender, count: int) -> RendererTargets:
-    """Align the labels of two renders of a scene with `count` objects."""
+    """Align the labels of two renders of a scene.
+
+    Args:
+        before: Render before the change.
+        after: Render after it.
+        count: Number of objects.
+    """
     first, second = before.targets, after.targets
     ignore = first.ignore[:count] | second.ignore[:count]
     regions = [targets.boxes_xyxy[count:] for targets in (first, second)]
@@ -162,7 +168,13 @@ def _is_same_failure(one: RendererFailure, other: RendererFailure) -> bool:
 
 
 def compare_objects(result: FrameResult, targets: RendererTargets, count: int) -> tuple[ObjectComparison, ...]:
-    """Compare the boxes of the scene's `count` objects in both renderers' pictures."""
+    """Compare the objects' boxes in both renderers' pictures.
+
+    Args:
+        result: The run's result.
+        targets: Labels of the second renderer.
+        count: Number of objects.
+    """
     benign = {t.index: t.xyxy for t in result.targets_benign if t.index is not None}
     moved = {t.index: t.xyxy for t in result.targets_moved if t.index is not None}
 

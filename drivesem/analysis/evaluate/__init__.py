@@ -1,1 +1,1 @@
-"""Detections against labels: where both come from, and what is written of them."""
+"""Computes detection metrics of detectors and prediction files."""

@@ -1,1 +1,1 @@
-"""Why a counterexample fails, and how little of it is enough: shares by parameter and car, the least change."""
+"""Explains failures by parameters and objects, and finds the smallest change that suffices."""

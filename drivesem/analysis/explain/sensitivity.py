@@ -61,7 +61,13 @@ def gradient_shares(gradient: Floats, object_id: NDArray[np.int64], count: int) 
 
 
 def draw_heatmap(image: Picture, gradient: Floats, brightest: float) -> Picture:
-    """Draw a blurred gradient (H, W) over a pale picture (H, W, 3); `brightest` is the end of the scale."""
+    """Draw a blurred gradient over a pale picture.
+
+    Args:
+        image: Picture (H, W, 3).
+        gradient: Gradient (H, W).
+        brightest: Value at full brightness.
+    """
     level = np.clip(_blur(gradient) / brightest, 0, 1) if brightest > 0 else np.zeros_like(gradient)
     heat = cv2.applyColorMap((255 * level).round().astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
     opacity = np.sqrt(level)[..., None]

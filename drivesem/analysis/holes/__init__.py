@@ -1,1 +1,1 @@
-"""How large the holes of a detector are, of which a run's certain failures are points."""
+"""Maps failure regions around certain failures."""

@@ -1,1 +1,1 @@
-"""Whether what fails one detector fails another: runs of `drivesem attack` shown to other detectors."""
+"""Tests counterexamples on other detectors."""

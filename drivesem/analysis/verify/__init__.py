@@ -1,1 +1,1 @@
-"""Whether a finished run is what it says it is: every frame computed again from its files."""
+"""Recomputes a run from its files and compares."""

@@ -55,16 +55,38 @@ class CheckLog:
     """Values that differ."""
 
     def compare(self, check: str, name: str, expected: object, found: object) -> None:
-        """Compare two values exactly."""
+        """Compare two values exactly.
+
+        Args:
+            check: Name of the check.
+            name: Name of the value.
+            expected: Value in the run's result.
+            found: Value that follows from its files.
+        """
         self.record(check, name, expected, found, agrees=expected == found)
 
     def compare_values(self, check: str, file: str, expected: Mapping[str, str], found: Mapping[str, str]) -> None:
-        """Compare the expected values of a file, by name."""
+        """Compare several values of a file exactly.
+
+        Args:
+            check: Name of the check.
+            file: The file.
+            expected: Values in the run's result, by name.
+            found: Values that follow from its files.
+        """
         for name, value in expected.items():
             self.compare(check, f"{file}: {name}", value, found.get(name))
 
     def record(self, check: str, name: str, expected: object, found: object, agrees: bool) -> None:
-        """Record a comparison with a known outcome."""
+        """Record a comparison.
+
+        Args:
+            check: Name of the check.
+            name: Name of the value.
+            expected: Value in the run's result.
+            found: Value that follows from its files.
+            agrees: Whether they agree.
+        """
         self.compared[check] = self.compared.get(check, 0) + 1
         if not agrees:
             self.differences.append(Mismatch(check, name, _format_value(expected), _format_value(found)))

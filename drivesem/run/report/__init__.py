@@ -1,1 +1,1 @@
-"""A run as one HTML page, and its failures in words and pictures; sees result files only."""
+"""The HTML report of runs, from result files only."""

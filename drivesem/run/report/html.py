@@ -157,10 +157,10 @@ def _how_sure(run: ReportedRun) -> str:
         mine = [failure for failure in failures if failure.grade == grade]
         if mine and grade is Grade.THRESHOLD:
             others = "More by threshold only" if describe_outcome else "By threshold only"
-            describe_outcome.append(f"{others}: {grading.summed(mine)}.")
+            describe_outcome.append(f"{others}: {grading.summarise_kinds(mine)}.")
         elif mine:
             word = f"only {grade}" if describe_outcome else str(grade)
-            describe_outcome.append(f"{word[0].upper()}{word[1:]}: {grading.summed(mine)}.")
+            describe_outcome.append(f"{word[0].upper()}{word[1:]}: {grading.summarise_kinds(mine)}.")
     unknown = sum(failure.grade is None for failure in failures)
     return " ".join([*describe_outcome, *([f"{unknown} of unknown grade."] if unknown else [])])
 

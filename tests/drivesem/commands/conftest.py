@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.config.commands import Attack
-from drivesem.config.text import to_yaml
+from drivesem.config.commands import AttackConfig
+from drivesem.config.options import to_yaml
 from drivesem.run.results import BoxRecord, FrameResult, dump_frame
 from scene_ir import files
 
@@ -52,7 +52,7 @@ def frame_result(name: str, found: tuple[bool, bool] = (False, True), score: flo
 def _write(folder: Path, same: bool = False, params: str = "rotate") -> Path:
     """same: the counterexample is the photograph."""
     names = ("a", "b", "c")
-    files.write_text(folder / "config.yaml", to_yaml(Attack(params=params)))
+    files.write_text(folder / "config.yaml", to_yaml(AttackConfig(params=params)))
     files.write_json(folder / "metrics.json", {"params": params.split(","), "t_star": 0.5})
     files.write_json(folder / "manifest.json", {"frames": {name: {} for name in names}})
     for seed, name in enumerate(names):

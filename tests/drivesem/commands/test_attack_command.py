@@ -15,7 +15,7 @@ from detectors.incremental import reference
 from detectors.types import CLASSES, Detections
 from drivesem.attack.feasibility_check import check_scene
 from drivesem.cli import main
-from drivesem.config.commands import GRADIENT_FREE, Attack
+from drivesem.config.commands import GRADIENT_FREE_METHODS, AttackConfig
 from drivesem.run import attack as run_attack
 from drivesem.run.results import load_frame
 from drivesem.synth.demo import demo_scene
@@ -288,8 +288,8 @@ def test_failures_have_kinds_and_grades(
         (["--draws", "8"], "--draws: expected at least 16, which a certificate's rule needs, found 8"),
         (["--nuisances", "wind=3"], "--nuisances: expected default, off, or NAME=NUMBER with commas"),
         (["--nuisances", "jpeg=99"], "--nuisances: jpeg: expected a number of at least 0, at most 95, found 99"),
-        (["--witness", "blind"], "--witness: detector blinking: expected one that knows Car, found dog"),
-        (["--peer", "blind"], "--peer: detector blinking: expected one that knows Car, found dog"),
+        (["--reference-detector", "blind"], "--reference-detector: detector blinking: expected one that knows Car, found dog"),
+        (["--second-detector", "blind"], "--second-detector: detector blinking: expected one that knows Car, found dog"),
     ],
 )
 def test_what_cannot_grade_is_refused(
@@ -331,10 +331,10 @@ def test_what_does_not_go_together_is_named(
 
 
 def test_methods_are_those_that_need_no_gradient() -> None:
-    names = get_args(get_type_hints(Attack)["method"])
-    free = [name for name in names if not run_attack.attack_method(Attack(method=name)).needs_gradient]
+    names = get_args(get_type_hints(AttackConfig)["method"])
+    free = [name for name in names if not run_attack.build_attack(AttackConfig(method=name)).needs_gradient]
     assert set(free) == {
-        *GRADIENT_FREE,
+        *GRADIENT_FREE_METHODS,
         "placebo",
         "corners",
         "climb",
@@ -407,9 +407,9 @@ def test_regions_that_disagree_are_told_in_one_line_and_passes_are_whole_then(
     expected = attack([*words, "--whole", "--out", str(tmp_path / "whole")], capsys)
     monkeypatch.setattr(reference, "AGREES", -1.0)
     passes = []
-    changed = reference.Reference._changed
+    changed = reference.ReferencePass._changed
     monkeypatch.setattr(
-        reference.Reference, "_changed", lambda self, *given: passes.append(0) or changed(self, *given)
+        reference.ReferencePass, "_changed", lambda self, *given: passes.append(0) or changed(self, *given)
     )
     assert main([*words, "--out", str(tmp_path / "regions")]) == 0
     told = capsys.readouterr()

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.space import combo
+from drivesem.attack.space import combo_parameters
 from drivesem.bench import render, step
-from drivesem.bench.scenes import bench_scene
-from drivesem.bench.timing import Taken
+from drivesem.bench.scenes import build_bench_scene
+from drivesem.bench.timing import CallTime
 from drivesem.cli import main
 from drivesem.commands import bench
 from tools.bench import climb, memory
@@ -61,7 +61,9 @@ def test_step(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
 def test_a_step_goes_on_from_a_theta_that_is_not_the_photograph() -> None:
     from detectors.registry import load_detector
 
-    attack = step.Stepping(bench_scene(1, 600).scene, combo(2), load_detector("squeezedet"), 0, "cpu")
+    attack = step.AttackSteps(
+        build_bench_scene(1, 600).scene, combo_parameters(2), load_detector("squeezedet"), 0, "cpu"
+    )
     before = attack.theta
     attack()
     assert bool(before.any())
@@ -76,11 +78,11 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
         def __init__(self) -> None:
             self.calls = 0
 
-        def taken(self, call: Any) -> Taken:
+        def taken(self, call: Any) -> CallTime:
             slow = 10 if self.calls in (2, 3) else 1
             self.calls += 1
             ms = 3.0 if call is stepping else 2.0
-            return Taken(slow * ms, 2 * ms - 2.0)
+            return CallTime(slow * ms, 2 * ms - 2.0)
 
     class Stepping:
         def __call__(self) -> None: ...
@@ -89,7 +91,7 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
             return 1.0, 2.0, 3.0, 4.0
 
     stepping = Stepping()
-    row = step._row(step.StepCase(1, 600), bench_scene(1, 600), stepping, lambda: None, Ticks(), 1e-9)  # type: ignore[arg-type]
+    row = step._row(step.StepCase(1, 600), build_bench_scene(1, 600), stepping, lambda: None, Ticks(), 1e-9)  # type: ignore[arg-type]
     assert row.repetitions == 3
     assert (row.ratio, row.ratio_iqr) == (1.5, 0.0)
     assert (row.step_ms, row.detector_ms) == (3.0, 2.0)
@@ -215,7 +217,7 @@ def test_planted_across(
     monkeypatch.setattr(across, "KINDS", (("height_px",), ("aspect",), ("lightness",)))
     monkeypatch.setattr(across, "FRAMES", 2)
     monkeypatch.setattr(across, "CARS", 3)
-    scene = bench_scene(1, 600).scene
+    scene = build_bench_scene(1, 600).scene
     monkeypatch.setattr(across.Across, "_scene", lambda *_: scene)
     monkeypatch.setattr(across_names, "SHAMS", 2)
     words = [

@@ -12,7 +12,7 @@ import drivesem as ds
 from drivesem.cli import main
 from drivesem.run import frame as run_frame
 from drivesem.run.results import FrameResult, load_frame
-from scene_ir.exchange import CHANGE
+from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene
 
 Runs = dict[str, tuple[Path, FrameResult]]
@@ -31,7 +31,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folders = {kind: tmp_path_factory.mktemp(kind) / "run" for kind in ("leave", "park")}
     worse = count(0, -1)
     with pytest.MonkeyPatch.context() as patch:  # the last one tried is kept, whatever it is worth
-        patch.setattr(run_frame, "value_of", lambda *_: next(worse))
+        patch.setattr(run_frame, "margin_objective", lambda *_: next(worse))
         return {kind: (folder, attacked(folder, kind)) for kind, folder in folders.items()}
 
 
@@ -43,7 +43,7 @@ def test_a_run_holds_what_was_done_and_agrees_with_its_files(runs: Runs, kind: s
     assert result.passes is not None
     assert result.passes <= PASSES
     scene = load_scene(folder / "frames" / "demo-000" / "scene")
-    assert scene.provenance[CHANGE] == result.change
+    assert scene.provenance[CHANGE_KEY] == result.change
     assert scene.before is not None
     assert words in (folder / "report.html").read_text()
     assert main(["verify", "--run", str(folder)]) == 0
@@ -68,8 +68,8 @@ def test_a_run_can_be_asked(runs: Runs, kind: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_same_from_python(monkeypatch: pytest.MonkeyPatch) -> None:
     worse = count(0, -1)
-    monkeypatch.setattr(run_frame, "value_of", lambda *_: next(worse))
-    found = ds.attack(
+    monkeypatch.setattr(run_frame, "margin_objective", lambda *_: next(worse))
+    found = ds.run_attack(
         ds.demo_scene(0), method="climb", budget="street", params="translate", passes=PASSES, changes="park",
         confirm=False,
     )  # fmt: skip

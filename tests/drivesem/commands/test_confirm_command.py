@@ -116,7 +116,7 @@ def test_another_picture_is_refused(
     assert main(["confirm", "--run", str(run), "--workers", "1", "--out", str(out)]) == 2
     told = " ".join(capsys.readouterr().err.split())
     assert (
-        "photograph of demo-000: expected the picture that the generator makes of it, found one 64 levels off"
+        "photograph of demo-000: expected the image that the generator renders, found one 64 levels off"
         in told
     )
     words = ("--run", str(run), "--workers", "1", "--out", str(out), "--keep-going")

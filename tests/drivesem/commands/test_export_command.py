@@ -175,7 +175,7 @@ def crowded(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     files.write_text(out / "people.txt", "".join(f"{line}\n" for line in (REGION, *PEOPLE)))
     others, scene = read_labels(out / "people.txt"), load_scene(frame / "scene")
     ignore = torch.cat([others.ignore_xyxy, others.boxes_xyxy])
-    save_scene(replace(scene, ignore=ignore, others=others), frame / "scene")
+    save_scene(replace(scene, ignore=ignore, other_labels=others), frame / "scene")
     moved = replace(read_labels(frame / "labels_moved.txt"), ignore_xyxy=ignore)
     write_labels(frame / "labels_moved.txt", moved)
     return out

@@ -86,7 +86,7 @@ def test_a_full_disk_ends_an_attack_which_then_goes_on(
         assert attack(tiny_kitti, out, *words) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("drivesem: ")
     assert done(out) == [NAMES[0]]
-    assert not files.leftovers(out)
+    assert not files.find_leftovers(out)
     assert attack(tiny_kitti, out) == 0
     assert done(out) == [*NAMES]
     assert main(["verify", "--run", str(out), "--workers", "1"]) == 0
@@ -143,7 +143,7 @@ def test_a_full_disk_leaves_no_half(
     with full_disk(20_000):
         line = say(name, tiny_kitti, out, capsys)
     assert "expected a place that can be written, found file too large" in line
-    assert not files.leftovers(out)
+    assert not files.find_leftovers(out)
     assert not [path for path in out.rglob("*") if path.suffix in (".png", ".npz", ".safetensors")]
     words = [word.format(kitti=tiny_kitti) for word in COMMANDS[name]]
     assert main([*words, "--out", str(out)]) == 0

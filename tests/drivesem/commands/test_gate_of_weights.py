@@ -19,7 +19,7 @@ def test_itself_passes_and_noise_in_the_weights_does_not(
 ) -> None:
     run, noisy = tmp_path / "run", tmp_path / "noisy.safetensors"
     words = ["--method", "climb", "--params", "color,weather,translate,rotate", "--limit", "1", "--workers", "1"]
-    assert main(["attack", *words, "--no-confirm", "--peer", "off", "--out", str(run)]) == 0
+    assert main(["attack", *words, "--no-confirm", "--second-detector", "off", "--out", str(run)]) == 0
     save_detector(with_noise(load_detector("squeezedet"), 0.5), noisy)
 
     def overall(told: dict[str, Any]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ ATTACK = [
     "--limit",
     "1",
 ]
-STILL = ["--nuisances", "off", "--no-confirm", "--peer", "off", "--workers", "1", "--json"]
+STILL = ["--nuisances", "off", "--no-confirm", "--second-detector", "off", "--workers", "1", "--json"]
 HOLES = ["--workers", "1", "--json", "--samples", "64", "--fresh", "10"]
 WIDE = 0.06
 """Of the band of lightness in which cars are not seen, below the lightness of either car as photographed."""

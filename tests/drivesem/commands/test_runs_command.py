@@ -21,7 +21,7 @@ WORDS = [
     "color",
     "--method",
     "fgsm",
-    "--peer",
+    "--second-detector",
     "off",
     "--limit",
     "3",
@@ -178,7 +178,7 @@ def test_prune_removes_what_a_killed_command_left(
     half.mkdir()
     (half / ".benign.png.89abcdef.tmp").write_bytes(b"half")
     before = {p for p in run.rglob("*") if half not in (p, *p.parents) and p.name != ".lock"}
-    assert files.leftovers(run) == [half]
+    assert files.find_leftovers(run) == [half]
     assert told(["prune", str(run), "--dry"], capsys) == {"removed": [str(half)]}
     assert half.is_dir()
     assert told(["prune", str(run)], capsys) == {"removed": [str(half)]}

@@ -16,9 +16,9 @@ from drivesem.cli import main
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.run.results import Failure
 from drivesem.training import retrain
-from drivesem.training.around import AroundFailures
-from drivesem.training.attacked import AttackedFrame, frames_of
+from drivesem.training.failure_neighbourhoods import FailureNeighbourhoods
 from drivesem.training.frames import FrameStore
+from drivesem.training.samples import AttackedFrame, load_attacked_frames
 from scene_ir import files
 
 NAMES = [f"Scene0{scene}/clone/Camera_0/0000{i}" for scene in (1, 2) for i in (0, 1)]
@@ -94,20 +94,20 @@ def test_frames_that_are_held_out_are_not_trained_on(
 def test_frames_of_other_streets_have_pools_of_their_own(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frames = frames_of(run)
+    frames = load_attacked_frames(run)
     assert [frame.name for frame in frames] == NAMES
     pools: list[Path] = []
 
-    def make(self: AroundFailures, frame: AttackedFrame, target: int, turn: int, folder: Path) -> None:
+    def make(self: FailureNeighbourhoods, frame: AttackedFrame, target: int, turn: int, folder: Path) -> None:
         pools.append(folder)
         raise InterruptedError
 
     lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, error="missed", grade="certain")
     for frame in frames:
         frame.__dict__["result"] = replace(frame.result, failures=(lost,))
-    monkeypatch.setattr(AroundFailures, "_make", make)
+    monkeypatch.setattr(FailureNeighbourhoods, "_make", make)
     nobody: Any = None  # looks: no state is made
-    around = AroundFailures(frames, nobody, (), nobody, tmp_path, CLASSES, 1.0, 0)
+    around = FailureNeighbourhoods(frames, nobody, (), nobody, tmp_path, CLASSES, 1.0, 0)
     for index in range(len(around)):
         with pytest.raises(InterruptedError):
             around.state(index, 0)

@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 
 from drivesem.cli import main
-from drivesem.commands.synth import order_of
-from drivesem.config.commands import Synth
+from drivesem.commands.synth import build_order
+from drivesem.config.commands import SynthConfig
 from drivesem.config.parsing import parse
 from drivesem.data.registry import open_dataset
 from scene_ir import files
 
 
 def test_defaults_follow_the_layout() -> None:
-    kitti, virtual = order_of(Synth(frames=12)), order_of(Synth(frames=12, layout="vkitti2"))
+    kitti, virtual = build_order(SynthConfig(frames=12)), build_order(SynthConfig(frames=12, layout="vkitti2"))
     assert (kitti.variations, kitti.sequence, kitti.people) == (("mixed",), 1, True)
     assert (virtual.variations, virtual.sequence, virtual.people) == (("clone",), 10, False)
-    assert order_of(Synth(frames=12, limit=3)).frames == 3
-    assert parse(["synth", "--people", "False", "--cameras", "2", "--layout", "vkitti2"]) == Synth(
+    assert build_order(SynthConfig(frames=12, limit=3)).frames == 3
+    assert parse(["synth", "--people", "False", "--cameras", "2", "--layout", "vkitti2"]) == SynthConfig(
         people=False, cameras=2, layout="vkitti2"
     )
 
@@ -76,7 +76,7 @@ def test_another_recipe_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     """No bar before it."""
     out = tmp_path / "set"
     stamp = out / ".drivesem" / "recipe.json"
-    files.write_json(stamp, order_of(Synth(frames=1, seed=7, out=str(out))).recipe())
+    files.write_json(stamp, build_order(SynthConfig(frames=1, seed=7, out=str(out))).recipe())
     assert main(["synth", "--frames", "1", "--seed", "8", "--out", str(out)]) == 2
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", f"drivesem: {stamp}: seed: expected 8, found 7\n")

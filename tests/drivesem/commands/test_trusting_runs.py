@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from detectors.registry import code_of
+from detectors.registry import find_code_to_run
 from drivesem.cli import main
-from drivesem.config.commands import Attack
+from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
-from drivesem.config.text import to_yaml
-from drivesem.run.folder import attack_of, trusted_attack
+from drivesem.config.options import to_yaml
+from drivesem.run.folder import load_attack_config, load_trusted_config
 
 CODE = """
 from pathlib import Path
@@ -42,7 +42,7 @@ class D:
     ],
 )
 def test_what_runs_code(name: str, code: str | None) -> None:
-    assert code_of(name) == code
+    assert find_code_to_run(name) == code
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def foreign(tmp_path: Path) -> Callable[[str], Path]:
         run, code = tmp_path / "run", tmp_path / "evil.py"
         code.write_text(CODE.format(mark=str(tmp_path / "mark")))
         (run / "frames" / "a").mkdir(parents=True)
-        (run / "config.yaml").write_text(to_yaml(replace(Attack(), **{setting: f"module:{code}:D"})))
+        (run / "config.yaml").write_text(to_yaml(replace(AttackConfig(), **{setting: f"module:{code}:D"})))
         return run
 
     return make
@@ -63,8 +63,8 @@ def foreign(tmp_path: Path) -> Callable[[str], Path]:
 def test_each_setting_that_names_a_detector(foreign: Callable[[str], Path], setting: str) -> None:
     run = foreign(setting)
     with pytest.raises(UsageError, match=rf"config\.yaml: {setting}: expected .*--trust.*evil\.py:D"):
-        trusted_attack(run, trust=False)
-    assert trusted_attack(run, trust=True) == attack_of(run)
+        load_trusted_config(run, trust=False)
+    assert load_trusted_config(run, trust=True) == load_attack_config(run)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_each_command_that_loads_a_run_s_detector(
     monkeypatch.chdir(tmp_path)
     run = write_run(tmp_path / "source")
     Path("evil.py").write_text(CODE.format(mark=str(tmp_path / "mark")))
-    (run / "config.yaml").write_text(to_yaml(Attack(params="rotate", detector="module:evil.py:D")))
+    (run / "config.yaml").write_text(to_yaml(AttackConfig(params="rotate", detector="module:evil.py:D")))
     before = sorted(tmp_path.rglob("*"))
     assert main([*words, str(run)]) == 2
     (line,) = capsys.readouterr().err.splitlines()

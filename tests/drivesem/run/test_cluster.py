@@ -189,7 +189,19 @@ def test_frames_that_a_cluster_makes_and_looks_at_are_those_made_here(
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_studies_and_questions_by_a_cluster_are_those_asked_here(tmp_path: Path, alike: Alike) -> None:
-    study = ["study", "labels", "--quick", "--limit", "1", "--steps", "1", "--peer", "off", "--bootstrap", "0"]
+    study = [
+        "study",
+        "labels",
+        "--quick",
+        "--limit",
+        "1",
+        "--steps",
+        "1",
+        "--second-detector",
+        "off",
+        "--bootstrap",
+        "0",
+    ]
     place_and_time = ("kept/study.json", "kept/frames.csv", "arms/translate/config.yaml")
     alike(study, "study", "study.", "largest", "label_sets", "arms/combo", *place_and_time)
     run = str(tmp_path / "study" / "arms" / "translate")

@@ -17,8 +17,8 @@ from drivesem.run.lock import LOCK, acquire_folder_lock, is_locked_elsewhere, re
 OTHER = """
 import sys
 from pathlib import Path
-from drivesem.run.lock import hold
-hold(Path(sys.argv[1]))
+from drivesem.run.lock import acquire_folder_lock
+acquire_folder_lock(Path(sys.argv[1]))
 print("held", flush=True)
 sys.stdin.read()
 """

@@ -132,11 +132,11 @@ def test_tables() -> None:
     by_parameter, by_frame = build_explain_tables(frames, summarise_parameters(frames, 0, 0))
     assert by_parameter.rows[0] == ("rotate", "+1.50", "+75", "75", "2", "0", "2", "5 deg", "2.5 deg")
     row = dict(zip(by_frame.columns, by_frame.rows[0], strict=True))
-    assert (row["loss"], row["failures"], row["still"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
-    assert (row["enough, %"], row["needs"], row["cars"]) == ("25.0", "rotate", "2 of 3")
+    assert (row["loss"], row["failures"], row["failures left"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
+    assert (row["minimal, %"], row["needs"], row["objects"]) == ("25.0", "rotate", "2 of 3")
     assert row["most loss by"] == "[2] +2.50"
     parts = {row[0]: row for row in build_frame_table(frames[0]).rows}
-    assert parts["everything"][4:6] == ("3.00", "1 + 2")
+    assert parts["whole change"][4:6] == ("3.00", "1 + 2")
     assert parts["rotate"][1:4] == ("+1.50", "+75", "75")
     assert parts["objects[0]"][1] == "-0.50 ± 0.10"
     assert parts["objects[0]"][4:] == ("1.00", "0 + 0", "3.00", "1 + 2")

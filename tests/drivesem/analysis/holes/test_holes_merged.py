@@ -80,7 +80,7 @@ def test_other_bands_and_classes_are_others() -> None:
 
 def test_the_largest_first_and_copies_last() -> None:
     found = {"a": [around(0, 50)], "b": [around(60, 95)], "c": [around(10, 20, label="Van")]}
-    order = [(hole.label, hole.words) for hole in merge(found)]
+    order = [(hole.label, hole.rule_text) for hole in merge(found)]
     assert order == [("Car", "height_px 0 to 50"), ("Van", "height_px 10 to 20"), ("Car", "height_px 60 to 95")]
 
 
@@ -91,7 +91,7 @@ def test_a_rule_of_nothing_is_the_whole_neighbourhood() -> None:
         FailureSamples(0, "Car", "missed", "certain", four, NOTHING, lost), FailureRule({}, False), NOTHING
     )
     (hole,) = merge({"a": [one]})
-    assert (hole.words, hole.probability, hole.outside, hole.lost) == ("anywhere", None, None, lost)
+    assert (hole.rule_text, hole.probability, hole.outside, hole.lost) == ("anywhere", None, None, lost)
 
 
 def drawn(rng: np.random.Generator, count: int, low: float = 0.0, high: float = 100.0) -> FeatureSamples:

@@ -35,11 +35,11 @@ def test_places() -> None:
     assert "A < B" in svg.get("aria-label", "")
 
 
-def test_steps_and_doubling() -> None:
+def test_steps_on_a_logarithmic_axis() -> None:
     line = ChartLine(
         "one", ((1.0, 10.0), (2.0, 40.0), (4.0, 40.0)), steps=True, band=((1.0, 5.0, 20.0), (4.0, 30.0, 50.0))
     )
-    svg = chart([line], x_range=(1.0, 4.0), doubling=True)
+    svg = chart([line], x_range=(1.0, 4.0), log2_x=True)
     (path,) = (e for e in svg.iter("path") if e.get("class") == "line s0")
     places = numbers(path.get("d", ""))
     xs, ys = places[0::2], places[1::2]
@@ -55,9 +55,11 @@ def test_lines_differ_in_colour_or_dash() -> None:
     assert len(set(signs)) == 2 * SERIES
 
 
-def test_falls() -> None:
+def test_drops() -> None:
     svg = ET.fromstring(
-        drop_chart([MetricDrop("ours & <co>", 95.7, 89.9), MetricDrop("theirs", 99.4, 65.9, theirs=True)], "AP50")
+        drop_chart(
+            [MetricDrop("ours & <co>", 95.7, 89.9), MetricDrop("theirs", 99.4, 65.9, from_paper=True)], "AP50"
+        )
     )
     words = [e.text for e in svg.iter("text")]
     assert {"ours & <co>", "95.7", "89.9", "99.4", "65.9", "AP50, %"} <= set(words)

@@ -17,6 +17,7 @@ from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import build_cards
 from drivesem.run.report.runs import load_reported_runs, query_curves, write_run_report
+from drivesem.run.results import SCHEMA
 from scene_ir import files
 
 
@@ -117,7 +118,7 @@ def test_runs_side_by_side(
     assert len([a for a in found.having("div") if a.get("data-runs") == "0 1"]) == 2
     assert "a: 1 lost" in found.text
     assert "b: withstood" in found.text
-    assert "1 that only some have are left out" in found.text
+    assert "1 frames that only some runs have are left out" in found.text
 
 
 def test_figures_of_all_frames_are_those_of_the_run(
@@ -152,7 +153,7 @@ def test_a_study_stands_for_its_arms(
     told = report([str(study)], capsys)
     assert [run["name"] for run in told["runs"]] == ["apgd", "random"]
     found = parse(study / "report.html")
-    assert "Frames broken after so many queries" in found.text
+    assert "Frames broken by number of queries" in found.text
     (chart,) = query_curves(study)
     assert [line.name for line in chart.lines] == ["apgd", "random"]
     assert chart.lines[1].points == ((1.0, 50.0), (2.0, 100.0))
@@ -204,8 +205,8 @@ def test_unfinished(refused: Callable[..., str], some_run: Path) -> None:
 
 
 def test_damaged_figures(refused: Callable[..., str], some_run: Path) -> None:
-    files.write_json(some_run / "metrics.json", {"params": ["mesh"], "detector": "x"})
-    assert "metrics.json: expected the figures of a run" in refused("report", str(some_run))
+    files.write_json(some_run / "metrics.json", {"schema": SCHEMA, "params": ["mesh"], "detector": "x"})
+    assert "metrics.json: expected the metrics of a run" in refused("report", str(some_run))
 
 
 def test_no_shared_frame(

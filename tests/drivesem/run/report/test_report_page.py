@@ -132,12 +132,12 @@ def test_the_papers_figures_stand_beside_its_protocol_only(
 ) -> None:
     text = parse(page).text
     assert "65.9" not in text
-    assert "Ours, own protocol: not comparable" in text
+    assert "does not follow the paper's protocol" in text
     theirs = make_run(tmp_path / "theirs", [frame("1", lost=True)], AttackConfig(**PROTOCOL))  # pyright: ignore[reportArgumentType]
     assert main(["report", str(theirs)]) == 0
     text = parse(theirs / "report.html").text
     assert "99.4 → 65.9" in text
-    assert "Ours, under the paper's protocol" in text
+    assert "This run follows the paper's protocol" in text
     both = tmp_path / "own"
     own = make_run(both, [frame("1")])
     assert main(["report", str(own), str(theirs), "--out", str(tmp_path / "both.html")]) == 0
@@ -149,7 +149,7 @@ def test_figures_are_told(page: Path, parse: Callable[[Path], Any]) -> None:
     metrics = json.loads((page.parent / "metrics.json").read_text())
     text = " ".join(found.text.split())
     assert f"{100 * metrics['benign']['ap50']:.1f} → {100 * metrics['attacked']['moved']['ap50']:.1f}" in text
-    assert "squeezedet loses 2 objects and makes up 2, in 3 of 4 frames" in text
+    assert "squeezedet loses 2 objects and reports 2, in 3 of 4 frames" in text
     for what in ("+0.21 m", "−0.08 m", "+17.2°", "1 offsets, up to 0.04 m", "drivesem attack"):
         assert what in text
 
