@@ -154,7 +154,7 @@ def _describe_failure(failure: Failure) -> str:
 def run_attack(scene: Scene | SceneIR, detector: str | Predictor = "squeezedet", **options: Any) -> Counterexample:
     """Change a scene, within what is feasible, until a detector fails.
 
-        counterexample = ds.attack(scene, "squeezedet", params="translate,rotate,mesh")
+        counterexample = ds.run_attack(scene, "squeezedet", params="translate,rotate,mesh")
         counterexample.picture, counterexample.theta, counterexample.failures
 
     The same scene, settings and number of torch threads give the theta and picture of the command.

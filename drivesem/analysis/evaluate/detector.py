@@ -181,7 +181,8 @@ def print_detector_metrics(metrics: DetectorMetrics, console: Console) -> None:
     console.print(table)
     for one in metrics.intervals:
         if one.low is not None and one.high is not None:
-            bounds = f"{format_percent(one.low)} to {format_percent(one.high)} in 95 % of {data['bootstrap']} draws of frames"
+            ends = f"{format_percent(one.low)} to {format_percent(one.high)}"
+            bounds = f"{ends} in 95 % of {data['bootstrap']} bootstrap draws of frames"
             console.print(f"{HEADLINE} {one.name} {format_percent(one.value)}, {bounds}", soft_wrap=True)
     console.print(
         f"{format_count(data['frames'], 'frame')}; evaluated: at least {data['min_height']:g} px high, occlusion "

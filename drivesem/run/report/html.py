@@ -208,7 +208,8 @@ def _notes(runs: Sequence[ReportedRun]) -> list[str]:
 
 def _lead(runs: Sequence[ReportedRun]) -> str:
     summary = runs[0].summary
-    data = f"{format_count(summary.frames, 'frame')} of {summary.dataset} with {format_count(summary.objects, 'vehicle')}"
+    vehicles = format_count(summary.objects, "vehicle")
+    data = f"{format_count(summary.frames, 'frame')} of {summary.dataset} with {vehicles}"
     if len(runs) > 1:
         return f"The same {data}, run by run."
     changed = " + ".join(summary.params)

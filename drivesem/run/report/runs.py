@@ -199,7 +199,9 @@ def precision_recall(runs: Sequence[ReportedRun]) -> list[ReportChart]:
     changed, unchanged = ([line for line in lines if line is not None] for lines in (after, before.values()))
     if not changed:
         return []
-    note = "Best precision at this recall or a higher one, as in AP50. Dots: all detections with a score of at least t*."
+    note = (
+        "Best precision at this recall or a higher one, as in AP50. Dots: detections with a score of at least t*."
+    )
     room = max(_MAX_LINES - len(unchanged), 1)
     if len(changed) > room:
         note += f" The first {room} of {len(changed)} runs."

@@ -48,7 +48,8 @@ def test_a_run_that_is_being_made_is_no_run_that_stopped(
 ) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "config.yaml").write_text("detector: squeezedet\ndataset: demo\nparams: null\ncombo: null\n")
+    config = "detector: squeezedet\ndataset: demo\nparams: null\ncombo: null\nmethod: si-fgsm\n"
+    (folder / "config.yaml").write_text(config)
     with another_process(folder):
         assert is_locked_elsewhere(folder)
         assert main(["explain", str(folder)]) == 2
@@ -65,7 +66,6 @@ def test_a_run_that_is_being_made_is_no_run_that_stopped(
 
 COMMANDS = {
     "attack": ["attack", "--limit", "1", "--steps", "1"],
-    "study": ["study", "multi", "--quick", "--limit", "1"],
     "synth": ["synth", "--frames", "1"],
 }
 

@@ -68,7 +68,7 @@ def test_the_page_begins_with_the_highest_grade(run: Path, parse: Callable[[Path
     # by the highest grade, then how many of it
     assert [a["data-name"] for a in found.having("article")] == ["c", "e", "b", "a", "d"]
     assert [a["data-grade"] for a in found.having("article")] == ["3", "2", "2", "1", "0"]
-    shots = text[text.index("What went wrong") : text.index("Grades")]
+    shots = text[text.index("Failures in close-up") : text.index("Meaning of the grades")]
     assert shots.index("confirmed") < shots.index("certain")
     assert "threshold" not in shots  # there are enough that are surer
 
@@ -108,7 +108,7 @@ def test_without_a_certain_failure_the_page_says_so(
     run = make_run(tmp_path / "run", [one, replace(frame("b"), grade_notes=())])
     _, text = page_of(run, parse)
     assert "No certain failure: 2 failures by threshold, which chance may explain" in text
-    assert "none of it is certain" in text
+    assert "none is certain" in text
     assert "By threshold only: 1 missed, 1 none of a kind." in text
 
 
