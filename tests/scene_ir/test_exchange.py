@@ -91,15 +91,15 @@ def test_one_more_stands_there_and_hides_what_is_behind(scene: SceneIR) -> None:
     more = add_vehicle(scene, vehicle(BEFORE_ANOTHER))
     assert len(more.objects) == len(more.origin.objects) == len(scene.objects) + 1
     assert torch.equal(picture(more.origin), picture(scene))  # the photograph, to the bit
-    shown = Compositor(more).render(more)
-    assert int((shown.object_id == 4).sum()) > 300
-    assert int((shown.object_id == 3).sum()) < int((Compositor(scene).render(scene).object_id == 3).sum())
-    away = torch.ones_like(shown.depth, dtype=torch.bool)
-    for crop in (shown.opacity[3], more.objects.source[3].shadow):
+    pictures = Compositor(more).render(more)
+    assert int((pictures.object_id == 4).sum()) > 300
+    assert int((pictures.object_id == 3).sum()) < int((Compositor(scene).render(scene).object_id == 3).sum())
+    away = torch.ones_like(pictures.depth, dtype=torch.bool)
+    for crop in (pictures.opacity[3], more.objects.source[3].shadow):
         assert crop is not None
         h, w = crop.values.shape[1:]
         away[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] = False
-    assert torch.equal(shown.image[:, away], picture(scene)[:, away])
+    assert torch.equal(pictures.image[:, away], picture(scene)[:, away])
 
 
 def test_it_casts_a_shadow_and_wears_its_paint(scene: SceneIR) -> None:
@@ -136,15 +136,15 @@ def test_another_takes_a_cars_place_and_its_row(scene: SceneIR) -> None:
     other = replace_vehicle(scene, 1, vehicle(scene.objects.translation[1]))
     assert len(other.objects) == len(scene.objects)
     assert other.meshes[int(other.objects.mesh_index[1])].name == "hatchback-0"
-    shown = Compositor(other).render(other)
-    assert int((shown.object_id == 2).sum()) > 300
-    kept = [0, 2]
-    assert torch.equal(other.objects.translation[kept], scene.objects.translation[kept])
-    # Nothing of the old car is left beside the new one.
+    pictures = Compositor(other).render(other)
+    assert int((pictures.object_id == 2).sum()) > 300
+    sources = [0, 2]
+    assert torch.equal(other.objects.translation[sources], scene.objects.translation[sources])
+    # Nothing of the old car is left outside the new one.
     bare = picture(remove_vehicle(scene, 1))
-    beside = (shown.object_id == 0) & (Compositor(scene).render(scene).object_id == 2)
-    brighter = (shown.image - bare)[:, beside].clamp(min=0)
-    assert beside.any()
+    outside = (pictures.object_id == 0) & (Compositor(scene).render(scene).object_id == 2)
+    brighter = (pictures.image - bare)[:, outside].clamp(min=0)
+    assert outside.any()
     assert float(brighter.mean()) < 0.005  # edges apart
 
 
@@ -152,10 +152,10 @@ def test_a_smaller_one_shows_what_the_old_car_hid(scene: SceneIR) -> None:
     row = 1
     small = replace(vehicle(scene.objects.translation[row]), size_lhw=torch.tensor([1.5, 0.8, 0.8]))
     other, bare = replace_vehicle(scene, row, small), remove_vehicle(scene, row)
-    shown, before = (Compositor(s).render(s) for s in (other, scene))
-    behind = (before.object_id == row + 1) & (shown.object_id != row + 1) & (shown.object_id > 0)
+    pictures, before = (Compositor(s).render(s) for s in (other, scene))
+    behind = (before.object_id == row + 1) & (pictures.object_id != row + 1) & (pictures.object_id > 0)
     assert int(behind.sum()) > 20
-    assert float((shown.image - picture(bare))[:, behind].abs().mean()) < 0.005  # edges of the small one
+    assert float((pictures.image - picture(bare))[:, behind].abs().mean()) < 0.005  # edges of the small one
 
 
 def test_both_renderers_draw_the_same(scene: SceneIR) -> None:

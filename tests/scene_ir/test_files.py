@@ -155,7 +155,9 @@ def test_the_largest_integers_are_read(number: int, tmp_path: Path) -> None:
     assert files.read_json(tmp_path / "a.json") == {"n": [number, 1 / 9]}
 
 
-def test_a_file_that_is_longer_than_it_says_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_longer_than_its_reported_size_is_read_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "a").write_bytes(b"0123456789")
     monkeypatch.setattr(files, "_CHUNK_BYTES", 3)
     monkeypatch.setattr(files, "check_regular", lambda path, most: 4)

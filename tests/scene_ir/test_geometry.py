@@ -176,13 +176,13 @@ def test_real_labels_3d_boxes_project_onto_their_2d_boxes() -> None:
 
 
 @pytest.mark.parametrize("tensors", [False, True])
-def test_kept_within_passes_gradients_up_to_its_bounds(tensors: bool) -> None:
+def test_clamp_inclusive_passes_gradients_up_to_its_bounds(tensors: bool) -> None:
     """Whatever torch.clamp has there: codes and saturated pixels lie on bounds."""
     values = torch.tensor([-0.5, 0.0, 0.3, 1.0, 1.5], requires_grad=True)
     bounds = (torch.zeros(5), torch.ones(5)) if tensors else (0.0, 1.0)
-    kept = geometry.clamp_inclusive(values, *bounds)
-    assert kept.tolist() == values.clamp(0, 1).tolist()
-    assert torch.equal(geometry.clamp_inclusive(values.detach(), *bounds), kept)
-    kept.sum().backward()
+    clamped = geometry.clamp_inclusive(values, *bounds)
+    assert clamped.tolist() == values.clamp(0, 1).tolist()
+    assert torch.equal(geometry.clamp_inclusive(values.detach(), *bounds), clamped)
+    clamped.sum().backward()
     assert values.grad is not None
     assert values.grad.tolist() == [0, 1, 1, 1, 0]

@@ -38,15 +38,15 @@ def npy(shape: str, dtype: str = "<f4") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
 
 
-def npz(member: bytes, said: int | None = None) -> bytes:
-    """An archive of one array. said: the size of it that the archive's directory tells."""
+def npz(member: bytes, declared: int | None = None) -> bytes:
+    """An archive of one array. declared: the size of it that the archive's directory tells."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("depth.npy", member)
     data = bytearray(buffer.getvalue())
-    if said is not None:
+    if declared is not None:
         at = data.index(b"PK\x01\x02")
-        data[at + 24 : at + 28] = struct.pack("<I", said)
+        data[at + 24 : at + 28] = struct.pack("<I", declared)
     return bytes(data)
 
 
@@ -63,10 +63,10 @@ def npz(member: bytes, said: int | None = None) -> bytes:
         ('{"\\udfff": 1}', "half of one"),
     ],
 )
-def test_json(tmp_path: Path, content: str, said: str) -> None:
+def test_json(tmp_path: Path, content: str, declared: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(content)
-    with pytest.raises(FormatError, match=rf"a\.json: expected .*{said}"):
+    with pytest.raises(FormatError, match=rf"a\.json: expected .*{declared}"):
         files.read_json(path)
 
 
@@ -92,10 +92,10 @@ BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("a
         ("x" * (1 << 19), "524,288"),
     ],
 )
-def test_yaml(tmp_path: Path, content: str, said: str) -> None:
+def test_yaml(tmp_path: Path, content: str, declared: str) -> None:
     path = tmp_path / "a.yaml"
     path.write_text(content)
-    with pytest.raises(FormatError, match=rf"a\.yaml: expected .*{said}"):
+    with pytest.raises(FormatError, match=rf"a\.yaml: expected .*{declared}"):
         files.read_yaml(path)
 
 
@@ -125,7 +125,7 @@ def test_what_a_phone_writes_behind_a_picture_is_passed_over(tmp_path: Path, suf
 
 
 @pytest.mark.parametrize("size", [(100_000, 100_000), (30_000, 30_000), (8_193, 8_192)])
-def test_a_picture_that_says_it_is_huge(tmp_path: Path, size: tuple[int, int], recwarn: Any) -> None:
+def test_a_picture_that_declares_a_huge_size(tmp_path: Path, size: tuple[int, int], recwarn: Any) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(png(*size))
     with pytest.raises(FormatError, match=r"a\.png: expected an image of at most 67,108,864 px"):
@@ -142,14 +142,14 @@ def test_a_picture_that_says_it_is_huge(tmp_path: Path, size: tuple[int, int], r
         (npz(npy("(0, 1000000000000)", "|O")), "allow_pickle"),
         (npz(npy("(0,)") + b"rest"), "in 4 bytes"),
         (npz(b""), "EOF"),
-        (npz(npy("(1,)"), said=(1 << 32) - 2), "4,294,967,294"),
+        (npz(npy("(1,)"), declared=(1 << 32) - 2), "4,294,967,294"),
         (npy("(1,)"), "a single array"),
     ],
 )
-def test_arrays(tmp_path: Path, data: bytes, said: str) -> None:
+def test_arrays(tmp_path: Path, data: bytes, declared: str) -> None:
     path = tmp_path / "a.npz"
     path.write_bytes(data)
-    with pytest.raises(FormatError, match=rf"a\.npz: expected .*{said}"):
+    with pytest.raises(FormatError, match=rf"a\.npz: expected .*{declared}"):
         files.read_npz(path)
 
 
@@ -203,7 +203,7 @@ def test_names_stay_in_their_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("place", "value", "said"), [(6, 1, "password"), (8, 97, "compression")])
-def test_an_archive_that_cannot_be_unpacked(tmp_path: Path, place: int, value: int, said: str) -> None:
+def test_an_archive_that_cannot_be_unpacked(tmp_path: Path, place: int, value: int, declared: str) -> None:
     """A member that is encrypted, or packed in a way that nobody knows, by its headers."""
     path = tmp_path / "a.npz"
     np.savez(path, a=np.zeros(3))
@@ -211,7 +211,7 @@ def test_an_archive_that_cannot_be_unpacked(tmp_path: Path, place: int, value: i
     data[place] = value  # of the member's own header
     data[data.index(b"PK\x01\x02") + 2 + place] = value  # of the archive's list
     path.write_bytes(data)
-    with pytest.raises(FormatError, match=rf"a\.npz: expected .*{said}"):
+    with pytest.raises(FormatError, match=rf"a\.npz: expected .*{declared}"):
         files.read_npz(path)
 
 
@@ -222,10 +222,10 @@ def test_a_header_that_python_cannot_take_apart(tmp_path: Path) -> None:
         files.read_npz(path)
 
 
-def test_no_more_is_unpacked_than_the_archive_says(tmp_path: Path) -> None:
+def test_no_more_is_unpacked_than_the_archive_lists(tmp_path: Path) -> None:
     """A directory that tells of 1,000 bytes, before 200 MB of zeros."""
     path = tmp_path / "a.npz"
-    path.write_bytes(npz(bytes(200 << 20), said=1000))
+    path.write_bytes(npz(bytes(200 << 20), declared=1000))
     tracemalloc.start()
     try:
         with pytest.raises(FormatError, match=r"a\.npz: expected an NPZ archive of arrays"):

@@ -27,11 +27,11 @@ def picture(scene: SceneIR) -> torch.Tensor:
     return render([scene])[0].image
 
 
-def region(scene: SceneIR, shown: Render, row: int) -> torch.Tensor:
+def region(scene: SceneIR, render_picture: Render, row: int) -> torch.Tensor:
     """(H, W) bool: where an object or its shadow has any effect."""
     mask = torch.zeros(scene.camera.height, scene.camera.width, dtype=torch.bool)
     shadow = scene.objects.source[row].shadow
-    parts = [(shown.opacity[row], shown.opacity[row].values > 0)]
+    parts = [(render_picture.opacity[row], render_picture.opacity[row].values > 0)]
     if shadow is not None:
         parts.append((shadow, (shadow.values < 1).any(dim=0, keepdim=True)))
     for crop, used in parts:
@@ -40,7 +40,7 @@ def region(scene: SceneIR, shown: Render, row: int) -> torch.Tensor:
     return mask
 
 
-def rows_kept(objects: Objects, rows: list[int]) -> Objects:
+def remaining_rows(objects: Objects, rows: list[int]) -> Objects:
     """The objects of some rows, their sources untouched: removal that forgets what hid what."""
     tensors = {f.name: getattr(objects, f.name)[rows] for f in fields(Objects) if f.name != "source"}
     return replace(objects, source=tuple(objects.source[row] for row in rows), **tensors)
@@ -48,18 +48,18 @@ def rows_kept(objects: Objects, rows: list[int]) -> Objects:
 
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_the_background_shows_and_the_others_keep_every_bit(scene: SceneIR, row: int) -> None:
-    shown = render([scene])[0]
+    render_picture = render([scene])[0]
     left = remove_objects(scene, [row])
     after = picture(left)
-    mine = region(scene, shown, row)
+    mine = region(scene, render_picture, row)
     assert mine.sum() > 100
-    assert torch.equal(after[:, ~mine], shown.image[:, ~mine])
+    assert torch.equal(after[:, ~mine], render_picture.image[:, ~mine])
     alone = mine.clone()
     for other in {0, 1, 2} - {row}:
-        alone &= ~region(scene, shown, other)
+        alone &= ~region(scene, render_picture, other)
     assert alone.sum() > 30
     assert torch.equal(after[:, alone], scene.background[:, alone])
-    assert not torch.equal(after[:, alone], shown.image[:, alone])
+    assert not torch.equal(after[:, alone], render_picture.image[:, alone])
 
 
 def test_without_any_the_background_is_left(scene: SceneIR) -> None:
@@ -74,7 +74,7 @@ def test_what_it_hid_is_completed(scene: SceneIR) -> None:
     after = render([remove_objects(scene, [NEAR])])[0].opacity[FAR - 1]
     assert (after.x0, after.y0, after.values.shape) == (before.x0, before.y0, before.values.shape)
     torch.testing.assert_close(after.values, before.values, atol=0.02, rtol=0)
-    forgetful = replace(scene, objects=rows_kept(scene.objects, [0, FAR]))
+    forgetful = replace(scene, objects=remaining_rows(scene.objects, [0, FAR]))
     assert float(render([forgetful])[0].opacity[1].values.sum()) < 0.9 * float(before.values.sum())
 
 
@@ -97,9 +97,9 @@ def test_only_what_it_hid_changes(scene: SceneIR, row: int) -> None:
         assert torch.equal(after[:, free], before[:, free])
     if row == FAR:
         assert left.source == scene.objects.source[:FAR]
-    kept = rows_kept(scene.objects, rows)
+    remaining = remaining_rows(scene.objects, rows)
     for name in (f.name for f in fields(Objects) if f.name != "source"):
-        assert torch.equal(getattr(left, name), getattr(kept, name))
+        assert torch.equal(getattr(left, name), getattr(remaining, name))
 
 
 def test_one_after_the_other_or_together(scene: SceneIR) -> None:

@@ -164,7 +164,7 @@ def test_equal_scenes_are_equal_bytes(tmp_path: Path) -> None:
     assert len(contents[0]) == 5
 
 
-def test_saving_replaces_the_folder_and_leaves_nothing_beside(tmp_path: Path) -> None:
+def test_saving_replaces_the_folder_and_leaves_nothing_else(tmp_path: Path) -> None:
     save_scene(rich_scene(0), tmp_path / "scene")
     (tmp_path / "scene" / "stray").write_text("old")
     save_scene(rich_scene(1), tmp_path / "scene")
@@ -389,7 +389,7 @@ def test_text_appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.Mo
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_json_refuses_what_json_cannot_say(tmp_path: Path) -> None:
+def test_json_rejects_what_json_cannot_hold(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         files.write_json(tmp_path / "a.json", {"x": float("nan")})
     assert not list(tmp_path.iterdir())

@@ -231,7 +231,7 @@ def test_check_finite_names_the_first_coordinate() -> None:
         check_finite("theta", torch.tensor([[0.0, 1.0], [torch.inf, torch.nan]]))
 
 
-def test_check_shape_takes_any_size_where_told() -> None:
+def test_check_shape_accepts_any_size_for_none() -> None:
     check_shape("x", torch.zeros(5, 3), None, 3)
     with pytest.raises(ShapeError, match="x: expected shape"):
         check_shape("x", torch.zeros(5), None, 3)

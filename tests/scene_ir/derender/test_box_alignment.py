@@ -66,8 +66,8 @@ def test_what_lies_beyond_the_border_is_cut_off_and_not_squeezed(where: str):
     faces = placement.mesh.faces.numpy()
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     found = box_alignment._clipped_bounds(clip, edges, CAMERA, np.zeros(4))
-    shown = np.array(box_of(seen(placement)))
-    assert np.abs(found - np.clip(shown, 0, [479, 199, 479, 199])).max() <= 1.5
+    drawn_box = np.array(box_of(seen(placement)))
+    assert np.abs(found - np.clip(drawn_box, 0, [479, 199, 479, 199])).max() <= 1.5
     assert ((found >= -1e-6) & (found <= np.array([479, 199, 479, 199]) + 1e-6)).all()
     whole = clip[:2] / np.maximum(clip[2], 0.5)
     assert (whole.min(1) < -5).any() or (whole.max(1) > np.array([484, 204])).any()

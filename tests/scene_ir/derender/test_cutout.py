@@ -69,7 +69,7 @@ def test_the_crop_holds_the_template_and_room_around_it(placement):
     assert rows.max() + 3 <= y1
 
 
-def test_a_template_beside_or_behind_the_camera_has_no_crop():
+def test_a_template_out_of_view_has_no_crop():
     assert cutout.crop_rectangle(car(x=60.0), CAMERA) is None
     assert cutout.crop_rectangle(car(z=-9.0), CAMERA) is None
     nothing = cutout.cut_out(
@@ -82,7 +82,7 @@ def test_a_template_beside_or_behind_the_camera_has_no_crop():
 def test_guides_show_the_template_where_the_photograph_has_it():
     placement = car()
     rect = cutout.crop_rectangle(placement, CAMERA)
-    said = cutout.render_guides(
+    guide_maps = cutout.render_guides(
         [placement], [cutout.crop_camera(CAMERA, rect)], [GROUND], np.zeros((1, 2, *CROP_HW), "f4")
     )
     mask = silhouette.render_silhouettes([placement], CAMERA)[0].astype(np.float32)
@@ -92,18 +92,18 @@ def test_guides_show_the_template_where_the_photograph_has_it():
     part = mask[top : min(y1, 200), left : min(x1, 480)]
     inner[top - y0 : top - y0 + part.shape[0], left - x0 : left - x0 + part.shape[1]] = part
     there = cv2.resize(inner, CROP_HW[::-1], interpolation=cv2.INTER_LINEAR) >= 0.5
-    assert silhouette.mask_iou(said[0, 0].numpy() >= 0.5, there) > 0.96
-    spots = said[0, 1:4].permute(1, 2, 0).numpy()
-    assert (np.abs(spots[there & (said[0, 0].numpy() > 0.99)]) <= 2.0001).all()
-    assert not spots[said[0, 0].numpy() == 0].any()
+    assert silhouette.mask_iou(guide_maps[0, 0].numpy() >= 0.5, there) > 0.96
+    spots = guide_maps[0, 1:4].permute(1, 2, 0).numpy()
+    assert (np.abs(spots[there & (guide_maps[0, 0].numpy() > 0.99)]) <= 2.0001).all()
+    assert not spots[guide_maps[0, 0].numpy() == 0].any()
 
 
 def test_nearness_is_that_of_the_ground_around_the_footprint():
     placement, ground = car(), torch.tensor([0.01, -0.9997, 0.02, 1.6])
     camera = cutout.crop_camera(CAMERA, cutout.crop_rectangle(placement, CAMERA))
-    said = cutout.render_guides([placement], [camera], [ground], np.zeros((1, 2, *CROP_HW), "f4"))
+    guide_maps = cutout.render_guides([placement], [camera], [ground], np.zeros((1, 2, *CROP_HW), "f4"))
     wanted = np.clip(-shadow.view_ground(placement, ground, camera).distance / 2, -1, 1)
-    assert np.abs(said[0, 4].numpy() - wanted).max() < 1e-4
+    assert np.abs(guide_maps[0, 4].numpy() - wanted).max() < 1e-4
 
 
 def test_what_lies_inside_a_rectangle_of_a_crop():
@@ -134,7 +134,7 @@ def test_disturbed_templates_lead_to_the_vehicles_of_a_generated_street():
     assert np.median(scores) > np.median(before)
 
 
-def test_the_same_again_and_with_others_beside():
+def test_cut_outs_do_not_depend_on_other_vehicles():
     frame = street()
     places = [placed(t) for t in vehicles(frame, 25.0)]
     nothing = [np.zeros(frame.depth_m.shape, bool)] * len(places)
@@ -212,7 +212,7 @@ def test_notches_that_the_outline_does_not_have_are_filled():
     assert not found.visible[20:40, 63:70].any()
 
 
-def test_only_borders_are_looked_at_again():
+def test_only_borders_are_refined():
     visible = np.zeros((80, 120))
     visible[20:60, 30:90] = 1
     wanted = cutout.find_uncertain_pixels(blob(visible))

@@ -87,7 +87,7 @@ def test_same_input_same_scene(street, scene):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_car_that_the_fit_leads_out_of_sight_stays_where_its_label_says(street, masked, monkeypatch):
+def test_a_car_that_the_fit_leads_out_of_sight_stays_at_its_label(street, masked, monkeypatch):
     def fit(placements: list[Placement], *_: object) -> list[Placement]:
         return [replace(p, translation=p.translation + torch.tensor([80.0, 0.0, 0.0])) for p in placements]
 
@@ -182,7 +182,7 @@ def test_who_hides_all_vehicles_keeps_their_colours(street):
     assert torch.equal(render(scene), street.frame.photograph)
 
 
-def test_what_is_labelled_and_no_vehicle_is_a_region_beside_those_of_the_labels(street):
+def test_labels_that_are_no_vehicles_become_ignored_regions(street):
     one, region = street.frame.labels, torch.tensor([[1.0, 2.0, 30.0, 40.0]])
     walker = torch.tensor([[300.0, 90.0, 320.0, 150.0]])
     twice = (torch.cat([t, t]) for t in (one.truncation, one.occlusion, one.translation, one.yaw, one.size_lhw))

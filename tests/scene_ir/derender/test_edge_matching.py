@@ -103,16 +103,16 @@ def test_edges_find_the_yaw_that_the_outline_leaves_open():
         silhouette.grow_mask(mask, 2) & (np.indices(mask.shape).sum(0) % 7 < 3) & ~mask
     )
     turn = {}
-    for name, beside in (("outline", None), ("edges", FitEvidence(picture))):
+    for name, evidence in (("outline", None), ("edges", FitEvidence(picture))):
         fitted = silhouette.fit_silhouettes(
-            [start], [ragged], [NOTHING], NO_BOXES, CAMERA, FitSettings(), evidence=beside
+            [start], [ragged], [NOTHING], NO_BOXES, CAMERA, FitSettings(), evidence=evidence
         )[0]
         turn[name] = abs(math.degrees(float(fitted.yaw) - 0.6))
     assert turn["edges"] < 1.5
     assert turn["edges"] < turn["outline"]
 
 
-def test_a_picture_tells_one_template_from_another():
+def test_a_picture_distinguishes_templates():
     for kind in ("sedan", "hatchback", "suv"):
         options = [car(kind=k) for k in ("sedan", "hatchback", "suv")]
         distances = silhouette.measure_edge_distances(options, NOTHING, painted(car(kind=kind)), CAMERA)
@@ -126,8 +126,8 @@ def test_a_car_out_of_sight_is_nowhere_near():
 def test_what_a_laser_measured_hardly_moves():
     truth, start = car(0.6), car(0.67)
     mask = silhouette.render_silhouettes([truth], CAMERA)[0]
-    beside = FitEvidence(painted(truth), [True])
+    evidence = FitEvidence(painted(truth), [True])
     fitted = silhouette.fit_silhouettes(
-        [start], [mask], [NOTHING], NO_BOXES, CAMERA, FitSettings(), evidence=beside
+        [start], [mask], [NOTHING], NO_BOXES, CAMERA, FitSettings(), evidence=evidence
     )[0]
     assert abs(float(fitted.yaw - start.yaw)) <= 0.25 * FitSettings().max_turn_rad + 1e-5

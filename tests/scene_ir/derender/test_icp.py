@@ -57,18 +57,18 @@ def test_points_correct_place_yaw_and_size(x: float, z: float, yaw: float):
     assert found.mesh is start.mesh
 
 
-def test_road_wall_and_what_is_beside_are_not_the_cars():
+def test_points_of_road_walls_and_neighbours_are_excluded():
     truth = car(0.5, 9.0, 0.6)
     points = swept(truth)
-    kept = points_near_box(truth, points)
-    assert len(kept) > 100
-    assert kept[:, 1].max() < 1.65 - 0.15
-    assert np.linalg.norm(kept[:, [0, 2]] - [0.5, 9.0], axis=1).max() < 2.9
+    inside = points_near_box(truth, points)
+    assert len(inside) > 100
+    assert inside[:, 1].max() < 1.65 - 0.15
+    assert np.linalg.norm(inside[:, [0, 2]] - [0.5, 9.0], axis=1).max() < 2.9
     neighbour = torch.tensor([[0.5, 1.0, 12.5]]).repeat(300, 1)
-    alone, beside = (align_to_points(truth, p, CAMERA) for p in (points, torch.cat([points, neighbour])))
+    alone, with_neighbour = (align_to_points(truth, p, CAMERA) for p in (points, torch.cat([points, neighbour])))
     assert alone is not None
-    assert beside is not None
-    assert torch.equal(alone.translation, beside.translation)
+    assert with_neighbour is not None
+    assert torch.equal(alone.translation, with_neighbour.translation)
 
 
 def test_some_wrong_points_inside_the_box_do_not_spoil_it():
@@ -83,7 +83,7 @@ def test_some_wrong_points_inside_the_box_do_not_spoil_it():
     assert errors(found, truth)[1] < 0.4 * errors(start, truth)[1]
 
 
-def test_too_few_points_say_nothing():
+def test_too_few_points_fit_nothing():
     truth = car(0.5, 9.0, 0.6)
     on_it = torch.from_numpy(points_near_box(truth, swept(truth))).float()
     assert align_to_points(truth, on_it[:20], CAMERA) is None

@@ -1,4 +1,4 @@
-"""Masks of large vehicles grow to what looks like the vehicle beside them, and no farther."""
+"""Masks of large vehicles grow to what counts like the vehicle neighbour them, and no farther."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def block(x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
     return out
 
 
-def looked(visible: np.ndarray, front: np.ndarray | None = None, shadow: np.ndarray | None = None) -> Cutout:
+def make_cutout(visible: np.ndarray, front: np.ndarray | None = None, shadow: np.ndarray | None = None) -> Cutout:
     nothing = np.zeros(SHAPE, bool)
     maps = (m if m is not None else nothing for m in (front, shadow))
     return Cutout(0, 0, visible.astype(np.float32), *(m.astype(np.float32) for m in maps))
@@ -49,72 +49,72 @@ MIRROR = MASK | block(72, 90, 80, 100)
 
 @pytest.mark.parametrize("car", [ROOF, MIRROR], ids=["roof", "mirror"])
 def test_a_missed_part_of_the_same_paint_is_added(car):
-    seen = looked(MASK)
+    seen = make_cutout(MASK)
     wide = found(picture(car), seen)
     assert np.count_nonzero(wide & car & ~MASK) > 0.9 * np.count_nonzero(car & ~MASK)
     assert iou(wide, car) > 0.99
 
 
 def test_a_mask_that_is_right_stays():
-    assert iou(found(picture(MASK), looked(MASK)), MASK) > 0.99
+    assert iou(found(picture(MASK), make_cutout(MASK)), MASK) > 0.99
 
 
-def test_what_one_look_missed_is_decided_by_colours():
+def test_colours_decide_what_one_cut_out_missed():
     car = MASK | block(30, 70, 80, 160)
-    # Beyond the band: without the second look nothing tells of it.
-    assert iou(found(picture(car), looked(MASK)), car) < 0.9
-    assert iou(found(picture(car), looked(MASK), looked(car)), car) > 0.97
-    assert iou(found(picture(MASK), looked(MASK), looked(car)), MASK) > 0.97
+    # Beyond the band: without the second cut_out nothing tells of it.
+    assert iou(found(picture(car), make_cutout(MASK)), car) < 0.9
+    assert iou(found(picture(car), make_cutout(MASK), make_cutout(car)), car) > 0.97
+    assert iou(found(picture(MASK), make_cutout(MASK), make_cutout(car)), MASK) > 0.97
 
 
-def test_shadows_and_nearer_things_of_the_same_colour_stay_out():
-    low, beside = block(80, 170, 240, 178), block(240, 60, 248, 170)
-    car = MASK | low | beside
+def test_shadows_and_nearer_objects_of_the_same_colour_stay_out():
+    low, neighbour = block(80, 170, 240, 178), block(240, 60, 248, 170)
+    car = MASK | low | neighbour
     image = picture(car, DARK)
-    wide = found(image, looked(MASK, shadow=low), allowed=~beside)
-    assert not (wide & beside).any()
+    wide = found(image, make_cutout(MASK, shadow=low), allowed=~neighbour)
+    assert not (wide & neighbour).any()
     assert np.count_nonzero(wide & low) < 0.2 * np.count_nonzero(low)
     pole = block(150, 40, 158, 60)
-    assert not (found(picture(ROOF), looked(MASK, front=pole)) & pole).any()
+    assert not (found(picture(ROOF), make_cutout(MASK, front=pole)) & pole).any()
 
 
 def test_shares_add_up_to_at_most_one():
     low = block(80, 166, 240, 178).astype(np.float32) * 0.4
-    seen = looked(MASK * 0.6, shadow=low)
+    seen = make_cutout(MASK * 0.6, shadow=low)
     wide = widen.extend_mask(picture(ROOF), seen, seen, MASK.astype(np.float32), np.ones(SHAPE, bool))
     assert (wide.visible + wide.front + wide.shadow <= 1 + 1e-6).all()
     assert (wide.visible >= seen.visible).all()
 
 
 def test_small_vehicles_stay_as_they_are():
-    seen = looked(block(80, 60, 240, 120))
+    seen = make_cutout(block(80, 60, 240, 120))
     assert widen.extend_mask(picture(ROOF), seen, seen, seen.visible, np.ones(SHAPE, bool)) is seen
 
 
 def test_the_same_input_gives_the_same_bytes():
-    one, two = (found(picture(MIRROR), looked(MASK)) for _ in range(2))
+    one, two = (found(picture(MIRROR), make_cutout(MASK)) for _ in range(2))
     assert np.array_equal(one, two)
 
 
 def test_paint_counts_wherever_on_the_vehicle_it_is():
-    # Bright windows below the missed roof, dark bars behind: near by only the bars look like it.
+    # Bright windows below the missed roof, dark bars behind: near by only the bars cut_out like it.
     paint = (60, 62, 66)
     image = picture(ROOF | (~MASK & (np.arange(SHAPE[1]) // 8 % 4 == 0)), paint)
     image[60:100, 84:236] = (200, 205, 210)
-    seen = looked(MASK)
+    seen = make_cutout(MASK)
     wide = widen.extend_mask(image, seen, seen, ROOF.astype(np.float32), np.ones(SHAPE, bool)).visible >= 0.5
     assert np.count_nonzero(wide & ROOF & ~MASK) > 0.9 * np.count_nonzero(ROOF & ~MASK)
 
 
 @pytest.mark.parametrize("fit", [True, False])
-def test_without_a_fit_each_vehicle_is_looked_at_once(street, monkeypatch, fit):
-    looks = []
-    look = cutout.cut_out
+def test_without_a_fit_each_vehicle_is_cut_out_once(street, monkeypatch, fit):
+    counts = []
+    cut_out = cutout.cut_out
 
     def counted(image, places, *rest, **options):
-        looks.append(len(places))
-        return look(image, places, *rest, **options)
+        counts.append(len(places))
+        return cut_out(image, places, *rest, **options)
 
     monkeypatch.setattr(cutout, "cut_out", counted)
     assert len(place_vehicles(street.frame, DerenderSettings(fit=fit))) == 1
-    assert sum(looks) == (2 if fit else 1)
+    assert sum(counts) == (2 if fit else 1)

@@ -58,42 +58,42 @@ def frame(masks: torch.Tensor | None = None, depth: torch.Tensor | None = None) 
 
 
 def test_a_labelled_person_is_cut_out_of_its_box():
-    things = front.find_labelled_occluders(picture(), frame(), [0], [1])
-    assert len(things) == 1
-    assert things[0].depth_m == pytest.approx(8.0)
-    assert silhouette.mask_iou(things[0].mask, person()) > 0.8
+    occluders = front.find_labelled_occluders(picture(), frame(), [0], [1])
+    assert len(occluders) == 1
+    assert occluders[0].depth_m == pytest.approx(8.0)
+    assert silhouette.mask_iou(occluders[0].mask, person()) > 0.8
 
 
-def test_masks_of_the_data_set_are_used_and_far_things_left_out():
+def test_masks_of_the_data_set_are_used_and_far_objects_left_out():
     masks = torch.zeros(2, 150, 240)
     masks[1, 60:90, 100:104] = 1.0
-    things = front.find_labelled_occluders(picture(), frame(masks), [0], [1])
-    assert np.array_equal(things[0].mask, (masks[1] > 0.5).numpy())
+    occluders = front.find_labelled_occluders(picture(), frame(masks), [0], [1])
+    assert np.array_equal(occluders[0].mask, (masks[1] > 0.5).numpy())
     assert front.find_labelled_occluders(picture(), frame(masks), [1], [0]) == []
 
 
-def test_depth_tells_a_pole_from_the_ground_and_from_what_is_behind():
+def test_depth_determines_a_pole_from_the_ground_and_from_what_is_behind():
     depth = np.minimum(maps.compute_plane_depth(LEVEL, CAMERA), 60.0)
     pole = np.zeros((150, 240), bool)
     pole[40:100, 118:122] = True
     depth[pole] = 9.0
     car = silhouette.place_mesh("hatchback", PLACES[0], YAWS[0], SIZES[0])
     outline = silhouette.render_silhouettes([car], CAMERA)[0]
-    shown = outline & ~pole
-    depth[shown] = 11.5
+    outlined = outline & ~pole
+    depth[outlined] = 11.5
     height = height_above_ground(torch.from_numpy(depth), LEVEL, CAMERA.matrix).float().numpy()
     ground = np.isfinite(maps.compute_plane_depth(LEVEL, CAMERA)) & ~pole & ~outline & (depth < 60)
     assert np.abs(height[ground]).max() < 0.01
-    things = front.find_measured_occluders(
-        depth.astype(np.float32), height, shown, [(outline, front.nearest_corner_depth(car, CAMERA))]
+    occluders = front.find_measured_occluders(
+        depth.astype(np.float32), height, outlined, [(outline, front.nearest_corner_depth(car, CAMERA))]
     )
-    assert len(things) == 1
-    assert things[0].depth_m == pytest.approx(9.0)
+    assert len(occluders) == 1
+    assert occluders[0].depth_m == pytest.approx(9.0)
     rows = slice(*silhouette.mask_bounds(outline)[1::2])
-    assert np.array_equal(things[0].mask[rows], (pole & (height > 0.2))[rows])
+    assert np.array_equal(occluders[0].mask[rows], (pole & (height > 0.2))[rows])
 
 
-def test_opacities_of_overlapping_things_add_up_to_at_most_one():
+def test_opacities_of_overlapping_objects_add_up_to_at_most_one():
     image = picture().astype(np.float32) / 255
     body = person()
     shifted = np.roll(body, 3, axis=1) & ~body

@@ -50,13 +50,13 @@ def test_plates_lamps_and_windows_are_no_paint(base):
     assert 0 <= share.min() <= share.max() <= 1
     wrong = (share > 0.5) != truth
     assert wrong.mean() < 0.03
-    told_by_mesh = (mesh_part(2).values[0].numpy() > 0.5) != truth
-    assert wrong.sum() < 0.4 * told_by_mesh.sum()
+    mesh_paint = (mesh_part(2).values[0].numpy() > 0.5) != truth
+    assert wrong.sum() < 0.4 * mesh_paint.sum()
     if np.ptp(base) > 0.1:  # white plates are no lighter than what grey paint may mirror
         assert share[41:45, 32:50].max() < 0.1
 
 
-def test_paint_as_dark_as_glass_is_where_the_mesh_says():
+def test_paint_as_dark_as_glass_follows_the_mesh():
     foreground, truth = picture((0.1, 0.11, 0.12))
     share = paint.estimate_paint_region(foreground, mesh_part(0)).values[0].numpy()
     assert ((share > 0.5) == truth).mean() > 0.9

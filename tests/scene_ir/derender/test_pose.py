@@ -46,7 +46,7 @@ class Oracle(PoseNet):
     def forward(self, crops: Tensor, numbers: Tensor) -> PosePrediction:
         centre = torch.arange(BINS) * (2 * math.pi / BINS)
         apart = self.alpha[:, None] - centre
-        said = PosePrediction(
+        prediction = PosePrediction(
             8 * apart.cos(),
             torch.stack([apart.cos(), apart.sin()], -1),
             self.offset,
@@ -57,7 +57,7 @@ class Oracle(PoseNet):
         )
         self.calls = getattr(self, "calls", 0) + 1
         # the second pass sees the mirror's image
-        return said if self.calls % 2 else pose.unmirror_prediction(said)
+        return prediction if self.calls % 2 else pose.unmirror_prediction(prediction)
 
 
 def row_of_cars(
@@ -128,27 +128,27 @@ def test_the_ground_is_what_most_vehicles_stand_on() -> None:
 @pytest.mark.parametrize("alpha", [-3.1, -1.6, -0.3, 0.0, 0.8, 1.57, 3.0])
 def test_mirrored_twice_is_the_same_and_once_is_the_other_angle(alpha: float) -> None:
     camera, place, _, size, boxes = row_of_cars(places=((0.0, 15.0),))
-    said = Oracle(camera, place, torch.tensor([alpha]), size, boxes)(
+    prediction = Oracle(camera, place, torch.tensor([alpha]), size, boxes)(
         grey()[None], torch.zeros(1, pose.BOX_FEATURES)
     )
-    turned = pose.unmirror_prediction(said)
-    assert torch.equal(pose.unmirror_prediction(turned).bins, said.bins)
-    assert torch.equal(pose.unmirror_prediction(turned).turn, said.turn)
+    turned = pose.unmirror_prediction(prediction)
+    assert torch.equal(pose.unmirror_prediction(turned).bins, prediction.bins)
+    assert torch.equal(pose.unmirror_prediction(turned).turn, prediction.turn)
     angle, sure = pose.decode_viewing_angle(turned)
     assert math.remainder(float(angle) - (math.pi - alpha), 2 * math.pi) == pytest.approx(0, abs=1e-5)
     assert float(sure) > 0.99
 
 
-def test_front_and_back_equally_likely_is_said_to_be_so() -> None:
+def test_equally_likely_front_and_back_have_no_confidence() -> None:
     centre = torch.arange(BINS) * (2 * math.pi / BINS)
     bins = 6 * (2 * (centre - 1.0)).cos()[None]  # alpha 1.0, or half a turn away
     apart = torch.where((centre - 1.0).cos() > 0, 1.0 - centre, 1.0 + math.pi - centre)
     turn = torch.stack([apart.cos(), apart.sin()], -1)[None]
     nothing = torch.zeros(1)
-    said = PosePrediction(
+    prediction = PosePrediction(
         bins, turn, torch.zeros(1, 2), torch.zeros(1, 3), nothing, nothing, torch.zeros(1, len(KINDS))
     )
-    alpha, sure = pose.decode_viewing_angle(said)
+    alpha, sure = pose.decode_viewing_angle(prediction)
     assert math.remainder(float(alpha) - 1.0, math.pi) == pytest.approx(0, abs=1e-4)
     assert float(sure) == pytest.approx(0.5, abs=0.01)
 
@@ -170,7 +170,7 @@ def test_crops_show_the_box_in_their_middle() -> None:
     assert large[50, 48] == pytest.approx([0, 0, 0], abs=1e-5)
 
 
-def test_numbers_tell_where_the_border_cuts() -> None:
+def test_features_mark_cut_sides() -> None:
     camera = kitti_camera()
     boxes = torch.tensor([[0.0, 50, 100, 374], [609.6 - 50, 172.9 - 30, 609.6 + 50, 172.9 + 30]])
     boxes = torch.cat([boxes, torch.tensor([[1100.0, 0, 1241, 200]])])

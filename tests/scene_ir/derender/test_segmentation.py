@@ -100,17 +100,17 @@ def test_same_picture_same_maps(street, image, seen):
     assert all(np.array_equal(getattr(again, f.name), getattr(seen, f.name)) for f in fields(Segmentation))
 
 
-def test_a_users_segmenter_is_asked_and_its_names_are_understood(image):
+def test_a_users_segmenter_replaces_the_network(image):
     names = ("Road", "sidewalk", "building", "vegetation", "sky", "car", "rider")
     shares = np.zeros((7, 4, 8), np.float32)
     shares[4, :2], shares[3, 2, :4], shares[5, 2, 4:], shares[0, 3, :6], shares[1, 3, 6:] = 1, 1, 1, 1, 1
     camera = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)
     blank = np.full((200, 480, 3), 0.5, np.float32)
-    asked = []
+    inputs = []
     found = segment.segment_photograph(
-        blank, LEVEL, camera, lambda picture: (asked.append(picture), (shares, names))[1]
+        blank, LEVEL, camera, lambda picture: (inputs.append(picture), (shares, names))[1]
     )
-    assert asked[0] is blank
+    assert inputs[0] is blank
     assert found.sky[20].min() > 0.95
     assert found.foliage[125, :180].min() > 0.9
     assert found.vehicle[125, 300:].min() > 0.9

@@ -42,17 +42,17 @@ def test_silhouette_lies_in_the_projected_box_and_nearly_fills_its_height():
     assert (y1 - y0) > 0.85 * float(box[3] - box[1])
 
 
-def test_silhouettes_of_no_cars_and_of_a_car_beside_the_image():
+def test_silhouettes_of_no_cars_and_of_a_car_next_to_the_image():
     assert silhouette.render_silhouettes([], CAMERA) == []
     assert not outline(car(x=60.0)).any()
 
 
 @pytest.mark.parametrize(("radius", "kept"), [(2.0, 45), (-2.0, 5)])
-def test_grow_and_shrink(radius, kept):
+def test_grow_and_shrink(radius, remaining):
     mask = np.zeros((30, 30), bool)
     mask[13:18, 13:18] = True
     grown = silhouette.grow_mask(mask, radius)
-    assert grown.sum() == pytest.approx(kept, abs=25 if radius > 0 else 8)
+    assert grown.sum() == pytest.approx(remaining, abs=25 if radius > 0 else 8)
     assert (grown >= mask).all() if radius > 0 else (grown <= mask).all()
 
 
@@ -202,7 +202,7 @@ def test_a_box_holds_a_car_that_the_image_cuts_by_what_is_inside():
 
 
 @pytest.mark.parametrize("radius", [0.0, 1.5, 4.0, -1.0, -2.5])
-def test_growing_looks_at_no_more_than_it_needs_and_misses_nothing(radius: float):
+def test_growing_in_a_window_equals_growing_everywhere(radius: float):
     mask = np.zeros((60, 90), bool)
     mask[20:33, 40:70] = mask[50:, :12] = True
     mask[25, 55] = False

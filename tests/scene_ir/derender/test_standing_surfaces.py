@@ -93,7 +93,7 @@ def test_without_an_upright_hole_nothing_changes(rows):
     assert not found.copied.any()
 
 
-def test_a_narrow_source_is_not_shown_again_and_again():
+def test_a_narrow_source_is_not_repeated():
     image = np.full((*SHAPE, 3), 0.9, np.float32)
     # 20 columns have the guide's colour: repeated, they would fill the 60 of the hole.
     image[:, 202:222] = 0.52
@@ -105,7 +105,7 @@ def test_a_narrow_source_is_not_shown_again_and_again():
     assert np.count_nonzero(found.image[60, 140:200, 0] < 0.7) <= 30
 
 
-def test_what_nothing_beside_fits_is_left_to_others():
+def test_columns_without_a_fitting_source_are_not_copied():
     image = fence()
     image[:, :140], image[:, 200:] = (1, 0, 0), (0, 0, 1)
     assert not copy_columns(spoilt(image), hole(), hole(), guide(image), HORIZON).copied.any()

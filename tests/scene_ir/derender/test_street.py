@@ -50,7 +50,7 @@ def photograph(heading: float = 0.15, grain: float = 0.02, bend: float = 0.0) ->
 
 
 def shares(ground: np.ndarray | None = None, stood: np.ndarray | None = None) -> StreetShares:
-    """Ground below row 93, or as told; sky above row 60."""
+    """Ground below row 93, or as with_flat; sky above row 60."""
     nowhere = np.zeros(ROWS.shape, bool)
     return StreetShares(
         ROAD if ground is None else ground, (ROWS < 60).astype(np.float32), nowhere if stood is None else stood
@@ -71,7 +71,7 @@ def test_plane_view_knows_a_point_of_the_road():
 
 
 @pytest.mark.parametrize(("heading", "bend"), [(0.15, 0.0), (-0.1, 0.0), (0.0, 0.006)])
-def test_edges_on_the_ground_tell_the_roads_course(heading, bend):
+def test_edges_on_the_ground_determine_the_roads_course(heading, bend):
     known = BELOW & (view().along < 45) & ~hole()
     found = estimate_road_course(photograph(heading, 0.005, bend), known, view())
     assert found == pytest.approx((heading, bend), abs=0.04)
@@ -103,7 +103,7 @@ def test_what_is_unknown_does_not_matter_and_the_result_is_the_same_twice():
     assert np.array_equal(first, second)
 
 
-def test_a_dash_beside_the_hole_is_not_smeared_into_it():
+def test_a_dash_next_to_the_hole_is_not_smeared_into_it():
     image = photograph(0.0, 0.0)
     image[110:116, 205:222] = 0.9
     guess = continue_street(image, hole(), shares(), view(), HORIZON).image
@@ -148,11 +148,11 @@ def test_where_a_vehicle_stood_is_ground():
     mask[80:190, 240:] = True
     stood = mask & (ROWS > 120)
     known = np.where(mask, 0, ROAD).astype(np.float32)
-    without, told = (
+    without, with_flat = (
         continue_street(photograph(), mask, shares(known, place), view(), HORIZON) for place in (None, stood)
     )
-    assert told.ground[121:189, 245:].all()
-    assert told.foot[300:].mean() < without.foot[300:].mean()
+    assert with_flat.ground[121:189, 245:].all()
+    assert with_flat.foot[300:].mean() < without.foot[300:].mean()
 
 
 def test_the_skyline_is_interpolated_behind_the_hole():

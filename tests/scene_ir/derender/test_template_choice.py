@@ -51,7 +51,7 @@ def test_a_heading_that_is_right_stays():
 
 
 @pytest.mark.parametrize("kind", ["sedan", "hatchback", "suv"])
-def test_the_template_is_told_from_labels_that_are_off(kind: str):
+def test_the_template_is_chosen_despite_label_errors(kind: str):
     truth = car(kind)
     options = [car(k, YAW + 0.08, (4.5, 1.45, 1.8)) for k in ("sedan", "hatchback", "suv")]
     found, apart = stand.choose_pose(options, box_of(truth), view_of(truth))

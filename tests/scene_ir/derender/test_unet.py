@@ -31,7 +31,7 @@ def test_a_photograph_is_seen_at_one_focal_length_and_at_a_bounded_size():
     assert large.elevation.size < 270_000
 
 
-def test_a_network_gives_half_of_the_size_and_as_many_channels_as_asked():
+def test_output_has_half_the_size_and_the_given_channels():
     network = unet.UNet(3).eval()
     seen = unet.prepare_input(np.zeros((200, 480, 3), np.float32), LEVEL, CAMERA)
     height, width = seen.elevation.shape

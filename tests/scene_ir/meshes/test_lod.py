@@ -99,7 +99,7 @@ def test_flat_regions_cost_nothing() -> None:
     assert merged(coarse).volume == pytest.approx(1.0, abs=1e-5)
 
 
-def test_edges_are_no_longer_than_asked() -> None:
+def test_edges_are_no_longer_than_the_limit() -> None:
     mesh = of(trimesh.creation.box((1, 1, 1)).subdivide().subdivide().subdivide())
     coarse = simplify(mesh, 12, longest=0.8)
     corners = coarse.vertices[coarse.faces] * torch.tensor([2.7, 1.0, 1.15])

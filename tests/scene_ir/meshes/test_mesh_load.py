@@ -80,12 +80,12 @@ def test_viewers_get_colours_and_an_upright_mesh(tmp_path: Path) -> None:
     mesh = template("sedan", 0)
     save_mesh(mesh, tmp_path / "a.glb")
     scene = trimesh.load_scene(tmp_path / "a.glb", process=False)
-    shown = scene.to_mesh()
-    assert shown.bounds[:, 1] == pytest.approx([0.0, 1.0], abs=1e-6)
-    assert shown.volume > 0
+    loaded_scene = scene.to_mesh()
+    assert loaded_scene.bounds[:, 1] == pytest.approx([0.0, 1.0], abs=1e-6)
+    assert loaded_scene.volume > 0
     linear = torch.where(mesh.colours <= 0.04045, mesh.colours / 12.92, ((mesh.colours + 0.055) / 1.055) ** 2.4)
-    shown = np.asarray(next(iter(scene.geometry.values())).visual.vertex_colors)[:, :3]
-    np.testing.assert_allclose(shown, 255 * linear.numpy(), atol=0.51)
+    loaded_scene = np.asarray(next(iter(scene.geometry.values())).visual.vertex_colors)[:, :3]
+    np.testing.assert_allclose(loaded_scene, 255 * linear.numpy(), atol=0.51)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb"])
@@ -196,7 +196,7 @@ def painted_glb(path: Path, colour: tuple[float, ...], dtype: str, factor: tuple
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1}
     if factor is not None:
         primitive["material"] = 0
-    told = {
+    message = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
@@ -214,7 +214,7 @@ def painted_glb(path: Path, colour: tuple[float, ...], dtype: str, factor: tuple
         "buffers": [{"uri": "my%20box%20%C3%A9.bin", "byteLength": starts[-1]}],
     }
     (path.parent / "my box é.bin").write_bytes(b"".join(blobs))
-    path.write_text(json.dumps(told))
+    path.write_text(json.dumps(message))
 
 
 @pytest.mark.parametrize("dtype", ["f4", "u2", "u1"])
@@ -281,13 +281,13 @@ def test_windows_at_one_end_only_are_a_cabs(tmp_path: Path, end: float) -> None:
 
 
 @pytest.mark.parametrize("end", [1.0, -1.0])
-def test_without_windows_a_lorry_is_taken_for_a_car_and_looks_backwards(tmp_path: Path, end: float) -> None:
+def test_without_windows_a_lorry_is_taken_for_a_car_and_faces_backwards(tmp_path: Path, end: float) -> None:
     # what makes the test above one: nothing but the windows tells where this lorry's cab is
     assert cab_side(lorry(tmp_path, end, "panel")) < -0.3
 
 
 @pytest.mark.parametrize("name", ["sedan", "garbage-truck", "ambulance"])
-def test_kenney_vehicles_look_forward_with_palette_colours(name: str) -> None:
+def test_kenney_vehicles_face_forward_with_palette_colours(name: str) -> None:
     file = KENNEY / f"{name}.glb"
     if not file.is_file():
         pytest.skip(f"../shared/data/meshes_kenney/{name}.glb is missing")
@@ -367,20 +367,22 @@ def claiming(path: Path, **changes: object) -> Path:
     parts = trimesh.Scene(trimesh.creation.box()).export(file_type="gltf")
     for name, content in parts.items():
         (path.parent / name).write_bytes(content)
-    told = json.loads(parts["model.gltf"])
-    path.write_text(json.dumps(told | {key: change(told) for key, change in changes.items()}))
+    message = json.loads(parts["model.gltf"])
+    path.write_text(json.dumps(message | {key: change(message) for key, change in changes.items()}))
     return path
 
 
 def test_files_that_claim_more_than_they_hold(tmp_path: Path) -> None:
     path = tmp_path / "a.gltf"
-    big = claiming(path, accessors=lambda told: [told["accessors"][0] | {"count": 10**9}, *told["accessors"][1:]])
+    big = claiming(
+        path, accessors=lambda message: [message["accessors"][0] | {"count": 10**9}, *message["accessors"][1:]]
+    )
     with pytest.raises(
         FormatError, match=r"a\.gltf: expected at most 20,000,000 vertices, faces .*, found 1,000,000"
     ):
         load_mesh(big)
     with pytest.raises(FormatError, match=r"a\.gltf: nodes: expected at most 10,000, found 20,000"):
-        load_mesh(claiming(path, nodes=lambda told: [told["nodes"][0]] * 20_000))
+        load_mesh(claiming(path, nodes=lambda message: [message["nodes"][0]] * 20_000))
     head = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
     for form in ("ascii", "binary_little_endian"):
         (tmp_path / "a.ply").write_text(head.format(form, 3) + "element face 1000000000\nend_header\n0 0 0\n")
