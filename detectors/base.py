@@ -276,6 +276,11 @@ class Detector(nn.Module, ABC):
     fresh_layers: tuple[str, ...] = ()
     """Name prefixes of the parameters that no pretrained backbone provides."""
 
+    @property
+    def is_frozen(self) -> bool:
+        """Whether it is in eval mode with all weights frozen."""
+        return not self.training and not any(parameter.requires_grad for parameter in self.parameters())
+
     @abstractmethod
     def forward(self, images: Tensor) -> Any:
         """Images (B, 3, H, W), RGB in [0, 1], any size, to `RawPredictions`; differentiable to the images."""

@@ -116,7 +116,7 @@ class ContractReport:
         return self
 
 
-class _ContractViolation(Exception):  # noqa: N818  (ends one check)
+class _Violation(Exception):  # noqa: N818  (ends one check)
     """A failed check; the text explains it."""
 
 
@@ -215,7 +215,7 @@ def _run_check(name: str, check: Callable[[ContractInputs], str], inputs: Contra
         return ContractCheck(name, "ok", check(inputs))
     except _NotApplicable as reason:
         return ContractCheck(name, "not tried", str(reason))
-    except _ContractViolation as reason:
+    except _Violation as reason:
         return ContractCheck(name, "failed", str(reason))
     except Exception as error:  # user code may raise anything
         return ContractCheck(name, "raised" if user_code_frames(error) else "failed", describe_error(error))
@@ -224,18 +224,18 @@ def _run_check(name: str, check: Callable[[ContractInputs], str], inputs: Contra
 def _check_attributes(inputs: ContractInputs) -> str:
     detector = inputs.detector
     if not (isinstance(detector.name, str) and detector.name):
-        raise _ContractViolation(f"name: expected a non-empty string, found {detector.name!r}")
+        raise _Violation(f"name: expected a non-empty string, found {detector.name!r}")
     classes = detector.classes
     if not (isinstance(classes, tuple) and classes and all(isinstance(c, str) and c for c in classes)):
-        raise _ContractViolation(f"classes: expected a tuple of names, found {classes!r}")
+        raise _Violation(f"classes: expected a tuple of names, found {classes!r}")
     if len(set(classes)) != len(classes):
-        raise _ContractViolation(f"classes: expected each once, found {', '.join(classes)}")
+        raise _Violation(f"classes: expected each once, found {', '.join(classes)}")
     detail = f"{len(classes)} classes, " + (
         f"Car is {classes.index('Car')}" if "Car" in classes else "without Car"
     )
     if isinstance(detector, Detector):
         if not 0 <= detector.t_star <= 1:
-            raise _ContractViolation(f"t_star: expected a number in [0, 1], found {detector.t_star!r}")
+            raise _Violation(f"t_star: expected a number in [0, 1], found {detector.t_star!r}")
         detail += f", t* {detector.t_star:.3f}"
     return detail
 
@@ -244,11 +244,11 @@ def _check_raw_predictions(inputs: ContractInputs) -> str:
     detector = inputs.differentiable
     raw = detector(inputs.images)
     if not isinstance(raw, RawPredictions):
-        raise _ContractViolation(f"forward: expected a length and `select`, found {type(raw).__name__}")
+        raise _Violation(f"forward: expected a length and `select`, found {type(raw).__name__}")
     if len(raw) != len(inputs.images):
-        raise _ContractViolation(f"len(raw): expected {len(inputs.images)}, found {len(raw)}")
+        raise _Violation(f"len(raw): expected {len(inputs.images)}, found {len(raw)}")
     if len(raw.select(1)) != 1:
-        raise _ContractViolation(f"len(raw.select(1)): expected 1, found {len(raw.select(1))}")
+        raise _Violation(f"len(raw.select(1)): expected 1, found {len(raw.select(1))}")
     return type(raw).__name__
 
 
@@ -259,7 +259,7 @@ def _check_detections(inputs: ContractInputs) -> str:
     for images in (inputs.images, odd):
         found = predict(inputs.detector, images)
         if not isinstance(found, list) or len(found) != len(images):
-            raise _ContractViolation(f"decode: expected a list of {len(images)}, found {found!r}"[:200])
+            raise _Violation(f"decode: expected a list of {len(images)}, found {found!r}"[:200])
         for detections in found:
             _check_well_formed(detections, images.shape[2:], len(inputs.detector.classes))
             counts.append(len(detections))
@@ -270,35 +270,29 @@ def _check_detections(inputs: ContractInputs) -> str:
 
 def _check_well_formed(found: Detections, image_hw: Sequence[int], classes: int) -> None:
     if not isinstance(found, Detections):
-        raise _ContractViolation(f"decode: expected Detections, found {type(found).__name__}")
+        raise _Violation(f"decode: expected Detections, found {type(found).__name__}")
     placed, scores, labels = found.boxes_xyxy, found.scores, found.labels
     if placed.requires_grad or scores.requires_grad:
-        raise _ContractViolation("decode: expected no gradient, found one")
+        raise _Violation("decode: expected no gradient, found one")
     if labels.dtype != torch.int64:
-        raise _ContractViolation(f"labels: expected int64, found {labels.dtype}")
+        raise _Violation(f"labels: expected int64, found {labels.dtype}")
     if not bool(torch.isfinite(placed).all() & torch.isfinite(scores).all()):
-        raise _ContractViolation("boxes and scores: expected finite numbers, found others")
+        raise _Violation("boxes and scores: expected finite numbers, found others")
     if not len(found):
         return
     height, width = image_hw
     limit = placed.new_tensor([width, height, width, height]) - 1 + OUTSIDE_PX
     if bool((placed < -OUTSIDE_PX).any() | (placed > limit).any()):
         worst = placed[((placed < -OUTSIDE_PX) | (placed > limit)).any(1)][0]
-        raise _ContractViolation(
-            f"boxes: expected inside 0..{width - 1} x 0..{height - 1}, found {_format_box(worst)}"
-        )
+        raise _Violation(f"boxes: expected inside 0..{width - 1} x 0..{height - 1}, found {_format_box(worst)}")
     if bool((placed[:, 2:] < placed[:, :2]).any()):
-        raise _ContractViolation(f"boxes: expected left <= right, top <= bottom, found {_format_box(placed[0])}")
+        raise _Violation(f"boxes: expected left <= right, top <= bottom, found {_format_box(placed[0])}")
     if bool((scores < 0).any() | (scores > 1).any()):
-        raise _ContractViolation(
-            f"scores: expected in [0, 1], found {float(scores.min()):g} to {float(scores.max()):g}"
-        )
+        raise _Violation(f"scores: expected in [0, 1], found {float(scores.min()):g} to {float(scores.max()):g}")
     if bool((scores[1:] > scores[:-1]).any()):
-        raise _ContractViolation("scores: expected best first, found another order")
+        raise _Violation("scores: expected best first, found another order")
     if bool((labels < 0).any() | (labels >= classes).any()):
-        raise _ContractViolation(
-            f"labels: expected 0..{classes - 1}, found {int(labels.min())} to {int(labels.max())}"
-        )
+        raise _Violation(f"labels: expected 0..{classes - 1}, found {int(labels.min())} to {int(labels.max())}")
 
 
 def _check_injection(inputs: ContractInputs) -> str:
@@ -309,12 +303,10 @@ def _check_injection(inputs: ContractInputs) -> str:
     for found in detector.decode(raw):
         sure = found.scores > 0.5
         if int(sure.sum()) != 1:
-            raise _ContractViolation(
-                f"expected only the injected box, found {int(sure.sum())} with a score above 0.5"
-            )
+            raise _Violation(f"expected only the injected box, found {int(sure.sum())} with a score above 0.5")
         overlap = float(boxes.paired_iou(found.boxes_xyxy[sure], box[None].to(found.boxes_xyxy))[0])
         if int(found.labels[sure][0]) != label or overlap < SAME_BOX_IOU:
-            raise _ContractViolation(
+            raise _Violation(
                 f"expected class {label} at {_format_box(box)}, found {int(found.labels[sure][0])} at "
                 f"{_format_box(found.boxes_xyxy[sure][0])}"
             )
@@ -337,7 +329,7 @@ def _check_images_untouched(inputs: ContractInputs) -> str:
     before = inputs.images.clone()
     predict(inputs.detector, inputs.images)
     if not torch.equal(before, inputs.images):
-        raise _ContractViolation("forward: expected unchanged images, found changed ones")
+        raise _Violation("forward: expected unchanged images, found changed ones")
     return "images unchanged"
 
 
@@ -348,7 +340,7 @@ def _check_deterministic(inputs: ContractInputs) -> str:
             torch.equal(getattr(one, part), getattr(other, part)) for part in ("boxes_xyxy", "labels", "scores")
         )
         if not same:
-            raise _ContractViolation("two calls with the same images: expected identical detections")
+            raise _Violation("two calls with the same images: expected identical detections")
     return "identical"
 
 
@@ -357,7 +349,7 @@ def _check_batch(inputs: ContractInputs) -> str:
     alone = [predict(inputs.detector, image[None])[0] for image in inputs.images]
     differing = max(_share_differing(one, other) for one, other in zip(together, alone, strict=True))
     if differing > MAX_SHARE_DIFFERING:
-        raise _ContractViolation(f"a batch of two and single images: {differing:.0%} of the detections differ")
+        raise _Violation(f"a batch of two and single images: {differing:.0%} of the detections differ")
     detail = f"{1 - differing:.0%} of the detections as with single images"
     if not isinstance(inputs.detector, Detector):
         return detail
@@ -372,7 +364,7 @@ def _check_batch(inputs: ContractInputs) -> str:
         ]
     worst = max(abs(one - other) / max(abs(other), 1e-12) for one, other in pairs)
     if worst > SAME_LOSS:
-        raise _ContractViolation(f"objectness of raw.select(i): off by {worst:.1e} (relative)")
+        raise _Violation(f"objectness of raw.select(i): off by {worst:.1e} (relative)")
     return f"{detail}, objectness within {worst:.0e}"
 
 
@@ -401,10 +393,10 @@ def _check_frozen(inputs: ContractInputs) -> str:
     after = predict(inputs.detector, inputs.images)
     inputs.detector.eval()
     if max(_share_differing(one, other) for one, other in zip(before, after, strict=True)) > 0:
-        raise _ContractViolation("with all weights frozen, detections differ after train()")
+        raise _Violation("with all weights frozen, detections differ after train()")
     changed = [n for n, t in inputs.detector.state_dict().items() if not torch.equal(t, state[n])]
     if changed:
-        raise _ContractViolation(f"with all weights frozen, train() changed {changed[0]}")
+        raise _Violation(f"with all weights frozen, train() changed {changed[0]}")
     return "frozen, train() changes nothing"
 
 
@@ -426,7 +418,7 @@ def _check_loss(inputs: ContractInputs) -> str:
         detector.loss(raw, inputs.targets[:1])
     except ValueError:
         return ", ".join(f"{name} {float(term):.4g}" for name, term in terms.items())
-    raise _ContractViolation("loss of two images and one Targets: expected a ValueError")
+    raise _Violation("loss of two images and one Targets: expected a ValueError")
 
 
 def _check_candidates(inputs: ContractInputs) -> str:
@@ -449,7 +441,7 @@ def _check_candidates(inputs: ContractInputs) -> str:
                 scored = (candidates.log_scores[:, label].exp() - score).abs() <= SAME_SCORE
                 placed = torch.minimum(candidates.boxes_for_class(label)[scored].clamp_min(0), limit.to(box))
                 if not bool(((placed - box).abs() <= SAME_PX).all(1).any()):
-                    raise _ContractViolation(
+                    raise _Violation(
                         f"candidates: expected every detection among them, found none at {box.tolist()}"
                     )
             count += len(detections)
@@ -459,14 +451,12 @@ def _check_candidates(inputs: ContractInputs) -> str:
 def _check_terms(terms: Any, case: str) -> None:
     missing = [name for name in REQUIRED_TERMS if name not in terms]
     if missing:
-        raise _ContractViolation(f"loss: expected {' and '.join(REQUIRED_TERMS)}, found {', '.join(terms)}")
+        raise _Violation(f"loss: expected {' and '.join(REQUIRED_TERMS)}, found {', '.join(terms)}")
     for name, term in terms.items():
         if not isinstance(term, Tensor) or term.ndim:
-            raise _ContractViolation(
-                f"loss: {name}: expected a scalar tensor, found {tuple(getattr(term, 'shape', ()))}"
-            )
+            raise _Violation(f"loss: {name}: expected a scalar tensor, found {tuple(getattr(term, 'shape', ()))}")
         if not bool(torch.isfinite(term)):
-            raise _ContractViolation(f"loss: {name}: expected a finite number, found {float(term)} ({case})")
+            raise _Violation(f"loss: {name}: expected a finite number, found {float(term)} ({case})")
 
 
 def _check_gradient(inputs: ContractInputs) -> str:
@@ -476,9 +466,9 @@ def _check_gradient(inputs: ContractInputs) -> str:
     raw = detector(live)
     (gradient,) = torch.autograd.grad(detector.loss(raw, target)["objectness"], live)
     if not bool(torch.isfinite(gradient).all()):
-        raise _ContractViolation("gradient of objectness to the image: expected finite numbers, found others")
+        raise _Violation("gradient of objectness to the image: expected finite numbers, found others")
     if not bool((gradient != 0).any()):
-        raise _ContractViolation("gradient of objectness to the image: expected one, found zero everywhere")
+        raise _Violation("gradient of objectness to the image: expected one, found zero everywhere")
 
     def value(picture: Tensor) -> float:
         return float(detector.loss(detector(picture), target)["objectness"])
@@ -499,7 +489,7 @@ def _check_gradient(inputs: ContractInputs) -> str:
     name = str(dtype).removeprefix("torch.")
     detail = f"error {best:.1e} against differences in {name} (step {best_step:g}, limit {TOLERANCES[dtype]:g})"
     if not best <= TOLERANCES[dtype]:
-        raise _ContractViolation(f"gradient of objectness to the image: {detail}")
+        raise _Violation(f"gradient of objectness to the image: {detail}")
     return detail
 
 
@@ -549,7 +539,7 @@ def _find_descent(name: str, before: float, gradient: Tensor, value: Callable[[f
     """Test that some step against the gradient lowers a loss, from large steps to small."""
     length = float(gradient.double().norm())
     if not length:
-        raise _ContractViolation(f"{name}: expected a gradient, found zero")
+        raise _Violation(f"{name}: expected a gradient, found zero")
     least = _MIN_DROP * torch.finfo(gradient.dtype).eps
     # Start with the step that would take a linear loss to zero, limited in size, then halve.
     step = min(abs(before) / length**2, _MAX_STEP * math.sqrt(gradient.numel()) / length)
@@ -558,7 +548,7 @@ def _find_descent(name: str, before: float, gradient: Tensor, value: Callable[[f
         if before - after > least * abs(before):
             return f"{name} falls from {before:.6g} to {after:.6g} along its gradient"
         step /= 2
-    raise _ContractViolation(f"{name}: no step along its gradient lowers it from {before:.6g}")
+    raise _Violation(f"{name}: no step along its gradient lowers it from {before:.6g}")
 
 
 def _in_float64(detector: Detector, images: Tensor) -> tuple[Detector, torch.dtype]:

@@ -22,15 +22,9 @@ from detectors.base import AnchorPredictions, Candidates, Detector, DetectorStag
 from detectors.types import CLASSES, Detections, Targets
 
 ANCHOR_SIZES_WH = (
-    (36.0, 37.0),
-    (366.0, 174.0),
-    (115.0, 59.0),
-    (162.0, 87.0),
-    (38.0, 90.0),
-    (258.0, 173.0),
-    (224.0, 108.0),
-    (78.0, 170.0),
-    (72.0, 43.0),
+    *((36.0, 37.0), (366.0, 174.0), (115.0, 59.0)),
+    *((162.0, 87.0), (38.0, 90.0), (258.0, 173.0)),
+    *((224.0, 108.0), (78.0, 170.0), (72.0, 43.0)),
 )
 """Anchor shapes in pixels: config/kitti_squeezeDet_config.py of the published code."""
 
@@ -66,21 +60,15 @@ class SqueezeDetLayout:
     """Fires followed by 3x3/2 max pooling, as is conv1."""
 
 
+def _name_fires(*channels: tuple[int, int]) -> dict[str, tuple[int, int]]:
+    """Channels by name, from fire2 on; each entry applies to two Fires."""
+    return {f"fire{i}": channels[i // 2 - 1] for i in range(2, 2 * len(channels) + 2)}
+
+
 _LAYOUT = SqueezeDetLayout(
     kernel=3,
     channels=64,
-    fires={
-        "fire2": (16, 64),
-        "fire3": (16, 64),
-        "fire4": (32, 128),
-        "fire5": (32, 128),
-        "fire6": (48, 192),
-        "fire7": (48, 192),
-        "fire8": (64, 256),
-        "fire9": (64, 256),
-        "fire10": (96, 384),
-        "fire11": (96, 384),
-    },
+    fires=_name_fires((16, 64), (32, 128), (48, 192), (64, 256), (96, 384)),
     pooled=("fire3", "fire5"),
 )
 """nets/squeezeDet.py of the published code."""
@@ -88,18 +76,7 @@ _LAYOUT = SqueezeDetLayout(
 _LAYOUT_PLUS = SqueezeDetLayout(
     kernel=7,
     channels=96,
-    fires={
-        "fire2": (96, 64),
-        "fire3": (96, 64),
-        "fire4": (192, 128),
-        "fire5": (192, 128),
-        "fire6": (288, 192),
-        "fire7": (288, 192),
-        "fire8": (384, 256),
-        "fire9": (384, 256),
-        "fire10": (384, 256),
-        "fire11": (384, 256),
-    },
+    fires=_name_fires((96, 64), (192, 128), (288, 192), (384, 256), (384, 256)),
     pooled=("fire4", "fire8"),
 )
 """nets/squeezeDetPlus.py of the published code."""
@@ -243,7 +220,7 @@ class SqueezeDet(Detector):
         if images.ndim != 4 or images.shape[1] != 3:
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
         height, width = int(images.shape[2]), int(images.shape[3])
-        if not self.training and not any(parameter.requires_grad for parameter in self.parameters()):
+        if self.is_frozen:
             coarse = torch.is_grad_enabled() and images.requires_grad
             return self._interpret(self._frozen_layers(coarse)(images), (height, width))
         mean = images.new_tensor(BGR_MEAN).view(1, 3, 1, 1)
@@ -258,7 +235,7 @@ class SqueezeDet(Detector):
     @torch.no_grad()
     def forward_for_search(self, images: Tensor) -> AnchorPredictions:
         """As `Detector.forward_for_search`, in `gradient_precision`."""
-        if self.training or any(parameter.requires_grad for parameter in self.parameters()):
+        if not self.is_frozen:
             return self(images)
         return self._interpret(
             self._frozen_layers(coarse=True)(images), (int(images.shape[2]), int(images.shape[3]))

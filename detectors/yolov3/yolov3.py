@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from detectors import boxes
 from detectors.base import AnchorPredictions, Candidates, Detector, DetectorStages
+from detectors.grid import MEETING_IOU, covered_by_ignored
 from detectors.types import CLASSES, Detections, Targets
 from detectors.yolov3 import layouts
 from detectors.yolov3.cfg import DarknetCfg
@@ -27,10 +28,6 @@ GREY = 0.5
 """Darknet's padding."""
 MAX_LOG_SIZE = 6.0
 """Boxes are at most e^6 = 400 times their anchor: untrained ones cannot overflow."""
-MEETING_IOU = 0.5
-"""IoU at which a predicted box matches an object, as in the evaluation."""
-IGNORE_OVERLAP = 0.5
-"""An anchor covered by an ignored region by more than this share need not be silent."""
 SCORE_MINIMUM = 0.005
 NMS_IOU = 0.45
 """Decoding for evaluation (published code: `validate_detector`)."""
@@ -150,17 +147,14 @@ class YoloV3(Detector):
             raise ValueError(f"images: expected shape (B, 3, H, W), found {tuple(images.shape)}")
         height, width = int(images.shape[2]), int(images.shape[3])
         stride = self.cfg.stride
-        if not self._is_frozen():
+        if not self.is_frozen:
             return self._interpret(self.network(_padded(images, stride)), (height, width))
         return self._forward_frozen(images, torch.is_grad_enabled() and images.requires_grad)
 
     @torch.no_grad()
     def forward_for_search(self, images: Tensor) -> AnchorPredictions:
         """As `Detector.forward_for_search`, in `gradient_precision`."""
-        return self._forward_frozen(images, coarse=True) if self._is_frozen() else self(images)
-
-    def _is_frozen(self) -> bool:
-        return not self.training and not any(p.requires_grad for p in self.network.parameters())
+        return self._forward_frozen(images, coarse=True) if self.is_frozen else self(images)
 
     def _forward_frozen(self, images: Tensor, coarse: bool) -> AnchorPredictions:
         """With folded convolutions. coarse: in the precision of gradients."""
@@ -268,7 +262,10 @@ class YoloV3(Detector):
                 negative[b] = overlap.max(0).values <= thresholds
                 matches_any[b] = (overlap >= MEETING_IOU).any(0)
             if len(regions):
-                negative[b] &= ~(_covered(_anchor_boxes(places), regions) | _covered(raw.boxes_xyxy[b], regions))
+                negative[b] &= ~(
+                    covered_by_ignored(_anchor_boxes(places), regions)
+                    | covered_by_ignored(raw.boxes_xyxy[b], regions)
+                )
             rows, columns = self._matches(wanted, raw.image_hw, places)
             image += [b] * len(rows)
             anchor += columns
@@ -476,12 +473,6 @@ def _anchor_boxes(places: AnchorPlacement) -> Tensor:
     """Anchors (A, 4) px around the middle of their cells."""
     centre = places.cells_xy + places.strides[:, None] / 2 - 0.5
     return torch.cat((centre - places.anchors_wh / 2, centre + places.anchors_wh / 2), -1)
-
-
-def _covered(candidates_xyxy: Tensor, regions_xyxy: Tensor) -> Tensor:
-    """(N,) bool: whether a region covers more than IGNORE_OVERLAP of a candidate."""
-    shared = boxes.intersection_matrix(regions_xyxy, candidates_xyxy)
-    return (shared > IGNORE_OVERLAP * boxes.area(candidates_xyxy)).any(0)
 
 
 def _centre_and_size(boxes_xyxy: Tensor) -> tuple[Tensor, Tensor]:

@@ -52,48 +52,24 @@ def make_raw(parts: dict[str, Tensor], height: int, width: int) -> AnchorPredict
     return AnchorPredictions(**parts, image_hw=(height, width))
 
 
-def test_parameter_count_is_the_published_one() -> None:
-    # Each line (in * k * k + 1) * out. Fire: squeeze, expand 1x1, expand 3x3.
-    conv1 = (3 * 9 + 1) * 64
-    fires = 0
-    for inputs, squeeze, expand in [
-        (64, 16, 64),
-        (128, 16, 64),
-        (128, 32, 128),
-        (256, 32, 128),
-        (256, 48, 192),
-        (384, 48, 192),
-        (384, 64, 256),
-        (512, 64, 256),
-        (512, 96, 384),
-        (768, 96, 384),
-    ]:
-        fires += (inputs + 1) * squeeze + (squeeze + 1) * expand + (squeeze * 9 + 1) * expand
-    convdet = (768 * 9 + 1) * 9 * (3 + 1 + 4)
-    assert conv1 + fires + convdet == 2_082_120  # 7.9 MiB of float32, as the paper says
-    assert sum(p.numel() for p in fresh().parameters()) == 2_082_120
-
-
-def test_parameter_count_of_squeezedet_plus_is_the_published_one() -> None:
-    conv1 = (3 * 49 + 1) * 96
-    fires = 0
-    for inputs, squeeze, expand in [
-        (96, 96, 64),
-        (128, 96, 64),
-        (128, 192, 128),
-        (256, 192, 128),
-        (256, 288, 192),
-        (384, 288, 192),
-        (384, 384, 256),
-        (512, 384, 256),
-        (512, 384, 256),
-        (512, 384, 256),
-    ]:
-        fires += (inputs + 1) * squeeze + (squeeze + 1) * expand + (squeeze * 9 + 1) * expand
-    convdet = (512 * 9 + 1) * 9 * (3 + 1 + 4)
-    assert conv1 + fires + convdet == 7_021_640  # 26.8 MiB of float32, as the paper says
-    plus = SqueezeDetPlus(classes=("Car", "Pedestrian", "Cyclist"))
-    assert sum(p.numel() for p in plus.parameters()) == 7_021_640
+@pytest.mark.parametrize(
+    ("kind", "kernel", "channels", "fires", "published"),
+    [  # 7.9 and 26.8 MiB of float32, as in the paper
+        (SqueezeDet, 3, 64, ((16, 64), (32, 128), (48, 192), (64, 256), (96, 384)), 2_082_120),
+        (SqueezeDetPlus, 7, 96, ((96, 64), (192, 128), (288, 192), (384, 256), (384, 256)), 7_021_640),
+    ],
+)
+def test_parameter_count_is_the_published_one(
+    kind: type[SqueezeDet], kernel: int, channels: int, fires: tuple[tuple[int, int], ...], published: int
+) -> None:
+    # A layer has (in * k * k + 1) * out parameters; a Fire is a squeeze, expand 1x1 and expand 3x3.
+    count = (3 * kernel**2 + 1) * channels
+    for squeeze, expand in (fire for fire in fires for _ in range(2)):
+        count += (channels + 1) * squeeze + (squeeze + 1) * expand + (squeeze * 9 + 1) * expand
+        channels = 2 * expand
+    count += (channels * 9 + 1) * 9 * (3 + 1 + 4)
+    detector = kind(classes=("Car", "Pedestrian", "Cyclist"))
+    assert count == published == sum(p.numel() for p in detector.parameters())
 
 
 def test_anchors_are_the_published_ones() -> None:
