@@ -8,14 +8,14 @@ import torch
 import drivesem as ds
 from drivesem.attack.budgets import PRESETS
 from drivesem.attack.changes import (
-    Change,
-    Changes,
-    _labelled,
-    affordable,
+    VehicleChange,
+    VehicleChangeSettings,
+    _with_moved_labels,
+    count_affordable_proposals,
     load_vehicle_mesh,
     parse_vehicle_changes,
-    passes_of,
-    proposals,
+    proposal_passes,
+    propose_scenes,
 )
 from drivesem.attack.feasibility_check import check_exchange, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
@@ -51,7 +51,7 @@ def labels_of(changed: SceneIR):
 
 @pytest.fixture(scope="module")
 def proposed(scene: SceneIR) -> list[SceneIR]:
-    return proposals(scene, Changes(tuple(Change)), 4, 7)
+    return propose_scenes(scene, VehicleChangeSettings(tuple(VehicleChange)), 4, 7)
 
 
 def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR]) -> None:
@@ -69,13 +69,13 @@ def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR
 
 @pytest.mark.slow
 def test_what_cannot_be_is_not_proposed(scene: SceneIR) -> None:
-    found = proposals(scene, Changes((Change.PARK,)), 6, 3)
+    found = propose_scenes(scene, VehicleChangeSettings((VehicleChange.PARK,)), 6, 3)
     assert found
     assert not [line for made in found for line in check_exchange(made)]
 
 
 def test_the_same_seed_proposes_the_same(scene: SceneIR, proposed: list[SceneIR]) -> None:
-    again = proposals(scene, Changes(tuple(Change)), 4, 7)
+    again = propose_scenes(scene, VehicleChangeSettings(tuple(VehicleChange)), 4, 7)
     for one, other in zip(proposed, again, strict=True):
         assert one.provenance == other.provenance
         assert torch.equal(one.objects.translation, other.objects.translation)
@@ -164,7 +164,7 @@ def test_labels_say_how_much_shows_of_one_more(column: float, level: int) -> Non
     x, z = (column - middle) / across * 12, 12.0
     y = -(ground[3] + ground[0] * x + ground[2] * z) / ground[1]
     vehicle = Vehicle(template("sedan"), Category.CAR, torch.tensor([x, y, z]), torch.tensor(1.57), SIZE)
-    made = _labelled(add_vehicle(scene, vehicle), None)
+    made = _with_moved_labels(add_vehicle(scene, vehicle), None)
     expected = 0.0 if column == 600 else 0.57
     assert float(made.objects.truncation[-1]) == pytest.approx(expected, abs=0.03)
     assert int(made.objects.occlusion[-1]) == level
@@ -172,7 +172,7 @@ def test_labels_say_how_much_shows_of_one_more(column: float, level: int) -> Non
 
 @pytest.mark.parametrize(("frame", "seed"), [(8, 0), (1, 1)])
 def test_a_place_beside_the_picture_is_passed_over(frame: int, seed: int) -> None:
-    made = proposals(demo_scene(0, frame), Changes((Change.PARK,)), 6, seed)
+    made = propose_scenes(demo_scene(0, frame), VehicleChangeSettings((VehicleChange.PARK,)), 6, seed)
     assert made
     for one in made:
         x0, y0, x1, y1 = one.objects.box2d[-1].tolist()
@@ -197,11 +197,11 @@ def test_what_cannot_be_is_said(scene: SceneIR, shift: tuple[float, float, float
 
 
 def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
-    assert [affordable(passes) for passes in (24, 29, 30, 36, 90, 1000)] == [0, 0, 1, 2, 6, 6]
+    assert [count_affordable_proposals(passes) for passes in (24, 29, 30, 36, 90, 1000)] == [0, 0, 1, 2, 6, 6]
     for passes in range(24, 200):
-        count = affordable(passes)
-        assert passes - passes_of(count) >= 24
-        assert passes_of(count) <= 0.25 * passes
+        count = count_affordable_proposals(passes)
+        assert passes - proposal_passes(count) >= 24
+        assert proposal_passes(count) <= 0.25 * passes
 
 
 @pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])
@@ -211,7 +211,7 @@ def test_what_is_no_change_is_named(text: str) -> None:
 
 
 def test_changes_by_name() -> None:
-    assert parse_vehicle_changes("swap, leave") == (Change.LEAVE, Change.SWAP)
+    assert parse_vehicle_changes("swap, leave") == (VehicleChange.LEAVE, VehicleChange.SWAP)
 
 
 def test_a_mesh_of_ones_own_parks_and_must_be_as_large_as_a_vehicle(scene: SceneIR, tmp_path: Path) -> None:
@@ -225,6 +225,6 @@ def test_a_mesh_of_ones_own_parks_and_must_be_as_large_as_a_vehicle(scene: Scene
     lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {' '.join(map(str, q))}" for q in quads]
     obj.write_text("\n".join(lines))
     own = load_vehicle_mesh(str(obj))
-    made = proposals(scene, Changes((Change.PARK,), own), 1, 0)
+    made = propose_scenes(scene, VehicleChangeSettings((VehicleChange.PARK,), own), 1, 0)
     assert made[0].meshes[-1].name == "block"
     assert made[0].objects.size_lhw[-1].tolist() == pytest.approx([4.0, 1.5, 1.8])

@@ -179,9 +179,7 @@ class PlainProjection:
         mesh, low, high = self.block(theta, Parameter.MESH), self.limits.strain[0], self.limits.strain[1]
         wrong = []
         for code, source, at_rest in zip(mesh, self.space.scene.objects.ffd, self.strain0, strict=True):
-            least, most, volume, lowest = _strain(
-                source.double() + ffd.from_symmetric(code.double())
-            )
+            least, most, volume, lowest = _strain(source.double() + ffd.from_symmetric(code.double()))
             wrong.append(
                 least < min(low, at_rest[0]) - SLACK
                 or most > max(high, at_rest[1]) + SLACK

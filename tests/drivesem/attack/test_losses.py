@@ -47,7 +47,9 @@ SEEN = candidates(
 
 
 def test_hide_counts_the_best_score_that_meets_each_object():
-    assert of("hide", SEEN, truth()) == pytest.approx(-logit(0.95) + losses.MAX_MARGIN + losses.MAX_MARGIN, abs=1e-5)
+    assert of("hide", SEEN, truth()) == pytest.approx(
+        -logit(0.95) + losses.MAX_MARGIN + losses.MAX_MARGIN, abs=1e-5
+    )
     assert of("hide", SEEN, truth((False, True, True))) == pytest.approx(-logit(0.95), abs=1e-5)
     assert of("hide", SEEN, truth((True, True, True))) == 0
 
@@ -72,7 +74,9 @@ def test_phantom_is_the_mean_of_the_best_false_alarms():
     assert cars == pytest.approx(expected / 2, abs=1e-5)
     # Of the other classes every candidate is silent, so of all of them eight count.
     rest = losses.MAX_PHANTOMS - 2
-    assert of("phantom", SEEN, truth()) == pytest.approx((expected + rest * logit(1e-9)) / losses.MAX_PHANTOMS, rel=1e-3)
+    assert of("phantom", SEEN, truth()) == pytest.approx(
+        (expected + rest * logit(1e-9)) / losses.MAX_PHANTOMS, rel=1e-3
+    )
 
 
 def test_what_lies_on_an_ignored_object_of_its_class_is_no_phantom():

@@ -8,7 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.visibility import FLARE, MIN_CONTRAST, VisibilityUnderWeather, contrast_between, compute_contrasts, luminance
+from drivesem.attack.visibility import (
+    FLARE,
+    MIN_CONTRAST,
+    VisibilityUnderWeather,
+    compute_contrasts,
+    contrast_between,
+    luminance,
+)
 from scene_ir.render.environment import apply_weather
 from scene_ir.types import Crop, Environment, Render
 
@@ -76,7 +83,9 @@ def test_who_is_seen(car, road, windows, seen):
 
 def test_an_object_that_shows_nowhere_has_none():
     render = _seen(0.1, 0.5)
-    assert compute_contrasts(Render(render.image, render.depth, render.object_id * 0, render.opacity)).tolist() == [0.0]
+    assert compute_contrasts(
+        Render(render.image, render.depth, render.object_id * 0, render.opacity)
+    ).tolist() == [0.0]
     assert contrast_between(np.array([0.5]), np.array([])) == 0.0
 
 
@@ -149,4 +158,6 @@ def test_who_is_faint_from_the_start_may_stay_so():
 def test_contrast_is_of_the_picture_as_written():
     render = _seen(0.5 + 0.4 / 255, 0.5)
     assert compute_contrasts(render)[0] == 0.0
-    assert math.isclose(compute_contrasts(_seen(0.6, 0.5))[0], compute_contrasts(_seen(round(0.6 * 255) / 255, 0.5))[0])
+    assert math.isclose(
+        compute_contrasts(_seen(0.6, 0.5))[0], compute_contrasts(_seen(round(0.6 * 255) / 255, 0.5))[0]
+    )

@@ -10,7 +10,7 @@ import pytest
 
 import drivesem as ds
 from drivesem.cli import main
-from drivesem.run import frame as run_frame
+from drivesem.run import attack as run_attack
 from drivesem.run.results import FrameResult, load_frame
 from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene
@@ -31,7 +31,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folders = {kind: tmp_path_factory.mktemp(kind) / "run" for kind in ("leave", "park")}
     worse = count(0, -1)
     with pytest.MonkeyPatch.context() as patch:  # the last one tried is kept, whatever it is worth
-        patch.setattr(run_frame, "margin_objective", lambda *_: next(worse))
+        patch.setattr(run_attack, "margin_objective", lambda *_: next(worse))
         return {kind: (folder, attacked(folder, kind)) for kind, folder in folders.items()}
 
 
@@ -68,7 +68,7 @@ def test_a_run_can_be_asked(runs: Runs, kind: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_same_from_python(monkeypatch: pytest.MonkeyPatch) -> None:
     worse = count(0, -1)
-    monkeypatch.setattr(run_frame, "margin_objective", lambda *_: next(worse))
+    monkeypatch.setattr(run_attack, "margin_objective", lambda *_: next(worse))
     found = ds.run_attack(
         ds.demo_scene(0), method="climb", budget="street", params="translate", passes=PASSES, changes="park",
         confirm=False,

@@ -71,7 +71,7 @@ class SlopeViews:
 
     def __init__(self, world: Slope) -> None:
         self.world = world
-        self.judged, self.differentiable, self.passes = torch.tensor([True]), True, 0
+        self.counted_objects, self.differentiable, self.passes = torch.tensor([True]), True, 0
 
     def margins(self, theta: Tensor, number: int) -> Tensor:
         self.passes += 1

@@ -25,7 +25,7 @@ class Street:
     """
 
     ripple: float = 0.0
-    judged: Tensor = field(default_factory=lambda: torch.ones(CARS, dtype=torch.bool))
+    counted_objects: Tensor = field(default_factory=lambda: torch.ones(CARS, dtype=torch.bool))
     differentiable: bool = True
     passes: int = 0
 

@@ -98,14 +98,14 @@ def test_objects_that_do_not_count_are_no_aim() -> None:
             margins = super().known_margins(theta, number)
             return torch.where(torch.arange(CARS) == 1, torch.inf, margins)
 
-    street = Hidden(judged=torch.tensor([True, False, True, True]))
+    street = Hidden(counted_objects=torch.tensor([True, False, True, True]))
     result = Climb(PASSES)(street.problem(), torch.zeros(DIM), 0)
     assert bool(torch.isfinite(result.theta).all())
     assert (street.known_margins(result.theta, 0)[[0, 2, 3]] < 0).all()
 
 
 def test_nothing_to_lose() -> None:
-    street = Street(judged=torch.zeros(CARS, dtype=torch.bool))
+    street = Street(counted_objects=torch.zeros(CARS, dtype=torch.bool))
     result = Climb(PASSES)(street.problem(), torch.zeros(DIM), 0)
     assert street.passes == 0
     assert not bool(result.theta.any())
@@ -133,4 +133,4 @@ def test_what_cannot_be() -> None:
     with pytest.raises(RangeError, match="passes"):
         Climb(LEAST_PASSES - 1)
     with pytest.raises(RangeError, match="views"):
-        Climb()(replace(Street().problem(), views=None), torch.zeros(DIM), 0)
+        Climb()(replace(Street().problem(), margin_oracle=None), torch.zeros(DIM), 0)

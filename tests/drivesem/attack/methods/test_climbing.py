@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import MAX_RESCORED, Attack, ParameterGroup, Problem, Proposals, Score
-from drivesem.attack.methods.fgsm import FGSM
 from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
 from drivesem.attack.methods.scw import SCW
 from drivesem.attack.theta import ProjectedTheta

@@ -94,7 +94,7 @@ def test_corners_are_projected_like_all_that_is_proposed() -> None:
 
 
 def test_nothing_to_lose() -> None:
-    street = Street(judged=torch.zeros(CARS, dtype=torch.bool))
+    street = Street(counted_objects=torch.zeros(CARS, dtype=torch.bool))
     result = Corners()(street.problem(), torch.zeros(DIM), 0)
     assert street.passes == 0
     assert not bool(result.theta.any())
@@ -104,4 +104,4 @@ def test_what_cannot_be() -> None:
     with pytest.raises(RangeError, match="passes"):
         Corners(LEAST_PASSES - 1)
     with pytest.raises(RangeError, match="views"):
-        Corners()(replace(Street().problem(), views=None), torch.zeros(DIM), 0)
+        Corners()(replace(Street().problem(), margin_oracle=None), torch.zeros(DIM), 0)
