@@ -51,7 +51,7 @@ def npz(member: bytes, declared: int | None = None) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "declared"),
     [
         ("[" * 200_000, "nested too deep"),
         ('{"a":' * 200_000, "nested too deep"),
@@ -80,7 +80,7 @@ BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("a
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "declared"),
     [
         ("[" * 20_000, "nested too deep"),
         ("a: " + "9" * 5000, "an integer of 5000 digits, too large for 64 bits"),
@@ -134,7 +134,7 @@ def test_a_picture_that_declares_a_huge_size(tmp_path: Path, size: tuple[int, in
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "declared"),
     [
         (npz(npy("(1000000000000,)")), r"an array of shape \(1000000000000,\) and float32 in 0 bytes"),
         (npz(npy("(-1,)")), r"shape \(-1,\)"),
@@ -202,7 +202,7 @@ def test_names_stay_in_their_folder(tmp_path: Path) -> None:
         assert files.resolve_inside(folder, name) == folder / name
 
 
-@pytest.mark.parametrize(("place", "value", "said"), [(6, 1, "password"), (8, 97, "compression")])
+@pytest.mark.parametrize(("place", "value", "declared"), [(6, 1, "password"), (8, 97, "compression")])
 def test_an_archive_that_cannot_be_unpacked(tmp_path: Path, place: int, value: int, declared: str) -> None:
     """A member that is encrypted, or packed in a way that nobody knows, by its headers."""
     path = tmp_path / "a.npz"
