@@ -161,7 +161,7 @@ def load_trusted_config(run: Path, trust: bool, setting: str = "--run") -> Attac
         UsageError: The folder holds no run, a file has changed, or code is not trusted.
     """
     attack = load_attack_config(run, setting)
-    for setting in ("detector", "peer", "witness"):
+    for setting in ("detector", "second_detector", "reference_detector"):
         code = find_code_to_run(getattr(attack, setting) or "")
         if code is not None and not trust:
             expected = f"a detector that is data alone, or --trust, which lets this run the code in {code}"
