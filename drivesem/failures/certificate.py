@@ -52,7 +52,7 @@ class CertificateRule:
 
     def __post_init__(self) -> None:
         if self.draws < MIN_DRAWS:
-            raise RangeError("draws", f"at least {MIN_DRAWS}, which a certificate needs", self.draws)
+            raise RangeError("draws", f"at least {MIN_DRAWS}, which a certificate's rule needs", self.draws)
 
     @property
     def before(self) -> int:

@@ -71,7 +71,9 @@ def place_margins(
         (K,) logits, at most -`MIN_MARGIN`.
     """
     logits = log_score_logits(candidates.log_scores.T.flatten())
-    candidate_boxes = torch.cat([candidates.boxes_for_class(label) for label in range(candidates.log_scores.shape[1])])
+    candidate_boxes = torch.cat(
+        [candidates.boxes_for_class(label) for label in range(candidates.log_scores.shape[1])]
+    )
     ious = boxes.iou_matrix(places_xyxy.to(candidate_boxes), candidate_boxes)
     margins = [-_best_margin(logits, row, SAME_PLACE_IOU, t_star, sharpness) for row in ious]
     return torch.stack(margins) if margins else candidates.log_scores[:0, 0]

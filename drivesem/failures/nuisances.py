@@ -39,8 +39,7 @@ long."""
 
 @dataclass(frozen=True, slots=True)
 class Nuisances:
-    """Ranges of the nuisances; 0 switches one off. The first seven belong to the camera, the others to the scene.
-    """
+    """Ranges of the nuisances; 0 switches one off. The first seven belong to the camera, the others to the scene."""
 
     shift_px: float = 15.0
     """Largest shift of the frame either way along both axes."""

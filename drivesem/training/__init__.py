@@ -1,1 +1,1 @@
-"""What training needs beyond detectors.training: frames, what is judged, weights kept, curves, the model card."""
+"""Training of detectors: data, losses, the training loop, checkpoints and model cards."""

@@ -1,4 +1,7 @@
-"""The model card: what a weights file is, what it was made from, how good it is, and how to make it again."""
+"""Model cards: what weights are, what they were trained on, how good they are, and how to train them again.
+
+Also the training curves, and the check whether frames to evaluate on belong to the data that a card names.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,9 @@ from drivesem.report.terminal import Console
 from drivesem.training.frames import TRAINING_LIMITS
 from scene_ir import files
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _CARD = """# {title}
 
 - Architecture: {name}, {parameters:,} parameters; classes {classes}.
@@ -31,9 +37,9 @@ _CARD = """# {title}
   Vans count as Car. Objects lower than {minimum:g} px or of unknown occlusion were ignored.
 - Training: {step:,} steps of {batch} views, {minutes:.0f} minutes on {machine}, seed {seed}.{note}
 
-## Figures
+## Metrics
 
-{figures}
+{metrics}
 ## Limits
 
 Small, hidden, or unusual objects are missed more often, and so is what looks unlike the frames it was trained on.
@@ -50,19 +56,22 @@ Not for use in a vehicle.
 
 @dataclass(frozen=True)
 class ValidationScores:
-    """COCO's figures, and the best F1 over all classes with its score."""
+    """COCO's metrics on held-out frames, and the best F1 over all classes."""
 
     scores: CocoScores
+    """COCO's metrics."""
     f1: float
+    """Best F1."""
     t_star: float
+    """Score of the best F1."""
 
     @property
     def selection_score(self) -> float:
-        """What weights are chosen by: the headline's AP50, and a quarter of the mean over classes."""
+        """The criterion for the best weights: the headline's AP50, plus a quarter of the mean over classes."""
         return (self.scores.headline.ap50 or 0.0) + 0.25 * (self.scores.overall.ap50 or 0.0)
 
     def summary(self) -> str:
-        """One line."""
+        """Format the metrics on one line."""
         rows = [
             f"{name} AP50 {s.ap50:.4f} recall {s.recall:.4f} ({s.objects})"
             for name, s in self.scores.per_class.items()
@@ -73,20 +82,28 @@ class ValidationScores:
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a card says besides figures. data: a sentence on the frames; start: one on the first weights; machine:
-    what it was trained on; commands: lines that train it again; also: a phrase for further frames.
-    """
+    """What a card states besides metrics."""
 
     data: str
+    """Sentence on the frames."""
     start: str
+    """Sentence on the first weights."""
     batch: int
+    """Views per step."""
     seed: int
+    """Seed of the training."""
     machine: str
+    """What it was trained on."""
     commands: tuple[str, ...]
+    """Commands that train it again."""
     by_clock: bool
+    """Whether the schedule follows the clock."""
     note: str = ""
+    """Remark."""
     also: str = "further frames"
+    """Phrase for the further frames."""
     judged: Difficulty = field(default_factory=Difficulty)
+    """Limits of the evaluated objects."""
 
 
 def format_card(
@@ -98,8 +115,16 @@ def format_card(
     also: tuple[int, ClassScores] | None,
     chosen_on: int | None = None,
 ) -> str:
-    """The card as Markdown. weights: their file, written; done: steps and seconds; held_out, also: how many
-    frames, and their figures; chosen_on: how many others chose step and t*, None where those of held_out did.
+    """Format the card as Markdown.
+
+    Args:
+        detector: The trained detector.
+        recipe: Facts of the training.
+        weights: File of the weights, already written.
+        done: Steps and seconds of the training.
+        held_out: Number of held-out frames and their metrics.
+        also: Number of further frames and their metrics.
+        chosen_on: Number of other frames that selected step and t*; None where the held-out ones did.
     """
     step, seconds = done
     return _CARD.format(
@@ -118,7 +143,7 @@ def format_card(
         machine=recipe.machine,
         seed=recipe.seed,
         note=f"\n  {recipe.note}" if recipe.note else "",
-        figures=_figures(recipe, held_out, also, chosen_on),
+        metrics=_format_metrics(recipe, held_out, also, chosen_on),
         commands="\n".join(recipe.commands),
         repeatable=(
             "The schedule follows the clock, so another run gives other weights of the same quality, not the same "
@@ -129,7 +154,7 @@ def format_card(
     )
 
 
-def _figures(
+def _format_metrics(
     recipe: CardFacts,
     held_out: tuple[int, ValidationScores] | None,
     also: tuple[int, ClassScores] | None,
@@ -140,7 +165,7 @@ def _figures(
     frames, marks = held_out
     judged = recipe.judged
     lines = [
-        f"{frames} held-out frames, judged at least {judged.min_height_px:g} px high, occlusion at most "
+        f"{frames} held-out frames, evaluated from {judged.min_height_px:g} px high, occlusion at most "
         f"{judged.max_occlusion}, truncation at most",
         f"{judged.max_truncation:g} (others are ignored), IoU 0.5:",
         "",
@@ -153,35 +178,35 @@ def _figures(
         if s.objects
     ]
     best = f"t* = {marks.t_star:.3f}: the score of best F1 ({marks.f1:.3f}) over all classes on"
-    told = [f"{best} these frames. The step was chosen on", "them too, so their figures are slightly optimistic."]
+    selection = [
+        f"{best} these frames. The step was selected on",
+        "them too, so metrics are slightly optimistic.",
+    ]
     if chosen_on is not None:
-        told = [f"{best} {chosen_on} further frames,", "which chose the step too: these had no say."]
-    lines += ["", *told, ""]
+        selection = [f"{best} {chosen_on} further frames,", "which selected the step too: these played no part."]
+    lines += ["", *selection, ""]
     if also is not None and also[1].objects:
         count, s = also
         lines += [
-            f"{count} {recipe.also}, never trained or tuned on, judged in the same way: Car AP50 "
+            f"{count} {recipe.also}, never trained or tuned on, evaluated in the same way: Car AP50 "
             f"{s.ap50:.3f}, recall {s.recall:.3f} ({s.objects} cars).",
             "",
         ]
     return "\n".join(lines)
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 _SIZE_IN, _DPI = (7.0, 7.4), 130
 _SMOOTHED_OVER = 0.02
-"""Share of the run over which the thick line averages."""
+"""Share of the run that the thick line averages over."""
 _FACTS = ("step", "seconds", "rate", "norm")
-"""Columns of the log that are no terms of the loss."""
+"""Columns of the log that are not terms of the loss."""
 _MOST_DIGITS = 2
 EVALUATED = ("car_ap50", "car_recall", "ap50", "f1")
-"""Columns of evaluations that are drawn."""
+"""Columns of the evaluations that are plotted."""
 
 
 def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """A CSV of numbers by column, float64; empty fields are NaN. Nothing where there is no such file."""
+    """Read a CSV of numbers by column; empty fields are NaN. Empty where there is no such file."""
     if not path.is_file():
         return {}
     with path.open(newline="") as file:
@@ -191,7 +216,7 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def moving_average(values: Sequence[float] | np.ndarray, over: int) -> np.ndarray:
-    """Means over `over` values around each; fewer at the ends."""
+    """Moving average over `over` values, fewer at the ends."""
     sums = np.cumsum(np.concatenate([[0.0], np.asarray(values, np.float64)]))
     place = np.arange(len(sums) - 1)
     first, last = np.maximum(place - over // 2, 0), np.minimum(place + (over - over // 2), len(place))
@@ -199,7 +224,14 @@ def moving_average(values: Sequence[float] | np.ndarray, over: int) -> np.ndarra
 
 
 def plot_curves(log: Path, evaluations: Path, out: Path, title: str) -> None:
-    """Terms of the loss, evaluations and the rate over steps, as PNG; nothing where the log has no step yet."""
+    """Plot terms of the loss, evaluations and the learning rate over steps as PNG, once the log has a step.
+
+    Args:
+        log: CSV of the steps.
+        evaluations: CSV of the evaluations.
+        out: The PNG file.
+        title: Title of the plot.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -233,7 +265,7 @@ def plot_curves(log: Path, evaluations: Path, out: Path, title: str) -> None:
         rate.set(ylabel="rate", xlabel="steps", ylim=(0, None))
         rate.ticklabel_format(axis="y", style="sci", scilimits=(-_MOST_DIGITS, _MOST_DIGITS))
         buffer = io.BytesIO()
-        # no date and no version in the file: equal figures give equal bytes
+        # no date and no version in the file: equal data give equal bytes
         figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     files.write_bytes(out, buffer.getvalue())
 
@@ -255,14 +287,14 @@ def _draw_marks(axes: Axes, judged: Mapping[str, np.ndarray]) -> None:
 
 
 SHARED = ("split", "seed", "vehicles", "building", "tree", "bush", "surface")
-"""What a frame's manifest says of its origin and of the shapes it shows."""
+"""Keys of a manifest's frame for its origin and its shapes."""
 MANIFEST = "manifest.json"
 _NAMED = re.compile(r"`([\w.-]+_data\.json)`")
-"""Files beside a model card that say what frames were made of."""
+"""Files next to a model card that describe generated frames."""
 
 
 def describe_data(folders: Iterable[Path], frames: int | None = None) -> dict[str, Any]:
-    """Splits, seeds and the union of shapes over folders of `drivesem synth`, the first `frames` of each."""
+    """Collect splits, seeds and shapes over folders of `drivesem synth`, from the first `frames` frames of each."""
     manifests = [files.read_json(folder / MANIFEST)["frames"] for folder in folders]
     entries = [entry for manifest in manifests for entry in manifest[:frames]]
     union: dict[str, Any] = {"frames": len(entries)}
@@ -273,19 +305,19 @@ def describe_data(folders: Iterable[Path], frames: int | None = None) -> dict[st
 
 
 def generated_folders(folders: str | None) -> list[Path]:
-    """The folders, with commas between, where `drivesem synth` made all of them; else none."""
+    """Split comma-separated folders; empty unless `drivesem synth` made all of them."""
     found = [Path(part) for part in (folders or "").split(",") if part]
     return found if found and all((folder / MANIFEST).is_file() for folder in found) else []
 
 
 def street_seeds(described: dict[str, Any]) -> set[tuple[str, int]]:
-    """Split and seed of streets that `describe` tells of: where two sets share one, they share streets."""
+    """Split and seed of the streets in a description; data sets that share one share streets."""
     return {(split, seed) for split in described["split"] for seed in described["seed"]}
 
 
 def list_overlaps(detector: str, folders: str | None) -> list[str]:
-    """Lines that say which frames of generated folders a detector's model card names as its own, to train on or to
-    choose by; none where the card or the folders do not tell.
+    """List the streets of generated folders that a detector's model card names as its own, to train on or to select
+    by; one line each. Empty where the card or the folders are unknown.
     """
     here = generated_folders(folders)
     card = SHIPPED.get(detector, Path(detector)).with_suffix(".md")
@@ -297,12 +329,18 @@ def list_overlaps(detector: str, folders: str | None) -> list[str]:
         for split, seed in sorted(own & street_seeds(files.read_json(path)) if path.is_file() else ()):
             lines.append(
                 f"{folders}: streets of split {split}, seed {seed}, are among those of {name}, which the card of "
-                f"{detector} names: figures on them are not of held-out frames"
+                f"{detector} names: metrics on them are not of held-out frames"
             )
     return lines
 
 
 def warn_about_overlaps(detectors: Sequence[str], folders: str | None, console: Console) -> None:
-    """Say it, a line each."""
+    """Print the lines of `list_overlaps` for several detectors.
+
+    Args:
+        detectors: Names or files of the detectors.
+        folders: Comma-separated folders.
+        console: Where the lines appear.
+    """
     for line in dict.fromkeys(line for one in detectors for line in list_overlaps(one, folders)):
         console.print(line, soft_wrap=True, markup=False, highlight=False)

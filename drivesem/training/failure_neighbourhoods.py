@@ -1,4 +1,4 @@
-"""Certain failures and what lies around them, to train on: each time another state, rendered anew."""
+"""Neighbourhoods of certain failures as training data and as auxiliary losses: newly rendered states each time."""
 
 from __future__ import annotations
 
@@ -33,16 +33,14 @@ from drivesem.training.semantic import render_state
 from scene_ir import files
 
 POOL_SIZE = 4
-"""States that are rendered together: a scene's reading costs more than a few renders of it."""
+"""States rendered together: loading a scene costs more than a few renders of it."""
 
 
 class FailureNeighbourhoods(Sequence[Sample]):
-    """A run's certain failures of objects, each shown as a state of its neighbourhood.
+    """A run's certain failures of objects, each as states of its neighbourhood.
 
-    The pool holds `AT_ONCE` states of each failure, made when one is first drawn, and is another one as soon as
-    all of it may have been shown: after so many steps. Its states lie in `folder`, and follow from the failure,
-    the seed and their number alone; a share of them, `near`, lies near the failure, as a hole may be small.
-    attack, params, detector: of the run; pace: views of all failures a step.
+    A pool holds `POOL_SIZE` states of each failure, rendered when one is first drawn, and is replaced once all of it
+    may have been used. States are cached in `folder` and follow from the failure, the seed and their number alone.
     """
 
     def __init__(
@@ -53,14 +51,27 @@ class FailureNeighbourhoods(Sequence[Sample]):
         detector: Predictor,
         folder: Path,
         classes: Sequence[str],
-        pace: float,
+        pool_rate: float,
         seed: int,
         near: float = 0.5,
     ) -> None:
+        """List the failures.
+
+        Args:
+            frames: Frames of the run.
+            attack: Its settings.
+            params: Its parameters.
+            detector: Its detector.
+            folder: Where states are cached.
+            classes: Names of the classes to train.
+            pool_rate: Views of all failures per step.
+            seed: Seed of the states.
+            near: Share of the states that are near the failure, as a failure region may be small.
+        """
         self.failures = list_failures(frames)
         self._attack, self._params, self._detector = attack, params, detector
         self._folder, self._classes, self._seed, self._near = folder, classes, seed, near
-        self._turns = pace / (POOL_SIZE * max(len(self.failures), 1))
+        self._turns = pool_rate / (POOL_SIZE * max(len(self.failures), 1))
 
     def __len__(self) -> int:
         return len(self.failures)
@@ -69,11 +80,17 @@ class FailureNeighbourhoods(Sequence[Sample]):
         return self.state(index, 0)[0]
 
     def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
-        """A state around failure `index` out of the pool of that step."""
+        """Draw a state from the pool of a step.
+
+        Args:
+            index: The failure.
+            step: The step.
+            generator: Source of random numbers.
+        """
         return self.state(index, self.draw_number(step, generator))[0]
 
     def draw_number(self, step: int, generator: np.random.Generator) -> int:
-        """Of one of the states in the pool of a step."""
+        """Draw the number of a state in the pool of a step."""
         return self.pool(step)[int(generator.integers(POOL_SIZE))]
 
     def pool(self, step: int) -> range:
@@ -82,12 +99,12 @@ class FailureNeighbourhoods(Sequence[Sample]):
         return range(first, first + POOL_SIZE)
 
     def is_near(self, number: int) -> bool:
-        """Whether a state lies near its failure: evenly spread, so that their share is kept all along."""
+        """Whether a state is near its failure; such states are evenly spaced."""
         return math.floor((number + 1) * self._near) > math.floor(number * self._near)
 
     def state(self, index: int, number: int) -> tuple[Sample, Targets]:
-        """The number-th state around a failure, to train on; and its targets as they are judged, whose first rows
-        are all of the scene's objects.
+        """The state of a number around a failure as a training sample, and its evaluation targets, which start with
+        all objects of the scene.
         """
         frame, target = self.failures[index]
         folder = self._folder / f"{frame.name.replace('/', '_')}-{target}" / f"{number // POOL_SIZE}"
@@ -115,34 +132,39 @@ class FailureNeighbourhoods(Sequence[Sample]):
                 )
                 files.write_png(part / f"{number}.png", image)
                 kitti.write_labels(part / f"{number}.txt", labels)
-                told = [judged.boxes_xyxy.tolist(), judged.labels.tolist(), judged.ignore.tolist()]
-                files.write_json(part / f"{number}.json", told)
+                targets = [judged.boxes_xyxy.tolist(), judged.labels.tolist(), judged.ignore.tolist()]
+                files.write_json(part / f"{number}.json", targets)
 
 
 def list_failures(frames: Sequence[AttackedFrame]) -> list[tuple[AttackedFrame, int]]:
-    """Certain failures of objects: the frame, and which object is lost."""
+    """List certain failures of objects: the frame, and the index of the lost object."""
     return [(f, one.index) for f in frames for one in certain_losses(f.result) if one.index is not None]
 
 
 class _NeighbourhoodLoss:
-    """What further terms of the loss share. weight: of the term; t_star: of margins; window_hw: of the part of
-    each picture that is seen, with the object that fails in its middle.
+    """What auxiliary losses on failure neighbourhoods share: a weight, t*, and the size of the image window around the
+    failing object.
     """
 
     def __init__(
-        self, around: FailureNeighbourhoods, weight: float, t_star: float, seed: int, window_hw: tuple[int, int]
+        self,
+        neighbourhoods: FailureNeighbourhoods,
+        weight: float,
+        t_star: float,
+        seed: int,
+        window_hw: tuple[int, int],
     ) -> None:
-        self._around, self._weight, self._t_star, self._seed = around, weight, t_star, seed
+        self._neighbourhoods, self._weight, self._t_star, self._seed = neighbourhoods, weight, t_star, seed
         self._window_hw = window_hw
 
     def _drawn(self, step: int) -> tuple[int, np.random.Generator]:
-        """The failure of a step, and what draws further."""
+        """The failure of a step, and the generator of further draws."""
         generator = np.random.default_rng([self._seed, 8, step])
-        return int(generator.integers(len(self._around))), generator
+        return int(generator.integers(len(self._neighbourhoods))), generator
 
     def _window(self, index: int, sample: Sample, state: Targets) -> tuple[int, int, int, int]:
-        """First row and column of the part, and those after the last."""
-        left, top, right, bottom = state.boxes_xyxy[self._around.failures[index][1]].tolist()
+        """First row and column of the window, and those after the last."""
+        left, top, right, bottom = state.boxes_xyxy[self._neighbourhoods.failures[index][1]].tolist()
         middle, size = np.array([top + bottom, left + right]) / 2, np.array(sample[0].shape[:2])
         side = np.minimum(self._window_hw, size)
         y0, x0 = np.clip(np.round(middle - side / 2), 0, size - side).astype(int).tolist()
@@ -150,27 +172,32 @@ class _NeighbourhoodLoss:
 
 
 class ConsistencyLoss(_NeighbourhoodLoss):
-    """What a detector says of an object is to be the same in the photograph and in a state around a failure, and
-    nothing is to be nearer to a phantom there: a term of the loss, by margins, on a pair of pictures a step.
+    """Penalises margins that differ between the photograph and a state around a failure, and background margins that
+    are smaller there; one pair of images per step.
     """
 
     name = "consistency"
 
     def images(self, step: int) -> Tensor:
-        """Of the photograph and of the state: (2, 3, h, w)."""
+        """Windows of the photograph and of the state: (2, 3, h, w) in [0, 1]."""
         index, (sample, state) = self._pair(step)
         window = self._window(index, sample, state)
         return torch.stack(
-            [_part(self._around.failures[index][0].image("benign"), window), _part(sample[0], window)]
+            [_part(self._neighbourhoods.failures[index][0].image("benign"), window), _part(sample[0], window)]
         )
 
     def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the objects that are judged in both pictures, and lie in the part that is seen; and of what is surest
-        of all that is reported on nothing there, lest scores rise everywhere.
+        """Compute the loss over objects that count in both images and lie in the window, and over the background, so
+        that scores do not rise everywhere.
+
+        Args:
+            detector: The detector.
+            raw: Its raw predictions for `images`.
+            step: The step.
         """
         index, (sample, state) = self._pair(step)
         window = self._window(index, sample, state)
-        frame = self._around.failures[index][0]
+        frame = self._neighbourhoods.failures[index][0]
         known = [box for box in frame.result.targets_benign if box.index is not None]
         still = targets_from_records(tuple(known), CLASSES)
         labels = _labels(detector, still)
@@ -186,34 +213,38 @@ class ConsistencyLoss(_NeighbourhoodLoss):
                 (after, state),
             )
         ]
-        # one-sided: what the photograph makes suspect of nothing is no aim
+        # one-sided: a background margin of the photograph is not a target
         nearer = (nothing[0].detach() - nothing[1]).clamp_min(0)
         return self._weight * (objects + F.smooth_l1_loss(nearer, torch.zeros_like(nearer)))
 
     def _pair(self, step: int) -> tuple[int, tuple[Sample, Targets]]:
         index, generator = self._drawn(step)
-        return index, self._around.state(index, self._around.draw_number(step, generator))
+        return index, self._neighbourhoods.state(index, self._neighbourhoods.draw_number(step, generator))
 
 
 class WorstCaseLoss(_NeighbourhoodLoss):
-    """An object is to be found where the detector, as it is at that step, is least sure of it, and nothing is to
-    be reported where it is nearest to a phantom: a term of the loss, the logistic losses of these margins, each in
-    that one of the pool's states around a failure in which it is least.
+    """Logistic losses of the smallest margin of the failing object, and of the smallest background margin, over the
+    states of the pool around a failure.
     """
 
     name = "worst"
 
     def images(self, step: int) -> Tensor:
-        """Of all states of the pool: (AT_ONCE, 3, h, w)."""
+        """Windows of all states of the pool: (POOL_SIZE, 3, h, w) in [0, 1]."""
         index, states = self._states(step)
         return torch.stack([_part(sample[0], self._window(index, sample, state)) for sample, state in states])
 
     def term(self, detector: Detector, raw: Any, step: int) -> Tensor:
-        """Of the object that fails, in the states in which it is judged and lies in the part that is seen; and of
-        all that is none, in every state.
+        """Compute the loss over the failing object, in states where it counts and lies in the window, and over the
+        background in every state.
+
+        Args:
+            detector: The detector.
+            raw: Its raw predictions for `images`.
+            step: The step.
         """
         index, states = self._states(step)
-        target = self._around.failures[index][1]
+        target = self._neighbourhoods.failures[index][1]
         margins, nothing = [], []
         for number, (sample, state) in enumerate(states):
             window, seen = self._window(index, sample, state), detector.candidates(raw.select(number))
@@ -228,7 +259,7 @@ class WorstCaseLoss(_NeighbourhoodLoss):
 
     def _states(self, step: int) -> tuple[int, list[tuple[Sample, Targets]]]:
         index, _ = self._drawn(step)
-        return index, [self._around.state(index, number) for number in self._around.pool(step)]
+        return index, [self._neighbourhoods.state(index, number) for number in self._neighbourhoods.pool(step)]
 
 
 def _part(image: NDArray[np.uint8], window: tuple[int, int, int, int]) -> Tensor:
@@ -247,22 +278,30 @@ def _inside(boxes_xyxy: Tensor, window: tuple[int, int, int, int]) -> Tensor:
 
 
 def _labels(detector: Detector, targets: Targets) -> Tensor:
-    """Of the detector's classes, -1 where it does not know one."""
+    """Indices of the detector's classes; -1 where it lacks one."""
     names = [detector.classes.index(n) if n in detector.classes else -1 for n in CLASSES]
     return torch.tensor(names)[targets.labels]
 
 
 def smallest_margin_loss(margins: Sequence[Tensor]) -> Tensor:
-    """Logistic loss () of the least of some margins, each (1,)."""
+    """Logistic loss () of the smallest of some margins, each (1,)."""
     return F.softplus(-torch.cat(list(margins)).min())
 
 
 def margin_difference(
     before: Candidates, after: Candidates, boxes_xyxy: tuple[Tensor, Tensor], labels: Tensor, t_star: float
 ) -> Tensor:
-    """How far the margins of objects differ between two pictures: a mean (), quadratic up to a logit and linear
-    beyond; 0 without objects. boxes_xyxy: (M, 4) px in either; labels: (M,) among the detector's classes. What is
-    said of the first picture is the aim, and taken as constant.
+    """Compute the smooth L1 loss between the margins of objects in two images.
+
+    Args:
+        before: Candidates in the first image, which is the target and gets no gradient.
+        after: Candidates in the second image.
+        boxes_xyxy: (M, 4) px in either image.
+        labels: (M,) among the detector's classes.
+        t_star: Score threshold.
+
+    Returns:
+        () mean over objects; 0 without any.
     """
     if not len(labels):
         return after.log_scores.new_zeros(())

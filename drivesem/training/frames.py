@@ -1,4 +1,4 @@
-"""Frames of any data set for training, decoded once."""
+"""Frames of any data set for training, decoded once, and the labels to train on and to evaluate by."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
 PIXELS, INDEX = "pixels.u8", "index.json"
-_LOOKED_AT = 5
-"""So many frames, or up to twice as many, tell whether a cache is of the same pictures."""
+_COMPARED_FRAMES = 5
+"""Number of frames, up to twice as many, that are compared to check a cache."""
 
 
 class FrameStore(Sequence[Sample]):
-    """Frames with their labels; the pixels lie decoded in one file that is mapped into memory.
+    """Frames with their labels; the decoded pixels lie in one memory-mapped file.
 
-    A data set that grows is read on where the file ends; one with other pictures is decoded anew.
+    New frames of a data set are appended to the file; a data set with other images is decoded again.
     """
 
     def __init__(
@@ -43,8 +43,18 @@ class FrameStore(Sequence[Sample]):
         classes: Sequence[str],
         done: Callable[[], object] | None = None,
     ) -> None:
-        """names: the frames to take; done: called after each. Raises FormatError for a frame that cannot be read,
-        and for one without labels; WriteError for a cache that cannot be written.
+        """Decode frames that are not in the cache.
+
+        Args:
+            dataset: The data set.
+            names: Frames to use.
+            cache: Folder of the decoded pixels.
+            classes: Names of the classes.
+            done: Called after each frame.
+
+        Raises:
+            FormatError: A frame cannot be read or has no labels.
+            WriteError: The cache cannot be written.
         """
         chosen = list(names)
         index = _known(cache, dataset, chosen)
@@ -92,39 +102,38 @@ class FrameStore(Sequence[Sample]):
         return known.hexdigest()
 
     def object_count(self) -> int:
-        """How many objects there are to learn."""
+        """Number of objects to train on."""
         return sum(int((~targets.ignore).sum()) for targets in self._targets)
 
     def fit_anchors(self, seed: int) -> tuple[tuple[float, float], ...]:
-        """As many anchors as SqueezeDet has published ones, by k-means of the objects' sizes.
-
-        Raises ValueError where fewer sizes differ.
+        """Fit as many anchors as SqueezeDet's published ones to the objects' sizes by k-means. Raises ValueError
+        for too few different sizes.
         """
         sizes = np.concatenate([target_sizes(targets) for targets in self._targets])
         return fit_anchors(sizes, len(ANCHOR_SIZES_WH), seed).sizes_wh
 
     def evaluation_targets(self, difficulty: Difficulty) -> list[Targets]:
-        """What a detector is judged by, frame by frame."""
+        """Labels to evaluate by, for each frame."""
         limits = adapt_limits(difficulty, self.labels)
         return [evaluation_targets(labels, limits, self.classes) for labels in self.labels]
 
 
 def _known(cache: Path, dataset: Dataset, names: Sequence[str]) -> dict[str, tuple[int, int, int]]:
-    """Where the pixels of each frame in a cache begin, and their height and width. Nothing where they are of other
-    pictures than the data set's: another folder's frames may have the same names.
+    """Offset, height and width of each frame in a cache. Empty where its pixels are not the data set's: another
+    folder's frames may have the same names.
     """
     if not (cache / INDEX).is_file() or not (cache / PIXELS).is_file():
         return {}
     index = {name: (start, height, width) for name, start, height, width in files.read_json(cache / INDEX)}
     shared = [name for name in names if name in index]
-    # From the last on: where a numbered frame was taken out or put in, later names mean others.
-    for name in shared[:: -max(len(shared) // _LOOKED_AT, 1)]:
+    # From the last one backwards: inserting or removing a numbered frame shifts all later names.
+    for name in shared[:: -max(len(shared) // _COMPARED_FRAMES, 1)]:
         start, height, width = index[name]
         image = to_uint8(dataset.frame(name).photograph)
-        kept = np.fromfile(cache / PIXELS, np.uint8, image.size, offset=start)
-        if image.shape[:2] != (height, width) or not np.array_equal(kept, image.reshape(-1)):
+        cached = np.fromfile(cache / PIXELS, np.uint8, image.size, offset=start)
+        if image.shape[:2] != (height, width) or not np.array_equal(cached, image.reshape(-1)):
             with files.name_write_errors(cache / INDEX):
-                (cache / INDEX).unlink()  # before its pixels go: a process may be killed in between
+                (cache / INDEX).unlink()  # before its pixels: the process may be killed in between
             return {}
     return index
 
@@ -137,42 +146,52 @@ def _labels(dataset: Dataset, name: str) -> Labels:
 
 
 OCCLUSION_UNKNOWN = 3
-"""KITTI's code for it."""
+"""KITTI's code of an unknown occlusion."""
 
 TRAINING_LIMITS = Difficulty(min_height_px=12.0, max_occlusion=OCCLUSION_UNKNOWN - 1, max_truncation=1.0)
-"""What is trained on: all that is high enough for a 16 px grid and not known to be hidden altogether."""
+"""Limits of training objects: high enough for a 16 px grid, and not known to be fully occluded."""
 
 
 def adapt_limits(difficulty: Difficulty, labels: Iterable[Labels]) -> Difficulty:
-    """The difficulty without its limit on occlusion where a data set never says how occluded an object is."""
+    """Drop the limit on occlusion where a data set never states it."""
     if any(bool((one.occlusion != OCCLUSION_UNKNOWN).any()) for one in labels):
         return difficulty
     return replace(difficulty, max_occlusion=OCCLUSION_UNKNOWN)
 
 
 def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[str]) -> Targets:
-    """Targets among `classes`; too hard objects and regions are ignored, objects of other classes left out.
-    So are types that are no road users: they are background.
+    """Convert labels to training targets. Too hard objects and regions are ignored; objects of other classes, and
+    types that are no road users, are background.
+
+    Args:
+        labels: Labels of a frame.
+        difficulty: Limits of the objects.
+        classes: Names of the classes.
     """
     labels = ROAD_USERS.known(labels)
     targets = ROAD_USERS.targets(labels)
     ignore = targets.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
     own = _places(classes)[targets.labels]
-    kept = (own >= 0) | ignore
-    return Targets(targets.boxes_xyxy[kept], own[kept].clamp_min(0), ignore[kept])
+    chosen = (own >= 0) | ignore
+    return Targets(targets.boxes_xyxy[chosen], own[chosen].clamp_min(0), ignore[chosen])
 
 
 def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[str]) -> Targets:
-    """What is judged, with labels among `classes`. Too hard objects, those of other classes, and regions are
-    ignored, for each of the classes. Types that are no road users are background.
+    """Convert labels to evaluation targets. Too hard objects, objects of other classes, and regions are ignored for
+    every class; types that are no road users are background.
+
+    Args:
+        labels: Labels of a frame.
+        difficulty: Limits of the objects.
+        classes: Names of the classes.
     """
     labels = ROAD_USERS.known(labels)
     named = ROAD_USERS.targets(labels)
     ignore = named.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
     own = _places(classes)[named.labels]
-    # an object of its own class that is not judged, a neighbour of a class, or a region: said for every class
+    # too hard objects, neighbours of a class, and regions are ignored for every class
     every = ignore | (own < 0)
     rows = torch.cat([torch.arange(len(ignore))[~every], torch.arange(len(ignore))[every].repeat(len(classes))])
     label = torch.cat([own[~every], torch.arange(len(classes)).repeat_interleave(int(every.sum()))])
@@ -181,7 +200,7 @@ def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence
 
 
 def _too_hard(labels: Labels, difficulty: Difficulty) -> torch.Tensor:
-    """(N,) bool. An unknown truncation (NaN) is no reason to leave an object out."""
+    """(N,) bool. An unknown truncation (NaN) does not exclude an object."""
     height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
     return (
         (height < difficulty.min_height_px)
@@ -191,5 +210,5 @@ def _too_hard(labels: Labels, difficulty: Difficulty) -> torch.Tensor:
 
 
 def _places(classes: Sequence[str]) -> torch.Tensor:
-    """Where each of CLASSES stands among `classes`; -1 where it does not."""
+    """Index of each of `CLASSES` in `classes`; -1 where it is missing."""
     return torch.tensor([classes.index(name) if name in classes else -1 for name in CLASSES])

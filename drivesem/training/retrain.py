@@ -1,4 +1,4 @@
-"""A detector trained on with counterexamples, before and after, and attacked again."""
+"""Fine-tunes a detector on counterexamples, evaluates it before and after, and attacks it again."""
 
 from __future__ import annotations
 
@@ -43,54 +43,58 @@ from drivesem.training.samples import (
 from drivesem.training.validation import score_detections
 from scene_ir import files
 
-FIGURES, CURVES = "retrain.json", "curves.png"
+WEIGHTS, RESULT, CURVES = "retrained.safetensors", "retrain.json", "curves.png"
 TABLES = ("retrain.csv", "retrain.md")
 FRESH, CACHE = "fresh", "cache"
-"""Folders: the new attack's run, decoded frames."""
+"""Folders of the new attack's run and of decoded frames."""
 _FRESH_OF = "fresh_of.txt"
-"""Digest of the weights that the new attack was against."""
-_WRITTEN = (WEIGHTS, FIGURES, CURVES, CHECKPOINT, LOG, _FRESH_OF, *TABLES, FRESH, CACHE)
+"""File with the digest of the weights that the new attack targets."""
+_WRITTEN = (WEIGHTS, RESULT, CURVES, CHECKPOINT, LOG, _FRESH_OF, *TABLES, FRESH, CACHE)
 _FREE = (*SHARING, "out", "resume", "json", "minutes", "checkpoint_every", "fresh", "trust")
 """Settings that a run may change on the way."""
 
 
 @dataclass(frozen=True)
 class RetrainRow:
-    """A set of frames and what two detectors find in it. broken: share of frames in which an attack made one lose
-    an object or see a phantom, None where nothing was attacked.
-    """
+    """Metrics of one detector on one set of frames."""
 
     frames: str
+    """Set of frames."""
     labels: str
+    """Label mode."""
     detector: str
+    """Before or after."""
     count: int
+    """Number of frames."""
     scores: ClassScores
+    """Metrics."""
     broken: float | None = None
+    """Share of frames in which an attack succeeded; None where nothing was attacked."""
 
     def to_json(self) -> dict[str, Any]:
-        """Flat, figures by name."""
-        told = {"set": self.frames, "labels": self.labels, "detector": self.detector, "frames": self.count}
-        return told | asdict(self.scores) | {"broken": self.broken}
+        """Flatten the row to metrics by name."""
+        row = {"set": self.frames, "labels": self.labels, "detector": self.detector, "frames": self.count}
+        return row | asdict(self.scores) | {"broken": self.broken}
 
 
 def retrain_detector(config: RetrainConfig, console: Console) -> tuple[dict[str, Any], list[RetrainRow]]:
-    """Retrain, or go on with it: the JSON's form, and its rows. Raises UsageError or SceneError for bad input."""
+    """Fine-tune or resume: the data of `--json`, and its rows. Raises UsageError or SceneError for bad input."""
     attack = load_trusted_config(Path(config.run), config.trust)
     frames = load_attacked_frames(Path(config.run))
-    kept_out, learned = _divided(frames, config)
+    held_out, training = _split_frames(frames, config)
     start = config.start or attack.detector
     before, after = load_start(start, config.device), load_start(start, config.device)
     if attack.dataset == "kitti":
         warn_about_overlaps([start], attack.root, console)
     out = Path(config.out or f"runs/retrain-{Path(config.run).name}-seed{config.seed}")
     claim_folder(out, config, _WRITTEN, _FREE)
-    mixture = _mixture(config, attack, learned, {frame.name for frame in kept_out}, out, after)
+    mixture = _mixture(config, attack, training, {frame.name for frame in held_out}, out, after)
     fine_tune(config, after, mixture, out, console)
-    found = detect_in_frames(after, kept_out, "benign", config.device)
-    after.t_star = _t_star(after, kept_out, found)
+    found = detect_in_frames(after, held_out, "benign", config.device)
+    after.t_star = _t_star(after, held_out, found)
     save_detector(after, out / WEIGHTS, {"retrained_from": Path(start).name, "steps": str(config.steps)})
-    rows = _known(before, "before", kept_out, config.device) + _known(after, "after", kept_out, config.device)
-    rows += _fresh(config, attack, kept_out, out)
+    rows = _known(before, "before", held_out, config.device) + _known(after, "after", held_out, config.device)
+    rows += _fresh(config, attack, held_out, out)
     data = {
         "out": str(out),
         "weights": str(out / WEIGHTS),
@@ -98,47 +102,47 @@ def retrain_detector(config: RetrainConfig, console: Console) -> tuple[dict[str,
         "detector": start,
         "frames": len(mixture),
         "counterexamples": len(mixture.drawn_counterexamples),
-        "held_out": len(kept_out),
+        "held_out": len(held_out),
         "t_star": {"before": before.t_star, "after": after.t_star},
         "rows": [row.to_json() for row in rows],
     }
-    files.write_json(out / FIGURES, data)
+    files.write_json(out / RESULT, data)
     _write(out, rows)
     plot_curves(out / LOG, out / "evaluations.csv", out / CURVES, f"{before.name}, retrained")
     return data, rows
 
 
-def _divided(
+def _split_frames(
     frames: Sequence[AttackedFrame], config: RetrainConfig
 ) -> tuple[list[AttackedFrame], list[AttackedFrame]]:
-    """Frames that are never trained on, drawn at random, and the others."""
+    """Split frames at random into held-out ones and training ones."""
     order = np.random.default_rng([config.seed, 6]).permutation(len(frames))
     count = max(round(config.validation * len(frames)), 1)
     if count >= len(frames):
         raise UsageError("--run", "at least 2 frames, some to train on and some to judge by", len(frames))
-    kept_out = {int(i) for i in order[:count]}
-    chosen = [[f for i, f in enumerate(frames) if (i in kept_out) == wanted] for wanted in (True, False)]
+    held_out = {int(i) for i in order[:count]}
+    chosen = [[f for i, f in enumerate(frames) if (i in held_out) == wanted] for wanted in (True, False)]
     return chosen[0], chosen[1]
 
 
 def _mixture(
     config: RetrainConfig,
     attack: AttackConfig,
-    learned: Sequence[AttackedFrame],
-    kept_out: set[str],
+    training: Sequence[AttackedFrame],
+    held_out: set[str],
     out: Path,
     after: Detector,
 ) -> TrainingMixture:
     mode, classes = config.label_mode, after.classes
-    counterexamples = AttackedSamples(select_counterexamples(learned, mode), "counterexample", mode, classes)
+    counterexamples = AttackedSamples(select_counterexamples(training, mode), "counterexample", mode, classes)
     benign: Sequence[Sample]
     if config.dataset is None:
-        benign = AttackedSamples(learned, "benign", "paper", classes)
+        benign = AttackedSamples(training, "benign", "paper", classes)
     else:
         dataset = open_dataset(config.dataset, Path(config.root or ""))
         names = list(dataset.identifiers[: config.limit])
-        if config.dataset == attack.dataset:  # what is judged by is not trained on, wherever it lies
-            names = [name for name in names if name not in kept_out]
+        if config.dataset == attack.dataset:  # never train on held-out frames, in any folder
+            names = [name for name in names if name not in held_out]
         if not names:
             raise UsageError("--root", "frames that are not held out", "none")
         benign = FrameStore(dataset, names, out / CACHE, classes)
@@ -146,14 +150,14 @@ def _mixture(
 
 
 def _t_star(detector: Detector, frames: Sequence[AttackedFrame], found: Sequence[Detections]) -> float:
-    """The score of best F1 on the benign frames that were held out."""
+    """The score of the best F1 on the held-out benign frames."""
     judged = EvaluatedClasses.from_detector(detector)
     wanted = [judged.map_targets(targets_from_records(frame.result.targets_benign, CLASSES)) for frame in frames]
     return score_detections(found, wanted, judged.names).t_star
 
 
 def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], device: str) -> list[RetrainRow]:
-    """Benign frames, and the counterexamples that the run found against the detector as it was."""
+    """Metrics on benign frames, and on the run's counterexamples against the original detector."""
     rows = []
     stages: tuple[tuple[Stage, tuple[LabelMode, ...]], ...] = (
         ("benign", ("paper",)),
@@ -173,10 +177,10 @@ def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], devic
 
 
 def _fresh(
-    config: RetrainConfig, attack: AttackConfig, kept_out: Sequence[AttackedFrame], out: Path
+    config: RetrainConfig, attack: AttackConfig, held_out: Sequence[AttackedFrame], out: Path
 ) -> list[RetrainRow]:
-    """The same attack on the same frames, against the retrained detector."""
-    names = [frame.name for frame in kept_out][: config.fresh]
+    """Repeat the attack on the held-out frames against the fine-tuned detector."""
+    names = [frame.name for frame in held_out][: config.fresh]
     if not names:
         return []
     again = replace(
@@ -203,25 +207,31 @@ def _fresh(
 
 
 def _write(out: Path, rows: Sequence[RetrainRow]) -> None:
-    """The table as CSV and as Markdown."""
+    """Write the table as CSV and Markdown."""
     words = ("frames", "labels", "detector")
     sheet = ReportTable("", (*words, *SCORE_TITLES, "objects", "frames broken"), tuple(map(_cells, rows)))
     csv_name, markdown_name = TABLES
     files.write_text(out / csv_name, rows_to_csv([row.to_json() for row in rows], line_end="\r\n"))
-    files.write_text(out / markdown_name, "\n".join(sheet.to_markdown(words)[2:]) + "\n")  # without a heading
+    files.write_text(out / markdown_name, "\n".join(sheet.to_markdown(words)[2:]) + "\n")  # without the heading
 
 
 def _cells(row: RetrainRow) -> tuple[str, ...]:
     share = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
-    figures = map(format_percent, row.scores.columns)
-    return row.frames, row.labels, row.detector, *figures, str(row.scores.objects), share
-
-
-WEIGHTS = "retrained.safetensors"
+    metrics = map(format_percent, row.scores.columns)
+    return row.frames, row.labels, row.detector, *metrics, str(row.scores.objects), share
 
 
 def load_start(name: str, device: str, setting: str = "--start") -> Detector:
-    """A detector that can be trained on. Raises UsageError, naming the setting, where it is none."""
+    """Load a detector that can be fine-tuned.
+
+    Args:
+        name: Detector.
+        device: Where it runs.
+        setting: Option that errors name.
+
+    Raises:
+        UsageError: The detector cannot be trained.
+    """
     try:
         detector = load_detector(name, device)
         EvaluatedClasses.from_detector(detector)
@@ -233,7 +243,16 @@ def load_start(name: str, device: str, setting: str = "--start") -> Detector:
 def select_counterexamples(
     frames: Sequence[AttackedFrame], mode: LabelMode, setting: str = "--run"
 ) -> list[AttackedFrame]:
-    """The frames whose counterexamples break the detector by labels of a mode. Raises UsageError where none do."""
+    """Select the frames in which the attack succeeds.
+
+    Args:
+        frames: Frames of a run.
+        mode: Labels that decide.
+        setting: Option that errors name.
+
+    Raises:
+        UsageError: There is no such frame.
+    """
     failed = [f for f in frames if (f.result.success_moved if mode == "moved" else f.result.success_paper)]
     if not failed:
         raise UsageError(setting, f"counterexamples that break the detector, by {mode} labels", "none")
@@ -241,7 +260,7 @@ def select_counterexamples(
 
 
 def mixture_shares(config: RetrainConfig) -> MixtureShares:
-    """How many counterexamples there are among the benign frames, and when."""
+    """Read the settings of the mixture."""
     return MixtureShares(config.fraction, config.mix, round(config.ramp * config.steps), config.seed)
 
 
@@ -251,17 +270,27 @@ def fine_tune(
     frames: Sequence[Sample],
     out: Path,
     console: Console,
-    beside: AuxiliaryLoss | None = None,
+    auxiliary_loss: AuxiliaryLoss | None = None,
 ) -> None:
-    """Train in place, or go on with it, with checkpoints in `out`; frozen again at the end. beside: a further term
-    of the loss. Raises UsageError.
+    """Fine-tune a detector in place, or resume, and freeze it again.
+
+    Args:
+        config: Settings.
+        detector: The detector.
+        frames: Training samples.
+        out: Folder of the checkpoints.
+        console: Where progress appears.
+        auxiliary_loss: Further term of the loss.
+
+    Raises:
+        UsageError: The loss becomes infinite.
     """
     settings = TrainingSettings(
         steps=config.steps,
         minutes=config.minutes,
         batch=config.batch,
         rate=config.rate,
-        backbone_rate=1.0,  # nothing starts anew
+        backbone_rate=1.0,  # all layers are pretrained
         warmup_steps=config.warmup,
         precision=config.precision,
         seed=config.seed,
@@ -280,14 +309,20 @@ def fine_tune(
             bar.update(task, completed=done, description=f"loss {row['total']:.3f}")
 
         try:
-            train(detector, frames, settings, out, progress=progress, auxiliary_loss=beside)
+            train(detector, frames, settings, out, progress=progress, auxiliary_loss=auxiliary_loss)
         except FloatingPointError as error:
             raise UsageError("--rate", "one at which the loss stays finite", error) from error
     detector.requires_grad_(False)
 
 
 def discard_stale_run(run: Path, weights: Path, stamp: Path) -> None:
-    """Remove a run that was against other weights than those that are there now. stamp: a file that says which."""
+    """Remove a run against other weights than the current ones.
+
+    Args:
+        run: Folder of the run.
+        weights: The current weights.
+        stamp: File with the digest of the run's weights.
+    """
     digest = files.sha256_digest(weights)
     if run.is_dir() and (not stamp.is_file() or files.read_text(stamp) != digest):
         shutil.rmtree(run)

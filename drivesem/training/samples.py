@@ -1,4 +1,4 @@
-"""The frames of an attack's run as training and evaluation take them."""
+"""Training samples and detections of an attack run's frames, and the mixture of benign frames and counterexamples."""
 
 from __future__ import annotations
 
@@ -29,15 +29,17 @@ from scene_ir.errors import FormatError
 from scene_ir.io import load_other_labels, load_scene
 
 Stage = Literal["benign", "rerender", "counterexample"]
-"""The photograph, the same rendered again without any change, and what the attack made of it."""
+"""The photograph, its re-render without changes, and the attacked image."""
 
 
 @dataclass(frozen=True)
 class AttackedFrame:
-    """A frame of a run. name: its identifier."""
+    """A frame of an attack run."""
 
     run: Path
+    """Folder of the run."""
     name: str
+    """Identifier of the frame."""
 
     @property
     def folder(self) -> Path:
@@ -45,7 +47,7 @@ class AttackedFrame:
 
     @cached_property
     def result(self) -> FrameResult:
-        """What came of the attack."""
+        """Result of the attack."""
         return load_frame(self.folder / RESULT)
 
     def image(self, stage: Stage) -> np.ndarray:
@@ -54,8 +56,9 @@ class AttackedFrame:
 
 
 class AttackedSamples(Sequence[Sample]):
-    """To train on: photographs, as they are or rendered again, with benign labels, or counterexamples with those
-    of a mode; read each time. People and whatever else the scenes leave as it is have their own labels.
+    """Training samples: photographs or re-renders with benign labels, or counterexamples with labels of a mode.
+
+    Images are read each time. People and other objects outside of the scenes keep their own labels.
     """
 
     def __init__(
@@ -78,8 +81,8 @@ class AttackedSamples(Sequence[Sample]):
 
 
 class GeneratorSamples(Sequence[Sample]):
-    """To train on: the changes of a run of generated frames, as the generator draws and labels them. Drawn when
-    they are first asked for, and kept in `folder`.
+    """Training samples: the changes of a run on generated frames, rendered and labelled by the generator when first
+    used, and cached in `folder`.
     """
 
     def __init__(
@@ -107,7 +110,7 @@ class GeneratorSamples(Sequence[Sample]):
 
 
 def load_attacked_frames(run: Path) -> list[AttackedFrame]:
-    """The finished frames of a run of `drivesem attack`, by name. Raises FormatError where there are none."""
+    """List the finished frames of a run of `drivesem attack` by name. Raises FormatError where there are none."""
     found = [AttackedFrame(run, name) for name in list_frames(run)]
     if not found:
         raise FormatError(str(run), "a run of drivesem attack with finished frames", "none")
@@ -117,7 +120,17 @@ def load_attacked_frames(run: Path) -> list[AttackedFrame]:
 def detect_in_frames(
     detector: Predictor, frames: Sequence[AttackedFrame], stage: Stage, device: str
 ) -> list[Detections]:
-    """What a detector finds in pictures of a stage: labels among the judged classes, on the CPU."""
+    """Detect objects in the images of a stage.
+
+    Args:
+        detector: The detector.
+        frames: Frames of a run.
+        stage: Which image of each frame.
+        device: Where the detector runs.
+
+    Returns:
+        Detections of each frame, with labels among the evaluated classes, on the CPU.
+    """
     return [detect_objects(detector, image_to_tensor(np.array(frame.image(stage)), device)) for frame in frames]
 
 
@@ -128,7 +141,15 @@ def headline_scores(
     found: Sequence[Detections],
     mode: LabelMode,
 ) -> ClassScores:
-    """The headline's figures of detections beside the labels of a mode, as `drivesem attack` judges them."""
+    """Compute the headline's metrics as `drivesem attack` does.
+
+    Args:
+        detector: The detector.
+        t_star: Score threshold for the recall.
+        frames: Frames of a run.
+        found: Detections of each frame.
+        mode: Labels to compare with.
+    """
     judged = EvaluatedClasses.from_detector(detector)
     results = [frame.result for frame in frames]
     records = [r.targets_benign if mode == "paper" else r.targets_moved for r in results]
@@ -141,21 +162,22 @@ Mix = Literal["replace", "add"]
 
 @dataclass(frozen=True, slots=True)
 class MixtureShares:
-    """fraction: share of the set that are counterexamples, in (0, 1); mix: in the place of benign frames drawn at
-    random, or beside all of them; ramp_steps: over so many steps a counterexample shows with a chance that rises
-    from 0 to 1, a benign frame otherwise; seed: of the draw.
-    """
+    """How counterexamples are mixed into benign frames."""
 
     fraction: float
+    """Share of counterexamples in the training set, in (0, 1)."""
     mix: Mix
+    """Whether counterexamples replace random benign frames or are added to all of them."""
     ramp_steps: int
+    """Steps over which the probability of a counterexample, instead of a benign frame, rises from 0 to 1."""
     seed: int
+    """Seed of the draws."""
 
 
 class TrainingMixture(Sequence[Sample]):
-    """Benign frames and counterexamples; each counterexample is shown as often as the others, or once more.
+    """Benign frames and counterexamples, each counterexample equally often, or once more.
 
-    Raises ValueError where there is none of either.
+    Raises ValueError where either is empty.
     """
 
     def __init__(self, benign: Sequence[Sample], counterexamples: Sequence[Sample], shares: MixtureShares) -> None:
@@ -184,8 +206,12 @@ class TrainingMixture(Sequence[Sample]):
         return self._counterexamples[int(self.drawn_counterexamples[index - len(self.drawn_benign)])]
 
     def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
-        """Entry `index`; while counterexamples come in, now and then any benign frame in its place.
-        Counterexamples that are drawn look otherwise each time.
+        """Draw an entry; during the ramp, a random benign frame sometimes replaces a counterexample.
+
+        Args:
+            index: The entry.
+            step: The step.
+            generator: Source of random numbers.
         """
         if index >= len(self.drawn_benign) and generator.random() * self._shares.ramp_steps > step:
             return self._benign[int(generator.integers(len(self._benign)))]

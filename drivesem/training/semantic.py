@@ -1,4 +1,4 @@
-"""Frames whose vehicles were moved, turned, bent and painted at random, feasibly, by the project's renderer."""
+"""Frames with vehicles moved, turned, deformed and painted at random, within the feasible set, by the renderer."""
 
 from __future__ import annotations
 
@@ -24,18 +24,17 @@ from scene_ir.render.compositor import Compositor
 from scene_ir.types import Frame, Labels, SceneIR
 
 VARIANTS = 4
-"""Different perturbations of a frame: a frame's scene costs more than a few renders of it."""
+"""Perturbations per frame: de-rendering costs more than a few renders."""
 PARAMETERS = PAPER_PARAMETERS
 _BENT_BY = 0.3
-"""Share of the budget that lattice offsets are drawn from: further out nearly all are scaled back to the same
-bound on strain."""
+"""Share of the budget from which lattice offsets are drawn: the bound on strain scales nearly all larger ones back."""
 
 
 class PerturbedFrames(Sequence[Sample]):
-    """The frames of a store, a share of which is shown perturbed, each time by chance.
+    """The frames of a store; each view is perturbed with probability `share`.
 
-    A frame is taken apart when it is first drawn, and its variants stay in `folder`: they depend on the frame, its
-    place and the seed alone. Frames without vehicles, or that cannot be taken apart, are shown as they are.
+    A frame is de-rendered when first drawn. Its variants are cached in `folder` and depend only on the frame, its
+    index and the seed. Frames without vehicles, or that cannot be de-rendered, stay as they are.
     """
 
     def __init__(self, store: FrameStore, folder: Path, share: float, seed: int) -> None:
@@ -48,7 +47,13 @@ class PerturbedFrames(Sequence[Sample]):
         return self._store[index]
 
     def draw(self, index: int, step: int, generator: np.random.Generator) -> Sample:
-        """Frame `index`, or one of its variants."""
+        """Draw a frame or one of its variants.
+
+        Args:
+            index: The frame.
+            step: Not used.
+            generator: Source of random numbers.
+        """
         if generator.random() >= self._share:
             return self._store[index]
         variant = int(generator.integers(VARIANTS))
@@ -64,7 +69,7 @@ class PerturbedFrames(Sequence[Sample]):
         )
 
     def _make(self, index: int, folder: Path) -> None:
-        """All variants of a frame, whole or not at all; an empty folder where there can be none."""
+        """Write all variants of a frame at once; an empty folder where there are none."""
         with files.atomic_folder(folder) as part:
             frame = self._store.dataset.frame(self._store.names[index])
             try:
@@ -78,9 +83,9 @@ class PerturbedFrames(Sequence[Sample]):
 
 @torch.no_grad()
 def perturb_frame(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, Labels]]:
-    """VARIANTS feasible perturbations of a labelled frame: pixels (H, W, 3) uint8 RGB, and labels that moved too.
+    """Perturb a labelled frame `VARIANTS` times: pixels (H, W, 3) uint8 RGB, and moved labels.
 
-    None for a frame without vehicles. Raises SceneError where the frame cannot be taken apart.
+    Empty for a frame without vehicles. Raises SceneError where the frame cannot be de-rendered.
     """
     scene = derender(frame, DerenderSettings(fit=False))
     if not len(scene.objects) or frame.labels is None:
@@ -93,7 +98,7 @@ def perturb_frame(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, L
     reach[space.blocks.get(Parameter.MESH)] = _BENT_BY
     found = []
     for _ in range(VARIANTS):
-        # Cubed: most codes stay near the photograph, as most days are no storm.
+        # Cubed: most codes stay near the photograph.
         drawn = torch.from_numpy(generator.uniform(-1, 1, space.dim).astype(np.float32)) ** 3 * reach
         theta = torch.where(drawn < 0, -drawn * space.lower, drawn * space.upper)
         image, labels, _ = render_state(feasible.project(theta).theta, space, compositor, labeller, scene)
@@ -105,9 +110,18 @@ def perturb_frame(frame: Frame, seed: Sequence[int]) -> list[tuple[np.ndarray, L
 def render_state(
     theta: Tensor, space: ParameterSpace, compositor: Compositor, labeller: Labeller, base: SceneIR
 ) -> tuple[np.ndarray, Labels, Targets]:
-    """The scene at theta (D,): pixels (H, W, 3) uint8 RGB, its labels, those of people and whatever else stays
-    among them, and targets as they are judged, whose first rows are all of the scene's objects. base: the scene of
-    the labels that move along.
+    """Render and label a state.
+
+    Args:
+        theta: (D,) the state.
+        space: Its parameters.
+        compositor: Renderer of the scene.
+        labeller: Its labeller.
+        base: Scene of the labels that move.
+
+    Returns:
+        Pixels (H, W, 3) uint8 RGB; labels, including people and other objects outside of the scene; evaluation
+        targets, of which the first rows are the scene's objects.
     """
     moved = space.apply(space.scene, theta)
     render = compositor.render(moved)

@@ -1,4 +1,4 @@
-"""A detector as training begins with it: drawn anew, or from weights of an earlier one."""
+"""The detector that training starts from: random weights, or those of an earlier one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from drivesem.config.errors import UsageError
 
 AUTO, NONE, SQUEEZENET = "auto", "none", "squeezenet"
 BACKBONE = Path("build/squeezenet1_1.safetensors")
-"""Where tools/fetch_backbone.py leaves SqueezeNet 1.1."""
+"""Where tools/fetch_backbone.py stores SqueezeNet 1.1."""
 _AVERAGE = "average."
-"""Before the names of the averaged weights in a training checkpoint."""
+"""Prefix of the averaged weights in a training checkpoint."""
 
 
 def build_detector(name: str, anchors: Sequence[Sequence[float]] | None = None) -> Detector:
-    """A detector of one of ARCHITECTURES with any weights. UsageError for an unknown name."""
+    """Build a detector of one of `ARCHITECTURES`, uninitialised. Raises UsageError for an unknown name."""
     if name not in ARCHITECTURES:
         raise UsageError("--detector", f"one of {', '.join(ARCHITECTURES)}", repr(name))
     build = ARCHITECTURES[name]
@@ -33,11 +33,19 @@ def build_detector(name: str, anchors: Sequence[Sequence[float]] | None = None) 
 
 
 def initialise_weights(detector: Detector, start: str, seed: int) -> str:
-    """Give the detector its first weights; a sentence for the model card about where they come from.
+    """Give the detector its first weights.
 
-    start: "none", drawn from `seed`; "auto", the shipped weights of the architecture, or none; "squeezenet", the
-    ImageNet backbone in build/; or a file: weights of the same architecture, a checkpoint of a training run, or a
-    backbone. Raises UsageError for a file that is none of these.
+    Args:
+        detector: The detector.
+        start: none: random weights; auto: the shipped weights of the architecture, or none; squeezenet: the ImageNet
+            backbone in build/; or a file with weights of the same architecture, a checkpoint, or a backbone.
+        seed: Seed of random weights.
+
+    Returns:
+        A sentence for the model card about the origin of the weights.
+
+    Raises:
+        UsageError: The file is none of these.
     """
     initialise = getattr(detector, "initialise")  # noqa: B009 - the contract leaves it to detectors that are trained
     initialise(torch.Generator().manual_seed(seed))
@@ -89,7 +97,7 @@ def _copy(detector: Detector, tensors: dict[str, Tensor], path: Path) -> None:
 
 
 def set_dropout(detector: Detector, probability: float) -> None:
-    """Of all dropout layers; a detector without any has none to set."""
+    """Set the probability of all dropout layers, if there are any."""
     for module in detector.modules():
         if isinstance(module, SeededDropout):
             module.probability = probability

@@ -1,4 +1,4 @@
-"""A training run: a detector from frames, with its curves, its best weights and their model card; resumable."""
+"""Trains a detector, with curves, best weights and their model card; resumable. Also fits anchors to a data set."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from drivesem.data.splits import chosen
 from drivesem.report.terminal import Console, training_progress_bar
 from drivesem.run.folder import SHARING, claim_folder
 from drivesem.run.workers import make_parallel_map
-from drivesem.training import validation as keeper
+from drivesem.training import validation
 from drivesem.training.card import CardFacts, describe_data, generated_folders
 from drivesem.training.frames import FrameStore
 from drivesem.training.semantic import PerturbedFrames
@@ -46,7 +46,7 @@ CACHES = "cache"
 SEMANTIC = "semantic"
 """Folder of perturbed frames in the run's folder."""
 _WRITTEN = (
-    *(CHECKPOINT, LOG, keeper.EVALUATIONS, keeper.BEST, keeper.CURVES),
+    *(CHECKPOINT, LOG, validation.EVALUATIONS, validation.BEST, validation.CURVES),
     *(CACHES, SEMANTIC, "tensorboard"),
 )
 _FREE = (
@@ -55,11 +55,11 @@ _FREE = (
 )
 """Settings that a run may change on the way."""
 _NOT_IN_COMMAND = ("out", "weights", "json", "resume", "workers", "loaders", "note", "limit")
-"""Settings that a card's command need not repeat."""
+"""Settings that a card's command omits."""
 
 
 class TrainingTime:
-    """Steps, and seconds by the clock and of the processor that they took, without what is done `beside` them."""
+    """Number of steps, and their time by the clock and of the CPU, without `paused` work."""
 
     def __init__(self, batch: int) -> None:
         self.steps, self.batch = 0, batch
@@ -67,13 +67,13 @@ class TrainingTime:
         self._ended = self._clock, self._processor
 
     def count(self) -> None:
-        """A step is done."""
+        """Count a finished step."""
         self.steps += 1
         self._ended = time.perf_counter(), time.process_time()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """What is done inside is no step."""
+        """Exclude the time of the enclosed work."""
         clock, processor = time.perf_counter(), time.process_time()
         yield
         self._clock += time.perf_counter() - clock
@@ -92,10 +92,12 @@ class TrainingTime:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What came of a run. data: the JSON; pace: of the steps that were taken now."""
+    """Result of a training run."""
 
     data: dict[str, Any]
+    """Data of `--json`."""
     time: TrainingTime
+    """Time of the steps of this call."""
 
 
 def run_training(config: TrainConfig) -> TrainingResult | None:
@@ -106,7 +108,7 @@ def run_training(config: TrainConfig) -> TrainingResult | None:
         console = Console(stderr=True, quiet=rank > 0)
         settings = _settings(config)
         detector = build_detector(config.detector)
-        start = _begin(config, detector)  # before the folder is made: bad settings leave nothing behind
+        start = _begin(config, detector)  # before the folder is created: bad settings leave nothing behind
         out = Path(config.out or f"runs/train-{config.detector}-seed{config.seed}")
         if rank == 0:
             claim_folder(out, config, _WRITTEN, _FREE)
@@ -116,29 +118,29 @@ def run_training(config: TrainConfig) -> TrainingResult | None:
             start = _begin(config, detector)
         detector = detector.to(device=device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         weights = Path(config.weights or out / f"{config.detector}.safetensors")
-        tell = partial(console.print, soft_wrap=True)
+        report = partial(console.print, soft_wrap=True)
         recipe = _recipe(config, frames, start)
         if rank == 0:
             recipe = replace(recipe, data=f"{recipe.data}{_described(config, weights)}")
-        judge = CheckpointSelector(out, weights, recipe, held_out, device, tell)
-        shown: Sequence[Sample] = frames
+        judge = CheckpointSelector(out, weights, recipe, held_out, device, report)
+        samples: Sequence[Sample] = frames
         if config.semantic:
-            shown = PerturbedFrames(frames, out / SEMANTIC, config.semantic, config.seed)
-        pace = TrainingTime(config.batch)
+            samples = PerturbedFrames(frames, out / SEMANTIC, config.semantic, config.seed)
+        time_spent = TrainingTime(config.batch)
 
         def evaluate(detector: Detector, step: int) -> None:
-            with pace.paused():
+            with time_spent.paused():
                 judge(detector, step)
 
-        with _shown(pace, out, console) as progress:
+        with _show_progress(time_spent, out, console) as progress:
             try:
-                train(detector, shown, settings, out, evaluate, progress=progress, loaders=config.loaders)
+                train(detector, samples, settings, out, evaluate, progress=progress, loaders=config.loaders)
             except FloatingPointError as error:
                 raise UsageError("--rate", "one at which the loss stays finite", error) from error
             except torch.OutOfMemoryError as error:
                 found = str(error).splitlines()[0]
                 raise UsageError("--window", "views that the device's memory holds one by one", found) from error
-        return _trained(config, out, weights, len(frames), pace) if rank == 0 else None
+        return _trained(config, out, weights, len(frames), time_spent) if rank == 0 else None
 
 
 def _settings(config: TrainConfig) -> TrainingSettings:
@@ -168,7 +170,7 @@ def _settings(config: TrainConfig) -> TrainingSettings:
 
 
 def _begin(config: TrainConfig, detector: Detector) -> str:
-    """Give the detector its first weights and settings; a sentence about where they come from."""
+    """Give the detector its first weights and settings; return a sentence about their origin."""
     start = initialise_weights(detector, config.start, config.seed)
     set_dropout(detector, config.dropout)
     if isinstance(detector, SqueezeDet):
@@ -189,7 +191,7 @@ def _with_own_anchors(config: TrainConfig, frames: FrameStore) -> Detector:
 def _data(
     config: TrainConfig, out: Path, detector: Detector, rank: int, console: Console
 ) -> tuple[FrameStore, ValidationSet | None]:
-    """The frames to train on and to judge by, decoded by the first process and read by the others."""
+    """The frames to train on and to evaluate on, decoded by the first process and read by the others."""
     if rank > 0:
         distributed.barrier()
     name, root, held_out = _folders(config, out, rank, console)
@@ -215,7 +217,7 @@ def _data(
 
 
 def _warn_of_shared(config: TrainConfig, console: Console) -> None:
-    """Say where frames to judge by are among those that are trained on, or that choose t*."""
+    """Warn where evaluation frames are also trained on, or select t*."""
 
     def folders(of: str | None) -> dict[Path, str]:
         return {Path(part).resolve(): part for part in (of or "").split(",") if part}
@@ -224,17 +226,17 @@ def _warn_of_shared(config: TrainConfig, console: Console) -> None:
     trained, judged, chosen = folders(config.root), folders(config.held_out), folders(config.validation)
     for setting, own in (("--held-out", judged), ("--validation", chosen)):
         for path, part in own.items():
-            told = None
+            warning = None
             if path in trained and not (setting == "--held-out" and divided):
-                told = "is trained on too: its figures, and t*, say nothing of other pictures"
+                warning = "is also trained on: its metrics and t* do not apply to other images"
             elif path in chosen and setting == "--held-out":
-                told = "chooses the weights and t* too: its figures are optimistic"
-            if told is not None:
-                console.print(f"{setting}: {part} {told}", soft_wrap=True, markup=False, highlight=False)
+                warning = "also selects the weights and t*: its metrics are optimistic"
+            if warning is not None:
+                console.print(f"{setting}: {part} {warning}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _folders(config: TrainConfig, out: Path, rank: int, console: Console) -> tuple[str, Path, Path | None]:
-    """Layout, folder to train on, folder to judge by."""
+    """Layout, folder to train on, folder to evaluate on."""
     if config.dataset != SYNTH:
         held_out = config.held_out or (config.root if config.held_out_split else None)
         return config.dataset, Path(config.root or ""), Path(held_out) if held_out else None
@@ -248,7 +250,7 @@ def _folders(config: TrainConfig, out: Path, rank: int, console: Console) -> tup
         for order in orders:
             done = synthesise(order, make_parallel_map(config))
             with training_progress_bar(console) as bar:
-                for _ in bar.track(done, total=order.frames, description="making frames"):
+                for _ in bar.track(done, total=order.frames, description="generating frames"):
                     pass
     return "kitti", root, held_out if config.held_out_frames else None
 
@@ -294,33 +296,36 @@ def _recipe(config: TrainConfig, frames: FrameStore, start: str) -> CardFacts:
 
 
 def _described(config: TrainConfig, weights: Path) -> str:
-    """Write beside the weights which generated streets they have seen; a sentence for the card that names the
-    files, empty where the folders do not tell.
+    """Write next to the weights which generated streets they were trained and selected on; return a sentence that
+    names the files for the card, empty for other frames.
     """
-    told = []
+    sentences = []
     chosen = config.validation or config.held_out
-    for folders, kind, what in ((config.root, "", "of these frames"), (chosen, "_chosen", "of those that chose")):
+    for folders, kind, what in (
+        (config.root, "", "of these frames"),
+        (chosen, "_chosen", "of those that selected"),
+    ):
         if known := generated_folders(folders):
             path = weights.with_name(f"{weights.stem}{kind}_data.json")
             files.write_json(path, describe_data(known))
-            told.append(f"`{path.name}` lists seeds and shapes {what}.")
-    return "".join(f"\n  {line}" for line in told)
+            sentences.append(f"`{path.name}` lists seeds and shapes {what}.")
+    return "".join(f"\n  {line}" for line in sentences)
 
 
 def _portable(config: TrainConfig) -> TrainConfig:
-    """The configuration with folders and files by their names, not where they lay on this machine."""
+    """The configuration with names of folders and files instead of their paths on this machine."""
     names = {key: getattr(config, key) for key in ("root", "held_out", "validation", "also", "start")}
     return replace(config, **{key: _names(value) for key, value in names.items() if value is not None})
 
 
 def _names(folders: str) -> str:
-    """The last parts of paths with commas between."""
+    """The last parts of comma-separated paths."""
     return ",".join(Path(part).name for part in folders.split(",") if part)
 
 
 @contextmanager
 def _processes(config: TrainConfig) -> Iterator[tuple[int, str]]:
-    """This process's number and its device; a process group where torchrun started several."""
+    """The rank and device of this process, in a process group where torchrun started several."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         check_device(config.device)
         yield 0, config.device
@@ -338,18 +343,18 @@ def _processes(config: TrainConfig) -> Iterator[tuple[int, str]]:
 
 
 @contextmanager
-def _shown(
-    pace: TrainingTime, out: Path, console: Console
+def _show_progress(
+    time_spent: TrainingTime, out: Path, console: Console
 ) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
-    """A bar with the loss and the speed, and TensorBoard's events where it is installed."""
+    """Show a progress bar with loss and speed, and write TensorBoard events where it is installed."""
     writer = _tensorboard(out)
     with training_progress_bar(console) as bar:
         task = bar.add_task("training", total=None)
 
         def progress(done: int, steps: int, row: Mapping[str, float]) -> None:
-            pace.count()
-            told = f"loss {row['total']:.3f}, {pace.images_a_second:.1f} images/s"
-            bar.update(task, completed=done, total=steps, description=told)
+            time_spent.count()
+            description = f"loss {row['total']:.3f}, {time_spent.images_a_second:.1f} images/s"
+            bar.update(task, completed=done, total=steps, description=description)
             if writer is not None:
                 for name, value in row.items():
                     writer.add_scalar(name, value, done)
@@ -362,7 +367,7 @@ def _shown(
 
 
 def _tensorboard(out: Path) -> Any:
-    """A writer of TensorBoard's events; None where TensorBoard is not installed."""
+    """A writer of TensorBoard events; None where TensorBoard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ModuleNotFoundError:
@@ -370,7 +375,9 @@ def _tensorboard(out: Path) -> Any:
     return SummaryWriter(str(out / "tensorboard"))
 
 
-def _trained(config: TrainConfig, out: Path, weights: Path, frames: int, pace: TrainingTime) -> TrainingResult:
+def _trained(
+    config: TrainConfig, out: Path, weights: Path, frames: int, time_spent: TrainingTime
+) -> TrainingResult:
     data = {
         "out": str(out),
         "weights": str(weights),
@@ -378,12 +385,12 @@ def _trained(config: TrainConfig, out: Path, weights: Path, frames: int, pace: T
         "dataset": config.dataset,
         "frames": frames,
         "steps": int(read_weights(out / CHECKPOINT)[0]["step"]),
-        "steps_now": pace.steps,
-        "images_a_second": round(pace.images_a_second, 2),
-        "processor_seconds_an_image": round(pace.processor_seconds_an_image, 4),
-        "best": files.read_json(out / keeper.BEST) if (out / keeper.BEST).is_file() else None,
+        "steps_now": time_spent.steps,
+        "images_a_second": round(time_spent.images_a_second, 2),
+        "processor_seconds_an_image": round(time_spent.processor_seconds_an_image, 4),
+        "best": files.read_json(out / validation.BEST) if (out / validation.BEST).is_file() else None,
     }
-    return TrainingResult(data, pace)
+    return TrainingResult(data, time_spent)
 
 
 _MIN_HEIGHT_PX = 12.0

@@ -1,4 +1,4 @@
-"""Judges a detector as it is trained, and keeps the best weights with their model card."""
+"""Evaluates a detector while it trains, and saves the best weights with their model card."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ _COLUMNS: tuple[str, ...] = ("step", "mark", "car_ap50", "car_recall", "car_ap",
 
 @dataclass(frozen=True)
 class ValidationSet:
-    """frames: to choose and to judge by; thin: every so-and-so-many-th of them while training goes on, all for the
-    card; also: further frames whose figures go into the card; test: what is judged by in the place of `frames`,
-    which then only choose.
-    """
+    """Frames that are not trained on."""
 
     frames: FrameStore
+    """Frames that select weights and t*, and measure them unless there is a `test`."""
     thin: int = 1
+    """Stride of the frames in evaluations during training; the card uses all."""
     also: FrameStore | None = None
+    """Further frames that the card reports."""
     test: FrameStore | None = None
+    """Frames that measure instead of `frames`, which then only select."""
 
 
 class CheckpointSelector:
-    """Called with the averaged detector now and then: writes evaluations, curves, and the weights if they are the
-    best so far, as float16 with t* and figures, and the card beside them.
+    """Evaluates the averaged detector, writes evaluations and curves, and saves the weights if they are the best so
+    far, as float16 with t* and metrics, with their model card.
 
-    Without held-out frames the last weights are the best.
+    Without held-out frames, the last weights are the best.
     """
 
     def __init__(
@@ -53,10 +54,20 @@ class CheckpointSelector:
         recipe: CardFacts,
         held_out: ValidationSet | None,
         device: str = "cpu",
-        tell: Callable[[str], None] = lambda line: None,
+        report: Callable[[str], None] = lambda line: None,
     ) -> None:
+        """Prepare the evaluation.
+
+        Args:
+            run: Folder of the run.
+            weights: File of the best weights.
+            recipe: Facts for the model card.
+            held_out: Frames to evaluate on; None for none.
+            device: Where the detector runs.
+            report: Receives lines of progress.
+        """
         self.run, self.weights, self.recipe, self.held_out = run, weights, recipe, held_out
-        self.device, self.tell = device, tell
+        self.device, self.report = device, report
         self.wanted = held_out.frames.evaluation_targets(recipe.judged) if held_out is not None else []
         best = files.read_json(run / BEST) if (run / BEST).is_file() else {}
         self.best = float(best.get("mark", 0.0))
@@ -70,21 +81,21 @@ class CheckpointSelector:
             self._export(detector, step, None)
         else:
             indices = range(0, len(self.wanted), self.held_out.thin)
-            marks = self._judge(detector, self.held_out.frames, indices)
-            self._record(step, marks)
-            self.tell(f"step {step}: {marks.summary()}")
-            if marks.selection_score >= self.best:
-                self.best = marks.selection_score
-                whole = marks
+            scores = self._evaluate(detector, self.held_out.frames, indices)
+            self._record(step, scores)
+            self.report(f"step {step}: {scores.summary()}")
+            if scores.selection_score >= self.best:
+                self.best = scores.selection_score
+                whole = scores
                 if len(indices) < len(self.wanted):
-                    whole = self._judge(detector, self.held_out.frames, range(len(self.wanted)))
+                    whole = self._evaluate(detector, self.held_out.frames, range(len(self.wanted)))
                 self._export(detector, step, whole)
                 files.write_json(
-                    self.run / BEST, {"mark": marks.selection_score, "step": step} | _row(step, whole)
+                    self.run / BEST, {"mark": scores.selection_score, "step": step} | _row(step, whole)
                 )
         plot_curves(self.run / LOG, self.run / EVALUATIONS, self.run / CURVES, f"{detector.name}, {self.run.name}")
 
-    def _judge(self, detector: Detector, frames: FrameStore, indices: range) -> ValidationScores:
+    def _evaluate(self, detector: Detector, frames: FrameStore, indices: range) -> ValidationScores:
         found = detect_in_store(detector, frames, indices, self.device)
         wanted = (
             self.wanted
@@ -93,73 +104,80 @@ class CheckpointSelector:
         )
         return score_detections(found, [wanted[i] for i in indices], detector.classes)
 
-    def _export(self, detector: Detector, step: int, marks: ValidationScores | None) -> None:
+    def _export(self, detector: Detector, step: int, scores: ValidationScores | None) -> None:
         facts = {"step": str(step)}
-        if marks is not None:
-            detector.t_star = marks.t_star
-            facts |= {"car": json.dumps(asdict(marks.scores.headline)), "f1": f"{marks.f1:.4f}"}
+        if scores is not None:
+            detector.t_star = scores.t_star
+            facts |= {"car": json.dumps(asdict(scores.scores.headline)), "f1": f"{scores.f1:.4f}"}
         save_detector(detector, self.weights, facts)
         also = None
         if self.held_out is not None and self.held_out.also is not None:
             frames = self.held_out.also
-            also = len(frames), self._judge(detector, frames, range(len(frames))).scores.headline
+            also = len(frames), self._evaluate(detector, frames, range(len(frames))).scores.headline
         log = read_columns(self.run / LOG)
         seconds = float(log["seconds"][-1]) if log else 0.0
-        told, chosen_on = None if marks is None else (len(self.wanted), marks), None
-        if marks is not None and self.held_out is not None and self.held_out.test is not None:
+        measured, chosen_on = None if scores is None else (len(self.wanted), scores), None
+        if scores is not None and self.held_out is not None and self.held_out.test is not None:
             test, chosen_on = self.held_out.test, len(self.wanted)
             found, wanted = (
                 detect_in_store(detector, test, range(len(test)), self.device),
                 test.evaluation_targets(self.recipe.judged),
             )
-            scores = evaluate(wanted, found, detector.classes, marks.t_star, "Car")
-            told = len(test), replace(marks, scores=scores)
+            coco_scores = evaluate(wanted, found, detector.classes, scores.t_star, "Car")
+            measured = len(test), replace(scores, scores=coco_scores)
         files.write_text(
             self.weights.with_suffix(".md"),
-            format_card(detector, self.recipe, self.weights, (step, seconds), told, also, chosen_on),
+            format_card(detector, self.recipe, self.weights, (step, seconds), measured, also, chosen_on),
         )
-        self.tell(f"step {step}: wrote {self.weights}")
+        self.report(f"step {step}: wrote {self.weights}")
 
-    def _record(self, step: int, marks: ValidationScores) -> None:
-        """Add a line; lines from this step on are of a run that was killed and went on from before."""
+    def _record(self, step: int, scores: ValidationScores) -> None:
+        """Append a line; replace lines from this step on, which an interrupted run left behind."""
         path = self.run / EVALUATIONS
-        kept: list[dict[str, str]] = []
+        earlier: list[dict[str, str]] = []
         if path.is_file():
             with path.open(newline="") as file:
-                kept = [row for row in csv.DictReader(file) if int(row["step"]) < step]
+                earlier = [row for row in csv.DictReader(file) if int(row["step"]) < step]
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, _COLUMNS)
         writer.writeheader()
-        writer.writerows(kept)
-        row = {k: "" if v is None else f"{v:.6g}" for k, v in _row(step, marks).items()}
+        writer.writerows(earlier)
+        row = {k: "" if v is None else f"{v:.6g}" for k, v in _row(step, scores).items()}
         writer.writerow(row | {"step": str(step)})
         files.write_text(path, table.getvalue())
 
 
-def _row(step: int, marks: ValidationScores) -> dict[str, float | None]:
-    car, every = marks.scores.headline, marks.scores.overall
+def _row(step: int, scores: ValidationScores) -> dict[str, float | None]:
+    car, every = scores.scores.headline, scores.scores.overall
     return {
         "step": step,
-        "mark": marks.selection_score,
+        "mark": scores.selection_score,
         "car_ap50": car.ap50,
         "car_recall": car.recall,
         "car_ap": car.ap,
         "ap50": every.ap50,
         "recall": every.recall,
-        "f1": marks.f1,
-        "t_star": marks.t_star,
+        "f1": scores.f1,
+        "t_star": scores.t_star,
     }
 
 
 EXCUSED = 0.5
-"""Overlap with an ignored box, or share inside it, from which a detection counts nowhere."""
+"""IoU with an ignored box, or share inside it, above which a detection does not count."""
 HIT_IOU = 0.5
 
 
 def score_detections(
     found: Sequence[Detections], wanted: Sequence[Targets], classes: Sequence[str], headline: str = "Car"
 ) -> ValidationScores:
-    """Figures of detections in images, and the score at which F1 over all classes is best."""
+    """Compute COCO's metrics, and the score of the best F1 over all classes.
+
+    Args:
+        found: Detections in each image.
+        wanted: Labels of each image.
+        classes: Names of the classes.
+        headline: Class that the paper reports.
+    """
     outcomes = [_outcomes(d, t, k) for d, t in zip(found, wanted, strict=True) for k in range(len(classes))]
     rows = np.concatenate(outcomes)
     rows = rows[np.argsort(-rows[:, 0], kind="stable")]
@@ -173,15 +191,15 @@ def score_detections(
 def _outcomes(found: Detections, wanted: Targets, label: int) -> np.ndarray:
     """(K, 2) score and hit of each detection of a class that counts."""
     mine = found.labels == label
-    boxes_xyxy, scores = found.boxes_xyxy[mine], found.scores[mine]
+    boxes_xyxy, confidences = found.boxes_xyxy[mine], found.scores[mine]
     counted = (wanted.labels == label) & ~wanted.ignore
     overlap = boxes.iou_matrix(boxes_xyxy, wanted.boxes_xyxy[counted]).numpy()
     ignored = wanted.boxes_xyxy[wanted.ignore & (wanted.labels == label)]
     excused = (boxes.iou_matrix(boxes_xyxy, ignored) > EXCUSED) | (boxes.ioa_matrix(boxes_xyxy, ignored) > EXCUSED)
-    excused = excused.any(1).numpy() if len(ignored) else np.zeros(len(scores), bool)
+    excused = excused.any(1).numpy() if len(ignored) else np.zeros(len(confidences), bool)
     free = np.ones(overlap.shape[1], bool)
     rows = []
-    for i, score in enumerate(scores.tolist()):
+    for i, score in enumerate(confidences.tolist()):
         candidates = np.where(free, overlap[i], 0.0)
         if candidates.size and candidates.max() >= HIT_IOU:
             free[candidates.argmax()] = False
@@ -194,7 +212,17 @@ def _outcomes(found: Detections, wanted: Targets, label: int) -> np.ndarray:
 def detect_in_store(
     detector: Predictor, frames: FrameStore, indices: Sequence[int], device: str = "cpu"
 ) -> list[Detections]:
-    """Detections in whole frames, on the CPU."""
+    """Detect objects in whole frames.
+
+    Args:
+        detector: The detector.
+        frames: Frames.
+        indices: Which of them.
+        device: Where the detector runs.
+
+    Returns:
+        Detections of each frame, on the CPU.
+    """
     found = []
     for index in indices:
         image = torch.from_numpy(np.array(frames.image(index))).permute(2, 0, 1)[None].float() / 255

@@ -1,1 +1,1 @@
-"""A change of cars over a whole clip: `drivesem drive`."""
+"""Attacks on a whole clip, with one consistent change per vehicle: `drivesem drive`."""

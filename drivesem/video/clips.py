@@ -1,4 +1,4 @@
-"""A clip taken apart, frame by frame, so that a car has one mesh and one size in all of its frames."""
+"""De-renders a clip frame by frame, with one mesh and one size per car in all of its frames."""
 
 from __future__ import annotations
 
@@ -24,45 +24,54 @@ from scene_ir.io import load_scene, save_scene
 from scene_ir.types import Camera, Labels, SceneIR
 
 DEMO_FRAMES = 30
-"""Of the embedded drive: three seconds."""
+"""Frames of the embedded clip: three seconds."""
 _TRACKS = "tracks"
-"""Key of a scene's provenance: the tracks of its labels."""
+"""Provenance key of a scene: the tracks of its labels."""
 _BYTES_A_PIXEL = 180
-"""What an attack on a clip keeps of each frame: its maps, and what the detector made of the photograph."""
+"""Memory of an attack per pixel of each frame: its maps, and the detector's layers for the photograph."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipSource:
-    """What is taken apart. folder: of clips, None for the embedded drive; name: of the clip, None for the first;
-    limit: frames, from the first on; fit: whether shapes are fitted; keep_going: past frames that cannot be used.
-    """
+    """The clip to de-render."""
 
     folder: str | None
+    """Folder of clips; None for the embedded one."""
     name: str | None
+    """Name of the clip; None for the first."""
     limit: int | None
+    """Number of frames from the first one."""
     seed: int
+    """Seed of the embedded clip."""
     fit: bool
+    """Whether to fit shapes."""
     keep_going: bool
+    """Whether to skip frames that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)
 class DerenderedClip:
-    """scenes, in order; tracks: of each scene's objects; failed: why others could not be used, by frame."""
+    """The scenes of a clip, in order."""
 
     name: str
+    """Name of the clip."""
     names: tuple[str, ...]
+    """Names of the frames."""
     scenes: tuple[SceneIR, ...]
+    """Scene of each frame."""
     tracks: tuple[tuple[int, ...], ...]
+    """Track of each object in each frame."""
     failed: dict[str, str] = field(default_factory=dict)
+    """Why other frames could not be used."""
 
 
 class _DemoFrames:
-    """The embedded drive's frames."""
+    """Frames of the embedded clip."""
 
-    def __init__(self, taking: ClipSource) -> None:
+    def __init__(self, source: ClipSource) -> None:
         from drivesem.synth.drives import drive_of
 
-        self._drive = drive_of(taking.seed, taking.limit or DEMO_FRAMES)
+        self._drive = drive_of(source.seed, source.limit or DEMO_FRAMES)
         self.name = DEMO
         self.names = tuple(f"drive-{number:03d}" for number in range(self._drive.frames))
 
@@ -70,89 +79,88 @@ class _DemoFrames:
         return self._drive.scene(self.names.index(name))
 
     def camera(self) -> Camera:
-        """Of the first frame."""
+        """Camera of the first frame."""
         return self._drive.plan(0).setting.view.camera
 
 
 class _LabelledFrames:
-    """The frames of a labelled clip. A car's shape and size are those of the frame in which it is seen best; it
-    stands where each frame's label says, whatever the photograph shows: what is found frame by frame differs from
-    frame to frame, and cars would tremble.
+    """Frames of a labelled clip.
+
+    A car takes its shape and size from the frame that shows it best, and its pose from each frame's label: poses
+    fitted frame by frame differ, and cars would jitter.
     """
 
-    def __init__(self, taking: ClipSource) -> None:
-        self._clip = clip_of(clips_in(taking.folder or ""), taking.name)
+    def __init__(self, source: ClipSource) -> None:
+        self._clip = clip_of(clips_in(source.folder or ""), source.name)
         self.name = self._clip.name
-        self.names = self._clip.frames[: taking.limit]
-        self._fit = taking.fit
-        self._passed_over = (SceneError,) if taking.keep_going else ()
+        self.names = self._clip.frames[: source.limit]
+        self._fit = source.fit
+        self._passed_over = (SceneError,) if source.keep_going else ()
         self._shapes: dict[int, Placement] | None = None
 
     def scene(self, name: str) -> SceneIR:
-        labels, tracks = _labels_of(self._clip, name), self._clip.tracks(name)
-        known = [self._standing(labels, row, track) for row, track in enumerate(tracks)]
+        labels, tracks = _load_labels(self._clip, name), self._clip.tracks(name)
+        known = [self._place_vehicle(labels, row, track) for row, track in enumerate(tracks)]
         frame = self._clip.dataset.frame(name)
         scene = derender(frame, replace(DerenderSettings.fast(), known=tuple(known)))
         return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
 
     def camera(self) -> Camera | None:
-        """Of the first frame that can be read; None where none can."""
+        """Camera of the first readable frame; None without one."""
         for name in self.names:
             with suppress(*self._passed_over):
                 return self._clip.dataset.frame(name).camera
         return None
 
-    def _standing(self, labels: Labels, row: int, track: int) -> Placement | None:
-        """A label's vehicle where the label says; None where it is none."""
+    def _place_vehicle(self, labels: Labels, row: int, track: int) -> Placement | None:
+        """Place a label's vehicle at the label; None where it is no vehicle."""
         kind, size = labels.kind[row], labels.size_lhw[row]
         if kind not in VEHICLE_CATEGORIES or not bool((size > 0).all()):
             return None
         at = labels.translation[row], labels.yaw[row]
-        shape = self._known().get(track)
-        if shape is None:  # in no frame could it be told what it is
+        shape = self._load_shapes().get(track)
+        if shape is None:  # no frame determines its shape
             return place_mesh(rank_template_kinds(kind, size.tolist())[0], *at, size)
         return replace(shape, translation=at[0], yaw=at[1])
 
-    def _known(self) -> dict[int, Placement]:
-        """The shape of each track, looked at once by each process: in the best of its frames that can be used."""
+    def _load_shapes(self) -> dict[int, Placement]:
+        """The shape of each track, from the best of its usable frames; computed once per process."""
         if self._shapes is None:
-            look = cache(self._shapes_in)
+            load = cache(self._shapes_in)
             best = {
-                track: next((shapes for name in names if (shapes := look(name)) is not None), {})
-                for track, names in self._views().items()
+                track: next((shapes for name in names if (shapes := load(name)) is not None), {})
+                for track, names in self._rank_frames().items()
             }
-            # not before all are known: with some, other frames' cars would be of no shape
+            # assigned at once: a partial result would leave cars of other frames without a shape
             self._shapes = {track: shapes[track] for track, shapes in best.items() if track in shapes}
         return self._shapes
 
     def _shapes_in(self, name: str) -> dict[int, Placement] | None:
-        """The shapes that a frame shows, by track; None where it is passed over."""
+        """The shapes in a frame by track; None where the frame is skipped."""
         with suppress(*self._passed_over):
             found = place_vehicles(self._clip.dataset.frame(name), derender_settings(self._fit))
             tracks = self._clip.tracks(name)
             return {tracks[row]: placement for row, placement in found.items()}
         return None
 
-    def _views(self) -> dict[int, list[str]]:
-        """For each vehicle's track its frames, the best first: those that show it largest, of those in which it is
-        hidden and cut least.
-        """
-        views: dict[int, list[tuple[tuple[bool, bool, float], str]]] = {}
+    def _rank_frames(self) -> dict[int, list[str]]:
+        """The frames of each vehicle's track, the best first: little occluded and truncated, then largest."""
+        ranked_frames: dict[int, list[tuple[tuple[bool, bool, float], str]]] = {}
         for name in self.names:
             with suppress(*self._passed_over):
-                labels = _labels_of(self._clip, name)
+                labels = _load_labels(self._clip, name)
                 heights = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
                 for row, track in enumerate(self._clip.tracks(name)):
                     if labels.kind[row] in VEHICLE_CATEGORIES:
                         plain = int(labels.occlusion[row]) <= 1, float(labels.truncation[row]) < 0.1
-                        views.setdefault(track, []).append(((*plain, float(heights[row])), name))
+                        ranked_frames.setdefault(track, []).append(((*plain, float(heights[row])), name))
         return {
             track: [name for _, name in sorted(ranked, key=itemgetter(0), reverse=True)]
-            for track, ranked in views.items()
+            for track, ranked in ranked_frames.items()
         }
 
 
-def _labels_of(clip: Clip, name: str) -> Labels:
+def _load_labels(clip: Clip, name: str) -> Labels:
     labels = clip.dataset.labels(name)
     if labels is None or len(labels.kind) != len(clip.tracks(name)):
         found = "none" if labels is None else f"{len(labels.kind)}"
@@ -163,54 +171,57 @@ def _labels_of(clip: Clip, name: str) -> Labels:
 
 
 class ClipDerenderer:
-    """What one process needs: built once, used for many frames."""
+    """Per-process state, built once and reused for all frames."""
 
-    def __init__(self, taking: ClipSource, out: Path) -> None:
-        self.source = _DemoFrames(taking) if taking.folder is None else _LabelledFrames(taking)
-        self.taking, self.out = taking, out
+    def __init__(self, source: ClipSource, out: Path) -> None:
+        self.frames = _DemoFrames(source) if source.folder is None else _LabelledFrames(source)
+        self.source, self.out = source, out
 
     def __call__(self, name: str) -> None:
-        """One frame to its folder. SceneError for one that cannot be used."""
-        save_scene(self.source.scene(name), self.out / name)
+        """De-render one frame into its folder. Raises SceneError where it cannot be used."""
+        save_scene(self.frames.scene(name), self.out / name)
 
 
-def derender_clip(work: ClipDerenderer, sharing: WorkerOptions) -> DerenderedClip:
-    """The clip's frames, taken apart into the taker's folder as far as they are not there yet. Raises UsageError
-    or SceneError for a clip that cannot be read, or has no vehicle.
+def derender_clip(work: ClipDerenderer, workers: WorkerOptions) -> DerenderedClip:
+    """De-render the frames of a clip that are not in the output folder yet, and load all.
+
+    Raises UsageError or SceneError for a clip that cannot be read or has no vehicle.
     """
-    taking, out = work.taking, work.out
-    names = work.source.names
-    _check_memory(work.source)
+    source, out = work.source, work.out
+    names = work.frames.names
+    _check_memory(work.frames)
     todo = [name for name in names if not (out / name / RECORD).is_file()]
     if todo:
-        make_ready(DerenderConfig(dataset=DEMO if taking.folder is None else "kitti", root=taking.folder))
+        make_ready(DerenderConfig(dataset=DEMO if source.folder is None else "kitti", root=source.folder))
     failed = run_frame_jobs(
         todo,
         work,
-        partial(ClipDerenderer, taking, out),
-        sharing,
-        ProgressSettings("taking frames apart", show_remaining=True),
+        partial(ClipDerenderer, source, out),
+        workers,
+        ProgressSettings("de-rendering frames", show_remaining=True),
     ).failed
-    kept = tuple(name for name in names if name not in failed)
-    scenes = tuple(load_scene(out / name) for name in kept)
+    usable = tuple(name for name in names if name not in failed)
+    scenes = tuple(load_scene(out / name) for name in usable)
     if not any(len(scene.objects) for scene in scenes):
-        found = next(iter(failed.values()), f"none in {format_count(len(kept), 'frame')}")
-        raise UsageError("CLIP", "frames with cars, vans or trucks that can be taken apart", found)
-    return DerenderedClip(work.source.name, kept, scenes, tuple(object_tracks(scene) for scene in scenes), failed)
+        found = next(iter(failed.values()), f"none in {format_count(len(usable), 'frame')}")
+        raise UsageError("CLIP", "frames with cars, vans or trucks that can be de-rendered", found)
+    return DerenderedClip(
+        work.frames.name, usable, scenes, tuple(object_tracks(scene) for scene in scenes), failed
+    )
 
 
-def _check_memory(source: _DemoFrames | _LabelledFrames) -> None:
-    """UsageError where the clip's frames would not fit into memory together."""
-    camera = source.camera()
+def _check_memory(frames: _DemoFrames | _LabelledFrames) -> None:
+    """Raise UsageError where the clip's frames do not fit into memory together."""
+    camera = frames.camera()
     if camera is None:
         return
     there, needed = memory_gb(), _BYTES_A_PIXEL * camera.width * camera.height / 2**30
-    if there is not None and len(source.names) * needed > there:
-        expected = f"at most {format_count(int(there / needed), 'frame')}, as memory of {there:g} GB holds"
-        raise UsageError("CLIP: frames", f"{expected} (--limit takes the first)", f"{len(source.names)}")
+    if there is not None and len(frames.names) * needed > there:
+        expected = f"at most {format_count(int(there / needed), 'frame')}, which fit into {there:g} GB of memory"
+        raise UsageError("CLIP: frames", f"{expected} (--limit takes the first)", f"{len(frames.names)}")
 
 
 def object_tracks(scene: SceneIR) -> tuple[int, ...]:
-    """The tracks of a scene's objects."""
-    told = scene.provenance[_TRACKS].split(",")
-    return tuple(int(told[int(scene.provenance[f"objects[{i}].label"])]) for i in range(len(scene.objects)))
+    """Read the tracks of a scene's objects from its provenance."""
+    tracks = scene.provenance[_TRACKS].split(",")
+    return tuple(int(tracks[int(scene.provenance[f"objects[{i}].label"])]) for i in range(len(scene.objects)))

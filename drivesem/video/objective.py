@@ -1,4 +1,4 @@
-"""theta of a clip to its loss: the mean of its frames', in each of which stands what is a frame's attack."""
+"""The objective of a clip: from its theta to the mean loss of its frames, each with its own frame objective."""
 
 from __future__ import annotations
 
@@ -24,20 +24,25 @@ from scene_ir.render.prepare import RenderSettings
 
 @dataclass(frozen=True, slots=True)
 class FrameDetection:
-    """What a detector makes of one frame. found, counted: of each object, whether it is found, and judged; lost,
-    phantoms: which are missed and how many are made up that were right in the photograph.
-    """
+    """Detections in one frame of a clip."""
 
     rendered: RenderEvaluation
+    """The rendered frame, its labels and detections."""
     found: tuple[bool, ...]
+    """Whether each object is detected."""
     counted: tuple[bool, ...]
+    """Whether each object counts."""
     lost: tuple[int, ...]
+    """Objects that are missed but were detected in the photograph."""
     phantoms: int
+    """Number of phantoms."""
 
 
 class ClipObjective:
-    """What an attack on a clip raises. keys: frames that a gradient step looks at, evenly spread; each step looks
-    at others, in turn. looked: is called for each frame that was looked at. Raises as `Objective`.
+    """The objective that an attack on a clip maximises.
+
+    Each gradient step uses `config.keys` evenly spaced frames, other ones in turn. `on_frame` is called for each
+    evaluated frame. Raises as `Objective` does.
     """
 
     def __init__(
@@ -72,11 +77,11 @@ class ClipObjective:
 
     @property
     def passes(self) -> int:
-        """Of the detector so far, a gradient counted as 3."""
+        """Detector passes so far; a gradient counts as 3."""
         return sum(objective.passes for objective in self.frames)
 
     def problem(self, keep_last: bool = False) -> Problem:
-        """This objective as attacks see it."""
+        """The problem that attacks solve."""
         space = self.space
         return Problem(
             loss_and_grad=self.loss_and_grad,
@@ -91,7 +96,7 @@ class ClipObjective:
         )
 
     def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
-        """Loss and gradient (D,) at theta (D,), the means over this step's key frames."""
+        """Mean loss and gradient (D,) at theta (D,) over the frames of this step."""
         count = len(self.frames)
         chosen = {(self._steps + round(k * count / self._keys)) % count for k in range(self._keys)}
         self._steps += 1
@@ -106,24 +111,26 @@ class ClipObjective:
             preview = objective.preview(here.detach())
             seen += [] if preview is None else [preview]
             self.on_frame()
-        self._previews[_key(theta)] = _summed(seen)
+        self._previews[_key(theta)] = _combine_scores(seen)
         return total / len(chosen), gradient / len(chosen)
 
     def score(self, theta: Tensor) -> Score:
-        """What the detector makes of the whole clip at theta (D,)."""
+        """Evaluate the whole clip at theta (D,)."""
         key = _key(theta)
         if key not in self._scores:
-            self._scores[key] = _summed([self._scored(frame, sight) for frame, sight in self.detect_clip(theta)])
+            self._scores[key] = _combine_scores(
+                [self._score_frame(frame, detection) for frame, detection in self.detect_clip(theta)]
+            )
         return self._scores[key]
 
     def detect_clip(self, theta: Tensor) -> Iterator[tuple[int, FrameDetection]]:
-        """Every frame at theta (D,), rendered, judged, by its number; none is kept."""
+        """Yield the number and detections of every frame at theta (D,), one at a time."""
         for frame in range(len(self.frames)):
             yield frame, self.detect_frame(theta, frame)
 
     @torch.no_grad()
     def detect_frame(self, theta: Tensor, frame: int) -> FrameDetection:
-        """One frame at theta (D,)."""
+        """Render one frame at theta (D,) and detect."""
         objective, here = self.frames[frame], self.space.frame_theta(theta, frame)
         scene = objective.space.apply(objective.space.scene, here)
         objective.passes += 1
@@ -131,7 +138,7 @@ class ClipObjective:
         return self.match_frame(frame, objective.evaluate_render(scene, objective.compositor.render(scene)))
 
     def match_frame(self, frame: int, rendered: RenderEvaluation) -> FrameDetection:
-        """What stands in a frame's picture."""
+        """Match the detections of a rendered frame."""
         objective = self.frames[frame]
         count = len(objective.space.scene.objects)
         targets = objective.classes.map_targets(rendered.moved.targets)
@@ -145,15 +152,15 @@ class ClipObjective:
             len(failed.phantoms),
         )
 
-    def _scored(self, frame: int, sight: FrameDetection) -> Score:
-        hidden = sight.rendered.moved.out_of_sight.nonzero()[:, 0].tolist()
+    def _score_frame(self, frame: int, detection: FrameDetection) -> Score:
+        hidden = detection.rendered.moved.out_of_sight.nonzero()[:, 0].tolist()
         tracks = [self.space.tracks[int(self.space.rows[frame][i])] for i in hidden]
-        paper = self.frames[frame].failures(sight.rendered, "paper")
+        paper = self.frames[frame].failures(detection.rendered, "paper")
         return Score(
-            loss=sight.rendered.loss,
-            lost=len(sight.lost),
-            phantoms=sight.phantoms,
-            success=bool(sight.lost or sight.phantoms),
+            loss=detection.rendered.loss,
+            lost=len(detection.lost),
+            phantoms=detection.phantoms,
+            success=bool(detection.lost or detection.phantoms),
             success_paper=paper.success,
             violations=tuple(f"cars[{track}]: visibility" for track in tracks),
         )
@@ -165,8 +172,8 @@ class ClipObjective:
         )
 
 
-def _summed(scores: Sequence[Score]) -> Score:
-    """A clip's score of its frames': the mean loss, and how much fails in all."""
+def _combine_scores(scores: Sequence[Score]) -> Score:
+    """Combine the scores of frames: the mean loss, and the sum of the failures."""
     violations = tuple(dict.fromkeys(name for score in scores for name in score.violations))
     return Score(
         loss=sum(score.loss for score in scores) / max(len(scores), 1),

@@ -1,4 +1,4 @@
-"""What is said of a clip: a table of its cars, and what its columns mean."""
+"""The report of a clip: a table of its cars, an HTML page with a slider over its frames, and a video."""
 
 from __future__ import annotations
 
@@ -24,17 +24,16 @@ from scene_ir import files
 from scene_ir.errors import WriteError
 from scene_ir.raster.launch import suppress_stderr
 
-WORDS = ("car",)
+TEXT_COLUMNS = ("car",)
 NOTES = (
-    "lost: frames in which the detector misses the car, of those in which it is judged; before: in the clip as it "
-    "was, after: with the change, random: with a random change as large.",
-    "longest: frames of the longest unbroken stretch of misses after it. unseen: metres by which the camera comes "
-    "nearer to the car while it is missed, of the metres while it is judged.",
-    "certain: of the frames in which it is newly missed and that were looked at again in draws, those in which "
-    "it is missed for certain (docs/guide/ideas.md).",
+    "lost: frames in which the detector misses the car, out of those in which it counts; before: in the original "
+    "clip, after: with the change, random: with a random change of the same size.",
+    "longest: longest unbroken run of missed frames after the change. unseen: metres by which the camera approaches "
+    "the car while it is missed, out of the metres while it counts.",
+    "certain: graded frames with a new miss in which the miss is certain (docs/guide/ideas.md).",
 )
-_LOOKS: dict[str, Any] = {
-    "unbroken": (*WORDS, "longest", "certain"),
+_TABLE_STYLE: dict[str, Any] = {
+    "unbroken": (*TEXT_COLUMNS, "longest", "certain"),
     "box": box.SIMPLE_HEAD,
     "padding": 0,
     "show_edge": False,
@@ -43,25 +42,25 @@ _LOOKS: dict[str, Any] = {
 
 
 def build_report(result: DriveResult) -> AnalysisReport:
-    """The answer, in the result's folder."""
+    """Build the report in the result's folder."""
     title = f"{result.detector} on {result.clip}: {' + '.join(result.params)}, {result.method}"
     rows = [format_car(car) for car in result.cars]
-    sheet = ReportTable(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), _LOOKS)
+    table = ReportTable(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), _TABLE_STYLE)
     return AnalysisReport(
         out=Path(result.out),
         name="drive",
         heading=f"{format_count(result.frames, 'frame')} of {result.clip}",
         data=asdict(result),
         csv_tables={"drive": [car_metrics(car) for car in result.cars]},
-        tables=[sheet],
+        tables=[table],
         notes=[*NOTES, format_summary(result), *list_infeasible(result)],
-        text_columns=WORDS,
+        text_columns=TEXT_COLUMNS,
         failed={f"frame {name}": reason for name, reason in result.failed.items()},
     )
 
 
 def format_car(car: CarResult) -> dict[str, str]:
-    """A car's line of the table."""
+    """Format a car's row of the table."""
     return {
         "car": f"{car.track} {car.kind}",
         "lost before": f"{car.lost_before}",
@@ -78,30 +77,30 @@ def format_car(car: CarResult) -> dict[str, str]:
 
 
 def format_summary(result: DriveResult) -> str:
-    """The clip in a line."""
+    """Summarise the clip on one line."""
     before, after, control = (
         sum(getattr(car, f"lost_{state}") for car in result.cars) for state in ("before", "after", "control")
     )
-    sights = format_count(sum(car.frames for car in result.cars), "sight")
+    sightings = format_count(sum(car.frames for car in result.cars), "sighting")
     phantoms, frames = format_count(result.phantoms["after"], "phantom"), format_count(result.frames, "frame")
     queries, passes = (
         format_count(result.queries, "query", "queries"),
         format_count(result.passes, "pass", "passes"),
     )
     return (
-        f"{after} of {sights} of {format_count(len(result.cars), 'car')} missed ({before} before, {control} by a "
+        f"{after} of {sightings} of {format_count(len(result.cars), 'car')} missed ({before} before, {control} by a "
         f"random change), {phantoms} ({result.phantoms['control']} random); "
         f"feasible in {result.feasible} of {frames}; {queries}, {passes}, {result.seconds:.0f} s"
     )
 
 
 def list_infeasible(result: DriveResult) -> list[str]:
-    """Frames in which the change is not feasible."""
-    return [f"not feasible in frame {name}: {'; '.join(lines)}" for name, lines in result.violations.items()]
+    """List the frames in which the change is not feasible."""
+    return [f"infeasible in frame {name}: {'; '.join(lines)}" for name, lines in result.violations.items()]
 
 
 def car_metrics(car: CarResult) -> dict[str, Any]:
-    """A car's numbers by name, without what there is of each frame."""
+    """A car's numbers by name, without its data per frame."""
     return {name: value for name, value in asdict(car).items() if name not in ("states", "distance_m", "path_m")}
 
 
@@ -109,7 +108,7 @@ _CLASSES = {FOUND: "f", LOST: "l", UNCOUNTED: "u"}
 
 
 def write_page(path: Path, result: DriveResult) -> None:
-    """Write the page, which shows the pictures and the video beside it. Atomic."""
+    """Write the page, which shows the images and the video in the same folder. Atomic."""
     pictures = [
         {"name": name} | {side: quote(f"{FRAMES}/{name}/{side}.jpg") for side in ("before", "after")}
         for name in result.names
@@ -134,7 +133,7 @@ def write_page(path: Path, result: DriveResult) -> None:
 
 
 def _runs(states: str) -> Iterator[tuple[int, int, str]]:
-    """Stretches of frames of one kind: where each begins, how long it is, its class; none where the car is not."""
+    """Yield runs of frames in one state: start, length and CSS class, without frames that lack the car."""
     start = 0
     for state, group in groupby(states):
         length = len(list(group))
@@ -146,7 +145,7 @@ def _runs(states: str) -> Iterator[tuple[int, int, str]]:
 def _headline(result: DriveResult) -> str:
     worst = result.cars[0]
     if worst.new_misses <= 0:
-        return f"{result.detector} misses no car of {result.clip} for longer than before"
+        return f"{result.detector} misses no car of {result.clip} in more frames than before"
     return (
         f"{result.detector} misses car {worst.track} in {worst.lost_after} of {format_count(worst.frames, 'frame')}, "
         f"{worst.lost_before} before"
@@ -155,8 +154,9 @@ def _headline(result: DriveResult) -> str:
 
 def _lead(result: DriveResult) -> str:
     return (
-        f"{' + '.join(result.params)} changed by {result.method}: each of {format_count(len(result.cars), 'car')} "
-        f"by the same over all of {format_count(result.frames, 'frame')}. Beside it, a random change as large."
+        f"{' + '.join(result.params)} changed by {result.method}: one change for each of "
+        f"{format_count(len(result.cars), 'car')} over {format_count(result.frames, 'frame')}, compared with a random "
+        "change of the same size."
     )
 
 
@@ -170,24 +170,24 @@ def _tiles(result: DriveResult) -> list[dict[str, str]]:
     graded, certain = sum(car.graded for car in cars), sum(car.certain for car in cars)
     return [
         {
-            "title": "sights of cars that are missed",
+            "title": "missed cars, over all frames",
             "figure": f"{before} → {lost}",
-            "more": f"of {counted}; by a random change {control}",
+            "more": f"of {counted}; random change: {control}",
         },
         {
-            "title": "longest unbroken stretch",
+            "title": "longest time missed",
             "figure": f"{longest.longest_after / 10:.1f} s",
             "more": f"car {longest.track}; {longest.longest_before / 10:.1f} s before",
         },
         {
-            "title": "most metres of approach unseen",
+            "title": "longest approach while missed",
             "figure": f"{unseen.metres_lost_after:.1f} m",
             "more": f"car {unseen.track}, of {unseen.metres:.1f} m; {unseen.metres_lost_before:.1f} m before",
         },
         {
-            "title": "new misses that are certain",
+            "title": "certain new misses",
             "figure": f"{certain} of {graded}" if graded else "none",
-            "more": "in frames that were looked at again in draws",
+            "more": "in graded frames",
         },
         {
             "title": "feasible",
@@ -202,8 +202,9 @@ _GAP_PX = 4
 
 
 def write_video(path: Path, folders: Sequence[Path]) -> None:
-    """Write a video of folders with before.jpg and after.jpg, a frame each, atomically. WriteError where OpenCV
-    was built without VP8.
+    """Write a WebM video (VP8) of frames, each a folder with before.jpg and after.jpg, one above the other. Atomic.
+
+    Raises WriteError where OpenCV was built without VP8.
     """
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / path.name
@@ -220,7 +221,7 @@ def write_video(path: Path, folders: Sequence[Path]) -> None:
 
 
 def _above_each_other(folder: Path) -> np.ndarray:
-    """The frame before and after (h, w, 3), with even sides, as the codec needs: the last row and column twice."""
+    """Stack a frame before and after (h, w, 3); the codec needs even sides, so the last row and column repeat."""
     before, after = (files.read_image(folder / f"{name}.jpg") for name in ("before", "after"))
     picture = np.concatenate([before, np.zeros((_GAP_PX, *before.shape[1:]), np.uint8), after])
     height, width = picture.shape[:2]
@@ -228,6 +229,6 @@ def _above_each_other(folder: Path) -> np.ndarray:
 
 
 def _writer(path: Path, size_wh: tuple[int, int]) -> cv2.VideoWriter:
-    with suppress_stderr():  # where it says that WebM has no such tag, which it does not need
+    with suppress_stderr():  # a harmless warning about the codec tag
         code = cv2.VideoWriter.fourcc(*"VP80")
         return cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, FRAMES_A_SECOND, size_wh)

@@ -1,4 +1,4 @@
-"""What an attack on a clip found, car by car, as plain dataclasses."""
+"""Results of an attack on a clip, car by car, as plain dataclasses."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from itertools import pairwise
 from typing import Literal
 
 FOUND, LOST, UNCOUNTED, ABSENT = "f", "l", "-", " "
-"""A car in one frame: found; missed; too small, hidden or cut to be judged; not in it."""
+"""State of a car in one frame: detected; missed; too small, hidden or truncated to count; absent."""
 State = Literal["before", "after", "control"]
 STATES: tuple[State, ...] = ("before", "after", "control")
-"""The clip as it was photographed, changed by the attack, and changed at random by as much."""
+"""The original clip, the attacked one, and one with a random change of the same size."""
 
 
 @dataclass(frozen=True, slots=True)
 class MissedInterval:
-    """How a car is missed in a clip. frames: in which it counts; lost: of these, missed; longest: frames of the
-    longest unbroken stretch of misses; metres: by which the camera comes nearer while it counts; metres_lost:
-    while it is missed.
-    """
+    """How long a car is missed in a clip."""
 
     frames: int
+    """Frames in which it counts."""
     lost: int
+    """Of these, frames in which it is missed."""
     longest: int
+    """Frames of the longest unbroken run of misses."""
     metres: float
+    """Approach of the camera while it counts, m."""
     metres_lost: float
+    """Approach of the camera while it is missed, m."""
 
     @classmethod
     def from_states(cls, states: str, distance_m: Sequence[float | None]) -> MissedInterval:
-        """states: FOUND, LOST, UNCOUNTED or ABSENT a frame; distance_m: from the camera, None where absent."""
+        """Measure from one state per frame, and the distances from the camera, None where absent."""
         nearer = [0.0]
         for before, now in pairwise(distance_m):
             nearer.append(0.0 if before is None or now is None else max(before - now, 0.0))
@@ -42,42 +44,55 @@ class MissedInterval:
             frames=sum(counted),
             lost=states.count(LOST),
             longest=longest,
-            metres=_metres(way for way, counts in zip(nearer, counted, strict=True) if counts),
-            metres_lost=_metres(way for way, state in zip(nearer, states, strict=True) if state == LOST),
+            metres=_metres(distance for distance, counts in zip(nearer, counted, strict=True) if counts),
+            metres_lost=_metres(distance for distance, state in zip(nearer, states, strict=True) if state == LOST),
         )
 
 
-def _metres(ways: Iterable[float]) -> float:
-    return round(sum(ways, 0.0), 3)
+def _metres(distances: Iterable[float]) -> float:
+    return round(sum(distances, 0.0), 3)
 
 
 @dataclass(frozen=True, slots=True)
 class CarResult:
-    """One car. track: its number in the data; frames: in which it counts, as changed; lost, longest, metres_lost:
-    as of `Missed`, by STATES; metres: by which the camera comes nearer while it counts; graded: frames in which it
-    is newly missed and was looked at in draws; certain: of these, missed for certain; states: by STATES, a letter
-    a frame; distance_m: from the camera, a number a frame; path_m: how far it stands from its place, along its
-    heading and across, a frame.
-    """
+    """Result of one car; see `MissedInterval` for lost, longest and metres, and `STATES` for their suffixes."""
 
     track: int
+    """Its number in the data."""
     kind: str
+    """Its class."""
     frames: int
+    """Frames of the attacked clip in which it counts."""
     lost_before: int
+    """Missed frames of the original clip."""
     lost_after: int
+    """Missed frames of the attacked clip."""
     lost_control: int
+    """Missed frames with the random change."""
     longest_before: int
+    """Longest run of misses in the original clip, frames."""
     longest_after: int
+    """Longest run of misses in the attacked clip, frames."""
     longest_control: int
+    """Longest run of misses with the random change, frames."""
     metres: float
+    """Approach of the camera while the car counts, m."""
     metres_lost_before: float
+    """Approach while it is missed in the original clip, m."""
     metres_lost_after: float
+    """Approach while it is missed in the attacked clip, m."""
     metres_lost_control: float
+    """Approach while it is missed with the random change, m."""
     graded: int
+    """Graded frames with a new miss."""
     certain: int
+    """Of these, frames in which the miss is certain."""
     states: dict[str, str]
+    """One letter per frame, by `STATES`."""
     distance_m: tuple[float | None, ...]
+    """Distance from the camera in each frame."""
     path_m: tuple[tuple[float, float] | None, ...]
+    """Offset from its place along and across its heading in each frame."""
 
     @classmethod
     def from_states(
@@ -89,9 +104,18 @@ class CarResult:
         path_m: tuple[tuple[float, float] | None, ...],
         certain: Sequence[bool],
     ) -> CarResult:
-        """certain: one a frame that was graded."""
+        """Measure a car.
+
+        Args:
+            track: Its number in the data.
+            kind: Its class.
+            states: One letter per frame, by `STATES`.
+            distance_m: Distance from the camera in each frame.
+            path_m: Offset along and across its heading in each frame.
+            certain: Whether the miss is certain, for each graded frame.
+        """
         missed = {state: MissedInterval.from_states(letters, distance_m) for state, letters in states.items()}
-        figures = {
+        metrics = {
             f"{name}_{state}": getattr(one, name)
             for state, one in missed.items()
             for name in ("lost", "longest", "metres_lost")
@@ -106,39 +130,54 @@ class CarResult:
             states=states,
             distance_m=distance_m,
             path_m=path_m,
-            **figures,
+            **metrics,
         )
 
     @property
     def new_misses(self) -> int:
-        """Frames in which it is missed beyond those before."""
+        """Increase of missed frames over the original clip."""
         return self.lost_after - self.lost_before
 
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """A whole clip. names: of its `frames`; feasible: frames in which the independent check finds nothing wrong;
-    violations: what it finds, by frame; phantoms: by STATES, in all frames; queries: gradients, or clips judged by
-    a search without; theta: coordinates that changed, in people's units; held_back: what was not feasible on the
-    way; failed: why frames could not be used.
-    """
+    """Result of an attack on a clip."""
 
     out: str
+    """Folder of the result."""
     clip: str
+    """Name of the clip."""
     detector: str
+    """The detector."""
     t_star: float
+    """Its score threshold."""
     params: tuple[str, ...]
+    """Attacked parameters."""
     method: str
+    """Search method."""
     frames: int
+    """Number of frames."""
     names: tuple[str, ...]
+    """Names of the frames."""
     cars: tuple[CarResult, ...]
+    """Results by car, the most missed first."""
     phantoms: dict[str, int]
+    """Phantoms in all frames, by `STATES`."""
     feasible: int
+    """Frames in which the independent check finds no violation."""
     violations: dict[str, tuple[str, ...]]
+    """Violations by frame."""
     held_back: tuple[str, ...]
+    """Constraints that were active in the search."""
     failed: dict[str, str]
+    """Why frames could not be used."""
     theta: dict[str, str]
+    """Changed coordinates in physical units."""
     loss_trace: tuple[float, ...]
+    """Loss of each step."""
     queries: int
+    """Gradients, or evaluated clips of a gradient-free search."""
     passes: int
+    """Detector passes; a gradient counts as 3."""
     seconds: float
+    """Run time, s."""

@@ -1,8 +1,8 @@
-"""theta of a clip: what changes is a car's, not a frame's.
+"""theta of a clip: one change per car instead of one per frame.
 
-A car's paint, shape, heading and size change by the same in all of its frames, and so do weather, foliage and sun.
-Its place changes along a smooth path: Bernstein's polynomials over the time in which it is seen, whose control
-points are theta's coordinates. They are weights that add up to one, so a path keeps to its control points' bounds.
+A car's paint, shape, heading and size change equally in all of its frames, as do weather, foliage and sun. Its place
+follows a smooth path: Bernstein polynomials over the time in which it is visible, with control points as coordinates
+of theta. Their weights sum to one, so a path stays within the bounds of its control points.
 """
 
 from __future__ import annotations
@@ -20,21 +20,25 @@ from drivesem.attack.theta import ParameterSpec, ProjectedTheta, ThetaSpace
 from scene_ir.errors import RangeError
 
 _INSIDE = 1 - 1e-5
-"""Of a path's bounds: sums of its weights are rounded."""
+"""Factor on a path's bounds, as the sum of its weights is rounded."""
 _SAME = 1e-6
-"""Within which a frame's projection left theta as it was."""
+"""Tolerance within which a frame's projection did not change theta."""
 _ROUNDS = 8
-"""In which what a frame holds back is held back in the clip, in the second half along whole paths; after that,
-cars that still violate something stay at rest."""
+"""Rounds in which the limits of frames are applied to the clip, in the second half to whole paths; afterwards, cars
+that still violate a constraint lose their changes of shape and place."""
 
 
 class ClipSpace(ThetaSpace[Parameter]):
-    """spaces: of each frame's scene, all of the same parameters and budget; tracks: of each frame's objects, in
-    their order; bend: degree of a path's polynomial, 0 for an offset that stays. Bounds are the tightest of a
-    car's frames.
-    """
+    """Parameters of a clip; bounds are the tightest of a car's frames."""
 
     def __init__(self, spaces: Sequence[ParameterSpace], tracks: Sequence[Sequence[int]], bend: int = 3) -> None:
+        """Combine the spaces of frames.
+
+        Args:
+            spaces: Space of each frame's scene, with equal parameters and budgets.
+            tracks: Track of each object in each frame.
+            bend: Degree of a path's polynomial; 0 for a constant offset.
+        """
         if bend < 0 or not spaces:
             raise RangeError("clip", "frames, and a bend of at least 0", f"{len(spaces)} frames, {bend}")
         self.spaces = tuple(spaces)
@@ -51,7 +55,7 @@ class ClipSpace(ThetaSpace[Parameter]):
             for parameter in self.params:
                 self._tighten(parameter, space, rows)
         for bound in (self.lower, self.upper):
-            bound[~bound.isfinite()] = 0  # of cars that no frame has, which there are none of
+            bound[~bound.isfinite()] = 0  # cars without any frame do not occur
 
     def name(self, i: int) -> str:
         """The name of coordinate `i`, by the car's track: `cars[12].translate.along[0]`."""
@@ -60,7 +64,7 @@ class ClipSpace(ThetaSpace[Parameter]):
         return f"cars[{self.tracks[owner]}].{spec.names[k]}" if spec.per_object else spec.names[k]
 
     def frame_theta(self, theta: Tensor, frame: int) -> Tensor:
-        """theta (D,) as that of a frame's own space (D',); differentiable."""
+        """Convert theta (D,) to a frame's own space (D',); differentiable."""
         parts = []
         for parameter in self.params:
             block = self.block(theta, parameter)
@@ -73,14 +77,23 @@ class ClipSpace(ThetaSpace[Parameter]):
             parts.append(block.reshape(-1))
         return torch.cat(parts)
 
-    def restrict(self, theta: Tensor, frame: int, asked: Tensor, granted: Tensor, whole: bool) -> Tensor:
-        """theta (D,) with what a frame granted (D',) of what was asked of it (D',). Of a path, those control
-        points that matter there give way, or, where `whole`, all of it by as large a part.
+    def restrict(self, theta: Tensor, frame: int, proposed: Tensor, projected: Tensor, whole: bool) -> Tensor:
+        """Apply a frame's projection to theta.
+
+        Args:
+            theta: (D,) of the clip.
+            frame: Number of the frame.
+            proposed: (D',) of the frame before its projection.
+            projected: (D',) of the frame after it.
+            whole: Whether to scale a whole path, instead of the control points that matter in the frame.
+
+        Returns:
+            (D,) of the clip.
         """
         theta, space = theta.clone(), self.spaces[frame]
         for parameter in self.params:
-            block, there = self.block(theta, parameter), space.block(granted, parameter)
-            before = space.block(asked, parameter)
+            block, there = self.block(theta, parameter), space.block(projected, parameter)
+            before = space.block(proposed, parameter)
             assert block is not None
             assert there is not None
             assert before is not None
@@ -97,7 +110,7 @@ class ClipSpace(ThetaSpace[Parameter]):
         return theta
 
     def reset_geometry(self, theta: Tensor, cars: Tensor) -> Tensor:
-        """theta (D,) without the changes of shape and place of `cars` (N,) bool."""
+        """theta (D,) without changes of shape and place of the chosen cars (N,) bool."""
         theta = theta.clone()
         for parameter in self.params:
             block = self.block(theta, parameter)
@@ -106,14 +119,14 @@ class ClipSpace(ThetaSpace[Parameter]):
         return theta
 
     def path_offsets(self, theta: Tensor, frame: int) -> Tensor:
-        """How far each object of a frame stands from its place (n, 2) m, along its heading and across."""
+        """Offset (n, 2) m of each object of a frame from its place, along and across its heading."""
         space = self.spaces[frame]
         offset = space.block(self.frame_theta(theta, frame), Parameter.TRANSLATE)
         length_m = space.scene.objects.size_lhw[:, :1]
         return length_m.new_zeros(len(length_m), 2) if offset is None else offset * length_m
 
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
-        """In metres, degrees or percent, as of a frame in which the car is."""
+        """Value in metres, degrees or percent, measured in the first frame with the car."""
         parameter, owner, k = self._locate(i)
         spec = SPECS[parameter]
         if not spec.per_object:
@@ -143,8 +156,13 @@ class ClipSpace(ThetaSpace[Parameter]):
 
 
 def project_clip(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> ProjectedTheta:
-    """theta (D,) brought back to what is feasible in every frame (sets, one a frame): what one frame holds back is
-    held back in the whole clip, in turn until no frame asks for more. theta = 0 is feasible.
+    """Project theta to what is feasible in every frame. The limits of each frame apply to the whole clip, repeatedly
+    until no frame changes theta; theta = 0 is feasible.
+
+    Args:
+        space: Parameters of the clip.
+        sets: Feasible set of each frame.
+        theta: (D,) of the clip.
     """
     theta = torch.minimum(torch.maximum(theta.detach(), space.lower), space.upper)
     active: list[str] = []
@@ -152,14 +170,14 @@ def project_clip(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -
         offenders = torch.zeros(space.count, dtype=torch.bool, device=theta.device)
         held = False
         for frame, feasible in enumerate(sets):
-            asked = space.frame_theta(theta, frame)
-            found = feasible.project(asked)
-            if torch.allclose(found.theta, asked, rtol=0, atol=_SAME):
+            proposed = space.frame_theta(theta, frame)
+            found = feasible.project(proposed)
+            if torch.allclose(found.theta, proposed, rtol=0, atol=_SAME):
                 continue
             held = True
             active += [_renamed(name, space, frame) for name in found.active]
-            theta = space.restrict(theta, frame, asked, found.theta, whole=attempt >= _ROUNDS // 2)
-            offenders[space.rows[frame][_differing(space.spaces[frame], asked, found.theta)]] = True
+            theta = space.restrict(theta, frame, proposed, found.theta, whole=attempt >= _ROUNDS // 2)
+            offenders[space.rows[frame][_differing(space.spaces[frame], proposed, found.theta)]] = True
         if not held:
             return ProjectedTheta(theta, tuple(dict.fromkeys(active)))
         if attempt >= _ROUNDS:
@@ -168,7 +186,7 @@ def project_clip(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -
 
 
 def _differing(space: ParameterSpace, one: Tensor, other: Tensor) -> Tensor:
-    """(n,) bool: objects of a frame of which two thetas (D',) differ."""
+    """(n,) bool: objects of a frame for which two thetas (D',) differ."""
     found = torch.zeros(space.count, dtype=torch.bool, device=one.device)
     for parameter in space.params:
         if SPECS[parameter].per_object:
@@ -180,7 +198,7 @@ def _differing(space: ParameterSpace, one: Tensor, other: Tensor) -> Tensor:
 
 
 def _renamed(name: str, space: ClipSpace, frame: int) -> str:
-    """`objects[3]: collision` of a frame as the car's."""
+    """Convert `objects[3]: collision` of a frame to the car's name."""
     if not name.startswith("objects["):
         return name
     index, _, rest = name.removeprefix("objects[").partition("]")
@@ -188,7 +206,7 @@ def _renamed(name: str, space: ClipSpace, frame: int) -> str:
 
 
 def _specs(points: int) -> dict[Parameter, ParameterSpec]:
-    """The parameters' facts, of cars instead of objects."""
+    """The specifications of the parameters, for cars instead of objects."""
     names = tuple(f"{name}[{k}]" for k in range(points) for name in SPECS[Parameter.TRANSLATE].names)
     path = ParameterSpec(2 * points, True, SPECS[Parameter.TRANSLATE].unit, names, "cars")
     return {p: replace(spec, owner="cars") for p, spec in SPECS.items()} | {Parameter.TRANSLATE: path}

@@ -18,7 +18,7 @@ from torch import Tensor
 from detectors.types import CLASSES, Targets
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.visibility import compute_contrasts
-from drivesem.failures.second_renderer import shading as weathering
+from drivesem.failures.second_renderer import shading
 from drivesem.failures.second_renderer.baking import BakedAppearance, TextureAtlas, bake_atlas
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose, to_numpy
@@ -64,8 +64,7 @@ class _RenderedScene:
 
 
 class PhotographRenderer:
-    """Renders any state of one photograph's scene. Raises NoSecondRendererError where this machine has no OpenGL.
-    """
+    """Renders any state of one photograph's scene. Raises NoSecondRendererError where this machine has no OpenGL."""
 
     name = "pyrender"
 
@@ -89,7 +88,7 @@ class PhotographRenderer:
         self._camera, self._context = PictureCamera.from_camera(still.camera), shared_context()
         self._photograph, self._background = (_to_image(p) for p in (still.photograph, still.background))
         self._depth_m = to_numpy(still.depth)
-        self._air = weathering.estimate_air_colour(self._photograph, to_numpy(still.environment.sky))
+        self._air = shading.estimate_air_colour(self._photograph, to_numpy(still.environment.sky))
         self._leaves = to_numpy(still.environment.foliage_map)
         self._vehicles = [self._make_vehicle(source, i) for i, source in enumerate(still.objects.source)]
         rest = self._render_state(still)
@@ -193,8 +192,8 @@ class PhotographRenderer:
         for vehicle, pose in zip(self._vehicles, poses, strict=True):
             vehicle.shadow.cast(pose, shade)
         # Foliage stands behind vehicles, or in `front`, which keeps the photograph's pixels.
-        behind = weathering.apply_foliage(self._background, to_numpy(environment.foliage), self._leaves, self._air)
-        image = behind * np.exp(-weathering.remaining_shade(to_numpy(environment.weather)) * shade)
+        behind = shading.apply_foliage(self._background, to_numpy(environment.foliage), self._leaves, self._air)
+        image = behind * np.exp(-shading.remaining_shade(to_numpy(environment.weather)) * shade)
         depth_m, owner = self._depth_m.copy(), np.zeros(image.shape[:2], np.int64)
         window = _enclosing_window(placed, camera)
         if window is not None:
@@ -214,7 +213,7 @@ class PhotographRenderer:
                 rendered,
                 self._occluder_layers(window),
             )
-        image = weathering.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
+        image = shading.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
         image = np.rint(np.clip(image, 0, 1) * 255).astype(np.float32) / np.float32(255)
         shares = np.array([self._visible_share(p, owner == i + 1) for i, p in enumerate(placed)], np.float32)
         return _RenderedScene(placed, image, owner, shares)
@@ -279,7 +278,7 @@ def _paint_texture(vehicle: _Vehicle, code: Array) -> NDArray[np.uint8]:
         return vehicle.texture
     atlas = vehicle.atlas
     return _to_levels(
-        weathering.apply_paint(atlas.colour, code, atlas.paint_share, atlas.height, atlas.paint_colour)
+        shading.apply_paint(atlas.colour, code, atlas.paint_share, atlas.height, atlas.paint_colour)
     )
 
 

@@ -150,12 +150,12 @@ def test_one_set_in_three_layouts_gives_the_same_figures(run: Run, kitti: tuple[
         assert main(["convert", *words, "--image-size", "1242x375"]) == 0
     words = ("--protocol", "coco", "--bootstrap", 0)
     plain = run("--gt", kitti[0], "--pred", kitti[1], *words)[1]
-    asked = run("--gt", tmp_path / "gt.json", "--pred", tmp_path / "pred.json", *words)[1]
+    requested = run("--gt", tmp_path / "gt.json", "--pred", tmp_path / "pred.json", *words)[1]
     mixed = run("--gt", kitti[0], "--pred", tmp_path / "pred.json", *words)[1]
-    assert asked["stats"] == pytest.approx(plain["stats"], abs=1e-9)
+    assert requested["stats"] == pytest.approx(plain["stats"], abs=1e-9)
     assert mixed["stats"] == pytest.approx(plain["stats"], abs=1e-9)
     for name in ("Car", "Van"):
-        rows = [next(r for r in d["classes"] if r["class"] == name) for d in (plain, asked, mixed)]
+        rows = [next(r for r in d["classes"] if r["class"] == name) for d in (plain, requested, mixed)]
         assert rows[0]["ap50"] == rows[1]["ap50"] == rows[2]["ap50"]
 
 
@@ -350,8 +350,8 @@ def test_virtual_kitti_and_its_weather(run: Run, tmp_path: Path, capsys: pytest.
         assert labels is not None
         rows = zip(labels.kind, labels.boxes_xyxy.tolist(), strict=True)
         lines = [_line(kind, box, 0.9 - 0.01 * i) for i, (kind, box) in enumerate(rows)]
-        kept = lines if "clone" in name else lines[:1]
-        (tmp_path / "pred" / f"{name.replace('/', '_')}.txt").write_text("\n".join(kept) + "\n")
+        retained = lines if "clone" in name else lines[:1]
+        (tmp_path / "pred" / f"{name.replace('/', '_')}.txt").write_text("\n".join(retained) + "\n")
     data = run("--gt", root, "--pred", tmp_path / "pred", "--bootstrap", 0)[1]
     recall = {(p["class"], p["part"]): p["recall"] for p in data["parts"] if p["by"] == "weather"}
     assert {part for _, part in recall} == {"clone", "fog"}

@@ -148,61 +148,61 @@ BOX = (100.0, 100.0, 200.0, 160.0)  # 60 px high
 EMPTY = (500.0, 100.0, 600.0, 160.0)
 
 
-def _figures(make_truths, make_found, truth, found, name="Car", difficulty="easy", small="ignore", frames=1):
+def _metrics(make_truths, make_found, truth, found, name="Car", difficulty="easy", small="ignore", frames=1):
     curves = evaluate(make_truths(truth, frames), make_found(found), KINDS, small)
     return next(c for c in curves if (c.name, c.difficulty) == (name, difficulty))
 
 
 @pytest.fixture
-def figures(make_truths, make_found):
+def metrics(make_truths, make_found):
     def call(truth, found, *args, **kwargs):
-        return _figures(make_truths, make_found, truth, found, *args, **kwargs)
+        return _metrics(make_truths, make_found, truth, found, *args, **kwargs)
 
     return call
 
 
-def test_one_object_found(figures):
-    one = figures([(0, "Car", BOX, 0.0, 0)], [(0, "Car", BOX, 0.9)])
+def test_one_object_found(metrics):
+    one = metrics([(0, "Car", BOX, 0.0, 0)], [(0, "Car", BOX, 0.9)])
     # one threshold: precision 1 at recall 0 and nowhere else
     assert (one.ground_truth, one.r11(), one.r40()) == (1, pytest.approx(1 / 11), 0.0)
 
 
-def test_forty_objects_found_of_forty(figures):
+def test_forty_objects_found_of_forty(metrics):
     boxes = [(float(200 * i), 100.0, 200.0 * i + 100, 160.0) for i in range(40)]
     truth = [(0, "Car", box, 0.0, 0) for box in boxes]
     found = [(0, "Car", box, 1 - i / 100) for i, box in enumerate(boxes)]
-    one = figures(truth, found)
+    one = metrics(truth, found)
     # n = 40: score 0 at r = 0; from then on every score is a threshold, 40 of them for 41 samples
     assert len(one.thresholds()) == 40
     assert one.r40() == pytest.approx(39 / 40)
     assert one.r11() == pytest.approx(10 / 11)
 
 
-def test_every_object_of_many_found_is_one(figures):
+def test_every_object_of_many_found_is_one(metrics):
     boxes = [(float(200 * i), 100.0, 200.0 * i + 100, 160.0) for i in range(400)]
-    one = figures(
+    one = metrics(
         [(0, "Car", box, 0.0, 0) for box in boxes], [(0, "Car", box, 1 - i / 1000) for i, box in enumerate(boxes)]
     )
     assert (len(one.thresholds()), one.r11(), one.r40()) == (41, 1.0, 1.0)
 
 
-def test_a_false_positive_between(figures):
+def test_a_false_positive_between(metrics):
     boxes = [(float(200 * i), 100.0, 200.0 * i + 100, 160.0) for i in range(4)]
     truth = [(0, "Car", box, 0.0, 0) for box in boxes]
     found = [(0, "Car", boxes[0], 0.9), (0, "Car", (0, 300, 90, 380), 0.8), (0, "Car", boxes[1], 0.7)]
     # precision 1 at the first threshold, 2/3 at the second, then nothing
-    assert figures(truth, found).precision()[:3] == pytest.approx([1, 2 / 3, 0])
-    assert figures(truth, found).r40() == pytest.approx(2 / 3 / 40)
+    assert metrics(truth, found).precision()[:3] == pytest.approx([1, 2 / 3, 0])
+    assert metrics(truth, found).r40() == pytest.approx(2 / 3 / 40)
 
 
 @pytest.mark.parametrize(
     ("kind", "name", "width"),
     [("Car", "Car", 70.0), ("Pedestrian", "Pedestrian", 50.0), ("Cyclist", "Cyclist", 50.0)],
 )
-def test_overlap_must_exceed_the_class_threshold(figures, kind, name, width):
+def test_overlap_must_exceed_the_class_threshold(metrics, kind, name, width):
     truth = [(0, kind, (0.0, 0.0, 100.0, 100.0), 0.0, 0)]
-    exactly = figures(truth, [(0, kind, (0.0, 0.0, width, 100.0), 0.9)], name)
-    more = figures(truth, [(0, kind, (0.0, 0.0, width + 1, 100.0), 0.9)], name)
+    exactly = metrics(truth, [(0, kind, (0.0, 0.0, width, 100.0), 0.9)], name)
+    more = metrics(truth, [(0, kind, (0.0, 0.0, width + 1, 100.0), 0.9)], name)
     assert (exactly.r11(), more.r11()) == (0.0, pytest.approx(1 / 11))
 
 
@@ -223,81 +223,81 @@ def test_overlap_must_exceed_the_class_threshold(figures, kind, name, width):
         ((0, 0, 99, 24.9), 0.0, 0, (0, 0, 0)),
     ],
 )
-def test_what_counts_at_each_difficulty(figures, box, truncation, occlusion, counted):
+def test_what_counts_at_each_difficulty(metrics, box, truncation, occlusion, counted):
     truth = [(0, "Car", box, truncation, occlusion)]
     found = [(0, "Car", box, 0.9)]
     for difficulty, number in zip(DIFFICULTIES, counted, strict=True):
-        one = figures(truth, found, difficulty=difficulty)
+        one = metrics(truth, found, difficulty=difficulty)
         assert one.ground_truth == number
         assert (one.r11() is None) == (number == 0)
 
 
 @pytest.mark.parametrize(("neighbour", "name"), [("Van", "Car"), ("Person_sitting", "Pedestrian")])
-def test_neighbours_are_neither_missed_nor_hit(figures, neighbour, name):
+def test_neighbours_are_neither_missed_nor_hit(metrics, neighbour, name):
     truth = [(0, name, BOX, 0.0, 0), (0, neighbour, EMPTY, 0.0, 0)]
-    missed = figures(truth, [(0, name, BOX, 0.5)], name)
-    hit = figures(truth, [(0, name, EMPTY, 0.9), (0, name, BOX, 0.5)], name)
+    missed = metrics(truth, [(0, name, BOX, 0.5)], name)
+    hit = metrics(truth, [(0, name, EMPTY, 0.9), (0, name, BOX, 0.5)], name)
     assert missed.ground_truth == 1
     assert missed.precision()[0] == hit.precision()[0] == 1.0
 
 
-def test_other_types_are_not_there(figures):
+def test_other_types_are_not_there(metrics):
     truth = [(0, "Car", BOX, 0.0, 0), (0, "Truck", EMPTY, 0.0, 0)]
-    one = figures(truth, [(0, "Car", EMPTY, 0.9), (0, "Car", BOX, 0.5)])
+    one = metrics(truth, [(0, "Car", EMPTY, 0.9), (0, "Car", BOX, 0.5)])
     assert one.precision()[0] == 0.5
 
 
-def test_dont_care_takes_false_positives_out(figures):
+def test_dont_care_takes_false_positives_out(metrics):
     truth = [(0, "Car", BOX, 0.0, 0), (0, "DontCare", (500.0, 0.0, 800.0, 400.0), -1.0, -1)]
-    whole = figures(truth, [(0, "Car", EMPTY, 0.9), (0, "Car", BOX, 0.5)])
+    whole = metrics(truth, [(0, "Car", EMPTY, 0.9), (0, "Car", BOX, 0.5)])
     assert whole.precision()[0] == 1.0
     # 70 of 100 px wide: not more than 0.7 of the detection
-    part = figures(truth, [(0, "Car", (470.0, 100.0, 570.0, 160.0), 0.9), (0, "Car", BOX, 0.5)])
+    part = metrics(truth, [(0, "Car", (470.0, 100.0, 570.0, 160.0), 0.9), (0, "Car", BOX, 0.5)])
     assert part.precision()[0] == 0.5
 
 
-def test_small_detections_in_both_kits(figures):
+def test_small_detections_in_both_kits(metrics):
     low = (500.0, 100.0, 600.0, 139.0)
     truth = [(0, "Car", BOX, 0.0, 0)]
     found = [(0, "Car", low, 0.9), (0, "Car", BOX, 0.5)]
-    assert figures(truth, found, small="ignore").precision()[0] == 1.0
-    assert figures(truth, found, small="count").precision()[0] == 0.5
-    assert figures(truth, found, small="ignore", difficulty="moderate").precision()[0] == 0.5
+    assert metrics(truth, found, small="ignore").precision()[0] == 1.0
+    assert metrics(truth, found, small="count").precision()[0] == 0.5
+    assert metrics(truth, found, small="ignore", difficulty="moderate").precision()[0] == 0.5
 
 
-def test_an_ignored_detection_gives_way_to_one_that_counts(figures):
+def test_an_ignored_detection_gives_way_to_one_that_counts(metrics):
     truth = [(0, "Car", (0.0, 0.0, 100.0, 41.0), 0.0, 0)]
     close, high = (0.0, 0.0, 100.0, 39.5), (0.0, 0.0, 100.0, 50.0)
-    one = figures(truth, [(0, "Car", close, 0.5), (0, "Car", high, 0.9)])
+    one = metrics(truth, [(0, "Car", close, 0.5), (0, "Car", high, 0.9)])
     assert one.precision()[0] == 1.0
     # the better score of an ignored one takes the object in the threshold pass: nothing is collected
-    assert len(figures(truth, [(0, "Car", close, 0.9), (0, "Car", high, 0.5)]).thresholds()) == 0
+    assert len(metrics(truth, [(0, "Car", close, 0.9), (0, "Car", high, 0.5)]).thresholds()) == 0
 
 
-def test_the_count_pass_goes_by_overlap_and_the_threshold_pass_by_score(figures):
+def test_the_count_pass_goes_by_overlap_and_the_threshold_pass_by_score(metrics):
     truth = [(0, "Car", (0.0, 0.0, 100.0, 50.0), 0.0, 0)]
     rough, exact = (0.0, 0.0, 100.0, 65.0), (0.0, 0.0, 100.0, 50.0)
-    one = figures(truth, [(0, "Car", rough, 0.9), (0, "Car", exact, 0.5)])
+    one = metrics(truth, [(0, "Car", rough, 0.9), (0, "Car", exact, 0.5)])
     assert one.thresholds().tolist() == [0.9]
     # the second is below the only threshold: no false positive
     assert one.precision()[0] == 1.0
 
 
-def test_a_double_detection_is_a_false_positive(figures):
+def test_a_double_detection_is_a_false_positive(metrics):
     truth = [(0, "Car", BOX, 0.0, 0), (0, "Car", EMPTY, 0.0, 0)]
     found = [(0, "Car", BOX, 0.9), (0, "Car", BOX, 0.8), (0, "Car", EMPTY, 0.7)]
-    assert figures(truth, found).precision()[:2] == pytest.approx([1, 2 / 3])
+    assert metrics(truth, found).precision()[:2] == pytest.approx([1, 2 / 3])
 
 
-def test_each_frame_for_itself(figures):
-    one = figures([(0, "Car", BOX, 0.0, 0)], [(1, "Car", BOX, 0.9), (0, "Car", BOX, 0.5)], frames=2)
+def test_each_frame_for_itself(metrics):
+    one = metrics([(0, "Car", BOX, 0.0, 0)], [(1, "Car", BOX, 0.9), (0, "Car", BOX, 0.5)], frames=2)
     assert one.precision()[0] == 0.5
 
 
-def test_no_detections_at_all(figures):
-    one = figures([(0, "Car", BOX, 0.0, 0)], [])
+def test_no_detections_at_all(metrics):
+    one = metrics([(0, "Car", BOX, 0.0, 0)], [])
     assert (one.r11(), one.r40()) == (0.0, 0.0)
-    assert figures([], [(0, "Car", BOX, 0.9)]).r40() is None
+    assert metrics([], [(0, "Car", BOX, 0.9)]).r40() is None
 
 
 def test_thresholds_by_the_plain_walk():

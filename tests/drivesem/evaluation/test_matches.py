@@ -50,9 +50,9 @@ def test_figures_are_those_of_coco_to_the_last_bit(seed: int) -> None:
 def test_what_has_no_say_changes_no_figure(seed: int) -> None:
     """To the last bit, at any weights of the frames."""
     matches = ThresholdMatches.from_frames(*random_frames(seed, 6), 0)
-    kept = matches.affects_metrics()
-    assert 0 < kept.sum() < len(kept)
-    less = ThresholdMatches(matches.frame[kept], matches.score[kept], matches.marks[kept], matches.objects)
+    stored = matches.affects_metrics()
+    assert 0 < stored.sum() < len(stored)
+    less = ThresholdMatches(matches.frame[stored], matches.score[stored], matches.marks[stored], matches.objects)
     assert less.affects_metrics().all()
     assert less.scores(0.4) == matches.scores(0.4)
     draws = np.random.default_rng(seed).multinomial(6, np.full(6, 1 / 6), 200).astype(np.float64)

@@ -53,12 +53,12 @@ def test_nothing_is_marked_without_pictures(tmp_path: Path, monkeypatch: pytest.
     files.write_png(tmp_path / "images/train/a.png", np.full((96, 128, 3), 120, np.uint8))
     files.write_text(tmp_path / "labels/train/a.txt", "0 0.5 0.5 0.4 0.4\n")
     files.write_text(tmp_path / "data.yaml", "train: images/train\nval: images/train\nnames: [Car]\n")
-    looked: list[int] = []
+    evaluated: list[int] = []
     marks = MatchedClass.frame_marks
-    monkeypatch.setattr(MatchedClass, "marks", lambda *words: looked.append(words[1]) or marks(*words))
+    monkeypatch.setattr(MatchedClass, "marks", lambda *words: evaluated.append(words[1]) or marks(*words))
     words = ["eval", "--detector", "squeezedet", "--dataset", "yolo", "--root", str(tmp_path), "--bootstrap", "0"]
     assert main([*words, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out/metrics.json").is_file()
-    assert not looked
+    assert not evaluated
     assert main([*words, "--workers", "1", "--out", str(tmp_path / "drawn"), "--pictures", "1"]) == 0
-    assert looked == [0]
+    assert evaluated == [0]

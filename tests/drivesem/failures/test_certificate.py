@@ -38,11 +38,11 @@ class Still(NuisanceSample):
     def __init__(self) -> None:
         pass
 
-    def boxes(self, boxes_xyxy: Tensor) -> Tensor:
+    def transform_boxes(self, boxes_xyxy: Tensor) -> Tensor:
         return boxes_xyxy
 
 
-def look(found: bool, twice: bool = False, alarm: float | None = None, hidden: bool = False) -> SampleOutcome:
+def make_outcome(found: bool, twice: bool = False, alarm: float | None = None, hidden: bool = False) -> SampleOutcome:
     boxes = PLACE if alarm is not None else PLACE[:0]
     scores = torch.tensor([] if alarm is None else [alarm])
     detections = Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), scores)
@@ -58,10 +58,10 @@ def counted(
     """And how many looks were taken."""
     taken: list[int] = []
 
-    def side(looks: Sequence[SampleOutcome]) -> Callable[[int], SampleOutcome]:
+    def side(outcomes: Sequence[SampleOutcome]) -> Callable[[int], SampleOutcome]:
         def one(number: int) -> SampleOutcome:
             taken.append(number)
-            return looks[number]
+            return outcomes[number]
 
         return one
 
@@ -69,7 +69,7 @@ def counted(
     return count, len(taken)
 
 
-FOUND, GONE = look(True), look(False)
+FOUND, GONE = make_outcome(True), make_outcome(False)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_what_the_rule_promises() -> None:
 
 def test_what_a_draw_hides_is_not_missed_in_it() -> None:
     """Nobody could see the car there: neither found nor missed."""
-    unseen = look(False, hidden=True)
+    unseen = make_outcome(False, hidden=True)
     count, _ = counted(LOST, [FOUND] * 16, [GONE] * 11 + [unseen] * 5)
     assert (count.after, CertificateRule().holds(count)) == (11, False)
     assert CertificateRule().holds(counted(LOST, [FOUND] * 16, [GONE] * 12 + [unseen] * 4)[0])
@@ -103,14 +103,14 @@ def test_no_more_looks_than_decide() -> None:
 
 
 def test_twice_and_background() -> None:
-    certain = counted(TWICE, [FOUND] * 16, [look(True, twice=True)] * 16)[0]
+    certain = counted(TWICE, [FOUND] * 16, [make_outcome(True, twice=True)] * 16)[0]
     assert CertificateRule().holds(certain)
     assert certain.margin_after is None
     assert not CertificateRule().holds(
-        counted(TWICE, [look(True, twice=True)] * 16, [look(True, twice=True)] * 16)[0]
+        counted(TWICE, [make_outcome(True, twice=True)] * 16, [make_outcome(True, twice=True)] * 16)[0]
     )
     # A phantom must be silent before: whatever is reported there from t* on speaks against it.
-    alarm, hint = look(True, alarm=0.8), look(True, alarm=0.4)
+    alarm, hint = make_outcome(True, alarm=0.8), make_outcome(True, alarm=0.4)
     certain = counted(PHANTOM, [hint] * 16, [alarm] * 16)[0]
     assert CertificateRule().holds(certain)
     assert (certain.margin_before or 0) > 0
@@ -135,7 +135,7 @@ class Sees:
 
     name = "sees"
     classes: tuple[str, ...] = ("Car",)
-    asked = 0
+    calls = 0
 
     def forward(self, images: Tensor) -> Tensor:
         self.asked += 1
@@ -170,6 +170,6 @@ def test_a_look_takes_labels_along() -> None:
     camera = NuisanceCamera(Masked(), Sees(), 0.5, quiet, "test")
     for number in range(3):
         seen = camera.evaluate(scene, number, torch.zeros(len(scene.objects), dtype=torch.bool))
-        shown = seen.labelled.visible_xyxy[largest]
-        torch.testing.assert_close(shown, seen.labelled.detections.boxes_xyxy[0], atol=1.6, rtol=0)
+        visible = seen.labelled.visible_xyxy[largest]
+        torch.testing.assert_close(visible, seen.labelled.detections.boxes_xyxy[0], atol=1.6, rtol=0)
         assert bool(seen.outcome.detected[largest])

@@ -49,11 +49,11 @@ class Oracle:
 
 
 @dataclasses.dataclass
-class Told:
+class PositionRenderer:
     """A renderer whose pictures tell the oracle where the cars are."""
 
     of: CompositorRenderer
-    name: str = "told"
+    name: str = "positions"
     honest: bool = True
 
     def render(self, changed: SceneIR) -> SecondRender:
@@ -92,7 +92,7 @@ def case() -> GradingInput:
     benign = EvaluatedScene(scene, render, paper, seen(boxes))
     now = EvaluatedScene(changed, compositor.render(changed), paper, seen(others))
     whole = build_grading_input("frame", renderer, judged, benign, now, lambda: scene)
-    return dataclasses.replace(whole, renderer=Told(renderer))
+    return dataclasses.replace(whole, renderer=PositionRenderer(renderer))
 
 
 OFF = Nuisances.parse("off")
@@ -111,9 +111,9 @@ def graded(case: GradingInput, second: SecondRenderer | None = None, peer: Oracl
     return grader.grade(case, LOST)
 
 
-def told(case: GradingInput, honest: bool = True) -> Told:
-    assert isinstance(case.renderer, Told)
-    return Told(case.renderer.of, "second", honest)
+def position_renderer(case: GradingInput, honest: bool = True) -> PositionRenderer:
+    assert isinstance(case.renderer, PositionRenderer)
+    return PositionRenderer(case.renderer.of, "second", honest)
 
 
 def test_certain_where_nobody_else_is_asked(case: GradingInput) -> None:
@@ -123,25 +123,25 @@ def test_certain_where_nobody_else_is_asked(case: GradingInput) -> None:
 
 
 def test_confirmed_where_the_second_renderer_fails_too(case: GradingInput) -> None:
-    (one,) = graded(case, told(case)).lost.values()
+    (one,) = graded(case, position_renderer(case)).lost.values()
     assert one.grade is Grade.CONFIRMED
     assert one.second is not None
     assert (one.second.by, one.second.before, one.second.after) == ("second", 4, 4)
 
 
 def test_not_confirmed_where_it_does_not(case: GradingInput) -> None:
-    (one,) = graded(case, told(case, honest=False)).lost.values()
+    (one,) = graded(case, position_renderer(case, honest=False)).lost.values()
     assert one.grade is Grade.CERTAIN
     assert one.second is not None
     assert one.second.after == 0
 
 
 def test_shared_where_the_peer_loses_it_too(case: GradingInput) -> None:
-    assert graded(case, told(case), Oracle()).lost[CAR].grade is Grade.SHARED
-    kept = graded(case, told(case), Oracle(blind=False)).lost[CAR]
-    assert kept.grade is Grade.CONFIRMED
-    assert kept.peer is not None
-    assert (kept.peer.before, kept.peer.after) == (4, 0)
+    assert graded(case, position_renderer(case), Oracle()).lost[CAR].grade is Grade.SHARED
+    fault = graded(case, position_renderer(case), Oracle(blind=False)).lost[CAR]
+    assert fault.grade is Grade.CONFIRMED
+    assert fault.peer is not None
+    assert (fault.peer.before, fault.peer.after) == (4, 0)
 
 
 def test_no_second_renderer_is_said_and_nothing_is_lost(case: GradingInput) -> None:
@@ -169,13 +169,13 @@ def test_a_failure_of_no_kind_has_no_grade_of_its_own(case: GradingInput) -> Non
 def test_draws_of_the_scene_before_the_change_are_kept(case: GradingInput) -> None:
     grader = Grader(Oracle(), 0.5, OFF)
     grader.grade(case, LOST)
-    asked: list[SceneIR] = []
+    rendered: list[SceneIR] = []
 
-    class Counting(Told):
+    class Counting(PositionRenderer):
         def render(self, changed: SceneIR) -> SecondRender:
-            asked.append(changed)
+            rendered.append(changed)
             return super().render(changed)
 
-    assert isinstance(case.renderer, Told)
+    assert isinstance(case.renderer, PositionRenderer)
     grader.grade(dataclasses.replace(case, renderer=Counting(case.renderer.of)), LOST)
-    assert len(asked) == 16
+    assert len(rendered) == 16

@@ -25,11 +25,11 @@ def targets(*boxes: Box, ignore: tuple[int, ...] = ()) -> Targets:
 
 
 def view(
-    truth: Targets, *reports: tuple[Box, int, float], shown: dict[int, Box] | None = None
+    truth: Targets, *reports: tuple[Box, int, float], visible_boxes: dict[int, Box] | None = None
 ) -> LabelledDetections:
     """Reports: box, label, score."""
     visible = truth.boxes_xyxy.clone()
-    for row, box in (shown or {}).items():
+    for row, box in (visible_boxes or {}).items():
         visible[row] = torch.tensor(box)
     boxes = torch.tensor([r[0] for r in reports]).reshape(-1, 4)
     labels = torch.tensor([r[1] for r in reports], dtype=torch.int64)
@@ -87,7 +87,7 @@ def test_one_phantom_a_place_whatever_its_classes() -> None:
 
 def test_an_occluded_object_is_found_by_what_shows_of_it() -> None:
     left_half = (100.0, 100.0, 145.0, 160.0)
-    changed = view(BOTH, (left_half, CAR, 0.8), (FAR, CAR, 0.8), shown={0: left_half})
+    changed = view(BOTH, (left_half, CAR, 0.8), (FAR, CAR, 0.8), visible_boxes={0: left_half})
     assert find_faults(RIGHT, changed, T_STAR) == ()
     assert match_detections(changed, T_STAR).detected.tolist() == [True, True]
 

@@ -183,7 +183,7 @@ def test_codes_at_zero_stay_as_photographed(scene: SceneIR) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("blur=1", "names among"),
         ("shift_px", "NAME=NUMBER"),
@@ -193,10 +193,10 @@ def test_codes_at_zero_stay_as_photographed(scene: SceneIR) -> None:
         ("gain=nan", "NAME=NUMBER"),
     ],
 )
-def test_bad_words(text: str, told: str) -> None:
+def test_bad_words(text: str, message: str) -> None:
     with pytest.raises(UsageError, match="--nuisances") as error:
         Nuisances.parse(text)
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_words() -> None:

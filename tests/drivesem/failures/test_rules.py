@@ -54,11 +54,11 @@ def test_two_features() -> None:
 
 def test_nothing_is_told_of_chance() -> None:
     """At most one rule in twenty where failures follow nothing."""
-    told = 0
+    message = 0
     for seed in range(60):
         features = samples(96, seed)
-        told += bool(fit_rule(features, failing(np.ones(96, np.bool_), seed, often=0.4)).intervals)
-    assert told <= 3
+        message += bool(fit_rule(features, failing(np.ones(96, np.bool_), seed, often=0.4)).intervals)
+    assert message <= 3
 
 
 def test_everything_fails_or_nothing() -> None:
@@ -119,15 +119,15 @@ def test_covering_finds_two_rules() -> None:
 @pytest.mark.parametrize("by_car", [True, False])
 def test_covering_tells_nothing_of_chance(by_car: bool) -> None:
     """Nor of a few cars that fail for no reason: samples of one car are much alike, and would seem to tell it."""
-    told = 0
+    message = 0
     for seed in range(20):
         features, objects = of_cars(40, 12, seed)
         rng = np.random.default_rng(seed)
         fails = rng.random(len(objects)) < 0.05
         if by_car:
             fails = np.isin(objects, rng.choice(40, 4, replace=False)) & (rng.random(len(objects)) < 0.5)
-        told += bool(fit_rule_list(features, fails, objects))
-    assert told <= 1
+        message += bool(fit_rule_list(features, fails, objects))
+    assert message <= 1
 
 
 @pytest.mark.parametrize("cars", [3, 4, 5])
@@ -142,13 +142,13 @@ def test_three_cars_are_enough(cars: int) -> None:
 @pytest.mark.parametrize("cars", [3, 4])
 def test_a_few_cars_tell_nothing_of_chance(cars: int) -> None:
     """Nor where each fails as often as it will."""
-    told = 0
+    message = 0
     for seed in range(30):
         features, objects = of_cars(cars, 48, seed)
         rng = np.random.default_rng(seed)
         for often in (0.05, 0.4, rng.random(cars)[objects]):
-            told += bool(fit_rule_list(features, rng.random(len(objects)) < often, objects))
-    assert told <= 4
+            message += bool(fit_rule_list(features, rng.random(len(objects)) < often, objects))
+    assert message <= 4
 
 
 def test_what_fails_in_two_cars_alone_is_no_rule() -> None:

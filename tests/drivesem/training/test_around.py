@@ -34,13 +34,13 @@ CAR = torch.zeros(1, dtype=torch.int64)
 T_STAR = 0.5
 
 
-def said(logits: Tensor, boxes_xyxy: Tensor = BOX) -> Candidates:
+def output(logits: Tensor, boxes_xyxy: Tensor = BOX) -> Candidates:
     """Candidates of one class at these boxes."""
     return Candidates(boxes_xyxy[:, None], torch.nn.functional.logsigmoid(logits)[:, None])
 
 
 def term(before: Tensor, after: Tensor) -> Tensor:
-    return margin_difference(said(before), said(after), (BOX, BOX), CAR, T_STAR)
+    return margin_difference(output(before), output(after), (BOX, BOX), CAR, T_STAR)
 
 
 def test_the_same_margins_are_not_apart() -> None:
@@ -48,7 +48,7 @@ def test_the_same_margins_are_not_apart() -> None:
     assert float(term(one, one)) == pytest.approx(0, abs=1e-9)
     assert float(term(one, one - 0.4)) == pytest.approx(0.5 * 0.4**2, rel=0.02)
     assert float(term(one, one - 3)) == pytest.approx(3 - 0.5, rel=0.02)
-    assert float(margin_difference(said(one), said(one), (BOX[:0], BOX[:0]), CAR[:0], T_STAR)) == 0
+    assert float(margin_difference(output(one), output(one), (BOX[:0], BOX[:0]), CAR[:0], T_STAR)) == 0
 
 
 def test_the_terms_gradient_is_that_of_differences() -> None:
@@ -59,7 +59,7 @@ def test_the_terms_gradient_is_that_of_differences() -> None:
     two = torch.cat([BOX, BOX])
 
     def loss(logits: Tensor, at: Tensor) -> Tensor:
-        return margin_difference(said(before, two), said(logits, at), (BOX, BOX), CAR, T_STAR)
+        return margin_difference(output(before, two), output(logits, at), (BOX, BOX), CAR, T_STAR)
 
     assert torch.autograd.gradcheck(loss, (after, placed), eps=1e-6, atol=1e-6)
     loss(after, placed).backward()
@@ -186,15 +186,15 @@ def test_consistency_on_real_pictures(around: FailureNeighbourhoods, monkeypatch
     value = once.term(detector, raw, 0)
     assert float(value.detach()) > 0
     assert float(twice.term(detector, raw, 0).detach()) == pytest.approx(2 * float(value.detach()))
-    said = {}
+    output = {}
     for name, pair in {"alike": (1.0, 1.0), "nearer": (1.0, -2.0), "farther": (-2.0, 1.0)}.items():
         margins = iter(map(torch.tensor, pair))
         with monkeypatch.context() as patch:
             patch.setattr(
                 "drivesem.training.failure_neighbourhoods.of_background", lambda *_, margins=margins: next(margins)
             )
-            said[name] = float(once.term(detector, raw, 0).detach())
-    assert said["nearer"] == pytest.approx(said["alike"] + 2.5), "background is nearer to a phantom than it was"
-    assert said["farther"] == pytest.approx(said["alike"]), "which is no harm the other way round"
+            output[name] = float(once.term(detector, raw, 0).detach())
+    assert output["nearer"] == pytest.approx(output["alike"] + 2.5), "background is nearer to a phantom than it was"
+    assert output["farther"] == pytest.approx(output["alike"]), "which is no harm the other way round"
     value.backward()
     assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())

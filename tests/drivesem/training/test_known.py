@@ -81,8 +81,8 @@ def test_the_shipped_cards_name_their_sets(tmp_path: Path) -> None:
     for detector in ("squeezedet", "yolov3-slim"):
         for name in SETS:
             (split, seed), *_ = sorted(street_seeds(read(name)))
-            shown = folder(tmp_path / f"{detector}-{name}", split, seed)
-            assert f"{name}.json" in "".join(list_overlaps(detector, str(shown))), (detector, name)
+            visible = folder(tmp_path / f"{detector}-{name}", split, seed)
+            assert f"{name}.json" in "".join(list_overlaps(detector, str(visible))), (detector, name)
 
 
 def test_folders_are_described_only_where_all_were_generated(tmp_path: Path) -> None:

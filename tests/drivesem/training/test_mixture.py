@@ -24,15 +24,15 @@ def numbers(mixture: TrainingMixture) -> list[int]:
 @pytest.mark.parametrize(("mix", "benign", "total"), [("replace", 30, 40), ("add", 40, 53)])
 def test_shares(mix: Mix, benign: int, total: int) -> None:
     mixture = TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 7))
-    shown = numbers(mixture)
-    assert len(shown) == total
-    assert len({n for n in shown if n < 100}) == sum(n < 100 for n in shown) == benign
-    counts = [shown.count(n) for n in range(100, 104)]
+    visible = numbers(mixture)
+    assert len(visible) == total
+    assert len({n for n in visible if n < 100}) == sum(n < 100 for n in visible) == benign
+    counts = [visible.count(n) for n in range(100, 104)]
     assert sum(counts) == total - benign
     assert max(counts) - min(counts) <= 1
-    assert numbers(TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 7))) == shown
+    assert numbers(TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 7))) == visible
     other = TrainingMixture(frames(0, 40), frames(100, 4), MixtureShares(0.25, mix, 0, 8))
-    assert numbers(other) != shown
+    assert numbers(other) != visible
 
 
 def test_counterexamples_come_in_little_by_little() -> None:

@@ -23,8 +23,8 @@ def clip_of(
     for frame in range(frames):
         there = [track for track in PLACES if not (frame == without and track == 9)]
         scene = street([(PLACES[t][0], PLACES[t][1] - STEP_M * frame) for t in there])
-        told = {"tracks": ",".join(map(str, there))} | {f"objects[{i}].label": str(i) for i in range(len(there))}
-        scene = replace(scene, provenance=told)
+        message = {"tracks": ",".join(map(str, there))} | {f"objects[{i}].label": str(i) for i in range(len(there))}
+        scene = replace(scene, provenance=message)
         scenes.append(photograph_scene(scene) if drawn else scene)
         tracks.append(tuple(there))
     return DerenderedClip("street", tuple(f"{f:03d}" for f in range(frames)), tuple(scenes), tuple(tracks))

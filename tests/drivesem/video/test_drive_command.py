@@ -64,23 +64,23 @@ def test_it_is_told_from_an_attack_that_was_killed(
 
 
 def test_what_is_written(finished: Path, taken: DerenderedClip) -> None:
-    told = json.loads((finished / "drive.json").read_text())
-    assert told["frames"] == 3
-    assert told["names"] == list(taken.names)
-    assert told["params"] == ["color", "translate"]
-    assert told["feasible"] == 3
-    assert told["queries"] == 1
-    assert sorted(car["track"] for car in told["cars"]) == [4, 7, 9]
-    for car in told["cars"]:
+    data = json.loads((finished / "drive.json").read_text())
+    assert data["frames"] == 3
+    assert data["names"] == list(taken.names)
+    assert data["params"] == ["color", "translate"]
+    assert data["feasible"] == 3
+    assert data["queries"] == 1
+    assert sorted(car["track"] for car in data["cars"]) == [4, 7, 9]
+    for car in data["cars"]:
         assert set(car["states"]) == {"before", "after", "control"}
         for state, letters in car["states"].items():
             assert len(letters) == 3
             assert car[f"lost_{state}"] == letters.count("l")
         assert car["frames"] == sum(letter in "fl" for letter in car["states"]["after"])
-    (last,) = (car for car in told["cars"] if car["track"] == 9)
+    (last,) = (car for car in data["cars"] if car["track"] == 9)
     assert [way is None for way in last["path_m"]] == [False, True, False]
     assert last["states"]["after"][1] == " "
-    assert any(name.startswith("cars[4].paint") for name in told["theta"])
+    assert any(name.startswith("cars[4].paint") for name in data["theta"])
     for name in taken.names:
         for side in ("before", "after"):
             assert files.read_image(finished / "frames" / name / f"{side}.jpg").shape == (188, 621, 3)
@@ -112,8 +112,8 @@ def test_a_clip_that_memory_cannot_hold_is_refused(
 ) -> None:
     monkeypatch.setattr(taking, "memory_gb", lambda: 0.5)
     assert main(["drive", "--limit", "30", "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.endswith(
+    output = capsys.readouterr().err.strip()
+    assert output.endswith(
         "CLIP: frames: expected at most 6 frames, as memory of 0.5 GB holds (--limit takes the first), found 30"
     )
     assert not (tmp_path / "out" / "scenes").exists()
@@ -122,9 +122,9 @@ def test_a_clip_that_memory_cannot_hold_is_refused(
 def test_the_table_names_cars(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert main([*(word for word in WORDS if word != "--json"), "--limit", "3", "--out", str(finished)]) == 0
-    said = capsys.readouterr().out
-    assert "4 Car" in said
-    assert "by a random change" in said
+    output = capsys.readouterr().out
+    assert "4 Car" in output
+    assert "by a random change" in output
 
 
 def test_the_page_escapes_and_runs_one_script(finished: Path, tmp_path: Path) -> None:
@@ -180,10 +180,10 @@ def test_bad_input_is_a_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["drive", *words]) == 2
-    said = capsys.readouterr()
-    assert message in said.err
-    assert said.err.count("\n") == 1
-    assert said.out == ""
+    output = capsys.readouterr()
+    assert message in output.err
+    assert output.err.count("\n") == 1
+    assert output.out == ""
 
 
 @pytest.mark.slow
@@ -198,11 +198,11 @@ def test_what_the_generator_wrote(layout: str, tmp_path: Path, capsys: pytest.Ca
     words += ["--workers", "1", "--out", str(out), "--json"]
     capsys.readouterr()
     assert main(words) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["frames"] == 3
-    assert told["cars"]
+    data = json.loads(capsys.readouterr().out)
+    assert data["frames"] == 3
+    assert data["cars"]
     meshes: dict[str, set[str]] = {}
-    for name in told["names"]:
+    for name in data["names"]:
         scene = load_scene(out / "scenes" / name)
         tracks = scene.provenance["tracks"].split(",")
         for i in range(len(scene.objects)):
@@ -226,7 +226,7 @@ def test_a_killed_command_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[
                 path.unlink() if path.is_file() else shutil.rmtree(path)
         capsys.readouterr()
         assert main([*words, "--out", str(out), "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        found.append({key: value for key, value in told.items() if key not in ("out", "seconds")})
+        data = json.loads(capsys.readouterr().out)
+        found.append({key: value for key, value in data.items() if key not in ("out", "seconds")})
     assert found[0] == found[1]
     assert len(found[0]["cars"]) >= 3

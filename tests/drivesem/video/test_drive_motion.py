@@ -32,7 +32,7 @@ class Watched:
         self.clip = clip
         self._compositors = [Compositor(scene) for scene in clip.scenes]
 
-    def trembling_px(self, shown: Sequence[SceneIR], meant: Sequence[SceneIR], *tracks: int) -> list[float]:
+    def trembling_px(self, visible: Sequence[SceneIR], meant: Sequence[SceneIR], *tracks: int) -> list[float]:
         """How far the pictures of cars leave, from frame to frame, the motion of their places. shown: what is
         drawn; meant: where the cars are to be.
 
@@ -42,7 +42,7 @@ class Watched:
         apart: dict[int, list[list[float]]] = {track: [] for track in tracks}
         for frame, of_frame in enumerate(self.clip.tracks):
             with torch.no_grad():
-                owner = self._compositors[frame].render(shown[frame]).object_id
+                owner = self._compositors[frame].render(visible[frame]).object_id
             for track in tracks:
                 row = of_frame.index(track)
                 rows, columns = (owner == row + 1).nonzero().double().unbind(1)
@@ -103,4 +103,4 @@ def test_cars_of_the_embedded_drive_move_as_their_places_do() -> None:
         for row, track in enumerate(tracks):
             mesh = scene.meshes[int(scene.objects.mesh_index[row])].name
             by_track.setdefault(track, set()).add((mesh, tuple(scene.objects.size_lhw[row].tolist())))
-    assert all(len(looks) == 1 for looks in by_track.values())
+    assert all(len(crops) == 1 for crops in by_track.values())

@@ -12,7 +12,7 @@ def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
     """Cars, by track and kind, that come nearer by a metre a frame and are missed from the second one on."""
     states: dict[str, str] = dict.fromkeys(map(str, STATES), "f" + "l" * (frames - 1))
     distance_m = tuple(float(frames - i) for i in range(frames))
-    told = (
+    message = (
         CarResult.from_states(track, kind, states, distance_m, (None,) * frames, (True, False))
         for track, kind in cars
     )
@@ -25,7 +25,7 @@ def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
         method="si-fgsm",
         frames=frames,
         names=tuple(map(str, range(frames))),
-        cars=tuple(told),
+        cars=tuple(message),
         phantoms=dict.fromkeys(map(str, STATES), 1),
         feasible=frames,
         violations={},
@@ -40,17 +40,17 @@ def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:
 
 
 def test_the_table_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
-    shown = io.StringIO()
+    visible = io.StringIO()
     answer = build_report(_result(tmp_path, 140, (3, "Car"), (1012, "Truck")))
-    answer.print(Console(file=shown, width=80))
-    lines = [line.split() for line in shown.getvalue().splitlines()[:6]]
-    figures = ["before", "after", "random", "of", "longest", "before", "after", "random", "of", "m", "certain"]
-    assert ["car", *figures] in lines
+    answer.print(Console(file=visible, width=80))
+    lines = [line.split() for line in visible.getvalue().splitlines()[:6]]
+    metrics = ["before", "after", "random", "of", "longest", "before", "after", "random", "of", "m", "certain"]
+    assert ["car", *metrics] in lines
     for name in ("3 Car", "1012 Truck"):
         assert [*name.split(), "139", "139", "139", "140", "139", *["139.0"] * 4, "1/2"] in lines
 
 
 def test_one_is_told_as_one(tmp_path: Path) -> None:
-    said = format_summary(_result(tmp_path, 1, (3, "Car")))
+    output = format_summary(_result(tmp_path, 1, (3, "Car")))
     for part in ("of 1 sight of 1 car missed", ", 1 phantom (", "in 1 of 1 frame; 1 query, 1 pass, "):
-        assert part in said
+        assert part in output

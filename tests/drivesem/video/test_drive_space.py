@@ -98,12 +98,12 @@ def test_gradients_go_back_to_the_clip(space: ClipSpace) -> None:
 
 
 def test_names_units_and_values_are_a_cars(space: ClipSpace) -> None:
-    told = space.theta_by_name(random_theta(space))
+    message = space.theta_by_name(random_theta(space))
     first = "cars[4].translate.along[0]"
-    assert first in told
-    assert str(told[first]["display"]).endswith(" m")
-    assert told["cars[9].yaw"]["unit"] == "rad"
-    assert "weather.fog" in told
+    assert first in message
+    assert str(message[first]["display"]).endswith(" m")
+    assert message["cars[9].yaw"]["unit"] == "rad"
+    assert "weather.fog" in message
 
 
 def test_projection_is_feasible_in_every_frame_and_keeps_what_is(

@@ -87,15 +87,15 @@ def test_the_next_best_view_stands_in_for_a_damaged_one(
 ) -> None:
     whole, meshes = taker(keep_going=True)
     for name in order:
-        whole.source.scene(name)
+        whole.frames.scene(name)
     assert meshes == {name: ["van", "van"] for name in order}
     damaged, meshes = taker("b", keep_going=True)
     for name in order:
         if name == "b":
             with pytest.raises(FormatError, match=r"b\.png"):
-                damaged.source.scene(name)
+                damaged.frames.scene(name)
         else:
-            damaged.source.scene(name)
+            damaged.frames.scene(name)
     assert meshes == {name: ["suv", "sedan"] for name in order if name != "b"}
 
 
@@ -106,16 +106,16 @@ def test_without_keep_going_no_frame_is_taken_apart_with_another_shape(
     damaged, meshes = taker("b", keep_going=False)
     for name in NAMES:
         with pytest.raises(FormatError, match=r"b\.png"):
-            damaged.source.scene(name)
+            damaged.frames.scene(name)
     assert not meshes
 
 
 def test_a_clip_whose_first_picture_is_damaged_has_a_camera(
     taker: Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]],
 ) -> None:
-    camera = taker("a", keep_going=True)[0].source.camera()
+    camera = taker("a", keep_going=True)[0].frames.camera()
     assert camera is not None
     assert (camera.width, camera.height) == (100, 60)
-    assert taker(*NAMES, keep_going=True)[0].source.camera() is None
+    assert taker(*NAMES, keep_going=True)[0].frames.camera() is None
     with pytest.raises(FormatError, match=r"a\.png"):
-        taker("a", keep_going=False)[0].source.camera()
+        taker("a", keep_going=False)[0].frames.camera()

@@ -87,9 +87,9 @@ def test_without_egl_and_osmesa_one_line_says_what_to_install(monkeypatch: pytes
     shared_context.cache_clear()
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     monkeypatch.setattr(ctypes, "CDLL", missing)
-    with pytest.raises(NoSecondRendererError, match="libegl1 or libosmesa6") as told:
+    with pytest.raises(NoSecondRendererError, match="libegl1 or libosmesa6") as message:
         PhotographRenderer("demo-000", demo_scene(0, 0))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(message.value)
     assert "PYOPENGL_PLATFORM" not in os.environ
     shared_context.cache_clear()
 
@@ -98,7 +98,10 @@ def test_without_egl_and_osmesa_one_line_says_what_to_install(monkeypatch: pytes
 def test_torchs_compiler_is_loaded_before_the_driver(tmp_path: Path) -> None:
     """A process that draws and then trains: with both LLVMs the other order is a segmentation fault."""
     (tmp_path / "triton.py").write_text("import sys\nprint('OpenGL' in sys.modules)\n")
-    program = "import torch, drivesem.failures.second_renderer.opengl as s; s.shared_screen(); print('triton' in sys.modules)"
+    program = (
+        "import torch, drivesem.failures.second_renderer.opengl as s; s.shared_context(); "
+        "print('triton' in sys.modules)"
+    )
     both = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[4])])
     ended = subprocess.run(
         [sys.executable, "-c", f"import sys; {program}"],
@@ -113,7 +116,7 @@ def test_torchs_compiler_is_loaded_before_the_driver(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("screen")
 def test_a_process_that_draws_can_train() -> None:
     program = (
-        "import torch, drivesem.failures.second_renderer.opengl as s; s.shared_screen(); import torch._dynamo"
+        "import torch, drivesem.failures.second_renderer.opengl as s; s.shared_context(); import torch._dynamo"
     )
     ended = subprocess.run([sys.executable, "-c", program], cwd=Path(__file__).parents[4], check=False)
     assert ended.returncode == 0

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.failures.second_renderer import shading as weathering
+from drivesem.failures.second_renderer import shading
 from drivesem.failures.second_renderer.baking import pack_patches
 from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose
 from scene_ir import ffd
@@ -83,7 +83,7 @@ BASE = np.array([0.3, 0.3, 0.3], np.float32)
 
 
 def painted(code: list[float], rgb: np.ndarray, paint: float = 1.0) -> np.ndarray:
-    return weathering.apply_paint(rgb, np.array(code, np.float32), paint * ONE, 0 * ONE, BASE)
+    return shading.apply_paint(rgb, np.array(code, np.float32), paint * ONE, 0 * ONE, BASE)
 
 
 def test_paint_codes_mean_what_they_say() -> None:
@@ -105,5 +105,5 @@ def test_paint_codes_mean_what_they_say() -> None:
 
 def test_shadows_go_under_a_closed_sky() -> None:
     clear, closed = np.zeros(4, np.float32), np.array([0, 0, 0, 1], np.float32)
-    assert weathering.remaining_shade(clear) == 1
-    assert weathering.remaining_shade(closed) == pytest.approx(0.4)
+    assert shading.remaining_shade(clear) == 1
+    assert shading.remaining_shade(closed) == pytest.approx(0.4)

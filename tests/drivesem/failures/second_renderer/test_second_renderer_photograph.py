@@ -73,8 +73,8 @@ def test_labels_move_as_ours_do(second: PhotographRenderer, scene: SceneIR) -> N
     changed = moved(scene, i, x=0.4, z=0.5, turn=0.1)
     drawn, ours = second.render(changed), Labeller(scene).moved(changed)
     torch.testing.assert_close(drawn.targets.boxes_xyxy[i], ours.boxes_xyxy[i], atol=0.05, rtol=0)
-    shown = second.render(scene).visible_xyxy[i]
-    assert float(drawn.visible_xyxy[i][0]) > float(shown[0]) + 1
+    visible = second.render(scene).visible_xyxy[i]
+    assert float(drawn.visible_xyxy[i][0]) > float(visible[0]) + 1
 
 
 def test_what_stands_nearer_hides_what_is_behind_it(second: PhotographRenderer, scene: SceneIR) -> None:
@@ -86,8 +86,8 @@ def test_what_stands_nearer_hides_what_is_behind_it(second: PhotographRenderer, 
     translation[far] = objects.translation[near] * torch.tensor([1.3, 1.0, 1.3])
     behind = second.render(scene.with_objects(translation=translation))
     assert bool(behind.targets.ignore[far])
-    shown = behind.visible_xyxy
-    height = shown[:, 3] - shown[:, 1]
+    visible = behind.visible_xyxy
+    height = visible[:, 3] - visible[:, 1]
     assert float(height[far]) < 0.5 * float(height[near])
     translation[far] = objects.translation[near] * torch.tensor([0.7, 1.0, 0.7])
     before = second.render(scene.with_objects(translation=translation))

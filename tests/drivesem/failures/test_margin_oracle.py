@@ -15,7 +15,7 @@ from drivesem.failures.nuisances import Nuisances
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 
-SHOWN, NEAR = 2, 0.3
+VISIBLE, NEAR = 2, 0.3
 
 
 @pytest.fixture(scope="module")
@@ -99,11 +99,11 @@ def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> Non
             torch.testing.assert_close(
                 regional.margins(place, number), whole.margins(place, number), atol=1e-4, rtol=0
             )
-    kept = [regional.cache_mb, whole.cache_mb]
+    cached = [regional.cache_mb, whole.cache_mb]
     regional.clear_cache()
-    kept.append(regional.cache_mb)
-    assert kept[0] > 0
-    assert kept[1:] == [0, 0]
+    cached.append(regional.cache_mb)
+    assert cached[0] > 0
+    assert cached[1:] == [0, 0]
 
 
 def test_a_picture_seen_again_costs_less_than_a_whole_pass(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,8 +126,8 @@ def test_a_picture_seen_again_costs_less_than_a_whole_pass(monkeypatch: pytest.M
 def test_weather_has_no_regions(objective: Objective) -> None:
     views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
     views.margins(0.5 * objective.space.upper, 0)
-    kept = views.cache_mb
-    assert kept == 0
+    cached = views.cache_mb
+    assert cached == 0
 
 
 def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
@@ -135,11 +135,11 @@ def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
     space = ParameterSpace(scene, ("translate",))
     objective = Objective(Compositor(scene), space, load_detector("squeezedet"), keep_mb=LIMIT_MB + 1.0)
     views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
-    kept = []
+    cached = []
     for number in range(2):
         views.margins(space.theta0, number)
-        kept.append(views.cache_mb)
-    assert kept[0] == kept[1] > 0
+        cached.append(views.cache_mb)
+    assert cached[0] == cached[1] > 0
 
 
 def test_the_benign_picture_counts_and_one_picture_keeps_no_more_than_the_process() -> None:

@@ -41,8 +41,8 @@ def test_what_shows_counts_too() -> None:
         margin.object_margins(candidates(boxes, scores), elsewhere, LABEL, NOTHING, T_STAR).item()
         == margin.MIN_MARGIN
     )
-    shown = margin.object_margins(candidates(boxes, scores), elsewhere, LABEL, BOX, T_STAR)
-    assert shown.item() > 0
+    visible = margin.object_margins(candidates(boxes, scores), elsewhere, LABEL, BOX, T_STAR)
+    assert visible.item() > 0
 
 
 def test_another_class_does_not_count() -> None:
