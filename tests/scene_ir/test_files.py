@@ -160,7 +160,7 @@ def test_a_file_longer_than_its_reported_size_is_read_whole(
 ) -> None:
     (tmp_path / "a").write_bytes(b"0123456789")
     monkeypatch.setattr(files, "_CHUNK_BYTES", 3)
-    monkeypatch.setattr(files, "check_regular", lambda path, most: 4)
+    monkeypatch.setattr(files, "check_regular_file", lambda path, most: 4)
     assert files.read_bytes(tmp_path / "a") == b"0123456789"
 
 
