@@ -204,7 +204,7 @@ def test_scene_folder_stores_occluders(fast_pole: SceneIR, tmp_path: Path) -> No
 
 
 def test_occluder_depth_is_validated() -> None:
-    with pytest.raises(RangeError, match=r"front\.depth_m"):
+    with pytest.raises(RangeError, match=r"occluder\.depth_m"):
         Occluder(Crop(torch.zeros(4, 2, 2), 0, 0), 0.0)
 
 
