@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from tools.experiments.__main__ import main
 from drivesem.config.commands import AttackConfig
 from drivesem.config.options import to_yaml
 from drivesem.data.kitti import write_labels
 from drivesem.run.results import Coordinate, FrameResult, dump_frame
 from scene_ir import files
 from scene_ir.types import Labels
+from tools.experiments.__main__ import main
 
 YAW, TURNED = -1.57, 0.8
 

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tools.experiments.__main__ import main
 from drivesem.evaluation.resampling import Interval
 from drivesem.run.results import dump_frame, load_frame
 from scene_ir import files
 from scene_ir.errors import ShapeError
+from tools.experiments.__main__ import main
 from tools.experiments.realism import comparison
 from tools.experiments.realism.comparison import crop_window, enclosing_rectangle, vehicle_boxes
-from tools.experiments.realism.measures import LEAST_PX
+from tools.experiments.realism.metrics import MIN_SIDE_PX
 
 
 @pytest.fixture
@@ -104,13 +104,13 @@ def test_a_table_for_people(
 
 def test_windows() -> None:
     rows, columns = crop_window([(10, 20, 30.5, 40)], 200, 300)
-    assert (rows.stop - rows.start, columns.stop - columns.start) == (LEAST_PX, LEAST_PX)
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (MIN_SIDE_PX, MIN_SIDE_PX)
     assert rows.start <= 20 < 40 <= rows.stop
     assert columns.start == 0
     both = crop_window([(10, 20, 90, 40), (100.2, 10, 190.4, 150.6)], 200, 300)
     assert both == (slice(10, 151), slice(10, 191))
     outside = crop_window([(290, 190, 400, 300)], 200, 300)
-    assert outside == (slice(200 - LEAST_PX, 200), slice(300 - LEAST_PX, 300))
+    assert outside == (slice(200 - MIN_SIDE_PX, 200), slice(300 - MIN_SIDE_PX, 300))
     with pytest.raises(ShapeError, match="at least 64 px"):
         crop_window([(0, 0, 1, 1)], 63, 300)
 

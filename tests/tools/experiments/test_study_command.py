@@ -13,10 +13,11 @@ import cv2
 import pytest
 import yaml
 
-from tools.experiments.__main__ import main
+from drivesem.cli import main as drivesem_main
 from drivesem.failures.second_renderer.base import NoSecondRendererError
 from drivesem.synth.write import Order, synthesise
-from tools.experiments.detection import asking as study_asking
+from tools.experiments.__main__ import main
+from tools.experiments.detection import study as study_module
 from tools.experiments.detection.arms import AttackArm, build_arms
 from tools.experiments.settings import StudyConfig
 
@@ -41,14 +42,14 @@ def study(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any
 
 @pytest.fixture(autouse=True)
 def fewer_arms(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study_asking, "arms_of", first_arm)
+    monkeypatch.setattr(study_module, "build_arms", first_arm)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study_asking, "arms_of", first_arm)
+        patch.setattr(study_module, "build_arms", first_arm)
         assert main([*WORDS, "--out", str(out)]) == 0
     return out
 
@@ -93,7 +94,7 @@ def test_tables_come_again_from_what_is_kept(
 def test_labels_come_again_from_what_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(study_asking, "arms_of", lambda config, out: build_arms(config, out)[:1])
+    monkeypatch.setattr(study_module, "build_arms", lambda config, out: build_arms(config, out)[:1])
     out = tmp_path / "labels"
     data = study(["labels", *WORDS[1:], "--out", str(out), "--json"], capsys)
     assert data["label_sets"][0]["objects"] > 0
@@ -105,7 +106,7 @@ def test_labels_come_again_from_what_is_kept(
     [
         (["classification"], "settings.name: expected classification, found multi"),
         (["single"], "settings.name: expected single, found multi"),
-        (["multi", "--steps", "7"], "--steps: expected none beside --results, which has the study's own settings"),
+        (["multi", "--steps", "7"], "--steps: expected none with --from, which uses the study's own settings"),
     ],
 )
 def test_what_cannot_be_told_again(
@@ -172,7 +173,7 @@ def test_the_placebo_is_as_large_as_the_attack(finished: Path) -> None:
 def test_an_arm_is_an_attack_like_any_other(finished: Path, tmp_path: Path) -> None:
     """The same settings, by drivesem attack alone, give the same frame."""
     words = ["attack", "--combo", "1", "--steps", "1", "--limit", "1", "--workers", "1", "--seed", "0"]
-    assert main([*words, "--out", str(tmp_path / "alone")]) == 0
+    assert drivesem_main([*words, "--out", str(tmp_path / "alone")]) == 0
     assert result(tmp_path / "alone") == result(finished / "arms" / "combo-1")
     for part in ("counterexample.png", "labels_moved.txt"):
         alone, arm = (

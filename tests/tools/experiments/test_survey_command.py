@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tools.experiments.__main__ import main
 from drivesem.run.finished import load_run
 from drivesem.run.results import BoxRecord, dump_frame, load_frame
 from scene_ir.errors import ShapeError
-from tools.experiments.survey.page import COLUMNS, items_of
+from tools.experiments.__main__ import main
+from tools.experiments.survey.page import COLUMNS, draw_items
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_of_vehicles_that_left_or_parked_those_are_shown_that_the_picture_has(
     before = (BoxRecord(car, "Car", index=0), BoxRecord(nowhere, "Truck", ignore=True, index=1))
     after = (BoxRecord(nowhere, "Car", ignore=True, index=0), BoxRecord(lorry, "Truck", ignore=True, index=1))
     path.write_text(dump_frame(replace(result, targets_benign=before, targets_moved=after)))
-    found = {item.kind: (item, view) for item, view in items_of([load_run(folder, limit=1)], 1, 1, 0)}
+    found = {item.kind: (item, view) for item, view in draw_items([load_run(folder, limit=1)], 1, 1, 0)}
     (changed, view), (unchanged, _) = found["counterexample"], found["unchanged"]
     assert (changed.object, changed.truth) == (1, "Truck")
     assert (unchanged.object, unchanged.truth) == (0, "Car")
@@ -105,7 +105,7 @@ def test_of_vehicles_that_left_or_parked_those_are_shown_that_the_picture_has(
     gone = replace(result, targets_benign=before[:1], targets_moved=after[:1])
     path.write_text(dump_frame(gone))
     with pytest.raises(ShapeError, match="expected a run with vehicles"):
-        items_of([load_run(folder, limit=1)], 1, 1, 0)
+        draw_items([load_run(folder, limit=1)], 1, 1, 0)
 
 
 def test_fewer_frames_than_asked_for(

@@ -14,10 +14,10 @@ import torch
 
 from detectors.base import Predictor
 from detectors.types import Detections
-from tools.experiments.__main__ import main
 from drivesem.run import detection_cache as looking
 from drivesem.training.retrain import WEIGHTS
 from scene_ir import files
+from tools.experiments.__main__ import main
 
 CARS = [[13.0, 20.0, 63.0, 50.0], [73.0, 10.0, 128.0, 60.0]]
 

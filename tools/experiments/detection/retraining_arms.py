@@ -70,7 +70,7 @@ _PAPER_BEFORE = (PAPER_COMBOS[DEFAULT_COMBO], PAPER_BENIGN)
 _PAPER_AFTER = (0.7276, 0.8473)
 """The paper's mAP on counterexamples of the original detector and on benign frames, before and after retraining: a
 quarter of 6,339 frames replaced, 6,000 steps. Its original detector had 24,000 steps on re-rendered benign frames."""
-_OURS = RetrainConfig(
+OURS = RetrainConfig(
     run="",
     mix="add",
     label_mode="moved",
@@ -171,7 +171,7 @@ def build_retraining_arms(study: StudyConfig) -> list[RetrainingArm]:
     Raises UsageError for an unknown arm.
     """
     ours = replace(
-        _OURS,
+        OURS,
         seed=study.seed,
         device=study.device,
         mix=study.mix,

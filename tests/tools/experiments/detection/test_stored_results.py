@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from detectors.types import CLASSES
 from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
 from drivesem.analysis.transfer.matrix import SourceRun, TransferCounts, TransferTarget
-from drivesem.analysis.verify.frame import BENIGN
 from drivesem.config.commands import AttackConfig
 from drivesem.data.virtual import KINDS
 from drivesem.evaluation.coco import IOU_THRESHOLDS
@@ -28,7 +29,7 @@ from tools.experiments.detection.arms import PLACEBO, RANDOM, ArmRun, AttackArm,
 from tools.experiments.detection.counts import ArmCounts, DetectedObject, FailureRecord, FrameCounts, StudyCounts
 from tools.experiments.detection.labels import compare_frame_labels, compare_labels
 from tools.experiments.detection.report import build_results
-from tools.experiments.detection.retraining_arms import build_retraining_arms
+from tools.experiments.detection.retraining_arms import BENIGN, build_retraining_arms
 from tools.experiments.detection.retraining_results import BenignMatches, RetrainingCounts, summarise_retraining
 from tools.experiments.detection.robustness import ANYWHERE, AROUND, FailureCounts, FrameStateCounts
 from tools.experiments.detection.stored_results import (

@@ -18,6 +18,7 @@ from drivesem.attack.methods.base import Attack
 from drivesem.run import detection_cache as looking
 from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS
 from tools.experiments.__main__ import main
+from tools.experiments.detection import transfer
 from tools.experiments.detection.arms import PLACEBO, build_arms
 from tools.experiments.detection.report import OWN_PROTOCOL
 from tools.experiments.settings import StudyConfig

@@ -13,9 +13,16 @@ from hypothesis import strategies as st
 from drivesem.synth.compare import QUANTITIES, Quantity, histograms, reference
 from scene_ir.errors import RangeError
 from scene_ir.types import Labels
-from tools.experiments.plausibility.percentiles import NAMES, Plausibility, Scale, plausibility, scales, scales_of
+from tools.experiments.plausibility.percentiles import (
+    NAMES,
+    PercentileScale,
+    VehiclePlausibility,
+    build_scales,
+    kitti_scales,
+    vehicle_plausibility,
+)
 
-EVEN = Scale(Quantity("Even", "m", (0.0, 1.0, 2.0, 3.0, 4.0)), np.full(4, 0.25))
+EVEN = PercentileScale(Quantity("Even", "m", (0.0, 1.0, 2.0, 3.0, 4.0)), np.full(4, 0.25))
 
 
 def labels(
@@ -44,7 +51,7 @@ def test_an_even_distribution_by_hand() -> None:
 
 
 def test_never_seen_is_zero() -> None:
-    scale = Scale(EVEN.quantity, np.array([0.0, 0.5, 0.5, 0.0]))
+    scale = PercentileScale(EVEN.quantity, np.array([0.0, 0.5, 0.5, 0.0]))
     assert scale.percentiles(np.array([0.4, 1.0, 3.6, 2.0])).tolist() == [0.0, 0.0, 0.0, 100.0]
 
 
@@ -53,7 +60,7 @@ def test_angles_by_hand() -> None:
     half = math.pi / 2
     quantity = Quantity("Angle", "rad", tuple((i - 0.5) * half - math.pi for i in range(5)), angle=True)
     # bins about -pi, -pi / 2, 0, pi / 2
-    scale = Scale(quantity, np.array([0.25, 0.0, 0.75, 0.0]))
+    scale = PercentileScale(quantity, np.array([0.25, 0.0, 0.75, 0.0]))
     ahead, behind, side, again = scale.percentiles(np.array([0.0, math.pi, half, 2 * math.pi]))
     assert ahead == again == pytest.approx(100)
     assert side == 0.0
@@ -64,7 +71,7 @@ def test_angles_by_hand() -> None:
 
 @given(st.sampled_from([n for n in NAMES if n != "yaw_rad"]), st.floats(-100, 200), st.floats(0.01, 50))
 def test_farther_from_the_median_is_never_more_common(name: str, value: float, step: float) -> None:
-    scale = scales()[name]
+    scale = kitti_scales()[name]
     edges = np.asarray(scale.quantity.edges)
     middle = np.interp(0.5, np.concatenate([[0.0], np.cumsum(scale.shares)]), edges)
     away = value + step if value >= middle else value - step
@@ -73,7 +80,7 @@ def test_farther_from_the_median_is_never_more_common(name: str, value: float, s
 
 
 def test_what_kitti_shows_often_and_what_it_does_not() -> None:
-    scale = scales()
+    scale = kitti_scales()
     along, across, slanted = scale["yaw_rad"].percentiles(np.array([-math.pi / 2, 0.0, 0.8]))
     assert along > 90 > across > slanted
     assert slanted < 5
@@ -84,7 +91,7 @@ def test_what_kitti_shows_often_and_what_it_does_not() -> None:
 
 
 def test_a_frame() -> None:
-    found = plausibility(labels((-2.0, 20.0, -1.57), (2.0, 20.0, 0.8)))
+    found = vehicle_plausibility(labels((-2.0, 20.0, -1.57), (2.0, 20.0, 0.8)))
     assert found.table.shape == (2, len(NAMES))
     assert set(found.percentiles) == set(NAMES)
     assert found.percentiles["spacing_m"][0] == found.percentiles["spacing_m"][1]
@@ -93,23 +100,23 @@ def test_a_frame() -> None:
 
 
 def test_one_alone_has_no_neighbour_and_people_are_left_out() -> None:
-    alone = plausibility(labels((-2.0, 20.0, -1.57)))
+    alone = vehicle_plausibility(labels((-2.0, 20.0, -1.57)))
     assert np.isnan(alone.percentiles["spacing_m"]).all()
     assert np.isfinite(alone.lowest).all()
-    people = plausibility(labels((-2.0, 20.0, -1.57), kind="Pedestrian"))
+    people = vehicle_plausibility(labels((-2.0, 20.0, -1.57), kind="Pedestrian"))
     assert people.table.shape == (0, len(NAMES))
     assert people.lowest.shape == (0,)
-    unknown = Plausibility({name: np.array([np.nan]) for name in NAMES})
+    unknown = VehiclePlausibility({name: np.array([np.nan]) for name in NAMES})
     assert np.isnan(unknown.lowest).all()
 
 
 def test_vehicles_without_poses_are_refused() -> None:
     with pytest.raises(RangeError, match="1 vehicles with poses, found 0"):
-        plausibility(labels((math.nan, 20.0, -1.57)))
+        vehicle_plausibility(labels((math.nan, 20.0, -1.57)))
     with pytest.raises(RangeError, match="histograms: depth_m"):
-        scales_of(histograms([]))
+        build_scales(histograms([]))
 
 
 def test_the_reference_covers_every_quantity() -> None:
     assert set(NAMES) <= set(QUANTITIES)
-    assert all(s.shares.sum() == pytest.approx(1, abs=1e-3) for s in scales_of(reference()).values())
+    assert all(s.shares.sum() == pytest.approx(1, abs=1e-3) for s in build_scales(reference()).values())

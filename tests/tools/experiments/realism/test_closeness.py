@@ -1,10 +1,11 @@
+from tools.experiments.realism.perceptual import PerceptualDistance
+
 """How near two pictures look: known values and bounds."""
 
 import numpy as np
 import pytest
 
 from scene_ir.errors import ShapeError
-from tools.experiments.realism.closeness import PerceptualDistance
 
 
 def _noise(seed: int = 0, height: int = 60, width: int = 90) -> np.ndarray:

@@ -10,8 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
-from tools.experiments.realism.frechet import Gaussian, frechet_distance
-from tools.experiments.realism.inception import FEATURES, Inception
+from tools.experiments.classification.features import FEATURES
+from tools.experiments.realism.feature_networks import Inception
+from tools.experiments.realism.metrics import Gaussian, frechet_distance
 
 
 def closed_form(m1: np.ndarray, c1: np.ndarray, m2: np.ndarray, c2: np.ndarray) -> float:

@@ -10,8 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from scene_ir.errors import ShapeError
-from tools.experiments.realism.lpips import TRUNKS, Lpips, load_published_heads
-from tools.experiments.realism.networks import FeatureTrunk
+from tools.experiments.realism.perceptual import TRUNKS, FeatureTrunk, Lpips, load_published_heads
 
 Weights = dict[str, Tensor]
 

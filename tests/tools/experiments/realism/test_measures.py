@@ -10,10 +10,8 @@ import torch
 
 from scene_ir.errors import FormatError, ShapeError
 from tools.experiments.realism import weights
-from tools.experiments.realism.closeness import PerceptualDistance
-from tools.experiments.realism.inception import Inception
-from tools.experiments.realism.lpips import TRUNKS
-from tools.experiments.realism.measures import (
+from tools.experiments.realism.feature_networks import Inception, MobileNetV2
+from tools.experiments.realism.metrics import (
     METRICS,
     load_metrics,
     psnr_db,
@@ -21,7 +19,7 @@ from tools.experiments.realism.measures import (
     structural_similarity,
     why_missing,
 )
-from tools.experiments.realism.networks import MobileNetV2
+from tools.experiments.realism.perceptual import TRUNKS, PerceptualDistance
 
 
 def noise(seed: int, height: int = 70, width: int = 90) -> np.ndarray:

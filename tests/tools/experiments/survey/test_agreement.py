@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tools.experiments.survey.agreement import alpha, interval, nominal
+from drivesem.data.virtual import alpha
+from tools.experiments.survey.results import interval_distance, nominal_distance
 
 # Four observers, twelve units, 0 where one said nothing (Krippendorff, Computing ... Alpha-Reliability, 2011).
 EXAMPLE = (
@@ -17,19 +18,21 @@ UNITS = [[value for value in unit if value] for unit in zip(*EXAMPLE, strict=Tru
 
 
 def test_the_published_example() -> None:
-    assert alpha(UNITS, nominal) == pytest.approx(0.743, abs=5e-4)
-    assert alpha(UNITS, interval) == pytest.approx(0.849, abs=5e-4)
+    assert alpha(UNITS, nominal_distance) == pytest.approx(0.743, abs=5e-4)
+    assert alpha(UNITS, interval_distance) == pytest.approx(0.849, abs=5e-4)
 
 
 def test_bounds() -> None:
-    assert alpha([[1, 1], [5, 5, 5], [9, 9]], interval) == 1
+    assert alpha([[1, 1], [5, 5, 5], [9, 9]], interval_distance) == 1
     # two people who always disagree: worse than chance
-    worst = alpha([["a", "b"], ["b", "a"]], nominal)
+    worst = alpha([["a", "b"], ["b", "a"]], nominal_distance)
     assert worst == pytest.approx(-0.5)
-    assert alpha([[2, 4], [4, 2], [2, 4]], interval) == alpha([[20, 40], [40, 20], [20, 40]], interval)
+    assert alpha([[2, 4], [4, 2], [2, 4]], interval_distance) == alpha(
+        [[20, 40], [40, 20], [20, 40]], interval_distance
+    )
 
 
 def test_undefined() -> None:
-    assert alpha([], nominal) is None
-    assert alpha([["a"], []], nominal) is None
-    assert alpha([["a", "a"], ["a", "a"]], nominal) is None
+    assert alpha([], nominal_distance) is None
+    assert alpha([["a"], []], nominal_distance) is None
+    assert alpha([["a", "a"], ["a", "a"]], nominal_distance) is None
