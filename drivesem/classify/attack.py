@@ -22,18 +22,18 @@ from drivesem.classify.protocol import aimed_by, attack_of, params_of, reach_of,
 from drivesem.classify.results import SCHEMA, ClassifiedFrame, ClassifiedRun, Verdict
 from drivesem.classify.scenes import ObjectScene, in_turn
 from drivesem.classify.space import ObjectSpace
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
-from drivesem.failures.certificate import Rule
+from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grades import Grade
 from drivesem.failures.nuisances import Nuisances
-from drivesem.report.tables import csv_text
-from drivesem.run.ask import Bar, ask
+from drivesem.report.tables import rows_to_csv
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.finished import METRICS
-from drivesem.run.folder import FRAMES, claim, folder_of
+from drivesem.run.folder import FRAMES, claim_folder, resolve_output_folder
 from drivesem.run.frame import RESULT
-from drivesem.run.page import PAGE
 from drivesem.run.records import dump_record, load_record
+from drivesem.run.report.runs import PAGE
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.io import to_uint8
@@ -56,14 +56,14 @@ def network_of(name_or_path: str, classes: Sequence[str], device: str) -> Scorer
 class Attacker:
     """What one process needs: built once, used for many pictures."""
 
-    config: Classify
+    config: ClassifyConfig
     studio: Studio
     network: Scorer
     method: Attack
     grader: PictureGrader
 
     @classmethod
-    def of(cls, config: Classify, like: Attacker | None = None) -> Attacker:
+    def of(cls, config: ClassifyConfig, like: Attacker | None = None) -> Attacker:
         """like: one that shows the same objects, and attacks the same network where it has that name. Raises
         UsageError or SceneError for settings, objects or a network that cannot be used.
         """
@@ -72,7 +72,7 @@ class Attacker:
             network = like.network
         else:
             network = network_of(config.network, studio.objects.classes, config.device)
-        grader = PictureGrader(Nuisances.of(config.nuisances), Rule(config.draws), config.seed)
+        grader = PictureGrader(Nuisances.parse(config.nuisances), CertificateRule(config.draws), config.seed)
         params_of(config)
         method = attack_of(config)
         if method.needs_gradient and not network.differentiable:
@@ -140,7 +140,7 @@ class Attacker:
             passes=passes,
             seconds=round(time.perf_counter() - start, 3),
         )
-        with files.whole_folder(out / FRAMES / shown.identifier) as part:
+        with files.atomic_folder(out / FRAMES / shown.identifier) as part:
             files.write_png(part / "benign.png", to_uint8(before))
             files.write_png(part / "counterexample.png", to_uint8(after))
             files.write_npz(part / "theta.npz", {"theta": theta.numpy().astype(np.float32)})
@@ -152,7 +152,7 @@ def verdict(seen: Seen, classes: tuple[str, ...]) -> Verdict:
     return Verdict(classes[seen.predicted], round(seen.confidence, 6), round(seen.margin, 6))
 
 
-def attack_run(config: Classify) -> ClassifiedRun:
+def attack_run(config: ClassifyConfig) -> ClassifiedRun:
     """Attack all pictures, as far as that is not done, and write report and figures. Raises UsageError or
     SceneError.
     """
@@ -160,11 +160,13 @@ def attack_run(config: Classify) -> ClassifiedRun:
     attacker = Attacker.of(config)
     shown, params = attacker.shown(), tuple(str(one) for one in params_of(config))
     name = f"classify-{Path(config.network).stem}-{config.method}-{'-'.join(params)}-seed{config.seed}"
-    out = folder_of(config.out, Path("runs") / name)
-    claim(out, config, WRITTEN)
+    out = resolve_output_folder(config.out, Path("runs") / name)
+    claim_folder(out, config, WRITTEN)
     todo = [one for one in shown if not (out / FRAMES / one.identifier / RESULT).is_file()]
     work, build = partial(attacker.attack, out=out), partial(_attacker, config, out)
-    failed = ask(todo, work, build, config, Bar("attacking pictures"), lambda one: one.identifier).failed
+    failed = run_frame_jobs(
+        todo, work, build, config, ProgressSettings("attacking pictures"), lambda one: one.identifier
+    ).failed
     done = [one for one in shown if one.identifier not in failed]
     if not done:
         raise FormatError("--objects", "a picture that can be attacked", f"none: {next(iter(failed.values()))}")
@@ -172,7 +174,7 @@ def attack_run(config: Classify) -> ClassifiedRun:
 
 
 def report_run(
-    config: Classify,
+    config: ClassifyConfig,
     out: Path,
     classes: tuple[str, ...],
     done: Sequence[Shown],
@@ -193,7 +195,7 @@ def report_run(
         seconds=round(seconds, 3),
     )
     files.write_json(out / METRICS, run.to_json())
-    files.write_text(out / CSV, csv_text([frame.row() for frame in frames]))
+    files.write_text(out / CSV, rows_to_csv([frame.row() for frame in frames]))
     write_page(out / PAGE, run, frames)
     return run
 
@@ -203,5 +205,5 @@ def frames_of(out: Path, done: Sequence[Shown]) -> list[ClassifiedFrame]:
     return [load_record(out / FRAMES / one.identifier / RESULT, ClassifiedFrame, SCHEMA) for one in done]
 
 
-def _attacker(config: Classify, out: Path) -> Callable[[Shown], None]:
+def _attacker(config: ClassifyConfig, out: Path) -> Callable[[Shown], None]:
     return partial(Attacker.of(config).attack, out=out)

@@ -18,17 +18,17 @@ from drivesem.classify.redraw.mitsuba import MitsubaRenderer
 from drivesem.classify.redraw.pyrender import PyrenderRenderer
 from drivesem.classify.results import SCHEMA, ClassifiedRun, SecondLook
 from drivesem.classify.scenes import camera
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.failures.grades import Grade
 from drivesem.failures.second_renderer.base import NoSecondRendererError
-from drivesem.run.ask import Bar, ask
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
-from drivesem.run.lock import hold
+from drivesem.run.lock import acquire_folder_lock
 from drivesem.run.records import dump_record
 from scene_ir import files
-from scene_ir.io import as_written, to_uint8
+from scene_ir.io import round_to_8bit, to_uint8
 
 
 def open_renderer(name: str) -> Redraw:
@@ -45,7 +45,7 @@ def open_renderer(name: str) -> Redraw:
 class ConfirmWorker:
     """What one process needs: built once, used for many pictures."""
 
-    def __init__(self, config: Classify, run: ClassifyRun) -> None:
+    def __init__(self, config: ClassifyConfig, run: ClassifyRun) -> None:
         self.run, self.renderer = run, open_renderer(config.renderer)
         self.attacker = Attacker.of(run.config)
 
@@ -58,7 +58,7 @@ class ConfirmWorker:
         for change in (None, objective.space.change(theta)):
             own = scene.mesh.render(scene.placed(change), camera(), scene.lights(change))
             other = self.renderer.draw(Solid.of(scene, change))
-            pictures.append(as_written(scene.shown(other)))
+            pictures.append(round_to_8bit(scene.shown(other)))
             alike.append(likeness(scene, own, other))
         agreement = self.attacker.grader.agreement(name, objective.look, by, *pictures)
         frame = self.run.frames[name]
@@ -71,18 +71,18 @@ class ConfirmWorker:
         files.write_text(folder / RESULT, dump_record(record, SCHEMA))
 
 
-def confirm_run(config: Classify) -> tuple[ClassifiedRun, dict[str, Any]]:
+def confirm_run(config: ClassifyConfig) -> tuple[ClassifiedRun, dict[str, Any]]:
     """Confirm a run's failures, or go on with it: its figures and its report are written anew. Raises UsageError
     or SceneError for bad input, NoSecondRendererError before anything is written.
     """
     run = ClassifyRun.of(config)
     build = partial(ConfirmWorker, config, run)
     worker = build()
-    hold(run.folder)
+    acquire_folder_lock(run.folder)
     by, names = worker.renderer.name, run.failures(config.limit)
     todo = [name for name in names if not (config.resume and _is_by(by, run, name))]
     work: Callable[[str], None] = worker
-    failed = ask(todo, work, build, config, Bar("drawing failures again")).failed
+    failed = run_frame_jobs(todo, work, build, config, ProgressSettings("drawing failures again")).failed
     before = files.read_json(run.folder / METRICS)
     done = [run.shown(name) for name in run.frames]
     classes = worker.attacker.network.classes

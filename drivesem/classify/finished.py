@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,18 +17,18 @@ from drivesem.classify.objective import ClassifierObjective
 from drivesem.classify.pictures import Shown
 from drivesem.classify.protocol import aimed_by
 from drivesem.classify.results import SCHEMA, ClassifiedFrame
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
-from drivesem.report.tables import number_of
-from drivesem.run.ask import Bar, Kept, KeptFrames
-from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_files, claim
+from drivesem.report.tables import format_count
+from drivesem.run.driver import CachedFrameResult, FrameAnalyser, ProgressSettings, analyse_frames
+from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_referenced_files, claim_folder
 from drivesem.run.frame import RESULT
-from drivesem.run.records import dump_record, from_json, load_record
+from drivesem.run.records import from_json, load_record
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-K = TypeVar("K", bound=Kept)
+K = TypeVar("K", bound=CachedFrameResult)
 
 
 @dataclass(frozen=True)
@@ -36,20 +36,20 @@ class ClassifyRun:
     """folder: of the run; config: what was asked of it, on the device of the question; frames: by name."""
 
     folder: Path
-    config: Classify
+    config: ClassifyConfig
     frames: dict[str, ClassifiedFrame]
 
     @classmethod
-    def of(cls, asked: Classify) -> ClassifyRun:
+    def of(cls, asked: ClassifyConfig) -> ClassifyRun:
         """The run that a question is asked of. Raises UsageError where the folder is none."""
         folder = Path(asked.folder or "")
         path = folder / CONFIG
         loaded = files.read_yaml(path) if path.is_file() else None
         if not isinstance(loaded, dict) or loaded.get("what") != "attack":
             raise UsageError("RUN", "a folder of drivesem classify attack", folder)
-        config: Classify = from_json(Classify, loaded, str(path))
+        config: ClassifyConfig = from_json(ClassifyConfig, loaded, str(path))
         config.check()
-        check_files(folder, config)
+        check_referenced_files(folder, config)
         paths = sorted((folder / FRAMES).glob(f"*/{RESULT}"))
         frames = [load_record(one, ClassifiedFrame, SCHEMA) for one in paths]
         if not frames:
@@ -75,7 +75,7 @@ class ClassifyRun:
         return ClassifierObjective(scene, space, attacker.network, aimed_by(self.config)), theta
 
 
-class FailureWorker(ABC, Generic[K]):
+class FailureWorker(FrameAnalyser[K]):
     """Answers a question about a run's failures, each in a folder of its own; built once for a process. question:
     its name, that of its folder in the run's and of its files; file, kind: of what is kept of a failure; grades:
     which failures it is about; needs_some: whether a run may have none; renews: as of `claim`; free: further
@@ -83,25 +83,19 @@ class FailureWorker(ABC, Generic[K]):
     """
 
     question: ClassVar[str]
-    file: ClassVar[str]
-    kind: ClassVar[type[Any]]
+    schema = SCHEMA
     grades: ClassVar[Collection[str]] = tuple(Grade)
     needs_some: ClassVar[bool] = True
     renews: ClassVar[bool] = False
     free: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, config: Classify, run: ClassifyRun, out: Path) -> None:
-        self.config, self.run, self.out, self.attacker = config, run, out, Attacker.of(run.config)
+    def __init__(self, config: ClassifyConfig, run: ClassifyRun, out: Path) -> None:
+        super().__init__(run.folder, out)
+        self.config, self.run, self.attacker = config, run, Attacker.of(run.config)
 
     @abstractmethod
-    def answer(self, name: str, source: str, folder: Path) -> K:
+    def analyse(self, name: str, source: str, folder: Path) -> K:
         """What is kept of a failure. source: digest of the run's result; folder: for pictures."""
-
-    def __call__(self, name: str) -> None:
-        """One failure, from the run's folder to its own."""
-        source = files.digest(self.run.folder / FRAMES / name / RESULT)
-        with files.whole_folder(self.out / FRAMES / name) as part:
-            files.write_text(part / self.file, dump_record(self.answer(name, source, part), SCHEMA))
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,16 +115,17 @@ class Asked(Generic[K]):
         return told | {"method": config.method, "frames_failed": self.failed}
 
 
-def ask_of_failures(config: Classify, worker: type[FailureWorker[K]], title: str) -> Asked[K]:
+def ask_of_failures(config: ClassifyConfig, worker: type[FailureWorker[K]], title: str) -> Asked[K]:
     """Ask about a run's failures, or go on with it. title: of the bar. Raises UsageError or SceneError."""
     run = ClassifyRun.of(config)
     names = run.failures(config.limit, worker.grades)
     if worker.needs_some and not names:
-        raise UsageError("RUN", "a run with failures", f"none in {number_of(len(run.frames), 'picture')}")
+        raise UsageError("RUN", "a run with failures", f"none in {format_count(len(run.frames), 'picture')}")
     out = Path(config.out) if config.out else run.folder / worker.question
     build = partial(worker, config, run, out)
     work = build()
     written = (*(f"{worker.question}.{kind}" for kind in ("json", "md", "csv", "xml")), FRAMES)
-    claim(out, config, written, (*PRESENTATION, "folder", *worker.free), renews=worker.renews)
-    kept = KeptFrames(run.folder, out, worker.file, partial(load_record, kind=worker.kind, schema=SCHEMA))
-    return Asked(run, out, *kept.ask(names, work, build, config, Bar(title, remaining=True)))
+    claim_folder(out, config, written, (*PRESENTATION, "folder", *worker.free), renews=worker.renews)
+    return Asked(
+        run, out, *analyse_frames(names, work, build, config, ProgressSettings(title, show_remaining=True))
+    )

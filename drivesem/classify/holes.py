@@ -21,12 +21,11 @@ from torch import Tensor
 
 from drivesem.classify.finished import FailureWorker, ask_of_failures
 from drivesem.classify.scenes import SEEN_PX, VIEWS
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
-from drivesem.failures.rules import Floats, Where, fit
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet
-from scene_ir.io import as_written
+from drivesem.failures.rules import Floats, Intervals, fit_rule
+from drivesem.report.tables import AnalysisReport, ReportTable
+from scene_ir.io import round_to_8bit
 
 AXES: tuple[str, ...] = ("pitch", "yaw", "roll")
 _NOTES = (
@@ -77,14 +76,14 @@ class HoleWorker(FailureWorker[PoseHole]):
 
     question, file, kind = "holes", "hole.json", PoseHole
 
-    def answer(self, name: str, source: str, folder: Path) -> PoseHole:
+    def analyse(self, name: str, source: str, folder: Path) -> PoseHole:
         """See `FailureWorker`."""
         poses, config = Poses(self, name), self.config
         label, bounds = poses.objective.scene.model.label, poses.bounds(config.reach)
         asked = poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
         fails = poses.called(asked) != label
-        rule = fit({axis: asked[:, i] for i, axis in enumerate(AXES)}, fails)
-        for axis, interval in rule.where.items():
+        rule = fit_rule({axis: asked[:, i] for i, axis in enumerate(AXES)}, fails)
+        for axis, interval in rule.intervals.items():
             bounds[AXES.index(axis)] = interval
         inside = poses.called(poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.fresh, 3)), config.samples)
         wrong = inside[inside != label].tolist()
@@ -94,10 +93,10 @@ class HoleWorker(FailureWorker[PoseHole]):
             source=source,
             label=frame.label,
             predicted=classes[Counter(wrong).most_common(1)[0][0]] if wrong else frame.attacked.predicted,
-            where=_as_seen(rule.where, frame.view),
+            where=_as_seen(rule.intervals, frame.view),
             fails=len(wrong),
             count=len(inside),
-            fails_outside=rule.fails_outside,
+            fails_outside=rule.failures_outside,
             count_outside=rule.count_outside,
             fails_all=int(fails.sum()),
             count_all=len(fails),
@@ -127,9 +126,9 @@ class Poses:
     def picture(self, degrees: Floats, number: int) -> Tensor:
         """The picture (3, H, W) in a pose (3,), in the draw of that number."""
         change = replace(self._change, angles=torch.from_numpy(np.radians(degrees)).float())
-        picture = as_written(self.objective.scene.picture(change))
-        draw = self._nuisances.of_picture(self._stream, number, (SEEN_PX, SEEN_PX))
-        return draw.picture(picture)
+        picture = round_to_8bit(self.objective.scene.picture(change))
+        draw = self._nuisances.sample_for_image(self._stream, number, (SEEN_PX, SEEN_PX))
+        return draw.degrade_image(picture)
 
     def called(self, degrees: Floats, first: int = 0) -> NDArray[np.int64]:
         """The classes (N,) that poses (N, 3) are called, in draws from the first on."""
@@ -137,13 +136,13 @@ class Poses:
         return np.array([self.objective.look(picture).predicted for picture in pictures], np.int64)
 
 
-def _as_seen(where: Where, view: str) -> dict[str, tuple[float, float]]:
+def _as_seen(where: Intervals, view: str) -> dict[str, tuple[float, float]]:
     """A rule with the view's own turn in it."""
     turn = dict(zip(AXES, (*np.degrees(VIEWS[view]).tolist(), 0.0), strict=True))
     return {axis: (round(low + turn[axis], 2), round(high + turn[axis], 2)) for axis, (low, high) in where.items()}
 
 
-def holes_run(config: Classify) -> Answer:
+def holes_run(config: ClassifyConfig) -> AnalysisReport:
     """Look around a run's failures, or go on with it. Raises UsageError or SceneError."""
     asked = ask_of_failures(config, HoleWorker, "looking around failures")
     ordered = sorted(asked.answers, key=lambda hole: (-hole.interval[0], hole.identifier))
@@ -161,13 +160,13 @@ def holes_run(config: Classify) -> Answer:
         for hole in ordered
     )
     title = f"Holes of {asked.run.config.network}, by pose"
-    answer = Answer(
+    answer = AnalysisReport(
         out=asked.out,
         name="holes",
         heading="Holes by pose",
         data={**asked.facts, "holes": rows},
-        tables={"holes": [_flat(row) for row in rows]} if rows else {},
-        sheets=[Sheet(title, ("where", "elsewhere, %", "of all near, %"), lines)],
+        csv_tables={"holes": [_flat(row) for row in rows]} if rows else {},
+        tables=[ReportTable(title, ("where", "elsewhere, %", "of all near, %"), lines)],
         notes=_NOTES,
         failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )

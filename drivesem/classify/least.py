@@ -12,12 +12,11 @@ import torch
 from rich import box
 from torch import Tensor
 
-from drivesem.analysis.explain.minimal import LeastSearch, ThetaBlock, minimal
+from drivesem.analysis.explain.minimal import MinimalChangeSearch, ThetaBlock, find_minimal_change
 from drivesem.classify.finished import FailureWorker, ask_of_failures
 from drivesem.classify.space import AXES, Moved, ObjectSpace
-from drivesem.config.commands import Classify
-from drivesem.report.answer import Answer
-from drivesem.report.tables import Sheet, number_of
+from drivesem.config.commands import ClassifyConfig
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 from scene_ir import files
 from scene_ir.errors import RangeError
 from scene_ir.io import to_uint8
@@ -78,18 +77,18 @@ class LeastWorker(FailureWorker[LeastChange]):
 
     question, file, kind = "explain", "least.json", LeastChange
 
-    def answer(self, name: str, source: str, folder: Path) -> LeastChange:
+    def analyse(self, name: str, source: str, folder: Path) -> LeastChange:
         """See `FailureWorker`."""
         objective, theta = self.run.rebuilt(self.attacker, name)
         space, problem = objective.space, objective.problem()
-        search = LeastSearch(
+        search = MinimalChangeSearch(
             project=lambda wanted: problem.project(wanted).theta,
             fails=lambda wanted: not objective.see(wanted).right,
             size=lambda wanted: float(problem.size(wanted)),
             points=_POINTS,
         )
         try:
-            found = minimal(theta, blocks(space), search)
+            found = find_minimal_change(theta, blocks(space), search)
         except RangeError as error:  # judged otherwise on this machine
             raise RangeError(f"{name}: {error.field}", error.expected, error.actual) from error
         files.write_png(folder / "least.png", to_uint8(objective.picture(found.theta)))
@@ -122,7 +121,7 @@ def _angles(space: ObjectSpace, theta: Tensor) -> dict[str, float]:
     return {} if pose is None else dict(zip(AXES, (round(a, 6) for a in pose.tolist()), strict=True))
 
 
-def explain_run(config: Classify) -> Answer:
+def explain_run(config: ClassifyConfig) -> AnalysisReport:
     """Find the least change of a run's failures, or go on with it. Raises UsageError or SceneError."""
     asked = ask_of_failures(config, LeastWorker, "shortening changes")
     found = asked.answers
@@ -135,26 +134,26 @@ def explain_run(config: Classify) -> Answer:
         | {"vertex": one.vertex, "light": one.light, "sign_changes": one.sign_changes}
         for one in found
     ]
-    answer = Answer(
+    answer = AnalysisReport(
         out=asked.out,
         name="explain",
         heading="How little is enough",
         data={**asked.facts, "share_median": round(middle, 4) if found else None, "least": rows},
-        tables={"explain": flat} if found else {},
-        sheets=[sheet_of(found, asked.run.config.network)],
+        csv_tables={"explain": flat} if found else {},
+        tables=[sheet_of(found, asked.run.config.network)],
         notes=(*_NOTES, f"In the median {100 * middle:.0f} % of the change are enough."),
-        words=WORDS,
+        text_columns=WORDS,
         failed={f"picture {name}": reason for name, reason in asked.failed.items()},
     )
     answer.write()
     return answer
 
 
-def sheet_of(found: Sequence[LeastChange], network: str) -> Sheet:
+def sheet_of(found: Sequence[LeastChange], network: str) -> ReportTable:
     """The table of a network's failures."""
     columns = ("picture", "called", "enough\n%", "pitch\nrad", "yaw\nrad", "roll\nrad", "vertex", "left out")
-    title = f"How little is enough: {number_of(len(found), 'failure')} of {network}"
+    title = f"How little is enough: {format_count(len(found), 'failure')} of {network}"
     short = all(len(one.identifier) <= _LONGEST for one in found)
     unbroken = columns[0 if short else 1 : -1]
     looks = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False, "unbroken": unbroken}
-    return Sheet(title, columns, tuple(one.row() for one in found), looks)
+    return ReportTable(title, columns, tuple(one.row() for one in found), looks)

@@ -8,12 +8,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import GRADIENT_PASSES, Group, Problem, Score
+from drivesem.attack.methods.base import GRADIENT_PASSES, ParameterGroup, Problem, Score
 from drivesem.classify.networks.base import Scorer
 from drivesem.classify.scenes import ObjectScene
 from drivesem.classify.space import ObjectSpace
 from scene_ir.errors import RangeError
-from scene_ir.io import as_written
+from scene_ir.io import round_to_8bit
 
 Aimed = Literal["logit", "hinge", "softmax"]
 """What an attack raises. logit: the true class's score falls, as in the paper; hinge: so does what it is ahead of
@@ -93,7 +93,7 @@ class ClassifierObjective:
     @torch.no_grad()
     def picture(self, theta: Tensor) -> Tensor:
         """(3, H, W) on the 8-bit grid: what is judged is what is written."""
-        return as_written(self.scene.picture(self.space.change(theta)))
+        return round_to_8bit(self.scene.picture(self.space.change(theta)))
 
     @torch.no_grad()
     def look(self, image: Tensor) -> Seen:
@@ -124,5 +124,7 @@ class ClassifierObjective:
             step=self.space.step,
             lower=self.space.lower,
             upper=self.space.upper,
-            groups=tuple(Group(str(p), where, self.space.owners(p)) for p, where in self.space.blocks.items()),
+            groups=tuple(
+                ParameterGroup(str(p), where, self.space.owner_count(p)) for p, where in self.space.blocks.items()
+            ),
         )

@@ -9,8 +9,8 @@ from typing import Any
 from drivesem.classify.results import ClassifiedFrame, ClassifiedRun, ClassTally
 from drivesem.failures.grades import Grade
 from drivesem.report import web
-from drivesem.report.drawing import jpeg_address
-from drivesem.report.tables import percent
+from drivesem.report.drawing import encode_jpeg_data_url
+from drivesem.report.tables import format_percent
 from scene_ir import files
 
 SECOND_PICTURE = "second.png"
@@ -26,12 +26,12 @@ def write_page(path: Path, run: ClassifiedRun, frames: Sequence[ClassifiedFrame]
     before, after = shares(run.whole)
     shown = {"title": run.network, "run": run, "cards": cards, "before": before, "after": after, "rows": rows}
     redrawn = any(frame.second is not None for frame in frames)
-    files.write_text(path, web.render("drivesem.classify:page.html", **shown, redrawn=redrawn))
+    files.write_text(path, web.render_page("drivesem.classify:page.html", **shown, redrawn=redrawn))
 
 
 def shares(tally: ClassTally) -> list[str]:
     """Accuracy before and after the change, as percentages."""
-    return [percent(one) for one in tally.accuracy.values()]
+    return [format_percent(one) for one in tally.accuracy.values()]
 
 
 def _card(frame: ClassifiedFrame, folder: Path) -> dict[str, Any]:
@@ -42,5 +42,5 @@ def _card(frame: ClassifiedFrame, folder: Path) -> dict[str, Any]:
     shots = {"before": "benign.png", "after": "counterexample.png"}
     if frame.second is not None:
         shots[frame.second.agreement.by] = SECOND_PICTURE
-    pictures = [(name, jpeg_address(files.read_image(folder / file))) for name, file in shots.items()]
+    pictures = [(name, encode_jpeg_data_url(files.read_image(folder / file))) for name, file in shots.items()]
     return {"frame": frame, "shots": pictures, "moved": ", ".join(told)}

@@ -14,9 +14,9 @@ from torch import Tensor
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectModel, ObjectSet, Split
 from drivesem.classify.scenes import VIEWS, ObjectScene, in_turn, open_backgrounds
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
-from drivesem.run.ask import Bar, JobResults, ask
+from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import to_uint8
@@ -45,7 +45,7 @@ class Studio:
     model: Callable[[str], ObjectModel]
 
     @classmethod
-    def of(cls, config: Classify) -> Studio:
+    def of(cls, config: ClassifyConfig) -> Studio:
         """Raises SceneError for objects or backgrounds that cannot be used."""
         objects = open_objects(config.objects)
         # The last object is kept, as it is seen from several views.
@@ -69,7 +69,7 @@ class Studio:
             files.write_png(path, to_uint8(self.scene(shown).picture().clamp(0, 1)))
 
 
-def views_of(config: Classify) -> tuple[str, ...]:
+def views_of(config: ClassifyConfig) -> tuple[str, ...]:
     """The views by name. Raises UsageError."""
     names = tuple(part.strip() for part in config.views.split(","))
     if not set(names) <= set(VIEWS) or len(set(names)) != len(names):
@@ -77,7 +77,7 @@ def views_of(config: Classify) -> tuple[str, ...]:
     return names
 
 
-def write_pictures(config: Classify, out: Path) -> tuple[dict[str, int], dict[str, str]]:
+def write_pictures(config: ClassifyConfig, out: Path) -> tuple[dict[str, int], dict[str, str]]:
     """Draw all splits into a folder, as far as they are not there: how many pictures each has, and why others
     could not be drawn. --limit: so many objects of each split, classes in turn.
     """
@@ -95,13 +95,15 @@ def write_pictures(config: Classify, out: Path) -> tuple[dict[str, int], dict[st
     return done, answers.failed
 
 
-def draw(jobs: Sequence[Shown], studio: Studio, config: Classify, out: Path) -> JobResults[Shown, None]:
+def draw(jobs: Sequence[Shown], studio: Studio, config: ClassifyConfig, out: Path) -> JobResults[Shown, None]:
     """Draw pictures into a folder, as far as they are not there. Raises SceneError."""
     work, build = partial(studio.write, out=out), partial(_drawer, config, out)
-    return ask(jobs, work, build, config, Bar("drawing objects"), lambda job: job.identifier)
+    return run_frame_jobs(
+        jobs, work, build, config, ProgressSettings("drawing objects"), lambda job: job.identifier
+    )
 
 
-def _drawer(config: Classify, out: Path) -> Callable[[Shown], None]:
+def _drawer(config: ClassifyConfig, out: Path) -> Callable[[Shown], None]:
     return partial(Studio.of(config).write, out=out)
 
 

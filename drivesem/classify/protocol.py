@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from drivesem.attack.methods.base import Attack
-from drivesem.attack.methods.sampling import Sampling
+from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
+from drivesem.attack.methods.gradient_free import Sampling
 from drivesem.attack.methods.scw import SCW
-from drivesem.attack.methods.sgd import SGD
-from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.classify.objective import Aimed
 from drivesem.classify.space import FARTHEST, Amounts, Moved, moved_of
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 
 SAMPLED = ("random", "halton")
 _LIGHT_STEP, _LARGER_LIGHT_STEP = 0.2, 0.4
@@ -31,7 +30,7 @@ _WITHIN = {
 """How far theta may go; the others are held by their few steps."""
 
 
-def attack_of(config: Classify) -> Attack:
+def attack_of(config: ClassifyConfig) -> Attack:
     """The algorithm. Each ends at the first picture that is misclassified, but for samples, which are all seen."""
     match config.method:
         case "si-fgsm":
@@ -44,28 +43,28 @@ def attack_of(config: Classify) -> Attack:
             return Sampling(config.queries, kind=config.method)
 
 
-def aimed_by(config: Classify) -> Aimed:
+def aimed_by(config: ClassifyConfig) -> Aimed:
     """What the method raises."""
     if config.method in SAMPLED:
         return "softmax"
     return "hinge" if config.method == "scw" else "logit"
 
 
-def params_of(config: Classify) -> tuple[Moved, ...]:
+def params_of(config: ClassifyConfig) -> tuple[Moved, ...]:
     """What moves. Raises FormatError."""
     return moved_of(config.params or ("pose" if config.method in SAMPLED else "pose,vertex"))
 
 
-def steps_of(config: Classify) -> Amounts:
+def steps_of(config: ClassifyConfig) -> Amounts:
     """The step of each parameter."""
     return _asked(config, "step", _STEPS[config.method])
 
 
-def reach_of(config: Classify) -> Amounts:
+def reach_of(config: ClassifyConfig) -> Amounts:
     """How far each parameter may go."""
     return _asked(config, "within", _WITHIN.get(config.method, FARTHEST))
 
 
-def _asked(config: Classify, which: str, usual: Amounts) -> Amounts:
+def _asked(config: ClassifyConfig, which: str, usual: Amounts) -> Amounts:
     given = {str(one): getattr(config, f"{which}_{one}") for one in Moved}
     return replace(usual, **{name: value for name, value in given.items() if value is not None})

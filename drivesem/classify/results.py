@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from drivesem.failures.grades import Agreement, Count, Grade
+from drivesem.failures.grades import Certificate, Grade, SecondOpinion
 
 SCHEMA = 1
 
@@ -36,7 +36,7 @@ class Likeness:
 class SecondLook:
     """What a second renderer's pictures of a failure say. before, after: how alike they are to the own ones."""
 
-    agreement: Agreement
+    agreement: SecondOpinion
     before: Likeness
     after: Likeness
 
@@ -56,7 +56,7 @@ class ClassifiedFrame:
     benign: Verdict
     attacked: Verdict
     grade: str | None
-    count: Count | None
+    count: Certificate | None
     sizes: dict[str, float]
     moved: dict[str, str]
     loss_trace: tuple[float, ...]
@@ -76,7 +76,7 @@ class ClassifiedFrame:
     def row(self) -> dict[str, Any]:
         """A line of the CSV."""
         data = asdict(self)
-        count = self.count or Count()
+        count = self.count or Certificate()
         flat = {key: data[key] for key in ("identifier", "object", "label", "view", "grade", "queries", "passes")}
         for name in ("benign", "attacked"):
             flat |= {f"{name}_{key}": value for key, value in data[name].items()}

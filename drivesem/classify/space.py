@@ -12,10 +12,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.theta import ParameterSpec, Projected, ThetaSpace, lattice_names, parameters_of
+from drivesem.attack.theta import ParameterSpec, ProjectedTheta, ThetaSpace, lattice_names, select_parameters
 from scene_ir import ffd
 from scene_ir.errors import RangeError
-from scene_ir.geometry import weld
+from scene_ir.geometry import weld_vertices
 from scene_ir.types import LATTICE, LATTICE_POINTS
 
 Shape = Literal["each", "smooth"]
@@ -66,7 +66,7 @@ def _vertex_spec(shape: Shape) -> ParameterSpec:
 
 def moved_of(text: str) -> tuple[Moved, ...]:
     """Parameters of "pose,vertex", in theta's order. Raises FormatError on an unknown, a repeated or no name."""
-    return parameters_of(Moved, (part for part in text.split(",") if part.strip()))
+    return select_parameters(Moved, (part for part in text.split(",") if part.strip()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class ObjectSpace(ThetaSpace[Moved]):
         shape: Shape = "each",
     ) -> None:
         specs = {Moved.VERTEX: _vertex_spec(shape), Moved.POSE: _POSE, Moved.LIGHTING: _LIGHTING}
-        self._place = weld(vertices)
+        self._place = weld_vertices(vertices)
         super().__init__(params, specs, int(self._place.max()) + 1, vertices)
         self._weights = None
         if shape == "smooth":
@@ -116,11 +116,11 @@ class ObjectSpace(ThetaSpace[Moved]):
             offsets = offsets.index_select(0, self._place)
         return Change(offsets, self.block(theta, Moved.POSE), self.block(theta, Moved.LIGHTING))
 
-    def project(self, theta: Tensor) -> Projected:
+    def project(self, theta: Tensor) -> ProjectedTheta:
         """theta (D,) within its bounds."""
         inside = theta.clamp(self.lower, self.upper)
         names = (str(p) for p, where in self.blocks.items() if not torch.equal(inside[where], theta[where]))
-        return Projected(inside, tuple(f"{name}: bounds" for name in names))
+        return ProjectedTheta(inside, tuple(f"{name}: bounds" for name in names))
 
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
         parameter, _, k = self._locate(i)

@@ -15,17 +15,16 @@ from torch import Tensor, nn
 
 from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
-from detectors.training import CHECKPOINT, PRECISIONS, in_sections, restore, state_of
+from detectors.training import CHECKPOINT, PRECISIONS, optimiser_state, restore_optimiser, split_by_section
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import save_classifier, to_train
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.pictures import read_pictures, write_pictures
-from drivesem.config.commands import Classify
+from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
-from drivesem.report.progress import progress_bar, training_bar
-from drivesem.report.terminal import Console
-from drivesem.run.folder import PRESENTATION, claim, folder_of
+from drivesem.report.terminal import Console, progress_bar, training_progress_bar
+from drivesem.run.folder import PRESENTATION, claim_folder, resolve_output_folder
 from scene_ir import files
 
 PICTURES = "pictures"
@@ -42,16 +41,16 @@ _Fitted = tuple[list[dict[str, float]], dict[str, float]]
 """What each epoch came to, and the accuracy by split."""
 
 
-def train_run(config: Classify) -> dict[str, Any]:
+def train_run(config: ClassifyConfig) -> dict[str, Any]:
     """Train, and write the weights and how it went: the JSON's form. Raises UsageError or SceneError."""
     start = time.perf_counter()
-    out = folder_of(config.out, Path("runs") / f"classifier-{config.network}-seed{config.seed}")
+    out = resolve_output_folder(config.out, Path("runs") / f"classifier-{config.network}-seed{config.seed}")
     classes = open_objects(config.objects).classes
     generator = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)  # dropout draws from torch's own
     anew = config.layers == "all"
     network = to_train(config.network, config.weights, classes, generator, anew).to(config.device)
-    claim(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
+    claim_folder(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
     folder = Path(config.data) if config.data else out / PICTURES
     failed = {} if config.data else write_pictures(config, folder)[1]
     splits = {name: read_pictures(folder, name, classes) for name in SPLITS}
@@ -87,7 +86,7 @@ def fit_last(
     network: Classifier,
     known: dict[str, Tensor],
     labels: dict[str, Tensor],
-    config: Classify,
+    config: ClassifyConfig,
     generator: torch.Generator,
     onward: bool = False,
 ) -> _Fitted:
@@ -120,7 +119,7 @@ def _fit_all(
     network: Classifier,
     images: dict[str, Tensor],
     labels: dict[str, Tensor],
-    config: Classify,
+    config: ClassifyConfig,
     generator: torch.Generator,
     checkpoint: Path,
 ) -> _Fitted:
@@ -156,7 +155,7 @@ def _fit(
     batch: Callable[[Tensor, int], tuple[Tensor, Tensor]],
     accuracy: Callable[[str, int], float],
     labels: Mapping[str, Tensor],
-    config: Classify,
+    config: ClassifyConfig,
     generator: torch.Generator,
     checkpoint: Path | None = None,
 ) -> _Fitted:
@@ -201,7 +200,7 @@ class _State:
     def save(self, path: Path, curve: list[dict[str, float]]) -> None:
         """curve: what each epoch came to so far."""
         tensors = {f"weights.{name}": value.contiguous() for name, value in self.module.state_dict().items()}
-        tensors |= {f"optimiser.{name}": value for name, value in state_of(self.optimiser).items()}
+        tensors |= {f"optimiser.{name}": value for name, value in optimiser_state(self.optimiser).items()}
         # Dropout draws from torch's own generator, the order of pictures from this one.
         tensors |= {"random.own": self.generator.get_state(), "random.torch": torch.get_rng_state()}
         rates = json.dumps(self.schedule.state_dict())
@@ -211,9 +210,9 @@ class _State:
         """What each epoch came to before the file was written. Raises DetectorError for what is no such file."""
         facts, tensors = read_weights(path)
         try:
-            parts = in_sections(tensors, "weights", "optimiser", "random")
+            parts = split_by_section(tensors, "weights", "optimiser", "random")
             self.module.load_state_dict(parts["weights"])
-            restore(self.optimiser, parts["optimiser"])
+            restore_optimiser(self.optimiser, parts["optimiser"])
             self.schedule.load_state_dict(json.loads(facts["schedule"]))
             self.generator.set_state(parts["random"]["own"])
             torch.set_rng_state(parts["random"]["torch"])
@@ -232,7 +231,7 @@ def embedded(network: Classifier, images: Tensor, device: str, title: str, half:
     """Features (N, K) of pictures (N, 3, H, W) uint8, computed once. title: of the bar; half: shown at half their
     size.
     """
-    with training_bar(Console(stderr=True)) as progress:
+    with training_progress_bar(Console(stderr=True)) as progress:
         parts = progress.track(images.split(_EMBEDDED_AT_A_TIME), description=title)
         return torch.cat([network.embed(_shown(part, device, half)) for part in parts])
 

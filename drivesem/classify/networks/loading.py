@@ -9,17 +9,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from detectors.base import ready
-from detectors.reading import read_state
+from detectors.base import prepare_for_inference
+from detectors.files import read_state
 from detectors.registry import SHIPPED as DETECTORS
-from detectors.registry import class_names, halved, write_weights
+from detectors.registry import half_precision_state, parse_class_names, write_weights
 from detectors.squeezedet import SqueezeDet
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.libraries import PREFIXES, LibraryClassifier
 from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.weights import load_into, read_weights
+from scene_ir.weights import load_weights, read_weights
 
 ARCHITECTURES: dict[str, type[Classifier]] = {
     kind.architecture: kind for kind in (SqueezeNet, VGG16, PooledVGG16, ResNet50)
@@ -48,8 +48,8 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
     if network.classes != tuple(classes):
         expected = f"one for the {len(classes)} classes {', '.join(classes)}"
         raise FormatError(str(path), expected, f"one for {', '.join(network.classes)}")
-    load_into(network, tensors, path)
-    return ready(network, device)
+    load_weights(network, tensors, path)
+    return prepare_for_inference(network, device)
 
 
 def to_train(
@@ -80,13 +80,13 @@ def to_train(
     # Of the file's own last layer, which tells other classes apart, nothing is used.
     replaced = (name, network.published_head)
     kept = {key: tensor for key, tensor in tensors.items() if key.rpartition(".")[0] not in replaced}
-    load_into(network, kept | {f"{name}.{part}": own[f"{name}.{part}"] for part in ("weight", "bias")}, path)
+    load_weights(network, kept | {f"{name}.{part}": own[f"{name}.{part}"] for part in ("weight", "bias")}, path)
     return network
 
 
 def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -> None:
     """Write weights as float16, what was counted in training as float32."""
-    tensors = {key: value for key, value in halved(network).items() if value.is_floating_point()}
+    tensors = {key: value for key, value in half_precision_state(network).items() if value.is_floating_point()}
     metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
     write_weights(path, metadata, tensors)
 
@@ -94,14 +94,14 @@ def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     """As `read_weights`; the shipped file is held against its model card first."""
     if path == SHIPPED:
-        files.check_card(path, files.read_bytes(path))
+        files.check_model_card(path, files.read_bytes(path))
     return read_weights(path)
 
 
 def classes_of(path: Path, metadata: Mapping[str, str]) -> tuple[str, ...]:
     """The classes that a weights file is for. Raises FormatError."""
     try:
-        return class_names(json.loads(metadata.get("classes", "")))
+        return parse_class_names(json.loads(metadata.get("classes", "")))
     except ValueError as error:
         raise FormatError(f"{path}: classes", "a list of names", repr(metadata.get("classes"))[:60]) from error
 

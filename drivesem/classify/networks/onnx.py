@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from detectors.adapters import onnx
-from detectors.adapters.spec import Spec, fit, prepare, settings_of
+from detectors.adapters.spec import NetworkSpec, fit_images, load_settings, normalise_images
 from detectors.base import DetectorError
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
 from scene_ir.errors import FormatError, RangeError
@@ -28,8 +28,8 @@ class OnnxClassifier:
 
     def __init__(self, path: Path, classes: Sequence[str]) -> None:
         try:
-            session = onnx.session_of(path)
-            settings = settings_of(path, None)
+            session = onnx.open_session(path)
+            settings = load_settings(path, None)
         except DetectorError as error:
             field, _, rest = str(error).partition(": ")
             raise FormatError(field, "an ONNX classifier", rest) from error
@@ -55,14 +55,14 @@ class OnnxClassifier:
                 f"{path.with_suffix('.yaml')}: size", f"{shape[2]} x {shape[3]}, as the graph has", size
             )
         usual = {"resize": "stretch", "mean": IMAGENET_MEAN, "std": IMAGENET_STD, "size": fixed}
-        self._spec = Spec(**(usual | settings))
+        self._spec = NetworkSpec(**(usual | settings))
         self._session, self._input = session, session.get_inputs()[0].name
         self._order = [own.index(name) for name in classes]
         self.classes = tuple(classes)
 
     def __call__(self, images: Tensor) -> Tensor:
         """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1]; without a gradient."""
-        fed = prepare(fit(images.detach().float().cpu(), self._spec)[0], self._spec)
+        fed = normalise_images(fit_images(images.detach().float().cpu(), self._spec)[0], self._spec)
         rows = [self._session.run(None, {self._input: one.numpy()})[0] for one in fed.contiguous().split(1)]
         scores = torch.cat([torch.from_numpy(row) for row in rows])[:, self._order]
         if not bool(scores.isfinite().all()):

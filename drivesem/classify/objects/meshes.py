@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from drivesem.classify.objects.types import ObjectModel, object_model, used
 from scene_ir.errors import FormatError
-from scene_ir.meshes.load import linear, painted, read_scene, texels
+from scene_ir.meshes.load import painted, read_scene, sample_texture, srgb_to_linear
 from scene_ir.meshes.lod import simplify
 from scene_ir.types import Mesh
 
@@ -88,7 +88,7 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
         if factor is not None:
             rgb[:] = 1.0
         elif visual.defined:
-            rgb = linear(np.asarray(visual.face_colors)[:, :3] / 255.0)
+            rgb = srgb_to_linear(np.asarray(visual.face_colors)[:, :3] / 255.0)
     elif isinstance(material, PBRMaterial):
         image = material.baseColorTexture
         rough = _number(material.roughnessFactor, 1.0, 1.0)
@@ -106,8 +106,8 @@ def _looks(part: trimesh.Trimesh, path: Path) -> Array:
         shininess = _number(said.get("ns"), shininess, _MOST_SHININESS)
     if image is not None and uv is not None and len(uv) == len(part.vertices):
         corners = np.nan_to_num(np.asarray(uv, float)[part.faces][..., :2], posinf=0.0, neginf=0.0)
-        seen = texels(image, np.einsum("pc,fcd->fpd", _PLACES, corners), path, _TEXTURE_PX)
-        rgb = rgb * linear(seen).mean(axis=1)
+        seen = sample_texture(image, np.einsum("pc,fcd->fpd", _PLACES, corners), path, _TEXTURE_PX)
+        rgb = rgb * srgb_to_linear(seen).mean(axis=1)
     if factor is not None:
         rgb = rgb * factor[part.faces].mean(axis=1)
     return np.column_stack([rgb.clip(0, 1), np.full(count, specular), np.full(count, shininess)])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scene_ir.meshes import solids
-from scene_ir.meshes.solids import Solid, cleaned, grid_quads, moved, quad_faces
+from scene_ir.meshes.solids import TemplateSolid, clean_solid, grid_quads, quad_faces, translate_solid
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 1.0, 0.0])
@@ -41,13 +41,13 @@ def circle(radius: ArrayLike, y: ArrayLike, angle: ArrayLike) -> Array:
     return points(radius * np.cos(angle), y, radius * np.sin(angle))
 
 
-def _closed(vertices: Array, quads: NDArray[np.int64], *extra: NDArray[np.int64]) -> Solid:
+def _closed(vertices: Array, quads: NDArray[np.int64], *extra: NDArray[np.int64]) -> TemplateSolid:
     """The solid of quads (Q, 4) and triangles (T, 3): doubled points are one, collapsed faces go."""
     faces = np.concatenate([quad_faces(quads, vertices), *extra])
-    return cleaned(vertices, faces, np.zeros(len(faces), np.int64))
+    return clean_solid(vertices, faces, np.zeros(len(faces), np.int64))
 
 
-def turned(solid: Solid, axis: Axis, angle: float) -> Solid:
+def turned(solid: TemplateSolid, axis: Axis, angle: float) -> TemplateSolid:
     """The solid turned by `angle` rad about an axis, right-handed."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -56,12 +56,12 @@ def turned(solid: Solid, axis: Axis, angle: float) -> Solid:
     return replace(solid, vertices=solid.vertices @ rotation.T)
 
 
-def turned_each(solid: Solid, angles: Array) -> list[Solid]:
+def turned_each(solid: TemplateSolid, angles: Array) -> list[TemplateSolid]:
     """The solid turned about the upright axis by each angle (n,), rad."""
     return [turned(solid, "y", angle) for angle in angles]
 
 
-def loft(rings: ArrayLike, *, around: bool = False) -> Solid:
+def loft(rings: ArrayLike, *, around: bool = False) -> TemplateSolid:
     """A skin over closed rings (K, N, 3), capped at both ends, or joined end to end where it goes `around`."""
     ring = np.asarray(rings, float)
     count, sides = ring.shape[:2]
@@ -75,7 +75,7 @@ def loft(rings: ArrayLike, *, around: bool = False) -> Solid:
     return _closed(np.concatenate([vertices, both]), grid_quads(index), *caps)
 
 
-def slab(outer: ArrayLike, inner: ArrayLike) -> Solid:
+def slab(outer: ArrayLike, inner: ArrayLike) -> TemplateSolid:
     """What lies between two like grids of points (A, B, 3), such as both faces of a deck, a sail or a visor."""
     top, under = np.asarray(outer, float), np.asarray(inner, float)
     a, b = np.arange(top.size // 3 * 2).reshape(2, *top.shape[:2])
@@ -85,21 +85,23 @@ def slab(outer: ArrayLike, inner: ArrayLike) -> Solid:
     return _closed(np.concatenate([top.reshape(-1, 3), under.reshape(-1, 3)]), quads)
 
 
-def lathe(profile: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), axis: Axis = "y", sides: int = 16) -> Solid:
+def lathe(
+    profile: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), axis: Axis = "y", sides: int = 16
+) -> TemplateSolid:
     """A solid of revolution: profile (K, 2) of radius and place along the axis through `centre`."""
     radius, along = np.asarray(profile, float).T[..., None]
     rings = circle(radius, along, turns(sides, 0.5))
     return loft(rings[..., _ORDER[axis]] + np.asarray(centre, float))
 
 
-def ball(centre: ArrayLike, radii: ArrayLike, sides: int = 12) -> Solid:
+def ball(centre: ArrayLike, radii: ArrayLike, sides: int = 12) -> TemplateSolid:
     """An ellipsoid."""
     angle = np.linspace(0, np.pi, sides // 2 + 1)
     unit = lathe(np.stack([np.sin(angle), -np.cos(angle)], 1), sides=sides)
-    return moved(replace(unit, vertices=unit.vertices * np.asarray(radii, float)), centre)
+    return translate_solid(replace(unit, vertices=unit.vertices * np.asarray(radii, float)), centre)
 
 
-def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> Solid:
+def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> TemplateSolid:
     """A round pipe along points (K, 3), of one radius or one a point."""
     places = np.asarray(path, float)
     steps = np.diff(places, axis=0)
@@ -117,22 +119,22 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> Solid:
     return loft(rings)
 
 
-def torus(centre: ArrayLike, radius: float, thick: float, axis: Axis = "z", sides: int = 24) -> Solid:
+def torus(centre: ArrayLike, radius: float, thick: float, axis: Axis = "z", sides: int = 24) -> TemplateSolid:
     """A ring about an axis: a tyre, a rim, a hoop. thick: radius of its section."""
     section = turns(8)
     rings = circle(radius + thick * np.cos(section), thick * np.sin(section), turns(sides)[:, None])
     return loft(rings[..., _ORDER[axis]] + np.asarray(centre, float), around=True)
 
 
-def box(low: ArrayLike, high: ArrayLike, bevel: float = 0.0) -> Solid:
+def box(low: ArrayLike, high: ArrayLike, bevel: float = 0.0) -> TemplateSolid:
     """An upright box between two corners, its edges cut by `bevel`."""
     a, b = np.asarray(low, float), np.asarray(high, float)
     if bevel:
-        return solids.box(a.tolist(), b.tolist(), solids.Material.PAINT, bevel=bevel)
+        return solids.box(a.tolist(), b.tolist(), solids.VehicleMaterial.PAINT, bevel=bevel)
     return boxes(((a + b) / 2)[None], (b - a)[None])
 
 
-def block(x: Pair, y: Pair, z: float, bevel: float = 0.0) -> Solid:
+def block(x: Pair, y: Pair, z: float, bevel: float = 0.0) -> TemplateSolid:
     """A box from -z to z: what most things have across their middle."""
     return box((x[0], y[0], -z), (x[1], y[1], z), bevel)
 
@@ -146,20 +148,20 @@ _SIDES = np.array(
 )
 
 
-def _many(corners: Array) -> Solid:
+def _many(corners: Array) -> TemplateSolid:
     """Bodies of eight corners (n, 8, 3) each, in the order of a box's."""
     count = len(corners)
     faces = (_SIDES + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
-    return Solid(corners.reshape(-1, 3), faces, np.zeros(len(faces), np.int64))
+    return TemplateSolid(corners.reshape(-1, 3), faces, np.zeros(len(faces), np.int64))
 
 
-def boxes(centres: ArrayLike, sizes: ArrayLike) -> Solid:
+def boxes(centres: ArrayLike, sizes: ArrayLike) -> TemplateSolid:
     """Plain boxes about points (n, 3), of one size (3,) or one each: windows, slats, blocks."""
     middle = np.asarray(centres, float)
     return _many(middle[:, None] + _CORNERS * np.broadcast_to(sizes, middle.shape)[:, None])
 
 
-def beams(starts: ArrayLike, ends: ArrayLike, thick: float, deep: float | None = None) -> Solid:
+def beams(starts: ArrayLike, ends: ArrayLike, thick: float, deep: float | None = None) -> TemplateSolid:
     """Square bars between points (n, 3), one or many at each end. deep: their other side where they are flat."""
     a, b = (p.reshape(-1, 3) for p in np.broadcast_arrays(np.asarray(starts, float), np.asarray(ends, float)))
     along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
@@ -176,7 +178,7 @@ def rectangle(x: Pair, y: float, z: float) -> Array:
     return np.array([[x[0], y, -z], [x[1], y, -z], [x[1], y, z], [x[0], y, z]])
 
 
-def squares(rows: Sequence[Pair]) -> Solid:
+def squares(rows: Sequence[Pair]) -> TemplateSolid:
     """A body of level squares: half their width, and their height."""
     return loft([rectangle((-half, half), y, half) for half, y in rows])
 
@@ -189,7 +191,7 @@ def section(x: float, half: float, low: float, high: float, radius: float) -> Ar
     return points(x, y.ravel(), z.ravel())
 
 
-def carriage(stations: ArrayLike, half: float, low: float, high: float, radius: float) -> Solid:
+def carriage(stations: ArrayLike, half: float, low: float, high: float, radius: float) -> TemplateSolid:
     """A long body of rounded section along x: stations (K, 4) of x, and how far its roof, floor and sides lie
     inside those of the full section there.
     """
@@ -201,7 +203,7 @@ _CHORD = np.array([0.0, 0.04, 0.15, 0.4, 0.7, 1.0, 0.7, 0.4, 0.15, 0.04])
 _RISE = np.array([0.0, 0.5, 0.9, 1.0, 0.55, 0.06, -0.3, -0.6, -0.6, -0.4]) / 2
 
 
-def wing(thick: float, *stations: Sequence[float], upright: bool = False) -> Solid:
+def wing(thick: float, *stations: Sequence[float], upright: bool = False) -> TemplateSolid:
     """A wing over stations: leading edge x, y, z, and chord. thick: of its section, a share of the chord.
     upright: a fin, thick along z.
     """
@@ -213,7 +215,7 @@ def wing(thick: float, *stations: Sequence[float], upright: bool = False) -> Sol
     return loft(rings)
 
 
-def body(stations: ArrayLike, sides: int = 14, square: float = 2.0) -> Solid:
+def body(stations: ArrayLike, sides: int = 14, square: float = 2.0) -> TemplateSolid:
     """A hull along x: stations (K, 4) of x, height of its axis, half height, half width. square: the exponent of
     its section, an ellipse's 2 or a box's more.
     """
@@ -228,7 +230,9 @@ def direction(polar: ArrayLike, azimuth: ArrayLike) -> Array:
     return points(np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth))
 
 
-def dome(radii: ArrayLike, polar: ArrayLike, azimuth: ArrayLike, thick: float, out: ArrayLike = 0.0) -> Solid:
+def dome(
+    radii: ArrayLike, polar: ArrayLike, azimuth: ArrayLike, thick: float, out: ArrayLike = 0.0
+) -> TemplateSolid:
     """A piece of an ellipsoidal shell about the origin, `thick` to the inside of `out` beyond its radii.
 
     polar (A,), azimuth (B,): as `direction` has them.
@@ -242,14 +246,14 @@ AROUND = turns(32)
 """Azimuths of a bowl's rim, from forward."""
 
 
-def bowl(radii: ArrayLike, rim: ArrayLike, thick: float, steps: int = 10) -> Solid:
+def bowl(radii: ArrayLike, rim: ArrayLike, thick: float, steps: int = 10) -> TemplateSolid:
     """An ellipsoidal shell about the origin from its top to a polar angle: one, or one for each of `AROUND`."""
     way = direction(np.linspace(0, 1, steps + 1)[:, None] * np.asarray(rim, float), AROUND)
     radius = np.asarray(radii, float)
     return loft(np.concatenate([way * radius, (way * (radius - thick))[::-1]]))
 
 
-def patch(stations: ArrayLike, x: Pair, angle: Pair, out: float) -> Solid:
+def patch(stations: ArrayLike, x: Pair, angle: Pair, out: float) -> TemplateSolid:
     """A piece of the skin of a `body` of elliptic section, its stations in order of x, raised by `out`: a
     windscreen, a stripe. angle: rad from the right side upwards.
     """

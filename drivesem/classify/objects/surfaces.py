@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drivesem.classify.objects.types import ObjectModel, object_model
-from scene_ir.meshes.solids import Solid, joined, mirrored
+from scene_ir.meshes.solids import TemplateSolid, join_solids, mirror_solid
 
 Rgb = tuple[float, float, float]
 
@@ -69,23 +69,23 @@ class Kit:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._solids: list[Solid] = []
+        self._solids: list[TemplateSolid] = []
         self._looks: list[np.ndarray] = []
 
-    def add(self, surface: Surface, *solids: Solid) -> None:
+    def add(self, surface: Surface, *solids: TemplateSolid) -> None:
         """Solids of one surface."""
         for solid in solids:
             self.painted([surface], solid)
 
-    def painted(self, surfaces: Sequence[Surface], solid: Solid) -> None:
+    def painted(self, surfaces: Sequence[Surface], solid: TemplateSolid) -> None:
         """A solid whose materials are numbers of surfaces."""
         table = np.array([(*s.diffuse, s.specular, s.shininess) for s in surfaces])
         self._solids.append(solid)
         self._looks.append(table[solid.material])
 
-    def both(self, surface: Surface, *solids: Solid) -> None:
+    def both(self, surface: Surface, *solids: TemplateSolid) -> None:
         """Solids of one surface, and their twins on the other side of z = 0."""
-        self.add(surface, *solids, *(mirrored(solid) for solid in solids))
+        self.add(surface, *solids, *(mirror_solid(solid) for solid in solids))
 
     def between(self, low: float, high: float) -> float:
         """A number drawn evenly."""
@@ -112,7 +112,7 @@ class Kit:
 
     def model(self, name: str, label: int) -> ObjectModel:
         """All solids as one object: centred, longest side 1, the front turned to -z."""
-        whole = joined(self._solids)
+        whole = join_solids(self._solids)
         low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
         unit = (whole.vertices - (low + high) / 2) / (high - low).max()
         turned = unit[:, [2, 1, 0]] * [1.0, 1.0, -1.0]

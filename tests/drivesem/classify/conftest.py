@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.networks.loading import ready
+from drivesem.classify.networks.loading import prepare_for_inference
 from tests.drivesem.classify.standins import KINDS
 
 
@@ -27,4 +27,4 @@ class Colours(Classifier):
 
 @pytest.fixture
 def colours():
-    return ready(Colours())
+    return prepare_for_inference(Colours())

@@ -24,7 +24,7 @@ def standins(monkeypatch):
     for module in (pictures, training):
         monkeypatch.setattr(module, "open_objects", lambda source: objects)
     monkeypatch.setattr(
-        attacking, "load_classifier", lambda name, classes, device: loading.ready(Colours(classes))
+        attacking, "load_classifier", lambda name, classes, device: loading.prepare_for_inference(Colours(classes))
     )
     return objects
 
@@ -60,7 +60,7 @@ def test_attack(standins, tmp_path, capsys):
     assert len((out / "classified.csv").read_text().splitlines()) == 13
 
     # what is written is what was judged, and the page's figures are those of the pictures
-    network = loading.ready(Colours())
+    network = loading.prepare_for_inference(Colours())
     for frame, result in zip(frames, results, strict=True):
         picture = torch.from_numpy(files.read_image(frame / "counterexample.png").transpose(2, 0, 1)).float() / 255
         scores = network(picture[None])[0]
@@ -78,7 +78,9 @@ def test_the_page_says_what_was_not_attacked(standins, monkeypatch, tmp_path, ca
     blind = Colours()
     with torch.no_grad():
         blind.score.weight[1] = 0  # nothing is called a ball
-    monkeypatch.setattr(attacking, "load_classifier", lambda name, classes, device: loading.ready(blind))
+    monkeypatch.setattr(
+        attacking, "load_classifier", lambda name, classes, device: loading.prepare_for_inference(blind)
+    )
     words = ("--out", str(tmp_path / "run"), "--params", "pose", "--views", "forward", "--json")
     code, data, _ = answer(capsys, "attack", *words)
     assert code == 0

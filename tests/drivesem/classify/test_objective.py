@@ -6,10 +6,9 @@ import pytest
 import torch
 from torch import nn
 
-from drivesem.attack.methods.sampling import Sampling
+from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
+from drivesem.attack.methods.gradient_free import Sampling
 from drivesem.attack.methods.scw import SCW
-from drivesem.attack.methods.sgd import SGD
-from drivesem.attack.methods.si_fgsm import SiFGSM
 from drivesem.classify.objective import ClassifierObjective, Seen, ahead, aim
 from drivesem.classify.scenes import DRAWN_PX, ObjectScene
 from drivesem.classify.space import Amounts, ObjectSpace, moved_of

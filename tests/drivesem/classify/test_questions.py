@@ -22,7 +22,7 @@ from drivesem.classify.scenes import DRAWN_PX, ObjectScene
 from drivesem.classify.space import Change
 from drivesem.cli import main
 from scene_ir import files
-from scene_ir.render.lit import LitMesh, Materials
+from scene_ir.render.lit_mesh import LitMesh, Materials
 from tests.drivesem.classify.conftest import Colours
 from tests.drivesem.classify.standins import StandIns, model
 
@@ -74,7 +74,9 @@ def finished(tmp_path_factory):
 
 def patched(patch):
     patch.setattr(pictures, "open_objects", lambda source: StandIns())
-    patch.setattr(attacking, "load_classifier", lambda name, classes, device: loading.ready(network_of(name)))
+    patch.setattr(
+        attacking, "load_classifier", lambda name, classes, device: loading.prepare_for_inference(network_of(name))
+    )
 
 
 def network_of(name):
@@ -157,7 +159,7 @@ def test_the_table_of_least_changes_breaks_no_number_at_80_columns(name):
     change = LeastChange(name, "", "bus", "motorcycle", 1.0, angles, angles, 0.0074, 0.0, dropped, 1, 1)
     shown = io.StringIO()
     sheet = least.sheet_of([change], "squeezenet")
-    Console(width=80, file=shown).print(sheet.table(least.WORDS, **sheet.looks))
+    Console(width=80, file=shown).print(sheet.to_rich(least.WORDS, **sheet.rich_options))
     told = shown.getvalue()
     assert {"-0.276", "+0.238", "-0.476", "0.0074", "motorcycle", "vertex,", "lighting"} <= set(told.split())
     first = "".join(line.split(" ")[0] for line in told.splitlines()[4:])

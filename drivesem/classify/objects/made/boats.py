@@ -14,11 +14,11 @@ from drivesem.classify.objects.shapes import (
     boxes,
     lathe,
     loft,
-    moved,
     points,
     rectangle,
     slab,
     torus,
+    translate_solid,
     tube,
     turned,
 )
@@ -38,7 +38,7 @@ from drivesem.classify.objects.surfaces import (
     metal,
     paint,
 )
-from scene_ir.meshes.solids import Solid
+from scene_ir.meshes.solids import TemplateSolid
 
 
 def _sections(length: float, beam: float, depth: float, sheer: float, stern: float, full: float = 2.0) -> Array:
@@ -71,7 +71,7 @@ def _hull(kit: Kit, sections: Array, top: Surface, bottom: Surface, deck: Surfac
     kit.both(bottom, tube(sections[:, -1], 3 * unit, 6))
 
 
-def _sail(*corners: tuple[float, float, float], belly: float) -> Solid:
+def _sail(*corners: tuple[float, float, float], belly: float) -> TemplateSolid:
     """A sail: tack, clew, head; how far the wind fills it to the right."""
     tack, clew, head = np.array(corners)
     u, v = np.linspace(0, 1, 8)[:, None, None], np.linspace(0, 1, 9)[None, :, None]
@@ -249,7 +249,7 @@ def ship(kit: Kit) -> None:
         outer, rim = [(0.03, 0.0), (0.026, 0.075), (0.026, 0.08)], [(0.027, 0.06), (0.025, 0.09)]
         for colour, profile in ((stripe, outer), (BLACK, rim)):
             pipe = lathe(np.array(profile) * long, sides=18)
-            kit.add(colour, moved(turned(pipe, "z", 0.15), (x, y, 0)))
+            kit.add(colour, translate_solid(turned(pipe, "z", 0.15), (x, y, 0)))
     for x, foot, high in ((b - 0.03 * long, y, 0.1 * long), (0.42 * long, depth, 0.14 * long)):
         kit.add(STEEL, tube([(x, foot, 0), (x, foot + high, 0)], 0.004 * long, 6))
     boats = [x0 + 0.05 * long] if cargo else np.linspace(x0 + 0.1 * long, 0.2 * long, 6)

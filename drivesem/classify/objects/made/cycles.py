@@ -16,10 +16,10 @@ from drivesem.classify.objects.shapes import (
     box,
     boxes,
     lathe,
-    moved,
     points,
     slab,
     torus,
+    translate_solid,
     tube,
     turned,
 )
@@ -41,7 +41,7 @@ from drivesem.classify.objects.surfaces import (
     paint,
     plastic,
 )
-from scene_ir.meshes.solids import Solid
+from scene_ir.meshes.solids import TemplateSolid
 
 _LEATHER = dull((0.015, 0.014, 0.014))
 
@@ -61,7 +61,7 @@ def _wheel(kit: Kit, x: float, radius: float, thick: float, spoked: bool) -> Non
     kit.add(rim, beams(starts, ends, wide, deep))
 
 
-def _fender(x: float, y: float, radius: float, angles: Pair, half: float) -> Solid:
+def _fender(x: float, y: float, radius: float, angles: Pair, half: float) -> TemplateSolid:
     """A mudguard around a wheel's axle, between two angles from forward, upwards."""
     a, z = np.linspace(*angles, 11)[:, None], np.linspace(-half, half, 5)
     rise = radius - 0.35 * half * (z / half) ** 2
@@ -99,7 +99,7 @@ def _engine(kit: Kit, twin: bool, y: float) -> None:
         for step in range(6):
             half = 0.075 if step % 2 else 0.095
             fin = box((-half, 0.12 + 0.035 * step, -half - 0.01), (half, 0.155 + 0.035 * step, half + 0.01))
-            kit.add(CHROME if step == 5 else STEEL, moved(turned(fin, "z", -lean), (-0.03, y, 0)))
+            kit.add(CHROME if step == 5 else STEEL, translate_solid(turned(fin, "z", -lean), (-0.03, y, 0)))
 
 
 def _exhaust(kit: Kit, y: float, rear: float, lift: float, sides: int) -> None:
@@ -230,7 +230,7 @@ def cruiser(kit: Kit) -> None:
     _lamps(kit, head[0] + 0.17, 0.8, (-base - 0.36, 0.52), kit.between(0.09, 0.115))
     if kit.chance(0.4):
         screen = turned(block((-0.008, 0.008), (0.0, 0.42), 0.24, 0.006), "z", 0.35)
-        kit.add(GLASS, moved(screen, (head[0] + 0.13, 0.92, 0)))
+        kit.add(GLASS, translate_solid(screen, (head[0] + 0.13, 0.92, 0)))
 
 
 def scooter(kit: Kit) -> None:

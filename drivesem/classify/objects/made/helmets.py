@@ -15,10 +15,10 @@ from drivesem.classify.objects.shapes import (
     dome,
     lathe,
     loft,
-    moved,
     points,
     slab,
     torus,
+    translate_solid,
     tube,
     turned,
 )
@@ -155,7 +155,7 @@ def hard_hat(kit: Kit) -> None:
         kit.both(BLACK, tube([(0.02, -0.01, strap), (0.03, -0.1, 0.75 * strap), (0.045, -0.15, 0.0)], 0.006, 6))
     if kit.chance(0.4):
         lamp = turned(block((-0.012, 0.02), (-0.02, 0.02), 0.03, 0.008), "z", -0.9)
-        kit.add(BLACK, moved(lamp, (0.93 * radii[0], 0.45 * radii[1], 0)))
+        kit.add(BLACK, translate_solid(lamp, (0.93 * radii[0], 0.45 * radii[1], 0)))
     else:
         kit.add(WHITE if colour.diffuse[2] < 0.5 else BLACK,
             dome(radii, np.linspace(1.05, 1.3, 4), np.linspace(-0.22, 0.22, 5), 0.01, 0.011))  # fmt: skip

@@ -14,11 +14,11 @@ from drivesem.classify.objects.shapes import (
     boxes,
     lathe,
     loft,
-    moved,
     points,
     rectangle,
     squares,
     torus,
+    translate_solid,
     tube,
     turned,
     turned_each,
@@ -40,7 +40,7 @@ from drivesem.classify.objects.surfaces import (
     paint,
     plastic,
 )
-from scene_ir.meshes.solids import Solid
+from scene_ir.meshes.solids import TemplateSolid
 
 
 def _slats(kit: Kit, wood: Surface, line: list[tuple[float, float]], length: float, wide: float) -> None:
@@ -48,7 +48,7 @@ def _slats(kit: Kit, wood: Surface, line: list[tuple[float, float]], length: flo
     places = np.array(line)
     for (x, y), way in zip(places, np.gradient(places, axis=0), strict=True):
         board = block((-wide / 2, wide / 2), (-0.016, 0.016), length / 2, 0.008)
-        kit.add(wood, moved(turned(board, "z", np.arctan2(way[1], way[0])), (x, y, 0)))
+        kit.add(wood, translate_solid(turned(board, "z", np.arctan2(way[1], way[0])), (x, y, 0)))
 
 
 def park_bench(kit: Kit) -> None:
@@ -94,7 +94,7 @@ def stone_bench(kit: Kit) -> None:
     foot, width = kit.between(0.55, 0.8) * half, kit.between(0.06, 0.14)
     profile = [(1.0, 0.0), (1.0, 0.12), (0.72, 0.2), (0.72, 0.75), (1.0, 0.86), (1.0, 1.0)]
     leg = loft([rectangle((-0.8 * deep * s, 0.8 * deep * s), (0.45 - thick) * t, width * s) for s, t in profile])
-    kit.add(stone, moved(leg, (0, 0, foot)), moved(leg, (0, 0, -foot)))
+    kit.add(stone, translate_solid(leg, (0, 0, foot)), translate_solid(leg, (0, 0, -foot)))
     wood = dull(kit.tint(WOODS))
     for x in np.linspace(-0.82 * deep, 0.82 * deep, 7):
         kit.add(wood, block((x - 0.11 * deep, x + 0.11 * deep), (0.445, 0.475), 0.96 * half, 0.012))
@@ -203,7 +203,7 @@ def slatted_bin(kit: Kit) -> None:
 TRASHCANS = (wheeled_bin, dustbin, slatted_bin, pedal_bin)
 
 
-def _tunnel(x: tuple[float, float], y: float, half: float, straight: float) -> Solid:
+def _tunnel(x: tuple[float, float], y: float, half: float, straight: float) -> TemplateSolid:
     """A box of rounded top along x: standing on y, straight sides, above them a half circle."""
     angle = np.linspace(0, np.pi, 21)
     top = np.stack([y + straight + half * np.sin(angle), half * np.cos(angle)], 1)
@@ -242,7 +242,7 @@ def rural_mailbox(kit: Kit) -> None:
         kit.add(wood, block((-0.45, 0.55 * long), (height - 0.09, height), 0.04, 0.01))
         kit.add(wood, beams((-0.28, height - 0.35, 0), (0.05, height - 0.06, 0), 0.05, 0.05))
         cap = ((0.07, 0.42), (0.07, 0.45), (0.005, 0.53))
-        kit.add(wood, moved(squares([(s, height + y) for s, y in cap]), (-0.3, 0, 0)))
+        kit.add(wood, translate_solid(squares([(s, height + y) for s, y in cap]), (-0.3, 0, 0)))
 
 
 def collection_box(kit: Kit) -> None:
@@ -297,7 +297,7 @@ def house_mailbox(kit: Kit) -> None:
     trim = CHROME if kit.chance(0.5) else BLACK
     kit.add(BLACK, block((0.9 * deep, deep + 0.006), (foot + 0.66 * tall, foot + 0.8 * tall), 0.72 * half))
     flap = turned(block((0, 0.014), (-0.01, 0.15 * tall), 0.78 * half, 0.004), "z", -0.5)
-    kit.add(trim, moved(flap, (deep + 0.004, foot + 0.7 * tall, 0)))
+    kit.add(trim, translate_solid(flap, (deep + 0.004, foot + 0.7 * tall, 0)))
     kit.add(WHITE, block((0.9 * deep, deep + 0.006), (foot + 0.22 * tall, foot + 0.42 * tall), 0.4 * half))
     kit.add(trim, ball((deep + 0.01, foot + 0.32 * tall, 0.7 * half), 0.014, 10))
     if kit.chance(0.5):

@@ -16,11 +16,11 @@ from drivesem.classify.objects.shapes import (
     carriage,
     lathe,
     loft,
-    moved,
     points,
     rectangle,
     section,
     torus,
+    translate_solid,
     tube,
 )
 from drivesem.classify.objects.surfaces import (
@@ -39,14 +39,14 @@ from drivesem.classify.objects.surfaces import (
     paint,
     plastic,
 )
-from scene_ir.meshes.solids import COLOUR, Material, cleaned
+from scene_ir.meshes.solids import COLOUR, VehicleMaterial, clean_solid
 from scene_ir.meshes.templates import template, typical_size_lhw
 
-_FITTINGS: dict[Material, Surface] = {Material.GLASS: GLASS, Material.TYRE: RUBBER, Material.RIM: CHROME,
-    Material.RIM_GAP: BLACK, Material.HEADLIGHT: LAMP, Material.TAIL_LIGHT: TAIL_LAMP, Material.INDICATOR: AMBER,
-    Material.PLATE: plastic((0.7, 0.7, 0.66)), Material.TRIM: BLACK, Material.UNDERBODY: RUBBER,
-    Material.CHROME: CHROME, Material.CARGO: WHITE}  # fmt: skip
-_TABLE = np.array([COLOUR[material] for material in Material])
+_FITTINGS: dict[VehicleMaterial, Surface] = {VehicleMaterial.GLASS: GLASS, VehicleMaterial.TYRE: RUBBER, VehicleMaterial.RIM: CHROME,
+    VehicleMaterial.RIM_GAP: BLACK, VehicleMaterial.HEADLIGHT: LAMP, VehicleMaterial.TAIL_LIGHT: TAIL_LAMP, VehicleMaterial.INDICATOR: AMBER,
+    VehicleMaterial.PLATE: plastic((0.7, 0.7, 0.66)), VehicleMaterial.TRIM: BLACK, VehicleMaterial.UNDERBODY: RUBBER,
+    VehicleMaterial.CHROME: CHROME, VehicleMaterial.CARGO: WHITE}  # fmt: skip
+_TABLE = np.array([COLOUR[material] for material in VehicleMaterial])
 
 
 def _template(kit: Kit, kind: str, coat: Surface) -> tuple[float, float, float]:
@@ -59,8 +59,8 @@ def _template(kit: Kit, kind: str, coat: Surface) -> tuple[float, float, float]:
     faces = mesh.faces.numpy()[:, ::-1]
     colours = mesh.colours.numpy()[faces[:, 0]]
     material = np.abs(colours[:, None] - _TABLE).sum(axis=2).argmin(axis=1)
-    surfaces = [coat if one == Material.PAINT else _FITTINGS[one] for one in Material]
-    kit.painted(surfaces, cleaned(vertices, faces, material))
+    surfaces = [coat if one == VehicleMaterial.PAINT else _FITTINGS[one] for one in VehicleMaterial]
+    kit.painted(surfaces, clean_solid(vertices, faces, material))
     return size
 
 
@@ -189,7 +189,10 @@ def school_bus(kit: Kit) -> None:
     half, low, nose = length / 2, 0.55, kit.between(1.3, 1.6)
     coat = paint(kit.tint(((0.66, 0.34, 0.006),), 0.1))
     front = half - nose
-    kit.add(coat, moved(carriage(_ends((half + front) / 2, 0.15, 0.4), wide, low, high, 0.3), -nose / 2 * AHEAD))
+    kit.add(
+        coat,
+        translate_solid(carriage(_ends((half + front) / 2, 0.15, 0.4), wide, low, high, 0.3), -nose / 2 * AHEAD),
+    )
     bonnet = [(front - 0.1, 1.78, 0.98), (front + 0.5 * nose, 1.66, 0.95), (half - 0.05, 1.5, 0.86),
         (half, 1.35, 0.8)]  # fmt: skip
     kit.add(coat, loft([section(x, w, low, top, 0.22) for x, top, w in bonnet]))
@@ -266,7 +269,7 @@ def _track(kit: Kit, rear: float, front: float) -> None:
 def _wagon(kit: Kit, rear: float, front: float, coat: Surface, stripe: Surface) -> None:
     """A passengers' wagon: windows, doors, a stripe, bogies."""
     middle, half = (rear + front) / 2, (front - rear) / 2
-    kit.add(coat, moved(carriage(_ends(half, 0.05, 0.2), 1.4, 0.9, 3.75, 0.5), middle * AHEAD))
+    kit.add(coat, translate_solid(carriage(_ends(half, 0.05, 0.2), 1.4, 0.9, 3.75, 0.5), middle * AHEAD))
     _panes(kit, (rear + 1.2, front - 1.2), (2.05, 2.85), 1.4, 6, 0.35)
     _band(kit, stripe, (rear + 0.1, front - 0.1), (1.35, 1.65), 1.4)
     for x in (rear + 0.65, front - 0.65):
@@ -414,7 +417,7 @@ def tram(kit: Kit) -> None:
             [half, 0.7, 0.05, 0.45]]  # fmt: skip
         stations = np.array(_ends(half, 0.05, 0.2)[:3] + nose)
         stations = stations if ahead else stations[::-1] * [-1, 1, 1, 1]
-        kit.add(coat, moved(carriage(stations, 1.3, 0.45, 3.4, 0.35), middle * AHEAD))
+        kit.add(coat, translate_solid(carriage(stations, 1.3, 0.45, 3.4, 0.35), middle * AHEAD))
         inner = (rear + 0.3, front - 1.3) if ahead else (rear + 1.3, front - 0.3)
         _panes(kit, inner, (1.6, 2.75), 1.3, kit.count(4, 5), 0.12)
         _band(kit, second, inner, (0.6, kit.between(1.0, 1.4)), 1.3)

@@ -14,7 +14,13 @@ from torch import nn
 from detectors.base import DetectorError
 from drivesem.classify.networks import libraries as libraries_module
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
-from drivesem.classify.networks.loading import ARCHITECTURES, load_classifier, ready, save_classifier, to_train
+from drivesem.classify.networks.loading import (
+    ARCHITECTURES,
+    load_classifier,
+    prepare_for_inference,
+    save_classifier,
+    to_train,
+)
 from drivesem.classify.networks.onnx import OnnxClassifier
 from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir.errors import FormatError, RangeError
@@ -69,7 +75,7 @@ def resnet_names():
 def test_torchvisions_file_of_vgg16(tmp_path):
     tensors = vgg_file()
     torch.save(tensors, tmp_path / "vgg16.pth")
-    network = ready(to_train("vgg16", str(tmp_path / "vgg16.pth"), CLASSES, seeded()))
+    network = prepare_for_inference(to_train("vgg16", str(tmp_path / "vgg16.pth"), CLASSES, seeded()))
     images = torch.rand(1, 3, 64, 64, generator=seeded())
     x = (images - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
     for place in VGG_CONVOLUTIONS:
@@ -93,13 +99,13 @@ def test_torchvisions_names_of_resnet50(tmp_path):
     file = {name: torch.zeros(shape) for name, shape in resnet_names().items()}
     file = {name: t + ("running_var" in name) for name, t in file.items()}
     torch.save(file | {name: torch.tensor(0) for name in counted}, tmp_path / "resnet50.pth")
-    network = ready(to_train("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded()))
+    network = prepare_for_inference(to_train("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded()))
     assert network.classes == CLASSES
     assert torch.equal(network(torch.rand(1, 3, 64, 64)), torch.zeros(1, 3))
 
 
 def test_a_block_of_resnet50_by_hand():
-    network = ready(ResNet50(CLASSES))
+    network = prepare_for_inference(ResNet50(CLASSES))
     block = network.get_submodule("layer2")[0]
     x = torch.rand(1, 256, 8, 8, generator=seeded())
 
@@ -117,7 +123,7 @@ def test_a_block_of_resnet50_by_hand():
 
 def test_vggs_convolutions_alone(tmp_path):
     save_file(vgg_file(small=True), tmp_path / "vgg.safetensors")
-    network = ready(to_train("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
+    network = prepare_for_inference(to_train("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
     assert isinstance(network, PooledVGG16)
     assert network.embed(torch.rand(2, 3, 64, 64)).shape == (2, 1024)
 
@@ -130,7 +136,9 @@ def test_squeezenets_layers_are_squeezedets(tmp_path):
     file = {k: v.contiguous() for k, v in detector.state_dict().items() if not k.startswith(beyond)}
     file |= {"conv10.weight": torch.zeros(1000, 512, 1, 1), "conv10.bias": torch.zeros(1000)}
     save_file(file, tmp_path / "squeezenet.safetensors")
-    network = ready(to_train("squeezenet", str(tmp_path / "squeezenet.safetensors"), CLASSES, seeded()))
+    network = prepare_for_inference(
+        to_train("squeezenet", str(tmp_path / "squeezenet.safetensors"), CLASSES, seeded())
+    )
     images = torch.rand(1, 3, 64, 64, generator=seeded())
     pixels = 255 * images.flip(1) - torch.tensor([103.939, 116.779, 123.68]).view(3, 1, 1)
     x = F.max_pool2d(F.relu(detector.conv1(pixels)), 3, 2, ceil_mode=True)
@@ -147,7 +155,7 @@ def test_what_is_written_is_read_again(tmp_path):
     again = load_classifier(str(tmp_path / "a.safetensors"), CLASSES)
     images = torch.rand(1, 3, 64, 64, generator=seeded())
     with torch.no_grad():
-        torch.testing.assert_close(again(images), ready(network)(images), rtol=1e-2, atol=1e-2)
+        torch.testing.assert_close(again(images), prepare_for_inference(network)(images), rtol=1e-2, atol=1e-2)
     assert not any(p.requires_grad for p in again.parameters())
 
 
