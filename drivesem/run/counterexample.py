@@ -2,7 +2,7 @@
 
 ```pycon
 >>> import drivesem as ds
->>> found = ds.attack(ds.demo_scene(0), "squeezedet", params="translate,rotate", steps=2)
+>>> found = ds.run_attack(ds.demo_scene(0), "squeezedet", params="translate,rotate", steps=2)
 >>> found.picture.shape, found.feasible
 ((376, 1241, 3), True)
 >>> sorted(found.theta)[0]

@@ -23,7 +23,18 @@ from drivesem.store import RemoteFolder, local_copy
 from scene_ir.errors import FormatError
 from tests.drivesem.commands.test_attack_command import contents, without_times
 
-ATTACK = ["attack", "--params", "color", "--method", "fgsm", "--second-detector", "off", "--no-confirm", "--workers", "1"]
+ATTACK = [
+    "attack",
+    "--params",
+    "color",
+    "--method",
+    "fgsm",
+    "--second-detector",
+    "off",
+    "--no-confirm",
+    "--workers",
+    "1",
+]
 
 
 class Plain(LocalFileSystem):
@@ -259,42 +270,45 @@ def test_a_folder_of_others_is_compared_by_what_the_store_says_of_it(tmp_path: P
         (["report", "memory://run"], "--runs: expected a path on this machine"),
         (["train", "--root", "gs://bucket/kitti"], "--root: expected a path on this machine"),
         (["runs", "prune", "memory://run"], "FOLDER: expected a folder on this machine, to prune"),
-        (["attack", "--out", "nothing://bucket"], "--out: expected a folder, or a URL whose library is here"),
+        (
+            ["attack", "--out", "nothing://bucket"],
+            "--out: expected a folder, or a URL with a library that is installed",
+        ),
         (["attack", "--dataset", "kitti", "--root", "memory://none"], "--root: expected a folder with files"),
         (["runs", "show", "memory://none"], "FOLDER: expected a folder with files"),
     ],
 )
-def test_what_cannot_be_elsewhere_is_one_line(
+def test_urls_that_cannot_be_used_are_refused_in_one_line(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_an_attack_is_elsewhere_what_it_is_here(
+def test_an_attack_on_a_store_equals_a_local_one(
     tmp_path: Path, machine: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"plain://{tmp_path}/bucket/run"
     assert main([*ATTACK, "--limit", "1", "--out", str(tmp_path / "here")]) == 0
     Plain.writes_left, Plain.raised = 6, OSError  # some files of the frame are there, and no commit
     assert main([*ATTACK, "--limit", "1", "--out", url]) == 2
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert f"--out: expected a store that can be written, found {url}: OSError: cut off" in told
-    kept = Path(told.partition("(what was made is kept in ")[2].rstrip(")"))
-    assert (kept / "frames" / "demo-000" / "result.json").is_file()
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert f"--out: expected a store that can be written, found {url}: OSError: cut off" in error
+    copy = Path(error.partition("(the results are in ")[2].rstrip(")"))
+    assert (copy / "frames" / "demo-000" / "result.json").is_file()
     Plain.writes_left = float("inf")
     here = os.environ["XDG_CACHE_HOME"]
     machine()
     assert main(["runs", "list", url]) == 2
-    assert f"FOLDER: expected a folder with files, found {url}, where there are none" in capsys.readouterr().err
+    assert f"FOLDER: expected a folder with files, found {url}, which is empty" in capsys.readouterr().err
     monkeypatch.setenv("XDG_CACHE_HOME", here)
-    begun = (kept / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
+    written = (copy / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
     assert main([*ATTACK, "--limit", "1", "--out", url]) == 0
-    assert (kept / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == begun, "nothing is made twice"
+    assert (copy / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == written, "nothing is made twice"
     machine()
     assert contents(local_copy(url) / "frames") == contents(tmp_path / "here" / "frames")
-    figures = [json.loads((run / "metrics.json").read_text()) for run in (local_copy(url), tmp_path / "here")]
-    assert without_times(figures[0]) == without_times(figures[1])
+    metrics = [json.loads((run / "metrics.json").read_text()) for run in (local_copy(url), tmp_path / "here")]
+    assert without_times(metrics[0]) == without_times(metrics[1])
     capsys.readouterr()
     assert main(["runs", "show", url, "--json"]) == 0
     (run,) = json.loads(capsys.readouterr().out)["runs"]

@@ -1,0 +1,381 @@
+"""The Python door: what comes back, that it is the command line's, and what bad arguments are told."""
+
+from __future__ import annotations
+
+import base64
+import doctest
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import drivesem as ds
+from drivesem.cli import main
+from drivesem.config.commands import AttackConfig
+from drivesem.config.errors import UsageError
+from drivesem.failures.grades import Certificate, SecondOpinion
+from drivesem.run import attack as attack_run
+from drivesem.run.attack import AttackWorker
+from drivesem.run.counterexample import OPTIONS as ATTACK_OPTIONS
+from drivesem.run.results import Failure, load_frame
+from drivesem.scenes.scene import image_of
+from scene_ir.errors import FormatError, RangeError, SceneError
+from scene_ir.files import read_image
+from scene_ir.types import Frame
+from tests.drivesem.commands.test_attack_command import Blinking
+
+OPTIONS = {"params": "translate,rotate", "steps": 2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def command_threads() -> Iterator[None]:
+    """As many threads as a command with one process takes: sums are then added up alike."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(min(os.cpu_count() or 1, before))  # as the command: no more than OMP_NUM_THREADS says
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def scene() -> ds.Scene:
+    return ds.demo_scene(0)
+
+
+@pytest.fixture(scope="module")
+def counterexample(scene: ds.Scene) -> ds.Counterexample:
+    return ds.run_attack(scene, "squeezedet", **OPTIONS)
+
+
+class Tags(HTMLParser):
+    """Reads HTML; notes images' sources and whether each tag that opens is closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.sources: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name == "src"]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def tags_of(html: str) -> Tags:
+    tags = Tags()
+    tags.feed(html)
+    assert not tags.open
+    return tags
+
+
+def picture_of(data: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert picture is not None
+    return picture
+
+
+def test_importing_is_quick_and_every_name_is_there() -> None:
+    code = (
+        "import sys, time; start = time.perf_counter(); import drivesem as ds\n"
+        "heavy = {'torch', 'cv2', 'numpy', 'warp', 'tyro'} & set(sys.modules)\n"
+        "print(time.perf_counter() - start, sorted(heavy), dir(ds) == ds.__all__)"
+    )
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    seconds, rest = said.split(maxsplit=1)
+    assert rest.strip() == "[] True"
+    assert float(seconds) < 0.2
+    assert all(callable(getattr(ds, name)) for name in ds.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = ds.nothing  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_run_attack_stands_next_to_the_package() -> None:
+    from drivesem.attack import space
+
+    assert importlib.import_module("drivesem.attack.space") is space
+    assert callable(ds.run_attack)
+    with pytest.raises(UsageError, match="attack: expected options among"):
+        ds.run_attack(None, nothing=1)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def test_options_are_the_commands() -> None:
+    assert {field.name for field in fields(AttackConfig)} > set(ATTACK_OPTIONS)
+
+
+def test_examples_in_docstrings() -> None:
+    for name in ("drivesem.scenes.scene", "drivesem.run.counterexample"):
+        module = importlib.import_module(name)
+        assert doctest.testmod(module, raise_on_error=True).attempted > 0
+        assert "```pycon\n>>> import" in (module.__doc__ or "")  # else the site shows quotations
+
+
+def test_a_scene_shows_and_tells_itself(scene: ds.Scene, tmp_path: Path) -> None:
+    picture = scene.render()
+    assert (picture.dtype, picture.shape) == (np.uint8, scene.photograph.shape)
+    assert scene.tensor().shape == (3, *picture.shape[:2])
+    assert np.array_equal(picture, scene.photograph)
+    assert np.array_equal(picture_of(scene._repr_png_()), picture)
+    rows = scene.rows()
+    assert [row["row"] for row in rows] == list(range(len(scene)))
+    assert json.loads(json.dumps(rows)) == rows
+    scene.save(tmp_path / "scene")
+    again = ds.load_scene(tmp_path / "scene")
+    assert np.array_equal(again.render(), picture)
+    (tmp_path / "else").mkdir()
+    (tmp_path / "else" / "file").touch()
+    with pytest.raises(UsageError, match="folder: expected a new folder, or one of a scene"):
+        scene.save(tmp_path / "else")
+
+
+def test_edits_are_the_commands(scene: ds.Scene, tmp_path: Path) -> None:
+    scene.save(tmp_path / "scene")
+    loaded = ds.load_scene(tmp_path / "scene")  # tensors' layout in memory decides how fog's last bits are rounded
+    changed = loaded.edit("objects[1].translate=0.5m,0m", weather="fog", remove=[3])
+    assert len(changed) == len(scene) - 1
+    same = loaded.edit(objects={1: {"translate": ("0.5m", "0m")}}, weather="fog", remove=[3])
+    assert np.array_equal(changed.render(), same.render())
+    words = ["--set", "objects[1].translate=0.5m,0m", "--set", "weather=fog", "--remove", "3"]
+    assert main(["edit", str(tmp_path / "scene"), *words, "-o", str(tmp_path / "moved.png")]) == 0
+    assert np.array_equal(read_image(tmp_path / "moved.png"), changed.render())
+    assert len(scene.edit(remove="all")) == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "named", "error", "line"),
+    [
+        ((), {}, UsageError, "edit: expected a change"),
+        (("objects[1].fly=1",), {}, FormatError, "edit objects\\[1\\].fly=1"),
+        ((), {"weather": "hail"}, FormatError, "edit: weather: expected codes, or one of"),
+        ((), {"remove": [99]}, RangeError, "objects\\[99\\]"),
+        ((), {"remove": "some"}, UsageError, "remove: expected rows from 0, or 'all'"),
+    ],
+)
+def test_bad_edits(
+    scene: ds.Scene, settings: tuple[str, ...], named: dict[str, object], error: type[Exception], line: str
+) -> None:
+    with pytest.raises(error, match=line):
+        scene.edit(*settings, **named)  # pyright: ignore[reportArgumentType]
+
+
+def test_an_attack_is_the_commands(counterexample: ds.Counterexample, small_run: Path, tmp_path: Path) -> None:
+    written = small_run / "frames" / "demo-000"
+    theta = json.loads((written / "theta.json").read_text())
+    assert counterexample.theta == {name: coordinate["value"] for name, coordinate in theta.items()}
+    assert np.array_equal(counterexample.picture, read_image(written / "counterexample.png"))
+    assert counterexample.result.failures == load_frame(written / "result.json").failures
+    counterexample.save(tmp_path / "frame")
+    names, saved = (
+        sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+        for folder in (written, tmp_path / "frame")
+    )
+    assert names == saved
+    for name in names:
+        if name.name != "result.json":  # which holds the seconds
+            assert (tmp_path / "frame" / name).read_bytes() == (written / name).read_bytes(), name
+
+
+def test_a_counterexample_shows_and_tells_itself(counterexample: ds.Counterexample, scene: ds.Scene) -> None:
+    assert counterexample.feasible
+    assert counterexample.tensor.shape == (3, *counterexample.picture.shape[:2])
+    assert np.array_equal(counterexample.photograph, scene.photograph)
+    assert counterexample.rows()[0].keys() == {"name", "unit", "value", "lower", "upper", "display"}
+    tags = tags_of(counterexample._repr_html_())
+    assert len(tags.sources) == 2
+    for source in tags.sources:
+        head, data = source.split(",")
+        assert head == "data:image/png;base64"
+        assert picture_of(base64.b64decode(data)).shape == counterexample.picture.shape
+    further = counterexample.scene.edit(weather="rain")  # what was found is a scene like any other
+    assert further.render().shape == counterexample.picture.shape
+
+
+def test_failures_tell_kind_grade_and_draws(counterexample: ds.Counterexample, small_run: Path) -> None:
+    box, count = (1.0, 2.0, 30.0, 40.0), Certificate(16, 16, 13, 16, 1.5, -0.5)
+    failures = (
+        Failure("lost", "Car", box, 0, None, "placed", "confirmed", count, SecondOpinion("generator", 4, 3, 4)),
+        Failure("phantom", "Car", box, score=0.7, grade="threshold"),
+    )
+    result = replace(counterexample.result, failures=failures)
+    found = replace(counterexample, result=result)
+    assert found.grades == {"threshold": 2, "certain": 1, "confirmed": 1, "shared": 0}
+    lost, phantom = found.failure_rows()
+    assert (lost["kind"], lost["grade"], lost["object"]) == ("placed", "confirmed", 0)
+    assert (lost["right_before"], lost["wrong_after"], lost["draws_after"]) == (16, 13, 16)
+    assert (lost["second"], lost["second_agrees"], lost["peer"]) == ("generator", True, None)
+    assert (phantom["kind"], phantom["grade"], phantom["score"]) == (None, "threshold", 0.7)
+    assert json.loads(json.dumps(found.failure_rows())) == [lost, phantom]
+    told = tags_of(found._repr_html_()).text
+    assert "2 threshold, 1 certain, 1 confirmed; feasible" in told
+    assert "confirmed: Car badly placed, objects[0] at 1, 2, 30, 40 px; found in 16/16 draws before" in told
+    run = ds.load_run(small_run)
+    (frame,) = run.frames
+    run = replace(run, frames=(replace(frame, result=result),))
+    assert run.failure_rows() == [{"frame": "demo-000", **row} for row in (lost, phantom)]
+    (row,) = run.rows()
+    assert (row["certain"], row["confirmed"], row["shared"]) == (1, 1, 0)
+    assert (row["placed"], row["missed"], row["passes"]) == (1, 0, result.passes)
+
+
+def test_failures_of_earlier_runs_are_of_unknown_grade(small_run: Path) -> None:
+    run = ds.load_run(small_run)
+    (frame,) = run.frames
+    lost = Failure("lost", "Car", (1.0, 2.0, 3.0, 4.0), index=0)
+    (row,) = replace(run, frames=(replace(frame, result=replace(frame.result, failures=(lost,))),)).rows()
+    assert (row["lost"], row["certain"], row["missed"]) == (1, None, None)
+    assert lost.to_row()["grade"] is None
+
+
+def test_names_are_escaped(counterexample: ds.Counterexample) -> None:
+    named = replace(counterexample, scene=replace(counterexample.scene, name="<script>"))
+    assert "<script>" not in named._repr_html_()
+    assert "<script>" in tags_of(named._repr_html_()).text
+
+
+def test_a_detector_that_is_loaded(scene: ds.Scene, counterexample: ds.Counterexample) -> None:
+    detector = ds.load_detector("squeezedet")
+    assert ds.run_attack(scene.ir, detector, **OPTIONS).theta == counterexample.theta
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"steps": 0}, "steps: expected at least 1, found 0"),
+        ({"steps": "many"}, "steps: expected a whole number, found 'many'"),
+        ({"t_star": 2.0}, "t_star: expected a score in"),
+        ({"method": "magic"}, "method: expected one of si-fgsm"),
+        ({"combo": 1, "params": "rotate"}, "params: expected no combo"),
+        ({"detector": "nobody"}, "detector: expected a detector"),
+        ({"target_objects": "77"}, "expected objects up to the 77th"),
+    ],
+)
+def test_bad_options_name_the_argument(scene: ds.Scene, options: dict[str, object], line: str) -> None:
+    with pytest.raises((UsageError, SceneError), match=line) as caught:
+        ds.run_attack(scene, **options)  # pyright: ignore[reportArgumentType]
+    assert "\n" not in str(caught.value)
+    assert "--" not in str(caught.value).partition("expected")[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"precision": "bfloat16"}, "precision: expected none with a loaded detector, found 'bfloat16'"),
+        ({"tiles": "off"}, "tiles: expected none with a loaded detector, found 'off'"),
+        ({"device": "meta"}, "device: expected that of the loaded detector: cpu, found 'meta'"),
+    ],
+)
+def test_a_loaded_detector_excludes_loading_options(scene: ds.Scene, options: dict[str, str], line: str) -> None:
+    with pytest.raises(UsageError, match=line):
+        ds.run_attack(scene, ds.load_detector("squeezedet"), **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_detector_without_gradient_gets_the_commands_method(
+    scene: ds.Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    methods: list[str] = []
+    monkeypatch.setattr(
+        AttackWorker, "attack_scene", lambda worker, *_: methods.append(worker.config.method) or 1 / 0
+    )
+    monkeypatch.setattr(attack_run, "load_predictor", lambda *_: Blinking())
+    for detector in (Blinking(), "any"):
+        with pytest.raises(ZeroDivisionError):
+            ds.run_attack(scene, detector, params="color", confirm=False)
+        every = "method: expected one of random, halton, cma-es, corners, climb for"
+        with pytest.raises(UsageError, match=every):
+            ds.run_attack(scene, detector, params="color", confirm=False, method="apgd")
+    assert methods == ["climb", "climb"]
+
+
+def test_runs_are_rows(small_run: Path) -> None:
+    run = ds.load_run(small_run)
+    (row,) = run.rows()
+    assert row["frame"] == "demo-000"
+    assert all(isinstance(value, str | int | float | bool | None) for value in row.values())
+    assert "squeezedet" in tags_of(run._repr_html_()).text
+    with pytest.raises(UsageError, match="folder: expected a folder of drivesem attack"):
+        ds.load_run(small_run / "frames")
+    for limit in (0, -1):
+        with pytest.raises(UsageError, match=f"limit: expected at least 1, found {limit}"):
+            ds.load_run(small_run, limit=limit)
+
+
+def test_frames_of_a_data_set(small_kitti: Path) -> None:
+    frames = ds.open_dataset("kitti", small_kitti)
+    assert len(frames) == len(frames.names)
+    first = next(iter(frames))
+    assert isinstance(first, Frame)
+    assert frames[frames.names[0]].identifier == first.identifier
+    with pytest.raises(RangeError, match="frame of"):
+        _ = frames["nobody"]
+    with pytest.raises(RangeError, match="dataset: expected one of coco"):
+        ds.open_dataset("lego", small_kitti)
+
+
+def test_photographs_as_files_arrays_tensors_and_frames(small_kitti: Path, tmp_path: Path) -> None:
+    name = "000008"
+    photo = small_kitti / "training" / "image_2" / f"{name}.png"
+    labels, calib = (small_kitti / "training" / part / f"{name}.txt" for part in ("label_2", "calib"))
+    frame = ds.open_dataset("kitti", small_kitti)[name]
+    assert torch.equal(image_of(read_image(photo)), frame.photograph)
+    assert torch.equal(image_of(frame.photograph), frame.photograph)
+    scenes = [
+        ds.derender(photo, labels, calib, fit=False),
+        ds.derender(read_image(photo), frame.labels, frame.camera.matrix.numpy(), fit=False),
+        ds.derender(replace(frame, depth=None, classes=None, masks=None), fit=False),
+    ]
+    words = ["--root", str(small_kitti), "--fast", "--workers", "1", "--out", str(tmp_path)]
+    assert main(["derender", "--dataset", "kitti", *words]) == 0
+    by_command, whole = ds.load_scene(tmp_path / name), ds.derender(frame, fit=False)
+    for same in ((scenes[0], scenes[1]), (scenes[1], scenes[2]), (by_command, whole)):
+        assert same[0].rows() == same[1].rows()
+        assert np.array_equal(same[0].ir.background, same[1].ir.background)
+
+
+def test_bad_photographs(small_kitti: Path) -> None:
+    folder = small_kitti / "training"
+    photo, labels = folder / "image_2" / "000008.png", folder / "label_2" / "000008.txt"
+    pixels = read_image(photo)
+    with pytest.raises(UsageError, match="calib: expected a calibration beside labels, found none"):
+        ds.derender(photo, labels)
+    with pytest.raises(UsageError, match="photo: expected an array"):
+        ds.derender(pixels.astype(np.float32))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UsageError, match="photo: expected values in"):
+        ds.derender(torch.full((3, 8, 8), 255.0))
+    with pytest.raises(UsageError, match="photo: expected a file, an array"):
+        ds.derender(7)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UsageError, match="calib: expected intrinsics"):
+        ds.derender(pixels, labels, np.eye(4))
+    with pytest.raises(UsageError, match="meshes: expected a folder"):
+        ds.derender(pixels, meshes="nowhere")
+    with pytest.raises(FormatError, match=r"nowhere\.png"):
+        ds.derender("nowhere.png")
+    with pytest.raises(RangeError, match="focal"):
+        ds.derender(pixels, focal=-1.0)
+
+
+def test_the_collector_looks_again_once_a_command_is_loaded() -> None:
+    code = (
+        "import gc\n"
+        "from drivesem.cli import main\n"
+        "assert main(['attack', '--dataset', 'kitti', '--root', '/nowhere']) == 2\n"
+        "assert gc.isenabled() and gc.get_freeze_count() > 0\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
