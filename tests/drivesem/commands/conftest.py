@@ -10,7 +10,7 @@ import pytest
 
 from drivesem.config.commands import AttackConfig
 from drivesem.config.options import to_yaml
-from drivesem.run.results import BoxRecord, FrameResult, dump_frame
+from drivesem.run.results import SCHEMA, BoxRecord, FrameResult, dump_frame
 from scene_ir import files
 
 HEIGHT, WIDTH = 80, 130
@@ -53,7 +53,7 @@ def _write(folder: Path, same: bool = False, params: str = "rotate") -> Path:
     """same: the counterexample is the photograph."""
     names = ("a", "b", "c")
     files.write_text(folder / "config.yaml", to_yaml(AttackConfig(params=params)))
-    files.write_json(folder / "metrics.json", {"params": params.split(","), "t_star": 0.5})
+    files.write_json(folder / "metrics.json", {"schema": SCHEMA, "params": params.split(","), "t_star": 0.5})
     files.write_json(folder / "manifest.json", {"frames": {name: {} for name in names}})
     for seed, name in enumerate(names):
         part = folder / "frames" / name

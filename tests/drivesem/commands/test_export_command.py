@@ -365,7 +365,7 @@ def test_convert_takes_a_run_with_its_pictures(
         (["nowhere", "--to", "gltf", "--out", "x"], "nowhere: expected a scene of drivesem derender"),
         (["nowhere", "--to", "kitti"], "--out: expected a new or empty folder"),
         (["--to", "kitti", "--out", "x"], "--run: expected a folder of drivesem attack"),
-        (["nowhere", "--to", "voc", "--out", "x"], "expected one of kitti"),
+        (["nowhere", "--to", "voc", "--out", "x"], "Expected one of ('kitti'"),
     ],
 )
 def test_what_cannot_be_exported(words: list[str], message: str, refused: Any) -> None:

@@ -96,7 +96,6 @@ COMMANDS = {
     "attack": ["attack", "--limit", "1", "--steps", "1", "--no-fit", "--workers", "1"],
     "derender": ["derender", "--limit", "1", "--fast", "--workers", "1"],
     "synth": ["synth", "--frames", "1", "--workers", "1"],
-    "study": ["study", "multi", "--quick", "--limit", "1", "--workers", "1"],
     "train": ["train", "--root", "{kitti}", "--steps", "1", "--batch", "1", "--window", "96x64"],
     "convert": ["convert", "{kitti}", "--to", "coco"],
     "eval": ["eval", "--detector", "squeezedet", "--root", "{kitti}"],

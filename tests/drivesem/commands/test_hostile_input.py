@@ -14,7 +14,7 @@ import torch
 from detectors import registry
 from detectors.registry import SHIPPED, read_weights, write_weights
 from detectors.types import CLASSES, Detections
-from drivesem import cli
+from drivesem import program
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from scene_ir import files
@@ -193,7 +193,7 @@ def test_runs(
     run = write_run(tmp_path / "run")
     places = {"result": run / "frames" / "a" / "result.json"}
     edit(places.get(file, run / f"{file}.json"), *keys, value=value)
-    assert message in said("worth", run, "--distance", "none")
+    assert message in said("holes", run)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_settings_of_runs(
     (run / "config.yaml").write_text(text.replace(old, new))
     assert message in said("verify", "--run", run)
     if "detector" in old:
-        assert message in said("worth", run, "--distance", "none")
+        assert message in said("holes", run)
 
 
 RAISING = """
@@ -410,14 +410,14 @@ def test_links_of_a_run_stay_in_it(
     path.unlink(missing_ok=True)
     (tmp_path / "secret").write_text("secret")
     path.symlink_to(tmp_path / "secret")
-    line = said("worth", run, "--distance", "none")
+    line = said("holes", run)
     assert f"{path}: expected a file in {run / 'frames' / 'b'}, found a link to" in line
     (run / "metrics.json").unlink()
     (run / "metrics.json").symlink_to("/etc/passwd")
-    assert "metrics.json: expected a file in" in said("worth", run, "--distance", "none")
+    assert "metrics.json: expected a file in" in said("holes", run)
     (run / "config.yaml").unlink()
     (run / "config.yaml").symlink_to("/dev/zero")
-    assert "config.yaml: expected a file in" in said("worth", run, "--distance", "none")
+    assert "config.yaml: expected a file in" in said("holes", run)
 
 
 def test_a_command_says_whose_code_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -427,5 +427,5 @@ def test_a_command_says_whose_code_it_runs(tmp_path: Path, capsys: pytest.Captur
     first, _ = capsys.readouterr().err.splitlines()
     assert first == f"drivesem: --detector: runs the code in {path}:A"
     for kind in registry.KINDS:
-        said = cli._CODE.findall(f"squeezedet,{kind}:a.b")  # pyright: ignore[reportPrivateUsage]
+        said = program.RUNS_CODE.findall(f"squeezedet,{kind}:a.b")
         assert said == (["a.b"] if kind in registry.RUNS_CODE else [])

@@ -154,7 +154,7 @@ def test_a_run_that_stopped_early_is_listed(
     shutil.copytree(parts / "part2", tmp_path / "run")
     (tmp_path / "run" / "metrics.json").unlink()
     assert main(["runs", "list", str(tmp_path)]) == 0
-    assert "run: 1 frame, not finished (the same command goes on)" in capsys.readouterr().out
+    assert "run: 1 frame, unfinished (the same command resumes)" in capsys.readouterr().out
 
 
 def test_runs_of_other_commands_are_passed_over(
@@ -217,8 +217,8 @@ def test_prune_passes_over_what_a_question_is_writing(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["runs", "merge", "a"], "--out: expected the folder of the run that is made, found nothing"),
-        (["runs", "show", "a", "--out", "b"], "--out: expected runs merge, found runs show"),
+        (["runs", "merge", "a"], "--out: expected the folder of the merged run, found nothing"),
+        (["runs", "show", "a", "--out", "b"], "--out: expected only with merge, found show"),
         (
             ["runs", "merge", "a", "--out", "b\udcff"],
             r"--out: expected text that UTF-8 holds, found 'b\udcff'",
@@ -227,7 +227,7 @@ def test_prune_passes_over_what_a_question_is_writing(
         (["runs", "show", "a/nope"], "FOLDER: expected a run's folder, with its config.yaml, found a/nope"),
         (["runs", "prune", "a", "--dry"], "FOLDER: expected a run's folder, with its config.yaml, found a"),
         (["runs", "list", "nowhere"], "FOLDER: expected a folder with runs of drivesem attack, found nowhere"),
-        (["runs", "list", "--dry"], "--dry: expected runs prune, found runs list"),
+        (["runs", "list", "--dry"], "--dry: expected only with prune, found list"),
         (["attack", "--part", "3/2"], "--part: expected K/N, the K-th of N parts, such as 2/4, found '3/2'"),
     ],
 )

@@ -89,7 +89,7 @@ def test_data_sets_are_those_that_can_be_read() -> None:
     assert sorted(DATASETS) == sorted(READERS)
 
 
-@pytest.mark.parametrize("command", ["derender", "attack", "gradcheck"])
+@pytest.mark.parametrize("command", ["derender", "attack", "bench"])
 def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     said = fail([command, "--dataset", "kitty", "--root", "."], capsys)
     assert (
@@ -172,7 +172,7 @@ def test_what_it_tells_of_each_frame(taken: Path, tmp_path: Path, capsys: pytest
     assert found["failed"] == {}
     assert Path(found["out"]) == out
     assert main(words) == 0
-    assert f"demo-000: {frame['objects']} vehicles, there before" in capsys.readouterr().out
+    assert f"demo-000: {frame['objects']} vehicles, already there" in capsys.readouterr().out
 
 
 def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
