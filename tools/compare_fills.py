@@ -20,12 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivesem.synth.layout import footprint
-from scene_ir.derender import background, maps, segment, street, upright
-from scene_ir.derender.derender import VEHICLES
-from scene_ir.derender.silhouette import grow
+from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import patch_fill as background
+from scene_ir.derender import segmentation as segment
+from scene_ir.derender import standing_surfaces as upright
+from scene_ir.derender import street
+from scene_ir.derender.derender import VEHICLE_CATEGORIES
+from scene_ir.derender.silhouette import grow_mask
 from tools.bench.derender import changed_region, make_case, share_of, without
 from tools.bench.pictures import psnr
-from tools.experiments.realism.closeness import Perception, Picture
+from tools.experiments.realism.perceptual import PerceptualDistance, Picture
 
 Mask = NDArray[np.bool_]
 SEED = 0
@@ -45,8 +49,8 @@ class Hole:
     hole: Mask
     ground: Mask
     people: Mask
-    plane: street.Plane
-    shares: street.Shares
+    plane: street.GroundCoordinates
+    shares: street.StreetShares
     horizon: float
 
     @property
@@ -57,7 +61,7 @@ class Hole:
     @property
     def forbidden(self) -> Mask:
         """Pixels that are no source."""
-        return grow(self.hole, 2) | self.people
+        return grow_mask(self.hole, 2) | self.people
 
     @property
     def like(self) -> NDArray[np.float32]:
@@ -72,7 +76,7 @@ def main() -> int:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     options = parser.parse_args()
     holes = [make_hole(index) for index in range(options.frames)]
-    perception = Perception()
+    perception = PerceptualDistance()
     lines = [
         "| method | PSNR, dB | ground | upright | perceptual | seconds |",
         "|---|---|---|---|---|---|",
@@ -88,29 +92,29 @@ def make_hole(index: int) -> Hole:
     """The hole that all vehicles of a generated street leave."""
     case = make_case(SEED, index)
     before = case.before
-    tracks = [t.actor.track for t in before.truths if t.actor.label in VEHICLES]
+    tracks = [t.actor.track for t in before.truths if t.actor.label in VEHICLE_CATEGORIES]
     empty = without(case, tracks)
     hole = changed_region(before, empty, tracks)
     people = np.zeros(hole.shape, bool)
     for truth in before.truths:
         if truth.actor.track not in tracks:
             people |= share_of(before, truth.actor.track) > 0
-    plane = street.plane_view(before.environment.ground, before.camera)
+    plane = street.ground_coordinates(before.environment.ground, before.camera)
     flat = np.isfinite(plane.along) & np.isfinite(empty.depth_m)
     along, depth = np.where(flat, plane.along, 1.0), np.where(flat, empty.depth_m, 2.0)
     ground = flat & (np.abs(along - depth) < _SAME_DEPTH * depth)
     horizon = maps.horizon_row(before.environment.ground, before.camera)
     image = before.image.astype(np.float32) / np.float32(255)
-    seen = segment.segment(image, before.environment.ground, before.camera)
+    seen = segment.segment_photograph(image, before.environment.ground, before.camera)
     stood = np.zeros(hole.shape, bool)
     for truth in before.truths:
         if truth.actor.track in tracks:
             stood |= _inside(footprint(truth.actor.position_xz, truth.actor.yaw, truth.actor.size_lhw), plane)
-    shares = street.Shares(seen.ground, seen.sky, stood & hole)
+    shares = street.StreetShares(seen.ground, seen.sky, stood & hole)
     return Hole(before.image, empty.image, hole, ground, people & ~hole, plane, shares, horizon)
 
 
-def _inside(corners: NDArray[np.float64], plane: street.Plane) -> Mask:
+def _inside(corners: NDArray[np.float64], plane: street.GroundCoordinates) -> Mask:
     """Pixels (H, W) that see the ground within a rectangle; corners (4, 2): (x, z) m, in order."""
     along = np.where(np.isfinite(plane.along), plane.along, -1.0)
     after = np.roll(corners, -1, axis=0)
@@ -121,7 +125,9 @@ def _inside(corners: NDArray[np.float64], plane: street.Plane) -> Mask:
     return (along > 0) & (np.all(np.stack(sides) > 0, 0) | np.all(np.stack(sides) < 0, 0))
 
 
-def _figures(hole: Hole, method: Callable[[Hole], NDArray[np.float32]], perception: Perception) -> list[float]:
+def _figures(
+    hole: Hole, method: Callable[[Hole], NDArray[np.float32]], perception: PerceptualDistance
+) -> list[float]:
     start = time.process_time()
     found = method(hole)
     seconds = time.process_time() - start
@@ -134,7 +140,7 @@ def _figures(hole: Hole, method: Callable[[Hole], NDArray[np.float32]], percepti
 
 def _opencv(kind: int) -> Callable[[Hole], NDArray[np.float32]]:
     def run(hole: Hole) -> NDArray[np.float32]:
-        filled = cv2.inpaint(hole.photograph, grow(hole.hole, 2).astype(np.uint8), _OPENCV_PX, kind)
+        filled = cv2.inpaint(hole.photograph, grow_mask(hole.hole, 2).astype(np.uint8), _OPENCV_PX, kind)
         return np.asarray(filled, np.float32) / np.float32(255)
 
     return run
@@ -142,7 +148,7 @@ def _opencv(kind: int) -> Callable[[Hole], NDArray[np.float32]]:
 
 def _xphoto(kind: int) -> Callable[[Hole], NDArray[np.float32]]:
     def run(hole: Hole) -> NDArray[np.float32]:
-        valid = (~grow(hole.hole, 2)).astype(np.uint8) * 255
+        valid = (~grow_mask(hole.hole, 2)).astype(np.uint8) * 255
         shift_map = kind == cv2.xphoto.INPAINT_SHIFTMAP
         source = cv2.cvtColor(hole.photograph, cv2.COLOR_RGB2Lab) if shift_map else hole.photograph[..., ::-1]
         target = np.zeros_like(hole.photograph)
@@ -158,12 +164,12 @@ def _smooth(hole: Hole) -> NDArray[np.float32]:
 
 
 def _patches(hole: Hole) -> NDArray[np.float32]:
-    known_ground = background.Ground(hole.hole & hole.ground, hole.like)
-    return background.fill(hole.image, hole.hole, hole.forbidden, hole.horizon, known_ground)
+    known_ground = background.GroundMaps(hole.hole & hole.ground, hole.like)
+    return background.fill_patches(hole.image, hole.hole, hole.forbidden, hole.horizon, known_ground)
 
 
-def _continued(hole: Hole) -> street.Continued:
-    return street.continued(hole.image, hole.forbidden, hole.shares, hole.plane, hole.horizon)
+def _continued(hole: Hole) -> street.StreetContinuation:
+    return street.continue_street(hole.image, hole.forbidden, hole.shares, hole.plane, hole.horizon)
 
 
 def _street(hole: Hole) -> NDArray[np.float32]:
@@ -172,16 +178,18 @@ def _street(hole: Hole) -> NDArray[np.float32]:
 
 def _street_patches(hole: Hole) -> NDArray[np.float32]:
     guide = _continued(hole)
-    known_ground = background.Ground(guide.ground, hole.like)
-    return background.fill(hole.image, hole.hole, hole.forbidden, hole.horizon, known_ground, guide=guide.image)
+    known_ground = background.GroundMaps(guide.ground, hole.like)
+    return background.fill_patches(
+        hole.image, hole.hole, hole.forbidden, hole.horizon, known_ground, guide=guide.image
+    )
 
 
 def _columns_and_patches(hole: Hole) -> NDArray[np.float32]:
     guide = _continued(hole)
-    found = upright.copied(hole.image, hole.hole, hole.forbidden | (hole.like > 0.5), guide, hole.horizon)
-    rest, forbidden = hole.hole & ~found.done, hole.forbidden & ~found.done
-    known_ground = background.Ground(guide.ground, hole.like)
-    return background.fill(found.image, rest, forbidden, hole.horizon, known_ground, guide=guide.image)
+    found = upright.copy_columns(hole.image, hole.hole, hole.forbidden | (hole.like > 0.5), guide, hole.horizon)
+    rest, forbidden = hole.hole & ~found.copied, hole.forbidden & ~found.copied
+    known_ground = background.GroundMaps(guide.ground, hole.like)
+    return background.fill_patches(found.image, rest, forbidden, hole.horizon, known_ground, guide=guide.image)
 
 
 METHODS: dict[str, Callable[[Hole], NDArray[np.float32]]] = {

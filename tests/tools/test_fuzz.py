@@ -14,7 +14,7 @@ import pytest
 from scene_ir.errors import FormatError
 from tools.fuzz import trial
 from tools.fuzz.__main__ import main
-from tools.fuzz.formats import FORMATS, Format, each
+from tools.fuzz.formats import FORMATS, Format, call_all
 from tools.fuzz.mutate import mutated
 from tools.fuzz.trial import Subject, fuzz
 
@@ -110,9 +110,9 @@ def test_readers_do_not_hide_one_another() -> None:
         raise KeyError
 
     with pytest.raises(KeyError):
-        each(lambda root: refused_always(), wrong)(Path())
+        call_all(lambda root: refused_always(), wrong)(Path())
     with pytest.raises(FormatError):
-        each(lambda root: refused_always(), taken_always)(Path())
+        call_all(lambda root: refused_always(), taken_always)(Path())
 
 
 def refused_always() -> None:

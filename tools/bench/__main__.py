@@ -18,9 +18,9 @@ from detectors.registry import SHIPPED, load_detector, load_predictor
 from drivesem import __version__
 from drivesem.attack.space import parse_params
 from drivesem.bench import render
-from drivesem.bench.scenes import MOST_CARS
-from drivesem.bench.session import Measured, conduct, targets_of, watched
-from drivesem.bench.tables import Section
+from drivesem.bench.scenes import MAX_CARS
+from drivesem.bench.session import BenchResult, output_paths, run_benchmark, show_progress
+from drivesem.bench.tables import BenchTable
 from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
 from drivesem.config.options import CommandConfig
@@ -76,42 +76,42 @@ def _load_benchmark(name: str) -> Callable[[Any], int]:
     return gradcheck.run if name == "gradcheck" else partial(_run, _MEASURES[name])
 
 
-def _run(measure: Callable[[Any, Console], Measured], config: BenchTool | DetectorBenchConfig) -> int:
+def _run(measure: Callable[[Any, Console], BenchResult], config: BenchTool | DetectorBenchConfig) -> int:
     """Measure, print, write; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
-    if max(parse_integers("--cars", config.cars)) > MOST_CARS:
-        raise UsageError("--cars", f"at most {MOST_CARS}", max(parse_integers("--cars", config.cars)))
-    return conduct(config, _PROGRAM, measure)
+    if max(parse_integers("--cars", config.cars)) > MAX_CARS:
+        raise UsageError("--cars", f"at most {MAX_CARS}", max(parse_integers("--cars", config.cars)))
+    return run_benchmark(config, _PROGRAM, measure)
 
 
-def _derender(config: BenchTool, console: Console) -> Measured:
+def _derender(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     frames = _frames(config, derender)
     settings = DerenderSettings.fast() if config.fast else DerenderSettings()
     measured = derender.measure(frames, config.seed, config.processes, config.ablate, _sheets(config), settings)
-    rows = list(watched(measured, frames, console))
+    rows = list(show_progress(measured, frames, console))
     fields = {"rows": [asdict(row) for row in rows], "summary": derender.summary(rows)}
     return _measured(derender, fields)
 
 
-def _parts(config: BenchTool, console: Console) -> Measured:
+def _parts(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
-    rows = list(watched(parts.measure(config), len(label_free.names(config)), console))
+    rows = list(show_progress(parts.measure(config), len(label_free.names(config)), console))
     return _measured(parts, {"rows": [asdict(row) for row in rows], "summary": parts.summary(rows)})
 
 
-def _depth(config: BenchTool, console: Console) -> Measured:
+def _depth(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     frames = _frames(config, depth)
     measured = depth.measure(config, frames, _sheets(config))
-    rows = [row for found in watched(measured, depth.count(config, frames), console) for row in found]
+    rows = [row for found in show_progress(measured, depth.count(config, frames), console) for row in found]
     return _measured(depth, {"rows": [asdict(row) for row in rows], "summary": depth.summary(rows)})
 
 
-def _found(config: BenchTool, console: Console) -> Measured:
+def _found(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     sheets = _sheets(config)
     try:
-        frames = dict(watched(found.measure(config, sheets), found.count(config), console))
+        frames = dict(show_progress(found.measure(config, sheets), found.count(config), console))
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     rows = [car for name in sorted(frames) for car in frames[name]]
@@ -121,10 +121,10 @@ def _found(config: BenchTool, console: Console) -> Measured:
     return _measured(found, fields)
 
 
-def _redraw(config: BenchTool, console: Console) -> Measured:
+def _redraw(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     try:
-        frames = dict(watched(redraw.measure(config, _sheets(config)), found.count(config), console))
+        frames = dict(show_progress(redraw.measure(config, _sheets(config)), found.count(config), console))
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     rows = [frames[name] for name in sorted(frames)]
@@ -132,88 +132,88 @@ def _redraw(config: BenchTool, console: Console) -> Measured:
     return _measured(redraw, fields)
 
 
-def _weather(config: BenchTool, console: Console) -> Measured:
+def _weather(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     frames = _frames(config, weather)
     try:
         measured = weather.measure(config, frames, _sheets(config))
-        rows = [row for found in watched(measured, frames, console) for row in found]
+        rows = [row for found in show_progress(measured, frames, console) for row in found]
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(weather, {"rows": [asdict(row) for row in rows], "summary": weather.summary(rows)})
 
 
-def _foliage(config: BenchTool, console: Console) -> Measured:
+def _foliage(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     frames = _frames(config, foliage)
     measured = foliage.measure(frames, _sheets(config))
-    rows = [row for found in watched(measured, frames, console) for row in found]
+    rows = [row for found in show_progress(measured, frames, console) for row in found]
     return _measured(foliage, {"rows": [asdict(row) for row in rows], "summary": foliage.summary(rows)})
 
 
-def _devices(config: BenchTool, console: Console) -> Measured:
+def _devices(config: BenchTool, console: Console) -> BenchResult:
     frames = _frames(config, devices)
     measured = devices.measure(frames, config.detector, config.device)
-    rows = [row for found in watched(measured, frames, console) for row in found]
+    rows = [row for found in show_progress(measured, frames, console) for row in found]
     return _measured(devices, {"rows": [asdict(row) for row in rows], "summary": devices.summary(rows)})
 
 
-def _label_free(config: BenchTool, console: Console) -> Measured:
+def _label_free(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
-    frames = dict(watched(label_free.measure(config), len(label_free.names(config)), console))
+    frames = dict(show_progress(label_free.measure(config), len(label_free.names(config)), console))
     ordered = [frames[name] for name in sorted(frames)]
     rows = [asdict(row) for frame in ordered for row in frame.rows]
     fields = {"frames": len(frames), "rows": rows, "summary": label_free.summary(ordered)}
     return _measured(label_free, fields)
 
 
-def _moves(config: BenchTool, console: Console) -> Measured:
+def _moves(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     frames = _frames(config, moves)
     try:
-        measured = watched(moves.measure(config, frames, _sheets(config)), frames, console)
+        measured = show_progress(moves.measure(config, frames, _sheets(config)), frames, console)
         rows = [row for found in measured for row in found]
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(moves, {"rows": [asdict(row) for row in rows], "summary": moves.summary(rows)})
 
 
-def _synth(config: BenchTool, console: Console) -> Measured:
+def _synth(config: BenchTool, console: Console) -> BenchResult:
     if not memory.supported():
         raise UsageError("bench synth", "a system with /proc", sys.platform)
     _on_cpu(config)
-    rows = list(watched(synth.measure(_frames(config, synth), config.seed, config.processes), 3, console))
+    rows = list(show_progress(synth.measure(_frames(config, synth), config.seed, config.processes), 3, console))
     first = {"frames_per_second": rows[0].frames_per_second, "peak_rss_mb": rows[0].peak_rss_mb}
     return _measured(synth, {**first, "rows": [asdict(row) for row in rows]})
 
 
-def _rivals(config: BenchTool, console: Console) -> Measured:
+def _rivals(config: BenchTool, console: Console) -> BenchResult:
     sizes = render.sizes(parse_integers("--cars", config.cars), parse_integers("--triangles", config.triangles))
     measured = rivals.measure(sizes, _RIVAL_SECONDS[0 if config.quick else 1], config.seed, config.device)
-    return _measured(rivals, {"rows": [asdict(row) for row in watched(measured, 2 * len(sizes), console)]})
+    return _measured(rivals, {"rows": [asdict(row) for row in show_progress(measured, 2 * len(sizes), console)]})
 
 
-def _eval(config: BenchTool, console: Console) -> Measured:
+def _eval(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
-    rows = watched(evaluation.measure(_frames(config, evaluation), config.seed), 3, console)
+    rows = show_progress(evaluation.measure(_frames(config, evaluation), config.seed), 3, console)
     return _measured(evaluation, {"rows": [asdict(row) for row in rows]})
 
 
-def _viewer(config: BenchTool, console: Console) -> Measured:
+def _viewer(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     scene = None if config.scenes is None else Path(config.scenes)
     states = viewer.QUICK_STATES if config.quick else viewer.FULL_STATES
     try:
         detector = load_predictor(config.detector, config.device, config.tiles)
-        rows = list(watched(viewer.measure(scene, detector, states, config.seed), 8, console))
+        rows = list(show_progress(viewer.measure(scene, detector, states, config.seed), 8, console))
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(viewer, {"rows": [asdict(row) for row in rows]})
 
 
-def _install(config: BenchTool, console: Console) -> Measured:
+def _install(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
-    rows = list(watched(install.measure(config.quick), 20, console))
+    rows = list(show_progress(install.measure(config.quick), 20, console))
     parts = (
         (install.STEPS_TITLE, install.STEPS, install.StepRow),
         (install.SIZES_TITLE, install.SIZES, install.SizeRow),
@@ -222,13 +222,13 @@ def _install(config: BenchTool, console: Console) -> Measured:
     of_kind = [
         (title, columns, [asdict(row) for row in rows if isinstance(row, kind)]) for title, columns, kind in parts
     ]
-    sections = [Section(title, columns, told) for title, columns, told in of_kind if told]
+    sections = [BenchTable(title, columns, told) for title, columns, told in of_kind if told]
     names = ("steps", "sizes", "starts")
     fields = {name: told for name, (_, _, told) in zip(names, of_kind, strict=True)}
-    return Measured({**fields, "method": install.METHOD}, sections)
+    return BenchResult({**fields, "method": install.METHOD}, sections)
 
 
-def _memory(config: DetectorBenchConfig, console: Console) -> Measured:
+def _memory(config: DetectorBenchConfig, console: Console) -> BenchResult:
     if not memory.supported():
         raise UsageError("bench memory", "a system with /proc", sys.platform)
     if config.device != "cpu":
@@ -236,24 +236,24 @@ def _memory(config: DetectorBenchConfig, console: Console) -> Measured:
     cases = memory.cases(
         parse_integers("--cars", config.cars), parse_integers("--triangles", config.triangles), config.quick
     )
-    rows = _dicts(watched(memory.measure(cases, config.seed, config.detector), len(cases), console))
-    return Measured({"rows": rows, "method": memory.METHOD}, [Section(memory.TITLE, memory.COLUMNS, rows)])
+    rows = _dicts(show_progress(memory.measure(cases, config.seed, config.detector), len(cases), console))
+    return BenchResult({"rows": rows, "method": memory.METHOD}, [BenchTable(memory.TITLE, memory.COLUMNS, rows)])
 
 
-def _detector(config: DetectorBenchConfig, console: Console) -> Measured:
+def _detector(config: DetectorBenchConfig, console: Console) -> BenchResult:
     """All that are shipped, or the one that was asked for."""
     names = sorted(SHIPPED) if config.detector == DetectorBenchConfig.detector else [config.detector]
     measured = detectors.measure(names, _DETECTOR_SECONDS[0 if config.quick else 1], config.seed, config.device)
     try:
-        rows = _dicts(watched(measured, len(names) * len(detectors.SIZES_HW), console))
+        rows = _dicts(show_progress(measured, len(names) * len(detectors.SIZES_HW), console))
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
-    return Measured(
-        {"rows": rows, "method": detectors.METHOD}, [Section(detectors.TITLE, detectors.COLUMNS, rows)]
+    return BenchResult(
+        {"rows": rows, "method": detectors.METHOD}, [BenchTable(detectors.TITLE, detectors.COLUMNS, rows)]
     )
 
 
-def _climb(config: DetectorBenchConfig, console: Console) -> Measured:
+def _climb(config: DetectorBenchConfig, console: Console) -> BenchResult:
     if config.device != "cpu":
         raise UsageError("--device", "cpu (the processor's time is measured)", config.device)
     try:
@@ -265,15 +265,15 @@ def _climb(config: DetectorBenchConfig, console: Console) -> Measured:
         raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
     cars, params = parse_integers("--cars", config.cars), parse_params(config.params)
     measured = climb.measure(cars, params, config.passes, 4 if config.quick else 20, by_precision, config.seed)
-    rows = _dicts(watched(measured, len(cars) * len(by_precision), console))
-    return Measured({"rows": rows, "method": climb.METHOD}, [Section(climb.TITLE, climb.COLUMNS, rows)])
+    rows = _dicts(show_progress(measured, len(cars) * len(by_precision), console))
+    return BenchResult({"rows": rows, "method": climb.METHOD}, [BenchTable(climb.TITLE, climb.COLUMNS, rows)])
 
 
-def _planted(config: DetectorBenchConfig, console: Console) -> Measured:
+def _planted(config: DetectorBenchConfig, console: Console) -> BenchResult:
     return _planted_in_frames(config, console) if config.across is None else _planted_across(config, console)
 
 
-def _planted_across(config: DetectorBenchConfig, console: Console) -> Measured:
+def _planted_across(config: DetectorBenchConfig, console: Console) -> BenchResult:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
     first = across.Across.of(config)
     names, _, failed = select_frames(first.source, config)
@@ -297,7 +297,7 @@ def _planted_across(config: DetectorBenchConfig, console: Console) -> Measured:
     rows = across_names.rows_of(faults, pools, judged, tuple(first.workers) if frames else ())
     told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
     summed += across_names.chance_rows(pools, config.seed, across_names.SHAMS)
-    return Measured(
+    return BenchResult(
         {
             "rows": told,
             "summary": summed,
@@ -306,13 +306,13 @@ def _planted_across(config: DetectorBenchConfig, console: Console) -> Measured:
             "method": across_names.METHOD,
         },
         [
-            Section(across_names.TITLE, across_names.COLUMNS, told),
-            Section(across_names.SUMMARY_TITLE, across_names.SUMMARY_COLUMNS, summed),
+            BenchTable(across_names.TITLE, across_names.COLUMNS, told),
+            BenchTable(across_names.SUMMARY_TITLE, across_names.SUMMARY_COLUMNS, summed),
         ],
     )
 
 
-def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> Measured:
+def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> BenchResult:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
     judge = yardstick.Yardstick.of(config)
     names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)
@@ -332,7 +332,7 @@ def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> Measure
     )
     judged = [asked.results[name] for name in names if name in asked.results]
     rows, kinds = summary.rows_of(judged, methods, config.seed), summary.kind_rows(judged, methods)
-    return Measured(
+    return BenchResult(
         {
             "rows": rows,
             "kinds": kinds,
@@ -341,15 +341,15 @@ def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> Measure
             "method": summary.METHOD,
         },
         [
-            Section(summary.TITLE, summary.COLUMNS, rows),
-            Section(summary.KINDS_TITLE, summary.kind_columns(methods), kinds),
+            BenchTable(summary.TITLE, summary.COLUMNS, rows),
+            BenchTable(summary.KINDS_TITLE, summary.kind_columns(methods), kinds),
         ],
     )
 
 
-def _scale(config: DetectorBenchConfig, console: Console) -> Measured:
-    rows = _dicts(watched(scale.measure(config), 2, console))
-    return Measured({"rows": rows, "method": scale.METHOD}, [Section(scale.TITLE, scale.COLUMNS, rows)])
+def _scale(config: DetectorBenchConfig, console: Console) -> BenchResult:
+    rows = _dicts(show_progress(scale.measure(config), 2, console))
+    return BenchResult({"rows": rows, "method": scale.METHOD}, [BenchTable(scale.TITLE, scale.COLUMNS, rows)])
 
 
 def _minutes(passes: int) -> str:
@@ -360,10 +360,12 @@ def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
     return [asdict(row) for row in rows]
 
 
-def _measured(benchmark: Any, fields: dict[str, Any]) -> Measured:
+def _measured(benchmark: Any, fields: dict[str, Any]) -> BenchResult:
     """What a benchmark, one of the modules here, found; its table shows the summary, where there is one."""
     rows = fields.get("summary", fields["rows"])
-    return Measured({**fields, "method": benchmark.METHOD}, [Section(benchmark.TITLE, benchmark.COLUMNS, rows)])
+    return BenchResult(
+        {**fields, "method": benchmark.METHOD}, [BenchTable(benchmark.TITLE, benchmark.COLUMNS, rows)]
+    )
 
 
 def _on_cpu(config: BenchTool) -> None:
@@ -377,11 +379,11 @@ def _frames(config: BenchTool, benchmark: Any) -> int:
 
 def _sheets(config: BenchTool) -> Path | None:
     """The folder for pictures, beside the results."""
-    targets = targets_of(config)
+    targets = output_paths(config)
     return None if targets is None else targets[0].with_suffix("")
 
 
-_MEASURES: dict[str, Callable[[Any, Console], Measured]] = {
+_MEASURES: dict[str, Callable[[Any, Console], BenchResult]] = {
     "derender": _derender,
     "parts": _parts,
     "depth": _depth,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.bench.tables import Columns
-from drivesem.config.blocks import DEMO
+from drivesem.config.options import DEMO
 from drivesem.data.registry import open_dataset
 from drivesem.report.drawing import write_picture
 from drivesem.synth.frames import SynthSettings, generate_frame
@@ -67,31 +67,33 @@ class Street:
     picture: Array
     plane: Tensor
     camera: Camera
-    ties: depth.Ties
+    ties: depth.DepthConstraints
 
     @staticmethod
     def of(scene: SceneIR) -> Street:
         """A scene's street."""
         picture = np.ascontiguousarray(scene.background.numpy().transpose(1, 2, 0))
         plane, camera, objects = scene.environment.ground, scene.camera, scene.objects
-        seen = segment.segment(picture, plane, camera)
+        seen = segment.segment_photograph(picture, plane, camera)
         count = len(objects)
         labels = Labels(
             ("Car",) * count, objects.box2d, objects.truncation, objects.occlusion,
             objects.translation, objects.yaw, objects.size_lhw, torch.zeros(0, 4),
         )  # fmt: skip
-        stood = maps.footprints(labels, list(range(count)), plane, camera)
-        return Street(picture, plane, camera, depth.Ties(seen.sky, seen.ground, stood, np.zeros_like(stood)))
+        stood = maps.draw_footprints(labels, list(range(count)), plane, camera)
+        return Street(
+            picture, plane, camera, depth.DepthConstraints(seen.sky, seen.ground, stood, np.zeros_like(stood))
+        )
 
     def guesses(self) -> dict[str, Array]:
         """Depths (H, W) m by name: what the depth that is used is made of, and what was used before."""
-        outlook, ties = depth.Outlook.of(self.picture, self.plane, self.camera), self.ties
+        outlook, ties = depth.GroundFrame.from_image(self.picture, self.plane, self.camera), self.ties
         horizon = maps.horizon_row(self.plane, self.camera)
         nearness = {
-            "walls, relaxed": depth.by_rule(outlook, ties),
-            "network alone": depth.by_network(outlook, ties.flat),
+            "walls, relaxed": depth.nearness_by_rule(outlook, ties),
+            "network alone": depth.nearness_by_network(outlook, ties.flat),
         }
-        guessed = maps.walls(outlook.plane_m, ties.flat, ties.stood, ties.sky, horizon)
+        guessed = maps.compute_wall_depth(outlook.plane_m, ties.flat, ties.footprint, ties.sky, horizon)
         without_sky = {name: outlook.depth_m(near * (1 - ties.sky)) for name, near in nearness.items()}
         return {"guessed walls": guessed, **without_sky}
 
@@ -155,7 +157,7 @@ def row_of(source: str, name: str, kind: str, found: Array, truth: Array | None,
     true = truth[known]
     guess = np.minimum(found[known], model.HAZE_CAP_M)
     error, ratio = np.abs(guess - true) / true, np.maximum(guess / true, true / guess)
-    up = true < 0.9 * maps.plane_depth(street.plane, street.camera)[known]
+    up = true < 0.9 * maps.compute_plane_depth(street.plane, street.camera)[known]
     near = ratio < 1.25
     figures = [float(m.mean()) for m in (error, near, error[up], near[up])]
     return DepthRow(source, name, kind, bands, *(round(figure, 4) for figure in figures))

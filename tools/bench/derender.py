@@ -35,7 +35,7 @@ from drivesem.synth.layout import Actor, Road, clearance, footprint
 from drivesem.synth.view import blocks
 from scene_ir import files
 from scene_ir.derender import silhouette
-from scene_ir.derender.derender import VEHICLES, DerenderSettings, derender
+from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings, derender
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
 from scene_ir.render import blend, surfaces
@@ -43,7 +43,7 @@ from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import Crop, Frame, Labels, SceneIR
 from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
-from tools.experiments.realism.closeness import PERCEPTUAL, Perception, Picture
+from tools.experiments.realism.perceptual import PERCEPTUAL, PerceptualDistance, Picture
 
 Mask = NDArray[np.bool_]
 
@@ -246,8 +246,8 @@ def _one_thread() -> None:
 
 
 @lru_cache(maxsize=1)
-def _perception() -> Perception:
-    return Perception()
+def _perception() -> PerceptualDistance:
+    return PerceptualDistance()
 
 
 def work(task: Task) -> DerenderRow:
@@ -330,7 +330,7 @@ def _promising(plan: Plan) -> bool:
     boxes, view = full_boxes(plan.actors, plan.setting.view), plan.setting.view
     inside = (boxes[:, 2] > 0) & (boxes[:, 0] < view.camera.width - 1)
     high = boxes[:, 3] - boxes[:, 1] >= LEAST_HEIGHT_PX
-    vehicles = np.array([a.label in VEHICLES for a in plan.actors], bool)
+    vehicles = np.array([a.label in VEHICLE_CATEGORIES for a in plan.actors], bool)
     return bool((inside & high & vehicles).any())
 
 
@@ -339,7 +339,7 @@ def eligible(truth: Truth) -> bool:
     height = truth.box_xyxy[3] - truth.box_xyxy[1]
     return (
         truth.labelled
-        and truth.actor.label in VEHICLES
+        and truth.actor.label in VEHICLE_CATEGORIES
         and height >= LEAST_HEIGHT_PX
         and truth.visible >= LEAST_VISIBLE
     )
@@ -521,7 +521,7 @@ def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
 def _removable(frame: SynthFrame) -> list[int]:
     """Tracks of the vehicles that must be found, and of those that show too little to be: whatever becomes of
     them, what they hide must not appear."""
-    vehicles = [t for t in frame.truths if t.actor.label in VEHICLES]
+    vehicles = [t for t in frame.truths if t.actor.label in VEHICLE_CATEGORIES]
     return [t.actor.track for t in vehicles if eligible(t) or t.visible < _HARDLY_SEEN]
 
 
@@ -635,7 +635,9 @@ def silhouettes(
             k = rows.index(track)
             kind = silhouette.rank_template_kinds(labels.kind[k], labels.size_lhw[k].tolist())[0]
             placed = silhouette.place_mesh(kind, labels.translation[k], labels.yaw[k], labels.size_lhw[k])
-            start = round(silhouette.mask_iou(silhouette.render_silhouettes([placed], frame.camera)[0], seen, hidden), 4)
+            start = round(
+                silhouette.mask_iou(silhouette.render_silhouettes([placed], frame.camera)[0], seen, hidden), 4
+            )
         yield Shape(
             track=track,
             kind=truth.actor.kind,

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from detectors.base import AnchorPredictions, Detector
 from detectors.registry import load_detector
-from drivesem.bench.scenes import bench_scene
+from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Budget, Clock, Spread, Taken, rounds
+from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
 from tools.bench import memory
 from tools.bench.probe import ProbeOrder, image_gradient, probe
 
@@ -78,17 +78,17 @@ def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Ite
     DetectorError for a detector that cannot be had or has no gradient, FormatError where the process that tells
     the memory ends without a result.
     """
-    photograph = bench_scene(_CARS, _TRIANGLES, seed).scene.photograph[None].float()
-    budget = Budget(seconds, len(names) * len(SIZES_HW))
+    photograph = build_bench_scene(_CARS, _TRIANGLES, seed).scene.photograph[None].float()
+    budget = TimeBudget(seconds, len(names) * len(SIZES_HW))
     for name in names:
         detector = load_detector(name, device)
         for size in SIZES_HW:
             image = F.interpolate(photograph, size, mode="bilinear").clamp(0, 1).to(device)
             image = image.contiguous(memory_format=torch.channels_last)
-            yield _row(name, detector, image, Clock(device), budget.share())
+            yield _row(name, detector, image, PairedTimer(device), budget.share())
 
 
-def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: float) -> DetectorRow:
+def _row(name: str, detector: Detector, image: Tensor, clock: PairedTimer, seconds: float) -> DetectorRow:
     height, width = image.shape[2:]
     with torch.no_grad():
         raw = detector(image)
@@ -104,13 +104,13 @@ def _row(name: str, detector: Detector, image: Tensor, clock: Clock, seconds: fl
     }
     for call in calls.values():
         call()
-    times: dict[str, list[Taken]] = {key: [] for key in calls}
-    for _ in rounds(seconds, _FEWEST, _MOST):
+    times: dict[str, list[CallTime]] = {key: [] for key in calls}
+    for _ in repetitions(seconds, _FEWEST, _MOST):
         for key, call in calls.items():
-            times[key].append(clock.taken(call))
-    median = {key: round(Spread.of([one.ms for one in found]).median, 3) for key, found in times.items()}
+            times[key].append(clock.time_call(call))
+    median = {key: round(Spread.from_values([one.ms for one in found]).median, 3) for key, found in times.items()}
     fastest = {key: round(min(one.ms for one in found), 3) for key, found in times.items()}
-    spent = {key: Spread.of([one.cpu_ms for one in found]).median for key, found in times.items()}
+    spent = {key: Spread.from_values([one.cpu_ms for one in found]).median for key, found in times.items()}
     return DetectorRow(
         detector=name,
         size=f"{width}x{height}",

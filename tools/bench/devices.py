@@ -19,7 +19,7 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Clock, Spread
+from drivesem.bench.timing import PairedTimer, Spread
 from drivesem.synth import frames as generated
 from drivesem.synth.frames import SPLITS, SynthSettings
 from scene_ir.derender.derender import derender
@@ -101,11 +101,11 @@ def _row(state: str, scene: SceneIR, number: int, there: Detector, here: Detecto
     (loss_there, gradient_there), (_, again) = other.loss_and_grad(moved), other.loss_and_grad(moved)
     gradient_there, again = gradient_there.cpu(), again.cpu()
     score, box = _apart(found, found_there)
-    clock, times = Clock(device), ([], [])
+    clock, times = PairedTimer(device), ([], [])
     for _ in range(_WARM_UP + _TIMES):
         for ms, objective, at in zip(times, (other, ours), (moved, theta), strict=True):
-            ms.append(clock.ms(partial(objective.loss_and_grad, at)))
-    step_ms, step_cpu_ms = (Spread.of(ms[_WARM_UP:]).median for ms in times)
+            ms.append(clock.milliseconds(partial(objective.loss_and_grad, at)))
+    step_ms, step_cpu_ms = (Spread.from_values(ms[_WARM_UP:]).median for ms in times)
     return DeviceRow(
         state=state,
         frame=f"{number:03d}",
@@ -142,7 +142,7 @@ def _looked(objective: Objective, theta: Tensor) -> tuple[Tensor, Detections]:
     """The picture (3, H, W) at theta, on the processor, and what is found in it, from t* on."""
     scene = objective.space.apply(objective.space.scene, theta)
     render = objective.compositor.render(scene)
-    found = objective.look(scene, render).detections
+    found = objective.evaluate_render(scene, render).detections
     counts = found.scores >= objective.t_star
     return render.image.cpu(), Detections(found.boxes_xyxy[counts], found.labels[counts], found.scores[counts])
 
@@ -186,8 +186,8 @@ def summary(rows: Sequence[DeviceRow]) -> list[dict[str, Any]]:
                 "found_off": max(row.found_off for row in chosen),
                 "score_off": max(row.score_off for row in chosen),
                 "box_off_px": max(row.box_off_px for row in chosen),
-                "step_ms": round(Spread.of([row.step_ms for row in chosen]).median, 2),
-                "step_cpu_ms": round(Spread.of([row.step_cpu_ms for row in chosen]).median, 2),
+                "step_ms": round(Spread.from_values([row.step_ms for row in chosen]).median, 2),
+                "step_cpu_ms": round(Spread.from_values([row.step_cpu_ms for row in chosen]).median, 2),
             }
         )
     return out

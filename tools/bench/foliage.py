@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.bench.tables import Columns
-from drivesem.config.edits import FOLIAGE_NAMES, FrameEdit
+from drivesem.config.edits import FOLIAGE_CODES, FrameEdit
 from drivesem.report.drawing import write_picture
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
@@ -36,8 +36,8 @@ METHOD = (
 )
 QUICK_FRAMES, FULL_FRAMES = 4, 24
 CODES: dict[str, FrameEdit] = {
-    f"{name} {code:g}": FrameEdit(foliage=tuple(code if i == at else 0.0 for i in range(len(FOLIAGE_NAMES))))
-    for at, name in enumerate(FOLIAGE_NAMES)
+    f"{name} {code:g}": FrameEdit(foliage=tuple(code if i == at else 0.0 for i in range(len(FOLIAGE_CODES))))
+    for at, name in enumerate(FOLIAGE_CODES)
     for code in (-1.0, -0.5, 0.5, 1.0)
 }
 _SEED = 83

@@ -22,10 +22,10 @@ from detectors.base import Predictor
 from detectors.registry import load_predictor
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller, SceneLabels
-from drivesem.attack.scene_edits import moved
+from drivesem.attack.scene_edits import apply_changes
 from drivesem.bench.tables import Columns
-from drivesem.config.blocks import SceneOptions
 from drivesem.config.edits import FrameEdit, ObjectEdit
+from drivesem.config.options import SceneOptions
 from drivesem.evaluation.resampling import wilson
 from drivesem.run.workers import run_jobs
 from drivesem.scenes.sources import SceneSource, open_source
@@ -272,7 +272,7 @@ class Moves:
         edits: dict[int | str, ObjectEdit] = {
             row: ObjectEdit(translate_m=(along, 0.0), rotate=turn) for row, (along, turn) in places.items()
         }
-        changed = moved(self._scene, FrameEdit(edits))
+        changed = apply_changes(self._scene, FrameEdit(edits))
         return None if check_places(self._scene, changed, range(len(self._scene.objects))) else changed
 
     def _drawn(self, changed: SceneIR) -> tuple[Tensor, SceneLabels]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from detectors.boxes import iou_matrix
 from detectors.types import Detections
-from drivesem.report.drawing import PAPER, TEXT_PX, text_extent, write_text
+from drivesem.report.drawing import PAPER_COLOUR, TEXT_PX, measure_text, write_text
 from tools.bench.sights import CAR, VEHICLES, Picture, View
 
 _TRUE, _GIVEN, _OTHER = (0, 158, 115), (240, 228, 66), (213, 94, 0)
@@ -48,9 +48,9 @@ def failure_sheet(before: View, after: View, row: int, caption: str) -> Picture:
                 told = f"{view.classes[int(label)]} {float(score):.2f}"
                 _draw(drawn, box, colour, told, (left, top, scale))
         panels.append(np.concatenate([plain, drawn]))
-    gap = np.full((panels[0].shape[0], _GAP_PX, 3), PAPER, np.uint8)
+    gap = np.full((panels[0].shape[0], _GAP_PX, 3), PAPER_COLOUR, np.uint8)
     picture = np.concatenate([panels[0], gap, panels[1]], axis=1)
-    head = np.full((text_extent(caption, TEXT_PX)[1] + _GAP_PX, picture.shape[1], 3), PAPER, np.uint8)
+    head = np.full((measure_text(caption, TEXT_PX)[1] + _GAP_PX, picture.shape[1], 3), PAPER_COLOUR, np.uint8)
     write_text(head, (2, 2), caption)
     return np.concatenate([head, picture])
 
@@ -63,6 +63,6 @@ def _draw(
     x0, y0, x1, y1 = ((box.cpu() + 0.5 - torch.tensor([left, top] * 2)) * scale).round().int().tolist()
     cv2.rectangle(canvas, (x0, y0), (x1, y1), colour, 2)
     if text:
-        wide, high = text_extent(text, TEXT_PX)
+        wide, high = measure_text(text, TEXT_PX)
         x, y = min(max(x0, 0), max(canvas.shape[1] - wide, 0)), min(max(y0 - high, 0), canvas.shape[0] - high)
         write_text(canvas, (x, y), text, colour)

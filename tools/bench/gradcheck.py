@@ -255,7 +255,7 @@ class SceneCheck:
     def differences(self, at: Point, parameter: Parameter) -> Differences:
         """Central differences of the float64 reference at a point, along random directions of one parameter."""
         theta, assignment, _ = self._at(at)
-        where = self.space.slice_of(parameter)
+        where = self.space.blocks.get(parameter)
         assert where is not None
         size = where.stop - where.start
         generator = _generator(self._seed, 2 + PAPER_PARAMETERS.index(parameter))
@@ -559,7 +559,7 @@ def _detector(name: str, device: str) -> SqueezeDet:
     try:
         detector = load_detector(name, device)
     except DetectorError as error:
-        raise UsageError.of("--detector", "a detector", error) from error
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if not isinstance(detector, SqueezeDet):
         raise UsageError("--detector", "one whose anchors can be held fixed: SqueezeDet", type(detector).__name__)
     return detector

@@ -158,7 +158,7 @@ def _commands(python: str, work: Path, attack: bool) -> Iterator[tuple[str, Sequ
 def _start(command: tuple[str, Sequence[str]], repetitions: int, folder: Path, run: Run) -> StartRow:
     name, words = command
     first, *others = (_timed(words, folder, run)[0] for _ in range(repetitions))
-    spread = Spread.of(others)
+    spread = Spread.from_values(others)
     return StartRow(name, repetitions, round(first, 2), round(spread.median, 2), round(spread.iqr, 2))
 
 

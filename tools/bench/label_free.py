@@ -17,9 +17,9 @@ from torch import Tensor
 
 from detectors.boxes import iou_matrix
 from drivesem.bench.tables import Columns
-from drivesem.config.blocks import DEMO
+from drivesem.config.options import DEMO
 from drivesem.run.workers import run_jobs
-from scene_ir.derender.derender import VEHICLES, DerenderSettings, placements
+from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings, place_vehicles
 from scene_ir.types import Camera, Frame, Labels
 from tools.bench.settings import BenchTool
 
@@ -130,9 +130,9 @@ def judge(frame: Frame, labels: Labels) -> FrameRows:
     bare = Frame(frame.identifier, frame.photograph, frame.camera)
     found = label_free(bare, detect(bare))
     assert found.labels is not None
-    fitted = placements(found, settings_for(DerenderSettings()))
+    fitted = place_vehicles(found, settings_for(DerenderSettings()))
     guess = found.labels
-    mine = [i for i, kind in enumerate(guess.kind) if kind in VEHICLES]
+    mine = [i for i, kind in enumerate(guess.kind) if kind in VEHICLE_CATEGORIES]
     wanted = judged(labels)
     overlap = iou_matrix(labels.boxes_xyxy[wanted].float(), guess.boxes_xyxy[mine]).numpy()
     rows = []
@@ -160,14 +160,14 @@ def judged(labels: Labels) -> list[int]:
         (height >= LEAST_HEIGHT_PX) & (labels.occlusion <= MOST_OCCLUSION) & (labels.truncation <= MOST_TRUNCATION)
     )
     posed = (labels.size_lhw > 0).all(1) & torch.isfinite(labels.yaw)
-    return [i for i, kind in enumerate(labels.kind) if kind in VEHICLES and bool(clear[i] & posed[i])]
+    return [i for i, kind in enumerate(labels.kind) if kind in VEHICLE_CATEGORIES and bool(clear[i] & posed[i])]
 
 
 def nearest(labels: Labels) -> list[int]:
     """Rows of the vehicles that are very near, whole or not."""
     height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
     clear = (height >= NEAR_PX) & (labels.occlusion <= MOST_OCCLUSION)
-    return [i for i, kind in enumerate(labels.kind) if kind in VEHICLES and bool(clear[i])]
+    return [i for i, kind in enumerate(labels.kind) if kind in VEHICLE_CATEGORIES and bool(clear[i])]
 
 
 def error(labels: Labels, row: int, translation: Tensor, yaw: float, camera: Camera) -> Error:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from drivesem.bench.scenes import bench_scene
+from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.tables import Columns
 from scene_ir.io import save_scene
 from tools.bench.probe import ProbeOrder, Resident, probe
@@ -90,7 +90,7 @@ def measure(case_list: Sequence[MemoryCase], seed: int, detector: str) -> Iterat
         for case in case_list:
             scene = folder / f"{case.cars}x{case.triangles}"
             if not scene.exists():
-                save_scene(bench_scene(case.cars, case.triangles, seed).scene, scene)
+                save_scene(build_bench_scene(case.cars, case.triangles, seed).scene, scene)
             order = ProbeOrder(detector, torch.get_num_threads(), str(scene), case.batch, case.steps, seed)
             if case.batch not in alone:
                 alone[case.batch] = probe("detector", order, _ASKER)

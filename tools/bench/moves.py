@@ -1,6 +1,6 @@
 """How far a car of a photograph can be moved until the picture no longer holds: moved cars beside the generator's.
 
-Budgets end where this table says so (docs/attacks.md).
+Budgets end where this table says so (docs/guide/attack.md).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivesem.run.workers import run_jobs
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, SynthFrame, Truth, render_frame
 from scene_ir import files
-from scene_ir.derender.derender import VEHICLES, derender
+from scene_ir.derender.derender import VEHICLE_CATEGORIES, derender
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 from tools.bench.derender import (
@@ -201,7 +201,7 @@ def changes(old: Truth, rng: np.random.Generator) -> Iterator[tuple[str, list[Mo
     for name in _BUDGETS:
         budget = PRESETS[name]
         distance_m = float(np.linalg.norm(old.translation))
-        along = min(budget.translate * length_m, budget.translate_m, budget.of_distance * distance_m)
+        along = min(budget.translate * length_m, budget.translate_m, budget.distance_share * distance_m)
         most = np.array([along, min(along, budget.across_m), budget.rotate, budget.size])
         drawn = rng.uniform(-most, most, (_TRIES, len(most))).tolist()
         yield f"anywhere in {name}", [Move(track, (x, z), turn, size) for x, z, turn, size in drawn]
@@ -222,7 +222,7 @@ def changed_case(case: Case, move: Move) -> Case | None:
 
 
 def _others(frame: SynthFrame, track: int) -> list[np.ndarray]:
-    return [t.box_xyxy for t in frame.truths if t.actor.label in VEHICLES and t.actor.track != track]
+    return [t.box_xyxy for t in frame.truths if t.actor.label in VEHICLE_CATEGORIES and t.actor.track != track]
 
 
 def _inside(truth: Truth, frame_hw: tuple[int, ...]) -> np.ndarray:

@@ -35,12 +35,12 @@ METHOD = (
 )
 PARTS: dict[str, Sequence[tuple[Any, str]]] = {
     "template and heading": [(stand, "likely")],
-    "what is whose pixel": [(taking._Looks, "at"), (taking._Looks, "cut")],
+    "what is whose pixel": [(taking._VehicleSegmenter, "at"), (taking._VehicleSegmenter, "cut")],
     "fit": [(silhouette, "fit")],
     "things in front": [(front, "labelled"), (front, "opacities")],
     "maps": [(segment, "segment")],
     "light and shadows": [(shadow, "light"), (taking, "_shaded")],
-    "fill behind": [(behind.Behind, "filled")],
+    "fill behind": [(behind.BackgroundFill, "filled")],
     "depth": [(depth, "surroundings")],
     "sources": [(taking, "solve_sources")],
     "paint": [(paint, "with_regions")],

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from scene_ir.errors import ShapeError
-from tools.experiments.realism.closeness import Mask, Picture
+from tools.experiments.realism.perceptual import Mask, Picture
 
 EXACT_DB = 99.0
 """Stands for the infinite PSNR of equal pixels, so that figures stay numbers."""

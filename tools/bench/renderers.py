@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.bench.scenes import Placed
+from drivesem.bench.scenes import PackedMeshes
 from scene_ir.raster import verbs
 from scene_ir.types import Camera
 
@@ -35,7 +35,7 @@ class UnavailableError(Exception):
 class RenderTask:
     """What to draw. colours (V, 3): random ones, one a vertex; weight (H, W, 3): the gradient that comes in."""
 
-    placed: Placed
+    placed: PackedMeshes
     camera: Camera
     colours: Tensor
     weight: Tensor

@@ -12,10 +12,10 @@ from multiprocessing import get_context
 
 import torch
 
-from drivesem.bench.render import SceneSize, Times, rounded, timed
-from drivesem.bench.scenes import BenchScene, Placed, bench_scene
+from drivesem.bench.render import RenderTimes, SceneSize, round_median, time_render
+from drivesem.bench.scenes import BenchScene, PackedMeshes, build_bench_scene
 from drivesem.bench.tables import Columns
-from drivesem.bench.timing import Budget, Clock
+from drivesem.bench.timing import PairedTimer, TimeBudget
 from scene_ir.types import convert_scene
 from tools.bench import renderers
 from tools.bench.renderers import RenderTask
@@ -70,16 +70,16 @@ class RivalRow:
 def measure(sizes: Sequence[SceneSize], seconds: float, seed: int, device: str) -> Iterator[RivalRow]:
     """A row a size of the project's verbs and of each other renderer, within about `seconds`."""
     names = list(renderers.RENDERERS)
-    budget = Budget(seconds, len(sizes) + len(names))
-    clock = Clock(device)
+    budget = TimeBudget(seconds, len(sizes) + len(names))
+    clock = PairedTimer(device)
     tasks: list[tuple[SceneSize, int, RenderTask]] = []
     for size in sizes:
         start = time.perf_counter()
-        bench = bench_scene(size.cars, size.triangles, seed, size.scale)
+        bench = build_bench_scene(size.cars, size.triangles, seed, size.scale)
         task = _task(bench, seed, device)
         tasks.append((size, bench.hit_pixels, task))
         own = renderers.own_verbs(task)
-        times = timed(own.forward, own.backward, clock, budget.share(time.perf_counter() - start))
+        times = time_render(own.forward, own.backward, clock, budget.share(time.perf_counter() - start))
         yield _row(OWN, size, bench.hit_pixels, own.shows, times)
     for name in names:
         yield from _rival_rows(name, tasks, budget.share(), device)
@@ -87,7 +87,7 @@ def measure(sizes: Sequence[SceneSize], seconds: float, seed: int, device: str) 
 
 def _task(bench: BenchScene, seed: int, device: str) -> RenderTask:
     scene = convert_scene(bench.scene, torch.float32, device)
-    placed = Placed.of(scene)
+    placed = PackedMeshes.from_scene(scene)
     generator = torch.Generator().manual_seed(seed)
     colours = torch.rand(placed.points.shape, generator=generator).to(placed.points)
     height, width = scene.camera.height, scene.camera.width
@@ -96,7 +96,7 @@ def _task(bench: BenchScene, seed: int, device: str) -> RenderTask:
 
 
 def _row(
-    backend: str, size: SceneSize, pixels: int, shows: str, times: Times, visible: int | None = None
+    backend: str, size: SceneSize, pixels: int, shows: str, times: RenderTimes, visible: int | None = None
 ) -> RivalRow:
     return RivalRow(
         backend=backend,
@@ -105,12 +105,12 @@ def _row(
         scale=size.scale,
         pixels=pixels,
         shows=shows,
-        forward_ms=rounded(times.forward),
+        forward_ms=round_median(times.forward),
         forward_iqr=round(times.forward.iqr, 3),
-        backward_ms=None if times.backward is None else rounded(times.backward),
+        backward_ms=None if times.backward is None else round_median(times.backward),
         backward_iqr=None if times.backward is None else round(times.backward.iqr, 3),
-        forward_backward_ms=None if times.both is None else rounded(times.both),
-        cpu_ms=rounded(times.spent),
+        forward_backward_ms=None if times.both is None else round_median(times.both),
+        cpu_ms=round_median(times.cpu),
         visible_pixels=visible,
     )
 
@@ -167,7 +167,7 @@ def _measure_rival(name: str, task: tuple[SceneSize, int, RenderTask], seconds: 
     except renderers.UnavailableError as error:
         return _unavailable(name, task, str(error))
     try:
-        times = timed(renderer.forward, renderer.backward, Clock(device), seconds)
+        times = time_render(renderer.forward, renderer.backward, PairedTimer(device), seconds)
         return _row(name, size, pixels, renderer.shows, times, renderer.hits(renderer.forward()))
     except Exception as error:  # whatever a library raises once it draws
         return _unavailable(name, task, f"{type(error).__name__}: {' '.join(str(error).split())}"[:160])

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 
 from drivesem.bench.tables import Columns
-from drivesem.config.blocks import WorkerOptions
+from drivesem.config.options import WorkerOptions
 from drivesem.run.workers import make_parallel_map
 from drivesem.synth.variations import MIXED
 from drivesem.synth.write import Order, synthesise

@@ -22,8 +22,8 @@ from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
 from drivesem.scenes.scene import demo_scene
 from drivesem.scenes.sources import scene_folders
-from drivesem.viewer.knobs import Knob
-from drivesem.viewer.server import HOST, Server, ShownFrame, Viewer
+from drivesem.viewer.server import HOST, Server, Viewer, ViewerFrame
+from drivesem.viewer.sliders import Slider
 from scene_ir.io import save_scene
 
 TITLE = "The viewer's answer to a slider"
@@ -81,13 +81,13 @@ def measure(scene: Path | None, detector: Predictor, states: int, seed: int) -> 
             save_scene(demo_scene(seed=seed).ir, folder)
         else:
             name, folder = next(iter(scene_folders(scene).items()))
-        viewer = Viewer(name, {name: ShownFrame(folder)}, detector, PRESETS[STREET])
+        viewer = Viewer(name, {name: ViewerFrame(folder)}, detector, PRESETS[STREET])
         with _served(viewer) as server:
-            stage = viewer.stage(name)
-            camera, cars = stage.knobs.rest.camera, len(stage.knobs.rest.objects)
+            stage = viewer.scene(name)
+            camera, cars = stage.sliders.rest.camera, len(stage.sliders.rest.objects)
             facts = (f"{camera.width} x {camera.height}", cars)
             wanted = [f"objects[{stage.focus}].{last}" for last in _LASTS]
-            knobs = [stage.knobs.knobs[n] for n in (*wanted, _SCENE) if n in stage.knobs.knobs]
+            knobs = [stage.sliders.sliders[n] for n in (*wanted, _SCENE) if n in stage.sliders.sliders]
             for knob in knobs:
                 times = _over_http(server, name, knob, states)
                 yield _row(knob, facts, "HTTP", *times)
@@ -100,13 +100,13 @@ def measure(scene: Path | None, detector: Predictor, states: int, seed: int) -> 
                         yield _row(knob, facts, "browser", *_in_browser(page, knob, states))
 
 
-def _values(knob: Knob, states: int) -> list[float]:
+def _values(knob: Slider, states: int) -> list[float]:
     """As many values, none of them 0, with one more to warm up on."""
     return [round(knob.high * (i + 1) / (states + 2), 4) for i in range(states + 1)]
 
 
 def _over_http(
-    server: Server, name: str, knob: Knob, states: int
+    server: Server, name: str, knob: Slider, states: int
 ) -> tuple[list[float], list[float], list[float] | None]:
     lines = [http.client.HTTPConnection(HOST, server.server_port, timeout=60) for _ in range(2)]
     found: list[tuple[float, float, float]] = []
@@ -140,21 +140,21 @@ def _get(line: http.client.HTTPConnection, path: str) -> float:
     return taken
 
 
-def _in_browser(page: Any, knob: Knob, states: int) -> tuple[list[float], list[float], None]:
+def _in_browser(page: Any, knob: Slider, states: int) -> tuple[list[float], list[float], None]:
     times = [page.evaluate(_ASK, [knob.name, value]) for value in _values(knob, states)][1:]
     page.evaluate(_ASK, [knob.name, 0])
     return [picture for picture, _ in times], [detections for _, detections in times], None
 
 
 def _row(
-    knob: Knob,
+    knob: Slider,
     facts: tuple[str, int],
     where: str,
     pictures: list[float],
     detections: list[float],
     cpu: list[float] | None,
 ) -> ViewerRow:
-    picture, found = Spread.of(pictures), Spread.of(detections)
+    picture, found = Spread.from_values(pictures), Spread.from_values(detections)
     return ViewerRow(
         slider=knob.name,
         size=facts[0],
@@ -165,7 +165,7 @@ def _row(
         picture_iqr_ms=round(picture.iqr, 1),
         detections_ms=round(found.median, 1),
         detections_iqr_ms=round(found.iqr, 1),
-        cpu_ms=None if cpu is None else round(Spread.of(cpu).median, 1),
+        cpu_ms=None if cpu is None else round(Spread.from_values(cpu).median, 1),
     )
 
 

@@ -20,12 +20,12 @@ from torch import Tensor
 
 from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
-from drivesem.attack.losses import of_detections
+from drivesem.attack.losses import candidates_from_detections
 from drivesem.attack.targets import resolve_t_star
 from drivesem.bench.tables import Columns
 from drivesem.config.edits import FrameEdit
 from drivesem.data.classes import VEHICLES
-from drivesem.failures.margin import object_margins
+from drivesem.failures.margins import object_margins
 from drivesem.report.drawing import write_picture
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
@@ -192,7 +192,7 @@ def _row(
 def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
     boxes = torch.tensor(np.stack([car.box_xyxy for car in shown]), dtype=torch.float32)
     labels = torch.tensor([int(VEHICLES[car.actor.label]) for car in shown])
-    found = of_detections(predict(detector, tensor_of(picture)[None])[0], len(detector.classes))
+    found = candidates_from_detections(predict(detector, tensor_of(picture)[None])[0], len(detector.classes))
     return object_margins(found, boxes, labels, boxes, resolve_t_star(detector))
 
 

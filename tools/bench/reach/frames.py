@@ -13,10 +13,10 @@ from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
-from drivesem.config.blocks import SceneOptions
 from drivesem.config.errors import UsageError
+from drivesem.config.options import SceneOptions
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.views import NuisanceMarginOracle
 from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
@@ -40,7 +40,7 @@ class ReachWorker:
         try:
             detector = load_detector(config.detector, config.device)
         except DetectorError as error:
-            raise UsageError.of("--detector", "a detector with gradients", error) from error
+            raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
         if type(detector).candidates is Detector.candidates:
             raise UsageError("--detector", "one that tells its candidates", detector.name)
         return cls(config, source, detector, None if config.out is None else Path(config.out) / "frames")

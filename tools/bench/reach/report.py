@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.report.plots import COLOURS, STYLE
+from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE
 from drivesem.report.tables import AnalysisReport, ReportTable
 from scene_ir import files
 from tools.bench.reach.agreement import ALL, ReachRow, Told
@@ -66,8 +66,10 @@ def write_reach(path: Path, rows: Sequence[ReachRow]) -> None:
     names = tuple(dict.fromkeys(row.row for row in rows))
     across = min(len(names), 4)
     down = -(-len(names) // across)
-    series = tuple(zip(_KINDS, (COLOURS[0], COLOURS[1], COLOURS[6]), ("-o", "--s", ":"), strict=True))
-    with mpl.rc_context(dict(STYLE)):  # pyright: ignore[reportArgumentType]
+    series = tuple(
+        zip(_KINDS, (PLOT_COLOURS[0], PLOT_COLOURS[1], PLOT_COLOURS[6]), ("-o", "--s", ":"), strict=True)
+    )
+    with mpl.rc_context(dict(PLOT_STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=(2.3 * across, 2.1 * down + 0.6), layout="constrained")
         panels = list(figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).flat)
         for panel, name in zip(panels, names, strict=False):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.base import Views
+from drivesem.attack.methods.base import MarginOracle
 from drivesem.attack.space import SPECS, Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError
@@ -64,7 +64,7 @@ def probes(space: ParameterSpace, generator: torch.Generator) -> tuple[Probe, ..
 
 
 def measure(
-    views: Views, feasible: FeasibleSet, tried: tuple[Probe, ...], draws: int, generator: torch.Generator
+    views: MarginOracle, feasible: FeasibleSet, tried: tuple[Probe, ...], draws: int, generator: torch.Generator
 ) -> tuple[Slopes, ...]:
     """Of all objects that are found as photographed, around theta0. Costs for each draw 6 passes a probe, and two
     gradients an object. Raises RangeError for a gradient that is not finite.
@@ -83,7 +83,7 @@ def measure(
     found: list[Slopes] = []
     for probe in tried:
         seen = torch.stack([_slopes(views, feasible, probe, steps, gradients, generator) for steps in STEPS])
-        for i in views.judged.nonzero()[:, 0].tolist():
+        for i in views.counted_objects.nonzero()[:, 0].tolist():
             wide, point, smoothed = (
                 tuple(tuple(None if math.isnan(one) else one for one in drawn) for drawn in kind.tolist())
                 for kind in seen[..., i].permute(2, 0, 1)
@@ -116,11 +116,11 @@ def _probe(space: ParameterSpace, row: str, name: str, where: slice, direction: 
     return Probe(row, name, ways)
 
 
-def _gradients(views: Views, space: ParameterSpace, theta: Tensor, draw: int) -> Tensor:
+def _gradients(views: MarginOracle, space: ParameterSpace, theta: Tensor, draw: int) -> Tensor:
     """Of each object's margin in a draw, at theta (D,): (N, D), 0 where one does not count."""
-    found = theta.new_zeros(len(views.judged), len(theta))
-    for i in views.judged.nonzero()[:, 0].tolist():
-        weights = torch.zeros(len(views.judged))
+    found = theta.new_zeros(len(views.counted_objects), len(theta))
+    for i in views.counted_objects.nonzero()[:, 0].tolist():
+        weights = torch.zeros(len(views.counted_objects))
         weights[i] = 1.0
         _, found[i] = views.margins_and_grad(theta, draw, weights)
         bad = (~torch.isfinite(found[i])).nonzero()
@@ -131,7 +131,7 @@ def _gradients(views: Views, space: ParameterSpace, theta: Tensor, draw: int) ->
 
 
 def _slopes(
-    views: Views,
+    views: MarginOracle,
     feasible: FeasibleSet,
     probe: Probe,
     steps: int,
