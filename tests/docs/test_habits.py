@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import drivesem
-from drivesem.doctor import PARTS
+from drivesem.commands.doctor import FEATURES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -57,7 +57,7 @@ def test_every_extra_is_documented() -> None:
     """An extra is named by `drivesem doctor` or by a page, or it brings tools of this repository."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert all(extras.values())
-    text = " ".join(part.bring for part in PARTS)
+    text = " ".join(part.bring for part in FEATURES)
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     text += " ".join(page.read_text(encoding="utf-8") for page in pages)
     named = set(re.findall(r"\[([a-z,]+)\]", text))
