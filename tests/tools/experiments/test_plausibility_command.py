@@ -14,7 +14,7 @@ import torch
 from drivesem.config.commands import AttackConfig
 from drivesem.config.options import to_yaml
 from drivesem.data.kitti import write_labels
-from drivesem.run.results import Coordinate, FrameResult, dump_frame
+from drivesem.run.results import SCHEMA, Coordinate, FrameResult, dump_frame
 from scene_ir import files
 from scene_ir.types import Labels
 from tools.experiments.__main__ import main
@@ -61,7 +61,7 @@ def run(tmp_path: Path) -> Path:
     folder = tmp_path / "run"
     frames = {"a": (labels(YAW, 20, 30), labels(TURNED, 20, 30)), "b": (labels(YAW, 25), labels(YAW, 25))}
     files.write_text(folder / "config.yaml", to_yaml(AttackConfig(out=str(folder))))
-    files.write_json(folder / "metrics.json", {"params": ["rotate"], "t_star": 0.5})
+    files.write_json(folder / "metrics.json", {"schema": SCHEMA, "params": ["rotate"], "t_star": 0.5})
     files.write_json(folder / "manifest.json", {"frames": {name: {} for name in frames}})
     for name, (before, after) in frames.items():
         part = folder / "frames" / name
@@ -118,7 +118,7 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         capsys.readouterr()
         assert main(["plausibility", *map(str, words)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        return line.removeprefix("drivesem: ")
+        return line.removeprefix("python -m tools.experiments: ")
 
     assert refused() == "--run: expected a folder of drivesem attack, found nothing"
     assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")

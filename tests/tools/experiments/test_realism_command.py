@@ -140,7 +140,7 @@ def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
 
 def test_bounds_of_psnr_swap_with_those_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """A small error is a large PSNR, and no error an infinite one."""
-    monkeypatch.setattr(comparison, "intervals", lambda *_: [Interval("", 25.0, 0.0, 100.0)])
+    monkeypatch.setattr(comparison, "bootstrap_intervals", lambda *_: [Interval("", 25.0, 0.0, 100.0)])
     part = comparison.PictureRegion(None, "", {"psnr": dict.fromkeys(comparison.PAIRS, 25.0)}, {})
     row = comparison.realism_rows([comparison.FrameRegions("a", (part,))], ["psnr"], 1, 0)[0]
     assert (row.low, row.high) == (pytest.approx(20 * np.log10(25.5)), None)

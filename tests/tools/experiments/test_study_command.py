@@ -151,7 +151,7 @@ def test_without_a_second_renderer_nothing_is_attacked(
     def nothing() -> None:
         raise NoSecondRendererError("pyrender", "EGL or OSMesa", "neither")
 
-    monkeypatch.setattr("drivesem.failures.second_renderer.selection.shared_screen", nothing)
+    monkeypatch.setattr("drivesem.failures.second_renderer.selection.shared_context", nothing)
     for _ in synthesise(Order(tmp_path / "data", 1, seed=3, split="heldout")):
         pass
     (tmp_path / "data" / "manifest.json").unlink()  # now nobody knows that they were generated
@@ -206,7 +206,6 @@ def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "NAME|single"),
         (["fifty"], "fifty|invalid choice"),
         (["single", "--steps", "0"], "--steps: expected at least 1, found 0"),
         (["samples", "--queries", "0"], "--queries: expected at least 1, found 0"),

@@ -148,7 +148,7 @@ def test_results(survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
         line["item"]: line for line in csv.DictReader((survey / "results" / "survey.csv").read_text().splitlines())
     }
     assert (lines[one]["answers"], lines[one]["realism_mean"]) == ("3", "7.0")
-    assert "| named rightly, % | 80.0" in (survey / "results" / "survey.md").read_text()
+    assert "| named correctly, % | 80.0" in (survey / "results" / "survey.md").read_text()
 
 
 def test_bad_input(survey: Path, tmp_path: Path, refused: Callable[..., str]) -> None:

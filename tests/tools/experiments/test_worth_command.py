@@ -131,7 +131,7 @@ def fingerprints(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         found.append(order.detector)
         return real(order, predictor)
 
-    monkeypatch.setattr(looking, "fingerprint", read)
+    monkeypatch.setattr(looking, "detector_fingerprint", read)
     return found
 
 

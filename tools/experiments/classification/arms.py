@@ -8,9 +8,9 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.classify.attack import WRITTEN, Attacker, frames_of
-from drivesem.classify.pictures import Shown
-from drivesem.classify.results import ClassifiedFrame
+from drivesem.classify.attack import WRITTEN, Attacker, load_picture_results
+from drivesem.classify.pictures import ObjectView
+from drivesem.classify.results import ClassifiedPicture
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.presets import find_presets
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
@@ -52,7 +52,7 @@ class ClassificationArm:
 
     config: ClassifyConfig
     """Its settings, with its folder."""
-    views: tuple[Shown, ...]
+    views: tuple[ObjectView, ...]
     """Its pictures."""
 
     @property
@@ -60,9 +60,9 @@ class ClassificationArm:
         """Its folder."""
         return Path(self.config.out or "")
 
-    def frames(self, views: Sequence[Shown]) -> list[ClassifiedFrame]:
+    def frames(self, views: Sequence[ObjectView]) -> list[ClassifiedPicture]:
         """Results of some of its pictures."""
-        return frames_of(self.out, views)
+        return load_picture_results(self.out, views)
 
 
 @cache
@@ -96,13 +96,13 @@ class _ArmAttackers:
         self._arms = arms
         self._attackers: dict[int, Attacker] = {}
 
-    def __call__(self, job: tuple[int, Shown]) -> None:
+    def __call__(self, job: tuple[int, ObjectView]) -> None:
         place, view = job
         arm = self._arms[place]
         if place not in self._attackers:
             # share with one on the same network, or else with any
             others = sorted(self._attackers.values(), key=lambda one: one.config.network != arm.config.network)
-            self._attackers[place] = Attacker.of(arm.config, next(iter(others), None))
+            self._attackers[place] = Attacker.from_config(arm.config, next(iter(others), None))
         self._attackers[place].attack(view, arm.out)
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.training import embedded
+from drivesem.classify.training import compute_features
 from drivesem.report.terminal import Console, training_progress_bar
 from drivesem.run.detection_cache import weights_digest
 from scene_ir import files
@@ -75,7 +75,7 @@ class NetworkFeatures:
         def compute() -> Mapping[str, np.ndarray]:
             images = torch.from_numpy(np.stack([files.read_image(path) for path in paths])).permute(0, 3, 1, 2)
             title = f"features of {self.name}, {name}"
-            return {"features": embedded(self.network, images, self.device, title).cpu().numpy()}
+            return {"features": compute_features(self.network, images, self.device, title).cpu().numpy()}
 
         path = self.folder / FEATURES / f"{self.name}-{name}.npz"
         return torch.from_numpy(load_or_compute(path, self.cache_key(paths), compute)["features"]).to(self.device)

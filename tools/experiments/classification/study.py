@@ -15,15 +15,15 @@ import torch
 from torch import Tensor
 
 from drivesem.analysis.transfer.run import split_list
-from drivesem.classify.attack import report_run
+from drivesem.classify.attack import write_run_report
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectSet, Split
-from drivesem.classify.paper import NETWORKS
-from drivesem.classify.pictures import Shown, Studio, draw
+from tools.experiments.classification.paper import NETWORKS
+from drivesem.classify.pictures import ObjectView, ObjectRenderer, draw
 from drivesem.classify.scenes import VIEWS, open_backgrounds
-from drivesem.classify.training import embedded, fit_last
+from drivesem.classify.training import compute_features, train_last_layer
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.report.tables import AnalysisReport
@@ -115,9 +115,9 @@ class ClassificationStudy:
     """The networks."""
     tables: tuple[str, ...]
     """Tables to make."""
-    test: tuple[Shown, ...]
+    test: tuple[ObjectView, ...]
     """Pictures to test on."""
-    train: tuple[Shown, ...]
+    train: tuple[ObjectView, ...]
     """Pictures to train on."""
     arms: dict[tuple[str, str, str], ClassificationArm] = field(
         default_factory=dict[tuple[str, str, str], ClassificationArm]
@@ -158,12 +158,12 @@ class ClassificationStudy:
         return any(name in self.tables for name in names)
 
     @cached_property
-    def usable(self) -> tuple[Shown, ...]:
+    def usable(self) -> tuple[ObjectView, ...]:
         """Test pictures that could be used in all arms."""
         return tuple(one for one in self.test if one.identifier not in self.failed)
 
     @cached_property
-    def retested(self) -> tuple[Shown, ...]:
+    def retested(self) -> tuple[ObjectView, ...]:
         """Pictures on which retrained networks are attacked; classes keep their shares."""
         rng = np.random.default_rng(self.study.seed)
         places = sample_stratified(self.labels(self.usable), self.study.fresh or len(self.usable), rng)
@@ -181,7 +181,7 @@ class ClassificationStudy:
         """Indices of the training pictures that counterexamples replace."""
         return draw_half(len(self.train), self.study.seed)
 
-    def labels(self, views: Sequence[Shown]) -> list[int]:
+    def labels(self, views: Sequence[ObjectView]) -> list[int]:
         """Class indices of pictures."""
         return [self.classes.index(one.name.partition("/")[0]) for one in views]
 
@@ -210,14 +210,14 @@ class ClassificationStudy:
         for key, arm in self.arms.items():
             if key[0] == "test":
                 seconds = sum(frame.seconds for frame in arm.frames(self.usable))
-                report_run(arm.config, arm.out, self.classes, self.usable, {}, seconds)
+                write_run_report(arm.config, arm.out, self.classes, self.usable, {}, seconds)
 
     def _add(
         self,
         kind: str,
         network: NetworkFeatures,
         strategy: str,
-        views: Sequence[Shown],
+        views: Sequence[ObjectView],
         name: str,
         **settings: Any,
     ) -> None:
@@ -231,7 +231,7 @@ class ClassificationStudy:
         if not self.wants(*RETRAINED_TABLES):
             return
         config = arm_config(self.study, self.out, "", self.networks[0].spec)
-        studio = Studio.of(config)
+        studio = ObjectRenderer.from_config(config)
         self.failed |= draw(self.train, studio, config, self.out / PICTURES).failed
         usable = [i for i, one in enumerate(self.train) if one.identifier not in self.failed]
         views = [self.train[i] for i in usable]
@@ -284,7 +284,7 @@ class ClassificationStudy:
             kind = "test" if other == BENIGN else f"against {other}"
         arm = self.arms[kind, network, GRADIENT_STRATEGIES[0] if strategy == BENIGN else strategy]
         frames = arm.frames(views)
-        return np.array([one.right_before if strategy == BENIGN else one.right_after for one in frames])
+        return np.array([one.correct_before if strategy == BENIGN else one.correct_after for one in frames])
 
     def distances(self, what: str, network: str, strategy: str, metric: str) -> Floats:
         """See `ResultSource`."""
@@ -335,7 +335,7 @@ class ClassificationStudy:
             attacked = attack_pixels(network.network, images / np.float32(255), np.array(labels))
             arrays: dict[str, np.ndarray] = {}
             for name, after in attacked.items():
-                features = embedded(network.network, torch.from_numpy(after), self.study.device, name)
+                features = compute_features(network.network, torch.from_numpy(after), self.study.device, name)
                 arrays[name] = classify_features(network.network, features, labels)
                 pairs = zip(before, after.transpose(0, 2, 3, 1), strict=True)
                 arrays[f"{name} apart"] = np.array([self.measures["perceptual"](a, b) for a, b in pairs])
@@ -377,14 +377,14 @@ class ClassificationStudy:
         )
 
 
-def _picture_paths(arm: ClassificationArm, views: Sequence[Shown]) -> tuple[list[Path], list[Path]]:
+def _picture_paths(arm: ClassificationArm, views: Sequence[ObjectView]) -> tuple[list[Path], list[Path]]:
     """An arm's pictures before and after."""
     folders = [arm.out / FRAMES / one.identifier for one in views]
     return [one / "benign.png" for one in folders], [one / "counterexample.png" for one in folders]
 
 
-def _sample_views(objects: ObjectSet, split: Split, size: int, seed: int) -> tuple[Shown, ...]:
-    every = [Shown(split, name, view) for name, view in product(objects.names(split), VIEWS)]
+def _sample_views(objects: ObjectSet, split: Split, size: int, seed: int) -> tuple[ObjectView, ...]:
+    every = [ObjectView(split, name, view) for name, view in product(objects.names(split), VIEWS)]
     if not every:
         raise UsageError("--objects", f"objects to {split}", "none")
     labels = [objects.classes.index(one.name.partition("/")[0]) for one in every]
@@ -426,7 +426,7 @@ def retrain_last_layer(
         config = ClassifyConfig(what="train", epochs=EPOCHS, layers="last")
         truth = labels.to(device)
         known, labelled = {"train": features, "val": features}, {"train": truth, "val": truth}
-        fit_last(learner, known, labelled, config, torch.Generator().manual_seed(seed), onward=True)
+        train_last_layer(learner, known, labelled, config, torch.Generator().manual_seed(seed), onward=True)
         save_classifier(prepare_for_inference(learner, device), path, {"trained_on": str(len(labels))})
     return load_classifier(str(path), network.classes, device)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.classify.objects.types import CLASSES, SPLITS
-from drivesem.classify.paper import NETWORKS, REMARKS, figures
+from tools.experiments.classification.paper import NETWORKS, REMARKS, paper_tables
 from drivesem.evaluation.resampling import Interval
 from drivesem.report.tables import ReportTable
 from tools.experiments.classification.arms import (
@@ -130,7 +130,7 @@ def _overall(results: ClassificationResults, answers: Predictions) -> Row:
         **interval_columns("overall", answers.overall(results.bootstrap), 5),
     }
     if results.facts.classes == CLASSES:
-        sizes = [counts[0] for counts in figures()["sizes"].values()]
+        sizes = [counts[0] for counts in paper_tables()["sizes"].values()]
         found |= interval_columns("at_paper_sizes", answers.overall(results.bootstrap, sizes), 5)
     return found
 
@@ -150,7 +150,7 @@ def _paper(table: str, *names: str) -> Iterator[tuple[Row, Any]]:
         else:
             yield {"network": NETWORKS[keys[0]], **dict(zip(names, keys[1:], strict=True))}, node
 
-    return walk(figures()[table], ())
+    return walk(paper_tables()[table], ())
 
 
 def _by_class(values: Sequence[float]) -> Row:
@@ -165,7 +165,7 @@ def _degradation(results: ClassificationResults) -> ResultTable:
         for one, answers in ours.items():
             row = {"network": network.name, "strategy": one, **_with_classes(results, answers)}
             rows.append(row | {"certain": None if one == BENIGN else results.count_certain(network, one)})
-        paper = {one: figures()["degradation"][network.paper_network][one][-1] for one in STRATEGIES}
+        paper = {one: paper_tables()["degradation"][network.paper_network][one][-1] for one in STRATEGIES}
         orders += _order(results, "degradation", network, paper, ours)
     reference = [row | _by_class(values) for row, values in _paper("degradation", "strategy")]
     columns = ("network", "strategy", *results.facts.classes, "overall", "at_paper_sizes", "certain")
@@ -184,7 +184,7 @@ def _parameters(results: ClassificationResults) -> ResultTable:
         }
         row = {"network": network.name, "strategy": strategy}
         rows += [row | {"params": params, **_overall(results, one)} for params, one in ours.items()]
-        paper: dict[str, float] = dict(zip(_COMPARED, figures()["parameters"]["vgg16"][strategy], strict=True))
+        paper: dict[str, float] = dict(zip(_COMPARED, paper_tables()["parameters"]["vgg16"][strategy], strict=True))
         orders += _order(results, f"parameters, {STRATEGY_NAMES[strategy]}", network, paper, ours)
     reference = [
         row | {"params": params, "overall": value}
@@ -205,7 +205,7 @@ def _hyperparameters(results: ClassificationResults) -> ResultTable:
             arms = "test" if paper_network == network.paper_network else paper_network
             answers = results.predictions("attacked", network, strategy, arms)
             rows.append({"network": network.name, **settings, **_overall(results, answers)})
-        value = figures()["degradation"][paper_network][strategy][-1]
+        value = paper_tables()["degradation"][paper_network][strategy][-1]
         reference.append({"network": NETWORKS[paper_network], **settings, "overall": value})
     columns = ("network", "strategy", "settings", *_SETTINGS, "overall")
     notes = REMARKS["hyperparameters"]
@@ -228,7 +228,7 @@ def _learners(
             rows.append(row | {"pictures": len(results.predictions(what, network, BENIGN, one).correct)})
         for i, test in enumerate(TESTS):
             paper = {
-                one: figures()[table][network.paper_network][one][i] for one in (BENIGN, *GRADIENT_STRATEGIES)
+                one: paper_tables()[table][network.paper_network][one][i] for one in (BENIGN, *GRADIENT_STRATEGIES)
             }
             ours = {one: results.predictions(what, network, test, one) for one in paper}
             pairs = _order(results, f"{table}, on {STRATEGY_NAMES[test]}", network, paper, ours)
@@ -350,7 +350,7 @@ def _sizes(results: ClassificationResults) -> ResultTable:
     reference = [
         {"class": f"{one} (paper)"}
         | {f"{split} objects": n for split, n in zip(("test", "train", "val"), counts, strict=True)}
-        for one, counts in figures()["sizes"].items()
+        for one, counts in paper_tables()["sizes"].items()
     ]
     columns = ("class", *(f"{split} objects" for split in SPLITS), "train pictures", "test pictures")
     return ResultTable("sizes", "Sizes", columns, rows, reference, plain=True)

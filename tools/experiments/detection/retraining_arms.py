@@ -17,8 +17,8 @@ from drivesem.config.commands import DEFAULT_COMBO, RetrainConfig
 from drivesem.config.constraints import parse_size_hw
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO
-from drivesem.data.joined import open_folders
 from drivesem.data.registry import Dataset, open_dataset
+from drivesem.data.subsets import open_folders
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.terminal import Console
 from drivesem.run.attack import AttackWorker

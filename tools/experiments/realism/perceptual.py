@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from detectors.registry import load_detector
 from detectors.squeezedet import BGR_MEAN, Fire, SqueezeDet
-from drivesem.classify.networks.published import vgg16_convolutions
+from drivesem.classify.networks.architectures import vgg16_convolutions
 from scene_ir import files
 from scene_ir.errors import ShapeError
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivesem.classify.objects.types import CLASSES
-from drivesem.classify.paper import figures
+from tools.experiments.classification.paper import paper_tables
 from drivesem.evaluation.resampling import Interval
 from tools.experiments.classification.tables import _judge_order
 
@@ -29,9 +29,9 @@ def test_overall_is_weighed_by_class_sizes():
 
 @pytest.mark.parametrize("table", ["degradation", "transfer"])
 def test_the_papers_own_overall_figures_are_weighed_by_its_sizes(table):
-    sizes = np.array([counts[0] for counts in figures()["sizes"].values()])
-    assert tuple(figures()["sizes"]) == CLASSES
-    rows = [row for strategies in figures()[table].values() for row in strategies.values()]
+    sizes = np.array([counts[0] for counts in paper_tables()["sizes"].values()])
+    assert tuple(paper_tables()["sizes"]) == CLASSES
+    rows = [row for strategies in paper_tables()[table].values() for row in strategies.values()]
     assert len(rows) == {"degradation": 16, "transfer": 6}[table]
     for row in rows:
         assert sizes @ row[:-1] / sizes.sum() == pytest.approx(row[-1], abs=1.6e-3)
@@ -60,7 +60,7 @@ def test_a_subset_keeps_shares_by_hand():
 
 
 def test_232_of_the_papers_pictures():
-    sizes = [counts[0] for counts in figures()["sizes"].values()]
+    sizes = [counts[0] for counts in paper_tables()["sizes"].values()]
     labels = np.repeat(np.arange(12), sizes)
     kept = labels[sample_stratified(list(labels), 232, np.random.default_rng(1))]
     assert list(np.bincount(kept)) == [49, 29, 7, 8, 98, 4, 1, 5, 3, 2, 6, 20]

@@ -15,7 +15,7 @@ from torch import nn
 
 from drivesem.classify import pictures, scenes
 from drivesem.classify.networks import loading
-from drivesem.classify.training import fit_last
+from drivesem.classify.training import train_last_layer
 from drivesem.config.commands import ClassifyConfig
 from scene_ir import files
 from tests.drivesem.classify.conftest import Colours
@@ -215,9 +215,9 @@ def test_training_on_begins_where_the_network_is():
         before = network.last(features)
     known, truth = dict.fromkeys(("train", "val"), features), dict.fromkeys(("train", "val"), labels)
     config = ClassifyConfig(what="train", epochs=1, rate=1e-9)
-    fit_last(network, known, truth, config, generator, onward=True)
+    train_last_layer(network, known, truth, config, generator, onward=True)
     assert torch.allclose(network.last(features), before, atol=1e-4)
-    fit_last(network, known, truth, config, generator)
+    train_last_layer(network, known, truth, config, generator)
     assert not torch.allclose(network.last(features), before, atol=1e-2)
 
 

@@ -28,9 +28,9 @@ from scene_ir.errors import SceneError
 from scene_ir.io import SCHEMA, VERSION
 from scene_ir.types import Labels
 from tools.experiments.detection import retraining_arms
-from tools.experiments.detection.attribution import OURS
 from tools.experiments.detection.retraining import prepare_retraining
 from tools.experiments.detection.retraining_arms import (
+    OURS,
     RETRAINING_ARMS,
     FrameDivision,
     FrameSubset,

@@ -18,7 +18,7 @@ from detectors.types import CLASSES
 from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
 from drivesem.analysis.transfer.matrix import SourceRun, TransferCounts, TransferTarget
 from drivesem.config.commands import AttackConfig
-from drivesem.data.virtual import KINDS
+from drivesem.data.vkitti import KINDS
 from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.matched_class import FALSE, IGNORED, TRUE, ThresholdMatches
 from drivesem.failures.grades import Grade, Kind, SecondOpinion

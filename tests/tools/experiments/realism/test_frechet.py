@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
-from tools.experiments.classification.features import FEATURES
 from tools.experiments.realism.feature_networks import Inception
 from tools.experiments.realism.metrics import Gaussian, frechet_distance
 
@@ -147,7 +146,7 @@ def test_inception_equals_its_second_writing(original: bool) -> None:
     net = random_inception(original)
     image = torch.rand(1, 3, 60, 90, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     found = net(image)
-    assert found.shape == (1, FEATURES)
+    assert found.shape == (1, 2048)
     expected = ByHand(dict(net.state_dict()), original).features(image)
     torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
     other = ByHand(dict(net.state_dict()), not original).features(image)

@@ -83,7 +83,7 @@ def test_what_is_shipped(no_cache: Path) -> None:
 def test_only_the_published_networks_bear_the_published_names() -> None:
     named = {name for name, metric in METRICS.items() if "LPIPS" in metric.name or "FID" in metric.name}
     assert named == {"lpips-alex", "lpips-vgg", "lpips-squeeze", "fid"}
-    assert weights.FILES[METRICS["fid"].needs or ""].pattern.startswith("pt_inception-2015-12-05")
+    assert weights.WEIGHT_FILES[METRICS["fid"].needs or ""].pattern.startswith("pt_inception-2015-12-05")
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from tools.experiments.worth.measures import (
     points_from_detections,
     points_from_probabilities,
     realism,
+    worth_interval,
 )
 
 CAR, NOTHING = CLASSES.index("Car"), len(CLASSES)
@@ -123,14 +124,14 @@ def test_gain() -> None:
         setting = WorthSettings(kind, weighted=False)
         same = information_gain(worse, worse, setting)
         assert (same.value, same.low, same.high) == (0, 0, 0)
-        gain, worth = information_gain(worse, right, setting), information_worth(worse, setting)
+        gain, worth = information_gain(worse, right, setting), worth_interval(worse, setting)
         assert gain.value == pytest.approx(worth.value)
         assert worth.value is not None
         assert worth.value > 0
         back = information_gain(right, worse, setting)
         assert back.value == pytest.approx(-worth.value)
     one = points_from_probabilities(np.array([[0.9, 0.1]]), label[:1])
-    assert information_worth(one, WorthSettings("binary", weighted=False)).low is None
+    assert worth_interval(one, WorthSettings("binary", weighted=False)).low is None
     with pytest.raises(ShapeError, match="the same 4 labels"):
         information_gain(
             worse,
@@ -150,7 +151,7 @@ def test_intervals_hold_what_all_pictures_are_worth() -> None:
     for _ in range(100):
         answer = np.array([rng.choice(classes, p=answers[one]) for one in label])
         shown = points_from_probabilities(one_hot(answer, classes), label)
-        found = information_worth(replace(shown, unit=unit), setting)
+        found = worth_interval(replace(shown, unit=unit), setting)
         assert found.value is not None
         assert found.low is not None
         assert found.high is not None
@@ -240,10 +241,10 @@ def test_what_detection_is_worth() -> None:
     half = points_from_detections(targets(), found((0, "Car", 1.0)), 0.5)
     for kind in ("binary", "fractional"):
         setting = WorthSettings(kind, weighted=True)
-        assert information_worth(perfect, setting).value == 0
-        assert information_worth(blind, setting).value == pytest.approx(math.log(2))
+        assert worth_interval(perfect, setting).value == 0
+        assert worth_interval(blind, setting).value == pytest.approx(math.log(2))
         # one subset of 1 car, one of 2 cars and 3 empty places
-        assert information_worth(half, setting).value == pytest.approx(5 / 6 * entropy(2 / 5, 3 / 5))
+        assert worth_interval(half, setting).value == pytest.approx(5 / 6 * entropy(2 / 5, 3 / 5))
         assert information_gain(blind, perfect, setting).value == pytest.approx(math.log(2))
 
 
@@ -257,7 +258,7 @@ def test_false_detections_beyond_the_empty_places_are_left_out() -> None:
     seen = found(*((x, "Car", 0.9) for x in range(300, 1000, 100)))
     points = points_from_detections(targets(), seen, 0.5)
     assert len(points.label) == 6
-    assert information_worth(points, WorthSettings("binary", weighted=False)).value == 0  # tidy, and all wrong
+    assert worth_interval(points, WorthSettings("binary", weighted=False)).value == 0  # tidy, and all wrong
 
 
 def test_frames_without_objects_and_realism_of_empty_places() -> None:
@@ -272,4 +273,4 @@ def test_frames_without_objects_and_realism_of_empty_places() -> None:
     both = join_points([none, three])
     assert both.unit.tolist() == [1] * 6
     assert isinstance(both, MembershipPoints)
-    assert information_worth(join_points([none]), WorthSettings("binary", weighted=False)).value is None
+    assert worth_interval(join_points([none]), WorthSettings("binary", weighted=False)).value is None

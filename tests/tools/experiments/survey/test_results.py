@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivesem.data.virtual import alpha
-from tools.experiments.survey.results import interval_distance, nominal_distance
+from tools.experiments.survey.results import interval_distance, krippendorff_alpha, nominal_distance
 
 # Four observers, twelve units, 0 where one said nothing (Krippendorff, Computing ... Alpha-Reliability, 2011).
 EXAMPLE = (
@@ -18,21 +17,21 @@ UNITS = [[value for value in unit if value] for unit in zip(*EXAMPLE, strict=Tru
 
 
 def test_the_published_example() -> None:
-    assert alpha(UNITS, nominal_distance) == pytest.approx(0.743, abs=5e-4)
-    assert alpha(UNITS, interval_distance) == pytest.approx(0.849, abs=5e-4)
+    assert krippendorff_alpha(UNITS, nominal_distance) == pytest.approx(0.743, abs=5e-4)
+    assert krippendorff_alpha(UNITS, interval_distance) == pytest.approx(0.849, abs=5e-4)
 
 
 def test_bounds() -> None:
-    assert alpha([[1, 1], [5, 5, 5], [9, 9]], interval_distance) == 1
+    assert krippendorff_alpha([[1, 1], [5, 5, 5], [9, 9]], interval_distance) == 1
     # two people who always disagree: worse than chance
-    worst = alpha([["a", "b"], ["b", "a"]], nominal_distance)
+    worst = krippendorff_alpha([["a", "b"], ["b", "a"]], nominal_distance)
     assert worst == pytest.approx(-0.5)
-    assert alpha([[2, 4], [4, 2], [2, 4]], interval_distance) == alpha(
+    assert krippendorff_alpha([[2, 4], [4, 2], [2, 4]], interval_distance) == krippendorff_alpha(
         [[20, 40], [40, 20], [20, 40]], interval_distance
     )
 
 
 def test_undefined() -> None:
-    assert alpha([], nominal_distance) is None
-    assert alpha([["a"], []], nominal_distance) is None
-    assert alpha([["a", "a"], ["a", "a"]], nominal_distance) is None
+    assert krippendorff_alpha([], nominal_distance) is None
+    assert krippendorff_alpha([["a"], []], nominal_distance) is None
+    assert krippendorff_alpha([["a", "a"], ["a", "a"]], nominal_distance) is None
