@@ -81,7 +81,7 @@ class Neighbourhood:
         self._objective, self._feasible, self._theta, self.index = objective, feasible, theta, index
         self._box = UnitBox(objective.problem(feasible), objective.space.theta0)
         self._own = ((self._box.owner == index) | (self._box.owner < 0)).nonzero()[:, 0]
-        mine = (self._box.holder == index) | (self._box.holder < 0)
+        mine = (self._box.theta_owner == index) | (self._box.theta_owner < 0)
         self._mine = mine.to(theta.device)
         self._span = reach * (objective.space.upper - objective.space.lower)
         renderer = CompositorRenderer(objective.compositor, objective.labeller)

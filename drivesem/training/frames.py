@@ -168,7 +168,7 @@ def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[s
         difficulty: Limits of the objects.
         classes: Names of the classes.
     """
-    labels = ROAD_USERS.known(labels)
+    labels = ROAD_USERS.drop_unknown(labels)
     targets = ROAD_USERS.targets(labels)
     ignore = targets.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
@@ -186,7 +186,7 @@ def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence
         difficulty: Limits of the objects.
         classes: Names of the classes.
     """
-    labels = ROAD_USERS.known(labels)
+    labels = ROAD_USERS.drop_unknown(labels)
     named = ROAD_USERS.targets(labels)
     ignore = named.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)

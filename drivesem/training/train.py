@@ -26,9 +26,8 @@ from drivesem.config.constraints import parse_integers, parse_interval, parse_si
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.config.options import format_command_line
-from drivesem.data.joined import open_folders
 from drivesem.data.registry import Dataset, open_dataset
-from drivesem.data.splits import chosen
+from drivesem.data.subsets import open_folders, select_split
 from drivesem.report.terminal import Console, training_progress_bar
 from drivesem.run.folder import SHARING, claim_folder
 from drivesem.run.workers import make_parallel_map
@@ -267,7 +266,7 @@ def _store(
 ) -> FrameStore:
     dataset = open_folders(name, str(root))
     if split is not None:
-        dataset = chosen(dataset, split)
+        dataset = select_split(dataset, split)
     names = dataset.identifiers if whole else dataset.identifiers[: config.limit]
     if not names:
         raise UsageError(str(root), "at least one frame", "none")

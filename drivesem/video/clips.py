@@ -12,11 +12,11 @@ from drivesem.config.commands import DerenderConfig
 from drivesem.config.devices import memory_gb
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO, WorkerOptions
-from drivesem.data.clips import Clip, clip_of, clips_in
+from drivesem.data.subsets import Clip, find_clips, select_clip
 from drivesem.report.tables import format_count
 from drivesem.run.derender import RECORD
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
-from drivesem.scenes.sources import derender_settings, make_ready
+from drivesem.scenes.sources import compile_source_kernels, derender_settings
 from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings, derender, place_vehicles
 from scene_ir.derender.silhouette import Placement, place_mesh, rank_template_kinds
 from scene_ir.errors import FormatError, SceneError
@@ -91,7 +91,7 @@ class _LabelledFrames:
     """
 
     def __init__(self, source: ClipSource) -> None:
-        self._clip = clip_of(clips_in(source.folder or ""), source.name)
+        self._clip = select_clip(find_clips(source.folder or ""), source.name)
         self.name = self._clip.name
         self.names = self._clip.frames[: source.limit]
         self._fit = source.fit
@@ -102,7 +102,7 @@ class _LabelledFrames:
         labels, tracks = _load_labels(self._clip, name), self._clip.tracks(name)
         known = [self._place_vehicle(labels, row, track) for row, track in enumerate(tracks)]
         frame = self._clip.dataset.frame(name)
-        scene = derender(frame, replace(DerenderSettings.fast(), known=tuple(known)))
+        scene = derender(frame, replace(DerenderSettings.fast(), known_placements=tuple(known)))
         return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
 
     def camera(self) -> Camera | None:
@@ -192,7 +192,9 @@ def derender_clip(work: ClipDerenderer, workers: WorkerOptions) -> DerenderedCli
     _check_memory(work.frames)
     todo = [name for name in names if not (out / name / RECORD).is_file()]
     if todo:
-        make_ready(DerenderConfig(dataset=DEMO if source.folder is None else "kitti", root=source.folder))
+        compile_source_kernels(
+            DerenderConfig(dataset=DEMO if source.folder is None else "kitti", root=source.folder)
+        )
     failed = run_frame_jobs(
         todo,
         work,

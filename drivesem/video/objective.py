@@ -13,13 +13,12 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.base import ParameterGroup, Problem, Score
 from drivesem.attack.objective import Objective, RenderEvaluation
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
-from drivesem.config.commands import DriveConfig
+from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.evaluation.failures import match_detections
 from drivesem.video.clips import DerenderedClip
 from drivesem.video.space import ClipSpace, project_clip
 from scene_ir import ffd
 from scene_ir.render.compositor import Compositor
-from scene_ir.render.prepare import RenderSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,16 +52,11 @@ class ClipObjective:
         budget: Budget,
         config: DriveConfig,
     ) -> None:
+        settings = AttackConfig(
+            objective_labels=config.objective_labels, objective=config.objective, t_star=config.t_star, whole=True
+        )
         self.frames = [
-            Objective(
-                Compositor(scene, RenderSettings()),
-                ParameterSpace(scene, params, budget),
-                detector,
-                config.objective_labels,
-                config.objective,
-                t_star=config.t_star,
-                whole=True,
-            )
+            Objective(Compositor(scene), ParameterSpace(scene, params, budget), detector, settings)
             for scene in clip.scenes
         ]
         self.space = ClipSpace([objective.space for objective in self.frames], clip.tracks, config.bend)

@@ -174,7 +174,7 @@ class _ClipRecorder:
             for row, offset in enumerate(self.objective.space.path_offsets(theta, frame).tolist()):
                 along, across = (round(value, 4) for value in offset)
                 self._path.setdefault(self.clip.tracks[frame][row], {})[frame] = (along, across)
-            wrong = tuple(check_scene(scene, after.rendered.scene, reach=reach))
+            wrong = tuple(check_scene(scene, after.rendered.scene, limits=reach))
             if wrong:
                 self.violations[name] = wrong
             for row in after.lost:

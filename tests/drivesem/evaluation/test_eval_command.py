@@ -428,7 +428,7 @@ def test_a_detectors_frames_are_shared_and_one_that_cannot_be_used_is_listed(
     assert "--root: expected frames that can be used, found none" in text
     code, _, text = run("--gt", "a", "--pred", "b", "--engine", "ray")
     assert code == 2
-    assert "--engine: expected --detector beside it, found none" in text
+    assert "--engine: expected --detector, found none" in text
 
 
 def test_a_detectors_mistakes_are_drawn_worst_first(run: Run, tmp_path: Path, kitti_with_images: Path):

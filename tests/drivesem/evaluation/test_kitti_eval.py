@@ -164,7 +164,7 @@ def metrics(make_truths, make_found):
 def test_one_object_found(metrics):
     one = metrics([(0, "Car", BOX, 0.0, 0)], [(0, "Car", BOX, 0.9)])
     # one threshold: precision 1 at recall 0 and nowhere else
-    assert (one.ground_truth, one.r11(), one.r40()) == (1, pytest.approx(1 / 11), 0.0)
+    assert (one.object_count, one.r11(), one.r40()) == (1, pytest.approx(1 / 11), 0.0)
 
 
 def test_forty_objects_found_of_forty(metrics):
@@ -228,7 +228,7 @@ def test_what_counts_at_each_difficulty(metrics, box, truncation, occlusion, cou
     found = [(0, "Car", box, 0.9)]
     for difficulty, number in zip(DIFFICULTIES, counted, strict=True):
         one = metrics(truth, found, difficulty=difficulty)
-        assert one.ground_truth == number
+        assert one.object_count == number
         assert (one.r11() is None) == (number == 0)
 
 
@@ -237,7 +237,7 @@ def test_neighbours_are_neither_missed_nor_hit(metrics, neighbour, name):
     truth = [(0, name, BOX, 0.0, 0), (0, neighbour, EMPTY, 0.0, 0)]
     missed = metrics(truth, [(0, name, BOX, 0.5)], name)
     hit = metrics(truth, [(0, name, EMPTY, 0.9), (0, name, BOX, 0.5)], name)
-    assert missed.ground_truth == 1
+    assert missed.object_count == 1
     assert missed.precision()[0] == hit.precision()[0] == 1.0
 
 

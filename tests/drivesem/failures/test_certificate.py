@@ -138,7 +138,7 @@ class Sees:
     calls = 0
 
     def forward(self, images: Tensor) -> Tensor:
-        self.asked += 1
+        self.calls += 1
         return images
 
     def decode(self, raw: Tensor) -> list[Detections]:

@@ -9,7 +9,7 @@ from detectors.incremental.reference import LIMIT_MB
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace
-from drivesem.attack.targets import TargetSelection
+from drivesem.config.commands import AttackConfig
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
 from drivesem.synth.demo import demo_scene
@@ -48,7 +48,7 @@ def test_the_aim_leaves_others_out(objective: Objective, views: NuisanceMarginOr
         objective.compositor,
         objective.space,
         objective.detector,
-        aim=TargetSelection(objects=(first,), classes=None),
+        AttackConfig(target_objects=str(first)),
     )
     assert NuisanceMarginOracle.for_objective(
         aimed, Nuisances(), "any"
@@ -90,7 +90,9 @@ def test_gradients_against_differences(objective: Objective) -> None:
 def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, detector = demo_scene(0, 0), load_detector("squeezedet")
     space = ParameterSpace(scene, ("color", "translate"))
-    of_regions, of_all = (Objective(Compositor(scene), space, detector, whole=whole) for whole in (False, True))
+    of_regions, of_all = (
+        Objective(Compositor(scene), space, detector, AttackConfig(whole=whole)) for whole in (False, True)
+    )
     regional, whole = (NuisanceMarginOracle.for_objective(o, Nuisances(), "search") for o in (of_regions, of_all))
     generator = torch.Generator().manual_seed(0)
     places = [torch.rand(space.dim, generator=generator) * space.upper for _ in range(3)]
@@ -133,7 +135,9 @@ def test_weather_has_no_regions(objective: Objective) -> None:
 def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
     scene = demo_scene(0, 0)
     space = ParameterSpace(scene, ("translate",))
-    objective = Objective(Compositor(scene), space, load_detector("squeezedet"), keep_mb=LIMIT_MB + 1.0)
+    objective = Objective(
+        Compositor(scene), space, load_detector("squeezedet"), AttackConfig(keep_mb=LIMIT_MB + 1.0)
+    )
     views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
     cached = []
     for number in range(2):
@@ -145,8 +149,8 @@ def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
 def test_the_benign_picture_counts_and_one_picture_keeps_no_more_than_the_process() -> None:
     scene, detector = demo_scene(0, 0), load_detector("squeezedet")
     space = ParameterSpace(scene, ("translate",))
-    whole = Objective(Compositor(scene), space, detector, whole=True)
-    tight = Objective(Compositor(scene), space, detector, keep_mb=10.0)
+    whole = Objective(Compositor(scene), space, detector, AttackConfig(whole=True))
+    tight = Objective(Compositor(scene), space, detector, AttackConfig(keep_mb=10.0))
     views = NuisanceMarginOracle.for_objective(tight, Nuisances(), "search")
     theta = 0.1 * space.upper
     loss, gradient = tight.loss_and_grad(theta)

@@ -38,7 +38,7 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
 def test_validation_chooses_and_held_out_frames_judge(
     tmp_path: Path, frames: list[str], kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """t* is that of the validation frames, whatever is judged by; the card says which figures are of which."""
+    """t* is that of the validation frames, not that of the held-out ones; the card names the frames of each metric."""
     validation = kitti_folder(tmp_path / "validation", 3, seed=2)
     runs = []
     for name, words in (("chosen", ["--held-out", str(validation)]), ("both", ["--validation", str(validation)])):
@@ -54,7 +54,7 @@ def test_validation_chooses_and_held_out_frames_judge(
     assert "chosen on\nthem too" in alone
     again = ["train", *frames, "--validation", frames[-1], *STEPS, "--out", str(tmp_path / "again")]
     assert main(again) == 0
-    assert "chooses the weights and t* too: its figures are optimistic" in capsys.readouterr().err
+    assert "also selects the weights and t*: its metrics are optimistic" in capsys.readouterr().err
     assert main(["train", *frames[:2], "--validation", str(validation)]) == 2
     assert "--held-out: expected frames to judge by, beside --validation" in capsys.readouterr().err
 
@@ -96,7 +96,7 @@ def test_frames_that_are_trained_on_and_judged_by_are_told(
     folder, other = kitti_folder(tmp_path / "train", 2), kitti_folder(tmp_path / "other", 2, seed=1)
     words = ["train", "--root", f"{other},{folder}", *STEPS, "--steps", "1", "--held-out"]
     assert main([*words, str(folder / ".." / "train"), "--out", str(tmp_path / "a")]) == 0
-    assert "is trained on too: its figures, and t*, say nothing of other pictures" in capsys.readouterr().err
+    assert "is also trained on: its metrics and t* do not apply to other images" in capsys.readouterr().err
     apart = kitti_folder(tmp_path / "apart", 2, seed=2)
     assert main([*words, str(apart), "--out", str(tmp_path / "b")]) == 0
     assert "is trained on too" not in capsys.readouterr().err

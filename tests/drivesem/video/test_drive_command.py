@@ -40,8 +40,8 @@ def finished(taken: DerenderedClip, tmp_path_factory: pytest.TempPathFactory) ->
     """A command on a clip that is taken apart already."""
     out = tmp_path_factory.mktemp("drive") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(running, "Taker", lambda *_: None)
-        patch.setattr(running, "take_clip", lambda *_: taken)
+        patch.setattr(running, "ClipDerenderer", lambda *_: None)
+        patch.setattr(running, "derender_clip", lambda *_: taken)
         assert main([*WORDS, "--limit", "3", "--out", str(out)]) == 0
     return out
 
@@ -114,7 +114,7 @@ def test_a_clip_that_memory_cannot_hold_is_refused(
     assert main(["drive", "--limit", "30", "--out", str(tmp_path / "out")]) == 2
     output = capsys.readouterr().err.strip()
     assert output.endswith(
-        "CLIP: frames: expected at most 6 frames, as memory of 0.5 GB holds (--limit takes the first), found 30"
+        "CLIP: frames: expected at most 6 frames, which fit into 0.5 GB of memory (--limit takes the first), found 30"
     )
     assert not (tmp_path / "out" / "scenes").exists()
 
@@ -166,8 +166,8 @@ def test_a_slider_shows_frames_in_a_browser(chromium: Any, finished: Path) -> No
     ("words", "message"),
     [
         (["none"], "none: expected a folder of clips: Virtual KITTI"),
-        (["--sequence", "0001"], "--sequence: expected a CLIP beside it, found 0001"),
-        (["--combo", "1", "--params", "mesh"], "--params: expected no --combo beside it"),
+        (["--sequence", "0001"], "--sequence: expected a CLIP, found none"),
+        (["--combo", "1", "--params", "mesh"], "--params: expected no --combo, found --combo 1"),
         (["--params", "wheels"], "wheels"),
         (["--bend", "9"], "--bend: expected 0 to 5, found 9"),
         (["--params", "sun"], "params: sun"),

@@ -52,5 +52,5 @@ def test_the_table_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
 
 def test_one_is_told_as_one(tmp_path: Path) -> None:
     output = format_summary(_result(tmp_path, 1, (3, "Car")))
-    for part in ("of 1 sight of 1 car missed", ", 1 phantom (", "in 1 of 1 frame; 1 query, 1 pass, "):
+    for part in ("of 1 sighting of 1 car missed", ", 1 phantom (", "in 1 of 1 frame; 1 query, 1 pass, "):
         assert part in output

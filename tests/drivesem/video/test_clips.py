@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from drivesem.data.clips import Clip
+from drivesem.data.subsets import Clip
 from drivesem.video import clips as taking
 from drivesem.video.clips import ClipDerenderer, ClipSource
 from scene_ir.derender.derender import DerenderSettings
@@ -73,8 +73,8 @@ def taker(
             return street([(-2.0, 15.0), (3.0, 20.0)])
 
         clip = Clip("clip", Drive(*damaged), NAMES, lambda _: TRACKS)
-        monkeypatch.setattr(taking, "clips_in", lambda _: {"clip": clip})
-        monkeypatch.setattr(taking, "placements", shapes)
+        monkeypatch.setattr(taking, "find_clips", lambda _: {"clip": clip})
+        monkeypatch.setattr(taking, "place_vehicles", shapes)
         monkeypatch.setattr(taking, "derender", derender)
         return ClipDerenderer(ClipSource("folder", None, None, 0, False, keep_going), tmp_path), meshes
 

@@ -164,7 +164,7 @@ def test_the_worst_of_four_on_real_pictures(
         raw = detector(worst.images(0))
         with monkeypatch.context() as patch:
             patch.setattr(
-                "drivesem.training.failure_neighbourhoods.of_background", lambda *_: torch.tensor(float("inf"))
+                "drivesem.training.failure_neighbourhoods.background_margin", lambda *_: torch.tensor(float("inf"))
             )
             objects.append(float(worst.term(detector, raw, 0).detach()))
         nothing.append(float(worst.term(detector, raw, 0).detach()) - objects[-1])
@@ -191,7 +191,7 @@ def test_consistency_on_real_pictures(around: FailureNeighbourhoods, monkeypatch
         margins = iter(map(torch.tensor, pair))
         with monkeypatch.context() as patch:
             patch.setattr(
-                "drivesem.training.failure_neighbourhoods.of_background", lambda *_, margins=margins: next(margins)
+                "drivesem.training.failure_neighbourhoods.background_margin", lambda *_, margins=margins: next(margins)
             )
             output[name] = float(once.term(detector, raw, 0).detach())
     assert output["nearer"] == pytest.approx(output["alike"] + 2.5), "background is nearer to a phantom than it was"
