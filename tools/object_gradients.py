@@ -26,8 +26,8 @@ from torch import Tensor
 
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.embedded import open_objects
-from drivesem.classify.scenes import SEEN_PX, VIEWS, ObjectScene, generated_background
-from drivesem.classify.space import Amounts, Moved, ObjectSpace
+from drivesem.classify.scenes import SEEN_PX, VIEWS, ObjectScene, generate_background
+from drivesem.classify.space import ClassifyParameter, ObjectSpace, ParameterAmounts
 
 STEPS = {"vertex": 1e-4, "pose": 1e-3, "lighting": 1e-2}
 """Object sizes, rad, shares."""
@@ -111,12 +111,14 @@ def main() -> None:
     )
     for word in told.names or usual:
         name, _, view = word.partition(":")
-        scene = ObjectScene(name, objects.load(name), view or views[0], generated_background(name))
+        scene = ObjectScene(name, objects.load(name), view or views[0], generate_background(name))
         for parameter in told.params:
-            space = ObjectSpace(scene.vertices, (Moved(parameter),), Amounts(0.002, 0.15, 0.2))
+            space = ObjectSpace(
+                scene.vertices, (ClassifyParameter(parameter),), ParameterAmounts(0.002, 0.15, 0.2)
+            )
 
             def picture(theta: Tensor, scene: ObjectScene = scene, space: ObjectSpace = space) -> Tensor:
-                return scene.picture(space.change(theta))
+                return scene.render(space.change(theta))
 
             def score(picture: Tensor, label: int = scene.model.label) -> Tensor:
                 return network(picture[None])[0, label]

@@ -20,12 +20,11 @@ import cv2
 import numpy as np
 import torch
 
-from drivesem.classify.confirm import open_renderer
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectSet
-from drivesem.classify.pictures import Shown
-from drivesem.classify.redraw.base import Solid, likeness
-from drivesem.classify.scenes import VIEWS, ObjectScene, camera, generated_background
+from drivesem.classify.pictures import ObjectView
+from drivesem.classify.scenes import VIEWS, ObjectScene, generate_background, picture_camera
+from drivesem.classify.second_renderer import PosedObject, measure_agreement, open_second_renderer
 from scene_ir import files
 from scene_ir.io import to_uint8
 
@@ -40,9 +39,9 @@ def row(objects: ObjectSet, names: list[str], views: list[str], size: int) -> np
     for name in names:
         model = objects.load(name)
         for view in views:
-            identifier = Shown("test", name, view).identifier
-            scene = ObjectScene(identifier, model, view, generated_background(identifier))
-            picture = to_uint8(scene.picture().clamp(0, 1))
+            identifier = ObjectView("test", name, view).identifier
+            scene = ObjectScene(identifier, model, view, generate_background(identifier))
+            picture = to_uint8(scene.render().clamp(0, 1))
             tiles.append(cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA))
     return np.hstack(tiles)
 
@@ -50,16 +49,16 @@ def row(objects: ObjectSet, names: list[str], views: list[str], size: int) -> np
 @torch.no_grad()
 def beside(objects: ObjectSet, second: str) -> np.ndarray:
     """The sheet of both renderers: in each of three columns the own picture, then the other."""
-    renderer, rows, found = open_renderer(second), [], []
+    renderer, rows, found = open_second_renderer(second), [], []
     for place, kind in enumerate(objects.classes):
         names = [name for name in objects.names("test") if name.startswith(f"{kind}/")]
         for name, view in zip(names, list(VIEWS)[place % 2 :: 2], strict=False):
-            scene = ObjectScene(name, objects.load(name), view, generated_background(name))
-            own = scene.mesh.render(scene.placed(), camera(), scene.lights())
-            other = renderer.draw(Solid.of(scene))
-            found.append(likeness(scene, own, other))
+            scene = ObjectScene(name, objects.load(name), view, generate_background(name))
+            own = scene.mesh.render(scene.camera_vertices(), picture_camera(), scene.lights())
+            other = renderer.render(PosedObject.from_scene(scene))
+            found.append(measure_agreement(scene, own, other))
             print(f"{name} {view}: silhouettes IoU {found[-1].iou:.4f}, colours Delta E {found[-1].colour:.2f}")
-            rows.append(np.hstack([to_uint8(scene.shown(drawn).clamp(0, 1)) for drawn in (own, other)]))
+            rows.append(np.hstack([to_uint8(scene.composite(drawn).clamp(0, 1)) for drawn in (own, other)]))
     ious, colours = [one.iou for one in found], [one.colour for one in found]
     print(
         f"{second}, {len(found)} views: IoU {np.mean(ious):.4f} in the mean, {min(ious):.4f} at least; "

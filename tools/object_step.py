@@ -15,15 +15,15 @@ import argparse
 
 import torch
 
-from drivesem.attack.methods.si_fgsm import SiFGSM
-from drivesem.bench.timing import Clock, Spread, Taken
+from drivesem.attack.methods.gradient_ascent import SiFGSM
+from drivesem.bench.timing import CallTime, PairedTimer, Spread
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.networks.loading import ARCHITECTURES, ready
-from drivesem.classify.objective import ClassifierObjective, aim
+from drivesem.classify.networks.loading import ARCHITECTURES, prepare_for_inference
+from drivesem.classify.objective import ClassifierObjective, compute_attack_loss
 from drivesem.classify.objects.embedded import open_objects
-from drivesem.classify.scenes import ObjectScene, generated_background
-from drivesem.classify.space import Amounts, Moved, ObjectSpace
-from drivesem.run.allocation import keep_freed
+from drivesem.classify.scenes import ObjectScene, generate_background
+from drivesem.classify.space import ClassifyParameter, ObjectSpace, ParameterAmounts
+from drivesem.run.jobs import keep_freed_memory
 
 USUAL = ("bus/0080:top", "helmet/0080:right")
 STEPS = 5
@@ -35,11 +35,13 @@ class Stepping:
 
     def __init__(self, scene: ObjectScene, network: Classifier) -> None:
         self.scene, self.network = scene, network
-        self.space = ObjectSpace(scene.vertices, (Moved.VERTEX, Moved.POSE), Amounts(0.002, 0.15, 0.2))
+        self.space = ObjectSpace(
+            scene.vertices, (ClassifyParameter.VERTEX, ClassifyParameter.POSE), ParameterAmounts(0.002, 0.15, 0.2)
+        )
         self.objective = ClassifierObjective(scene, self.space, network, "logit")
         chance = torch.rand(self.space.dim, generator=torch.Generator().manual_seed(0))
         self.theta = self.space.step * (chance - 0.5)
-        self.seen = self.objective.picture(self.theta)
+        self.seen = self.objective.render(self.theta)
         self.gradient = torch.randn(self.seen.shape, generator=torch.Generator().manual_seed(1))
 
     def whole(self) -> None:
@@ -48,19 +50,21 @@ class Stepping:
     def drawing(self) -> None:
         """The picture, and from a gradient of it to theta."""
         leaf = self.theta.clone().requires_grad_(True)
-        picture = self.scene.picture(self.space.change(leaf))
+        picture = self.scene.render(self.space.change(leaf))
         torch.autograd.grad(picture, leaf, self.gradient)
 
     def looking(self) -> None:
         """The network's score, and its gradient to the picture."""
         leaf = self.seen.clone().requires_grad_(True)
-        torch.autograd.grad(aim(self.network(leaf[None])[0], self.scene.model.label, "logit"), leaf)
+        torch.autograd.grad(
+            compute_attack_loss(self.network(leaf[None])[0], self.scene.model.label, "logit"), leaf
+        )
 
-    def attack(self) -> Taken:
+    def attack(self) -> CallTime:
         """Five steps, from a new objective."""
         objective = ClassifierObjective(self.scene, self.space, self.network, "logit")
         search = SiFGSM(STEPS, early_stop=False)
-        return Clock().taken(lambda: search(objective.problem(), self.space.theta0, 0))
+        return PairedTimer().time_call(lambda: search(objective.problem(), self.space.theta0, 0))
 
 
 def main() -> None:
@@ -72,22 +76,22 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--threads", type=int, help="of torch and of the kernels")
     told = parser.parse_args()
-    keep_freed()
+    keep_freed_memory()
     if told.threads is not None:
         torch.set_num_threads(told.threads)
     objects = open_objects(told.objects)
     torch.manual_seed(0)
-    network = ready(ARCHITECTURES[told.network](objects.classes))
+    network = prepare_for_inference(ARCHITECTURES[told.network](objects.classes))
     for word in told.names:
         name, _, view = word.partition(":")
-        scene = ObjectScene(name, objects.load(name), view or "forward", generated_background(name))
-        stepping, clock = Stepping(scene, network), Clock()
+        scene = ObjectScene(name, objects.load(name), view or "forward", generate_background(name))
+        stepping, clock = Stepping(scene, network), PairedTimer()
         parts = (stepping.whole, stepping.drawing, stepping.looking)
         for part in parts:
             part()  # what is loaded once
-        taken = [[clock.taken(part).cpu_ms for part in parts] for _ in range(told.rounds)]
-        step, drawing, looking = (Spread.of(column) for column in zip(*taken, strict=True))
-        share = Spread.of([100 * drawn / (drawn + looked) for _, drawn, looked in taken])
+        taken = [[clock.time_call(part).cpu_ms for part in parts] for _ in range(told.rounds)]
+        step, drawing, looking = (Spread.from_values(column) for column in zip(*taken, strict=True))
+        share = Spread.from_values([100 * drawn / (drawn + looked) for _, drawn, looked in taken])
         attack = stepping.attack()
         print(
             f"{word}, {len(scene.mesh.faces)} triangles, {told.network}: renderer {share.median:.1f} % "

@@ -1,4 +1,4 @@
-"""`drivesem classify gate`: another network, in the poses around a run's certain failures."""
+"""`drivesem classify gate`: compares a new network with a run's, in poses around the run's certain failures."""
 
 from __future__ import annotations
 
@@ -6,69 +6,71 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivesem.analysis.gate import PairedSamples, build_gate_report, compute_gate_rows
-from drivesem.classify.attack import network_of
-from drivesem.classify.finished import ClassifyRun, FailureWorker, ask_of_failures
-from drivesem.classify.holes import Poses
-from drivesem.classify.objective import Seen
+from drivesem.classify.analysis import ClassifyRun, FailureAnalyser, analyse_failures
+from drivesem.classify.holes import PoseSampler
+from drivesem.classify.networks.loading import open_network
+from drivesem.classify.objective import ClassLogits
 from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.failures.grades import Grade
 from drivesem.failures.neighbourhood import NEAR_REACH
 from drivesem.report.tables import AnalysisReport
 
-_WORDS = (
-    "wrong",
-    "Wrong: share of poses around a certain failure in which a network misclassifies the object; both see the "
+_VERB = "wrong"
+_NOTE = (
+    "Wrong: share of poses around a certain failure in which a network misclassifies the object; both get the "
     "same pictures. In brackets: 95 % by paired bootstrap, over poses of one failure, and over failures for "
-    "classes and for all. p: exact sign test of the poses in which one network alone is wrong, Holm's over all "
-    "rows. A row grew where the difference is above the tolerance, its interval above 0, and p below 0.05.",
+    "classes and for all. p: exact sign test of the poses in which only one network is wrong, with Holm's correction "
+    "over all rows. A row grew if the difference is above the tolerance, its interval above 0, and p below 0.05."
 )
 
 
 @dataclass(frozen=True, slots=True)
-class FramePair:
-    """One failure before two networks. source: digest of the run's result."""
+class PairedPoseSamples:
+    """Samples around one failure, classified by both networks."""
 
     identifier: str
+    """The picture."""
     source: str
+    """Digest of its result in the run."""
     pair: PairedSamples
+    """The samples."""
 
 
-class GateWorker(FailureWorker[FramePair]):
-    """Shows poses around a failure to both networks."""
+class NetworkGateAnalyser(FailureAnalyser[PairedPoseSamples]):
+    """Classifies poses around certain failures with both networks."""
 
-    question, file, kind = "gate", "pair.json", FramePair
-    grades, needs_some, free = (Grade.CERTAIN, Grade.CONFIRMED), False, ("tolerance",)
+    command, file, kind = "gate", "pair.json", PairedPoseSamples
+    grades, needs_failures, free = (Grade.CERTAIN, Grade.CONFIRMED), False, ("tolerance",)
     renews = True
 
     def __init__(self, config: ClassifyConfig, run: ClassifyRun, out: Path) -> None:
         super().__init__(config, run, out)
-        self.after = network_of(config.network, self.attacker.network.classes, config.device)
+        self.new_network = open_network(config.network, self.attacker.network.classes, config.device)
 
-    def analyse(self, name: str, source: str, folder: Path) -> FramePair:
-        """See `FailureWorker`."""
-        poses = Poses(self, name)
-        objective = poses.objective
+    def analyse(self, name: str, source: str, folder: Path) -> PairedPoseSamples:
+        """See `FrameAnalyser.analyse`."""
+        sampler = PoseSampler(self, name)
+        objective = sampler.objective
         wrong: list[tuple[bool, bool]] = []
         for number in range(self.config.samples):
-            # One half near the failure: a hole may be small beside its neighbourhood.
-            bounds = poses.bounds(self.config.reach * (1.0 if number % 2 == 0 else NEAR_REACH))
-            picture = poses.picture(poses.rng.uniform(bounds[:, 0], bounds[:, 1]), number)
-            after = Seen(self.after(picture[None])[0], objective.scene.model.label)
-            wrong.append((not objective.look(picture).right, not after.right))
+            # Half of them near the failure, since its region may be small within the neighbourhood.
+            bounds = sampler.bounds(self.config.reach * (1.0 if number % 2 == 0 else NEAR_REACH))
+            picture = sampler.render_sample(sampler.rng.uniform(bounds[:, 0], bounds[:, 1]), number)
+            new = ClassLogits(self.new_network(picture[None])[0], objective.scene.model.label)
+            wrong.append((not objective.classify(picture).correct, not new.correct))
         before, after = zip(*wrong, strict=True)
-        own = self.run.frames[name].label
-        return FramePair(name, source, PairedSamples(None, own, own, before, after))
+        label = self.run.results[name].label
+        return PairedPoseSamples(name, source, PairedSamples(None, label, label, before, after))
 
 
-def gate_run(config: ClassifyConfig) -> AnalysisReport:
-    """Whether --network may take the place of the run's: `passed` of the data. Raises UsageError or SceneError."""
-    asked = ask_of_failures(config, GateWorker, "comparing")
-    pairs = {one.identifier: [one.pair] for one in asked.answers}
+def compare_networks(config: ClassifyConfig) -> AnalysisReport:
+    """Test whether `network` may replace the run's: `passed` of the data. Raises UsageError or SceneError."""
+    analysis = analyse_failures(config, NetworkGateAnalyser, "comparing networks")
+    pairs = {one.identifier: [one.pair] for one in analysis.results}
     rows = compute_gate_rows(pairs, config.tolerance, DRAWS, config.seed)
-    facts = {"run": str(asked.run.folder), "before": asked.run.config.network, "after": config.network}
-    answer = build_gate_report(
-        asked.out, rows, len(pairs), facts | {"tolerance": config.tolerance}, asked.failed, *_WORDS
-    )
-    answer.write()
-    return answer
+    facts = {"run": str(analysis.run.folder), "before": analysis.run.config.network, "after": config.network}
+    facts |= {"tolerance": config.tolerance}
+    report = build_gate_report(analysis.out, rows, len(pairs), facts, analysis.failed, _VERB, _NOTE)
+    report.write()
+    return report

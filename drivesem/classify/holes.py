@@ -1,7 +1,7 @@
-"""`drivesem classify holes`: the poses in which an object is misclassified, around each failure of a run.
+"""`drivesem classify holes`: the poses around each failure in which the object is misclassified.
 
-Samples, rules and intervals are those of detectors' holes; the features are the angles themselves, so that fresh
-samples are drawn inside of a rule and not looked for.
+Samples, rules and intervals are those of the failure regions of detectors. The features are the angles themselves,
+so fresh samples are drawn inside a rule directly.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import zlib
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.classify.finished import FailureWorker, ask_of_failures
+from drivesem.classify.analysis import FailureAnalyser, analyse_failures
 from drivesem.classify.scenes import SEEN_PX, VIEWS
 from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
@@ -29,153 +28,165 @@ from scene_ir.io import round_to_8bit
 
 AXES: tuple[str, ...] = ("pitch", "yaw", "roll")
 _NOTES = (
-    "Where: pitch, yaw and roll of the object in degrees, the view's own turn included (top: pitch 20; left and "
-    "right: yaw 29 and -29), with shape and light as they were found. Misclassified: share of fresh samples "
-    "inside of the rule, each seen once, with nuisances, and Wilson's 95 % interval. Elsewhere: the same of "
-    "samples outside of it, within --reach of the pose that was found.",
+    "Where: pitch, yaw and roll of the object in degrees, including the view's own angles (top: pitch 20; left and "
+    "right: yaw 29 and -29), with the shape and light of the failure. Misclassified: share of fresh samples "
+    "inside the rule, each evaluated once, with nuisances, and Wilson's 95 % interval. Elsewhere: the same for "
+    "samples outside of it, within --reach of the failure's pose.",
 )
 
 
 @dataclass(frozen=True, slots=True)
-class PoseHole:
-    """Around one failure. source: digest of the run's result; predicted: what it is called most often there;
-    where: intervals by axis, degrees, empty where no angle tells failures; fails, count: of fresh samples inside;
-    fails_outside, count_outside: of samples outside of it; fails_all, count_all: of the whole neighbourhood.
-    """
+class PoseFailureRegion:
+    """The poses around one failure in which the object is misclassified."""
 
     identifier: str
+    """The picture."""
     source: str
+    """Digest of its result in the run."""
     label: str
+    """True class."""
     predicted: str
+    """Class that is predicted most often in the region."""
     where: dict[str, tuple[float, float]]
+    """Intervals by axis, degrees; empty if no angle separates failures."""
     fails: int
+    """Failures among fresh samples inside."""
     count: int
+    """Fresh samples inside."""
     fails_outside: int
+    """Failures among samples outside."""
     count_outside: int
+    """Samples outside."""
     fails_all: int
+    """Failures in the whole neighbourhood."""
     count_all: int
+    """Samples in the whole neighbourhood."""
     passes: int
+    """Passes of the network."""
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Of the probability inside."""
+        """Wilson's 95 % interval of the failure rate inside."""
         return wilson(self.fails, self.count)
 
     def sentence(self) -> str:
-        """For people."""
-        ends = (f"{axis} from {low:.0f} to {high:.0f} degrees" for axis, (low, high) in self.where.items())
+        """Describe the region."""
+        intervals = [f"{axis} from {low:.0f} to {high:.0f} degrees" for axis, (low, high) in self.where.items()]
         low, high = self.interval
-        share = f"{100 * self.fails / self.count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
-        place = " and ".join(ends) or "any angle near"
-        called = f"misclassified, mostly as {self.predicted}"
-        return f"The {self.label} of {self.identifier} is {called}, in {share} of poses with {place}"
+        rate = f"{100 * self.fails / self.count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+        place = " and ".join(intervals) or "any angle near"
+        error = f"misclassified, mostly as {self.predicted}"
+        return f"The {self.label} of {self.identifier} is {error}, in {rate} of poses with {place}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The region with its failure rate and description."""
+        rate = {"probability": self.fails / self.count, "interval": list(self.interval)}
+        return {**asdict(self), **rate, "sentence": self.sentence()}
+
+    def to_table_row(self) -> tuple[str, ...]:
+        """The row of the table."""
+        outside = f"{100 * self.fails_outside / self.count_outside:.0f}" if self.count_outside else "-"
+        return self.sentence(), outside, f"{100 * self.fails_all / self.count_all:.0f}"
+
+    def to_csv_row(self) -> dict[str, Any]:
+        """The row of the CSV file."""
+        data = self.to_json()
+        row = {key: data[key] for key in ("identifier", "label", "predicted", "probability", "fails", "count")}
+        for axis in AXES:
+            row[f"{axis}_low"], row[f"{axis}_high"] = self.where.get(axis, (None, None))
+        return {**row, "fails_outside": self.fails_outside, "count_outside": self.count_outside}
 
 
-class HoleWorker(FailureWorker[PoseHole]):
-    """Turns an object around the pose in which it failed."""
+class PoseRegionAnalyser(FailureAnalyser[PoseFailureRegion]):
+    """Samples poses around a failure and fits a rule to those that fail."""
 
-    question, file, kind = "holes", "hole.json", PoseHole
+    command, file, kind = "holes", "hole.json", PoseFailureRegion
 
-    def analyse(self, name: str, source: str, folder: Path) -> PoseHole:
-        """See `FailureWorker`."""
-        poses, config = Poses(self, name), self.config
-        label, bounds = poses.objective.scene.model.label, poses.bounds(config.reach)
-        asked = poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
-        fails = poses.called(asked) != label
-        rule = fit_rule({axis: asked[:, i] for i, axis in enumerate(AXES)}, fails)
+    def analyse(self, name: str, source: str, folder: Path) -> PoseFailureRegion:
+        """See `FrameAnalyser.analyse`."""
+        sampler, config = PoseSampler(self, name), self.config
+        label, bounds = sampler.objective.scene.model.label, sampler.bounds(config.reach)
+        poses = sampler.rng.uniform(bounds[:, 0], bounds[:, 1], (config.samples, 3))
+        fails = sampler.classify_poses(poses) != label
+        rule = fit_rule({axis: poses[:, i] for i, axis in enumerate(AXES)}, fails)
         for axis, interval in rule.intervals.items():
             bounds[AXES.index(axis)] = interval
-        inside = poses.called(poses.rng.uniform(bounds[:, 0], bounds[:, 1], (config.fresh, 3)), config.samples)
-        wrong = inside[inside != label].tolist()
-        frame, classes = self.run.frames[name], self.attacker.network.classes
-        return PoseHole(
+        fresh = sampler.rng.uniform(bounds[:, 0], bounds[:, 1], (config.fresh, 3))
+        predicted = sampler.classify_poses(fresh, config.samples)
+        wrong = predicted[predicted != label].tolist()
+        result, classes = self.run.results[name], self.attacker.network.classes
+        return PoseFailureRegion(
             identifier=name,
             source=source,
-            label=frame.label,
-            predicted=classes[Counter(wrong).most_common(1)[0][0]] if wrong else frame.attacked.predicted,
-            where=_as_seen(rule.intervals, frame.view),
+            label=result.label,
+            predicted=classes[Counter(wrong).most_common(1)[0][0]] if wrong else result.attacked.predicted,
+            where=_add_view_angles(rule.intervals, result.view),
             fails=len(wrong),
-            count=len(inside),
+            count=len(predicted),
             fails_outside=rule.failures_outside,
             count_outside=rule.count_outside,
             fails_all=int(fails.sum()),
             count_all=len(fails),
-            passes=poses.objective.passes,
+            passes=sampler.objective.passes,
         )
 
 
-class Poses:
-    """The object of a failure that a question is about, as it was found, in other poses. rng: of poses. Raises
-    SceneError.
-    """
+class PoseSampler:
+    """Renders the object of a failure in other poses, with nuisances."""
 
-    def __init__(self, worker: FailureWorker[Any], name: str) -> None:
-        seed = worker.config.seed
-        self.objective, theta = worker.run.rebuilt(worker.attacker, name)
+    def __init__(self, analyser: FailureAnalyser[Any], name: str) -> None:
+        """
+        Args:
+            analyser: The analysis; its settings seed the samples.
+            name: The failure.
+
+        Raises:
+            SceneError: An object that cannot be used.
+        """
+        seed = analyser.config.seed
+        self.objective, theta = analyser.run.load_objective(analyser.attacker, name)
         self.rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        """Generator of poses."""
         self._change = self.objective.space.change(theta)
-        self._nuisances, self._stream = worker.attacker.grader.nuisances, f"{worker.question}:{name}:{seed}"
+        self._nuisances, self._stream = analyser.attacker.grader.nuisances, f"{analyser.command}:{name}:{seed}"
 
     def bounds(self, reach: float) -> Floats:
-        """Lowest and highest angles (3, 2), degrees, within `reach` rad of the pose that was found."""
+        """Lowest and highest angles (3, 2), degrees, within `reach` rad of the failure's pose."""
         angles = self._change.angles
-        found = np.zeros(3) if angles is None else np.degrees(angles.numpy().astype(float))
-        return np.stack([found - math.degrees(reach), found + math.degrees(reach)], axis=1)
+        pose = np.zeros(3) if angles is None else np.degrees(angles.numpy().astype(float))
+        return np.stack([pose - math.degrees(reach), pose + math.degrees(reach)], axis=1)
 
     @torch.no_grad()
-    def picture(self, degrees: Floats, number: int) -> Tensor:
-        """The picture (3, H, W) in a pose (3,), in the draw of that number."""
+    def render_sample(self, degrees: Floats, number: int) -> Tensor:
+        """Render a pose (3,) with the nuisances of the sample of that number (3, H, W)."""
         change = replace(self._change, angles=torch.from_numpy(np.radians(degrees)).float())
-        picture = round_to_8bit(self.objective.scene.picture(change))
-        draw = self._nuisances.sample_for_image(self._stream, number, (SEEN_PX, SEEN_PX))
-        return draw.degrade_image(picture)
+        picture = round_to_8bit(self.objective.scene.render(change))
+        return self._nuisances.sample_for_image(self._stream, number, (SEEN_PX, SEEN_PX)).degrade_image(picture)
 
-    def called(self, degrees: Floats, first: int = 0) -> NDArray[np.int64]:
-        """The classes (N,) that poses (N, 3) are called, in draws from the first on."""
-        pictures = (self.picture(one, number) for number, one in enumerate(degrees, first))
-        return np.array([self.objective.look(picture).predicted for picture in pictures], np.int64)
-
-
-def _as_seen(where: Intervals, view: str) -> dict[str, tuple[float, float]]:
-    """A rule with the view's own turn in it."""
-    turn = dict(zip(AXES, (*np.degrees(VIEWS[view]).tolist(), 0.0), strict=True))
-    return {axis: (round(low + turn[axis], 2), round(high + turn[axis], 2)) for axis, (low, high) in where.items()}
+    def classify_poses(self, degrees: Floats, first: int = 0) -> NDArray[np.int64]:
+        """Predict the classes (N,) of poses (N, 3), with samples from number `first` on."""
+        pictures = (self.render_sample(one, number) for number, one in enumerate(degrees, first))
+        return np.array([self.objective.classify(picture).predicted for picture in pictures], np.int64)
 
 
-def holes_run(config: ClassifyConfig) -> AnalysisReport:
-    """Look around a run's failures, or go on with it. Raises UsageError or SceneError."""
-    asked = ask_of_failures(config, HoleWorker, "looking around failures")
-    ordered = sorted(asked.answers, key=lambda hole: (-hole.interval[0], hole.identifier))
-    rows = [
-        asdict(hole)
-        | {"probability": hole.fails / hole.count, "interval": list(hole.interval), "sentence": hole.sentence()}
-        for hole in ordered
-    ]
-    lines = tuple(
-        (
-            hole.sentence(),
-            "-" if not hole.count_outside else f"{100 * hole.fails_outside / hole.count_outside:.0f}",
-            f"{100 * hole.fails_all / hole.count_all:.0f}",
-        )
-        for hole in ordered
+def _add_view_angles(where: Intervals, view: str) -> dict[str, tuple[float, float]]:
+    angles = dict(zip(AXES, (*np.degrees(VIEWS[view]).tolist(), 0.0), strict=True))
+    return {
+        axis: (round(low + angles[axis], 2), round(high + angles[axis], 2)) for axis, (low, high) in where.items()
+    }
+
+
+def find_pose_regions(config: ClassifyConfig) -> AnalysisReport:
+    """Find the failure regions of a run by pose. Raises UsageError or SceneError."""
+    analysis = analyse_failures(config, PoseRegionAnalyser, "sampling around failures")
+    regions = sorted(analysis.results, key=lambda region: (-region.interval[0], region.identifier))
+    title = f"Failure regions of {analysis.run.config.network}, by pose"
+    rows = tuple(region.to_table_row() for region in regions)
+    return analysis.write_report(
+        "holes",
+        "Failure regions by pose",
+        {"holes": [region.to_json() for region in regions]},
+        [region.to_csv_row() for region in regions],
+        ReportTable(title, ("where", "elsewhere, %", "of all near, %"), rows),
+        _NOTES,
     )
-    title = f"Holes of {asked.run.config.network}, by pose"
-    answer = AnalysisReport(
-        out=asked.out,
-        name="holes",
-        heading="Holes by pose",
-        data={**asked.facts, "holes": rows},
-        csv_tables={"holes": [_flat(row) for row in rows]} if rows else {},
-        tables=[ReportTable(title, ("where", "elsewhere, %", "of all near, %"), lines)],
-        notes=_NOTES,
-        failed={f"picture {name}": reason for name, reason in asked.failed.items()},
-    )
-    answer.write()
-    return answer
-
-
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    told = {key: row[key] for key in ("identifier", "label", "predicted", "probability", "fails", "count")}
-    for axis in AXES:
-        told[f"{axis}_low"], told[f"{axis}_high"] = row["where"].get(axis, (None, None))
-    return {**told, "fails_outside": row["fails_outside"], "count_outside": row["count_outside"]}

@@ -1,4 +1,4 @@
-"""theta -> what a classifier makes of the object's picture: the one place where space, scene and network meet."""
+"""The objective of an attack on a classifier: theta to picture to loss, prediction and gradient."""
 
 from __future__ import annotations
 
@@ -9,114 +9,135 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.methods.base import GRADIENT_PASSES, ParameterGroup, Problem, Score
-from drivesem.classify.networks.base import Scorer
+from drivesem.classify.networks.base import ImageClassifier
 from drivesem.classify.scenes import ObjectScene
 from drivesem.classify.space import ObjectSpace
 from scene_ir.errors import RangeError
 from scene_ir.io import round_to_8bit
 
-Aimed = Literal["logit", "hinge", "softmax"]
-"""What an attack raises. logit: the true class's score falls, as in the paper; hinge: so does what it is ahead of
-the best other class, down to 0, which is Carlini and Wagner's f; softmax: the best wrong class's probability
-rises, by which the paper chooses among samples."""
+AttackLoss = Literal["logit", "hinge", "softmax"]
+"""Loss that an attack maximises.
+
+logit: minus the true class's logit, as in the paper; hinge: minus the margin, where positive (Carlini and Wagner's f);
+softmax: the highest probability of a wrong class, by which the paper chooses among samples.
+"""
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """What a classifier says of one picture. scores (C,): before softmax."""
+class ClassLogits:
+    """A network's logits for one picture."""
 
-    scores: Tensor
+    logits: Tensor
+    """Scores before softmax (C,)."""
     label: int
+    """Index of the true class."""
 
     @property
     def predicted(self) -> int:
-        """The class of the highest score; of equal ones the first."""
-        return int(self.scores.argmax())
+        """Index of the class with the highest logit; the first of equal ones."""
+        return int(self.logits.argmax())
 
     @property
-    def right(self) -> bool:
+    def correct(self) -> bool:
+        """Whether the prediction is the true class."""
         return self.predicted == self.label
 
     @property
     def confidence(self) -> float:
-        """Softmax of the predicted class."""
-        return float(self.scores.softmax(0).amax())
+        """Softmax of the predicted class, in [0, 1]."""
+        return float(self.logits.softmax(0).amax())
 
     @property
     def margin(self) -> float:
-        """How far the true class is ahead of the best other one, in logits; below 0 it is misclassified."""
-        return float(ahead(self.scores, self.label))
+        """Logit of the true class minus the highest other one; negative if misclassified."""
+        return float(class_margin(self.logits, self.label))
 
 
-def ahead(scores: Tensor, label: int) -> Tensor:
-    """How far () the true class's score is ahead of the best other one's; scores (C,)."""
-    others = torch.cat([scores[:label], scores[label + 1 :]])
-    return scores[label] - others.amax()
+def class_margin(logits: Tensor, label: int) -> Tensor:
+    """Compute the logit of the true class minus the highest other one (), of logits (C,)."""
+    others = torch.cat([logits[:label], logits[label + 1 :]])
+    return logits[label] - others.amax()
 
 
-def aim(scores: Tensor, label: int, aimed: Aimed) -> Tensor:
-    """What is to be raised, (), of scores (C,); differentiable."""
-    if aimed == "logit":
-        return -scores[label]
-    if aimed == "hinge":
-        return -ahead(scores, label).clamp_min(0)
-    chances = scores.softmax(0)
-    return torch.cat([chances[:label], chances[label + 1 :]]).amax()
+def compute_attack_loss(logits: Tensor, label: int, loss: AttackLoss) -> Tensor:
+    """Compute the loss () that an attack maximises; differentiable.
+
+    Args:
+        logits: Logits of one picture (C,).
+        label: Index of the true class.
+        loss: Name of the loss.
+    """
+    if loss == "logit":
+        return -logits[label]
+    if loss == "hinge":
+        return -class_margin(logits, label).clamp_min(0)
+    probabilities = logits.softmax(0)
+    return torch.cat([probabilities[:label], probabilities[label + 1 :]]).amax()
 
 
 class ClassifierObjective:
-    """What an attack on a classifier raises, as a function of theta (D,). passes: of the network so far, a
-    gradient counted as GRADIENT_PASSES. Raises RangeError where a loss or gradient is not finite.
-    """
+    """Loss, gradient and prediction of one picture as functions of theta (D,)."""
 
-    def __init__(self, scene: ObjectScene, space: ObjectSpace, network: Scorer, aimed: Aimed) -> None:
+    def __init__(self, scene: ObjectScene, space: ObjectSpace, network: ImageClassifier, loss: AttackLoss) -> None:
+        """
+        Args:
+            scene: The object and its view.
+            space: Its parameters.
+            network: The network.
+            loss: Name of the loss.
+
+        Raises:
+            RangeError: Logits that are not finite.
+        """
         self.scene = scene
         self.space = space
         self.network = network
-        self.aimed: Aimed = aimed
+        self.loss: AttackLoss = loss
         self.passes = 0
-        self._seen: dict[bytes, Seen] = {}
-        self.benign = self.see(space.theta0)
+        """Passes of the network so far; a gradient counts as GRADIENT_PASSES."""
+        self._evaluated: dict[bytes, ClassLogits] = {}
+        self.benign = self.evaluate(space.theta0)
+        """Prediction of the unchanged picture."""
 
     def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
-        """Loss and its gradient (D,)."""
+        """Compute the loss and its gradient (D,). Raises RangeError if one is not finite."""
         leaf = theta.detach().clone().requires_grad_(True)
-        image = self.scene.picture(self.space.change(leaf))
-        loss = aim(self.network(image[None])[0], self.scene.model.label, self.aimed)
+        image = self.scene.render(self.space.change(leaf))
+        loss = compute_attack_loss(self.network(image[None])[0], self.scene.model.label, self.loss)
         if not bool(loss.isfinite()):
-            raise RangeError(f"objective: {self.aimed}", "a finite loss", float(loss.detach()))
+            raise RangeError(f"objective: {self.loss}", "a finite loss", float(loss.detach()))
         (gradient,) = torch.autograd.grad(loss, leaf)
         self.space.check_gradient(gradient)
         self.passes += GRADIENT_PASSES
         return float(loss.detach()), gradient
 
     @torch.no_grad()
-    def picture(self, theta: Tensor) -> Tensor:
-        """(3, H, W) on the 8-bit grid: what is judged is what is written."""
-        return round_to_8bit(self.scene.picture(self.space.change(theta)))
+    def render(self, theta: Tensor) -> Tensor:
+        """Render theta's picture (3, H, W), rounded to 8 bits as in its file."""
+        return round_to_8bit(self.scene.render(self.space.change(theta)))
 
     @torch.no_grad()
-    def look(self, image: Tensor) -> Seen:
-        """What the network says of a picture (3, H, W)."""
+    def classify(self, image: Tensor) -> ClassLogits:
+        """Classify a picture (3, H, W)."""
         self.passes += 1
-        return Seen(self.network(image[None])[0], self.scene.model.label)
+        return ClassLogits(self.network(image[None])[0], self.scene.model.label)
 
-    def see(self, theta: Tensor) -> Seen:
-        """The same of theta (D,), each once."""
+    def evaluate(self, theta: Tensor) -> ClassLogits:
+        """Classify the picture of theta (D,); each theta is rendered once."""
         key = theta.detach().cpu().numpy().tobytes()
-        if key not in self._seen:
-            self._seen[key] = self.look(self.picture(theta))
-        return self._seen[key]
+        if key not in self._evaluated:
+            self._evaluated[key] = self.classify(self.render(theta))
+        return self._evaluated[key]
 
     def score(self, theta: Tensor) -> Score:
-        """What the network makes of theta (D,): a failure where it was right before, and is not now."""
-        seen = self.see(theta)
-        failed = self.benign.right and not seen.right
-        loss = float(aim(seen.scores, seen.label, self.aimed))
+        """Score theta (D,): a failure if the prediction was correct before and is not now."""
+        prediction = self.evaluate(theta)
+        failed = self.benign.correct and not prediction.correct
+        loss = float(compute_attack_loss(prediction.logits, prediction.label, self.loss))
         return Score(loss, lost=int(failed), phantoms=0, success=failed, success_paper=failed)
 
     def problem(self) -> Problem:
-        """This objective as attacks see it."""
+        """This objective as a problem for attacks."""
         return Problem(
             loss_and_grad=self.loss_and_grad,
             project=self.space.project,

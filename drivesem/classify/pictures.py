@@ -1,7 +1,8 @@
-"""Pictures of objects as a data set: SPLIT/CLASS/OBJECT-VIEW.png in a folder."""
+"""Pictures of objects, rendered into a data set SPLIT/CLASS/OBJECT-VIEW.png and read from it."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectModel, ObjectSet, Split
-from drivesem.classify.scenes import VIEWS, ObjectScene, in_turn, open_backgrounds
+from drivesem.classify.scenes import VIEWS, ObjectScene, open_backgrounds
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
@@ -23,93 +24,147 @@ from scene_ir.io import to_uint8
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """An object to be drawn from a view. name: of the object, "bus/0007"; of its class and it."""
+class ObjectView:
+    """One view of one object, which makes a picture."""
 
     split: Split
+    """Split of the object."""
     name: str
+    """Class and name of the object, such as "bus/0007"."""
     view: str
+    """Key of `VIEWS`."""
 
     @property
     def identifier(self) -> str:
-        """As folders are named."""
+        """Name of the picture, as in file names."""
         return f"{self.name.replace('/', '-')}-{self.view}"
 
 
 @dataclass(frozen=True)
-class Studio:
-    """What a process needs to draw objects: built once, used for many. model: loads an object by name."""
+class ObjectRenderer:
+    """Loads and renders objects; built once per process."""
 
     objects: ObjectSet
+    """The objects."""
     backgrounds: Callable[[str], Tensor]
-    model: Callable[[str], ObjectModel]
+    """Returns a picture's background by its name."""
+    load_model: Callable[[str], ObjectModel]
+    """Loads an object by name."""
 
     @classmethod
-    def of(cls, config: ClassifyConfig) -> Studio:
-        """Raises SceneError for objects or backgrounds that cannot be used."""
+    def from_config(cls, config: ClassifyConfig) -> ObjectRenderer:
+        """Open objects and backgrounds. Raises SceneError if they cannot be used."""
         objects = open_objects(config.objects)
-        # The last object is kept, as it is seen from several views.
+        # Cache the last object, since its views follow each other.
         return cls(objects, open_backgrounds(config.backgrounds), lru_cache(maxsize=1)(objects.load))
 
-    def scene(self, shown: Shown) -> ObjectScene:
-        """Raises SceneError naming the object's file, or the background's."""
-        model = self.model(shown.name)
-        return ObjectScene(shown.identifier, model, shown.view, self.backgrounds(shown.identifier))
-
-    def place(self, shown: Shown, out: Path) -> Path:
-        """Where a picture of a data set is, in its folder."""
-        return out / shown.split / shown.name.partition("/")[0] / f"{shown.identifier}.png"
+    def load_scene(self, view: ObjectView) -> ObjectScene:
+        """Load the scene of a view. Raises SceneError for the object's or the background's file."""
+        model = self.load_model(view.name)
+        return ObjectScene(view.identifier, model, view.view, self.backgrounds(view.identifier))
 
     @torch.no_grad()
-    def write(self, shown: Shown, out: Path) -> None:
-        """Draw a picture of a data set, where it is not there."""
-        path = self.place(shown, out)
+    def write_picture(self, view: ObjectView, out: Path) -> None:
+        """Render a picture into the data set at `out`, unless it is there."""
+        path = picture_path(view, out)
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
-            files.write_png(path, to_uint8(self.scene(shown).picture().clamp(0, 1)))
+            files.write_png(path, to_uint8(self.load_scene(view).render().clamp(0, 1)))
 
 
-def views_of(config: ClassifyConfig) -> tuple[str, ...]:
-    """The views by name. Raises UsageError."""
+def picture_path(view: ObjectView, folder: Path) -> Path:
+    """Path of a picture in a data set's folder."""
+    return folder / view.split / view.name.partition("/")[0] / f"{view.identifier}.png"
+
+
+def parse_views(config: ClassifyConfig) -> tuple[str, ...]:
+    """Parse the names of views. Raises UsageError."""
     names = tuple(part.strip() for part in config.views.split(","))
     if not set(names) <= set(VIEWS) or len(set(names)) != len(names):
         raise UsageError("--views", f"names among {', '.join(VIEWS)}, each once", repr(config.views))
     return names
 
 
+def interleave_classes(names: Sequence[str]) -> list[str]:
+    """Order names "class/object" so that the first of each class come first, then the second."""
+    counts: Counter[str] = Counter()
+    ranks: list[tuple[int, str]] = []
+    for name in names:
+        kind = name.rpartition("/")[0]
+        ranks.append((counts[kind], name))
+        counts[kind] += 1
+    return [name for _, name in sorted(ranks, key=lambda rank: rank[0])]
+
+
 def write_pictures(config: ClassifyConfig, out: Path) -> tuple[dict[str, int], dict[str, str]]:
-    """Draw all splits into a folder, as far as they are not there: how many pictures each has, and why others
-    could not be drawn. --limit: so many objects of each split, classes in turn.
+    """Render the missing pictures of all splits, of at most `limit` objects each.
+
+    Args:
+        config: Settings.
+        out: Folder of the data set.
+
+    Returns:
+        Number of pictures by split, and reason by picture that could not be rendered.
+
+    Raises:
+        UsageError: There are no objects.
+        SceneError: An object that cannot be used, without --keep-going.
     """
-    studio, views = Studio.of(config), views_of(config)
+    renderer, views = ObjectRenderer.from_config(config), parse_views(config)
     jobs = [
-        Shown(split, name, view)
+        ObjectView(split, name, view)
         for split in SPLITS
-        for name in in_turn(studio.objects.names(split))[: config.limit]
+        for name in interleave_classes(renderer.objects.names(split))[: config.limit]
         for view in views
     ]
     if not jobs:
         raise UsageError("--objects", "objects in any of the splits", "none")
-    answers = draw(jobs, studio, config, out)
-    done = {split: sum(job.split == split for job in answers.results) for split in SPLITS}
-    return done, answers.failed
+    outcome = render_pictures(jobs, renderer, config, out)
+    counts = {split: sum(job.split == split for job in outcome.results) for split in SPLITS}
+    return counts, outcome.failed
 
 
-def draw(jobs: Sequence[Shown], studio: Studio, config: ClassifyConfig, out: Path) -> JobResults[Shown, None]:
-    """Draw pictures into a folder, as far as they are not there. Raises SceneError."""
-    work, build = partial(studio.write, out=out), partial(_drawer, config, out)
+def render_pictures(
+    views: Sequence[ObjectView], renderer: ObjectRenderer, config: ClassifyConfig, out: Path
+) -> JobResults[ObjectView, None]:
+    """Render the missing pictures of a data set.
+
+    Args:
+        views: The pictures.
+        renderer: Renderer of this process.
+        config: Settings, of which other processes make theirs.
+        out: Folder of the data set.
+
+    Raises:
+        SceneError: An object that cannot be used, without --keep-going.
+    """
     return run_frame_jobs(
-        jobs, work, build, config, ProgressSettings("drawing objects"), lambda job: job.identifier
+        views,
+        partial(renderer.write_picture, out=out),
+        partial(_make_worker, config, out),
+        config,
+        ProgressSettings("rendering objects"),
+        lambda view: view.identifier,
     )
 
 
-def _drawer(config: ClassifyConfig, out: Path) -> Callable[[Shown], None]:
-    return partial(Studio.of(config).write, out=out)
+def _make_worker(config: ClassifyConfig, out: Path) -> Callable[[ObjectView], None]:
+    return partial(ObjectRenderer.from_config(config).write_picture, out=out)
 
 
 def read_pictures(folder: Path, split: str, classes: tuple[str, ...]) -> tuple[Tensor, Tensor]:
-    """Pictures (N, 3, H, W) uint8 RGB of a split, and their labels (N,) int64. Raises FormatError where a class
-    has none, where one of them does not decode, or they differ in size.
+    """Read the pictures of a split.
+
+    Args:
+        folder: Folder of the data set.
+        split: The split.
+        classes: Names of the classes, in the order of labels.
+
+    Returns:
+        RGB (N, 3, H, W) uint8, and labels (N,) int64.
+
+    Raises:
+        FormatError: A class without pictures, a damaged picture, or different sizes.
     """
     images: list[np.ndarray] = []
     labels: list[int] = []

@@ -1,4 +1,4 @@
-"""What an attack on a classifier leaves behind, as plain dataclasses: written as JSON, read by the report."""
+"""Results of an attack on a classifier: one record per picture, and the metrics of a run."""
 
 from __future__ import annotations
 
@@ -12,153 +12,189 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """What a network says of one picture. predicted: a class; confidence: its softmax; margin: by how many logits
-    the true class is ahead of the best other one.
-    """
+class ClassPrediction:
+    """A network's prediction for one picture."""
 
     predicted: str
+    """Predicted class."""
     confidence: float
+    """Its softmax, in [0, 1]."""
     margin: float
+    """Logit of the true class minus the highest other one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Likeness:
-    """How alike two renderers draw an object. iou: of the pixels that it covers by half at least; colour: mean
-    distance in CIE L*a*b* (Delta E of 1976) over the pixels that both cover, at the size that a network sees.
-    """
+class RendererAgreement:
+    """Agreement between two renderers on one object."""
 
     iou: float
+    """IoU of the pixels covered by at least half, in [0, 1]."""
     colour: float
+    """Mean CIE L*a*b* distance (Delta E 1976) over the pixels that both cover, at the network's size."""
 
 
 @dataclass(frozen=True, slots=True)
-class SecondLook:
-    """What a second renderer's pictures of a failure say. before, after: how alike they are to the own ones."""
+class SecondRenderComparison:
+    """Test of one failure with a second renderer."""
 
     agreement: SecondOpinion
-    before: Likeness
-    after: Likeness
+    """Whether the failure persists in its pictures."""
+    before: RendererAgreement
+    """Agreement with the project's renderer on the unchanged object."""
+    after: RendererAgreement
+    """The same on the changed object."""
 
 
 @dataclass(frozen=True, slots=True)
-class ClassifiedFrame:
-    """One picture of a run. label: the true class; sizes: the largest change of each parameter, in theta's units;
-    moved: pose and light by name, as people write them; grade, count: of a failure, see `truth.grades`; None where
-    there is none; second: of `classify confirm`. queries: gradients and judged samples; passes: of the network, a
-    gradient counted as 3.
-    """
+class ClassifiedPicture:
+    """Result of one picture."""
 
     identifier: str
+    """Name of the picture."""
     object: str
+    """Name of the object."""
     label: str
+    """True class."""
     view: str
-    benign: Verdict
-    attacked: Verdict
+    """View of the object."""
+    benign: ClassPrediction
+    """Prediction before the change."""
+    attacked: ClassPrediction
+    """Prediction after the change."""
     grade: str | None
+    """Grade of the failure; None without one."""
     count: Certificate | None
+    """Certificate of the failure; None without one."""
     sizes: dict[str, float]
+    """Largest change of each parameter, in theta's units."""
     moved: dict[str, str]
+    """Pose and light by name, formatted."""
     loss_trace: tuple[float, ...]
+    """Loss after each step."""
     queries: int
+    """Gradients and evaluated samples."""
     passes: int
+    """Passes of the network; a gradient counts as 3."""
     seconds: float
-    second: SecondLook | None = None
+    """Time taken, s."""
+    second: SecondRenderComparison | None = None
+    """Test with a second renderer; None without one."""
 
     @property
-    def right_before(self) -> bool:
+    def correct_before(self) -> bool:
+        """Whether the prediction before the change is correct."""
         return self.benign.predicted == self.label
 
     @property
-    def right_after(self) -> bool:
+    def correct_after(self) -> bool:
+        """Whether the prediction after the change is correct."""
         return self.attacked.predicted == self.label
 
-    def row(self) -> dict[str, Any]:
-        """A line of the CSV."""
+    def to_csv_row(self) -> dict[str, Any]:
+        """The picture's row of the CSV file."""
         data = asdict(self)
         count = self.count or Certificate()
-        flat = {key: data[key] for key in ("identifier", "object", "label", "view", "grade", "queries", "passes")}
+        row = {key: data[key] for key in ("identifier", "object", "label", "view", "grade", "queries", "passes")}
         for name in ("benign", "attacked"):
-            flat |= {f"{name}_{key}": value for key, value in data[name].items()}
-        flat |= {"right_before": count.before, "draws_before": count.before_draws}
-        flat |= {"wrong_after": count.after, "draws_after": count.after_draws}
-        flat |= {"second": self.second.agreement.by if self.second else None}
-        return flat | {f"size_{key}": value for key, value in self.sizes.items()} | self.moved
+            row |= {f"{name}_{key}": value for key, value in data[name].items()}
+        row |= {"right_before": count.before, "draws_before": count.before_draws}
+        row |= {"wrong_after": count.after, "draws_after": count.after_draws}
+        row |= {"second": self.second.agreement.by if self.second else None}
+        return row | {f"size_{key}": value for key, value in self.sizes.items()} | self.moved
 
 
 @dataclass(frozen=True, slots=True)
-class ClassTally:
-    """Pictures of one class. benign, attacked: classified rightly before and after the change; certain, confirmed:
-    failures that are at least so sure.
-    """
+class ClassCounts:
+    """Counts of one class's pictures."""
 
     name: str
+    """Name of the class."""
     pictures: int
+    """All its pictures."""
     benign: int
+    """Correct before the change."""
     attacked: int
+    """Correct after it."""
     certain: int
+    """Failures of grade certain or above."""
     confirmed: int = 0
+    """Failures of grade confirmed."""
 
     @property
     def accuracy(self) -> dict[str, float | None]:
-        """Before and after the change; None without pictures."""
+        """Accuracy before and after the change, in [0, 1]; None without pictures."""
         counts = {"benign": self.benign, "attacked": self.attacked}
         return {name: count / self.pictures if self.pictures else None for name, count in counts.items()}
 
 
 @dataclass(frozen=True, slots=True)
-class ClassifiedRun:
-    """The figures of a run; `to_json` is what `--json` prints. accuracy is the share of all its pictures, that is,
-    the mean of classes' accuracies weighed by their sizes, as in the paper.
-    """
+class ClassifyMetrics:
+    """Metrics of a run; its accuracy counts every picture equally, as in the paper."""
 
     out: str
+    """Folder of the run."""
     objects: str
+    """Folder of the objects, or "embedded"."""
     network: str
+    """The attacked network."""
     method: str
+    """Search method."""
     params: tuple[str, ...]
-    classes: tuple[ClassTally, ...]
+    """Attacked parameters."""
+    classes: tuple[ClassCounts, ...]
+    """Counts by class."""
     frames_failed: dict[str, str]
+    """Reason by picture without a result."""
     queries: int
+    """Gradients and evaluated samples."""
     passes: int
+    """Passes of the network."""
     seconds: float
+    """Time taken, s."""
 
     @classmethod
-    def of(cls, frames: Sequence[ClassifiedFrame], classes: Sequence[str], **facts: Any) -> ClassifiedRun:
-        """Count frames. facts: the fields that frames do not tell."""
-        tallies = []
-        for name in classes:
-            own = [frame for frame in frames if frame.label == name]
-            benign, attacked = (sum(getattr(f, right) for f in own) for right in ("right_before", "right_after"))
-            confirmed = sum(frame.grade == Grade.CONFIRMED for frame in own)
-            certain = confirmed + sum(frame.grade == Grade.CERTAIN for frame in own)
-            tallies.append(ClassTally(name, len(own), benign, attacked, certain, confirmed))
+    def from_results(
+        cls, results: Sequence[ClassifiedPicture], classes: Sequence[str], **facts: Any
+    ) -> ClassifyMetrics:
+        """Count the results of pictures.
+
+        Args:
+            results: Results of pictures.
+            classes: Names of all classes.
+            facts: The fields that are not counted.
+        """
+
+        def count(name: str) -> ClassCounts:
+            own = [result for result in results if result.label == name]
+            benign = sum(result.correct_before for result in own)
+            attacked = sum(result.correct_after for result in own)
+            confirmed = sum(result.grade == Grade.CONFIRMED for result in own)
+            certain = confirmed + sum(result.grade == Grade.CERTAIN for result in own)
+            return ClassCounts(name, len(own), benign, attacked, certain, confirmed)
+
         return cls(
-            classes=tuple(tallies),
-            queries=sum(frame.queries for frame in frames),
-            passes=sum(frame.passes for frame in frames),
+            classes=tuple(count(name) for name in classes),
+            queries=sum(result.queries for result in results),
+            passes=sum(result.passes for result in results),
             **facts,
         )
 
     @property
-    def whole(self) -> ClassTally:
-        """All classes as one."""
+    def overall(self) -> ClassCounts:
+        """Counts over all classes."""
         counts = ("pictures", "benign", "attacked", "certain", "confirmed")
-        return ClassTally("all", *(sum(getattr(one, name) for one in self.classes) for name in counts))
-
-    @property
-    def pictures(self) -> int:
-        return self.whole.pictures
+        return ClassCounts("all", *(sum(getattr(one, name) for one in self.classes) for name in counts))
 
     @property
     def grades(self) -> dict[str, int]:
-        """How many failures are at least so sure."""
-        whole = self.whole
-        counts = (whole.benign - whole.attacked, whole.certain, whole.confirmed)
+        """Number of failures of at least each grade."""
+        overall = self.overall
+        counts = (overall.benign - overall.attacked, overall.certain, overall.confirmed)
         return dict(zip(map(str, (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)), counts, strict=True))
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object."""
-        accuracy = {name: None if one is None else round(one, 4) for name, one in self.whole.accuracy.items()}
-        data = {"schema": SCHEMA, **asdict(self), "pictures": self.pictures}
+        """The JSON object that `--json` prints."""
+        overall = self.overall
+        accuracy = {name: None if one is None else round(one, 4) for name, one in overall.accuracy.items()}
+        data = {"schema": SCHEMA, **asdict(self), "pictures": overall.pictures}
         return data | {"accuracy": accuracy, "grades": self.grades}

@@ -1,4 +1,4 @@
-"""Training a classifier on pictures of objects: its last layer, as in the paper, or all of it."""
+"""Trains a classifier on pictures of objects: its last layer, as in the paper, or all layers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
 from detectors.training import CHECKPOINT, PRECISIONS, optimiser_state, restore_optimiser, split_by_section
 from drivesem.classify.networks.base import Classifier
-from drivesem.classify.networks.loading import save_classifier, to_train
+from drivesem.classify.networks.loading import load_for_training, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.pictures import read_pictures, write_pictures
@@ -28,44 +28,47 @@ from drivesem.run.folder import PRESENTATION, claim_folder, resolve_output_folde
 from scene_ir import files
 
 PICTURES = "pictures"
-"""Folder in --out where pictures are drawn, unless --data has them."""
+"""Folder in --out for rendered pictures, without --data."""
 RECORD = "training.json"
 _FREE = tuple(name for name in PRESENTATION if name != "limit")
-"""Settings that a run may be gone on with; --limit says what is learnt."""
+"""Settings that may differ when training is continued; --limit selects the training data."""
 _RATES = {"last": 3e-3, "all": 1e-4}
-_EMBEDDED_AT_A_TIME = 4
-"""More is no faster on a CPU, and VGG-16's maps are so large that the system clears them anew each time."""
+_FEATURE_BATCH = 4
+"""More is not faster on a CPU, where VGG-16's maps are so large that the system clears them each time."""
 _TINY = 1e-12
 
-_Fitted = tuple[list[dict[str, float]], dict[str, float]]
-"""What each epoch came to, and the accuracy by split."""
+_TrainingHistory = tuple[list[dict[str, float]], dict[str, float]]
+"""Loss and accuracy of each epoch, and the final accuracy by split."""
 
 
-def train_run(config: ClassifyConfig) -> dict[str, Any]:
-    """Train, and write the weights and how it went: the JSON's form. Raises UsageError or SceneError."""
+def train_classifier(config: ClassifyConfig) -> dict[str, Any]:
+    """Train, write weights and record, and return the record. Raises UsageError or SceneError."""
     start = time.perf_counter()
     out = resolve_output_folder(config.out, Path("runs") / f"classifier-{config.network}-seed{config.seed}")
     classes = open_objects(config.objects).classes
     generator = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)  # dropout draws from torch's own
-    anew = config.layers == "all"
-    network = to_train(config.network, config.weights, classes, generator, anew).to(config.device)
+    random_weights = config.layers == "all"
+    network = load_for_training(config.network, config.weights, classes, generator, random_weights)
+    network = network.to(config.device)
     claim_folder(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
     folder = Path(config.data) if config.data else out / PICTURES
     failed = {} if config.data else write_pictures(config, folder)[1]
     splits = {name: read_pictures(folder, name, classes) for name in SPLITS}
-    images = {name: shown for name, (shown, _) in splits.items()}
-    labels = {name: told.to(config.device) for name, (_, told) in splits.items()}
+    images = {name: pictures for name, (pictures, _) in splits.items()}
+    labels = {name: truth.to(config.device) for name, (_, truth) in splits.items()}
     if config.layers == "last":
         network.eval()
-        known = {name: embedded(network, images[name], config.device, f"looking at {name}") for name in SPLITS}
-        curve, accuracy = fit_last(network, known, labels, config, generator)
+        features = {
+            name: compute_features(network, images[name], config.device, f"features of {name}") for name in SPLITS
+        }
+        curve, accuracy = train_last_layer(network, features, labels, config, generator)
     else:
-        curve, accuracy = _fit_all(network, images, labels, config, generator, out / CHECKPOINT)
+        curve, accuracy = _train_all_layers(network, images, labels, config, generator, out / CHECKPOINT)
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
-    counts = {name: len(told) for name, told in labels.items()}
+    counts = {name: len(truth) for name, truth in labels.items()}
     data = {
         "out": str(out),
         "weights": str(path),
@@ -82,67 +85,75 @@ def train_run(config: ClassifyConfig) -> dict[str, Any]:
     return data
 
 
-def fit_last(
+def train_last_layer(
     network: Classifier,
-    known: dict[str, Tensor],
+    features: dict[str, Tensor],
     labels: dict[str, Tensor],
     config: ClassifyConfig,
     generator: torch.Generator,
-    onward: bool = False,
-) -> _Fitted:
-    """Fit the last layer to features (N, K) and labels (N,) by split, of which `train` is learnt and `val`
-    watched. onward: go on from what the layer is.
+    continued: bool = False,
+) -> _TrainingHistory:
+    """Train the last layer.
+
+    Args:
+        network: The network.
+        features: Features (N, K) by split: trained on `train`, evaluated on the others.
+        labels: Labels (N,) by split.
+        config: Settings.
+        generator: Generator of the order of samples.
+        continued: Begin with the present weights.
     """
-    # Fitted to features of mean 0 and deviation 1, whatever the network, and then told in its own.
-    deviation, mean = torch.std_mean(known["train"], dim=0)
+    # Train on normalised features, and convert the weights afterwards.
+    deviation, mean = torch.std_mean(features["train"], dim=0)
     deviation = deviation + 1e-3 * deviation.mean() + _TINY
-    known = {name: (features - mean) / deviation for name, features in known.items()}
+    features = {name: (values - mean) / deviation for name, values in features.items()}
     last = network.last
-    if onward:
+    if continued:
         with torch.no_grad():
             last.bias.add_(last.weight @ mean)
             last.weight.mul_(deviation)
 
     def batch(rows: Tensor, _: int) -> tuple[Tensor, Tensor]:
-        return last(known["train"][rows]), labels["train"][rows]
+        return last(features["train"][rows]), labels["train"][rows]
 
-    found = _fit(
-        last, batch, lambda name, _: _accuracy(last(known[name]), labels[name]), labels, config, generator
-    )
+    def evaluate(name: str, _: int) -> float:
+        return _accuracy(last(features[name]), labels[name])
+
+    history = _train(last, batch, evaluate, labels, config, generator)
     with torch.no_grad():
         last.weight.div_(deviation)
         last.bias.sub_(last.weight @ mean)
-    return found
+    return history
 
 
-def _fit_all(
+def _train_all_layers(
     network: Classifier,
     images: dict[str, Tensor],
     labels: dict[str, Tensor],
     config: ClassifyConfig,
     generator: torch.Generator,
     checkpoint: Path,
-) -> _Fitted:
-    """Fit all layers to pictures (N, 3, H, W) uint8, mirrored in half of all epochs, and labels (N,), by split."""
+) -> _TrainingHistory:
+    """Train all layers on pictures (N, 3, H, W) uint8 by split, each mirrored with probability 1/2."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     dtype = PRECISIONS[config.precision]
 
     def batch(rows: Tensor, epoch: int) -> tuple[Tensor, Tensor]:
         network.train()
-        shown = _shown(images["train"][rows], config.device, epoch <= config.half)
+        pictures = _to_float(images["train"][rows], config.device, epoch <= config.half)
         mirrored = torch.rand(len(rows), generator=generator) < 0.5
-        shown = torch.where(mirrored.to(shown.device).view(-1, 1, 1, 1), shown.flip(-1), shown)
+        pictures = torch.where(mirrored.to(pictures.device).view(-1, 1, 1, 1), pictures.flip(-1), pictures)
         with torch.autocast(config.device.partition(":")[0], dtype, enabled=dtype != torch.float32):
-            scores = network(shown.contiguous(memory_format=torch.channels_last))
+            scores = network(pictures.contiguous(memory_format=torch.channels_last))
         return scores.float(), labels["train"][rows]
 
-    def accuracy(name: str, epoch: int) -> float:
+    def evaluate(name: str, epoch: int) -> float:
         network.eval()
         half = epoch <= config.half
-        features = embedded(network, images[name], config.device, f"looking at {name}", half)
+        features = compute_features(network, images[name], config.device, f"features of {name}", half)
         return _accuracy(network.last(features), labels[name])
 
-    return _fit(network, batch, accuracy, labels, config, generator, checkpoint)
+    return _train(network, batch, evaluate, labels, config, generator, checkpoint)
 
 
 @torch.no_grad()
@@ -150,24 +161,31 @@ def _accuracy(scores: Tensor, labels: Tensor) -> float:
     return round(float((scores.argmax(1) == labels).float().mean()), 4)
 
 
-def _fit(
+def _train(
     module: nn.Module,
     batch: Callable[[Tensor, int], tuple[Tensor, Tensor]],
-    accuracy: Callable[[str, int], float],
+    evaluate: Callable[[str, int], float],
     labels: Mapping[str, Tensor],
     config: ClassifyConfig,
     generator: torch.Generator,
     checkpoint: Path | None = None,
-) -> _Fitted:
-    """Adam, with a rate that falls in a half cosine. batch: scores and labels of some of the pictures of `train`,
-    in an epoch, of which the first is 1; accuracy: of a split, after an epoch; labels: by split; checkpoint:
-    written after each epoch, and gone on from.
+) -> _TrainingHistory:
+    """Train with Adam and a cosine schedule of the learning rate.
+
+    Args:
+        module: The trained layers.
+        batch: Scores and labels of rows of `train` in an epoch, from 1.
+        evaluate: Accuracy on a split after an epoch.
+        labels: Labels by split.
+        config: Settings.
+        generator: Generator of the order of samples.
+        checkpoint: File that is written after each epoch, and continued from.
     """
     count = len(labels["train"])
     optimiser = torch.optim.Adam(module.parameters(), lr=config.rate or _RATES[config.layers])
     steps = config.epochs * -(-count // config.batch)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    state = _State(module, optimiser, schedule, generator)
+    state = _ClassifierTrainingState(module, optimiser, schedule, generator)
     curve = state.load(checkpoint) if checkpoint is not None and checkpoint.is_file() else []
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task("training", total=steps, completed=steps * len(curve) // config.epochs)
@@ -182,15 +200,15 @@ def _fit(
                 schedule.step()
                 total += float(loss.detach()) * len(rows)
                 progress.advance(task)
-            curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": accuracy("val", epoch)})
+            curve.append({"epoch": epoch, "loss": round(total / count, 5), "val": evaluate("val", epoch)})
             if checkpoint is not None:
                 state.save(checkpoint, curve)
-    return curve, {name: accuracy(name, config.epochs + 1) for name in labels}
+    return curve, {name: evaluate(name, config.epochs + 1) for name in labels}
 
 
 @dataclass(frozen=True)
-class _State:
-    """All that the next epoch depends on."""
+class _ClassifierTrainingState:
+    """State of the training after an epoch."""
 
     module: nn.Module
     optimiser: torch.optim.Optimizer
@@ -198,16 +216,16 @@ class _State:
     generator: torch.Generator
 
     def save(self, path: Path, curve: list[dict[str, float]]) -> None:
-        """curve: what each epoch came to so far."""
+        """Write a checkpoint with the loss and accuracy of all epochs so far."""
         tensors = {f"weights.{name}": value.contiguous() for name, value in self.module.state_dict().items()}
         tensors |= {f"optimiser.{name}": value for name, value in optimiser_state(self.optimiser).items()}
-        # Dropout draws from torch's own generator, the order of pictures from this one.
+        # Dropout uses torch's global generator, the order of pictures this one.
         tensors |= {"random.own": self.generator.get_state(), "random.torch": torch.get_rng_state()}
         rates = json.dumps(self.schedule.state_dict())
         write_weights(path, {"curve": json.dumps(curve), "schedule": rates}, tensors)
 
     def load(self, path: Path) -> list[dict[str, float]]:
-        """What each epoch came to before the file was written. Raises DetectorError for what is no such file."""
+        """Load a checkpoint and return the loss and accuracy of its epochs. Raises DetectorError if it is none."""
         facts, tensors = read_weights(path)
         try:
             parts = split_by_section(tensors, "weights", "optimiser", "random")
@@ -227,16 +245,25 @@ class _State:
 
 
 @torch.no_grad()
-def embedded(network: Classifier, images: Tensor, device: str, title: str, half: bool = False) -> Tensor:
-    """Features (N, K) of pictures (N, 3, H, W) uint8, computed once. title: of the bar; half: shown at half their
-    size.
+def compute_features(network: Classifier, images: Tensor, device: str, title: str, half: bool = False) -> Tensor:
+    """Compute the features of pictures.
+
+    Args:
+        network: The network.
+        images: Pictures (N, 3, H, W) uint8.
+        device: torch device.
+        title: Title of the progress bar.
+        half: Halve the pictures first.
+
+    Returns:
+        Features (N, K).
     """
     with training_progress_bar(Console(stderr=True)) as progress:
-        parts = progress.track(images.split(_EMBEDDED_AT_A_TIME), description=title)
-        return torch.cat([network.embed(_shown(part, device, half)) for part in parts])
+        parts = progress.track(images.split(_FEATURE_BATCH), description=title)
+        return torch.cat([network.embed(_to_float(part, device, half)) for part in parts])
 
 
-def _shown(images: Tensor, device: str, half: bool) -> Tensor:
-    """Pictures (N, 3, H, W) uint8 as networks see them, or at half their size."""
+def _to_float(images: Tensor, device: str, half: bool) -> Tensor:
+    """Convert pictures (N, 3, H, W) uint8 to [0, 1], optionally at half the size."""
     pictures = images.to(device).float() / 255
     return F.avg_pool2d(pictures, 2) if half else pictures

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from drivesem.classify.attack import attack_run
-from drivesem.classify.confirm import confirm_run
-from drivesem.classify.gate import gate_run
-from drivesem.classify.holes import holes_run
-from drivesem.classify.least import explain_run
-from drivesem.classify.page import shares
+from drivesem.classify.attack import attack_pictures
+from drivesem.classify.confirm import confirm_failures
+from drivesem.classify.explain import explain_failures
+from drivesem.classify.gate import compare_networks
+from drivesem.classify.holes import find_pose_regions
 from drivesem.classify.pictures import write_pictures
-from drivesem.classify.results import ClassifiedRun, ClassTally
-from drivesem.classify.training import train_run
+from drivesem.classify.report import format_accuracy
+from drivesem.classify.results import ClassCounts, ClassifyMetrics
+from drivesem.classify.training import train_classifier
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.devices import check_device
 from drivesem.report.tables import ReportTable, format_count, format_percent, print_json
@@ -23,11 +23,11 @@ from drivesem.run.driver import print_output_folder, publish_report
 from drivesem.run.folder import claim_folder, resolve_output_folder
 from drivesem.run.report.runs import PAGE
 
-_ANALYSES = {"explain": explain_run, "holes": holes_run, "gate": gate_run}
+_ANALYSES = {"explain": explain_failures, "holes": find_pose_regions, "gate": compare_networks}
 
 
 def classify_command(config: ClassifyConfig) -> int:
-    """`drivesem classify`: exit code 1 if a gate is not passed."""
+    """Run `drivesem classify`; exit code 1 if a gate is not passed."""
     check_device(config.device)
     if config.what in _ANALYSES:
         report = _ANALYSES[config.what](config)
@@ -47,7 +47,7 @@ def _data(config: ClassifyConfig, console: Console) -> None:
 
 
 def _train(config: ClassifyConfig, console: Console) -> None:
-    data = train_run(config)
+    data = train_classifier(config)
     rows = tuple((str(e["epoch"]), f"{e['loss']:.4f}", format_percent(e["val"])) for e in data["epochs"])
     table = ReportTable(f"{config.network}: {config.layers} layers", ("epoch", "loss", "accuracy on val, %"), rows)
     console.print(table.to_rich(()))
@@ -61,24 +61,24 @@ def _train(config: ClassifyConfig, console: Console) -> None:
 
 
 def _attack(config: ClassifyConfig, console: Console) -> None:
-    run = attack_run(config)
-    console.print(_table(run).to_rich(("class",)))
-    grades = run.grades
+    metrics = attack_pictures(config)
+    console.print(_table(metrics).to_rich(("class",)))
+    grades = metrics.grades
     console.print(
-        f"{format_count(run.pictures, 'picture')}, {format_count(run.queries, 'query', 'queries')}, "
-        f"{format_count(run.passes, 'pass', 'passes')} in {run.seconds:.0f} s: "
+        f"{format_count(metrics.overall.pictures, 'picture')}, {format_count(metrics.queries, 'query', 'queries')}, "
+        f"{format_count(metrics.passes, 'pass', 'passes')} in {metrics.seconds:.0f} s: "
         f"{grades['threshold']} misclassified by threshold, {grades['certain']} certain",
         soft_wrap=True,
     )
-    _print_end(config, console, Path(run.out) / PAGE, run.to_json(), run.frames_failed)
+    _print_end(config, console, Path(metrics.out) / PAGE, metrics.to_json(), metrics.frames_failed)
 
 
 def _confirm(config: ClassifyConfig, console: Console) -> None:
-    run, facts = confirm_run(config)
-    console.print(_table(run).to_rich(("class",)))
+    metrics, facts = confirm_failures(config)
+    console.print(_table(metrics).to_rich(("class",)))
     lines = [
         f"{facts['renderer']} agrees on {facts['agree']} of {format_count(facts['failures'], 'failure')}; "
-        f"{run.grades['certain']} are certain, {run.grades['confirmed']} confirmed"
+        f"{metrics.grades['certain']} are certain, {metrics.grades['confirmed']} confirmed"
     ]
     if facts["iou"]:
         lines.append(
@@ -88,7 +88,9 @@ def _confirm(config: ClassifyConfig, console: Console) -> None:
             "(CIE 1976, mean of an object)"
         )
     console.print("\n".join(lines), soft_wrap=True)
-    _print_end(config, console, Path(run.out) / PAGE, {**run.to_json(), "second": facts}, facts["frames_failed"])
+    _print_end(
+        config, console, Path(metrics.out) / PAGE, {**metrics.to_json(), "second": facts}, facts["frames_failed"]
+    )
 
 
 def _print_end(
@@ -99,12 +101,15 @@ def _print_end(
         print_json(data)
 
 
-def _table(run: ClassifiedRun) -> ReportTable:
-    def row(name: str, tally: ClassTally) -> tuple[str, ...]:
-        return name, str(tally.pictures), *shares(tally), str(tally.certain), str(tally.confirmed)
+def _table(metrics: ClassifyMetrics) -> ReportTable:
+    def row(name: str, counts: ClassCounts) -> tuple[str, ...]:
+        return name, str(counts.pictures), *format_accuracy(counts), str(counts.certain), str(counts.confirmed)
 
-    rows = [*(row(tally.name, tally) for tally in run.classes if tally.pictures), row("all", run.whole)]
-    title = f"{run.network} on {run.objects} objects: {run.method}, {' + '.join(run.params)}"
+    rows = [
+        *(row(counts.name, counts) for counts in metrics.classes if counts.pictures),
+        row("all", metrics.overall),
+    ]
+    title = f"{metrics.network} on {metrics.objects} objects: {metrics.method}, {' + '.join(metrics.params)}"
     columns = ("class", "pictures", "accuracy, %", "attacked, %", "certain", "confirmed")
-    count = len(columns) if run.grades["confirmed"] else len(columns) - 1
+    count = len(columns) if metrics.grades["confirmed"] else len(columns) - 1
     return ReportTable(title, columns[:count], tuple(row[:count] for row in rows))

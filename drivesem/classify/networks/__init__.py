@@ -1,1 +1,1 @@
-"""Networks that say of what class a picture is."""
+"""Networks that classify pictures."""

@@ -1,4 +1,4 @@
-"""What every classifier is: pictures to features, and features to one score a class."""
+"""Interface and base class of classifiers: pictures to features, and features to one score per class."""
 
 from __future__ import annotations
 
@@ -10,46 +10,57 @@ import torch
 from torch import Tensor, nn
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of RGB in [0, 1]: what torchvision's weights were trained with."""
+"""Normalisation of RGB in [0, 1] with which torchvision's weights were trained."""
 
 
-class Scorer(Protocol):
-    """What attacks ask of a classifier. differentiable: whether its scores have a gradient to the pictures."""
+class ImageClassifier(Protocol):
+    """A classifier that can be attacked."""
 
     differentiable: bool
+    """Whether scores have a gradient with respect to pictures."""
     classes: tuple[str, ...]
+    """Names of the classes, in the order of scores."""
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1]."""
+        """Compute scores before softmax (B, C) of pictures (B, 3, H, W), RGB in [0, 1]."""
         ...
 
 
 class Classifier(nn.Module, ABC):
-    """A network whose last layer, a linear one, tells `classes` apart. architecture: its name in weights files;
-    head: the path of that layer, by torchvision's names where it has the network; published_head: what files of
-    the published weights hold in its place, where that has another name.
-    """
+    """A network with a linear last layer, which can be replaced for other classes."""
 
     differentiable = True
     architecture: str
+    """Name in weights files."""
     head: ClassVar[str]
+    """Path of the last layer, by torchvision's names if torchvision has the network."""
     published_head: str = ""
+    """Path of the last layer in files of published weights, if it differs."""
 
     classes: tuple[str, ...]
+    """Names of the classes, in the order of scores."""
     mean: Tensor
+    """Mean of RGB (3, 1, 1)."""
     std: Tensor
+    """Deviation of RGB (3, 1, 1)."""
 
     def __init__(
         self, classes: Sequence[str], mean: Sequence[float] = IMAGENET_MEAN, std: Sequence[float] = IMAGENET_STD
     ) -> None:
+        """
+        Args:
+            classes: Names of the classes.
+            mean: Mean of RGB.
+            std: Deviation of RGB.
+        """
         super().__init__()
         self.classes = tuple(classes)
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
 
     @abstractmethod
-    def encode(self, prepared: Tensor) -> Tensor:
-        """What the last layer reads (B, K) of prepared pictures (B, 3, H, W)."""
+    def encode(self, normalised: Tensor) -> Tensor:
+        """Compute features (B, K) of normalised pictures (B, 3, H, W)."""
 
     @property
     def last(self) -> nn.Linear:
@@ -59,19 +70,19 @@ class Classifier(nn.Module, ABC):
         return layer
 
     def embed(self, images: Tensor) -> Tensor:
-        """Features (B, K) of pictures (B, 3, H, W), RGB in [0, 1]."""
+        """Compute features (B, K) of pictures (B, 3, H, W), RGB in [0, 1]."""
         return self.encode((images - self.mean) / self.std)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Scores (B, C) before softmax, of pictures (B, 3, H, W), RGB in [0, 1], wherever they lie."""
+        """Compute scores before softmax (B, C) of pictures (B, 3, H, W), RGB in [0, 1], on any device."""
         return self.last(self.embed(images.to(self.mean))).to(images)
 
-    def own_name(self, published: str) -> str:
-        """What a tensor of the published weights is called here."""
+    def local_name(self, published: str) -> str:
+        """The name here of a tensor of the published weights."""
         return published
 
-    def retarget(self, classes: Sequence[str], generator: torch.Generator) -> None:
-        """Have a new last layer, for other classes, with small random weights."""
+    def replace_last_layer(self, classes: Sequence[str], generator: torch.Generator) -> None:
+        """Replace the last layer by one for other classes, with small random weights."""
         layer = nn.Linear(self.last.in_features, len(classes))
         with torch.no_grad():
             layer.weight.normal_(0, 0.01, generator=generator)

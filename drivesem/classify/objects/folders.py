@@ -1,4 +1,4 @@
-"""Objects in folders: ShapeNetCore's layout, and meshes by class."""
+"""Sets of objects in folders: ShapeNetCore's layout, or meshes by class."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from zlib import crc32
 
 import numpy as np
 
-from drivesem.classify.objects.meshes import read_object
+from drivesem.classify.objects.meshes import load_object
 from drivesem.classify.objects.types import CLASSES, SPLITS, ObjectModel, Split
-from drivesem.classify.paper import figures
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
@@ -31,52 +30,75 @@ _SYNSETS = {
     "04468005": "train",
     "04530566": "boat",
 }
-"""ShapeNetCore's folders of the paper's classes: WordNet's numbers."""
+"""Classes by ShapeNetCore's folder, which is a WordNet number."""
+_PAPER_SIZES = {
+    "airplane": (775, 2713, 388),
+    "bench": (464, 1624, 232),
+    "trashcan": (119, 417, 60),
+    "bus": (127, 445, 64),
+    "car": (1549, 5421, 774),
+    "helmet": (60, 210, 30),
+    "mailbox": (15, 53, 8),
+    "motorcycle": (73, 258, 37),
+    "skateboard": (49, 171, 24),
+    "tower": (25, 87, 12),
+    "train": (99, 344, 49),
+    "boat": (315, 1100, 157),
+}
+"""Objects that the paper tests, trains and validates on, by class."""
 _SHARES = (0.7, 0.1)
-"""Of training and validation where a class has fewer objects than in the paper: the paper's own shares."""
+"""Shares of training and validation if a class has fewer objects than in the paper: the paper's own."""
 _MODELS = ("models/model_normalized.obj", "model.obj")
-"""Of an object in ShapeNetCore's second and first version."""
+"""File of an object in ShapeNetCore's second and first version."""
 _SUFFIXES = (".obj", ".glb", ".ply")
 
 
 class FolderObjects:
-    """Objects read from a folder: `ObjectSet`.
+    """`ObjectSet` of a folder.
 
-    Either ShapeNetCore's `SYNSET/HASH/models/model_normalized.obj`, of which the paper's classes are taken, or
-    `CLASS/NAME.obj` (or .glb, .ply) with any classes. Splits come from `splits.json` in the folder ({"train":
-    ["bus/NAME", ...], "val": [...], "test": [...]}) or from `train.txt`, `val.txt` and `test.txt`, a name a line;
-    else they are drawn by `seed`, class by class: of the paper's sizes where a class has so many objects, else 70,
-    10 and 20 %. most_triangles: finer meshes are simplified to so many.
-    Raises FormatError for a folder without objects, and for lists that name what is not there.
+    The folder has ShapeNetCore's layout `SYNSET/HASH/models/model_normalized.obj`, of which the paper's classes are
+    used, or `CLASS/NAME.obj` (.glb, .ply) with any classes. `splits.json` ({"train": ["bus/NAME", ...], "val": [...],
+    "test": [...]}) or `train.txt`, `val.txt` and `test.txt`, with one name per line, define the splits. Otherwise they
+    are drawn at random within each class: of the paper's sizes if the class has that many objects, else 70, 10 and
+    20 %.
     """
 
-    def __init__(self, folder: str | Path, *, seed: int = 0, most_triangles: int | None = None) -> None:
-        if most_triangles is not None and most_triangles < 4:
-            raise RangeError("most_triangles", "at least 4", most_triangles)
-        self._root, self._seed, self._most = Path(folder), seed, most_triangles
+    def __init__(self, folder: str | Path, *, seed: int = 0, max_triangles: int | None = None) -> None:
+        """
+        Args:
+            folder: The folder.
+            seed: Seed of random splits.
+            max_triangles: Simplify meshes with more triangles to this number.
+
+        Raises:
+            FormatError: A folder without objects, or lists that name missing objects.
+        """
+        if max_triangles is not None and max_triangles < 4:
+            raise RangeError("max_triangles", "at least 4", max_triangles)
+        self._root, self._seed, self._max_triangles = Path(folder), seed, max_triangles
         if not self._root.is_dir():
             raise FormatError(str(folder), "a folder of objects", "no such folder")
         self._synsets = {name: self._root / s for s, name in _SYNSETS.items() if (self._root / s).is_dir()}
-        self._paths = self._shapenet() if self._synsets else self._by_class()
+        self._paths = self._find_shapenet_objects() if self._synsets else self._find_meshes_by_class()
         if not self._paths:
             expected = f"ShapeNetCore's folders, or folders of {', '.join(_SUFFIXES)} by class"
             raise FormatError(str(folder), expected, "no object")
         known = {name.partition("/")[0] for name in self._paths}
         self.classes: tuple[str, ...] = CLASSES if known <= set(CLASSES) else tuple(sorted(known))
         if len(self.classes) < 2:
-            raise FormatError(str(folder), "objects of two classes at least", f"of {min(known)} alone")
+            raise FormatError(str(folder), "objects of at least two classes", f"only {min(known)}")
         folders = Counter(name.replace("/", "-") for name in self._paths)
-        twice = next((name for name, count in folders.items() if count > 1), None)
-        if twice is not None:
-            raise FormatError(str(folder), "names that differ with - for /", f"{twice} twice")
-        self._splits = self._listed() or self._drawn()
+        duplicate = next((name for name, count in folders.items() if count > 1), None)
+        if duplicate is not None:
+            raise FormatError(str(folder), "names that differ with - for /", f"{duplicate} twice")
+        self._splits = self._read_splits() or self._draw_splits()
 
     def names(self, split: Split) -> tuple[str, ...]:
-        """Names of a split's objects, in the order of classes."""
+        """List the names of a split's objects, in the order of classes."""
         return self._splits[split]
 
     def load(self, name: str) -> ObjectModel:
-        """The object of that name. Raises FormatError where it cannot be read, RangeError where there is none."""
+        """Load an object by name. Raises FormatError if it cannot be read, RangeError for an unknown name."""
         if name not in self._paths:
             raise RangeError("object", f"one of the {len(self._paths):,} in {self._root}", name)
         path, label = self._paths[name], self.classes.index(name.partition("/")[0])
@@ -84,29 +106,29 @@ class FolderObjects:
             path, folder = next((path / m for m in _MODELS if (path / m).is_file()), path / _MODELS[0]), path
         else:
             folder = path.parent
-        return read_object(path, name, label, folder, self._most)
+        return load_object(path, name, label, folder, self._max_triangles)
 
-    def _shapenet(self) -> dict[str, Path]:
-        """Folders of objects by name."""
-        found = {kind: _inside(synset) for kind, synset in self._synsets.items()}
-        return {f"{kind}/{path.name}": path for kind, paths in found.items() for path in paths if path.is_dir()}
+    def _find_shapenet_objects(self) -> dict[str, Path]:
+        """Find folders of objects by name."""
+        folders = {kind: _list_folder(synset) for kind, synset in self._synsets.items()}
+        return {f"{kind}/{path.name}": path for kind, paths in folders.items() for path in paths if path.is_dir()}
 
-    def _by_class(self) -> dict[str, Path]:
-        """Mesh files by name."""
+    def _find_meshes_by_class(self) -> dict[str, Path]:
+        """Find mesh files by name."""
         paths: dict[str, Path] = {}
-        for folder in (path for path in _inside(self._root) if path.is_dir()):
-            for path in _inside(folder):
+        for folder in (path for path in _list_folder(self._root) if path.is_dir()):
+            for path in _list_folder(folder):
                 name = f"{folder.name}/{path.stem}"
                 if path.suffix.lower() not in _SUFFIXES:
                     continue
                 if name in paths:
-                    raise FormatError(str(path), "one mesh of a name", f"{paths[name].name} too")
+                    raise FormatError(str(path), "one mesh per name", f"also {paths[name].name}")
                 paths[name] = path
         return paths
 
     @cached_property
     def _aliases(self) -> dict[str, str]:
-        """Names by what lists call objects: by class, by synset, and by hash alone."""
+        """Names of objects by their names in lists: with the class, with the synset, or the hash alone."""
         aliases = {name: name for name in self._paths}
         for name in self._paths if self._synsets else ():
             kind, _, code = name.partition("/")
@@ -114,8 +136,8 @@ class FolderObjects:
             aliases[code] = name
         return aliases
 
-    def _listed(self) -> dict[Split, tuple[str, ...]] | None:
-        """The splits as lists beside the objects say; None where there are none."""
+    def _read_splits(self) -> dict[Split, tuple[str, ...]] | None:
+        """Read the splits from lists in the folder; None without lists."""
         path = self._root / "splits.json"
         if path.exists():
             lists = _check_lists(path, files.read_json(path))
@@ -128,18 +150,20 @@ class FolderObjects:
         owner: dict[str, Split] = {}
         for split in SPLITS:
             where = str(path) if path.exists() else str(self._root / f"{split}.txt")
-            for listed in lists[split]:
-                name = self._aliases.get(listed)
+            for entry in lists[split]:
+                name = self._aliases.get(entry)
                 if name is None:
-                    raise FormatError(f"{where}: {split}", f"objects of {self._root}", repr(listed[:200]))
+                    raise FormatError(f"{where}: {split}", f"objects of {self._root}", repr(entry[:200]))
                 if owner.setdefault(name, split) != split:
-                    raise FormatError(f"{where}: {split}", "objects of no other split", repr(listed[:200]))
-        return {split: self._ordered([name for name, own in owner.items() if own == split]) for split in SPLITS}
+                    raise FormatError(f"{where}: {split}", "objects of no other split", repr(entry[:200]))
+        return {
+            split: self._sort_by_class([name for name, own in owner.items() if own == split]) for split in SPLITS
+        }
 
-    def _drawn(self) -> dict[Split, tuple[str, ...]]:
-        """Splits drawn by seed."""
+    def _draw_splits(self) -> dict[Split, tuple[str, ...]]:
+        """Draw splits at random."""
         splits: dict[Split, list[str]] = {split: [] for split in SPLITS}
-        sizes = figures()["sizes"] if self._synsets else {}
+        sizes = _PAPER_SIZES if self._synsets else {}
         for kind in self.classes:
             own = sorted(name for name in self._paths if name.partition("/")[0] == kind)
             order = np.random.default_rng([self._seed, crc32(kind.encode())]).permutation(len(own))
@@ -150,14 +174,14 @@ class FolderObjects:
             ends = np.cumsum([0, train, val, test])
             for split, start, end in zip(SPLITS, ends[:-1], ends[1:], strict=True):
                 splits[split] += [own[i] for i in order[start:end]]
-        return {split: self._ordered(names) for split, names in splits.items()}
+        return {split: self._sort_by_class(names) for split, names in splits.items()}
 
-    def _ordered(self, names: Sequence[str]) -> tuple[str, ...]:
+    def _sort_by_class(self, names: Sequence[str]) -> tuple[str, ...]:
         return tuple(sorted(names, key=lambda name: (self.classes.index(name.partition("/")[0]), name)))
 
 
-def _inside(folder: Path) -> list[Path]:
-    """What a folder holds, in order, hidden things left out. Raises FormatError where it cannot be read."""
+def _list_folder(folder: Path) -> list[Path]:
+    """List a folder in order, without hidden files. Raises FormatError if it cannot be read."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:
@@ -165,7 +189,7 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _check_lists(path: Path, value: Any) -> dict[Split, list[str]]:
-    """Lists of names by split, as a file of JSON has them."""
+    """Check the contents of splits.json."""
     if not isinstance(value, dict) or not set(value) <= set(SPLITS):
         raise FormatError(str(path), f"lists by {', '.join(SPLITS)}", "another value")
     lists: dict[Split, list[str]] = {}

@@ -1,4 +1,4 @@
-"""An object with its class and its materials, and a set of objects in three splits."""
+"""An object with its class and materials, and the interface of a set of objects in three splits."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ CLASSES = (
     *("airplane", "bench", "trashcan", "bus", "car", "helmet"),
     *("mailbox", "motorcycle", "skateboard", "tower", "train", "boat"),
 )
-"""The paper's classes in its order: an object's label is its class's place here, unless its set says otherwise."""
+"""The paper's classes in its order; labels are indices into it, unless a set has its own classes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectModel:
-    """One object of a class.
-
-    name: of the object in its set, "bus/0007". label: its class's place in the set's classes. mesh: vertices
-    (V, 3) float32, centred, longest side 1, y up, the front towards -z, as ShapeNetCore v2 has it (not the unit
-    box of vehicles); faces (F, 3), counter-clockwise seen from outside. diffuse (F, 3): linear RGB in [0, 1];
-    specular (F,) in [0, 1]; shininess (F,), Phong's exponent, at least 0: float32, one a face.
-    Raises ShapeError for a shape or type, or no faces, RangeError for a value, naming the object.
-    """
+    """One object of a class. Raises ShapeError or RangeError for bad values."""
 
     name: str
+    """Name in its set, such as "bus/0007"."""
     label: int
+    """Index of its class in the set's classes."""
     mesh: Mesh
+    """Vertices (V, 3) float32, centred, longest side 1, y up, front towards -z as in ShapeNetCore v2; faces (F, 3)
+    counter-clockwise seen from outside."""
     diffuse: Tensor
+    """Linear RGB of each face (F, 3) float32, in [0, 1]."""
     specular: Tensor
+    """Specular reflectance of each face (F,) float32, in [0, 1]."""
     shininess: Tensor
+    """Phong exponent of each face (F,) float32, at least 0."""
 
     def __post_init__(self) -> None:
         if self.label < 0:
@@ -60,34 +60,44 @@ class ObjectModel:
                 raise RangeError(f"{self.name}: {field}", expected, low if low < 0 else high)
 
 
-def used(mesh: Mesh) -> Mesh:
-    """The mesh without vertices that no face has, which nothing draws and an attack would move all the same."""
-    places, faces = torch.unique(mesh.faces, return_inverse=True)
-    return replace(mesh, vertices=mesh.vertices[places], faces=faces)
+def drop_unused_vertices(mesh: Mesh) -> Mesh:
+    """Drop vertices without faces, which are invisible but would be attacked."""
+    used, faces = torch.unique(mesh.faces, return_inverse=True)
+    return replace(mesh, vertices=mesh.vertices[used], faces=faces)
 
 
-def object_model(
-    name: str, label: int, vertices: NDArray[np.floating], faces: NDArray[np.integer], looks: NDArray[np.float64]
+def make_object_model(
+    name: str,
+    label: int,
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    materials: NDArray[np.float64],
 ) -> ObjectModel:
-    """The object of vertices (V, 3), faces (F, 3), and their linear RGB, specular share and exponent (F, 5)."""
+    """Make an object.
+
+    Args:
+        name: Its name.
+        label: Index of its class.
+        vertices: Vertices (V, 3).
+        faces: Faces (F, 3).
+        materials: Linear RGB, specular reflectance and Phong exponent of each face (F, 5).
+    """
     corners, sides = torch.from_numpy(vertices.astype(np.float32)), torch.from_numpy(faces.astype(np.int64))
-    table = torch.from_numpy(looks.astype(np.float32))
-    mesh = used(Mesh(corners, sides, torch.full((len(faces),), int(Part.OTHER)), name))
+    table = torch.from_numpy(materials.astype(np.float32))
+    mesh = drop_unused_vertices(Mesh(corners, sides, torch.full((len(faces),), int(Part.OTHER)), name))
     return ObjectModel(name, label, mesh, table[:, :3].contiguous(), table[:, 3], table[:, 4])
 
 
 class ObjectSet(Protocol):
-    """Objects by name, in three splits that share none."""
+    """Objects by name in three disjoint splits."""
 
     classes: tuple[str, ...]
     """Names of the classes, in the order of labels."""
 
     def names(self, split: Split) -> tuple[str, ...]:
-        """Names of a split's objects, in the order of classes."""
+        """List the names of a split's objects, in the order of classes."""
         ...
 
     def load(self, name: str) -> ObjectModel:
-        """The object of that name, the same each time. Raises FormatError where it cannot be read, RangeError for
-        a name that the set does not have.
-        """
+        """Load an object by name. Raises FormatError if it cannot be read, RangeError for an unknown name."""
         ...

@@ -9,44 +9,44 @@ from torch import nn
 from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
 from drivesem.attack.methods.gradient_free import Sampling
 from drivesem.attack.methods.scw import SCW
-from drivesem.classify.objective import ClassifierObjective, Seen, ahead, aim
+from drivesem.classify.objective import ClassifierObjective, ClassLogits, ahead, aim
 from drivesem.classify.scenes import DRAWN_PX, ObjectScene
-from drivesem.classify.space import Amounts, ObjectSpace, moved_of
+from drivesem.classify.space import ParameterAmounts, ObjectSpace, parse_parameters
 from scene_ir.errors import RangeError
 from tests.drivesem.classify.standins import model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.5)
-WIDE = Amounts(0.5, 3.0, 0.9)
+WIDE = ParameterAmounts(0.5, 3.0, 0.9)
 SCORES = torch.tensor([2.0, 3.0, -1.0])
 
 
 def objective_of(network, aimed="logit", params="pose", kind="box", reach=WIDE):
     scene = ObjectScene(kind, model(kind), "forward", GREY)
-    space = ObjectSpace(scene.vertices, moved_of(params), Amounts(0.002, 0.15, 0.2), reach)
+    space = ObjectSpace(scene.vertices, parse_parameters(params), ParameterAmounts(0.002, 0.15, 0.2), reach)
     return ClassifierObjective(scene, space, network, aimed)
 
 
 def test_aims_by_hand():
-    assert float(aim(SCORES, 1, "logit")) == -3
-    assert float(aim(SCORES, 1, "hinge")) == -1
-    assert float(aim(SCORES, 0, "hinge")) == 0
+    assert float(compute_attack_loss(SCORES, 1, "logit")) == -3
+    assert float(compute_attack_loss(SCORES, 1, "hinge")) == -1
+    assert float(compute_attack_loss(SCORES, 0, "hinge")) == 0
     chances = [math.exp(s) / (math.exp(2) + math.exp(3) + math.exp(-1)) for s in (2, 3, -1)]
-    assert float(aim(SCORES, 1, "softmax")) == pytest.approx(chances[0])
-    assert float(aim(SCORES, 2, "softmax")) == pytest.approx(chances[1])
+    assert float(compute_attack_loss(SCORES, 1, "softmax")) == pytest.approx(chances[0])
+    assert float(compute_attack_loss(SCORES, 2, "softmax")) == pytest.approx(chances[1])
     assert (float(ahead(SCORES, 1)), float(ahead(SCORES, 2))) == (1, -4)
 
 
 def test_what_is_said_of_a_picture():
-    seen = Seen(SCORES, 1)
+    seen = ClassLogits(SCORES, 1)
     assert (seen.predicted, seen.right, seen.margin) == (1, True, 1.0)
     assert seen.confidence == pytest.approx(float(SCORES.softmax(0)[1]))
-    assert not Seen(SCORES, 0).right
+    assert not ClassLogits(SCORES, 0).right
 
 
 def test_loss_and_gradient(colours):
     objective = objective_of(colours)
     loss, gradient = objective.loss_and_grad(torch.tensor([0.1, 0.2, 0.0]))
-    seen = objective.see(torch.tensor([0.1, 0.2, 0.0]))
+    seen = objective.evaluate(torch.tensor([0.1, 0.2, 0.0]))
     assert loss == pytest.approx(-float(seen.scores[0]), abs=0.02)  # what is judged is rounded to 8 bits
     assert gradient.shape == (3,)
     assert objective.passes == 1 + 3 + 1
@@ -93,10 +93,10 @@ METHODS = {
 def test_the_papers_methods_find_a_failure_and_stop_at_it(name, colours):
     method, aimed = METHODS[name]
     params = "pose" if name == "halton" else "pose,vertex"
-    objective = objective_of(Narrow(colours, 0.02), aimed, params, reach=Amounts(0.05, 0.75, 0.9))
+    objective = objective_of(Narrow(colours, 0.02), aimed, params, reach=ParameterAmounts(0.05, 0.75, 0.9))
     result = method(objective.problem(), objective.space.theta0, seed=0)
     assert result.success_moved
-    assert not objective.see(result.theta).right
+    assert not objective.evaluate(result.theta).right
     assert result.queries == 5 if name == "halton" else result.queries < 5
     again = method(objective.problem(), objective.space.theta0, seed=0)
     assert torch.equal(again.theta, result.theta)
@@ -142,7 +142,7 @@ class Chosen:
 def test_of_five_samples_the_misclassified_one_with_the_highest_wrong_softmax(kind, outcomes, winner, colours):
     from dataclasses import replace
 
-    objective, known = objective_of(colours, "softmax", reach=Amounts(0.05, 0.75, 0.5)), Chosen(outcomes)
+    objective, known = objective_of(colours, "softmax", reach=ParameterAmounts(0.05, 0.75, 0.5)), Chosen(outcomes)
     problem = replace(objective.problem(), score=known.score)
     result = Sampling(5, kind=kind)(problem, objective.space.theta0, seed=1)
     assert len(known.asked) == 5

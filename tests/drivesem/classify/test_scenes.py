@@ -12,12 +12,12 @@ from drivesem.classify.scenes import (
     VIEWS,
     ObjectScene,
     camera,
-    generated_background,
-    in_turn,
+    generate_background,
+    interleave_classes,
     open_backgrounds,
     rotation,
 )
-from drivesem.classify.space import Amounts, Change, ObjectSpace, moved_of
+from drivesem.classify.space import ParameterAmounts, Change, ObjectSpace, parse_parameters
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.render.lit_mesh import composite_over
@@ -28,7 +28,7 @@ GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)
 
 def test_the_front_faces_the_camera_and_up_is_up():
     scene = ObjectScene("box", model("box"), "forward", GREY)
-    placed, rest = scene.placed(), scene.vertices
+    placed, rest = scene.camera_vertices(), scene.vertices
     front, top = rest[:, 2] < 0, rest[:, 1] > 0
     assert float(placed[front, 2].max()) < float(placed[~front, 2].min())
     assert float(placed[top, 1].max()) < float(placed[~top, 1].min())
@@ -68,14 +68,14 @@ def test_only_what_is_around_an_object_is_drawn_smaller(drawn_px, along, monkeyp
     monkeypatch.setattr(scenes, "DRAWN_PX", drawn_px)
     behind = torch.rand(3, drawn_px, drawn_px, generator=torch.Generator().manual_seed(0))
     scene, view = ObjectScene("ball", model("ball"), "forward", behind), camera(drawn_px)
-    vertices = (scene.placed() + torch.tensor([*along, 0.0])).requires_grad_(True)
+    vertices = (scene.camera_vertices() + torch.tensor([*along, 0.0])).requires_grad_(True)
     weight = torch.randn(3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(1))
     drawn = scene.mesh.render(vertices, view, scene.lights())
     whole = torch.nn.functional.interpolate(
         composite_over(drawn, behind)[None], (SEEN_PX, SEEN_PX), mode="bilinear", antialias=True
     )[0]
     part, x, y = scene.mesh.render_part(vertices, view, scene.lights())
-    found = scene.shown(part, x, y)
+    found = scene.composite(part, x, y)
     torch.testing.assert_close(found, whole, atol=2e-5, rtol=0)
     assert part.numel() < drawn.numel()
     if not part.numel():
@@ -94,13 +94,13 @@ def smooth_noise():
 @pytest.mark.parametrize("params", ["pose", pytest.param("vertex", marks=pytest.mark.slow), "lighting"])
 def test_gradients_through_the_picture_and_through_a_score(params, colours):
     """512 px drawn, 224 seen, and what a network makes of it."""
-    scene = ObjectScene("box", model("box"), "left", generated_background("box"))
-    space = ObjectSpace(scene.vertices, moved_of(params), Amounts(0.002, 0.15, 0.2))
+    scene = ObjectScene("box", model("box"), "left", generate_background("box"))
+    space = ObjectSpace(scene.vertices, parse_parameters(params), ParameterAmounts(0.002, 0.15, 0.2))
     weight = smooth_noise()
     step = 1e-2 if params == "lighting" else 2e-3
     through = {
-        "image": lambda theta: (scene.picture(space.change(theta)).double() * weight).sum(),
-        "score": lambda theta: colours(scene.picture(space.change(theta))[None])[0, 0].double(),
+        "image": lambda theta: (scene.render(space.change(theta)).double() * weight).sum(),
+        "score": lambda theta: colours(scene.render(space.change(theta))[None])[0, 0].double(),
     }
     for name, value in through.items():
         leaf = torch.zeros(space.dim, requires_grad=True)
@@ -114,12 +114,12 @@ def test_gradients_through_the_picture_and_through_a_score(params, colours):
 @pytest.mark.parametrize("name", ["bus/0080", "airplane/0080"])
 def test_gradients_of_objects_with_parts_thinner_than_a_pixel(name):
     """Through the picture; where faces came and went with the pixels' centres, it was 0.86 and 0.57."""
-    scene = ObjectScene(name, open_objects(None).load(name), "top", generated_background(name))
-    space = ObjectSpace(scene.vertices, moved_of("pose"), Amounts(0.002, 0.15, 0.2))
+    scene = ObjectScene(name, open_objects(None).load(name), "top", generate_background(name))
+    space = ObjectSpace(scene.vertices, parse_parameters("pose"), ParameterAmounts(0.002, 0.15, 0.2))
     weight = smooth_noise()
 
     def value(theta):
-        return (scene.picture(space.change(theta)).double() * weight).sum()
+        return (scene.render(space.change(theta)).double() * weight).sum()
 
     step, leaf = 1e-3, torch.zeros(3, requires_grad=True)
     (gradient,) = torch.autograd.grad(value(leaf), leaf)
@@ -129,11 +129,11 @@ def test_gradients_of_objects_with_parts_thinner_than_a_pixel(name):
 
 
 def test_made_backgrounds_follow_from_their_names():
-    one = generated_background("a")
+    one = generate_background("a")
     assert one.shape == (3, DRAWN_PX, DRAWN_PX)
     assert bool((one >= 0).all() and (one <= 1).all())
-    assert torch.equal(one, generated_background("a"))
-    assert not torch.equal(one, generated_background("b"))
+    assert torch.equal(one, generate_background("a"))
+    assert not torch.equal(one, generate_background("b"))
 
 
 def test_photographs_as_backgrounds(tmp_path):
@@ -154,4 +154,4 @@ def test_backgrounds_that_cannot_be_used(tmp_path):
 
 
 def test_classes_in_turn():
-    assert in_turn(["a/0", "a/1", "b/0", "b/1", "b/2"]) == ["a/0", "b/0", "a/1", "b/1", "b/2"]
+    assert interleave_classes(["a/0", "a/1", "b/0", "b/1", "b/2"]) == ["a/0", "b/0", "a/1", "b/1", "b/2"]

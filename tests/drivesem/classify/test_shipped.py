@@ -10,7 +10,7 @@ from drivesem.classify.networks import loading
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import CLASSES
-from drivesem.classify.scenes import ObjectScene, generated_background, in_turn
+from drivesem.classify.scenes import ObjectScene, generate_background, interleave_classes
 from scene_ir.errors import FormatError
 
 
@@ -20,9 +20,9 @@ def test_held_out_objects_are_told_apart():
     objects = open_objects(None)
     network = load_classifier("squeezenet", objects.classes)
     right = []
-    for i, name in enumerate(in_turn(objects.names("test"))[-24:]):
+    for i, name in enumerate(interleave_classes(objects.names("test"))[-24:]):
         model, view = objects.load(name), ("left", "right", "top", "forward")[i % 4]
-        picture = ObjectScene(name, model, view, generated_background(f"{name}-{view}")).picture().clamp(0, 1)
+        picture = ObjectScene(name, model, view, generate_background(f"{name}-{view}")).picture().clamp(0, 1)
         right.append(int(network(picture[None])[0].argmax()) == model.label)
     assert sum(right) / len(right) >= 0.95
 
@@ -38,4 +38,4 @@ def test_it_is_held_to_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(FormatError, match=r"squeezenet-objects\.safetensors: expected the SHA-256 of"):
         load_classifier("squeezenet", CLASSES)
     with pytest.raises(FormatError, match="expected the SHA-256 of"):
-        loading.to_train("squeezenet", None, CLASSES, torch.Generator())
+        loading.load_for_training("squeezenet", None, CLASSES, torch.Generator())

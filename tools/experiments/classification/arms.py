@@ -8,8 +8,9 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.classify.attack import WRITTEN, Attacker, load_picture_results
+from drivesem.classify.attack import Attacker
 from drivesem.classify.pictures import ObjectView
+from drivesem.classify.report import WRITTEN, load_picture_results
 from drivesem.classify.results import ClassifiedPicture
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.presets import find_presets

@@ -15,13 +15,12 @@ import torch
 from torch import Tensor
 
 from drivesem.analysis.transfer.run import split_list
-from drivesem.classify.attack import write_run_report
 from drivesem.classify.networks.base import Classifier
 from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectSet, Split
-from tools.experiments.classification.paper import NETWORKS
-from drivesem.classify.pictures import ObjectView, ObjectRenderer, draw
+from drivesem.classify.pictures import ObjectRenderer, ObjectView, picture_path, render_pictures
+from drivesem.classify.report import write_run_report
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.training import compute_features, train_last_layer
 from drivesem.config.commands import ClassifyConfig
@@ -50,6 +49,7 @@ from tools.experiments.classification.features import (
     measure_distances,
     set_distance,
 )
+from tools.experiments.classification.paper import NETWORKS
 from tools.experiments.classification.results import (
     ClassificationResults,
     Floats,
@@ -231,12 +231,12 @@ class ClassificationStudy:
         if not self.wants(*RETRAINED_TABLES):
             return
         config = arm_config(self.study, self.out, "", self.networks[0].spec)
-        studio = ObjectRenderer.from_config(config)
-        self.failed |= draw(self.train, studio, config, self.out / PICTURES).failed
+        renderer = ObjectRenderer.from_config(config)
+        self.failed |= render_pictures(self.train, renderer, config, self.out / PICTURES).failed
         usable = [i for i, one in enumerate(self.train) if one.identifier not in self.failed]
         views = [self.train[i] for i in usable]
         labels = torch.tensor(self.labels(views))
-        paths = [studio.place(one, self.out / PICTURES) for one in views]
+        paths = [picture_path(one, self.out / PICTURES) for one in views]
         replaced = torch.tensor([i in set(self.replaced) for i in usable])
         for network in self.slow_networks:
             benign = network.features("train", paths)
@@ -426,7 +426,7 @@ def retrain_last_layer(
         config = ClassifyConfig(what="train", epochs=EPOCHS, layers="last")
         truth = labels.to(device)
         known, labelled = {"train": features, "val": features}, {"train": truth, "val": truth}
-        train_last_layer(learner, known, labelled, config, torch.Generator().manual_seed(seed), onward=True)
+        train_last_layer(learner, known, labelled, config, torch.Generator().manual_seed(seed), continued=True)
         save_classifier(prepare_for_inference(learner, device), path, {"trained_on": str(len(labels))})
     return load_classifier(str(path), network.classes, device)
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from drivesem.classify.objects.types import CLASSES, SPLITS
-from tools.experiments.classification.paper import NETWORKS, REMARKS, paper_tables
 from drivesem.evaluation.resampling import Interval
 from drivesem.report.tables import ReportTable
 from tools.experiments.classification.arms import (
@@ -25,6 +24,7 @@ from tools.experiments.classification.arms import (
     paper_preset,
 )
 from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT
+from tools.experiments.classification.paper import NETWORKS, REMARKS, paper_tables
 from tools.experiments.classification.results import OVERALL, ClassificationResults, Predictions, StudyNetwork
 from tools.experiments.realism.metrics import METRICS
 from tools.experiments.tables import interval_columns
@@ -184,7 +184,9 @@ def _parameters(results: ClassificationResults) -> ResultTable:
         }
         row = {"network": network.name, "strategy": strategy}
         rows += [row | {"params": params, **_overall(results, one)} for params, one in ours.items()]
-        paper: dict[str, float] = dict(zip(_COMPARED, paper_tables()["parameters"]["vgg16"][strategy], strict=True))
+        paper: dict[str, float] = dict(
+            zip(_COMPARED, paper_tables()["parameters"]["vgg16"][strategy], strict=True)
+        )
         orders += _order(results, f"parameters, {STRATEGY_NAMES[strategy]}", network, paper, ours)
     reference = [
         row | {"params": params, "overall": value}

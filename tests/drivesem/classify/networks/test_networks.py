@@ -19,10 +19,10 @@ from drivesem.classify.networks.loading import (
     load_classifier,
     prepare_for_inference,
     save_classifier,
-    to_train,
+    load_for_training,
 )
 from drivesem.classify.networks.onnx import OnnxClassifier
-from drivesem.classify.networks.published import VGG16, PooledVGG16, ResNet50, SqueezeNet
+from drivesem.classify.networks.architectures import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir.errors import FormatError, RangeError
 from tools.onnx_graph import constant_graph
 
@@ -75,7 +75,7 @@ def resnet_names():
 def test_torchvisions_file_of_vgg16(tmp_path):
     tensors = vgg_file()
     torch.save(tensors, tmp_path / "vgg16.pth")
-    network = prepare_for_inference(to_train("vgg16", str(tmp_path / "vgg16.pth"), CLASSES, seeded()))
+    network = prepare_for_inference(load_for_training("vgg16", str(tmp_path / "vgg16.pth"), CLASSES, seeded()))
     images = torch.rand(1, 3, 64, 64, generator=seeded())
     x = (images - torch.tensor(IMAGENET_MEAN).view(3, 1, 1)) / torch.tensor(IMAGENET_STD).view(3, 1, 1)
     for place in VGG_CONVOLUTIONS:
@@ -99,7 +99,7 @@ def test_torchvisions_names_of_resnet50(tmp_path):
     file = {name: torch.zeros(shape) for name, shape in resnet_names().items()}
     file = {name: t + ("running_var" in name) for name, t in file.items()}
     torch.save(file | {name: torch.tensor(0) for name in counted}, tmp_path / "resnet50.pth")
-    network = prepare_for_inference(to_train("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded()))
+    network = prepare_for_inference(load_for_training("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded()))
     assert network.classes == CLASSES
     assert torch.equal(network(torch.rand(1, 3, 64, 64)), torch.zeros(1, 3))
 
@@ -123,7 +123,7 @@ def test_a_block_of_resnet50_by_hand():
 
 def test_vggs_convolutions_alone(tmp_path):
     save_file(vgg_file(small=True), tmp_path / "vgg.safetensors")
-    network = prepare_for_inference(to_train("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
+    network = prepare_for_inference(load_for_training("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
     assert isinstance(network, PooledVGG16)
     assert network.embed(torch.rand(2, 3, 64, 64)).shape == (2, 1024)
 
@@ -137,7 +137,7 @@ def test_squeezenets_layers_are_squeezedets(tmp_path):
     file |= {"conv10.weight": torch.zeros(1000, 512, 1, 1), "conv10.bias": torch.zeros(1000)}
     save_file(file, tmp_path / "squeezenet.safetensors")
     network = prepare_for_inference(
-        to_train("squeezenet", str(tmp_path / "squeezenet.safetensors"), CLASSES, seeded())
+        load_for_training("squeezenet", str(tmp_path / "squeezenet.safetensors"), CLASSES, seeded())
     )
     images = torch.rand(1, 3, 64, 64, generator=seeded())
     pixels = 255 * images.flip(1) - torch.tensor([103.939, 116.779, 123.68]).view(3, 1, 1)
@@ -150,7 +150,7 @@ def test_squeezenets_layers_are_squeezedets(tmp_path):
 
 
 def test_what_is_written_is_read_again(tmp_path):
-    network = to_train("squeezenet", None, CLASSES, seeded(3))
+    network = load_for_training("squeezenet", None, CLASSES, seeded(3))
     save_classifier(network, tmp_path / "a.safetensors", {"fact": "1"})
     again = load_classifier(str(tmp_path / "a.safetensors"), CLASSES)
     images = torch.rand(1, 3, 64, 64, generator=seeded())
@@ -163,7 +163,7 @@ def test_what_is_written_is_read_again(tmp_path):
 def test_a_new_last_layer_follows_from_its_generator(name):
     one, other = (ARCHITECTURES[name](("a", "b")) for _ in range(2))
     for network in (one, other):
-        network.retarget(CLASSES, seeded(5))
+        network.replace_last_layer(CLASSES, seeded(5))
     assert one.classes == CLASSES
     assert torch.equal(one.last.weight, other.last.weight)
     assert one.last.out_features == 3
@@ -199,21 +199,21 @@ def not_finite(tensors):
 def test_weights_of_another_network(tmp_path, spoil, message):
     save_file(spoil(vgg_file(small=True)), tmp_path / "other.safetensors")
     with pytest.raises(FormatError, match=message):
-        to_train("vgg16-pooled", str(tmp_path / "other.safetensors"), CLASSES, seeded())
+        load_for_training("vgg16-pooled", str(tmp_path / "other.safetensors"), CLASSES, seeded())
 
 
 def test_names_and_files_that_are_no_networks(tmp_path):
     with pytest.raises(
         FormatError, match="squeezenet, vgg16, vgg16-pooled, resnet50, torchvision:NAME, timm:NAME"
     ):
-        to_train("alexnet", None, CLASSES, seeded())
+        load_for_training("alexnet", None, CLASSES, seeded())
     with pytest.raises(FormatError, match="--weights: expected a file with weights of vgg16, found nothing"):
-        to_train("vgg16", None, CLASSES, seeded())
+        load_for_training("vgg16", None, CLASSES, seeded())
     (tmp_path / "torn.pth").write_bytes(b"PK no weights")
     with pytest.raises(DetectorError, match=r"torn\.pth"):
-        to_train("vgg16", str(tmp_path / "torn.pth"), CLASSES, seeded())
+        load_for_training("vgg16", str(tmp_path / "torn.pth"), CLASSES, seeded())
     with pytest.raises(DetectorError, match=r"gone\.pth"):
-        to_train("vgg16", str(tmp_path / "gone.pth"), CLASSES, seeded())
+        load_for_training("vgg16", str(tmp_path / "gone.pth"), CLASSES, seeded())
     torch.save({"w": torch.zeros(1 << 20)}, tmp_path / "plain.pth")
     with zipfile.ZipFile(tmp_path / "plain.pth") as plain:
         parts = {name: plain.read(name) for name in plain.namelist()}
@@ -221,10 +221,10 @@ def test_names_and_files_that_are_no_networks(tmp_path):
         for name, data in parts.items():
             packed.writestr(name, data)
     with pytest.raises(DetectorError, match=r"packed\.pth: .* parts of 4,\d+,\d+ bytes in a file of"):
-        to_train("vgg16", str(tmp_path / "packed.pth"), CLASSES, seeded())
+        load_for_training("vgg16", str(tmp_path / "packed.pth"), CLASSES, seeded())
     torch.save([1, 2], tmp_path / "list.pth")
     with pytest.raises(FormatError, match=r"list\.pth: expected tensors by name"):
-        to_train("vgg16", str(tmp_path / "list.pth"), CLASSES, seeded())
+        load_for_training("vgg16", str(tmp_path / "list.pth"), CLASSES, seeded())
     with pytest.raises(FormatError, match="--network"):
         load_classifier("resnet50", CLASSES)
 
@@ -262,7 +262,7 @@ def test_parameters_of_the_published_networks():
 
 def test_a_network_begins_anew_without_a_file():
     one, again, other = (
-        to_train("vgg16-pooled", None, ("cat", "dog"), torch.Generator().manual_seed(seed), anew=True)
+        load_for_training("vgg16-pooled", None, ("cat", "dog"), torch.Generator().manual_seed(seed), anew=True)
         for seed in (0, 0, 1)
     )
     name = "features.0.weight"
@@ -303,7 +303,7 @@ def libraries(monkeypatch):
 
 @pytest.mark.parametrize("library", ["timm", "torchvision"])
 def test_networks_of_libraries_get_a_new_last_layer(library, libraries, tmp_path):
-    network = to_train(f"{library}:tiny", None, CLASSES, seeded())
+    network = load_for_training(f"{library}:tiny", None, CLASSES, seeded())
     assert libraries[0] in ({"pretrained": True}, {"weights": "DEFAULT"})
     images = torch.rand(2, 3, 16, 16, generator=seeded())
     body = network.body.conv
@@ -318,14 +318,14 @@ def test_networks_of_libraries_get_a_new_last_layer(library, libraries, tmp_path
 def test_weights_by_a_librarys_names(libraries, tmp_path):
     weights = {"conv.weight": torch.full((4, 3, 3, 3), 0.5), "head.fc.weight": torch.zeros(1000, 4)}
     torch.save(weights | {"head.fc.bias": torch.zeros(1000)}, tmp_path / "tiny.pth")
-    network = to_train("timm:tiny", str(tmp_path / "tiny.pth"), CLASSES, seeded())
+    network = load_for_training("timm:tiny", str(tmp_path / "tiny.pth"), CLASSES, seeded())
     assert bool((network.body.conv.weight == 0.5).all())
     assert network.last.out_features == 3
 
 
 def test_libraries_that_are_not_there_and_names_they_do_not_know(libraries, monkeypatch):
     with pytest.raises(FormatError, match="--network: expected a network of timm, found timm:huge: RuntimeError"):
-        to_train("timm:huge", None, CLASSES, seeded())
+        load_for_training("timm:huge", None, CLASSES, seeded())
     with pytest.raises(FormatError, match="found timm:tiny, which tells ImageNet's classes apart: train it"):
         load_classifier("timm:tiny", CLASSES)
 
@@ -334,7 +334,7 @@ def test_libraries_that_are_not_there_and_names_they_do_not_know(libraries, monk
 
     monkeypatch.setattr(libraries_module.importlib, "import_module", missing)
     with pytest.raises(FormatError, match="--network: expected timm installed, for timm:tiny, found No module"):
-        to_train("timm:tiny", None, CLASSES, seeded())
+        load_for_training("timm:tiny", None, CLASSES, seeded())
 
 
 SCORES = np.array([[1.0, 3.0, 2.0]])

@@ -13,7 +13,7 @@ from PIL import Image
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.folders import FolderObjects
 from drivesem.classify.objects.types import CLASSES
-from drivesem.classify.paper import figures
+from tools.experiments.classification.paper import figures
 from scene_ir.errors import FormatError, RangeError
 
 BUS, CAR = "02924116", "02958343"
@@ -244,15 +244,15 @@ def test_meshes_by_class(tmp_path: Path) -> None:
         for name, mesh in (("one", CUBE), ("two", trimesh.creation.icosphere(3))):
             mesh.export(tmp_path / folder / f"{name}.ply")
         (tmp_path / folder / "notes.txt").write_text("")
-    objects = open_objects(str(tmp_path), most_triangles=400)
+    objects = open_objects(str(tmp_path), max_triangles=400)
     assert objects.classes == ("cat", "dog")
     assert len(objects.names("train")) + len(objects.names("val")) + len(objects.names("test")) == 4
     assert objects.load("dog/one").label == 1
     ball = objects.load("cat/two")
     assert 300 < ball.mesh.faces.shape[0] <= 400 == len(ball.diffuse) + 400 - ball.mesh.faces.shape[0]
     assert FolderObjects(tmp_path).load("cat/two").mesh.faces.shape[0] == 1280
-    with pytest.raises(RangeError, match="most_triangles: expected at least 4"):
-        FolderObjects(tmp_path, most_triangles=3)
+    with pytest.raises(RangeError, match="max_triangles: expected at least 4"):
+        FolderObjects(tmp_path, max_triangles=3)
     CUBE.export(tmp_path / "cat" / "one.obj")
     with pytest.raises(FormatError, match=r"expected one mesh of a name, found one\.obj too"):
         open_objects(str(tmp_path))
@@ -291,7 +291,7 @@ def test_vertices_that_no_face_has_are_left_out(tmp_path: Path, most: int | None
         for line in lonely.splitlines()
     ]
     shapenet(tmp_path, BUS, "abc", "\n".join(lines))
-    mesh = open_objects(str(tmp_path), most_triangles=most).load("bus/abc").mesh
+    mesh = open_objects(str(tmp_path), max_triangles=most).load("bus/abc").mesh
     assert (len(mesh.faces) <= 200) == (most is not None)
     assert torch.equal(mesh.faces.unique(), torch.arange(len(mesh.vertices)))
     assert float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).max()) == pytest.approx(1.0, rel=1e-3)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivesem.classify.objects.types import CLASSES
-from tools.experiments.classification.paper import paper_tables
 from drivesem.evaluation.resampling import Interval
+from tools.experiments.classification.paper import paper_tables
 from tools.experiments.classification.tables import _judge_order
 
 DRAWING = RatioBootstrap(50, 0)
@@ -28,7 +28,7 @@ def test_overall_is_weighed_by_class_sizes():
 
 
 @pytest.mark.parametrize("table", ["degradation", "transfer"])
-def test_the_papers_own_overall_figures_are_weighed_by_its_sizes(table):
+def test_the_papers_own_overall_metrics_are_weighed_by_its_sizes(table):
     sizes = np.array([counts[0] for counts in paper_tables()["sizes"].values()])
     assert tuple(paper_tables()["sizes"]) == CLASSES
     rows = [row for strategies in paper_tables()[table].values() for row in strategies.values()]
@@ -54,25 +54,25 @@ def test_pairs_are_compared_on_the_same_pictures():
 
 def test_a_subset_keeps_shares_by_hand():
     labels = [0] * 10 + [1] * 5 + [2]
-    kept = sample_stratified(labels, 8, np.random.default_rng(0))  # shares 5, 2.5, 0.5: the first loses as much
-    assert [sum(labels[i] == c for i in kept) for c in range(3)] == [5, 3, 0]
+    stored = sample_stratified(labels, 8, np.random.default_rng(0))  # shares 5, 2.5, 0.5: the first loses as much
+    assert [sum(labels[i] == c for i in stored) for c in range(3)] == [5, 3, 0]
     assert sample_stratified(labels, 16, np.random.default_rng(0)) == list(range(16))
 
 
 def test_232_of_the_papers_pictures():
     sizes = [counts[0] for counts in paper_tables()["sizes"].values()]
     labels = np.repeat(np.arange(12), sizes)
-    kept = labels[sample_stratified(list(labels), 232, np.random.default_rng(1))]
-    assert list(np.bincount(kept)) == [49, 29, 7, 8, 98, 4, 1, 5, 3, 2, 6, 20]
+    stored = labels[sample_stratified(list(labels), 232, np.random.default_rng(1))]
+    assert list(np.bincount(stored)) == [49, 29, 7, 8, 98, 4, 1, 5, 3, 2, 6, 20]
 
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=60), st.integers(1, 60), st.integers(0, 5))
-def test_a_subset_is_as_large_as_asked_and_no_class_is_off_by_one(labels, size, seed):
-    kept = sample_stratified(labels, size, np.random.default_rng(seed))
-    assert len(kept) == len(set(kept)) == min(size, len(labels))
+def test_a_subset_is_as_large_as_requested_and_no_class_is_off_by_one(labels, size, seed):
+    stored = sample_stratified(labels, size, np.random.default_rng(seed))
+    assert len(stored) == len(set(stored)) == min(size, len(labels))
     for label in set(labels):
         share = min(size, len(labels)) * labels.count(label) / len(labels)
-        assert abs(sum(labels[i] == label for i in kept) - share) < 1
+        assert abs(sum(labels[i] == label for i in stored) - share) < 1
 
 
 @pytest.mark.parametrize(
@@ -85,5 +85,5 @@ def test_a_subset_is_as_large_as_asked_and_no_class_is_off_by_one(labels, size, 
         (0.1, None, None, None, "undecided"),
     ],
 )
-def test_verdict(theirs, value, low, high, said):
-    assert _judge_order(theirs, Interval("x", value, low, high)) == said
+def test_verdict(theirs, value, low, high, output):
+    assert _judge_order(theirs, Interval("x", value, low, high)) == output

@@ -45,7 +45,7 @@ def two_networks(monkeypatch, tmp_path):
     """Small pictures of boxes, balls and poles; the files of two networks that go by colour."""
     for name, size in (("DRAWN_PX", 96), ("SEEN_PX", 64)):
         monkeypatch.setattr(scenes, name, size)
-    monkeypatch.setattr(scenes, "camera", functools.partial(scenes.camera, 96))
+    monkeypatch.setattr(scenes, "picture_camera", functools.partial(scenes.picture_camera, 96))
     for module in (pictures, study_module):
         monkeypatch.setattr(module, "open_objects", lambda source: StandIns())
     monkeypatch.setitem(loading.ARCHITECTURES, Tints.architecture, Tints)
@@ -62,8 +62,8 @@ def two_networks(monkeypatch, tmp_path):
 def study(capsys, *words):
     """Exit code, the JSON, and what else was said."""
     code = main(["classification", "--quick", "--workers", "1", "--bootstrap", "20", *words])
-    said = capsys.readouterr()
-    return code, json.loads(said.out) if said.out.startswith("{") else said.out, said.err
+    output = capsys.readouterr()
+    return code, json.loads(output.out) if output.out.startswith("{") else output.out, output.err
 
 
 def test_sizes_need_no_attack(two_networks, tmp_path, capsys):
@@ -80,9 +80,9 @@ def test_sizes_need_no_attack(two_networks, tmp_path, capsys):
         "train pictures": 24,
         "test pictures": 1,
     }
-    code, told, _ = study(capsys, *words)
+    code, printed, _ = study(capsys, *words)
     assert code == 0
-    assert "Sizes" in told
+    assert "Sizes" in printed
     assert "skateboard (paper)" in (tmp_path / "out" / "study.md").read_text()
 
 
@@ -163,19 +163,19 @@ def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     assert (code, again) == (0, data)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("result.json")} == before
     # and what is kept tells the same without objects, networks or run
-    kept = shutil.copytree(out / "results", tmp_path / "results")
+    stored = shutil.copytree(out / "results", tmp_path / "results")
     with monkeypatch.context() as patch:
         patch.setattr(study_module, "open_objects", None)
-        assert main(["classification", "--from", str(kept), "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert told | {"out": str(out)} == data
-        assert main(["classification", "--from", str(kept), "--out", str(tmp_path / "again")]) == 0
+        assert main(["classification", "--from", str(stored), "--json"]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed | {"out": str(out)} == data
+        assert main(["classification", "--from", str(stored), "--out", str(tmp_path / "again")]) == 0
     for name in ("study.md", "worth.csv", "orders.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
     capsys.readouterr()
-    code, _, said = study(capsys, *words, "--train-pictures", "24")
+    code, _, output = study(capsys, *words, "--train-pictures", "24")
     assert code == 2
-    assert "other values of train_pictures" in said
+    assert "other values of train_pictures" in output
 
 
 def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
@@ -188,8 +188,8 @@ def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
         ("--backgrounds", str(tmp_path / "gone")): "--backgrounds: expected a folder of photographs",
     }
     for words, message in cases.items():
-        code, _, said = study(capsys, "--out", str(tmp_path / "out"), *words)
-        lines = [line for line in said.splitlines() if line.startswith("drivesem: ")]
+        code, _, output = study(capsys, "--out", str(tmp_path / "out"), *words)
+        lines = [line for line in output.splitlines() if line.startswith("drivesem: ")]
         assert (code, len(lines)) == (2, 1), words
         assert message in lines[0]
 
@@ -204,8 +204,8 @@ def test_attacks_on_pixels_keep_near():
     assert bool((network(torch.from_numpy(images)).argmax(1).numpy() == labels).all())
     for name in PIXEL_ATTACKS[:2]:
         assert np.abs(found[name] / 255 - images).max() < 4.6 / 255
-        said = network(torch.from_numpy(found[name]) / 255).argmax(1).numpy()
-        assert not bool((said == labels).any())
+        output = network(torch.from_numpy(found[name]) / 255).argmax(1).numpy()
+        assert not bool((output == labels).any())
 
 
 def test_training_on_begins_where_the_network_is():
@@ -229,7 +229,7 @@ def test_half_of_the_pictures_are_replaced():
     assert max(places) < 9
 
 
-def test_a_retrained_network_knows_what_it_was_shown(tmp_path):
+def test_a_retrained_network_knows_what_it_was_given(tmp_path):
     """Pictures whose colours are swapped are learnt; the file is what the network is."""
     network, generator = loading.prepare_for_inference(Tints()), torch.Generator().manual_seed(0)
     network.last.weight.mul_(0.01)

@@ -129,7 +129,7 @@ def test_the_whole_network_can_be_trained(standins, tmp_path, capsys):
     words = ("train", "--out", str(tmp_path / "net"), "--views", "left", "--limit", "3", "--layers", "all")
     code, trained, _ = answer(capsys, *words, "--epochs", "1", "--batch", "4", "--json")
     assert code == 0
-    start = loading.to_train("squeezenet", None, standins.classes, torch.Generator())
+    start = loading.load_for_training("squeezenet", None, standins.classes, torch.Generator())
     network = loading.load_classifier(trained["weights"], standins.classes)
     assert not torch.equal(network.get_parameter("conv1.weight"), start.get_parameter("conv1.weight"))
 
@@ -261,7 +261,7 @@ def test_a_class_without_pictures(standins, tmp_path, capsys):
 
 @pytest.mark.parametrize("network", ["vgg16", "resnet50"])
 def test_presets_are_the_papers(network):
-    from drivesem.classify.protocol import params_of, reach_of, steps_of
+    from drivesem.classify.methods import attacked_parameters, parameter_bounds, step_sizes
     from drivesem.config.parsing import parse
 
     table = {
@@ -274,12 +274,12 @@ def test_presets_are_the_papers(network):
     }
     for method in ("si-fgsm", "sgd", "scw"):
         config = parse(["classify", "attack", "--config", f"configs/classify-{network}-{method}.yaml"])
-        steps, reach, expected = steps_of(config), reach_of(config), table[network, method]
+        steps, reach, expected = step_sizes(config), parameter_bounds(config), table[network, method]
         assert (config.method, config.steps) == (method, 5)
         assert (steps.vertex, steps.pose) == expected[:2]
-        assert [str(one) for one in params_of(config)] == ["vertex", "pose"]
+        assert [str(one) for one in attacked_parameters(config)] == ["vertex", "pose"]
         if len(expected) > 2:
             assert (reach.vertex, reach.pose) == expected[2:]
         if network == "vgg16":
             usual = parse(["classify", "attack", "--method", method])
-            assert (steps_of(usual), reach_of(usual)) == (steps, reach)
+            assert (step_sizes(usual), parameter_bounds(usual)) == (steps, reach)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.classify.confirm import open_renderer
+from drivesem.classify.confirm import open_second_renderer
 from drivesem.classify.objects.embedded import EmbeddedObjects
 from drivesem.classify.redraw import mitsuba
-from drivesem.classify.redraw.base import Solid, likeness
-from drivesem.classify.results import Likeness
-from drivesem.classify.scenes import DRAWN_PX, VIEWS, ObjectScene, camera, generated_background
+from drivesem.classify.second_renderer import PosedObject, measure_agreement
+from drivesem.classify.results import RendererAgreement
+from drivesem.classify.scenes import DRAWN_PX, VIEWS, ObjectScene, camera, generate_background
 from drivesem.classify.space import Change
 from drivesem.failures.second_renderer.base import NoSecondRendererError
 from tests.drivesem.classify.standins import model
@@ -25,15 +25,15 @@ MOST_COLOUR = {"mitsuba": 15.0, "pyrender": 8.0}
 @pytest.fixture(params=MOST_COLOUR)
 def renderer(request):
     try:
-        return open_renderer(request.param)
+        return open_second_renderer(request.param)
     except NoSecondRendererError as error:
         pytest.skip(str(error))
 
 
 def both(renderer, scene, change=None):
     with torch.no_grad():
-        own = scene.mesh.render(scene.placed(change), camera(), scene.lights(change))
-    return own, renderer.draw(Solid.of(scene, change))
+        own = scene.mesh.render(scene.camera_vertices(change), camera(), scene.lights(change))
+    return own, renderer.render(PosedObject.from_scene(scene, change))
 
 
 @pytest.mark.parametrize("change", [None, CHANGE], ids=["still", "changed"])
@@ -45,7 +45,7 @@ def test_the_same_place_and_the_same_light(renderer, kind, change):
     assert other.shape == own.shape
     assert float(other.min()) >= 0
     assert float(other.max()) <= 1
-    alike = likeness(scene, own, other)
+    alike = measure_agreement(scene, own, other)
     assert alike.iou >= 0.995
     assert alike.colour <= 4.0
 
@@ -54,7 +54,7 @@ def test_a_lamp_that_moves_lights_the_other_side(renderer):
     scene = ObjectScene("ball", model("ball"), "forward", GREY)
     sides = []
     for x in (-1.0, 1.0):
-        drawn = renderer.draw(Solid.of(scene, Change(light=torch.tensor([0, 0, 3 * x, 0.8, -0.2]))))
+        drawn = renderer.render(PosedObject.from_scene(scene, Change(light=torch.tensor([0, 0, 3 * x, 0.8, -0.2]))))
         left, right = (drawn[:3, 256, column].mean() for column in (176, 336))
         sides.append(float(right - left))
     assert sides[0] < -0.05
@@ -67,8 +67,8 @@ def test_two_renderers_agree_on_24_views(renderer):
     for place, kind in enumerate(objects.classes):
         for number, view in enumerate(list(VIEWS)[place % 2 :: 2]):
             name = f"{kind}/{80 + number:04d}"
-            scene = ObjectScene(name, objects.load(name), view, generated_background(name))
-            found.append(likeness(scene, *both(renderer, scene)))
+            scene = ObjectScene(name, objects.load(name), view, generate_background(name))
+            found.append(measure_agreement(scene, *both(renderer, scene)))
     assert len(found) == 24
     assert min(one.iou for one in found) >= 0.98
     assert max(one.colour for one in found) <= MOST_COLOUR[renderer.name]
@@ -78,18 +78,18 @@ def test_likeness_by_hand():
     scene = ObjectScene("box", model("box"), "forward", GREY)
     one = torch.zeros(4, DRAWN_PX, DRAWN_PX)
     one[:, 100:300, 100:300] = 1.0
-    assert likeness(scene, one, one) == Likeness(1.0, 0.0)
+    assert measure_agreement(scene, one, one) == RendererAgreement(1.0, 0.0)
     other = one.clone()
     other[:, 200:300] = 0.0
     other[:3] = 0.0
-    black = likeness(scene, one, other)
+    black = measure_agreement(scene, one, other)
     assert black.iou == 0.5
     assert black.colour == pytest.approx(100.0, abs=0.1)  # black from white
 
 
 def test_faces_and_normals_look_towards_the_camera():
     scene = ObjectScene("box", model("box"), "right", GREY)
-    solid = Solid.of(scene)
+    solid = PosedObject.from_scene(scene)
     corners = solid.points.reshape(-1, 3, 3)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (across * corners.mean(axis=1)).sum(axis=1).max() < 0
@@ -104,5 +104,5 @@ def test_what_is_not_installed_is_told(monkeypatch):
     mitsuba._mitsuba.cache_clear()
     monkeypatch.setattr(mitsuba.importlib, "import_module", missing)
     with pytest.raises(NoSecondRendererError, match=r"mitsuba: .*drivesem\[mitsuba\]"):
-        open_renderer("mitsuba")
+        open_second_renderer("mitsuba")
     mitsuba._mitsuba.cache_clear()

@@ -1,26 +1,34 @@
-"""The published networks, by torchvision's names of weights: SqueezeNet 1.1 (Iandola et al. 2016,
-arXiv:1602.07360), VGG-16 (Simonyan and Zisserman 2015, arXiv:1409.1556, configuration D), ResNet-50 (He et al.
-2015, arXiv:1512.03385).
+"""Published networks with torchvision's names of weights, and networks of torchvision and timm.
+
+SqueezeNet 1.1: Iandola et al. 2016, arXiv:1602.07360. VGG-16: Simonyan and Zisserman 2015, arXiv:1409.1556,
+configuration D. ResNet-50: He et al. 2015, arXiv:1512.03385.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors.squeezedet import BGR_MEAN, Fire, SqueezeDet
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD, Classifier
+from scene_ir.errors import FormatError
+
+PREFIXES = ("torchvision:", "timm:")
+"""Prefixes of names of libraries' networks."""
 
 _FIRES = dict(list(SqueezeDet.layout.fires.items())[:8])
-"""Up to fire9: what SqueezeDet has after that is its own."""
+"""Up to fire9: SqueezeDet's further layers are not SqueezeNet's."""
 
 
 class SqueezeNet(Classifier):
-    """Up to its last Fire module, and one layer on mean and maximum of what that finds anywhere. The names of its
-    convolutions are those of SqueezeDet, which begins with the same ones.
+    """SqueezeNet up to its last Fire module, and one layer on the spatial mean and maximum of its features.
+
+    Its convolutions have the names of SqueezeDet, which begins with the same ones.
     """
 
     architecture = "squeezenet"
@@ -38,8 +46,8 @@ class SqueezeNet(Classifier):
             channels = 2 * expand
         self.classifier = nn.Linear(2 * channels, len(self.classes))
 
-    def encode(self, prepared: Tensor) -> Tensor:
-        x = F.max_pool2d(F.relu(self.conv1(prepared.flip(1))), 3, 2, ceil_mode=True)  # its weights read BGR
+    def encode(self, normalised: Tensor) -> Tensor:
+        x = F.max_pool2d(F.relu(self.conv1(normalised.flip(1))), 3, 2, ceil_mode=True)  # its weights read BGR
         for name, fire in self.fires.items():
             x = fire(x)
             if name in SqueezeDet.layout.pooled:
@@ -48,7 +56,7 @@ class SqueezeNet(Classifier):
 
 
 def vgg16_convolutions() -> list[nn.Module]:
-    """The layers of VGG-16 up to relu5_3, in torchvision's order."""
+    """Build the layers of VGG-16 up to relu5_3, in torchvision's order."""
     layers: list[nn.Module] = []
     channels = 3
     for width, count in zip((64, 128, 256, 512, 512), (2, 2, 3, 3, 3), strict=True):
@@ -61,7 +69,7 @@ def vgg16_convolutions() -> list[nn.Module]:
 
 
 class VGG16(Classifier):
-    """The published network."""
+    """VGG-16."""
 
     architecture = "vgg16"
     head = "classifier.6"
@@ -73,14 +81,15 @@ class VGG16(Classifier):
         deep = [nn.Linear(4096, 4096), nn.ReLU(inplace=True), nn.Dropout()]
         self.classifier = nn.Sequential(*wide, *deep, nn.Linear(4096, len(self.classes)))
 
-    def encode(self, prepared: Tensor) -> Tensor:
-        pooled = F.adaptive_avg_pool2d(self.features(prepared), 7)
+    def encode(self, normalised: Tensor) -> Tensor:
+        pooled = F.adaptive_avg_pool2d(self.features(normalised), 7)
         return self.classifier[:6](torch.flatten(pooled, 1))
 
 
 class PooledVGG16(Classifier):
-    """Its convolutions, and one layer on mean and maximum of what the last of them find: where the three large
-    layers of the published network are not at hand, which hold nine tenths of its weights.
+    """VGG-16's convolutions, and one layer on the spatial mean and maximum of their features.
+
+    It does without the three large layers, which hold nine tenths of the weights.
     """
 
     architecture = "vgg16-pooled"
@@ -91,8 +100,8 @@ class PooledVGG16(Classifier):
         self.features = nn.Sequential(*vgg16_convolutions(), nn.MaxPool2d(2, 2))
         self.classifier = nn.Linear(2 * 512, len(self.classes))
 
-    def encode(self, prepared: Tensor) -> Tensor:
-        x = self.features(prepared)
+    def encode(self, normalised: Tensor) -> Tensor:
+        x = self.features(normalised)
         return torch.cat([x.mean(dim=(2, 3)), x.amax(dim=(2, 3))], dim=1)
 
 
@@ -101,7 +110,7 @@ _EXPANSION = 4
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1, and what went in; as in torchvision, one that halves the picture does so in its 3x3."""
+    """Residual block of 1x1, 3x3 and 1x1 convolutions; the 3x3 has the stride, as in torchvision."""
 
     def __init__(self, channels: int, width: int, stride: int) -> None:
         super().__init__()
@@ -123,7 +132,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNet50(Classifier):
-    """The published network."""
+    """ResNet-50."""
 
     architecture = "resnet50"
     head = "fc"
@@ -142,8 +151,54 @@ class ResNet50(Classifier):
             self.add_module(f"layer{i + 1}", nn.Sequential(*blocks))
         self.fc = nn.Linear(channels, len(self.classes))
 
-    def encode(self, prepared: Tensor) -> Tensor:
-        x = self.maxpool(F.relu(self.bn1(self.conv1(prepared))))
+    def encode(self, normalised: Tensor) -> Tensor:
+        x = self.maxpool(F.relu(self.bn1(self.conv1(normalised))))
         for i in range(len(_BLOCKS)):
             x = self.get_submodule(f"layer{i + 1}")(x)
         return torch.flatten(F.adaptive_avg_pool2d(x, 1), 1)
+
+
+class LibraryClassifier(Classifier):
+    """A network of a library: all but its last layer, which is new."""
+
+    head = "last_layer"
+
+    def __init__(self, architecture: str, classes: Sequence[str], *, pretrained: bool = False) -> None:
+        """
+        Args:
+            architecture: `torchvision:NAME` or `timm:NAME`.
+            classes: Names of the classes.
+            pretrained: Use the library's weights, which it may download.
+
+        Raises:
+            FormatError: The library or the network is missing.
+        """
+        library, _, name = architecture.partition(":")
+        try:
+            if library == "timm":
+                body: Any = importlib.import_module("timm").create_model(name, pretrained=pretrained)
+            else:
+                models: Any = importlib.import_module("torchvision.models")
+                body = models.get_model(name, weights="DEFAULT" if pretrained else None)
+        except ImportError as error:
+            raise FormatError("--network", f"{library} installed, for {architecture}", error) from error
+        except Exception as error:  # libraries and networks raise anything
+            found = " ".join(f"{type(error).__name__} {error}".split())[:160]
+            raise FormatError("--network", f"a network of {library}", f"{architecture}: {found}") from error
+        linear_layers = [(path, part) for path, part in body.named_modules() if isinstance(part, nn.Linear)]
+        if not linear_layers:
+            raise FormatError("--network", "a network that ends in a linear layer", architecture)
+        config = getattr(body, "default_cfg", {})
+        super().__init__(classes, config.get("mean", IMAGENET_MEAN), config.get("std", IMAGENET_STD))
+        path, last = linear_layers[-1]
+        body.set_submodule(path, nn.Identity())
+        self.architecture = architecture
+        self.published_head = f"body.{path}"
+        self.body = body
+        self.last_layer = nn.Linear(last.in_features, len(self.classes))
+
+    def encode(self, normalised: Tensor) -> Tensor:
+        return torch.flatten(self.body(normalised), 1)
+
+    def local_name(self, published: str) -> str:
+        return published if published.startswith(f"{self.head}.") else f"body.{published.removeprefix('body.')}"

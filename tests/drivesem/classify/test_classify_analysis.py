@@ -13,10 +13,10 @@ from rich.console import Console
 
 from drivesem.classify import attack as attacking
 from drivesem.classify import confirm as confirming
-from drivesem.classify import least, pictures
-from drivesem.classify.finished import ClassifyRun
-from drivesem.classify.holes import PoseHole
-from drivesem.classify.least import LeastChange
+from drivesem.classify import explain, pictures
+from drivesem.classify.analysis import ClassifyRun
+from drivesem.classify.holes import PoseFailureRegion
+from drivesem.classify.explain import MinimalObjectChange
 from drivesem.classify.networks import loading
 from drivesem.classify.scenes import DRAWN_PX, ObjectScene
 from drivesem.classify.space import Change
@@ -75,11 +75,11 @@ def finished(tmp_path_factory):
 def patched(patch):
     patch.setattr(pictures, "open_objects", lambda source: StandIns())
     patch.setattr(
-        attacking, "load_classifier", lambda name, classes, device: loading.prepare_for_inference(network_of(name))
+        attacking, "load_classifier", lambda name, classes, device: loading.prepare_for_inference(open_network(name))
     )
 
 
-def network_of(name):
+def open_network(name):
     network = Areas()
     network.most = {"squeezenet": MOST, "blind": 0.0, "keen": 1.0}[name]
     return network
@@ -99,16 +99,16 @@ def answer(capsys, *words):
 
 
 def test_confirm_reads_a_run_twice_however_many_failures_there_are(run, capsys, monkeypatch):
-    monkeypatch.setattr(confirming, "open_renderer", lambda name: Other("twin"))
+    monkeypatch.setattr(confirming, "open_second_renderer", lambda name: Other("twin"))
     monkeypatch.setattr(ClassifyRun, "failures", lambda self, limit: [NAME] * 5)
-    read = mock.Mock(side_effect=ClassifyRun.of)
+    read = mock.Mock(side_effect=ClassifyRun.load)
     monkeypatch.setattr(ClassifyRun, "of", read)
     assert answer(capsys, "confirm", run)[0] == 0
     assert read.call_count == 2
 
 
 def test_confirm_writes_the_grade_and_the_page(run, capsys, monkeypatch):
-    monkeypatch.setattr(confirming, "open_renderer", lambda name: Other("twin"))
+    monkeypatch.setattr(confirming, "open_second_renderer", lambda name: Other("twin"))
     code, data, _ = answer(capsys, "confirm", run)
     assert code == 0
     assert data["grades"] == {"threshold": 1, "certain": 1, "confirmed": 1}
@@ -126,7 +126,7 @@ def test_confirm_writes_the_grade_and_the_page(run, capsys, monkeypatch):
     written = (run / "frames" / NAME / "result.json").stat().st_mtime_ns
     assert answer(capsys, "confirm", run)[1]["second"]["agree"] == 1
     assert (run / "frames" / NAME / "result.json").stat().st_mtime_ns == written
-    monkeypatch.setattr(confirming, "open_renderer", lambda name: Other("blank", blank=True))
+    monkeypatch.setattr(confirming, "open_second_renderer", lambda name: Other("blank", blank=True))
     code, data, _ = answer(capsys, "confirm", run)
     assert data["grades"] == {"threshold": 1, "certain": 1, "confirmed": 0}
     assert data["second"]["agree"] == 0
@@ -144,7 +144,7 @@ def test_explain_finds_the_least_turn(run, tmp_path, capsys, monkeypatch):
     assert bool((angles.abs() <= whole.abs() + 1e-6).all())
     grey = torch.full((3, DRAWN_PX, DRAWN_PX), 128 / 255)
     scene = ObjectScene(NAME, model("box", 8), "forward", grey)
-    areas = [float(area_of(scene.picture(Change(angles=share * angles))[None])) for share in (0.9, 1.0)]
+    areas = [float(area_of(scene.render(Change(angles=share * angles))[None])) for share in (0.9, 1.0)]
     assert areas[0] <= MOST
     assert areas[1] >= MOST - 1e-3
     assert f"{NAME} is called ball with" in found["sentence"]
@@ -156,9 +156,9 @@ def test_explain_finds_the_least_turn(run, tmp_path, capsys, monkeypatch):
 def test_the_table_of_least_changes_breaks_no_number_at_80_columns(name):
     angles = {"pose.pitch": -0.276, "pose.yaw": 0.238, "pose.roll": -0.476}
     dropped = ("vertex", "lighting")
-    change = LeastChange(name, "", "bus", "motorcycle", 1.0, angles, angles, 0.0074, 0.0, dropped, 1, 1)
+    change = MinimalObjectChange(name, "", "bus", "motorcycle", 1.0, angles, angles, 0.0074, 0.0, dropped, 1, 1)
     shown = io.StringIO()
-    sheet = least.sheet_of([change], "squeezenet")
+    sheet = least.build_table([change], "squeezenet")
     Console(width=80, file=shown).print(sheet.to_rich(least.WORDS, **sheet.rich_options))
     told = shown.getvalue()
     assert {"-0.276", "+0.238", "-0.476", "0.0074", "motorcycle", "vertex,", "lighting"} <= set(told.split())
@@ -184,7 +184,7 @@ def test_holes_tell_poses(run, tmp_path, capsys):
 
 
 def test_a_hole_in_words():
-    hole = PoseHole("bus-0007-left", "", "bus", "train", {"yaw": (31.2, 43.8)}, 30, 32, 2, 40, 20, 64, 96)
+    hole = PoseFailureRegion("bus-0007-left", "", "bus", "train", {"yaw": (31.2, 43.8)}, 30, 32, 2, 40, 20, 64, 96)
     assert hole.sentence() == (
         "The bus of bus-0007-left is misclassified, mostly as train, in 94 % [80, 98] of poses with yaw "
         "from 31 to 44 degrees"

@@ -1,7 +1,7 @@
-"""Closed solids that objects are put together from: boxes, tubes, lathes, lofts, slabs.
+"""Closed solids of which objects are composed: boxes, tubes, lathes, lofts, slabs.
 
-Axes x forward, y up, z to the right; lengths in metres. Every solid is closed and wound outwards, its material 0.
-Points come as (3,) or (n, 3) sequences.
+Axes are x forward, y up, z to the right; lengths are in metres. Solids are wound outwards and have material 0.
+Points are sequences (3,) or (n, 3).
 """
 
 from __future__ import annotations
@@ -18,37 +18,55 @@ from scene_ir.meshes.solids import TemplateSolid, clean_solid, grid_quads, quad_
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 1.0, 0.0])
-AHEAD = np.array([1.0, 0.0, 0.0])
+FORWARD = np.array([1.0, 0.0, 0.0])
 Axis = Literal["x", "y", "z"]
 Pair = tuple[float, float]
 
 _ORDER = {"x": [1, 0, 2], "y": [0, 1, 2], "z": [0, 2, 1]}
-"""Where (across, along, across) of a lathe's axis lie among x, y, z."""
+"""Order of x, y, z that moves the y axis to each axis."""
 
 
 def points(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Array:
-    """Points (..., 3) of coordinates that are broadcast."""
+    """Broadcast coordinates and stack them to points (..., 3).
+
+    Args:
+        x: Forward.
+        y: Up.
+        z: To the right.
+    """
     return np.stack(np.broadcast_arrays(x, y, z), -1)
 
 
-def turns(count: int, start: float = 0.0) -> Array:
-    """As many even steps of a whole turn, rad, the first `start` steps from 0."""
+def even_angles(count: int, start: float = 0.0) -> Array:
+    """Divide a full turn into `count` equal steps, rad, beginning `start` steps from 0."""
     return 2 * np.pi * (np.arange(count) + start) / count
 
 
 def circle(radius: ArrayLike, y: ArrayLike, angle: ArrayLike) -> Array:
-    """Points (..., 3) about the upright axis, at angles that go from forward to the right."""
+    """Points (..., 3) around the upright axis.
+
+    Args:
+        radius: Distance from the axis.
+        y: Height.
+        angle: Angles from forward to the right, rad.
+    """
     return points(radius * np.cos(angle), y, radius * np.sin(angle))
 
 
-def _closed(vertices: Array, quads: NDArray[np.int64], *extra: NDArray[np.int64]) -> TemplateSolid:
-    """The solid of quads (Q, 4) and triangles (T, 3): doubled points are one, collapsed faces go."""
+def _closed_solid(vertices: Array, quads: NDArray[np.int64], *extra: NDArray[np.int64]) -> TemplateSolid:
+    """Make a solid of quads (Q, 4) and triangles (T, 3), without duplicate points and collapsed faces."""
     faces = np.concatenate([quad_faces(quads, vertices), *extra])
     return clean_solid(vertices, faces, np.zeros(len(faces), np.int64))
 
 
-def turned(solid: TemplateSolid, axis: Axis, angle: float) -> TemplateSolid:
-    """The solid turned by `angle` rad about an axis, right-handed."""
+def rotate(solid: TemplateSolid, axis: Axis, angle: float) -> TemplateSolid:
+    """Rotate a solid.
+
+    Args:
+        solid: The solid.
+        axis: Axis of the rotation.
+        angle: Right-handed angle, rad.
+    """
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
     rotation = np.eye(3)
@@ -56,60 +74,79 @@ def turned(solid: TemplateSolid, axis: Axis, angle: float) -> TemplateSolid:
     return replace(solid, vertices=solid.vertices @ rotation.T)
 
 
-def turned_each(solid: TemplateSolid, angles: Array) -> list[TemplateSolid]:
-    """The solid turned about the upright axis by each angle (n,), rad."""
-    return [turned(solid, "y", angle) for angle in angles]
+def rotate_each(solid: TemplateSolid, angles: Array) -> list[TemplateSolid]:
+    """Copy a solid, rotated about the upright axis by each angle (n,), rad."""
+    return [rotate(solid, "y", angle) for angle in angles]
 
 
 def loft(rings: ArrayLike, *, around: bool = False) -> TemplateSolid:
-    """A skin over closed rings (K, N, 3), capped at both ends, or joined end to end where it goes `around`."""
+    """A skin over closed rings (K, N, 3), with caps at both ends, or closed to a loop if `around`."""
     ring = np.asarray(rings, float)
     count, sides = ring.shape[:2]
     vertices = ring.reshape(-1, 3)
     index = np.pad(np.arange(count * sides).reshape(count, sides), ((0, int(around)), (0, 1)), mode="wrap")
     if around:
-        return _closed(vertices, grid_quads(index))
+        return _closed_solid(vertices, grid_quads(index))
     first, last, middle = index[0], index[-1], np.full(sides, count * sides)
     caps = (np.stack([middle, first[1:], first[:-1]], -1), np.stack([middle + 1, last[:-1], last[1:]], -1))
     both = [ring[0].mean(axis=0), ring[-1].mean(axis=0)]
-    return _closed(np.concatenate([vertices, both]), grid_quads(index), *caps)
+    return _closed_solid(np.concatenate([vertices, both]), grid_quads(index), *caps)
 
 
 def slab(outer: ArrayLike, inner: ArrayLike) -> TemplateSolid:
-    """What lies between two like grids of points (A, B, 3), such as both faces of a deck, a sail or a visor."""
+    """The space between two grids of points (A, B, 3), such as both faces of a deck, a sail or a visor."""
     top, under = np.asarray(outer, float), np.asarray(inner, float)
     a, b = np.arange(top.size // 3 * 2).reshape(2, *top.shape[:2])
     rim = [(a[0], b[0]), (a[:, -1], b[:, -1]), (a[-1, ::-1], b[-1, ::-1]), (a[::-1, 0], b[::-1, 0])]
     sides = [np.stack([p[1:], p[:-1], q[:-1], q[1:]], -1) for p, q in rim]
     quads = np.concatenate([grid_quads(a), grid_quads(b[:, ::-1]), *sides])
-    return _closed(np.concatenate([top.reshape(-1, 3), under.reshape(-1, 3)]), quads)
+    return _closed_solid(np.concatenate([top.reshape(-1, 3), under.reshape(-1, 3)]), quads)
 
 
 def lathe(
     profile: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0), axis: Axis = "y", sides: int = 16
 ) -> TemplateSolid:
-    """A solid of revolution: profile (K, 2) of radius and place along the axis through `centre`."""
+    """A solid of revolution.
+
+    Args:
+        profile: Radius and position along the axis (K, 2).
+        centre: A point of the axis, where the position is 0.
+        axis: Direction of the axis.
+        sides: Number of sides.
+    """
     radius, along = np.asarray(profile, float).T[..., None]
-    rings = circle(radius, along, turns(sides, 0.5))
+    rings = circle(radius, along, even_angles(sides, 0.5))
     return loft(rings[..., _ORDER[axis]] + np.asarray(centre, float))
 
 
 def ball(centre: ArrayLike, radii: ArrayLike, sides: int = 12) -> TemplateSolid:
-    """An ellipsoid."""
+    """An ellipsoid.
+
+    Args:
+        centre: Its centre (3,).
+        radii: Radii along x, y, z (3,), or one for a sphere.
+        sides: Number of sides.
+    """
     angle = np.linspace(0, np.pi, sides // 2 + 1)
     unit = lathe(np.stack([np.sin(angle), -np.cos(angle)], 1), sides=sides)
     return translate_solid(replace(unit, vertices=unit.vertices * np.asarray(radii, float)), centre)
 
 
 def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> TemplateSolid:
-    """A round pipe along points (K, 3), of one radius or one a point."""
+    """A round pipe.
+
+    Args:
+        path: Points of its axis (K, 3).
+        radius: One radius, or one per point (K,).
+        sides: Number of sides.
+    """
     places = np.asarray(path, float)
     steps = np.diff(places, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     normal = np.eye(3)[int(np.argmin(np.abs(tangents[0])))]
-    angle = turns(sides, 0.5)
+    angle = even_angles(sides, 0.5)
     rings = []
     for point, tangent, r in zip(places, tangents, np.broadcast_to(radius, len(places)), strict=True):
         normal = normal - tangent * (normal @ tangent)
@@ -120,14 +157,28 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int = 8) -> TemplateSolid:
 
 
 def torus(centre: ArrayLike, radius: float, thick: float, axis: Axis = "z", sides: int = 24) -> TemplateSolid:
-    """A ring about an axis: a tyre, a rim, a hoop. thick: radius of its section."""
-    section = turns(8)
-    rings = circle(radius + thick * np.cos(section), thick * np.sin(section), turns(sides)[:, None])
+    """A ring about an axis, such as a tyre.
+
+    Args:
+        centre: Its centre.
+        radius: Radius of the ring.
+        thick: Radius of its section.
+        axis: The axis.
+        sides: Number of sides.
+    """
+    section = even_angles(8)
+    rings = circle(radius + thick * np.cos(section), thick * np.sin(section), even_angles(sides)[:, None])
     return loft(rings[..., _ORDER[axis]] + np.asarray(centre, float), around=True)
 
 
 def box(low: ArrayLike, high: ArrayLike, bevel: float = 0.0) -> TemplateSolid:
-    """An upright box between two corners, its edges cut by `bevel`."""
+    """An axis-aligned box.
+
+    Args:
+        low: Lowest corner (3,).
+        high: Highest corner (3,).
+        bevel: Width by which edges are cut off.
+    """
     a, b = np.asarray(low, float), np.asarray(high, float)
     if bevel:
         return solids.box(a.tolist(), b.tolist(), solids.VehicleMaterial.PAINT, bevel=bevel)
@@ -135,7 +186,14 @@ def box(low: ArrayLike, high: ArrayLike, bevel: float = 0.0) -> TemplateSolid:
 
 
 def block(x: Pair, y: Pair, z: float, bevel: float = 0.0) -> TemplateSolid:
-    """A box from -z to z: what most things have across their middle."""
+    """A box across the middle of an object.
+
+    Args:
+        x: Range of x.
+        y: Range of y.
+        z: Half its width.
+        bevel: Width by which edges are cut off.
+    """
     return box((x[0], y[0], -z), (x[1], y[1], z), bevel)
 
 
@@ -148,21 +206,28 @@ _SIDES = np.array(
 )
 
 
-def _many(corners: Array) -> TemplateSolid:
-    """Bodies of eight corners (n, 8, 3) each, in the order of a box's."""
+def _hexahedra(corners: Array) -> TemplateSolid:
+    """Bodies with eight corners each (n, 8, 3), in the order of a box's."""
     count = len(corners)
     faces = (_SIDES + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
     return TemplateSolid(corners.reshape(-1, 3), faces, np.zeros(len(faces), np.int64))
 
 
 def boxes(centres: ArrayLike, sizes: ArrayLike) -> TemplateSolid:
-    """Plain boxes about points (n, 3), of one size (3,) or one each: windows, slats, blocks."""
+    """Boxes around points (n, 3), with one size (3,) or one per box (n, 3): windows, slats, blocks."""
     middle = np.asarray(centres, float)
-    return _many(middle[:, None] + _CORNERS * np.broadcast_to(sizes, middle.shape)[:, None])
+    return _hexahedra(middle[:, None] + _CORNERS * np.broadcast_to(sizes, middle.shape)[:, None])
 
 
 def beams(starts: ArrayLike, ends: ArrayLike, thick: float, deep: float | None = None) -> TemplateSolid:
-    """Square bars between points (n, 3), one or many at each end. deep: their other side where they are flat."""
+    """Bars between points.
+
+    Args:
+        starts: First ends, one (3,) or many (n, 3).
+        ends: Second ends, one or many.
+        thick: Side of their section.
+        deep: Other side of their section, if it is not square.
+    """
     a, b = (p.reshape(-1, 3) for p in np.broadcast_arrays(np.asarray(starts, float), np.asarray(ends, float)))
     along = (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
     helper = np.where(np.abs(along[:, 1:2]) > 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
@@ -170,21 +235,35 @@ def beams(starts: ArrayLike, ends: ArrayLike, thick: float, deep: float | None =
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     up = np.cross(side, along)
     shift = _CORNERS[None, :, 1:2] * up[:, None] * (deep or thick) + _CORNERS[None, :, 2:] * side[:, None] * thick
-    return _many(np.where(_CORNERS[None, :, :1] < 0, a[:, None], b[:, None]) + shift)
+    return _hexahedra(np.where(_CORNERS[None, :, :1] < 0, a[:, None], b[:, None]) + shift)
 
 
 def rectangle(x: Pair, y: float, z: float) -> Array:
-    """The outline (4, 3) of a level rectangle at height `y`, from x[0] to x[1] and -z to z."""
+    """Outline (4, 3) of a horizontal rectangle.
+
+    Args:
+        x: Range of x.
+        y: Height.
+        z: Half its width.
+    """
     return np.array([[x[0], y, -z], [x[1], y, -z], [x[1], y, z], [x[0], y, z]])
 
 
 def squares(rows: Sequence[Pair]) -> TemplateSolid:
-    """A body of level squares: half their width, and their height."""
+    """A body over horizontal squares, each with half its width and its height."""
     return loft([rectangle((-half, half), y, half) for half, y in rows])
 
 
 def section(x: float, half: float, low: float, high: float, radius: float) -> Array:
-    """An upright rectangle (12, 3) across x, -half to half and low to high, with corners of `radius`."""
+    """Outline (12, 3) of an upright rectangle across x with rounded corners.
+
+    Args:
+        x: Its position.
+        half: Half its width.
+        low: Its lower edge.
+        high: Its upper edge.
+        radius: Radius of the corners.
+    """
     angle = np.linspace(0, np.pi / 2, 3) + np.pi / 2 * np.arange(4)[:, None]
     z = np.array([[1.0], [-1.0], [-1.0], [1.0]]) * (half - radius) + radius * np.cos(angle)
     y = np.array([[high - radius]] * 2 + [[low + radius]] * 2) + radius * np.sin(angle)
@@ -192,8 +271,14 @@ def section(x: float, half: float, low: float, high: float, radius: float) -> Ar
 
 
 def carriage(stations: ArrayLike, half: float, low: float, high: float, radius: float) -> TemplateSolid:
-    """A long body of rounded section along x: stations (K, 4) of x, and how far its roof, floor and sides lie
-    inside those of the full section there.
+    """A long body along x with rounded sections.
+
+    Args:
+        stations: x, and the distances of roof, floor and sides from those of the full section (K, 4).
+        half: Half the full width.
+        low: Floor of the full section.
+        high: Its roof.
+        radius: Radius of its corners.
     """
     table = np.asarray(stations, float)
     return loft([section(x, half - side, low + floor, high - roof, radius) for x, roof, floor, side in table])
@@ -204,8 +289,12 @@ _RISE = np.array([0.0, 0.5, 0.9, 1.0, 0.55, 0.06, -0.3, -0.6, -0.6, -0.4]) / 2
 
 
 def wing(thick: float, *stations: Sequence[float], upright: bool = False) -> TemplateSolid:
-    """A wing over stations: leading edge x, y, z, and chord. thick: of its section, a share of the chord.
-    upright: a fin, thick along z.
+    """A wing.
+
+    Args:
+        thick: Thickness as a fraction of the chord.
+        stations: Position x, y, z of the leading edge, and chord, of each station.
+        upright: Make a fin, with its thickness along z.
     """
     across = np.array([0.0, 0.0, 1.0] if upright else [0.0, 1.0, 0.0])
     rings = []
@@ -216,46 +305,67 @@ def wing(thick: float, *stations: Sequence[float], upright: bool = False) -> Tem
 
 
 def body(stations: ArrayLike, sides: int = 14, square: float = 2.0) -> TemplateSolid:
-    """A hull along x: stations (K, 4) of x, height of its axis, half height, half width. square: the exponent of
-    its section, an ellipse's 2 or a box's more.
+    """A hull along x.
+
+    Args:
+        stations: x, height of the axis, half height, half width (K, 4).
+        sides: Number of sides.
+        square: Exponent of the section: 2 for an ellipse, larger for rounder boxes.
     """
-    angle = turns(sides, 0.5)
+    angle = even_angles(sides, 0.5)
     up, side = (np.sign(v) * np.abs(v) ** (2 / square) for v in (np.sin(angle), np.cos(angle)))
     x, y, height, width = np.asarray(stations, float).T[..., None]
     return loft(points(x, y + height * up, width * side))
 
 
 def direction(polar: ArrayLike, azimuth: ArrayLike) -> Array:
-    """Directions (..., 3) at angles that are broadcast: rad from the top, and rad from forward to the right."""
+    """Directions (..., 3) at polar angles from the top and azimuths from forward to the right, rad."""
     return points(np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth))
 
 
 def dome(
     radii: ArrayLike, polar: ArrayLike, azimuth: ArrayLike, thick: float, out: ArrayLike = 0.0
 ) -> TemplateSolid:
-    """A piece of an ellipsoidal shell about the origin, `thick` to the inside of `out` beyond its radii.
+    """A patch of an ellipsoidal shell around the origin.
 
-    polar (A,), azimuth (B,): as `direction` has them.
+    Args:
+        radii: Radii along x, y, z (3,).
+        polar: Polar angles (A,), see `direction`.
+        azimuth: Azimuths (B,).
+        thick: Thickness, inwards.
+        out: Distance of the outer face beyond the radii.
     """
     way = direction(np.asarray(polar, float)[:, None], azimuth)
     radius = np.asarray(radii, float) + np.asarray(out, float)
     return slab(way * radius, way * (radius - thick))
 
 
-AROUND = turns(32)
-"""Azimuths of a bowl's rim, from forward."""
+RIM_AZIMUTHS = even_angles(32)
+"""Azimuths of a bowl's rim (32,), rad."""
 
 
 def bowl(radii: ArrayLike, rim: ArrayLike, thick: float, steps: int = 10) -> TemplateSolid:
-    """An ellipsoidal shell about the origin from its top to a polar angle: one, or one for each of `AROUND`."""
-    way = direction(np.linspace(0, 1, steps + 1)[:, None] * np.asarray(rim, float), AROUND)
+    """An ellipsoidal shell around the origin, open at the bottom.
+
+    Args:
+        radii: Radii along x, y, z (3,).
+        rim: Polar angle of the rim, one or one for each of `RIM_AZIMUTHS`, rad.
+        thick: Thickness, inwards.
+        steps: Number of steps from the top to the rim.
+    """
+    way = direction(np.linspace(0, 1, steps + 1)[:, None] * np.asarray(rim, float), RIM_AZIMUTHS)
     radius = np.asarray(radii, float)
     return loft(np.concatenate([way * radius, (way * (radius - thick))[::-1]]))
 
 
 def patch(stations: ArrayLike, x: Pair, angle: Pair, out: float) -> TemplateSolid:
-    """A piece of the skin of a `body` of elliptic section, its stations in order of x, raised by `out`: a
-    windscreen, a stripe. angle: rad from the right side upwards.
+    """A patch on the skin of a `body` of elliptic section, such as a windscreen or a stripe.
+
+    Args:
+        stations: Stations of the body, in order of x.
+        x: Range of x.
+        angle: Range of angles from the right side upwards, rad.
+        out: Height above the skin.
     """
     table = np.asarray(stations, float).T
     along, around = np.linspace(*x, 9)[:, None], np.linspace(*angle, 9)

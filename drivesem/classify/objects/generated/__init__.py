@@ -1,0 +1,1 @@
+"""Generators of objects of twelve classes; each generator draws proportions and colours at random."""

@@ -1,1 +1,0 @@
-"""Objects drawn by other renderers than the project's own, with the same lights and materials."""
