@@ -1,7 +1,7 @@
 """A user's own meshes and skies for the generator: folders of vehicles, and packs of vehicles and skies.
 
-A folder of vehicles holds mesh files (.glb, .gltf, .obj, .ply) and may hold `vehicles.yaml`, which says what the
-files do not. It maps file names to entries; all keys of an entry may be left out:
+A folder of vehicles holds mesh files (.glb, .gltf, .obj, .ply) and may hold `vehicles.yaml`, with what the
+files lack. It maps file names to entries; all keys of an entry may be left out:
 
     taxi.glb:
       kind: sedan               # sedan, hatchback, estate, suv, pickup, van, truck or bus; else guessed
@@ -33,7 +33,7 @@ from drivesem.synth.light import Light, Panorama
 from drivesem.synth.soup import Material, Soup, creased_normals, make
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
-from scene_ir.meshes.load import Imported, import_mesh
+from scene_ir.meshes.load import ImportedMesh, import_mesh
 from scene_ir.meshes.lod import simplify
 from scene_ir.meshes.templates import KINDS
 from scene_ir.types import Mesh, Part
@@ -59,7 +59,7 @@ _NAMES = (
     ("hatchback", r"hatch|compact|\bmini\b|smart|city ?car|golf|polo|leon|focus|beetle"),
     ("sedan", r"sedan|saloon|limousine|taxi|police|coupe|roadster|sport|\bcar\b|race"),
 )
-"""What file names say of the body; the first that is found counts."""
+"""Vehicle kinds by words in file names; the first match counts."""
 _RANGE_LHW = {
     "sedan": ((3.9, 5.2), (1.25, 1.60), (1.60, 2.05)),
     "hatchback": ((3.3, 4.5), (1.25, 1.65), (1.50, 2.00)),
@@ -100,7 +100,7 @@ class _Entry:
 class VehicleMesh:
     """A vehicle from a file. name: the file's, its id; kind: one of the templates' KINDS; size_lhw: usual size, m.
 
-    Small, hashable and picklable: the triangles are read when asked for and few are kept.
+    Small, hashable and picklable: triangles are read on demand, and few are cached.
     """
 
     name: str
@@ -118,11 +118,11 @@ class VehicleMesh:
     @property
     def split(self) -> str:
         """ "train" or "heldout", by the name alone."""
-        return split_of(self.name)
+        return choose_split(self.name)
 
 
-def split_of(name: str) -> str:
-    """ "heldout" for one name in three, else "train": the same on every machine, whatever else lies beside it."""
+def choose_split(name: str) -> str:
+    """ "heldout" for one name in three, else "train": the same on every machine and in every folder."""
     return "heldout" if hashlib.sha256(name.encode()).digest()[0] % 3 == 0 else "train"
 
 
@@ -136,9 +136,9 @@ def of_split(meshes: Sequence[VehicleMesh], split: str) -> tuple[VehicleMesh, ..
 def meshes_in(folder: str | Path) -> tuple[VehicleMesh, ...]:
     """The vehicles of a folder, sorted by name; of folders below it only what OBJ and GLTF files point to.
 
-    Files that cannot be read are left out; `unreadable_in` names them. The answer is kept per process while the
-    folder's list of files stays. Raises FormatError where the folder or every mesh in it cannot be read, and for
-    a faulty `vehicles.yaml`.
+    Files that cannot be read are left out; `unreadable_in` names them. The result is cached per process while the
+    folder's list of files stays the same. Raises FormatError for an unreadable folder, if no mesh in it can be read,
+    and for a faulty `vehicles.yaml`.
     """
     return _folder(*_listing(folder))[0]
 
@@ -172,7 +172,9 @@ def _folder(
     entries = _sidecar(place / SIDECAR) if len(names) < len(listing) else {}
     for name in entries:
         if name not in names:
-            raise FormatError(f"{place / SIDECAR}: {name}", "the name of a mesh file beside it", "no such file")
+            raise FormatError(
+                f"{place / SIDECAR}: {name}", "the name of a mesh file in the same folder", "no such file"
+            )
     vehicles, faults = [], []
     for name in names:
         entry = entries.get(name, _Entry())
@@ -240,7 +242,7 @@ def _positive(value: object) -> bool:
 def _vehicle(path: Path, entry: _Entry) -> VehicleMesh:
     up = entry.up if entry.up != "auto" else _up(path)
     length, height, width = (e * entry.metres_per_unit for e in _read(path, up, entry.front).size_lhw)
-    kind = entry.kind or kind_of(path.stem, (length, height, width))
+    kind = entry.kind or classify_vehicle(path.stem, (length, height, width))
     size = entry.size_lhw_m or usual_size(kind, (length, height, width))
     return VehicleMesh(path.name, kind, size, path, up, entry.front)
 
@@ -257,7 +259,7 @@ def _up(path: Path) -> str:
     return "y"
 
 
-def kind_of(name: str, size_lhw: tuple[float, float, float]) -> str:
+def classify_vehicle(name: str, size_lhw: tuple[float, float, float]) -> str:
     """The body of a vehicle, by its file's name or else by its proportions (of any unit)."""
     words = re.sub(r"[^a-z0-9]+", " ", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
     length, height, width = size_lhw
@@ -289,7 +291,7 @@ def usual_size(kind: str, size_lhw: tuple[float, float, float]) -> tuple[float, 
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, up: str, front: str) -> Imported:
+def _read(path: Path, up: str, front: str) -> ImportedMesh:
     return import_mesh(path, up=up, front=front)
 
 
@@ -302,7 +304,7 @@ def _mesh(vehicle: VehicleMesh) -> Mesh:
 
 
 def with_parts(mesh: Mesh) -> Mesh:
-    """The mesh with windows, trim and lights found by colour, where its names tell of paint and tyres at most.
+    """The mesh with windows, trim and lights found by colour, if its names distinguish paint and tyres at most.
 
     Many models have one material for the whole body, with a palette: pale blue or nearly black high up is glass,
     dark grey is trim unless it is the main colour, small yellow, red or white patches at the ends are lights.
@@ -371,13 +373,13 @@ def mesh_soup(mesh: Mesh, size_lhw: tuple[float, float, float], crease_rad: floa
 
 @lru_cache(maxsize=48)
 def vehicle_soup(vehicle: VehicleMesh, fine: bool = True) -> Soup:
-    """`mesh_soup` of a vehicle at its usual size, kept; fine: with the triangles that are seen from near only."""
+    """`mesh_soup` of a vehicle at its usual size, cached. fine: with the triangles that only show from near."""
     mesh = vehicle.mesh
     return mesh_soup(mesh if fine else simplify(mesh, _FAR_FACES), vehicle.size_lhw)
 
 
 def _tint(albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """Paint (n, 3) against the main paint, in [0, 2]: hue is kept where the main paint is grey, else dropped."""
+    """Paint (n, 3) against the main paint, in [0, 2]: hue is preserved where the main paint is grey, else dropped."""
     order = np.argsort(albedo.sum(axis=1), kind="stable")
     share = np.cumsum(area[order])
     main = albedo[order[np.searchsorted(share, share[-1] / 2)]] if share[-1] > 0 else albedo[0]
@@ -425,7 +427,7 @@ class Sky:
     @property
     def split(self) -> str:
         """ "train" or "heldout", by the name alone."""
-        return split_of(self.name)
+        return choose_split(self.name)
 
 
 def measured(name: str, pixels: np.ndarray) -> Sky:
@@ -457,7 +459,7 @@ def measured(name: str, pixels: np.ndarray) -> Sky:
         y = (weight * np.sin(elevation)[:, None]).sum()
         sun_azimuth, sun_elevation = float(np.arctan2(x, z)), float(np.arctan2(y, np.hypot(x, z)))
         shade = rest * (limit / np.maximum(value, 1e-9))[..., None]
-        # Compressed panoramas keep the disc's strength but not its colour, which its height tells well enough.
+        # Compressed panoramas keep the disc's strength but not its colour, which follows from its height well enough.
         strength = float((((rest - shade) * (disc * solid)[..., None]).sum(axis=(0, 1)) / np.pi).max())
         low = float(np.clip(1 - sun_elevation / np.deg2rad(30), 0, 1))
         sun_colour = strength * np.array([1.0, 0.95 - 0.2 * low, 0.86 - 0.42 * low])
@@ -486,7 +488,7 @@ def _mended(pixels: np.ndarray, hole: np.ndarray) -> np.ndarray:
 
 
 def skies_in(folder: str | Path) -> tuple[Sky, ...]:
-    """The skies (.npz with `pixels`, see `measured`) of a folder, sorted by name; kept per process.
+    """The skies (.npz with `pixels`, see `measured`) of a folder, sorted by name; cached per process.
 
     Raises FormatError where the folder holds none, or one cannot be read.
     """
@@ -531,15 +533,15 @@ def with_sky(light: Light, sky: Sky, rng: np.random.Generator) -> Light:
     gain *= float(before @ _LUMINANCE) / float((gain * now) @ _LUMINANCE)
     rows = sky.pixels.shape[0] // 2
     horizon = sky.pixels[rows - max(rows // 6, 1) : rows].mean(axis=(0, 1)) * gain
-    shown = max(_LEAST_HORIZON / max(float(horizon @ _LUMINANCE), 1e-9), 1.0)
-    pixels = sky.pixels * (gain * shown).astype(np.float32)
+    brightening = max(_LEAST_HORIZON / max(float(horizon @ _LUMINANCE), 1e-9), 1.0)
+    pixels = sky.pixels * (gain * brightening).astype(np.float32)
     return replace(
         light,
         weather=("dusk" if elevation < 0.26 else "sun") if sky.sunny else "overcast",
         sun=sun,
         sun_colour=shining * gain,
         zenith=pixels[: max(rows // 3, 1)].mean(axis=(0, 1)).astype(np.float64),
-        horizon=horizon * shown,
+        horizon=horizon * brightening,
         ambient=sky.ambient * gain,
         panorama=Panorama(pixels, turn),
     )

@@ -34,19 +34,24 @@ _STEEL = np.array([0.16, 0.165, 0.17], np.float32)
 
 @dataclass(frozen=True, slots=True)
 class BuildingStyle:
-    """Look of one building. wall, roof, trim: linear albedo. pattern: window pitch and storey height in metres,
-    and the window's share of both. pitched: roof form. shop: whether the ground floor is one. shutters: beside
-    windows. balconies: on blocks of flats.
-    """
+    """Appearance of one building."""
 
     wall: np.ndarray
+    """Linear albedo (3,)."""
     roof: np.ndarray
+    """Linear albedo (3,)."""
     trim: np.ndarray
+    """Linear albedo (3,)."""
     pattern: tuple[float, float, float, float]
+    """Window pitch and storey height, m, and the window's share of each."""
     pitched: bool
+    """Whether the roof is pitched."""
     shop: bool
+    """Whether the ground floor is a shop."""
     shutters: bool
+    """Whether windows have shutters."""
     balconies: bool
+    """Whether blocks of flats have balconies."""
 
 
 @lru_cache(maxsize=512)
@@ -86,32 +91,36 @@ def building(
     along: whether the ridge of a pitched roof runs along x; else gables face +z and -z. front: sign of z of the
     side with doors and fittings; 0: bare walls, for far away. city: whether it may have a shop or balconies.
     """
-    look = style(identifier)
+    building_style = style(identifier)
     rng = np.random.default_rng([0xB12, identifier, storeys])
-    shop = city and look.shop and storeys > 1 and front != 0
-    height = storeys * look.pattern[1] + 0.5 + (_SHOP_M - 0.5 - look.pattern[1] if shop else 0.0)
+    shop = city and building_style.shop and storeys > 1 and front != 0
+    height = (
+        storeys * building_style.pattern[1] + 0.5 + (_SHOP_M - 0.5 - building_style.pattern[1] if shop else 0.0)
+    )
     parts = []
     for turn in range(4):
         wide, out = (length_m, depth_m / 2) if turn % 2 == 0 else (depth_m, length_m / 2)
         faces_street = front != 0 and turn == (0 if front > 0 else 2)
-        wall = _wall(look, wide, height, shop and faces_street)
+        wall = _wall(building_style, wide, height, shop and faces_street)
         if faces_street:
-            wall += _fittings(look, (wide, height), storeys, shop, city and look.balconies, rng)
+            wall += _fittings(
+                building_style, (wide, height), storeys, shop, city and building_style.balconies, rng
+            )
         at = {0: (0.0, 0.0, out), 1: (out, 0.0, 0.0), 2: (0.0, 0.0, -out), 3: (-out, 0.0, 0.0)}[turn]
         parts.append(placed(join(wall), at, turn * np.pi / 2, (1, 1, 1)))
-    if look.pitched:
-        parts += _gable(length_m, depth_m, height, look, along)
+    if building_style.pitched:
+        parts += _gable(length_m, depth_m, height, building_style, along)
         span = depth_m if along else length_m
         if identifier % 3 != 1:
-            chimney = box((0.7, height + 0.62 * span * 0.5 + 0.8, 0.6), Material.WALL, look.roof * 0.9)
+            chimney = box((0.7, height + 0.62 * span * 0.5 + 0.8, 0.6), Material.WALL, building_style.roof * 0.9)
             spot = (length_m * 0.22, 0.0, span * 0.08) if along else (span * 0.08, 0.0, depth_m * 0.22)
             parts.append(placed(chimney, spot, 0.0, (1, 1, 1)))
         if front:
-            parts += _roof_fittings((length_m, depth_m), height, look, along, front, rng)
+            parts += _roof_fittings((length_m, depth_m), height, building_style, along, front, rng)
     else:
-        rim = box((length_m + 0.3, 0.45, depth_m + 0.3), Material.WALL, look.wall * 0.7)
+        rim = box((length_m + 0.3, 0.45, depth_m + 0.3), Material.WALL, building_style.wall * 0.7)
         parts.append(placed(rim, (0, -height + 0.02, 0), 0.0, (1, 1, 1)))
-        hut = box((2.6, 1.7, 2.2), Material.WALL, look.wall * 0.6)
+        hut = box((2.6, 1.7, 2.2), Material.WALL, building_style.wall * 0.6)
         parts.append(placed(hut, (length_m * float(rng.uniform(-0.25, 0.25)), -height, 0), 0.0, (1, 1, 1)))
     return join(parts)
 
@@ -144,24 +153,24 @@ def _copies(soup: Soup, at: np.ndarray) -> Soup:
     return replace(many, corners=many.corners + np.repeat(at, len(soup), axis=0)[:, None].astype(np.float32))
 
 
-def _windows(look: BuildingStyle, wide_m: float) -> tuple[int, float, float]:
+def _windows(building_style: BuildingStyle, wide_m: float) -> tuple[int, float, float]:
     """Number of windows side by side on a wall, their pitch in metres, and their share of it: none is cut off."""
-    number = max(int(wide_m / look.pattern[0] + 0.2), 1)
+    number = max(int(wide_m / building_style.pattern[0] + 0.2), 1)
     pitch = wide_m / number
-    return number, pitch, min(look.pattern[2] * look.pattern[0] / pitch, 0.62)
+    return number, pitch, min(building_style.pattern[2] * building_style.pattern[0] / pitch, 0.62)
 
 
-def _wall(look: BuildingStyle, wide_m: float, height_m: float, shop: bool) -> list[Soup]:
+def _wall(building_style: BuildingStyle, wide_m: float, height_m: float, shop: bool) -> list[Soup]:
     """A wall with windows at z = 0 that faces +z, its foot's middle at the origin."""
-    _, pitch, share = _windows(look, wide_m)
+    _, pitch, share = _windows(building_style, wide_m)
     low = _SHOP_M if shop else 0.0
-    upper = _panel((-wide_m / 2, wide_m / 2), (low, height_m), 0.0, Material.FACADE, look.wall)
-    upper.pattern[:] = (pitch, look.pattern[1], share, look.pattern[3])
+    upper = _panel((-wide_m / 2, wide_m / 2), (low, height_m), 0.0, Material.FACADE, building_style.wall)
+    upper.pattern[:] = (pitch, building_style.pattern[1], share, building_style.pattern[3])
     if not shop:
         return [upper]
     upper.uv[..., 1] += 0.5 - _SHOP_M
     panes = max(round(wide_m / 3.4), 1)
-    lower = _panel((-wide_m / 2, wide_m / 2), (0.0, _SHOP_M), 0.0, Material.FACADE, look.wall * 0.6)
+    lower = _panel((-wide_m / 2, wide_m / 2), (0.0, _SHOP_M), 0.0, Material.FACADE, building_style.wall * 0.6)
     lower.pattern[:] = (wide_m / panes, _SHOP_M - 0.5, 0.84, 0.8)
     return [upper, lower]
 
@@ -172,7 +181,7 @@ def _at(soup: Soup, x: float, y: float, z: float) -> Soup:
 
 
 def _fittings(
-    look: BuildingStyle,
+    building_style: BuildingStyle,
     size_m: tuple[float, float],
     storeys: int,
     shop: bool,
@@ -181,8 +190,8 @@ def _fittings(
 ) -> list[Soup]:
     """What stands out of the wall towards the street: door, sills, shutters, balconies, sign, awning, downpipe."""
     wide, height = size_m
-    number, pitch, share = _windows(look, wide)
-    storey, tall = look.pattern[1], look.pattern[3]
+    number, pitch, share = _windows(building_style, wide)
+    storey, tall = building_style.pattern[1], building_style.pattern[3]
     low = _SHOP_M - 0.5 if shop else 0.0
     middles = (np.arange(number) + 0.5) * pitch - wide / 2
     window = share * pitch
@@ -200,11 +209,11 @@ def _fittings(
         sill = box((window + 0.24, 0.07, 0.16), Material.FLAT, np.full(3, 0.34))
         parts.append(_copies(sill, np.stack([x, 0.10 - bottom, np.full(len(x), 0.06)], axis=1)))
         top = bottom + storey * tall
-        if look.shutters:
+        if building_style.shutters:
             near, far = window / 2 + 0.12, window / 2 + 0.12 + 0.45 * window
             spans = np.concatenate([x[:, None] + [near, far], x[:, None] - [far, near]])
             heights = np.tile(np.stack([bottom, top], axis=1), (2, 1))
-            parts.append(_panels(spans, heights, 0.05, Material.FENCE, look.trim))
+            parts.append(_panels(spans, heights, 0.05, Material.FENCE, building_style.trim))
         # roller shutters, let down part of the way
         shut = rng.random(len(x)) < 0.14
         drop = rng.uniform(0.25, 1.0, len(x)) * storey * tall
@@ -213,7 +222,7 @@ def _fittings(
             roller = np.full(3, float(rng.uniform(0.25, 0.5)))
             parts.append(_panels(spans, np.stack([top - drop, top], 1)[shut], 0.03, Material.WALL, roller))
     if blind >= 0:
-        one = join(_balcony(max(window + 0.9, 2.2), look))
+        one = join(_balcony(max(window + 0.9, 2.2), building_style))
         floors = base[1:] if not shop else base
         spots = np.stack([np.full(len(floors), middles[blind]), -floors, np.zeros(len(floors))], axis=1)
         parts.append(_copies(one, spots))
@@ -226,36 +235,36 @@ def _fittings(
                 (0.0, 0.55 + storey * (0.5 + tall / 2)),
                 0.03,
                 Material.WALL,
-                look.wall * 0.8,
+                building_style.wall * 0.8,
             )
         )
         parts.append(_panel((x - 0.62, x + 0.62), (0.0, 2.35), 0.05, Material.FLAT, np.full(3, 0.4)))
-        parts.append(_panel((x - 0.52, x + 0.52), (0.1, 2.25), 0.06, Material.FLAT, look.trim))
+        parts.append(_panel((x - 0.52, x + 0.52), (0.1, 2.25), 0.06, Material.FLAT, building_style.trim))
         parts.append(_panel((x - 0.3, x + 0.3), (1.2, 2.05), 0.07, Material.GLASS, np.full(3, 0.03)))
         parts.append(_at(box((1.5, 0.14, 1.1), Material.WALL, np.full(3, 0.2)), x, 0.0, 0.5))
         if rng.random() < 0.6:
-            parts.append(_at(box((1.8, 0.12, 1.0), Material.FLAT, look.roof), x, -2.6, 0.5))
+            parts.append(_at(box((1.8, 0.12, 1.0), Material.FLAT, building_style.roof), x, -2.6, 0.5))
     else:
-        parts += _shop(look, wide, rng)
+        parts += _shop(building_style, wide, rng)
     pipe = float(rng.choice([-1.0, 1.0])) * (wide / 2 - 0.25)
     parts.append(stick((pipe, 0, 0.1), (pipe, -height + 0.1, 0.1), (0.05, 0.05), Material.METAL, _STEEL, 4))
     return parts
 
 
-def _balcony(wide_m: float, look: BuildingStyle) -> list[Soup]:
+def _balcony(wide_m: float, building_style: BuildingStyle) -> list[Soup]:
     """A slab and a parapet of sheet metal or bars."""
-    slab = _at(box((wide_m, 0.16, 1.3), Material.WALL, look.wall * 0.8), 0.0, 0.05, 0.65)
-    front = _at(box((wide_m, 0.85, 0.05), Material.FENCE, look.trim * 1.3), 0.0, -0.16, 1.25)
+    slab = _at(box((wide_m, 0.16, 1.3), Material.WALL, building_style.wall * 0.8), 0.0, 0.05, 0.65)
+    front = _at(box((wide_m, 0.85, 0.05), Material.FENCE, building_style.trim * 1.3), 0.0, -0.16, 1.25)
     ends = [
-        _at(box((0.05, 0.85, 1.25), Material.FENCE, look.trim * 1.3), s * wide_m / 2, -0.16, 0.62)
+        _at(box((0.05, 0.85, 1.25), Material.FENCE, building_style.trim * 1.3), s * wide_m / 2, -0.16, 0.62)
         for s in (-1.0, 1.0)
     ]
     return [slab, front, *ends]
 
 
-def _shop(look: BuildingStyle, wide_m: float, rng: np.random.Generator) -> list[Soup]:
+def _shop(building_style: BuildingStyle, wide_m: float, rng: np.random.Generator) -> list[Soup]:
     """A sign with letters over the panes, perhaps an awning."""
-    board = look.trim * float(rng.uniform(0.8, 2.2))
+    board = building_style.trim * float(rng.uniform(0.8, 2.2))
     low = _SHOP_M - 0.72
     parts = [_at(box((wide_m - 0.5, 0.6, 0.1), Material.FLAT, board), 0.0, -low, 0.05)]
     ink = np.full(3, 0.5) if board.mean() < 0.15 else np.full(3, 0.03)
@@ -284,7 +293,7 @@ def _shop(look: BuildingStyle, wide_m: float, rng: np.random.Generator) -> list[
         cloth = make(
             points[:, _PANEL].reshape(-1, 3, 3),
             Material.CLOTH,
-            look.trim * 1.8,
+            building_style.trim * 1.8,
             np.broadcast_to(normal, (2 * stripes, 3, 3)),
         )
         if not plain:
@@ -296,7 +305,7 @@ def _shop(look: BuildingStyle, wide_m: float, rng: np.random.Generator) -> list[
 def _roof_fittings(
     plan_m: tuple[float, float],
     height: float,
-    look: BuildingStyle,
+    building_style: BuildingStyle,
     along: bool,
     front: float,
     rng: np.random.Generator,
@@ -318,9 +327,14 @@ def _roof_fittings(
         for x in spots:
             if draw < 0.3:
                 dormer = _at(
-                    box((1.5, 1.35, 1.6), Material.WALL, look.wall), float(x), -y + 0.25, z - front * 0.35
+                    box((1.5, 1.35, 1.6), Material.WALL, building_style.wall),
+                    float(x),
+                    -y + 0.25,
+                    z - front * 0.35,
                 )
-                lid = _at(box((1.9, 0.12, 2.1), Material.FLAT, look.roof), float(x), -y - 1.1, z - front * 0.35)
+                lid = _at(
+                    box((1.9, 0.12, 2.1), Material.FLAT, building_style.roof), float(x), -y - 1.1, z - front * 0.35
+                )
                 pane = _panel((-0.5, 0.5), (0.15, 1.0), 0.46, Material.GLASS, np.full(3, 0.03))
                 turned = placed(
                     pane,
@@ -352,7 +366,9 @@ def _skylight(x: float, spot: tuple[float, float], slope: float, front: float) -
     return make(quad(np.array(corners)), Material.GLASS, (0.03, 0.03, 0.03), np.broadcast_to(out, (2, 3, 3)))
 
 
-def _gable(length_m: float, depth_m: float, height: float, look: BuildingStyle, along: bool) -> list[Soup]:
+def _gable(
+    length_m: float, depth_m: float, height: float, building_style: BuildingStyle, along: bool
+) -> list[Soup]:
     """A saddle roof with eaves, and its two gable walls."""
     long, short = (length_m, depth_m) if along else (depth_m, length_m)
     rise, eave = 0.42 * short, 0.45
@@ -367,7 +383,9 @@ def _gable(length_m: float, depth_m: float, height: float, look: BuildingStyle, 
         uv = np.array([[ends[0], 0], [ends[1], 0], [ends[1], short * 0.65], [ends[0], short * 0.65]])
         normal = np.array([0, -short / 2, sign * rise])
         normal /= np.linalg.norm(normal)
-        roofs.append(make(quad(points), Material.ROOF, look.roof, np.broadcast_to(normal, (2, 3, 3)), quad(uv)))
+        roofs.append(
+            make(quad(points), Material.ROOF, building_style.roof, np.broadcast_to(normal, (2, 3, 3)), quad(uv))
+        )
         gable = np.array(
             [
                 [sign * long / 2, -height, short / 2],
@@ -376,7 +394,7 @@ def _gable(length_m: float, depth_m: float, height: float, look: BuildingStyle, 
             ]
         )
         normal = np.array([sign, 0.0, 0.0])
-        gables.append(make(gable[None], Material.WALL, look.wall, np.broadcast_to(normal, (1, 3, 3))))
+        gables.append(make(gable[None], Material.WALL, building_style.wall, np.broadcast_to(normal, (1, 3, 3))))
     parts = roofs + gables
     return parts if along else [placed(p, (0, 0, 0), np.pi / 2, (1, 1, 1)) for p in parts]
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import wasserstein_distance
 
 from drivesem.data.registry import Dataset
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from scene_ir.errors import FormatError
 from scene_ir.files import write_bytes
 from scene_ir.types import Labels
@@ -131,12 +131,12 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 4)
 
 
-def _shown(value: float | None, decimals: int) -> str:
-    """A figure for people, a dash where there is none."""
+def _format_value(value: float | None, decimals: int) -> str:
+    """Format a value, or a dash for None."""
     return "-" if value is None else f"{value:.{decimals}f}"
 
 
-def values_of(labels: Labels) -> dict[str, np.ndarray]:
+def measure_labels(labels: Labels) -> dict[str, np.ndarray]:
     """Every quantity of one frame's vehicles; those of unknown pose (NaN) are left out of what needs one."""
     rows = np.array([i for i, kind in enumerate(labels.kind) if kind in VEHICLES], np.int64)
     boxes = labels.boxes_xyxy.double().numpy()[rows]
@@ -168,7 +168,7 @@ def histograms(frames: Iterable[Labels]) -> Histograms:
     """The distributions of the vehicles in many frames' labels."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in QUANTITIES}
     for labels in frames:
-        for name, values in values_of(labels).items():
+        for name, values in measure_labels(labels).items():
             found[name].append(values)
     values = {name: np.concatenate(parts) if parts else np.zeros(0) for name, parts in found.items()}
     means = {
@@ -186,16 +186,16 @@ def histograms(frames: Iterable[Labels]) -> Histograms:
 def reference() -> Histograms:
     """KITTI's own distributions, from the figures shipped with the package."""
     raw = json.loads(resources("drivesem.synth").joinpath("kitti_statistics.json").read_text(encoding="utf-8"))
-    kept = raw["histograms"]
+    histograms = raw["histograms"]
     for name, quantity in QUANTITIES.items():
-        found = kept["quantities"].get(name, {}).get("edges", [])
+        found = histograms["quantities"].get(name, {}).get("edges", [])
         if len(found) != len(quantity.edges) or not np.allclose(found, quantity.edges, atol=1e-5):
             raise FormatError(f"kitti_statistics.json: {name}", f"bins at {quantity.edges}", f"bins at {found}")
     return Histograms(
-        frames=kept["frames"],
-        vehicles=kept["vehicles"],
-        shares={name: np.array(kept["quantities"][name]["share"]) for name in QUANTITIES},
-        means={name: kept["quantities"][name]["mean"] for name in QUANTITIES},
+        frames=histograms["frames"],
+        vehicles=histograms["vehicles"],
+        shares={name: np.array(histograms["quantities"][name]["share"]) for name in QUANTITIES},
+        means={name: histograms["quantities"][name]["mean"] for name in QUANTITIES},
     )
 
 
@@ -214,7 +214,7 @@ class Distance:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A data set's distributions beside KITTI's."""
+    """A data set's distributions compared with KITTI's."""
 
     own: Histograms
     kitti: Histograms
@@ -261,14 +261,16 @@ class Comparison:
 
     def table(self) -> str:
         """A Markdown table: mean here and in KITTI, Wasserstein-1 distance, total variation."""
-        head = f"{number_of(self.own.frames, 'frame')} with {number_of(self.own.vehicles, 'vehicle')} against "
+        head = (
+            f"{format_count(self.own.frames, 'frame')} with {format_count(self.own.vehicles, 'vehicle')} against "
+        )
         head += f"KITTI's {self.kitti.frames} with {self.kitti.vehicles}.\n\n"
         rows = ["| quantity | unit | mean | KITTI's mean | Wasserstein-1 | total variation |"]
         rows.append("|---|---|---:|---:|---:|---:|")
         for name, d in self.distances.items():
-            figures = " | ".join(_shown(v, 2) for v in (d.mean, d.kitti_mean, d.wasserstein))
+            cells = " | ".join(_format_value(v, 2) for v in (d.mean, d.kitti_mean, d.wasserstein))
             title = QUANTITIES[name].title.lower()
-            rows.append(f"| {title} | {d.unit} | {figures} | {_shown(d.total_variation, 3)} |")
+            rows.append(f"| {title} | {d.unit} | {cells} | {_format_value(d.total_variation, 3)} |")
         mine, theirs = self.truncated
         rows.append(
             f"| truncated vehicles | % | {100 * mine:.1f} | {100 * theirs:.1f} | | {abs(mine - theirs):.3f} |"
@@ -285,7 +287,7 @@ class Comparison:
         panels = figure.subplots(2, 3)
         for axes, name in zip(panels.flat, _PANELS, strict=True):
             self._panel(axes, name)
-        names = (f"KITTI ({self.kitti.frames} frames)", f"generated ({number_of(self.own.frames, 'frame')})")
+        names = (f"KITTI ({self.kitti.frames} frames)", f"generated ({format_count(self.own.frames, 'frame')})")
         figure.legend(panels.flat[0].get_legend_handles_labels()[0], names, loc="outside upper center", ncols=2)
         data = io.BytesIO()
         figure.savefig(data, format="png", dpi=110)
@@ -304,7 +306,7 @@ class Comparison:
         axes.set_ylabel("share" if whole else f"share per {quantity.unit}")
         if quantity.unit == "level":
             axes.set_xticks(quantity.middles)
-        cost, variation = _shown(distance.wasserstein, 2), _shown(distance.total_variation, 3)
+        cost, variation = _format_value(distance.wasserstein, 2), _format_value(distance.total_variation, 3)
         axes.set_title(f"W1 {cost} {distance.unit}, TV {variation}", fontsize=10)
 
 

@@ -1,4 +1,4 @@
-"""The embedded scenes: synthetic streets taken apart exactly, with no de-rendering in between."""
+"""The embedded scenes: synthetic streets as exact scenes, without de-rendering."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def _thinned(plan: Plan) -> Plan | None:
         if len(plan.actors) < _FEWEST:
             return None
         truths = boxes_alone(plan)
-        kept = [t for t in truths if _fits(t)]
-        kept = sorted(sorted(kept, key=lambda t: (t.translation[2], t.index))[:_MOST], key=lambda t: t.index)
-        if len(kept) < _FEWEST or sum(map(_clear, kept)) < _CLEAR_CARS:
+        usable = [t for t in truths if _fits(t)]
+        usable = sorted(sorted(usable, key=lambda t: (t.translation[2], t.index))[:_MOST], key=lambda t: t.index)
+        if len(usable) < _FEWEST or sum(map(_clear, usable)) < _CLEAR_CARS:
             return None
-        if len(kept) == len(plan.actors):
+        if len(usable) == len(plan.actors):
             return plan
-        plan = replace(plan, actors=tuple(t.actor for t in kept))
+        plan = replace(plan, actors=tuple(t.actor for t in usable))
     return None
 
 
@@ -176,8 +176,8 @@ def _mattes(frame: SynthFrame) -> list[Crop]:
         own = truth.opacity.values.shape
         x0, y0 = max(truth.opacity.x0 - 3, 0), max(truth.opacity.y0 - 3, 0)
         x1, y1 = min(truth.opacity.x0 + own[2] + 3, width), min(truth.opacity.y0 + own[1] + 3, height)
-        shown = np.stack([p[y0:y1, x0:x1] == truth.index + 1 for p in parts]).mean(axis=0, dtype=np.float32)
-        share = cv2.GaussianBlur(shown, (5, 5), frame.setting.response.blur_px)
+        coverage = np.stack([p[y0:y1, x0:x1] == truth.index + 1 for p in parts]).mean(axis=0, dtype=np.float32)
+        share = cv2.GaussianBlur(coverage, (5, 5), frame.setting.response.blur_px)
         share[share < 1e-3] = 0
         out.append(Crop(torch.from_numpy(np.minimum(share, 1.0))[None], x0, y0))
     return out

@@ -1,4 +1,4 @@
-"""Embedded drives: clips of one synthetic street, taken apart exactly, a vehicle the same in all frames."""
+"""Embedded drives: clips of one synthetic street as exact scenes; a vehicle is the same in all frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _KINDS = ("residential", "city")
 """Of roads: with parked rows that the camera's car goes past."""
 _LAYOUT = LayoutSettings(variants=VARIANTS["heldout"], people=False, vehicles=(10, 18), max_heavy=1, kinds=_KINDS)
 _ATTEMPTS = 60
-_LOOKS = 5
+_CHECKED_FRAMES = 5
 """Frames, evenly spread, by which a drive is chosen."""
 _CLEAR_HEIGHT_PX, _CLEAR_VISIBLE = 30.0, 0.6
 _FEWEST, _MOST = 4, 8
@@ -44,7 +44,7 @@ class Drive:
         return replace(plan, actors=tuple(actor for actor in plan.actors if actor.track in self.tracks))
 
     def scene(self, number: int) -> SceneIR:
-        """Frame `number`, taken apart: `tracks` of its provenance names the vehicles, in the objects' order."""
+        """Scene of frame `number`; `tracks` of its provenance names the vehicles in the objects' order."""
         frame = render_frame(self.plan(number), with_background=True)
         assert frame is not None
         scene = take_apart(_without_hidden(frame), f"drive-{number:03d}")
@@ -53,18 +53,21 @@ class Drive:
         return replace(scene, provenance=dict(scene.provenance) | tracks | labels)
 
 
-def drive_of(seed: int, frames: int) -> Drive:
-    """The embedded drive of so many frames, ten a second: the first of a seed's in which enough vehicles come
-    near. RangeError for no frame.
+def make_drive(seed: int, frames: int) -> Drive:
+    """Return the embedded drive of `frames` frames, ten a second: the seed's first with enough near vehicles.
+
+    Raises RangeError for no frame.
     """
     if frames < 1:
         raise RangeError("frames of a drive", "at least 1", frames)
-    looks = sorted({round(i * (frames - 1) / max(_LOOKS - 1, 1)) for i in range(_LOOKS)})
+    checked_frames = sorted(
+        {round(i * (frames - 1) / max(_CHECKED_FRAMES - 1, 1)) for i in range(_CHECKED_FRAMES)}
+    )
     for attempt in range(_ATTEMPTS):
         if _plan(seed, frames, 0, attempt).setting.road.ego_speed_mps < _LEAST_SPEED_MPS:
             continue
         height: dict[int, float] = {}
-        for number in looks:
+        for number in checked_frames:
             for truth in boxes_alone(_plan(seed, frames, number, attempt)):
                 tall = float(truth.box_xyxy[3] - truth.box_xyxy[1])
                 if tall >= _CLEAR_HEIGHT_PX and truth.visible >= _CLEAR_VISIBLE and truth.truncation < 0.3:
@@ -84,13 +87,13 @@ def _without_hidden(frame: SynthFrame) -> SynthFrame:
     """The frame with objects for the labelled vehicles alone: of others, hardly seen or cut by the camera's plane,
     what shows stays in the background.
     """
-    kept = tuple(truth for truth in frame.truths if truth.labelled)
-    others = (frame.owner > 0) & ~np.isin(frame.owner, [truth.index + 1 for truth in kept])
+    labelled = tuple(truth for truth in frame.truths if truth.labelled)
+    others = (frame.owner > 0) & ~np.isin(frame.owner, [truth.index + 1 for truth in labelled])
     if not others.any():
-        return replace(frame, truths=kept)
+        return replace(frame, truths=labelled)
     height, width = frame.camera.height, frame.camera.width
-    shown = np.asarray(others.reshape(height, 2, width, 2).any(axis=(1, 3)), np.uint8)
-    shown = cv2.dilate(shown, np.ones((2 * _LENS_PX + 1,) * 2, np.uint8)).astype(bool)
+    uncovered = np.asarray(others.reshape(height, 2, width, 2).any(axis=(1, 3)), np.uint8)
+    uncovered = cv2.dilate(uncovered, np.ones((2 * _LENS_PX + 1,) * 2, np.uint8)).astype(bool)
     assert frame.background is not None
-    background = np.where(shown[..., None], frame.image, frame.background)
-    return replace(frame, truths=kept, background=background)
+    background = np.where(uncovered[..., None], frame.image, frame.background)
+    return replace(frame, truths=labelled, background=background)

@@ -101,10 +101,10 @@ def _painted(paint: tuple[float, float, float], code: tuple[float, ...]) -> tupl
     """Linear albedo of a paint under a texture code, as the compositor changes it in the picture."""
     if not any(code):
         return paint
-    shown = torch.tensor([paint], dtype=torch.float64).clamp(0, 1) ** (1 / _GAMMA)
+    display_colour = torch.tensor([paint], dtype=torch.float64).clamp(0, 1) ** (1 / _GAMMA)
     one = torch.ones(1, dtype=torch.float64)
     row = torch.tensor([code], dtype=torch.float64)
-    changed = apply_texture_code(shown, one, row, one, 0.5 * one, 50.0 * one)[0]
+    changed = apply_texture_code(display_colour, one, row, one, 0.5 * one, 50.0 * one)[0]
     red, green, blue = (changed.clamp(0.0, 1.0) ** _GAMMA).tolist()
     return red, green, blue
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from drivesem.data.truth import SKY_CM, Exposure, TrackedObject
+from drivesem.data.ground_truth import SKY_CM, Exposure, TrackedObject
 from drivesem.synth.frames import SynthFrame, Truth
 from drivesem.synth.soup import Semantic
 from drivesem.synth.view import View
@@ -97,8 +97,8 @@ def _object(truth: Truth, pixels: int, view: View, first_track: int) -> TrackedO
 
 def paint_name(albedo: Sequence[float]) -> str:
     """The nearest of the named paints, by the cube roots of linear RGB, which are about even to the eye."""
-    looks = np.cbrt(np.asarray(albedo, float))
-    return min(_PAINT_NAMES, key=lambda name: float(np.abs(np.cbrt(_PAINT_NAMES[name]) - looks).sum()))
+    cube_roots = np.cbrt(np.asarray(albedo, float))
+    return min(_PAINT_NAMES, key=lambda name: float(np.abs(np.cbrt(_PAINT_NAMES[name]) - cube_roots).sum()))
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:

@@ -56,10 +56,10 @@ def _crown(
     blob = rng.choice(len(centres), size=count, p=share / share.sum())
     direction = rng.normal(0, 1, (count, 3))
     depth = np.where(rng.random(count) < 0.14, rng.uniform(1.1, 1.32, count), rng.uniform(0.8, 1.1, count))
-    kept, points, outward, light = mesh_kernels.crown((centres, radii), blob, direction, depth)
+    rows, points, outward, light = mesh_kernels.crown((centres, radii), blob, direction, depth)
     cores = balls(centres, radii * 0.8, Material.LEAF, colour * 0.32, 1 if size_m < 0.02 else 0)
     # single leaves against the sky must not look like shards
-    coat = leaves(points, outward, size_m * np.where(depth[kept, None] > 1.1, 0.55, 1.0), colour, rng)
+    coat = leaves(points, outward, size_m * np.where(depth[rows, None] > 1.1, 0.55, 1.0), colour, rng)
     coat.albedo[:] *= light[:, None]
     return [cores, coat]
 
@@ -132,7 +132,7 @@ def bush(identifier: int, detail: int) -> Soup:
 def hedge(size_m: tuple[float, float, float], front: float, detail: int, rng: np.random.Generator) -> Soup:
     """A hedge of a length, height and depth along x, centred on the origin, standing on the ground.
 
-    front: -1 or 1, the sign of z on the side that is looked at (the other is thinner). detail: as for trees.
+    front: -1 or 1, the sign of z on the side that faces the camera (the other is thinner). detail: as for trees.
     """
     length_m, height_m, depth_m = size_m
     colour = leaf_colour(rng, 0.02)
@@ -193,7 +193,7 @@ def _prism(ring: np.ndarray, height_m: float, colour: np.ndarray) -> Soup:
 
 
 def tree_line(start: np.ndarray, end: np.ndarray, height_m: float, rng: np.random.Generator) -> Soup:
-    """A wood seen from far away: a wall (x, z) start to end whose top follows crowns, under leaf clusters."""
+    """A wood seen from far away: a wall (x, z) start to end with a top that follows crowns, under leaf clusters."""
     length = float(np.hypot(*(end - start)))
     columns = max(int(length / 1.1), 4)
     at = np.linspace(0, length, columns + 1)

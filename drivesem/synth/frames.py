@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from drivesem.data.truth import occlusion_of
+from drivesem.data.ground_truth import occlusion_from_visible
 from drivesem.synth import kernels
 from drivesem.synth.assets import Sky, with_sky
 from drivesem.synth.layout import (
@@ -29,7 +29,7 @@ from drivesem.synth.noise import noise_set
 from drivesem.synth.render import pixel_sums, rasterise, render, render_without_actors, see
 from drivesem.synth.seasons import leaved
 from drivesem.synth.soup import Material, Soup, box, join, placed, transformed
-from drivesem.synth.variations import MIXED, VARIATIONS, kept_in_world, turned, vary
+from drivesem.synth.variations import MIXED, VARIATIONS, fix_light_in_world, turned, vary
 from drivesem.synth.vehicles import instance_ffd
 from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blocks, fine_matrix
 from drivesem.synth.world import POOLS, actor_soup, surroundings
@@ -106,7 +106,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class SynthFrame:
-    """A synthetic frame. image, background (H, W, 3) uint8 (the background where it was asked for); labels:
+    """A synthetic frame. image, background (H, W, 3) uint8 (the background on request); labels:
     KITTI's classes; truths: actors that appear in the image; depth_m (H, W), inf in the sky, semantic (H, W)
     uint8, a `Semantic`, and instance (H, W) uint16, 0 or track + 1 of one of `truths`: of each pixel's nearest
     sample; owner (2H, 2W): what each sample shows, -1 sky, 0 surroundings, i + 1 actor i; ground_material (H, W):
@@ -211,12 +211,12 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
         if own.sum() < 4:
             continue
         seen = owner[y0:y1, x0:x1]
-        shown = (seen == i + 1) & own
+        own_visible = (seen == i + 1) & own
         rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
         # Sample k of an axis covers [k / n - 1/2, (k + 1) / n - 1/2] px, as pixel j covers [j - 1/2, j + 1/2].
         outline = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1] + 1, y0 + rows[-1] + 1]) / n - 0.5
         outline = np.clip(outline, 0, [width - 1, height - 1, width - 1, height - 1])
-        visible = float(shown.sum() / own.sum())
+        visible = float(own_visible.sum() / own.sum())
         screened = float(((seen == 0) & own).sum() / own.sum())
         cut = np.clip(full[i], 0, [width - 1, height - 1, width - 1, height - 1])
         whole = np.prod(full[i][2:] - full[i][:2])
@@ -231,7 +231,7 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
                 index=i,
                 visible=visible,
                 screened=screened,
-                occlusion=occlusion_of(visible),
+                occlusion=occlusion_from_visible(visible),
                 truncation=truncation if truncation > 0.005 else 0.0,
                 opacity=Crop(torch.from_numpy(opacity)[None], int(x0) // n, int(y0) // n),
             )
@@ -239,22 +239,22 @@ def measure(actors: Sequence[Actor], soups: list[Soup], owner: np.ndarray, view:
     return found
 
 
-def labels_of(truths: Sequence[Truth]) -> Labels:
-    """KITTI labels; what is hardly visible or tiny becomes a region to ignore."""
-    kept = [t for t in truths if t.labelled]
+def labels_from_truths(truths: Sequence[Truth]) -> Labels:
+    """Make KITTI labels; hardly visible or tiny objects become ignored regions."""
+    labelled = [t for t in truths if t.labelled]
     ignored = [
         t.box_xyxy
         for t in truths
         if not t.labelled and t.visible > 0 and (t.box_xyxy[2:] > t.box_xyxy[:2] + 0.5).all()
     ]
     return Labels(
-        kind=tuple(t.actor.label for t in kept),
-        boxes_xyxy=table([t.box_xyxy for t in kept], 4),
-        truncation=torch.tensor([t.truncation for t in kept], dtype=torch.float32),
-        occlusion=torch.tensor([t.occlusion for t in kept], dtype=torch.int64),
-        translation=table([t.translation for t in kept], 3),
-        yaw=torch.tensor([t.yaw for t in kept], dtype=torch.float32),
-        size_lhw=table([t.actor.size_lhw for t in kept], 3),
+        kind=tuple(t.actor.label for t in labelled),
+        boxes_xyxy=table([t.box_xyxy for t in labelled], 4),
+        truncation=torch.tensor([t.truncation for t in labelled], dtype=torch.float32),
+        occlusion=torch.tensor([t.occlusion for t in labelled], dtype=torch.int64),
+        translation=table([t.translation for t in labelled], 3),
+        yaw=torch.tensor([t.yaw for t in labelled], dtype=torch.float32),
+        size_lhw=table([t.actor.size_lhw for t in labelled], 3),
         ignore_xyxy=table(ignored, 4),
     )
 
@@ -265,7 +265,7 @@ def table(rows: Sequence[ArrayLike], width: int) -> torch.Tensor:
 
 
 _SHARES = ((Material.SKY,), (Material.LEAF, Material.GRASS), (Material.ROAD, Material.PARKING))
-"""Materials whose share of each pixel an `Environment` knows: sky, foliage, road."""
+"""Materials of the maps of an `Environment`: sky, foliage, road."""
 
 
 def _shares(material: np.ndarray) -> list[torch.Tensor]:
@@ -359,7 +359,7 @@ def _own_shape(actor: Actor, bent: bool) -> Actor:
     return replace(actor, ffd=tuple(instance_ffd(actor).reshape(-1).tolist()))
 
 
-def variation_of(plan: Plan, name: str) -> Plan:
+def apply_variation(plan: Plan, name: str) -> Plan:
     """The plan in another of Virtual KITTI's variations. RangeError for an unknown name."""
     seed, street, attempt = plan.origin
     kind = (MIXED, *VARIATIONS).index(name) if name in (MIXED, *VARIATIONS) else 0
@@ -376,7 +376,7 @@ def drive(plan: Plan, time_s: float) -> Plan:
     x, z = road.point(0.0, way)
     moved = replace(turned(view, road.curvature * way), position_xz=(float(x), float(z)))
     actors = tuple(_after(a, road, time_s) for a in plan.actors)
-    setting = replace(plan.setting, view=moved, light=kept_in_world(plan.setting.light, view, moved))
+    setting = replace(plan.setting, view=moved, light=fix_light_in_world(plan.setting.light, view, moved))
     return replace(plan, actors=actors, setting=setting, time_s=plan.time_s + time_s)
 
 
@@ -430,7 +430,7 @@ class Street:
     used: dict[str, list[int]]
 
 
-def street_of(plan: Plan) -> Street:
+def build_street(plan: Plan) -> Street:
     """The surroundings of a plan: a matter of its origin, road, view and foliage, and not of its actors."""
     seed, street, attempt = plan.origin
     rng = stream(seed, street, plan.split, 16 * attempt + 3)
@@ -446,11 +446,11 @@ def render_frame(
 ) -> SynthFrame | None:
     """Render a plan; with_background: also the street without its actors and their shadows. None where
     `accept` is given and turns the truths down, which is known before anything is shaded. surround: the plan's,
-    where it is at hand.
+    if available.
     """
     setting, view = plan.setting, plan.setting.view
     seed, _, attempt = plan.origin
-    surround = surround or street_of(plan)
+    surround = surround or build_street(plan)
     street = surround.soup
     soups = actor_soups(plan)
     shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in plan.actors]
@@ -466,14 +466,14 @@ def render_frame(
     closest = kernels.nearest(sight.depth)
     # Of an actor with no more than a few samples there is no truth, and so no instance. Owner -1, the sky, reads
     # the last.
-    told = {truth.actor.track for truth in truths}
-    tracks = np.array([0, *(a.track + 1 if a.track in told else 0 for a in plan.actors), 0], np.uint16)
+    tracked = {truth.actor.track for truth in truths}
+    tracks = np.array([0, *(a.track + 1 if a.track in tracked else 0 for a in plan.actors), 0], np.uint16)
     vehicles = {t.actor.model for t in truths if t.actor.label in ("Car", "Van", "Truck")}
     return SynthFrame(
         image=picture.image,
         background=None if empty is None else empty.image,
         background_depth_m=None if plain is None else plain.depth_m,
-        labels=labels_of(truths),
+        labels=labels_from_truths(truths),
         truths=tuple(truths),
         depth_m=sight.depth.reshape(-1)[closest],
         semantic=sight.semantic.reshape(-1)[closest],

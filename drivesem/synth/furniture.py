@@ -1,4 +1,4 @@
-"""What stands on pavements and verges: lamps, signs, traffic lights, shelters, bins, things much like vehicles."""
+"""Street furniture: lamps, signs, traffic lights, shelters, bins, and objects similar to vehicles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _moved(soup: Soup, x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.
 
 
 def lamp(height_m: float, side: int) -> Soup:
-    """A street lamp whose arm reaches over the road: side -1 for the left of the road, 1 for the right."""
+    """A street lamp with an arm over the road: side -1 for the left of the road, 1 for the right."""
     pole = stick((0, 0, 0), (0, -height_m, 0), (0.09, 0.05), Material.METAL, _GREY, 8)
     foot = stick((0, 0, 0), (0, -1.1, 0), (0.11, 0.11), Material.METAL, _GREY * 0.9, 8)
     top = (0, -height_m - 0.35, side * 1.8)
@@ -143,7 +143,7 @@ def _turned(angle: float) -> np.ndarray:
 def traffic_light(rng: np.random.Generator, reach_m: float) -> Soup:
     """A pole with lights for traffic that comes from -x; reach_m: length of an arm over the road along z, or 0."""
     lit = int(rng.integers(3))
-    shown = np.array([[0.75, 0.03, 0.02], [0.75, 0.42, 0.02], [0.05, 0.65, 0.30]])
+    lamp_colours = np.array([[0.75, 0.03, 0.02], [0.75, 0.42, 0.02], [0.05, 0.65, 0.30]])
     height = 5.4 if reach_m else 3.3
     parts = [stick((0, 0, 0), (0, -height, 0), (0.08, 0.06), Material.METAL, _GREY, 8)]
     heads = [(0.0, 2.3)]
@@ -156,7 +156,7 @@ def traffic_light(rng: np.random.Generator, reach_m: float) -> Soup:
         case = _moved(box((0.22, 0.95, 0.32), Material.FLAT, _BLACK * 1.6), -0.1, -foot, z)
         parts.append(tagged(case, Semantic.TRAFFIC_LIGHT))
         for i in range(3):
-            albedo = shown[i] if i == lit else shown[i] * 0.06
+            albedo = lamp_colours[i] if i == lit else lamp_colours[i] * 0.06
             lens = _moved(_plate(disc, foot + 0.78 - 0.3 * i, 0.225, albedo), 0.0, 0.0, z)
             parts.append(tagged(lens, Semantic.TRAFFIC_LIGHT))
             hood = _moved(box((0.14, 0.02, 0.24), Material.FLAT, _BLACK * 1.6), -0.27, -foot - 0.9 + 0.3 * i, z)

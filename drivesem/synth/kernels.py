@@ -29,12 +29,12 @@ from drivesem.synth.surfaces import (
     ground_light,
 )
 from drivesem.synth.view import Setting, Shadow, Sight, SunMaps, fine_matrix
-from scene_ir.raster.lanes import OPTIONS, exp_, load, log_
-from scene_ir.raster.launch import halves, launch, start_warp, threads
+from scene_ir.raster.launch import launch, split_range, start_warp, threads
+from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, log_
 from scene_ir.raster.verbs import NEAR_M
 
 start_warp()
-wp.set_module_options(OPTIONS)
+wp.set_module_options(SIMD_OPTIONS)
 
 Floats = wp.array(dtype=wp.float32)
 Ints = wp.array(dtype=wp.int32)
@@ -110,7 +110,7 @@ class Air:
 
 
 @wp.struct
-class Street:
+class StreetMarkings:
     """Markings (middle, width, dash, period), the crossing (from, to; from > to: none), d from which on its stop line
     lies, and `SOAKED` by material."""
 
@@ -124,7 +124,7 @@ class Street:
 @wp.struct
 class Lens:
     """The view. ray (3 x 3): fine pixels to rays. axes (3 x 3), origin: camera to world. develop: exposure and white
-    balance; curve: see `shown`."""
+    balance; curve: see `apply_tone_curve`."""
 
     ray: wp.mat33f
     axes: wp.mat33f
@@ -138,7 +138,7 @@ class Lens:
 
 
 @wp.struct
-class Scene:
+class PixelArrays:
     """What each fine pixel shows, flat, and the faces' numbers."""
 
     table: Floats
@@ -282,7 +282,7 @@ def reflected_radiance(air: Air, textures: Noise, direction: wp.vec3f, soft: boo
 
 
 @wp.func
-def shown(x: float, curve: Floats):
+def apply_tone_curve(x: float, curve: Floats):
     """`light.develop` of a radiance x, exposed and white, by a table over the root of x."""
     place = wp.sqrt(wp.min(wp.max(x, 0.0), WHITE)) * PER_ROOT
     i = wp.int32(place)
@@ -313,7 +313,7 @@ def pulse(x: float, period: float, share: float, blur: float):
 
 
 @wp.func
-def paint_road(s: Spot, street: Street, textures: Noise):
+def paint_road(s: Spot, street: StreetMarkings, textures: Noise):
     d = s.u
     q = s.v
     x = d + s.pattern[0]
@@ -493,7 +493,7 @@ def leaf(s: Spot, air: Air, textures: Noise, incoming: wp.vec3f):
 
 
 @wp.func
-def surface(s: Spot, material: int, air: Air, street: Street, textures: Noise):
+def surface(s: Spot, material: int, air: Air, street: StreetMarkings, textures: Noise):
     incoming = irradiance(s, air)
     tone = float(1.0)
     if material == M_LEAF:
@@ -559,7 +559,7 @@ def surface(s: Spot, material: int, air: Air, street: Street, textures: Noise):
 
 
 @wp.func
-def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: Street, textures: Noise):
+def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: StreetMarkings, textures: Noise):
     soaked = street.soaked[material]
     out = dry * (1.0 - soaked[0] * air.wet)
     if soaked[1] + soaked[2] > 0.0:
@@ -659,8 +659,8 @@ def open_sky(world: wp.vec3f, on_ground: bool, actor: bool, shade: Shade):
             along = wp.abs(x * cos - z * sin) - shade.prints[i, 5]
             across = wp.abs(x * sin + z * cos) - shade.prints[i, 6]
             over = wp.max(along, 0.0)
-            beside = wp.max(across, 0.0)
-            outside = wp.sqrt(over * over + beside * beside)
+            lateral = wp.max(across, 0.0)
+            outside = wp.sqrt(over * over + lateral * lateral)
             inside = wp.min(wp.max(along, across), 0.0)
             dark = 0.62 * exp_(-outside / (0.32 * shade.prints[i, 7])) + 0.36 * saturate(-inside / 0.25)
             if dark >= 0.004:
@@ -675,9 +675,9 @@ def open_sky(world: wp.vec3f, on_ground: bool, actor: bool, shade: Shade):
 @wp.kernel
 def pixel_kernel(
     start: int,
-    scene: Scene,
+    scene: PixelArrays,
     air: Air,
-    street: Street,
+    street: StreetMarkings,
     textures: Noise,
     lens: Lens,
     shade: Shade,
@@ -758,7 +758,7 @@ def pixel_kernel(
                 elif air.fog == 0:
                     colour = sky_radiance(air, textures, wp.normalize(ray))
                 for axis in range(3):
-                    total[axis] += shown(colour[axis] * lens.develop[axis], lens.curve)
+                    total[axis] += apply_tone_curve(colour[axis] * lens.develop[axis], lens.curve)
             out[i] = total * (1.0 / float(count))
         touched[i] = wp.uint8(changed)
 
@@ -988,7 +988,7 @@ def sun_kernel(start: int, bands: int, corners: Vec3s, material: Bytes, owner: I
                         end,
                         shade.depth,
                         -1,
-                        owner,  # not written to: no faces are asked for
+                        owner,  # not written: no faces are requested
                     )
 
 
@@ -1033,15 +1033,15 @@ def sight_kernel(
             # turned so that a is alone on its side of the near plane
             alone = ahead == 1
             if (b[2] >= NEAR) == alone:
-                kept = a
+                swapped = a
                 a = b
                 b = c
-                c = kept
+                c = swapped
             elif (c[2] >= NEAR) == alone:
-                kept = a
+                swapped = a
                 a = c
                 c = b
-                b = kept
+                b = swapped
             d = to_pixel(cut(a, b))
             e = to_pixel(cut(a, c))
             if alone:
@@ -1146,7 +1146,7 @@ def see(soup: Soup, matrix: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarr
     inputs = [bands, size[1], size[0], to_pixels, corners, _flat(depth), _flat(face)]
     launch(sight_kernel, range(bands + 1), inputs)
     tables = [_flat(soup.material), _flat(soup.owner), _flat(soup.semantic)]
-    launch(owner_kernel, halves(face.size), [_flat(face), *tables, _flat(depth), *(_flat(o) for o in rest)])
+    launch(owner_kernel, split_range(face.size), [_flat(face), *tables, _flat(depth), *(_flat(o) for o in rest)])
     return face, depth, *rest
 
 
@@ -1154,7 +1154,7 @@ def nearest(depth: np.ndarray) -> np.ndarray:
     """See `Sight.nearest`. depth (2H, 2W) -> (H, W) int64."""
     height, width = depth.shape[0] // 2, depth.shape[1] // 2
     out = np.empty((height, width), np.int64)
-    launch(nearest_kernel, halves(out.size), [width, _flat(depth), _flat(out)])
+    launch(nearest_kernel, split_range(out.size), [width, _flat(depth), _flat(out)])
     return out
 
 
@@ -1204,8 +1204,8 @@ def _air(light: Light) -> Air:
     return air
 
 
-def _street(road: Road) -> Street:
-    street = Street()
+def _street(road: Road) -> StreetMarkings:
+    street = StreetMarkings()
     lines = [(m.middle_m, m.width_m, m.dash_m, m.period_m) for m in road.markings]
     street.markings = _flat(np.array(lines or [(0.0,) * 4], np.float32), wp.vec4f)
     street.count = len(lines)
@@ -1239,7 +1239,7 @@ def develop_pixels(
     """
     image, wanted = target
     seen, view = sight.faces, setting.view
-    scene = Scene()
+    scene = PixelArrays()
     table = np.empty((max(len(seen), 1), TABLE), np.float32)
     scene.table = _flat(table)
     scene.face, scene.depth, scene.owner = _flat(sight.face), _flat(sight.depth), _flat(sight.owner)
@@ -1247,8 +1247,8 @@ def develop_pixels(
     soup = [_flat(seen.corners, wp.vec3f), _flat(seen.normals, wp.vec3f), _flat(seen.uv, wp.vec2f)]
     paint = [_flat(seen.albedo, wp.vec3f), _flat(seen.pattern, wp.vec4f)]
     used = _flat(np.zeros(max(len(seen), 1), np.uint8))
-    launch(mark_kernel, halves(sight.face.size), [scene.face, used])
-    launch(table_kernel, halves(len(seen)), [used, *soup, *paint, scene.table])
+    launch(mark_kernel, split_range(sight.face.size), [scene.face, used])
+    launch(table_kernel, split_range(len(seen)), [used, *soup, *paint, scene.table])
     lens = Lens()
     lens.ray, lens.axes = _mat(np.linalg.inv(fine_matrix(view))), _mat(view.rotation.T)
     lens.origin, lens.centre = _vec(view.origin), _vec(view.centre)

@@ -66,7 +66,7 @@ MARGIN_M = 0.3
 _CLUSTER = 1.4
 """Spread of the log weight along a row: how much vehicles stand together."""
 _CHANCE = 0.6
-"""How much chance has to say against weights: 1 draws places as often as they weigh, 0 takes the heaviest."""
+"""Weight of chance: 1 draws places in proportion to their weights, 0 takes the heaviest."""
 _NEAR_GAIN, _NEAR_M = 0.8, 12.0
 """Near places weigh more by this factor around this depth: standing together favours the far ones."""
 _HARDLY_SEEN, _HARDLY_SEEN_DEFERRED = 0.25, 0.9
@@ -356,8 +356,9 @@ def _street(rng: np.random.Generator, kind: str, crossing: tuple[float, float] |
 def _side(
     rng: np.random.Generator, kind: str, side: int, edge: float, facing: int
 ) -> tuple[list[Lane], list[Strip], tuple[float, float], float]:
-    """What lies beside a street: parked rows, strips outwards, where people walk, the pavement's height. facing:
-    the direction that most parked cars have.
+    """Return parked rows, strips outwards, where people walk, and the pavement's height, along a street.
+
+    facing: the direction of most parked cars.
     """
     quiet = kind == "residential"
     rows: list[Lane] = []
@@ -646,13 +647,13 @@ def _before_camera(outline: np.ndarray) -> np.ndarray:
     """The part (K, 2) of a convex outline (4, 2) in front of the camera."""
     if (outline[:, 1] >= _NEAR_PLANE_M).all():
         return outline
-    kept = []
+    corners = []
     for one, two in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         if one[1] >= _NEAR_PLANE_M:
-            kept.append(one)
+            corners.append(one)
         if (one[1] >= _NEAR_PLANE_M) != (two[1] >= _NEAR_PLANE_M):
-            kept.append(one + (two - one) * (_NEAR_PLANE_M - one[1]) / (two[1] - one[1]))
-    return np.array(kept).reshape(-1, 2)
+            corners.append(one + (two - one) * (_NEAR_PLANE_M - one[1]) / (two[1] - one[1]))
+    return np.array(corners).reshape(-1, 2)
 
 
 def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSettings) -> list[Actor]:
@@ -666,12 +667,12 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
         wanted = int(rng.integers(settings.vehicles[0], settings.vehicles[1] + 1))
     actors: list[Actor] = []
     sights: list[_Sight] = []
-    shown = np.zeros(0)
+    visible_shares = np.zeros(0)
     outlines = [footprint(*_EGO)]
     heavy = 0
     queue = [(spot, False) for spot in _candidates(road, rng)]
     for spot, patient in queue:
-        if len(actors) >= MOST_VEHICLES or (shown >= _LEAST_VISIBLE).sum() >= wanted:
+        if len(actors) >= MOST_VEHICLES or (visible_shares >= _LEAST_VISIBLE).sum() >= wanted:
             break
         actor = _settle(rng, road, settings, spot, heavy < settings.max_heavy)
         outline = footprint(actor.position_xz, actor.yaw, actor.size_lhw)
@@ -681,7 +682,9 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
         after = _shares([*sights, sight])
         hidden = (after < _HARDLY_SEEN).any() and rng.random() < _HARDLY_SEEN_DEFERRED
         apart = (
-            after[-1] > _PLAINLY_SEEN and (after[:-1] > shown - 0.08).all() and actor.position_xz[1] > _ALWAYS_M
+            after[-1] > _PLAINLY_SEEN
+            and (after[:-1] > visible_shares - 0.08).all()
+            and actor.position_xz[1] > _ALWAYS_M
         )
         if not patient and (hidden or (bool(actors) and apart and rng.random() < _APART_DEFERRED)):
             queue.append((spot, True))
@@ -689,7 +692,7 @@ def place_vehicles(rng: np.random.Generator, road: Road, settings: LayoutSetting
         actors.append(actor)
         sights.append(sight)
         outlines.append(outline)
-        shown = after
+        visible_shares = after
         heavy += actor.kind in ("truck", "bus")
     return actors
 
@@ -717,7 +720,7 @@ def _settle(rng: np.random.Generator, road: Road, settings: LayoutSettings, spot
     d, yaw = spot.d, spot.yaw
     turn = float(rng.normal(0, statistics().yaw_spread_rad))
     if lane is not None and not lane.parked:
-        # Whatever passes in the next lane must find its own free: long vehicles keep straighter.
+        # The next lane must stay free: long vehicles drive straighter.
         slack = max(lane.slack_m - size[2] / 2, 0.0)
         d += float(np.clip(rng.normal(0, 0.25), -slack, slack))
         turn *= min(1.0, 3.0 / size[0])

@@ -12,7 +12,7 @@ _WEATHER_SHARE = (0.72, 0.15, 0.05, 0.08)
 
 
 PANORAMA_GLARE = 4.0
-"""Polished things mirror no more of a panorama than this: its sun is drawn from `Light.sun`, not twice."""
+"""Limit of a panorama in reflections: its sun is drawn from `Light.sun`, not twice."""
 
 
 @dataclass(frozen=True, slots=True)

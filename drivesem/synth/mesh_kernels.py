@@ -33,8 +33,8 @@ assert LATTICE == (4, 4, 4)
 def cut_kernel(
     start: int, corners: Vec3s, parent: Ints, whole: Vec3s, planes: Vec4s, room: int, slots: Vec3s, counts: Ints
 ):
-    """One triangle of a face, cut by every plane. room: triangles in the slots of each; a count beyond it says that
-    they did not do."""
+    """One triangle of a face, cut by every plane. room: triangles in the slots of each; a larger count means that they
+    did not suffice."""
     i = start + wp.tid()
     base = 3 * i * room
     for j in range(3):
@@ -82,15 +82,15 @@ def cut_kernel(
                                 slots[more + 5] = two
                             count += 2
     if count <= room:
-        kept = int(0)
+        rows = int(0)
         for t in range(count):
             at = base + 3 * t
             if wp.abs(wp.dot(slots[at], wp.cross(slots[at + 1], slots[at + 2]))) > NOTHING:
-                to = base + 3 * kept
+                to = base + 3 * rows
                 for j in range(3):
                     slots[to + j] = slots[at + j]
-                kept += 1
-        count = kept
+                rows += 1
+        count = rows
     counts[i] = count
 
 
@@ -349,15 +349,15 @@ def crown(
     inputs += [_indices(blob), _vectors(direction), wp.array(depth, dtype=wp.float32, copy=False, device="cpu")]
     outputs = [_vectors(points), _vectors(outward), wp.array(light, dtype=wp.float32, copy=False, device="cpu")]
     launch(crown_kernel, [0, len(blob)], [*inputs, *outputs])
-    kept = np.flatnonzero(light >= 0)
-    return kept, points[kept], outward[kept], light[kept]
+    rows = np.flatnonzero(light >= 0)
+    return rows, points[rows], outward[rows], light[rows]
 
 
 def leaves(
     points: np.ndarray, outward: np.ndarray, draws: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners and normals (n, 3, 3) float32 of a slender triangle at each point (n, 3) of a surface whose normals
-    are `outward`. draws: normal deviates (n, 3) of its normal and its turn, and its reach (n,) m.
+    """Corners and normals (n, 3, 3) float32 of a slender triangle at each point (n, 3) of a surface with normals
+    `outward`. draws: normal deviates (n, 3) of its normal and its turn, and its reach (n,) m.
     """
     corners, normals = np.empty((2, len(points), 3, 3), np.float32)
     reach = wp.array(np.ascontiguousarray(draws[2], np.float32), dtype=wp.float32, copy=False, device="cpu")

@@ -1,6 +1,6 @@
 """From triangles to a photograph: visibility at twice the resolution, then shading, then lens and sensor.
 
-Kernels do it. Plain numpy beside their tests, `tests/drivesem/synth/reference_*.py`, defines what they compute.
+Kernels compute it. Plain numpy in `tests/drivesem/synth/reference_*.py` defines what is correct.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drivesem.synth import kernels
 from drivesem.synth.soup import Soup
 from drivesem.synth.view import SHADOW_VIEWS_M, SUPERSAMPLING, Setting, Shadow, Sight, SunMaps, View, fine_matrix
 from scene_ir.raster import verbs
-from scene_ir.raster.layout import Layout
+from scene_ir.raster.layout import PixelLayout
 
 SHADOW_TEXELS = 1024
 """Along one side of a shadow map."""
@@ -50,7 +50,10 @@ def rasterise(
     clip = torch.from_numpy((corners.reshape(-1, 3) @ matrix.T).astype(np.float32))
     faces = torch.arange(clip.shape[0], dtype=torch.int32).reshape(-1, 3)
     fragments = verbs.rasterize(
-        clip, faces, torch.from_numpy(np.asarray(ranges, np.int32)), Layout.of(torch.from_numpy(np.asarray(rects)))
+        clip,
+        faces,
+        torch.from_numpy(np.asarray(ranges, np.int32)),
+        PixelLayout.from_rects(torch.from_numpy(np.asarray(rects))),
     )
     return fragments.face.numpy(), fragments.depth.numpy()
 

@@ -44,8 +44,8 @@ def leaved(soup: Soup, foliage: tuple[float, ...]) -> Soup:
 
 def _coloured(albedo: np.ndarray, hue: float, lightness: float) -> np.ndarray:
     """Linear albedo (n, 3) under the codes of hue and lightness."""
-    shown = torch.from_numpy(np.clip(albedo, 0, 1).T[:, None].astype(np.float64)) ** (1 / 2.2)
-    row = torch.zeros(shown.shape[1:], dtype=torch.float64)
+    display_colour = torch.from_numpy(np.clip(albedo, 0, 1).T[:, None].astype(np.float64)) ** (1 / 2.2)
+    row = torch.zeros(display_colour.shape[1:], dtype=torch.float64)
     environment = Environment(
         weather=row.new_zeros(4),
         foliage=row.new_tensor([hue, lightness, 0.0]),
@@ -55,5 +55,5 @@ def _coloured(albedo: np.ndarray, hue: float, lightness: float) -> np.ndarray:
         foliage_map=torch.ones_like(row),
         road=row,
     )
-    changed = apply_foliage(shown, environment, row.new_zeros(5, *row.shape))
+    changed = apply_foliage(display_colour, environment, row.new_zeros(5, *row.shape))
     return (changed.clamp(0, 1) ** 2.2)[:, 0].T.float().numpy()

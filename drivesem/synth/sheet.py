@@ -14,16 +14,16 @@ from drivesem.data.registry import Dataset
 from drivesem.data.vkitti2 import COLOURS
 from drivesem.report.drawing import (
     FAR_M,
-    INK,
     MARGIN_PX,
     NEAR_M,
-    PAPER,
+    PAPER_COLOUR,
+    TEXT_COLOUR,
     TEXT_PX,
-    UNKNOWN,
-    depth_colours,
-    object_colours,
+    UNKNOWN_COLOUR,
+    colourise_depth,
+    colourise_objects,
+    measure_text,
     paste,
-    text_extent,
     write_text,
 )
 from scene_ir.errors import RangeError
@@ -64,7 +64,7 @@ class _SheetRow:
     instances: np.ndarray | None
 
 
-def sheet_of(dataset: Dataset, identifiers: Sequence[str]) -> np.ndarray:
+def draw_sheet(dataset: Dataset, identifiers: Sequence[str]) -> np.ndarray:
     """A sheet (h, 2000, 3) uint8 RGB of frames as a reader gives them: what was written, not what was meant.
 
     RangeError for none or more than 12 frames; FormatError where one does not read.
@@ -104,7 +104,7 @@ def _compose(rows: Sequence[_SheetRow]) -> np.ndarray:
     if not 1 <= len(rows) <= MOST_FRAMES:
         raise RangeError("frames of a sheet", f"1 to {MOST_FRAMES}", len(rows))
     strips = [_strip(row) for row in rows]
-    gap = np.full((MARGIN_PX, WIDTH_PX, 3), PAPER, np.uint8)
+    gap = np.full((MARGIN_PX, WIDTH_PX, 3), PAPER_COLOUR, np.uint8)
     return np.concatenate([part for strip in strips for part in (gap, strip)] + [gap])
 
 
@@ -114,19 +114,19 @@ def _strip(row: _SheetRow) -> np.ndarray:
     tall = max(round(_PHOTO_PX * height / width), 2 * TEXT_PX)
     small = ((WIDTH_PX - _PHOTO_PX - 4 * MARGIN_PX) // 2, tall // 2 - MARGIN_PX // 2)
     top = TEXT_PX + 10
-    strip = np.full((top + tall, WIDTH_PX, 3), PAPER, np.uint8)
+    strip = np.full((top + tall, WIDTH_PX, 3), PAPER_COLOUR, np.uint8)
     write_text(strip, (MARGIN_PX, 2), row.title)
     right = MARGIN_PX + _PHOTO_PX + MARGIN_PX
     columns, lines = (right, right + small[0] + MARGIN_PX), (top, top + tall - small[1])
     paste(strip, (MARGIN_PX, top), _photograph(row, (_PHOTO_PX, tall)))
     panels = (
-        ("depth", None if row.depth_m is None else depth_colours(row.depth_m)),
+        ("depth", None if row.depth_m is None else colourise_depth(row.depth_m)),
         ("classes", None if row.classes is None else _class_colours(row.classes, row.class_names)),
-        ("masks", None if row.instances is None else object_colours(row.instances, row.image)),
+        ("masks", None if row.instances is None else colourise_objects(row.instances, row.image)),
     )
     for (name, picture), x, y in zip(panels, (*columns, columns[0]), (lines[0], *lines), strict=True):
         if picture is None:
-            write_text(strip, (x, y), f"no {name}", UNKNOWN)
+            write_text(strip, (x, y), f"no {name}", UNKNOWN_COLOUR)
         else:
             paste(strip, (x, y), cv2.resize(picture, small, interpolation=cv2.INTER_AREA))
     _legend(strip, (columns[1], lines[1]), row)
@@ -151,7 +151,7 @@ def _photograph(row: _SheetRow, size_wh: tuple[int, int]) -> np.ndarray:
     # nearest, that is largest, first: where two texts would meet, the smaller object's is left out
     for xyxy, colour, text in sorted(row.boxes, key=lambda b: (b[0][1] - b[0][3]) * (b[0][2] - b[0][0])):
         x0, y0, _, y1 = corners(xyxy)
-        wide, high = text_extent(text, TEXT_PX - 3)
+        wide, high = measure_text(text, TEXT_PX - 3)
         x = min(max(x0, 0), max(size_wh[0] - wide, 0))
         for y in (y0 - high - 1, y1 + 2):
             spot = (x, y, x + wide, y + high)
@@ -165,7 +165,7 @@ def _photograph(row: _SheetRow, size_wh: tuple[int, int]) -> np.ndarray:
 
 
 def _class_colour(name: str) -> tuple[int, int, int]:
-    return COLOURS.get(name) or _MORE_COLOURS.get(name, UNKNOWN)
+    return COLOURS.get(name) or _MORE_COLOURS.get(name, UNKNOWN_COLOUR)
 
 
 def _class_colours(classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -182,7 +182,7 @@ def _legend(strip: np.ndarray, corner: tuple[int, int], row: _SheetRow) -> None:
     y = y0 + TEXT_PX + 8
     if row.depth_m is not None:
         ramp = np.geomspace(NEAR_M, FAR_M, 160)[None].repeat(TEXT_PX - 5, axis=0)
-        paste(strip, (x0 + 34, y + 3), depth_colours(ramp))
+        paste(strip, (x0 + 34, y + 3), colourise_depth(ramp))
         write_text(strip, (x0, y), f"{NEAR_M:.0f} m")
         write_text(strip, (x0 + 202, y), f"{FAR_M:.0f} m (log), sky grey")
         y += TEXT_PX + 8
@@ -194,11 +194,11 @@ def _legend(strip: np.ndarray, corner: tuple[int, int], row: _SheetRow) -> None:
         if shares[i] < 0.001:
             break
         name = row.class_names[i]
-        wide = text_extent(name, TEXT_PX - 2)[0] + 26
+        wide = measure_text(name, TEXT_PX - 2)[0] + 26
         if x + wide > WIDTH_PX - MARGIN_PX:
             x, y = x0, y + TEXT_PX + 5
         if y + TEXT_PX > strip.shape[0]:
             break
         strip[y + 4 : y + 15, x : x + 14] = _class_colour(name)
-        write_text(strip, (x + 18, y), name, INK, TEXT_PX - 2)
+        write_text(strip, (x + 18, y), name, TEXT_COLOUR, TEXT_PX - 2)
         x += wide

@@ -69,7 +69,7 @@ _SEMANTIC_OF_MATERIAL = np.array(
     ],
     np.uint8,
 )
-"""What each material belongs to where nothing else is said, in the order of `Material`."""
+"""Default semantic class of each material, in the order of `Material`."""
 
 GROUND = (Material.ROAD, Material.PARKING, Material.PAVEMENT, Material.KERB, Material.GRASS, Material.GRAVEL)
 """Materials that receive vehicles' shadows."""

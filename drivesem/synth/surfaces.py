@@ -32,9 +32,8 @@ def _soaked() -> np.ndarray:
 
 
 SOAKED = _soaked()
-"""Of each material: the share of its light that it loses when wet, how much of it mirrors as a film of water, how
-much more in puddles. Wet, porous ground is about half as bright. Source: Lekner and Dorf 1988, "Why some things
-are darker when wet".
+"""Per material: share of light lost when wet, reflectance as a film of water, and the addition in puddles. Wet, porous
+ground is about half as bright. Source: Lekner and Dorf, Applied Optics 27 (1988).
 """
 
 

@@ -72,7 +72,7 @@ def vary(setting: Setting, name: str, rng: np.random.Generator) -> Setting:
         raise RangeError("variation", ", ".join(VARIATIONS), name)
     if name in _TURNS_DEG:
         view = turned(setting.view, float(np.deg2rad(_TURNS_DEG[name])))
-        return replace(setting, view=view, light=kept_in_world(setting.light, setting.view, view))
+        return replace(setting, view=view, light=fix_light_in_world(setting.light, setting.view, view))
     if name in _WEATHERS:
         light, response = _weather(setting, name, rng)
         return replace(setting, light=replace(light, weather=name), response=response)
@@ -86,8 +86,8 @@ def turned(view: View, angle: float) -> View:
     return replace(view, rotation=view.rotation @ about_y, heading=view.heading + angle)
 
 
-def kept_in_world(light: Light, before: View, after: View) -> Light:
-    """Light whose directions, which are in camera axes, stay where they are in the world when the camera turns."""
+def fix_light_in_world(light: Light, before: View, after: View) -> Light:
+    """Rotate the light's directions, given in camera axes, so that they stay fixed in the world."""
     turn = after.rotation @ before.rotation.T
     heading = light.heading + after.heading - before.heading
     return replace(light, sun=turn @ light.sun, up=turn @ light.up, heading=heading)

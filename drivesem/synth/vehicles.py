@@ -153,7 +153,7 @@ def vehicle_mesh(kind: str, variant: int) -> Mesh:
 
 
 def instance_ffd(actor: Actor) -> np.ndarray:
-    """Lattice offsets (64, 3) float32 that tell this vehicle from others of its mesh, in unit-box lengths.
+    """Lattice offsets (64, 3) float32 that distinguish this vehicle from others of its mesh, in unit-box lengths.
 
     Symmetric, a function of the actor's seed alone. Ends, roof and ground stay where they are (their lattice
     points do, and Bernstein polynomials keep the hull), and the width over the mirrors to within a centimetre.
@@ -190,7 +190,7 @@ def deformed(shape: VehicleShape, offsets: np.ndarray) -> Soup:
 
 
 def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
-    """Number plates: a blue band at the left, a row of signs whose strokes each vehicle fills itself."""
+    """Number plates: a blue band at the left, a row of characters with strokes of each vehicle's own."""
     colour = _PLATE_YELLOW if yellow else _PLATE_WHITE
     # the mean of the ground and the characters
     pieces.albedo[:] = colour * 0.72
@@ -226,7 +226,7 @@ def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
 def _lamp_outline(
     style: int, low: np.ndarray, high: np.ndarray, side: float, rng: np.random.Generator
 ) -> list[Plane]:
-    """Planes (normal, offset) whose outer side, in a lamp's rectangle (z, y), is sheet metal: corners cut off."""
+    """Planes (normal, offset) that cut corners off a lamp's rectangle (z, y): their outer side is sheet metal."""
     wide, tall = high[2] - low[2], high[1] - low[1]
     inner, outer = (low[2], high[2]) if side > 0 else (high[2], low[2])
     top, bottom = low[1], high[1]
@@ -424,13 +424,13 @@ def _panes(base: _Base, pieces: _Pieces, rng: np.random.Generator, fine: bool) -
 
 
 def _sources(mesh: Mesh) -> np.ndarray:
-    """What the templates' builder made each face of (F,), told by the colour; other meshes' faces match none."""
+    """Part of each face (F,) in the templates' builder, by colour; faces of other meshes match none."""
     faces = mesh.faces.numpy()
     if mesh.colours is None:
         return np.full(len(faces), -1)
-    table = _colour_key(np.array([solids.COLOUR[m] for m in solids.Material]))
+    table = _colour_key(np.array([solids.COLOUR[m] for m in solids.VehicleMaterial]))
     order = np.argsort(table)
-    # the templates' vertices are split between materials: one tells its face's
+    # the templates' vertices are split between materials: one identifies its face
     key = _colour_key(mesh.colours.numpy())[faces[:, 0]]
     place = np.minimum(np.searchsorted(table[order], key), len(order) - 1)
     return np.where(table[order][place] == key, order[place], -1)
@@ -445,14 +445,14 @@ def _detailed(kind: str, base: _Base, pieces: _Pieces, source: np.ndarray, seed:
     """Details painted on the faces that the templates' builder made of known materials."""
     rng = np.random.default_rng([0xCA2, KINDS.index(kind), seed])
     pieces = pieces.take(np.argsort(source, kind="stable"))
-    ends = np.cumsum(np.bincount(source + 1, minlength=len(solids.Material) + 1))
+    ends = np.cumsum(np.bincount(source + 1, minlength=len(solids.VehicleMaterial) + 1))
     found = [pieces.part(0, int(ends[0]))]
-    groups = {m: pieces.part(int(ends[m]), int(ends[m + 1])) for m in solids.Material}
-    sheet, car = groups[solids.Material.PAINT].albedo[:1], kind not in ("bus", "truck")
-    trim = _joined([groups.pop(solids.Material.TRIM), groups.pop(solids.Material.CHROME)])
-    glass, paint = groups.pop(solids.Material.GLASS), groups.pop(solids.Material.PAINT)
-    plates = groups.pop(solids.Material.PLATE)
-    head, tail = groups.pop(solids.Material.HEADLIGHT), groups.pop(solids.Material.TAIL_LIGHT)
+    groups = {m: pieces.part(int(ends[m]), int(ends[m + 1])) for m in solids.VehicleMaterial}
+    sheet, car = groups[solids.VehicleMaterial.PAINT].albedo[:1], kind not in ("bus", "truck")
+    trim = _joined([groups.pop(solids.VehicleMaterial.TRIM), groups.pop(solids.VehicleMaterial.CHROME)])
+    glass, paint = groups.pop(solids.VehicleMaterial.GLASS), groups.pop(solids.VehicleMaterial.PAINT)
+    plates = groups.pop(solids.VehicleMaterial.PLATE)
+    head, tail = groups.pop(solids.VehicleMaterial.HEADLIGHT), groups.pop(solids.VehicleMaterial.TAIL_LIGHT)
     whole = all(len(g.parent) for g in (glass, paint, head, tail))
     if fine and whole and car:
         glass_high = _extent(base, glass)[1]

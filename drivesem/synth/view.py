@@ -22,7 +22,7 @@ of the camera."""
 @dataclass(frozen=True, slots=True)
 class View:
     """A camera above the ground. rotation (3, 3): world to camera axes. centre (3,): the image's centre of
-    projection in camera axes (KITTI's camera 2 sits beside the origin). height_m: of the axes' origin above the
+    projection in camera axes (KITTI's camera 2 is next to the origin). height_m: of the axes' origin above the
     ground. position_xz: of the origin, m; heading: rad that the camera is turned to the right, part of `rotation`.
     """
 

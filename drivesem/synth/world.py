@@ -91,17 +91,19 @@ class _Builder:
         scale: tuple[float, float, float] = (1, 1, 1),
         y: float = 0.0,
     ) -> None:
-        """Place a soup whose x runs along the road (turn 0), turned by `turn`."""
+        """Place a soup turned by `turn`; at 0 its x runs along the road."""
         x, z = self.road.point(d, s)
         self.parts.append(placed(soup, (float(x), y, float(z)), self.road.yaw(s, 1) + turn, scale))
 
 
 def _ground(b: _Builder) -> None:
     road = b.road
-    look = np.random.default_rng([0x5F, b.draw("surface", b.pool.surfaces)])
-    tone = {m: look.uniform(0.75, 1.3) * look.uniform(0.96, 1.04, 3) for m in _GROUND_ALBEDO}
-    tone[Material.GRASS] = look.uniform(0.8, 1.4) * np.array([look.uniform(0.8, 1.6), 1.0, look.uniform(0.8, 1.2)])
-    seed = float(look.integers(1000))
+    surface_rng = np.random.default_rng([0x5F, b.draw("surface", b.pool.surfaces)])
+    tone = {m: surface_rng.uniform(0.75, 1.3) * surface_rng.uniform(0.96, 1.04, 3) for m in _GROUND_ALBEDO}
+    tone[Material.GRASS] = surface_rng.uniform(0.8, 1.4) * np.array(
+        [surface_rng.uniform(0.8, 1.6), 1.0, surface_rng.uniform(0.8, 1.2)]
+    )
+    seed = float(surface_rng.integers(1000))
     spans = [(_STATIONS_M[0], _STATIONS_M[-1])]
     if road.crossing:
         spans = [(_STATIONS_M[0], road.crossing[0]), (road.crossing[1], _STATIONS_M[-1])]
@@ -385,9 +387,9 @@ def _street_furniture(b: _Builder) -> None:
             # on the pavement's outer side, or well off the road
             d = _edge(b, side) + side * (-0.55 if small else float(rng.uniform(1.8, 3.0)))
             turn = float(rng.normal(0, 0.02 if small else 0.2)) + (np.pi if rng.random() < 0.5 else 0.0)
-            thing = furniture.clutter(rng, small)
+            clutter = furniture.clutter(rng, small)
             if small or b.clear_of_plants(d, where, 3.5):
-                b.put(thing, d, where, turn)
+                b.put(clutter, d, where, turn)
     if road.pavements and rng.random() < 0.3:
         side = int(rng.choice([-1, 1]))
         where = float(rng.uniform(10, 45))
@@ -578,7 +580,7 @@ def surroundings(road: Road, pool: Pool, rng: np.random.Generator) -> tuple[Soup
 
 
 def _flank(b: _Builder, side: int, edge: float) -> None:
-    """What stands beside the road on one side."""
+    """Everything along one side of the road."""
     rng, kind = b.rng, b.road.kind
     b.leaves = 0
     if kind in ("residential", "city", "junction"):

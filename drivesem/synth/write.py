@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from drivesem.data.registry import WRITERS, Writer
-from drivesem.data.truth import Place
+from drivesem.data.ground_truth import FrameLocation
+from drivesem.data.registry import WRITERS, DatasetWriter
 from drivesem.data.vkitti2 import Vkitti2Writer
 from drivesem.synth.assets import Assets, assets_from, meshes_in, of_split
 from drivesem.synth.edits import Edits, apply_edits, read_edits
@@ -23,11 +23,11 @@ from drivesem.synth.frames import (
     Plan,
     SynthFrame,
     SynthSettings,
+    apply_variation,
     boxes_alone,
     plan_frame,
     render_frame,
     second_camera,
-    variation_of,
 )
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.variations import MIXED, parse_variations
@@ -48,7 +48,7 @@ _FIRST_WORLDS = (1, 2, 6, 18, 20)
 """Virtual KITTI's; further scenes take the numbers between and after."""
 _STREETS_A_SCENE = 10
 """Single streets that share one of Virtual KITTI's scenes: their tracks stay below the 254 that its 8-bit instance
-images can tell apart."""
+images can distinguish."""
 _FEWEST_IN_A_DRIVE, _MOST_ATTEMPTS = 3, 10
 TRACKS_A_STREET = 25
 """Track numbers set apart for each of those."""
@@ -97,21 +97,21 @@ class Order:
         if self.people and self.layout.startswith("vkitti"):
             raise RangeError("synth people", f"none in layout {self.layout}, which has no class for them", "some")
         parse_variations(",".join(self.variations))
-        _edits_of(self.edits)
+        _read_edits(self.edits)
         _pack(self.meshes, self.assets)
 
     def recipe(self) -> dict[str, object]:
         """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""
-        told = {k: v for k, v in asdict(self).items() if k not in ("out", "frames", "resume")}
-        told["variations"] = list(self.variations)
+        recipe = {k: v for k, v in asdict(self).items() if k not in ("out", "frames", "resume")}
+        recipe["variations"] = list(self.variations)
         if self.edits is not None:
-            told["edits"] = hashlib.sha256(files.read_bytes(self.edits)).hexdigest()
+            recipe["edits"] = hashlib.sha256(files.read_bytes(self.edits)).hexdigest()
         for name in ("meshes", "assets"):
             folder: Path | None = getattr(self, name)
-            told[name] = None if folder is None else folder.name
+            recipe[name] = None if folder is None else folder.name
             if folder is not None:
-                told[name + _DIGEST] = self._digest(folder)
-        return {"generator": GENERATOR_VERSION, "version": MANIFEST_VERSION, **told}
+                recipe[name + _DIGEST] = self._digest(folder)
+        return {"generator": GENERATOR_VERSION, "version": MANIFEST_VERSION, **recipe}
 
     def _digest(self, folder: Path) -> str:
         """Of the files below a folder that vehicles and skies are read from, and their names; not of what this
@@ -121,10 +121,10 @@ class Order:
         inside = made.is_relative_to(folder.resolve())
         for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in _READ and path.is_file()):
             if not (inside and path.resolve().is_relative_to(made)):
-                known.update(f"{path.relative_to(folder).as_posix()}\0{files.digest(path)}\0".encode())
+                known.update(f"{path.relative_to(folder).as_posix()}\0{files.sha256_digest(path)}\0".encode())
         return known.hexdigest()
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[FrameLocation]:
         """The frames of the data set, in order: frame by frame, each in all its variations."""
         found = []
         for index in range(self.frames):
@@ -132,7 +132,7 @@ class Order:
             per_scene = 1 if self.sequence > 1 else _STREETS_A_SCENE
             scene, inside = divmod(street, per_scene)
             for variation in self.variations:
-                place = Place(
+                place = FrameLocation(
                     number=len(found),
                     scene=_scene_name(scene),
                     variation="clone" if variation == MIXED else variation,
@@ -153,7 +153,7 @@ class Job:
     """One frame to make."""
 
     order: Order
-    place: Place
+    place: FrameLocation
     index: int
     variation: str
 
@@ -168,7 +168,7 @@ def _entry_path(out: Path, number: int) -> Path:
 
 
 @lru_cache(maxsize=2)
-def _edits_of(path: Path | None) -> Edits:
+def _read_edits(path: Path | None) -> Edits:
     return {} if path is None else read_edits(path)
 
 
@@ -191,7 +191,7 @@ def _busy_attempt(seed: int, start: int, split: str, settings: SynthSettings) ->
     return 0
 
 
-def _writer(order: Order) -> Writer:
+def _writer(order: Order) -> DatasetWriter:
     return Vkitti2Writer(order.out, 2) if order.cameras == 2 else WRITERS[order.layout](order.out)
 
 
@@ -201,7 +201,7 @@ def _rendered(plan: Plan) -> SynthFrame:
     return frame
 
 
-def plan_of(job: Job) -> Plan:
+def plan_job(job: Job) -> Plan:
     """What the frame will show, before it is rendered."""
     order = job.order
     split = "heldout" if job.place.part == "val" else order.split
@@ -215,8 +215,8 @@ def plan_of(job: Job) -> Plan:
         bent=True,
     )
     attempt = _busy_attempt(order.seed, job.index - job.index % order.sequence, split, settings)
-    plan = variation_of(plan_frame(order.seed, job.index, split, settings, attempt), job.variation)
-    return apply_edits(plan, _edits_of(order.edits), job.index)
+    plan = apply_variation(plan_frame(order.seed, job.index, split, settings, attempt), job.variation)
+    return apply_edits(plan, _read_edits(order.edits), job.index)
 
 
 def make_frame(job: Job) -> int:
@@ -226,7 +226,7 @@ def make_frame(job: Job) -> int:
     entry_path = _entry_path(order.out, place.number)
     if order.resume and entry_path.exists() and writer.exists(place):
         return place.number
-    plan = plan_of(job)
+    plan = plan_job(job)
     first_track = 0
     if order.layout.startswith("vkitti") and order.sequence == 1:
         first_track = TRACKS_A_STREET * (job.index % _STREETS_A_SCENE)
@@ -239,13 +239,13 @@ def make_frame(job: Job) -> int:
     objects = [
         {"track": o.track, "kind": o.kind, "model": o.model, "labelled": o.labelled} for o in exposure.objects
     ]
-    told = {**asdict(place), **exposure.manifest, "objects": objects}
-    entry = {"written": written, "manifest": told}
+    manifest_row = {**asdict(place), **exposure.manifest, "objects": objects}
+    entry = {"written": written, "manifest": manifest_row}
     files.write_text(entry_path, json.dumps(entry, allow_nan=False))
     return place.number
 
 
-def jobs_of(order: Order) -> list[Job]:
+def list_jobs(order: Order) -> list[Job]:
     """All frames of the data set, in order."""
     variations = order.variations
     return [
@@ -255,11 +255,11 @@ def jobs_of(order: Order) -> list[Job]:
 
 
 def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
-    """Make the data set that `order` asks for: each frame's number, as it is done.
+    """Make the data set of `order`. Yields the number of each finished frame.
 
     At the end come the files that frames share, and `manifest.json`: recipe, and each frame's seed, shapes and
     objects. A frame's bytes depend on its seed, index and settings alone, not on order, engine or number of
-    frames. Raises FormatError where the folder holds frames of another recipe, before the first is asked for.
+    frames. Raises FormatError where the folder holds frames of another recipe, before the first one is made.
     """
     stamp = order.out / _STATE / "recipe.json"
     recipe = order.recipe()
@@ -277,7 +277,7 @@ def synthesise(order: Order, engine: Engine | None = None) -> Iterator[int]:
 
 
 def _made(order: Order, recipe: Mapping[str, object], engine: Engine) -> Iterator[int]:
-    jobs = jobs_of(order)
+    jobs = list_jobs(order)
     yield from engine(make_frame, jobs)
     _finish(order, recipe, jobs)
 

@@ -122,10 +122,10 @@ def develop_pixels(
     spread = np.stack([corner + dy * n * width + dx for dy in range(n) for dx in range(n)], axis=1).reshape(-1)
     sites = np.concatenate([first_sample(whole), spread])
     radiance, changed = _shade_sites(sight, sites, setting, maps, shadows)
-    shown = develop(radiance, setting.response)
-    image[whole] = shown[: len(whole)]
-    fine_shown = shown[len(whole) :].reshape(-1, n * n, 3)
-    image[parts] = sum(fine_shown[:, i] for i in range(n * n)) / np.float32(n * n)
+    visible = develop(radiance, setting.response)
+    image[whole] = visible[: len(whole)]
+    fine_visible = visible[len(whole) :].reshape(-1, n * n, 3)
+    image[parts] = sum(fine_visible[:, i] for i in range(n * n)) / np.float32(n * n)
     touched = np.zeros(len(image), bool)
     touched[whole] = changed[: len(whole)]
     touched[parts] = changed[len(whole) :].reshape(-1, n * n).any(axis=1)

@@ -25,9 +25,9 @@ def test_demo_scenes_are_held_out(index: int) -> None:
     provenance = demo_scene(0, index).provenance
     assert int(provenance["seed"]) not in trained_on["seed"] or provenance["split"] not in trained_on["split"]
     for kind in SHAPES:
-        shown = set(ast.literal_eval(provenance[kind]))
+        shapes = set(ast.literal_eval(provenance[kind]))
         assert trained_on[kind], f"the training frames name no {kind}"
-        assert not shown & set(trained_on[kind]), kind
+        assert not shapes & set(trained_on[kind]), kind
 
 
 def test_the_cards_held_out_frames_are_held_out() -> None:

@@ -111,7 +111,7 @@ def test_the_sidecar_overrides_and_leaves_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         ({"a.glb": {"kind": "rocket"}}, "kind"),
         ({"a.glb": {"front": "ahead"}}, "front"),
@@ -126,10 +126,10 @@ def test_the_sidecar_overrides_and_leaves_out(tmp_path: Path) -> None:
         ([1], "vehicles.yaml"),
     ],
 )
-def test_faults_in_the_sidecar_are_named(tmp_path: Path, entry: object, said: str) -> None:
+def test_faults_in_the_sidecar_are_named(tmp_path: Path, entry: object, message: str) -> None:
     write_template(tmp_path / "a.glb", "sedan", (4.5, 1.45, 1.8))
     (tmp_path / "vehicles.yaml").write_text(yaml.safe_dump(entry))
-    with pytest.raises(FormatError, match=said):
+    with pytest.raises(FormatError, match=message):
         assets.meshes_in(tmp_path)
 
 
@@ -179,7 +179,7 @@ def test_splits_are_by_name_alone_and_share_nothing() -> None:
     ],
 )
 def test_kinds_by_name_and_by_proportions(name: str, size: tuple[float, float, float], kind: str) -> None:
-    assert assets.kind_of(name, size) == kind
+    assert assets.classify_vehicle(name, size) == kind
 
 
 def test_a_palette_body_gets_windows_and_trim() -> None:

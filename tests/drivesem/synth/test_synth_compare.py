@@ -100,7 +100,7 @@ def test_no_frame_at_all_is_no_error():
     assert "| depth | m | - | 29.24 | - | - |" in Comparison(empty, reference()).table()
 
 
-def test_kittis_figures_are_whole_and_agree_with_those_the_layout_follows():
+def test_kitti_statistics_agree_with_the_layout():
     kitti, fitted = reference(), statistics()
     assert (kitti.frames, kitti.vehicles) == (7481, 32750)
     for name, quantity in QUANTITIES.items():

@@ -53,7 +53,7 @@ def test_a_size_is_of_all_three_sides(plan):
 
 
 def test_a_share_of_a_shape_is_refused(plan):
-    edit = FrameEdit(objects={ALL: ObjectEdit(mesh_share=0.5)})
+    edit = FrameEdit(objects={ALL: ObjectEdit(mesh_fraction=0.5)})
     with pytest.raises(RangeError, match=r"mesh: expected lattice offsets; .* found 50%"):
         apply_edit(plan, edit)
 
@@ -177,7 +177,7 @@ def test_edits_for_all_frames_come_before_those_of_one(plan):
     assert way == pytest.approx([1.0, 2.0])
 
 
-def test_a_file_says_it_in_physical_units(tmp_path):
+def test_file_in_physical_units(tmp_path):
     path = write(
         tmp_path,
         "frames:\n  all: {weather: {fog: 0.5}, foliage: {hue: -0.5}}\n"

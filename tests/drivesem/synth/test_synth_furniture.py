@@ -27,7 +27,7 @@ def _large(rng: np.random.Generator) -> Soup:
 
 
 @pytest.mark.parametrize("make", [furniture.sign, furniture.bus_stop, _small, _large])
-def test_things_stand_on_the_ground(make: Callable[[np.random.Generator], Soup]) -> None:
+def test_furniture_stands_on_the_ground(make: Callable[[np.random.Generator], Soup]) -> None:
     for seed in range(30):
         soup = make(np.random.default_rng(seed))
         _check(soup)

@@ -115,7 +115,7 @@ WEATHERS = {
 
 @pytest.mark.parametrize("heading", [0.0, -0.5])
 @pytest.mark.parametrize("weather", WEATHERS)
-def test_every_material_looks_the_same_by_kernel_and_by_numpy(weather, heading):
+def test_materials_agree_with_numpy(weather, heading):
     view = a_view(heading, (1.5, -2.0), (160, 480))
     light = a_light(view, heading=heading, **WEATHERS[weather])
     setting = a_setting(view, replace(light, sun=light.sun / np.linalg.norm(light.sun)))
@@ -153,7 +153,7 @@ def test_a_street_photographed_by_kernel_and_by_numpy(seed):
 def test_as_many_threads_as_you_like_give_the_same_bytes():
     view = a_view(size=(200, 600))
     world, setting = a_world(view), a_setting(view)
-    kept, found = torch.get_num_threads(), []
+    selected, found = torch.get_num_threads(), []
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
@@ -162,7 +162,7 @@ def test_as_many_threads_as_you_like_give_the_same_bytes():
             assert picture.sun_maps is not None
             found.append((sight.face, sight.depth, picture.sun_maps.depth, picture.developed, picture.image))
     finally:
-        torch.set_num_threads(kept)
+        torch.set_num_threads(selected)
     for one, other in zip(*found, strict=True):
         assert one.tobytes() == other.tobytes()
 
@@ -189,7 +189,7 @@ def test_ground_below_the_camera_is_cut_at_the_near_plane():
     assert sight.depth[row][ground] == pytest.approx(expected, rel=1e-5)
 
 
-def test_shadow_maps_lie_before_the_camera_wherever_it_looks():
+def test_shadow_maps_lie_before_the_camera():
     view = a_view(0.6, (40.0, -7.0))
     maps = sun_maps(a_world(view), a_setting(view))
     assert maps is not None
@@ -199,7 +199,7 @@ def test_shadow_maps_lie_before_the_camera_wherever_it_looks():
 
 
 def test_a_turned_and_moved_camera_sees_the_same_shadows():
-    shown = []
+    developed = []
     for heading, position in ((0.0, (0.0, 0.0)), (-0.5, (3.0, 1.0))):
         view = a_view(heading, position, (160, 480))
         world = a_world(view)
@@ -207,10 +207,10 @@ def test_a_turned_and_moved_camera_sees_the_same_shadows():
         for point in ([1.2, 0.0, 8.2], [0.4, 0.0, 6.5]):
             place = fine_matrix(view) @ (view.to_camera(np.array(point)) - view.centre)
             u, v = np.rint(place[:2] / place[2] / 2).astype(int)
-            shown.append(float(picture.developed.reshape(160, 480, 3)[v, u].mean()))
-    dark, light = shown[:2]
+            developed.append(float(picture.developed.reshape(160, 480, 3)[v, u].mean()))
+    dark, light = developed[:2]
     assert dark < 0.8 * light
-    assert shown[2:] == pytest.approx([dark, light], rel=0.12)
+    assert developed[2:] == pytest.approx([dark, light], rel=0.12)
 
 
 def test_wet_ground_is_darker_below_and_mirrors_the_sky_far_away():
@@ -250,12 +250,12 @@ def test_display_values_from_the_table_are_those_of_the_formula():
     fog = a_light(view, weather="fog", horizon=np.array([0.003, 0.4, 30.0]))
     setting = a_setting(view, fog)
     sight = see(make(np.zeros((0, 3, 3)), Material.ROAD, (0.1, 0.1, 0.1)), view)
-    shown = render(sight, sight.faces, [], setting).developed
+    developed = render(sight, sight.faces, [], setting).developed
     expected = develop((fog.horizon * 0.8).astype(np.float32)[None], RESPONSE)
-    assert np.abs(shown - expected).max() < 1e-4
+    assert np.abs(developed - expected).max() < 1e-4
 
 
-def test_grain_is_normal_does_not_repeat_and_is_the_same_by_both_ways():
+def test_grain_is_normal_and_agrees_with_numpy():
     noise = white_noise(5, 400_000)
     assert noise.mean() == pytest.approx(0, abs=0.01)
     assert noise.std() == pytest.approx(1, abs=0.01)
@@ -294,10 +294,10 @@ def test_chromatic_error_moves_red_outwards_and_blue_inwards():
     view = a_view()
     image = np.zeros((96, 320, 3), np.float32)
     image[:, 300:] = 1.0
-    shown = rendering._fringed(image, 0.5)
-    assert np.array_equal(shown[..., 1], image[..., 1])
+    developed = rendering._fringed(image, 0.5)
+    assert np.array_equal(developed[..., 1], image[..., 1])
     share = (300 - 0.5 - 159.5) / np.hypot(159.5, 47.5) * 0.5
-    edge = shown[48].sum(axis=0)
+    edge = developed[48].sum(axis=0)
     assert edge[1] - edge[0] == pytest.approx(share, abs=0.02)
     assert edge[2] - edge[1] == pytest.approx(share, abs=0.02)
     assert view.camera.width == 320

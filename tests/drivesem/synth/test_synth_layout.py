@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivesem.synth.compare import Comparison, histograms, reference
-from drivesem.synth.frames import Plan, SynthSettings, boxes_alone, labels_of, plan_frame
+from drivesem.synth.frames import Plan, SynthSettings, boxes_alone, labels_from_truths, plan_frame
 from drivesem.synth.layout import (
     MARGIN_M,
     MOST_VEHICLES,
@@ -105,7 +105,7 @@ def plans() -> list[Plan]:
 @pytest.fixture(scope="module")
 def comparison(plans) -> Comparison:
     """150 streets beside KITTI: what the boxes of their actors hide of one another, without surroundings."""
-    return Comparison(histograms(labels_of(boxes_alone(plan)) for plan in plans), reference())
+    return Comparison(histograms(labels_from_truths(boxes_alone(plan)) for plan in plans), reference())
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_no_frame_has_more_vehicles_than_there_are_tracks():
     assert max(len(_actors(seed, vehicles=(30, 40))) for seed in range(20)) <= MOST_VEHICLES
 
 
-def test_the_asked_number_can_be_seen():
+def test_requested_number_of_vehicles_is_visible():
     counts = [len(_actors(seed, vehicles=(5, 5), kinds=("city",))) for seed in range(30)]
     assert min(counts) >= 4
     assert np.mean(counts) < 8
@@ -231,7 +231,7 @@ def test_sizes_of_cars_are_near_the_labels_mean():
 
 
 @pytest.mark.parametrize("kind", ROAD_KINDS)
-def test_every_kind_of_road_can_be_asked_for(kind):
+def test_every_kind_of_road_can_be_requested(kind):
     road = plan_road(np.random.default_rng(3), (kind,))
     assert road.kind == kind
     assert (road.crossing is not None) == (kind == "junction")
@@ -244,7 +244,7 @@ def test_strips_do_not_overlap():
         assert all(b[0] >= a[1] - 1e-6 for a, b in itertools.pairwise(spans)), (road.kind, spans)
 
 
-def test_variants_stay_in_the_asked_range():
+def test_variants_stay_in_the_requested_range():
     actors = [a for seed in range(30) for a in _actors(seed, variants=(100, 60), vehicles=(5, 8))]
     assert actors
     assert all(100 <= a.variant < 160 for a in actors)

@@ -62,23 +62,23 @@ def test_leaves_stand_around_their_blobs_and_not_inside() -> None:
     rng = np.random.default_rng(3)
     centres, radii = rng.normal(0, 0.5, (5, 3)), rng.uniform(0.3, 0.6, (5, 3))
     blob, direction, depth = rng.integers(5, size=400), rng.normal(0, 1, (400, 3)), rng.uniform(0.8, 1.3, 400)
-    kept, points, outward, light = mesh_kernels.crown((centres, radii), blob, direction, depth)
+    rows, points, outward, light = mesh_kernels.crown((centres, radii), blob, direction, depth)
     towards = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     places = centres[blob] + towards * radii[blob] * depth[:, None]
     inside = (((places[:, None] - centres) / radii) ** 2).sum(axis=2).min(axis=1) < 0.6
     assert 0 < inside.sum() < 400
-    assert np.array_equal(kept, np.flatnonzero(~inside))
-    assert np.abs(points - places[kept]).max() < 1e-5
-    assert np.linalg.norm(outward, axis=1) == pytest.approx(np.ones(len(kept)), abs=1e-5)
-    assert ((outward * towards[kept]).sum(axis=1) > 0).mean() > 0.95
-    upper = light[(towards[kept, 1] < -0.5)].mean()
-    assert upper > light[(towards[kept, 1] > 0.5)].mean() + 0.1
-    reach = rng.uniform(0.1, 0.2, len(kept))
-    draws = rng.normal(0, 1, (len(kept), 3)), rng.normal(0, 1, (len(kept), 3)), reach
+    assert np.array_equal(rows, np.flatnonzero(~inside))
+    assert np.abs(points - places[rows]).max() < 1e-5
+    assert np.linalg.norm(outward, axis=1) == pytest.approx(np.ones(len(rows)), abs=1e-5)
+    assert ((outward * towards[rows]).sum(axis=1) > 0).mean() > 0.95
+    upper = light[(towards[rows, 1] < -0.5)].mean()
+    assert upper > light[(towards[rows, 1] > 0.5)].mean() + 0.1
+    reach = rng.uniform(0.1, 0.2, len(rows))
+    draws = rng.normal(0, 1, (len(rows), 3)), rng.normal(0, 1, (len(rows), 3)), reach
     corners, normals = mesh_kernels.leaves(points, outward, draws)
     assert np.linalg.norm(corners[:, 0] - points, axis=1) == pytest.approx(reach, rel=1e-3)
     slender = _areas(corners) / reach**2
-    assert slender == pytest.approx(np.full(len(kept), slender.mean()), rel=1e-3)
+    assert slender == pytest.approx(np.full(len(rows), slender.mean()), rel=1e-3)
     facing = draws[0] * 0.55 + outward
     facing /= np.linalg.norm(facing, axis=1, keepdims=True)
     assert np.abs(((corners[:, 1] - corners[:, 0]) * facing).sum(axis=1)).max() < 1e-5

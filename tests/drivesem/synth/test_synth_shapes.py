@@ -8,7 +8,7 @@ from drivesem.synth import buildings, flora, people
 from drivesem.synth.light import develop, draw_light, draw_response
 from drivesem.synth.noise import SIZE, noise_set
 from drivesem.synth.soup import Material, Soup, ball, box, creased_normals, join, make, placed, stick, unit_sphere
-from scene_ir.geometry import place
+from scene_ir.geometry import place_vertices
 from tests.drivesem.synth.reference_light import sample, sky_radiance
 
 
@@ -34,7 +34,9 @@ def test_placed_agrees_with_the_projects_placing():
     soup = make(rng.uniform(-0.5, 0.5, (7, 3, 3)), Material.FLAT, (0.5, 0.5, 0.5))
     found = placed(soup, (1.0, 1.6, 9.0), 0.8, (4.0, 1.5, 1.8)).corners
     points = torch.from_numpy(soup.corners.reshape(-1, 3))
-    expected = place(points, torch.tensor([4.0, 1.5, 1.8]), torch.tensor(0.8), torch.tensor([1.0, 1.6, 9.0]))
+    expected = place_vertices(
+        points, torch.tensor([4.0, 1.5, 1.8]), torch.tensor(0.8), torch.tensor([1.0, 1.6, 9.0])
+    )
     assert np.abs(found.reshape(-1, 3) - expected.numpy()).max() < 1e-5
 
 
@@ -127,10 +129,10 @@ def unit_box() -> Soup:
 def test_the_camera_response_rises_and_stays_in_range():
     response = draw_response(np.random.default_rng(0), "sun")
     ramp = np.repeat(np.linspace(0, 2, 50, dtype=np.float32)[:, None], 3, axis=1)
-    shown = develop(ramp, response)
-    assert (np.diff(shown, axis=0) > 0).all()
-    assert shown[0] == pytest.approx(np.zeros(3))
-    assert shown.max() <= 1.0
+    visible = develop(ramp, response)
+    assert (np.diff(visible, axis=0) > 0).all()
+    assert visible[0] == pytest.approx(np.zeros(3))
+    assert visible.max() <= 1.0
 
 
 def test_the_sky_is_brightest_near_the_sun():

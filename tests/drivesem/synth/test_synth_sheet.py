@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
 from drivesem.data.registry import WRITERS, open_dataset
-from drivesem.data.truth import SKY_CM, Exposure, Place
 from drivesem.report import drawing
 from drivesem.synth import sheet as sheets
 from drivesem.synth.exposure import expose
@@ -17,7 +17,7 @@ from drivesem.synth.frames import generate_frame
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
-PLACES = tuple(Place(i, "01", "clone", i, "train") for i in range(2))
+PLACES = tuple(FrameLocation(i, "01", "clone", i, "train") for i in range(2))
 
 
 @pytest.fixture(scope="module")
@@ -42,51 +42,51 @@ def rows_of(exposure: Exposure) -> tuple[int, int, int]:
 
 def test_a_row_a_frame(exposures: Sequence[Exposure], folders: Path) -> None:
     dataset = open_dataset("kitti", folders / "kitti")
-    one, two = (sheets.sheet_of(dataset, ["000000", "000001"][:count]) for count in (1, 2))
+    one, two = (sheets.draw_sheet(dataset, ["000000", "000001"][:count]) for count in (1, 2))
     assert one.dtype == two.dtype == np.uint8
     assert one.shape[1:] == two.shape[1:] == (sheets.WIDTH_PX, 3)
     assert np.array_equal(two[: len(one) - drawing.MARGIN_PX], one[: -drawing.MARGIN_PX])
     made = exposures[0]
     top, left, tall = rows_of(made)
-    shown = one[top : top + tall, left : left + sheets._PHOTO_PX].astype(float)
+    tiles = one[top : top + tall, left : left + sheets._PHOTO_PX].astype(float)
     small = cv2.resize(made.image, (sheets._PHOTO_PX, tall), interpolation=cv2.INTER_AREA)
-    assert np.median(np.abs(shown - small)) == 0
+    assert np.median(np.abs(tiles - small)) == 0
     # the left edge of every box is drawn in its class's colour, unless a text or another box lies there
     scale = sheets._PHOTO_PX / made.camera.width
     drawn = 0
     for kind, (x0, y0, _, y1) in zip(made.labels.kind, made.labels.boxes_xyxy.tolist(), strict=True):
         row, column = round((y0 + y1 + 1) / 2 * scale - 0.5), round((x0 + 0.5) * scale - 0.5)
-        drawn += tuple(shown[row, column]) == sheets.BOX_COLOURS[kind]
+        drawn += tuple(tiles[row, column]) == sheets.BOX_COLOURS[kind]
     assert drawn >= 0.5 * len(made.labels.kind) > 0
 
 
 def test_a_folder_shows_what_was_written(exposures: Sequence[Exposure], folders: Path) -> None:
     dataset = open_dataset("kitti", folders / "kitti")
-    shown = sheets.sheet_of(dataset, ["000000"])
+    tiles = sheets.draw_sheet(dataset, ["000000"])
     made = exposures[0]
     top, left, tall = rows_of(made)
     right = left + sheets._PHOTO_PX + drawing.MARGIN_PX
     depth = np.s_[top : top + tall // 2 - drawing.MARGIN_PX, right : right + 350]
     depth_m = np.where(made.depth_cm == SKY_CM, np.inf, made.depth_cm.astype(np.float32) / 100)
     small = ((sheets.WIDTH_PX - sheets._PHOTO_PX - 4 * drawing.MARGIN_PX) // 2, tall // 2 - drawing.MARGIN_PX // 2)
-    expected = cv2.resize(drawing.depth_colours(depth_m), small, interpolation=cv2.INTER_AREA)
+    expected = cv2.resize(drawing.colourise_depth(depth_m), small, interpolation=cv2.INTER_AREA)
     expected = expected[: tall // 2 - drawing.MARGIN_PX, :350]
     # 1/256 m for centimetres, but what lies beyond 256 m, which KITTI's depth cannot hold, is grey as the sky
-    grey = (shown[depth] == drawing.UNKNOWN).all(axis=-1)
-    assert np.quantile(np.abs(shown[depth].astype(int) - expected)[~grey], 0.99) <= 8
+    grey = (tiles[depth] == drawing.UNKNOWN_COLOUR).all(axis=-1)
+    assert np.quantile(np.abs(tiles[depth].astype(int) - expected)[~grey], 0.99) <= 8
     path = folders / "kitti/training/depth_2/000000.png"
     before = path.read_bytes()
     files.write_png(path, np.full_like(files.read_uint16(path), 10 * 256))
-    changed = sheets.sheet_of(dataset, ["000000"])
+    changed = sheets.draw_sheet(dataset, ["000000"])
     path.write_bytes(before)
     assert len(np.unique(changed[depth].reshape(-1, 3), axis=0)) == 1
-    assert np.array_equal(changed[:, :right], shown[:, :right])
+    assert np.array_equal(changed[:, :right], tiles[:, :right])
 
 
 @pytest.mark.parametrize("name", ["coco", "yolo"])
 def test_a_folder_without_maps_has_a_sheet(name: str, folders: Path) -> None:
     dataset = open_dataset(name, folders / name)
-    assert sheets.sheet_of(dataset, dataset.identifiers).shape[1] == sheets.WIDTH_PX
+    assert sheets.draw_sheet(dataset, dataset.identifiers).shape[1] == sheets.WIDTH_PX
 
 
 def test_nothing_to_label(exposures: Sequence[Exposure], tmp_path: Path) -> None:
@@ -106,16 +106,16 @@ def test_nothing_to_label(exposures: Sequence[Exposure], tmp_path: Path) -> None
     )
     writer = WRITERS["kitti"](tmp_path)
     writer.finish([writer.write(PLACES[0], empty)])
-    assert len(np.unique(sheets.sheet_of(open_dataset("kitti", tmp_path), ["000000"]))) > 1
+    assert len(np.unique(sheets.draw_sheet(open_dataset("kitti", tmp_path), ["000000"]))) > 1
 
 
 def test_classes_and_depths_have_fixed_colours() -> None:
     classes = sheets._class_colours(np.array([[0, 1, 2, 3]]), ("Road", "Car", "Pedestrian", "Nonsense"))
-    assert classes[0].tolist() == [[100, 60, 100], [255, 127, 80], [220, 20, 60], list(drawing.UNKNOWN)]
-    depth = drawing.depth_colours(np.array([[1.0, 3.0, 30.0, 200.0, 500.0, np.inf, np.nan]]))[0].astype(int)
+    assert classes[0].tolist() == [[100, 60, 100], [255, 127, 80], [220, 20, 60], list(drawing.UNKNOWN_COLOUR)]
+    depth = drawing.colourise_depth(np.array([[1.0, 3.0, 30.0, 200.0, 500.0, np.inf, np.nan]]))[0].astype(int)
     assert depth[0].tolist() == depth[1].tolist() == [253, 231, 37]  # both ends of matplotlib's viridis
     assert depth[3].tolist() == depth[4].tolist() == [68, 1, 84]
-    assert depth[5].tolist() == depth[6].tolist() == list(drawing.UNKNOWN)
+    assert depth[5].tolist() == depth[6].tolist() == list(drawing.UNKNOWN_COLOUR)
     assert depth[1].sum() > depth[2].sum() > depth[3].sum()
 
 
@@ -131,12 +131,12 @@ def test_written_as_png_or_jpeg(tmp_path: Path) -> None:
 def test_bad_requests(folders: Path) -> None:
     dataset = open_dataset("yolo", folders / "yolo")
     with pytest.raises(RangeError, match="frames of a sheet: expected 1 to 12, found 0"):
-        sheets.sheet_of(dataset, [])
+        sheets.draw_sheet(dataset, [])
     with pytest.raises(RangeError, match="frames of a sheet: expected 1 to 12, found 13"):
-        sheets.sheet_of(dataset, ["000000"] * 13)
+        sheets.draw_sheet(dataset, ["000000"] * 13)
     path = folders / "yolo/images/train/000001.png"
     data = path.read_bytes()
     path.write_bytes(data[:100])
     with pytest.raises(FormatError, match=r"000001\.png: expected an image"):
-        sheets.sheet_of(dataset, ["000001"])
+        sheets.draw_sheet(dataset, ["000001"])
     path.write_bytes(data)

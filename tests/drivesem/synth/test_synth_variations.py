@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from drivesem.synth.exposure import CLASS_NAMES, expose, paint_name
-from drivesem.synth.frames import BASELINE_M, SynthSettings, plan_frame, render_frame, second_camera, variation_of
+from drivesem.synth.frames import (
+    BASELINE_M,
+    SynthSettings,
+    apply_variation,
+    plan_frame,
+    render_frame,
+    second_camera,
+)
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.variations import VARIATIONS, parse_variations
 from scene_ir.errors import RangeError
@@ -30,18 +37,18 @@ def exposure(plan):
 
 @pytest.mark.parametrize("name", VARIATIONS)
 def test_a_variation_keeps_the_world(plan, name):
-    varied = variation_of(plan, name)
+    varied = apply_variation(plan, name)
     assert varied.actors == plan.actors
     assert varied.variation == name
     assert varied.setting.view.origin == pytest.approx(plan.setting.view.origin)
     sun = [p.setting.light.up @ p.setting.view.rotation for p in (plan, varied)]
     assert sun[0] == pytest.approx(sun[1])
-    assert variation_of(plan, name).setting.light.haze_per_m == varied.setting.light.haze_per_m
+    assert apply_variation(plan, name).setting.light.haze_per_m == varied.setting.light.haze_per_m
 
 
 @pytest.mark.parametrize(("name", "degrees"), [("15-deg-left", -15), ("30-deg-right", 30)])
 def test_a_turned_camera_sees_the_same_places_elsewhere(plan, name, degrees):
-    turned = variation_of(plan, name).setting.view
+    turned = apply_variation(plan, name).setting.view
     point = np.array([3.0, -1.0, 20.0])
     straight, other = plan.setting.view.to_camera(point), turned.to_camera(point)
     assert np.linalg.norm(straight) == pytest.approx(np.linalg.norm(other))
@@ -51,13 +58,13 @@ def test_a_turned_camera_sees_the_same_places_elsewhere(plan, name, degrees):
 
 
 def test_weathers_differ_as_they_should(plan):
-    light = {name: variation_of(plan, name).setting.light for name in VARIATIONS}
+    light = {name: apply_variation(plan, name).setting.light for name in VARIATIONS}
     height = {name: float(entry.sun @ entry.up) for name, entry in light.items()}
     assert height["sunset"] < height["morning"] < height["clone"]
     assert light["fog"].haze_per_m > 5 * light["clone"].haze_per_m
     assert light["rain"].wet > 0.5
     assert light["overcast"].sun_colour.max() == 0
-    assert variation_of(plan, "rain").setting.response.streaks > 0
+    assert apply_variation(plan, "rain").setting.response.streaks > 0
 
 
 @pytest.mark.parametrize("text", ["night", "clone,,fog", ""])
@@ -98,7 +105,7 @@ def test_the_second_camera_stands_to_the_right(plan):
     assert shift == pytest.approx([BASELINE_M, 0, 0], abs=1e-12)
 
 
-def test_the_exposure_says_what_the_frame_shows(plan, exposure):
+def test_exposure_matches_the_frame(plan, exposure):
     assert exposure.class_names == CLASS_NAMES
     assert (exposure.depth_cm == 65535).mean() == pytest.approx(
         (exposure.classes == CLASS_NAMES.index("Sky")).mean(), abs=1e-6

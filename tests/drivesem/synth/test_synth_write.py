@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.config.blocks import Sharing
+from drivesem.config.options import WorkerOptions
 from drivesem.data.registry import WRITERS, open_dataset
-from drivesem.run.workers import mapping
+from drivesem.run.workers import make_parallel_map
 from drivesem.synth import write
 from drivesem.synth.exposure import CLASS_NAMES, expose
-from drivesem.synth.frames import VARIANTS, SynthSettings, boxes_alone, plan_frame, render_frame, variation_of
+from drivesem.synth.frames import VARIANTS, SynthSettings, apply_variation, boxes_alone, plan_frame, render_frame
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.write import Order, synthesise
 from scene_ir import files
@@ -60,7 +60,7 @@ def order_for(out: Path, layout: str, **changes: object) -> Order:
 def exposed(order: Order, index: int):
     """The ground truth that frame `index` was written from."""
     settings = settings_of(order.layout, order.people)
-    frame = render_frame(variation_of(plan_frame(order.seed, index, settings=settings), order.variations[0]))
+    frame = render_frame(apply_variation(plan_frame(order.seed, index, settings=settings), order.variations[0]))
     assert frame is not None
     return expose(frame)
 
@@ -88,10 +88,10 @@ def test_every_layout_reads_back_what_was_made(made):
     assert (frame.camera.matrix - truth.camera.matrix).abs().max() < 1e-3
     assert frame.labels is not None
     if made.layout.startswith("vkitti"):
-        shown = [o for o in truth.objects if o.pixels > 0]
-        boxes = torch.tensor([o.box_ltrb for o in shown], dtype=torch.float32)
-        kinds = tuple(o.kind for o in shown)
-        poses = torch.tensor([[*o.translation, o.yaw] for o in shown])
+        listed = [o for o in truth.objects if o.pixels > 0]
+        boxes = torch.tensor([o.box_ltrb for o in listed], dtype=torch.float32)
+        kinds = tuple(o.kind for o in listed)
+        poses = torch.tensor([[*o.translation, o.yaw] for o in listed])
     else:
         boxes, kinds = truth.labels.boxes_xyxy, truth.labels.kind
         poses = torch.cat([truth.labels.translation, truth.labels.yaw[:, None]], dim=1)
@@ -111,11 +111,11 @@ def test_every_layout_reads_back_what_was_made(made):
         seen = np.unique(truth.classes)
         assert (names[seen] >= 0).all()
         assert np.array_equal(frame.classes.numpy(), names[truth.classes])
-        for mask, found in zip(frame.masks.numpy(), shown, strict=True):
+        for mask, found in zip(frame.masks.numpy(), listed, strict=True):
             assert np.array_equal(mask > 0.5, truth.instances == found.track + 1)
 
 
-def test_the_manifest_says_where_every_frame_comes_from(made):
+def test_manifest_records_the_source_of_every_frame(made):
     manifest = files.read_json(made.out / "manifest.json")
     assert [f["index"] for f in manifest["frames"]] == [0, 1]
     assert manifest["seed"] == SEED
@@ -258,7 +258,7 @@ def test_edits_reach_the_files(tmp_path):
     assert track not in objects[1]
 
 
-def test_the_right_camera_is_written_beside_the_left(tmp_path):
+def test_right_camera_is_written_with_the_left(tmp_path):
     order = order_for(tmp_path / "out", "vkitti2", frames=1, cameras=2)
     list(synthesise(order))
     left, right = (
@@ -273,7 +273,7 @@ def test_the_right_camera_is_written_beside_the_left(tmp_path):
 def test_workers_change_nothing(tmp_path, layout):
     one, two = (order_for(tmp_path / str(n), layout, frames=4) for n in (1, 2))
     list(synthesise(one))
-    list(synthesise(two, mapping(Sharing(workers=2))))
+    list(synthesise(two, make_parallel_map(WorkerOptions(workers=2))))
     assert tree(two.out) == tree(one.out)
 
 
@@ -281,8 +281,8 @@ def test_a_sliver_of_a_car_at_the_border_has_no_track(tmp_path):
     # Frame 198 of these drives has a car that reaches into its last row with three samples, two pixels: too
     # little for ground truth.
     order = Order(tmp_path, 199, 26, "vkitti1", variations=("clone",), people=False, sequence=50)
-    exposure = expose(render_frame(write.plan_of(write.jobs_of(order)[198])))
-    shown = set(np.unique(exposure.instances).tolist()) - {0}
-    assert shown
-    assert shown <= {thing.track + 1 for thing in exposure.objects}
+    exposure = expose(render_frame(write.plan_job(write.list_jobs(order)[198])))
+    listed = set(np.unique(exposure.instances).tolist()) - {0}
+    assert listed
+    assert listed <= {entry.track + 1 for entry in exposure.objects}
     WRITERS["vkitti1"](tmp_path).write(order.places()[198], exposure)
