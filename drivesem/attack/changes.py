@@ -17,7 +17,7 @@ from torch import Tensor
 
 from drivesem.attack.feasibility_check import check_exchange
 from drivesem.attack.labels import Labeller
-from drivesem.attack.methods.margin_search import LEAST_PASSES
+from drivesem.attack.methods.margin_search import MIN_PASSES
 from drivesem.attack.space import ground_axes
 from scene_ir import exchange
 from scene_ir.errors import FormatError
@@ -99,7 +99,7 @@ def load_vehicle_mesh(path: str) -> ImportedMesh:
 
 def count_affordable_proposals(passes: int) -> int:
     """Number of proposals that an attack with so many passes can evaluate."""
-    spare = min(int(_MAX_PASS_SHARE * passes), passes - LEAST_PASSES)
+    spare = min(int(_MAX_PASS_SHARE * passes), passes - MIN_PASSES)
     return min(max((spare - SAMPLES - 1) // (SAMPLES + 1), 0), _MAX_PROPOSALS)
 
 

@@ -1,8 +1,8 @@
-"""The ground truth of a perturbed scene: moving a car moves its label.
+"""Ground truth of a perturbed scene, in two label modes.
 
-Two modes. `paper`: the benign labels, whatever moved. `moved`: the benign box plus the change of the projected,
-deformed mesh, and likewise for truncation and occlusion, so that at theta = 0 it *is* the benign label (KITTI's
-hand-drawn boxes meet projected ones at a mean IoU of 0.975 only).
+`paper`: the benign labels, wherever objects move. `moved`: the benign box plus the change of the projected, deformed
+mesh, and likewise for truncation and occlusion, so that at theta = 0 it equals the benign label (KITTI's hand-drawn
+boxes match projected ones only at a mean IoU of 0.975).
 """
 
 from __future__ import annotations
@@ -26,61 +26,68 @@ from scene_ir.types import LATTICE, Category, Labels, Mesh, Render, SceneIR
 Array = NDArray[np.float64]
 Levels = NDArray[np.int64]
 Values = NDArray[np.floating[Any]]
-"""Of the labels' own dtype, float32 or float64."""
+"""Arrays in the labels' dtype, float32 or float64."""
 LabelMode = Literal["paper", "moved"]
 LABEL_MODES: tuple[LabelMode, ...] = ("paper", "moved")
 
 _NEAR_M = 0.1
 """Meshes are cut at this distance from the camera plane before they are projected."""
 _OCCLUSION_BOUNDS = np.array([0.0, 0.1, 0.5, 1.0])
-"""Hidden share of a car at which KITTI's levels 0 (fully visible), 1 (partly), 2 (largely) begin; KITTI names no
-numbers, these are ours. Level 3 (unknown) never changes."""
-_SHOWED, _SHOWS = 0.25, 0.1
-"""Of a car that showed at least the first share of itself, at least the second must still show. Below, a car that
-is nearly hidden from the start would hold back all others by a few pixels."""
+"""Hidden shares at which KITTI's levels 0 (fully visible), 1 (partly), 2 (largely) begin. The numbers are a choice:
+KITTI gives none. Level 3 (unknown) never changes."""
+_VISIBLE_BEFORE, _VISIBLE_NOW = 0.25, 0.1
+"""An object with at least the first visible share in the benign scene must keep the second. A lower first share would
+let a few pixels of a nearly hidden car block all others."""
 _OPAQUE = 0.5
 """Opacity from which a pixel belongs to an object, as in `Render.object_id`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difficulty:
-    """Which objects are judged; the others are ignored, neither missed nor hit. Defaults: KITTI's "moderate", and
-    what a person can see (`contrast`), as far as there are pictures; a min_contrast of 0 leaves that out.
+    """Which objects are evaluated; the others are ignored, neither missed nor hit. Defaults: KITTI's "moderate", and
+    what a person can see.
     """
 
     min_height_px: float = 25.0
+    """Minimum height of a box."""
     max_occlusion: int = 1
+    """Maximum occlusion level of KITTI, 0 to 3."""
     max_truncation: float = 0.3
+    """Maximum share outside of the picture."""
     min_contrast: float = MIN_CONTRAST
+    """Minimum contrast in renders (`compute_contrasts`); 0: no condition."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneLabels:
-    """Labels of one scene in one mode, object by object (the i-th row is object i).
-
-    boxes_xyxy (N, 4) px; category (N,) int64; truncation (N,) in [0, 1]; occlusion (N,) int64, 0 to 3;
-    ignore (N,) bool: too hard in the benign scene, or now. became_ignored (N,) bool: only now.
-    became_counted (N,) bool: too hard in the benign scene, no longer now (still ignored, so that benign and
-    attacked figures are over the same objects). out_of_sight (N,) bool: showed in the benign scene, and is behind
-    others now. regions_xyxy (K, 4) px: no detection is judged there. in_view (N,) bool: not behind the camera,
-    where those stand that are not in the scene.
-    """
+    """Labels of one scene in one mode; row i belongs to object i."""
 
     mode: LabelMode
+    """The mode."""
     boxes_xyxy: Tensor
+    """(N, 4) px."""
     category: Tensor
+    """(N,) int64."""
     truncation: Tensor
+    """(N,), share outside of the picture, in [0, 1]."""
     occlusion: Tensor
+    """(N,) int64, KITTI's level, 0 to 3."""
     ignore: Tensor
+    """(N,) bool, too hard in the benign scene or now."""
     became_ignored: Tensor
+    """(N,) bool, too hard only now."""
     became_counted: Tensor
+    """(N,) bool, too hard only in the benign scene; still ignored, so that both scenes have the same objects."""
     out_of_sight: Tensor
+    """(N,) bool, visible in the benign scene, behind others now."""
     regions_xyxy: Tensor
+    """(K, 4) px, regions in which no detection is evaluated."""
     in_view: Tensor
+    """(N,) bool, in front of the camera; objects that are not in the scene are behind it."""
 
     @property
     def targets(self) -> Targets:
-        """For detectors and evaluation: the objects in order, then every region once for each class, ignored."""
+        """Targets of detectors and evaluation: the objects, then each region once for each class, ignored."""
         classes, regions = len(CLASSES), len(self.regions_xyxy)
         boxes = torch.cat(
             [self.boxes_xyxy, self.regions_xyxy.repeat_interleave(classes, dim=0).to(self.boxes_xyxy)]
@@ -91,9 +98,9 @@ class SceneLabels:
 
 
 class Labeller:
-    """Labels scenes that differ from `base` by theta only. Carries no gradient: what a loss aims at is constant.
+    """Labels scenes that differ from `base` by theta only; without gradient.
 
-    base_render: the benign re-render; without it occlusion is taken as unchanged, and all is taken to be seen.
+    Without `base_render`, the benign re-render, occlusion counts as unchanged and all objects as visible.
     """
 
     def __init__(
@@ -101,15 +108,15 @@ class Labeller:
     ) -> None:
         self.base = base
         self.difficulty = difficulty or Difficulty()
-        self._outlines: dict[int, tuple[Mesh, _Outline]] = {}
+        self._projected_meshes: dict[int, tuple[Mesh, _ProjectedMesh]] = {}
         objects, camera = base.objects, base.camera
         self._limit = np.array([camera.width - 1.0, camera.height - 1.0] * 2)
         self._boxes = self._project(base)
         self._absent = ~_any_area(self._boxes)
-        """(N,): what comes with a change, and was not in the picture before."""
+        """(N,) bool, objects that a change adds, which are not in the benign picture."""
         self._inside = self._clipped(self._boxes)
         self._outside = _outside(self._boxes, self._inside)
-        self._hidden = None if base_render is None else _hidden_shares(base_render)
+        self._hidden = None if base_render is None else hidden_shares(base_render)
         self._box2d = objects.box2d.detach().cpu().numpy()
         self._truncation = objects.truncation.detach().cpu().numpy()
         self._occlusion = objects.occlusion.cpu().numpy()
@@ -137,7 +144,7 @@ class Labeller:
         return self._paper
 
     def moved(self, perturbed: SceneIR, render: Render | None = None) -> SceneLabels:
-        """Labels that went along with the cars. Raises ShapeError where `perturbed` has other objects."""
+        """Labels that follow the objects. Raises ShapeError where `perturbed` has other objects."""
         if len(perturbed.objects) != len(self.base.objects):
             raise ShapeError("perturbed.objects", f"{len(self.base.objects)} objects", len(perturbed.objects))
         whole = self._project(perturbed)
@@ -153,10 +160,10 @@ class Labeller:
         occlusion, gone = self._occlusion, np.zeros_like(self._ignore)
         out_of_sight = gone
         if self._hidden is not None and render is not None:
-            hidden = _hidden_shares(render)
+            hidden = hidden_shares(render)
             occlusion = _new_occlusion(self._occlusion, np.where(self._absent, 0.0, self._hidden), hidden)
             gone = (hidden >= 1) & (self._hidden < 1)
-            out_of_sight = (self._hidden <= 1 - _SHOWED) & (hidden > 1 - _SHOWS) & in_view
+            out_of_sight = (self._hidden <= 1 - _VISIBLE_BEFORE) & (hidden > 1 - _VISIBLE_NOW) & in_view
         hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render) | ~in_view
         device = self._paper.boxes_xyxy.device
         return SceneLabels(
@@ -174,17 +181,26 @@ class Labeller:
         )
 
     def labels(self, mode: LabelMode, perturbed: SceneIR, render: Render | None = None) -> SceneLabels:
-        """`paper` or `moved` labels. Raises RangeError on another mode."""
+        """Labels of a perturbed scene.
+
+        Args:
+            mode: `paper` or `moved`.
+            perturbed: the scene.
+            render: its render; see `Labeller`.
+
+        Raises:
+            RangeError: another mode.
+        """
         if mode not in LABEL_MODES:
             raise RangeError("label mode", f"one of {', '.join(LABEL_MODES)}", repr(mode))
         return self.paper() if mode == "paper" else self.moved(perturbed, render)
 
     def _clipped(self, boxes_xyxy: Array) -> Array:
-        # The same as `geometry.clip_boxes`, in numpy: `np.clip` takes ten times as long on so few numbers.
+        # Like `geometry.clip_boxes`, in numpy: `np.clip` takes ten times as long on so few numbers.
         return np.minimum(np.maximum(boxes_xyxy, 0), self._limit)
 
     def _too_hard(self, boxes_xyxy: Values, truncation: Values, occlusion: Levels) -> NDArray[np.bool_]:
-        """(N,) bool: what the difficulty leaves out, and boxes without an area."""
+        """(N,) bool: objects outside of the difficulty, and boxes without an area."""
         size = boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]
         return (
             (size[:, 1] < self.difficulty.min_height_px)
@@ -194,52 +210,32 @@ class Labeller:
         )
 
     def _faint(self, render: Render | None) -> NDArray[np.bool_]:
-        """(N,) bool: what a person can hardly see in a render."""
+        """(N,) bool: objects that a person can hardly see in a render."""
         if self._hidden is None or render is None or self.difficulty.min_contrast == 0:
             return np.zeros(len(self._box2d), np.bool_)
         return compute_contrasts(render) < self.difficulty.min_contrast
 
-    def _outline(self, mesh: Mesh) -> _Outline:
-        # Kept beside its mesh, whose number would else be given to another one.
-        if id(mesh) not in self._outlines:
-            self._outlines[id(mesh)] = (mesh, _Outline.of(mesh))
-        return self._outlines[id(mesh)][1]
+    def _projected_mesh(self, mesh: Mesh) -> _ProjectedMesh:
+        # The mesh is stored too: otherwise its id could be reused by another one.
+        if id(mesh) not in self._projected_meshes:
+            self._projected_meshes[id(mesh)] = (mesh, _ProjectedMesh.from_mesh(mesh))
+        return self._projected_meshes[id(mesh)][1]
 
     def _project(self, scene: SceneIR) -> Array:
         """Tight boxes (N, 4) px of the deformed meshes, cut at the near plane, not at the image border."""
         objects = scene.objects
         parts = (objects.ffd, objects.size_lhw, objects.yaw, objects.translation, scene.camera.matrix)
         offsets, size, yaw, translation, matrix = (t.detach().cpu().double() for t in parts)
-        # Placing and projecting are affine: done to the lattice, they are done to all that it carries.
+        # Placing and projecting are affine, so they are applied to the lattice instead of each vertex.
         control = to_clip(place_vertices(_LATTICE_AT_REST + offsets, size, yaw, translation), matrix)
         nets = control.transpose(1, 2).contiguous().numpy()
         meshes = [scene.meshes[index] for index in objects.mesh_index.tolist()]
-        boxes = [self._outline(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
+        boxes = [self._projected_mesh(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
         return np.array(boxes, dtype=np.float64).reshape(-1, 4)
 
 
-def targets(
-    base_scene: SceneIR,
-    perturbed_scene: SceneIR,
-    mode: LabelMode = "moved",
-    base_render: Render | None = None,
-    render: Render | None = None,
-    difficulty: Difficulty | None = None,
-) -> SceneLabels:
-    """Labels of a perturbed scene, for a single call; keep a `Labeller` where one scene is labelled more often.
-
-    Not differentiable. Without the two renders occlusion is taken as unchanged, and all is taken to be seen.
-    """
-    return Labeller(base_scene, base_render, difficulty).labels(mode, perturbed_scene, render)
-
-
-def hidden_shares(render: Render) -> Tensor:
-    """Share (N,) float64 of each object's own pixels that are not its own in the image; 1 where it has none."""
-    return torch.from_numpy(_hidden_shares(render)).to(render.object_id.device)
-
-
 def visible_boxes(render: Render) -> Tensor:
-    """The box (N, 4) px of what shows of each object; zeros where nothing does."""
+    """Boxes (N, 4) px of the visible pixels of each object; zeros where there are none."""
     ids = render.object_id.cpu().numpy()
     boxes = np.zeros((len(render.opacity), 4), dtype=np.float32)
     for i, crop in enumerate(render.opacity):
@@ -251,13 +247,14 @@ def visible_boxes(render: Render) -> Tensor:
     return torch.from_numpy(boxes).to(render.object_id.device)
 
 
-def _hidden_shares(render: Render) -> Array:
+def hidden_shares(render: Render) -> Array:
+    """Share (N,) of each object's pixels that others hide; 1 for objects without pixels."""
     ids = render.object_id.cpu().numpy()
     shares: list[float] = []
     for i, crop in enumerate(render.opacity):
         opacity = crop.values[0].detach().cpu().numpy()
         own = int(np.count_nonzero(opacity >= _OPAQUE))
-        # A pixel that shows the object is one of its own, and those lie in its crop.
+        # All pixels of the object lie in its crop.
         window = ids[crop.y0 : crop.y0 + opacity.shape[0], crop.x0 : crop.x0 + opacity.shape[1]]
         seen = int(np.count_nonzero(window == i + 1))
         shares.append(min(max(1 - seen / own, 0.0), 1.0) if own else 1.0)
@@ -267,11 +264,16 @@ def _hidden_shares(render: Render) -> Array:
 def to_kitti_labels(
     labels: SceneLabels, base: SceneIR, perturbed: SceneIR, kinds: Sequence[str] | None = None
 ) -> Labels:
-    """Labels of one mode as a KITTI file holds them: `paper` with the base's 3D boxes, `moved` with the new ones,
-    of objects that are in view.
+    """Labels in the form of a KITTI file, of objects in view.
 
-    A moved 3D box follows the pose and the change of the deformed mesh's extents; where nothing changed it is the
-    base's to the bit. kinds: the types as labelled (a Van counts as a Car); else those of the categories.
+    A moved 3D box follows the pose and the change of the deformed mesh's extents; without a change it equals the
+    base's to the bit.
+
+    Args:
+        labels: labels of one mode: `paper` takes the base's 3D boxes, `moved` the perturbed ones.
+        base: the benign scene.
+        perturbed: the labelled scene.
+        kinds: types as labelled (a Van counts as a Car); None: those of the categories.
     """
     names = tuple(kinds) if kinds is not None else tuple(_kind(c) for c in labels.category.tolist())
     rows = labels.in_view
@@ -300,10 +302,10 @@ def to_kitti_labels(
 
 
 def append_other_labels(labels: Labels, others: Labels | None) -> Labels:
-    """Labels of a scene's vehicles, and of what it leaves as it is (`SceneIR.others`: people, trams), as objects.
+    """Labels with other objects of the scene (`SceneIR.others`: people, trams) appended as objects.
 
-    `to_kitti_labels` and a run's files tell of these as regions, after those of the labels. None, of scenes that
-    do not know: the labels as they are. Where a vehicle that moved now hides a person is not told.
+    `to_kitti_labels` and a run's files list these as regions, after those of the labels. The labels stay unchanged
+    for None. It is unknown whether a moved vehicle hides a person.
     """
     if others is None:
         return labels
@@ -331,25 +333,27 @@ _SLICE = LATTICE[1] * LATTICE[2]
 _LATTICE_AT_REST = torch.cartesian_prod(
     *(torch.linspace(0, 1, n, dtype=torch.float64) for n in LATTICE)
 ) - torch.tensor([0.5, 1.0, 0.5], dtype=torch.float64)
-"""Where the lattice points (64, 3) lie in the unit box. Bernstein polynomials reproduce linear functions, so the
-weighted sum of these positions is the vertex itself."""
+"""Lattice points (64, 3) in the unit box. Bernstein polynomials reproduce linear functions, so the weighted sum of
+these positions is the vertex itself."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Outline:
-    """What the image box of a mesh needs of it, at its K distinct vertices (parts of a mesh repeat shared ones).
+class _ProjectedMesh:
+    """A mesh's K distinct vertices (parts of a mesh repeat shared ones) as lattice weights, for its image box.
 
-    along (4, K), across (16, K): weights of the lattice's slices along the length, and of the points in a slice;
-    their products are those of `ffd.lattice_weights`, in a third of the memory, which is what takes the time.
-    faces: (F, 3) int64 into the distinct vertices.
+    The products of `along` and `across` are those of `ffd.lattice_weights`, in a third of the memory, which takes
+    most of the time.
     """
 
     along: Array
+    """(4, K), weights of the lattice's slices along the length."""
     across: Array
+    """(16, K), weights of the points in a slice."""
     faces: NDArray[np.int64]
+    """(F, 3), indices of the distinct vertices."""
 
     @classmethod
-    def of(cls, mesh: Mesh) -> _Outline:
+    def from_mesh(cls, mesh: Mesh) -> _ProjectedMesh:
         vertices, inverse = np.unique(mesh.vertices.detach().cpu().double().numpy(), axis=0, return_inverse=True)
         weights = ffd.lattice_weights(torch.from_numpy(vertices)).numpy().reshape(-1, LATTICE[0], _SLICE)
         # Each factor of the weights sums to 1.
@@ -358,7 +362,7 @@ class _Outline:
         return cls(np.ascontiguousarray(along.T), np.ascontiguousarray(across.T), faces)
 
     def image_box(self, net: Array) -> tuple[float, ...]:
-        """Tight box px, xyxy, under a lattice (3, 64) in clip space; zeros where all is behind the near plane."""
+        """Tight box xyxy px under a lattice (3, 64) in clip space; zeros where all is behind the near plane."""
         slices = net.reshape(-1, _SLICE) @ self.across
         clip = np.einsum("cik,ik->ck", slices.reshape(3, LATTICE[0], -1), self.along)
         if not clip.shape[1] or clip[2].min() < _NEAR_M:
@@ -369,7 +373,7 @@ class _Outline:
         return (*pixels.min(axis=1).tolist(), *pixels.max(axis=1).tolist())
 
     def _in_front(self, clip: Array) -> Array:
-        """Vertices (3, K) in front of the near plane, and where the edges pass through it: (3, K')."""
+        """Vertices (3, K') in front of the near plane, and intersections of the edges with it."""
         front = clip[2] >= _NEAR_M
         edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         edges = edges[front[edges[:, 0]] != front[edges[:, 1]]]
@@ -379,7 +383,7 @@ class _Outline:
 
 
 def _outside(whole_xyxy: Array, inside_xyxy: Array) -> Array:
-    """Share (N,) of each box that the image's border cuts off."""
+    """Share (N,) of each box outside of the picture."""
     return 1 - _area(inside_xyxy) / np.maximum(_area(whole_xyxy), 1e-9)
 
 
@@ -393,10 +397,10 @@ def _area(boxes_xyxy: Array) -> Array:
 
 
 def _new_occlusion(level: Levels, hidden0: Array, hidden: Array) -> Levels:
-    """KITTI levels (N,) after the hidden share went from hidden0 to hidden, both (N,).
+    """KITTI levels (N,) after the hidden share changed from hidden0 to hidden, both (N,).
 
-    The labelled level counts what the render cannot know (trees, poles): the share starts inside the labelled
-    level's range and moves by the difference. Unchanged shares keep their level.
+    The labelled level includes occluders that the render lacks (trees, poles): the share starts inside the labelled
+    level's range and changes by the difference. Unchanged shares keep their level.
     """
     known = np.minimum(level, 2)
     start = np.clip(hidden0, _OCCLUSION_BOUNDS[known], _OCCLUSION_BOUNDS[known + 1])

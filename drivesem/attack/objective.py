@@ -21,10 +21,9 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty, Labeller, LabelMode, SceneLabels
 from drivesem.attack.methods.base import GRADIENT_PASSES, MarginOracle, ParameterGroup, Problem, Score
 from drivesem.attack.space import Parameter, ParameterSpace
-from drivesem.attack.targets import ALL_TARGETS, EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attack.targets import EvaluatedClasses, TargetSelection, resolve_t_star
 from drivesem.attack.visibility import VisibilityUnderWeather
 from drivesem.config.commands import AttackConfig
-from drivesem.config.options import DEFAULT_KEEP_MB
 from drivesem.evaluation import failures
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
@@ -68,53 +67,41 @@ class Objective:
         compositor: Compositor,
         space: ParameterSpace,
         detector: Predictor,
-        label_mode: LabelMode = "moved",
-        term: str = "objectness",
+        config: AttackConfig | None = None,
         difficulty: Difficulty | None = None,
-        t_star: float | None = None,
-        aim: TargetSelection = ALL_TARGETS,
-        whole: bool = False,
-        keep_mb: float = DEFAULT_KEEP_MB,
     ) -> None:
         """Render and evaluate the benign scene.
 
         Args:
             compositor: renders the scene.
             space: the parameter space of the scene.
-            detector: the detector under attack.
-            label_mode: labels of the loss, constant in its gradient: `moved`, or `paper`, the benign labels, which
-                reward drifting away from the label.
-            term: one of `losses.GOALS`, or a term of `Detector.loss`; a detector without a gradient has
-                GRADIENT_FREE_TERMS only.
+            detector: the detector under attack; one without a gradient has GRADIENT_FREE_TERMS only.
+            config: settings of the loss, the targets and the detector's passes; None: the defaults.
             difficulty: which objects are evaluated.
-            t_star: score from which a detection counts; None: the detector's own.
-            aim: which failures count and are sought; by default all.
-            whole: whether the detector always evaluates whole pictures, instead of only what differs from the
-                benign one (`detectors.incremental`).
-            keep_mb: limit on cached layers in MB, those of `failures.margin_oracle` included.
 
         Raises:
             DetectorError: the detector knows no cars, or does not provide the candidates that a goal needs.
-            RangeError: there is no such term.
+            RangeError: the detector does not provide the term.
         """
+        config = config or AttackConfig()
         self.compositor = compositor
         self.space = space
         self.detector = detector
-        self.label_mode: LabelMode = label_mode
-        self.term = term
-        self.t_star = resolve_t_star(detector, t_star)
+        self.label_mode: LabelMode = config.objective_labels
+        self.term: str = config.objective
+        self.t_star = resolve_t_star(detector, config.t_star)
         self.classes = EvaluatedClasses.from_detector(detector)
-        self.aim = aim
+        self.aim = TargetSelection.from_options(config.target_objects, config.target_classes)
         self.difficulty = difficulty or Difficulty()
         with torch.no_grad():
             base_render = compositor.render(space.apply(space.scene, space.theta0).origin)
         base = space.scene.origin
         self._labeller = Labeller(base, base_render, self.difficulty)
-        self.keep_mb = keep_mb
+        self.keep_mb = config.keep_mb
         self._whole = True  # the reference comes first
         self._reference: ReferencePass | None = None
         self._benign = self.evaluate_render(base, base_render)
-        self._whole = whole
+        self._whole = config.whole
         self.passes = 1
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
@@ -122,14 +109,12 @@ class Objective:
 
     @property
     def labeller(self) -> Labeller:
-        """What labels the scene's states."""
+        """Labels states of the scene."""
         return self._labeller
 
     @property
     def benign(self) -> RenderEvaluation:
-        """The scene at theta = 0, re-rendered; where vehicles were exchanged, added or taken away, the one
-        before.
-        """
+        """The scene at theta = 0, re-rendered; the one before, where vehicles were exchanged, added or removed."""
         return self._benign
 
     @classmethod
@@ -145,18 +130,8 @@ class Objective:
             difficulty: which objects are evaluated.
         """
         budget, params = parse_budget(config.budget), resolve_parameters(config)
-        return cls(
-            Compositor(scene, RenderSettings(backend=config.backend)),
-            ParameterSpace(scene, params, budget, parametrisation=config.parametrisation),
-            detector,
-            config.objective_labels,
-            config.objective,
-            difficulty,
-            config.t_star,
-            TargetSelection.from_options(config.target_objects, config.target_classes),
-            config.whole,
-            config.keep_mb,
-        )
+        space = ParameterSpace(scene, params, budget, parametrisation=config.parametrisation)
+        return cls(Compositor(scene, RenderSettings(backend=config.backend)), space, detector, config, difficulty)
 
     def __call__(self, theta: Tensor) -> Tensor:
         """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
@@ -245,7 +220,13 @@ class Objective:
     def problem(
         self, feasible: FeasibleSet, keep_last: bool = False, margin_oracle: MarginOracle | None = None
     ) -> Problem:
-        """This objective on a feasible set, as attacks use it; `keep_last`, `margin_oracle`: see `Problem`."""
+        """The problem that attacks solve.
+
+        Args:
+            feasible: the feasible set.
+            keep_last: see `Problem`.
+            margin_oracle: see `Problem`.
+        """
         return Problem(
             loss_and_grad=partial(self.loss_and_grad, feasible=feasible),
             project=feasible.project,
@@ -316,7 +297,13 @@ class Objective:
         return self.classes.map_detections(predict(self.detector, image[None])[0])
 
     def loss_from_predictions(self, raw: AnchorPredictions, scene: SceneIR, render: Render) -> Tensor:
-        """The loss () of one image's predictions, by the labels of its scene and render."""
+        """The loss () of one image's predictions.
+
+        Args:
+            raw: predictions of one image.
+            scene: the state that the image shows.
+            render: its render.
+        """
         labels = self._labeller.labels(self.label_mode, scene, render)
         return self._loss(self.differentiable, raw, labels.targets)
 

@@ -1,7 +1,7 @@
-"""Edits applied to a scene: vehicles moved, turned, bent, painted, removed; other weather and foliage.
+"""Edits of a scene: vehicles moved, turned, bent, painted or removed; weather and foliage changed.
 
-The counterpart for generated streets is `drivesem.synth.edits`; both take the edits of `drivesem.config.edits`.
-Objects are numbered by their row.
+`drivesem.synth.edits` applies the same edits (`drivesem.config.edits`) to generated streets. Objects are numbered by
+their row.
 """
 
 from __future__ import annotations
@@ -19,38 +19,54 @@ from scene_ir.removal import remove_objects
 from scene_ir.types import SceneIR
 
 REMOVED = "removed"
-"""Where a scene's provenance says that vehicles were taken out: nothing is kept of these."""
+"""Provenance key of a scene from which vehicles were removed."""
 
 
 @dataclass(frozen=True, slots=True)
 class EditedScene:
-    """A scene after an edit. removed: rows of the scene before; notes: which vehicles left the ground or the road,
-    or stand in one another: lines as of `check_places`.
-    """
+    """A scene after an edit."""
 
     scene: SceneIR
+    """The scene without the removed vehicles."""
     removed: tuple[int, ...]
+    """Rows of the removed vehicles in the scene before."""
     notes: tuple[str, ...]
+    """Violations that `check_places` found."""
 
 
 def apply_edit(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> EditedScene:
-    """The scene after an edit. bent: as of `moved`. Raises as `moved` does."""
+    """Edit a scene, remove vehicles, and check the positions of the others.
+
+    Args:
+        scene: the scene.
+        edit: the edit.
+        bent: see `apply_changes`.
+
+    Raises:
+        RangeError: see `apply_changes`.
+    """
     removed = [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
     changed = apply_changes(scene, edit, bent)
     notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in removed))
-    left = remove_objects(changed, removed)
+    remaining = remove_objects(changed, removed)
     if removed:
-        left = replace(left, provenance={**left.provenance, REMOVED: "vehicles, by an edit"})
-    return EditedScene(left, tuple(removed), tuple(notes))
+        remaining = replace(remaining, provenance={**remaining.provenance, REMOVED: "vehicles, by an edit"})
+    return EditedScene(remaining, tuple(removed), tuple(notes))
 
 
 def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> SceneIR:
-    """The scene after an edit, with the vehicles that it removes still there (`scene_ir.removal` takes them out).
+    """Edit a scene, but leave removed vehicles in place (`scene_ir.removal` removes them).
 
-    What is said of all objects and of one adds up, and all of it adds to what the scene has: moves on the ground
-    plane, along and across the heading that the vehicle has in `scene`; codes end at the bounds that theta's do.
-    bent: a state of the scene in which its vehicles have the shapes that shares of shapes are of.
-    Raises RangeError where the edit names a row that the scene does not have, or a share where nothing is bent.
+    Edits of all objects and of one add up, and add to the scene's own state. Moves are on the ground plane, along and
+    across the vehicle's heading in `scene`; codes are limited to the bounds of theta.
+
+    Args:
+        scene: the scene.
+        edit: the edit.
+        bent: a state of the scene with changed shapes, for edits that set shares of them.
+
+    Raises:
+        RangeError: the edit names a row that the scene lacks, or a share of a shape without `bent`.
     """
     changes = _by_row(scene, edit)
     objects, environment = scene.objects, scene.environment
@@ -60,35 +76,35 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         return like.new_tensor([[sum(parts) for parts in zip(*row, strict=True)] for row in values])
 
     limits = Budget()
-    touched: dict[str, Tensor] = {}
+    changed_fields: dict[str, Tensor] = {}
     if any(changes):
         length_m = objects.size_lhw[:, 0]
-        own = summed([[(0.0, 0.0), *(c.translate for c in row)] for row in changes])
+        lengths = summed([[(0.0, 0.0), *(c.translate for c in row)] for row in changes])
         metres = summed([[(0.0, 0.0), *(c.translate_m for c in row)] for row in changes])
         axes = ground_axes(objects.yaw, length_m, scene.environment.ground)
-        shift = (own + metres / length_m[:, None])[:, :, None] * axes
+        shift = (lengths + metres / length_m[:, None])[:, :, None] * axes
         turn = summed([[(0.0,), *((c.rotate,) for c in row)] for row in changes])[:, 0]
         none = (0.0,) * ffd.SYMMETRIC_DIM
         bend = summed([[none, *(c.mesh or none for c in row)] for row in changes])
         grown = summed([[(1.0,), *((c.size,) for c in row)] for row in changes])
         paint = summed([[(0.0,) * objects.texture_code.shape[1], *(c.color for c in row)] for row in changes])
-        touched = {
+        changed_fields = {
             "translation": objects.translation + shift.sum(dim=1),
             "yaw": objects.yaw + turn,
-            "ffd": objects.ffd + ffd.from_symmetric(bend) + _shares(scene, changes, bent),
+            "ffd": objects.ffd + ffd.from_symmetric(bend) + _shape_shares(scene, changes, bent),
             "size_lhw": objects.size_lhw * grown,
             "texture_code": (objects.texture_code + paint).clamp(-limits.color, limits.color),
         }
     weather = environment.weather + environment.weather.new_tensor(edit.weather)
     foliage = environment.foliage + environment.foliage.new_tensor(edit.foliage)
-    return scene.with_objects(**touched).with_environment(
+    return scene.with_objects(**changed_fields).with_environment(
         weather=weather.clamp(0.0, limits.weather),
         foliage=foliage.clamp(-limits.foliage, limits.foliage),
         light=(environment.light + environment.light.new_tensor(edit.sun)).clamp(-1.0, 1.0),
     )
 
 
-def _shares(scene: SceneIR, changes: list[list[ObjectEdit]], bent: SceneIR | None) -> Tensor:
+def _shape_shares(scene: SceneIR, changes: list[list[ObjectEdit]], bent: SceneIR | None) -> Tensor:
     """Lattice offsets (N, P, 3) by shares of the shapes of `bent`."""
     ffds = scene.objects.ffd
     share = ffds.new_tensor([sum((c.mesh_fraction for c in row), 0.0) for row in changes])
@@ -102,7 +118,7 @@ def _shares(scene: SceneIR, changes: list[list[ObjectEdit]], bent: SceneIR | Non
 
 
 def _by_row(scene: SceneIR, edit: FrameEdit) -> list[list[ObjectEdit]]:
-    """What happens to each object: what is said of all, then of it."""
+    """The edits of each object: those of all objects, then its own."""
     count = len(scene.objects)
     for key in edit.objects:
         if isinstance(key, int) and key >= count:

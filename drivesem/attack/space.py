@@ -84,7 +84,7 @@ _MAX_TRUNCATION = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limits of the change. Codes are bounded in value, whatever they start from; other limits are distances from
+    """Limits of the change. Codes are bounded in value, regardless of the start; other limits are distances from
     the photographed scene. Where several limits apply, the tightest binds.
     """
 
@@ -137,13 +137,21 @@ class StepSizes:
     """
 
     color: float = 0.05
+    """Code."""
     weather: float = 0.25
+    """Code."""
     foliage: float = 0.10
+    """Code."""
     translate: float = 0.01
+    """Own lengths."""
     rotate: float = 0.01
+    """rad."""
     mesh: float = 0.025
+    """Unit boxes, of a lattice offset."""
     size: float = 0.01
+    """Share of the vehicle's size."""
     sun: float = 0.10
+    """Code."""
 
     def __post_init__(self) -> None:
         _check_positive("steps", self)
@@ -259,12 +267,9 @@ class ParameterSpace(ThetaSpace[Parameter]):
                 continue
             spec = self.specs[parameter]
             shape = (self.count, spec.size) if spec.per_object else (spec.size,)
-            if value is None or tuple(value.shape) != shape:
-                raise ShapeError(
-                    f"perturbation.{parameter.value}",
-                    f"shape {shape}",
-                    None if value is None else tuple(value.shape),
-                )
+            actual = None if value is None else tuple(value.shape)
+            if value is None or actual != shape:
+                raise ShapeError(f"perturbation.{parameter.value}", f"shape {shape}", actual)
             parts.append(value.reshape(-1))
         return torch.cat(parts) if parts else self.theta0
 
@@ -288,21 +293,18 @@ class ParameterSpace(ThetaSpace[Parameter]):
             changes["ffd"] = objects.ffd + ffd.from_symmetric(part.mesh)
         if part.size is not None:
             changes["size_lhw"] = objects.size_lhw * (1 + part.size)
+        budget = self.budget
         if part.color is not None:
-            changes["texture_code"] = _clamp_code(
-                objects.texture_code, part.color, -self.budget.color, self.budget.color
-            )
+            changes["texture_code"] = _clamp_code(objects.texture_code, part.color, -budget.color, budget.color)
         if changes:
             scene = scene.with_objects(**changes)
         codes: dict[str, Tensor] = {}
         if part.weather is not None:
-            codes["weather"] = _clamp_code(environment.weather, part.weather, 0.0, self.budget.weather)
+            codes["weather"] = _clamp_code(environment.weather, part.weather, 0.0, budget.weather)
         if part.foliage is not None:
-            limit = self.budget.foliage
-            codes["foliage"] = _clamp_code(environment.foliage, part.foliage, -limit, limit)
+            codes["foliage"] = _clamp_code(environment.foliage, part.foliage, -budget.foliage, budget.foliage)
         if part.sun is not None:
-            light = environment.light.to(part.sun)
-            codes["light"] = _clamp_code(light, part.sun, -self.budget.sun, self.budget.sun)
+            codes["light"] = _clamp_code(environment.light.to(part.sun), part.sun, -budget.sun, budget.sun)
         return scene.with_environment(**codes) if codes else scene
 
     def _shift_m(self, scene: SceneIR, translate: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
-"""Which of a detector's classes are judged, and from which score on: said once for eval, attacks and transfer.
+"""The evaluated classes, the targeted objects, and the score threshold t* of a detector.
 
-Labels know the classes of `detectors.types.CLASSES`; a detector may know more, fewer, or others. Classes of the
-same name are judged. What a detector says of others counts nowhere, and objects that it has no name for are
-ignored: neither missed nor a hit.
+Labels use `detectors.types.CLASSES`; a detector may have more, fewer, or other classes. Classes of the same name are
+evaluated. Detections of other classes do not count, and objects of a class that the detector lacks are ignored.
 """
 
 from __future__ import annotations
@@ -19,93 +18,97 @@ from drivesem.config.errors import UsageError
 from drivesem.evaluation.failures import FrameFailures
 
 HEADLINE = "Car"
-"""The class that the paper reports; a detector that is judged knows it."""
+"""The class that the paper reports, which every evaluated detector must have."""
 DEFAULT_T_STAR = 0.3
-"""The score from which a detection counts, where a detector has no threshold of its own."""
+"""Score threshold of a detection for detectors without their own."""
+
+
+def resolve_t_star(detector: Predictor, t_star: float | None = None, default: float = DEFAULT_T_STAR) -> float:
+    """The score threshold of a detection.
+
+    Args:
+        detector: has its own threshold, or none.
+        t_star: overrides the detector's own.
+        default: for detectors without their own.
+    """
+    if t_star is not None:
+        return t_star
+    own: float | None = getattr(detector, "t_star", None)
+    return default if own is None else float(own)
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedClasses:
-    """names: the judged classes, in the order of CLASSES; own: all of the detector's, which its labels index."""
+    """The classes of a detector that are evaluated."""
 
     names: tuple[str, ...]
+    """Evaluated classes, in the order of CLASSES."""
     detector_classes: tuple[str, ...]
+    """All classes of the detector, which its labels index."""
 
     @classmethod
     def from_detector(cls, detector: Predictor) -> EvaluatedClasses:
-        """Raises DetectorError where the detector does not know HEADLINE."""
+        """The evaluated classes of a detector. Raises DetectorError where it lacks HEADLINE."""
         own = tuple(detector.classes)
         if HEADLINE not in own:
-            raise DetectorError(f"detector {detector.name}: expected one that knows {HEADLINE}, found {_few(own)}")
+            found = ", ".join(own[:6]) + (", ..." if len(own) > 6 else "")
+            raise DetectorError(f"detector {detector.name}: expected one that knows {HEADLINE}, found {found}")
         return cls(tuple(name for name in CLASSES if name in own), own)
 
-    def map_detections(self, found: Detections) -> Detections:
-        """Detections with labels among the detector's own classes, as those with labels among `names`."""
+    def map_detections(self, detections: Detections) -> Detections:
+        """Detections of the evaluated classes; labels change from the detector's own classes to `names`."""
         if self.detector_classes == self.names:
-            return found
-        label = _places(self.detector_classes, self.names).to(found.labels.device)[found.labels]
-        kept = label >= 0
-        return Detections(found.boxes_xyxy[kept], label[kept], found.scores[kept])
+            return detections
+        labels = _index_map(self.detector_classes, self.names).to(detections.labels.device)[detections.labels]
+        rows = labels >= 0
+        return Detections(detections.boxes_xyxy[rows], labels[rows], detections.scores[rows])
 
     def map_targets(self, targets: Targets) -> Targets:
-        """Targets with labels among CLASSES, as those with labels among `names`.
+        """Targets with labels among `names` instead of CLASSES; rows stay in order.
 
-        The i-th row stays the i-th. An object of no judged class is ignored for each of them, in further rows at
-        the end.
+        An object of another class is ignored for each of `names`, in additional rows at the end.
         """
         if self.names == CLASSES:
             return targets
-        label = _places(CLASSES, self.names).to(targets.labels.device)[targets.labels]
-        foreign = label < 0
+        labels = _index_map(CLASSES, self.names).to(targets.labels.device)[targets.labels]
+        foreign = labels < 0
         others = len(self.names) - 1
-        further = torch.arange(1, others + 1, device=label.device).repeat(int(foreign.sum()))
+        additional = torch.arange(1, others + 1, device=labels.device).repeat(int(foreign.sum()))
         return Targets(
             boxes_xyxy=torch.cat([targets.boxes_xyxy, targets.boxes_xyxy[foreign].repeat_interleave(others, 0)]),
-            labels=torch.cat([label.clamp_min(0), further]),
-            ignore=torch.cat([targets.ignore | foreign, torch.ones_like(further, dtype=torch.bool)]),
+            labels=torch.cat([labels.clamp_min(0), additional]),
+            ignore=torch.cat([targets.ignore | foreign, torch.ones_like(additional, dtype=torch.bool)]),
         )
 
     def to_detector_targets(self, targets: Targets) -> Targets:
-        """Targets with labels among `names`, as the detector's loss takes them: labels among its own classes."""
+        """Targets for the detector's loss: labels change from `names` to its own classes."""
         if self.detector_classes == self.names:
             return targets
-        label = _places(self.names, self.detector_classes).to(targets.labels.device)[targets.labels]
-        return Targets(targets.boxes_xyxy, label, targets.ignore)
+        labels = _index_map(self.names, self.detector_classes).to(targets.labels.device)[targets.labels]
+        return Targets(targets.boxes_xyxy, labels, targets.ignore)
 
 
-def resolve_t_star(detector: Predictor, asked: float | None = None, otherwise: float = DEFAULT_T_STAR) -> float:
-    """The score from which a detection counts: as asked, else the detector's own, else `otherwise`."""
-    if asked is not None:
-        return asked
-    own: float | None = getattr(detector, "t_star", None)
-    return otherwise if own is None else float(own)
-
-
-def _places(names: Sequence[str], among: Sequence[str]) -> Tensor:
-    """Where each of `names` stands among others (N,) int64; -1 where it is none of them."""
-    return torch.tensor([among.index(name) if name in among else -1 for name in names])
-
-
-def _few(names: Sequence[str], most: int = 6) -> str:
-    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+def _index_map(names: Sequence[str], others: Sequence[str]) -> Tensor:
+    """Index (N,) int64 of each of `names` in `others`; -1 where it is missing."""
+    return torch.tensor([others.index(name) if name in others else -1 for name in names])
 
 
 @dataclass(frozen=True, slots=True)
 class TargetSelection:
-    """objects: indices of the scene's objects; classes: names among CLASSES; None is all of them.
-
-    Of others, what is lost counts as no failure, and no attack asks for it. Where objects are chosen and no
-    class, no phantom counts: the attack is after these objects.
+    """The objects and classes that an attack targets; failures of others do not count. With targeted objects and no
+    targeted class, no phantom counts.
     """
 
     objects: tuple[int, ...] | None = None
+    """Indices of the scene's objects; None: all."""
     classes: tuple[str, ...] | None = None
+    """Names among CLASSES; None: all."""
 
     @classmethod
     def from_options(cls, objects: str | None, classes: str | None) -> TargetSelection:
-        """Of a command's words, with commas. Raises UsageError naming the setting."""
-        rows = None if objects is None else _words(objects)
-        names = None if classes is None else _words(classes)
+        """Parse the values of --target-objects and --target-classes. Raises UsageError naming the option."""
+        rows = None if objects is None else _split(objects)
+        names = None if classes is None else _split(classes)
         if rows is not None and not (rows and all(row.isdecimal() for row in rows)):
             raise UsageError("--target-objects", "indices of objects with commas", repr(objects))
         if names is not None and not (names and set(names) <= set(CLASSES)):
@@ -116,46 +119,52 @@ class TargetSelection:
         )
 
     def targets(self, targets: Targets) -> Targets:
-        """Targets with labels among CLASSES, those that are not aimed at ignored. The i-th is object i, as far as
-        there are objects.
+        """Targets with all but the targeted ones ignored. Labels are among CLASSES; the first rows are the scene's
+        objects.
         """
         if self == ALL_TARGETS:
             return targets
-        return Targets(targets.boxes_xyxy, targets.labels, targets.ignore | ~self._aimed_at(targets))
+        return Targets(targets.boxes_xyxy, targets.labels, targets.ignore | ~self._targeted(targets))
 
     def failures(
-        self, found: FrameFailures, targets: Targets, detections: Detections, names: Sequence[str]
+        self, failures: FrameFailures, targets: Targets, detections: Detections, names: Sequence[str]
     ) -> FrameFailures:
-        """Those failures that are aimed at. targets: labels among CLASSES; detections: labels among `names`."""
+        """The failures that are targeted.
+
+        Args:
+            failures: all failures of a frame.
+            targets: labels among CLASSES.
+            detections: labels among `names`.
+            names: the evaluated classes.
+        """
         if self == ALL_TARGETS:
-            return found
-        aimed = self._aimed_at(targets)
-        known = self.classes_of(names)
+            return failures
+        targeted = self._targeted(targets)
+        phantom_classes = self.classes_of(names)
         return FrameFailures(
-            lost=tuple(i for i in found.lost if bool(aimed[i])),
-            phantoms=tuple(i for i in found.phantoms if names[int(detections.labels[i])] in known),
+            lost=tuple(i for i in failures.lost if bool(targeted[i])),
+            phantoms=tuple(i for i in failures.phantoms if names[int(detections.labels[i])] in phantom_classes),
         )
 
     def classes_of(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Those of `names` whose phantoms count."""
+        """The classes among `names` in which phantoms count."""
         if self.classes is not None:
             return tuple(name for name in names if name in self.classes)
         return tuple(names) if self.objects is None else ()
 
-    def _aimed_at(self, targets: Targets) -> Tensor:
-        """(M,) bool."""
-        aimed = torch.ones(len(targets), dtype=torch.bool, device=targets.labels.device)
+    def _targeted(self, targets: Targets) -> Tensor:
+        """(M,) bool: which targets are targeted."""
+        targeted = torch.ones(len(targets), dtype=torch.bool, device=targets.labels.device)
         if self.objects is not None:
-            aimed &= torch.isin(torch.arange(len(aimed)), torch.tensor(self.objects)).to(aimed.device)
+            targeted &= torch.isin(torch.arange(len(targeted)), torch.tensor(self.objects)).to(targeted.device)
         if self.classes is not None:
-            aimed &= torch.isin(
-                targets.labels, torch.tensor([CLASSES.index(c) for c in self.classes]).to(targets.labels)
-            )
-        return aimed
+            labels = torch.tensor([CLASSES.index(name) for name in self.classes]).to(targets.labels)
+            targeted &= torch.isin(targets.labels, labels)
+        return targeted
 
 
 ALL_TARGETS = TargetSelection()
 
 
-def _words(text: str) -> list[str]:
+def _split(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]

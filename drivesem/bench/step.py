@@ -18,6 +18,7 @@ from drivesem.attack.space import Parameter, ParameterSpace, combo_parameters
 from drivesem.bench.scenes import BenchScene, build_bench_scene
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
+from drivesem.config.commands import AttackConfig
 from drivesem.config.options import DEFAULT_KEEP_MB
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -256,7 +257,8 @@ class AttackSteps:
         scene = convert_scene(scene, torch.float32, device)
         self.space = ParameterSpace(scene, params)
         self.compositor = Compositor(scene, RenderSettings(lod=lod))
-        self.objective = Objective(self.compositor, self.space, detector, term=_TERM, whole=whole, keep_mb=keep_mb)
+        config = AttackConfig(objective=_TERM, whole=whole, keep_mb=keep_mb)
+        self.objective = Objective(self.compositor, self.space, detector, config)
         self.feasible = FeasibleSet(self.space)
         self.detector = detector
         with torch.no_grad():

@@ -29,8 +29,7 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
 from drivesem.attack.methods.climb import Climb
-from drivesem.attack.methods.fgsm import FGSM
-from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
+from drivesem.attack.methods.gradient_ascent import FGSM, SGD, SiFGSM
 from drivesem.attack.methods.gradient_free import CMAES, Sampling
 from drivesem.attack.methods.margin_search import FIRST_HELD_OUT_SAMPLE, Corners, MarginSearch, margin_objective
 from drivesem.attack.methods.placebo import FixedTheta, Placebo
@@ -57,7 +56,7 @@ from drivesem.run.manifest import build_manifest
 from drivesem.run.report.runs import write_run_report
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.summary import summarise_frames
-from drivesem.scenes.sources import NoVehicleError, SceneSource, make_ready, open_source
+from drivesem.scenes.sources import NoVehicleError, SceneSource, compile_source_kernels, open_source
 from scene_ir import files
 from scene_ir.errors import RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings
@@ -99,8 +98,12 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
 
 
 def attack_frames(worker: AttackWorker, names: Sequence[str], out: Path) -> RunSummary:
-    """Attack the frames `names` of the worker's source, into the run folder `out`; finished frames stay. Raises as
-    `attack_dataset`.
+    """Attack frames into a run folder; finished frames stay. Raises as `attack_dataset`.
+
+    Args:
+        worker: has the frames in its source.
+        names: the frames.
+        out: the run folder.
     """
     start = time.perf_counter()
     claim_folder(out, worker.config, WRITTEN)
@@ -113,7 +116,7 @@ def _prepare_jobs(worker: AttackWorker, names: Sequence[str], out: Path) -> tupl
     config = worker.config
     pending = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
     if pending and config.backend == "warp" and config.device == "cpu":
-        make_ready(config)
+        compile_source_kernels(config)
     progress = ProgressSettings("attacking frames", show_remaining=True)
     return (
         pending,
@@ -589,7 +592,14 @@ def _run_name(config: AttackConfig, params: tuple[Parameter, ...]) -> str:
 def summarise_run(
     config: AttackConfig, params: tuple[Parameter, ...], detector: Predictor, results: Sequence[FrameResult]
 ) -> RunSummary:
-    """The metrics of a run, as far as they follow from its settings and frames."""
+    """The metrics of a run that follow from its settings and frames.
+
+    Args:
+        config: the settings.
+        params: the attacked parameters.
+        detector: the attacked detector.
+        results: of all frames.
+    """
     t_star = resolve_t_star(detector, config.t_star)
     return RunSummary(
         out="",

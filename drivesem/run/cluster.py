@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
-from drivesem.run.jobs import Start, begin, do, ended
+from drivesem.run.jobs import ProcessStart, raise_process_ended, run_job, start_process
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -35,9 +35,9 @@ _TRIES = 3
 class _RayWorker:
     """Class of the actors. Paths in settings are relative to the working directory of the command."""
 
-    def __init__(self, folder: str, start: Start) -> None:
+    def __init__(self, folder: str, start: ProcessStart) -> None:
         os.chdir(folder)
-        begin(start)
+        start_process(start)
 
     def ready(self) -> None:
         """Return once the worker has been made."""
@@ -45,7 +45,7 @@ class _RayWorker:
     def do(self, job: Any) -> tuple[Any, Exception | None]:
         """Run a job. Returns its result or its error."""
         try:
-            return do(job), None
+            return run_job(job), None
         except Exception as error:
             return None, error
 
@@ -65,7 +65,7 @@ class _ActorState:
 
 
 def run_jobs_on_ray(
-    start: Start, jobs: Sequence[J], config: WorkerOptions
+    start: ProcessStart, jobs: Sequence[J], config: WorkerOptions
 ) -> Iterator[tuple[J, Callable[[], Any]]]:
     """Yield each job, as it completes, with a function that returns its result or raises its error.
 
@@ -139,7 +139,7 @@ def _distribute_jobs(
             if state.job is not None and state.tries + 1 < _TRIES:
                 left.appendleft((state.job, state.tries + 1))
             elif state.job is not None:
-                outcome = ended
+                outcome = raise_process_ended
         if ready and left:
             job, tries = left.popleft()
             pending[state.actor.do.remote(job)] = _ActorState(state.actor, job, tries)

@@ -37,7 +37,7 @@ from drivesem.run.frame import AttackedScene, frame_result, write_frame
 from drivesem.run.report import page, pictures
 from drivesem.run.results import Failure, FrameResult
 from drivesem.run.summary import count_grades
-from drivesem.scenes.scene import Scene, png
+from drivesem.scenes.scene import Scene, encode_png
 from scene_ir.io import to_uint8
 from scene_ir.types import SceneIR
 
@@ -128,9 +128,9 @@ class Counterexample:
         before = pictures.draw_overlay(
             self.photograph, result.targets_benign, result.detections_benign, (), t_star
         )
-        figures = "".join(
+        figure_html = "".join(
             f'<figure style="margin:0;flex:1"><img alt="{name}" style="width:100%" src="data:image/png;base64,'
-            f'{base64.b64encode(png(picture)).decode("ascii")}"/><figcaption>{name}</figcaption></figure>'
+            f'{base64.b64encode(encode_png(picture)).decode("ascii")}"/><figcaption>{name}</figcaption></figure>'
             for name, picture in (("before", before), ("after", marked))
         )
         lines = "".join(f"<li>{escape(_describe_failure(failure))}</li>" for failure in result.failures)
@@ -138,7 +138,7 @@ class Counterexample:
         feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
         grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count) or "no failure"
         head = f"{self.scene.name}: {grades}; {feasible}, {format_count(result.queries, 'query', 'queries')}"
-        return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{figures}</div><ul>{lines}</ul></div>'
+        return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{figure_html}</div><ul>{lines}</ul></div>'
 
 
 def _describe_failure(failure: Failure) -> str:

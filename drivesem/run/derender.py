@@ -1,4 +1,4 @@
-"""Frames of a data set, or one photograph, taken apart: a scene folder for each, resumable."""
+"""De-rendering of a data set's frames or of photographs into scene folders, resumable."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 from drivesem.config.commands import DerenderConfig
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import PRESENTATION, claim_folder
-from drivesem.scenes.sheet import write_scene_sheet
-from drivesem.scenes.sources import SceneSource, make_ready, open_source
+from drivesem.scenes.scene_sheet import write_scene_sheet
+from drivesem.scenes.sources import SceneSource, compile_source_kernels, open_source
 from scene_ir.io import count_objects, load_scene, save_scene
 
 RECORD, SHEET = "scene.json", "sheet.jpg"
@@ -21,33 +21,37 @@ RECORD, SHEET = "scene.json", "sheet.jpg"
 
 @dataclass(frozen=True, slots=True)
 class DerenderSummary:
-    """One frame taken apart. objects: vehicles in its scene; seconds: to take it apart and write it, None where an
-    earlier run did.
-    """
+    """One de-rendered frame."""
 
     objects: int
+    """Number of vehicles in its scene."""
     seconds: float | None
+    """Time to de-render and write it; None for frames of an earlier run."""
 
 
 @dataclass(frozen=True, slots=True)
 class DerenderRunResult:
-    """All frames: in order those that were taken apart, and why others could not be."""
+    """The frames of a run of `drivesem derender`."""
 
     out: Path
+    """Folder of the scenes."""
     frames: dict[str, DerenderSummary]
+    """De-rendered frames, in order."""
     failed: dict[str, str]
+    """Frames that could not be de-rendered, with the reason."""
     seconds: float
+    """Total time."""
 
 
 class FrameDerenderer:
-    """What one process needs: built once, used for many frames."""
+    """Per-process state, built once and reused for all frames."""
 
     def __init__(self, config: DerenderConfig, out: Path) -> None:
         self.config, self.out = config, out
         self.source: SceneSource = open_source(config)
 
     def __call__(self, identifier: str) -> DerenderSummary:
-        """One frame, from the source to its folder. Raises SceneError for a frame that cannot be used."""
+        """De-render a frame into its folder. Raises SceneError for an unusable frame."""
         start = time.perf_counter()
         folder = self.out / identifier
         if self.config.resume and (folder / RECORD).is_file():
@@ -61,9 +65,16 @@ class FrameDerenderer:
         return DerenderSummary(len(scene.objects), seconds)
 
 
-def derender_frames(config: DerenderConfig, begin: Callable[[SceneSource], None]) -> DerenderRunResult:
-    """Take apart the frames that are not there yet. begin: is told the source, before the first frame. Raises
-    UsageError or SceneError for bad input.
+def derender_frames(config: DerenderConfig, on_source: Callable[[SceneSource], None]) -> DerenderRunResult:
+    """De-render the frames that are not in the folder yet.
+
+    Args:
+        config: the settings.
+        on_source: called with the source, before the first frame.
+
+    Raises:
+        UsageError: a setting is invalid.
+        SceneError: the input cannot be read.
     """
     start = time.perf_counter()
     config = replace(config, fit=config.fit and not config.fast, fast=False)
@@ -75,18 +86,16 @@ def derender_frames(config: DerenderConfig, begin: Callable[[SceneSource], None]
     names = list(islice(worker.source.identifiers(), config.limit))
     done: dict[str, DerenderSummary] = {}
     for name in names:
-        whole = config.resume and (out / name / RECORD).is_file()
-        if whole and (not config.sheet or (out / name / SHEET).is_file()):
+        complete = config.resume and (out / name / RECORD).is_file()
+        if complete and (not config.sheet or (out / name / SHEET).is_file()):
             done[name] = DerenderSummary(count_objects(out / name), None)
-    begin(worker.source)
-    todo = [name for name in names if name not in done]
-    if todo:
-        make_ready(config)
-    answers = run_frame_jobs(
-        todo, worker, build, config, ProgressSettings("taking frames apart", show_remaining=True)
-    )
-    done |= answers.results
+    on_source(worker.source)
+    pending = [name for name in names if name not in done]
+    if pending:
+        compile_source_kernels(config)
+    progress = ProgressSettings("de-rendering frames", show_remaining=True)
+    jobs = run_frame_jobs(pending, worker, build, config, progress)
+    done |= jobs.results
     frames = {name: done[name] for name in names if name in done}
-    return DerenderRunResult(
-        out, frames, dict(sorted(answers.failed.items())), round(time.perf_counter() - start, 3)
-    )
+    seconds = round(time.perf_counter() - start, 3)
+    return DerenderRunResult(out, frames, dict(sorted(jobs.failed.items())), seconds)

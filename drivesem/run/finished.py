@@ -18,7 +18,6 @@ from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace
-from drivesem.attack.targets import TargetSelection
 from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
@@ -237,12 +236,7 @@ def rebuild_objective(
         raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
     theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
     compositor = Compositor(scene, RenderSettings(backend=attack.backend))
-    labels, term = attack.objective_labels, attack.objective
-    aim = TargetSelection.from_options(attack.target_objects, attack.target_classes)
-    difficulty = Difficulty(min_contrast=result.min_contrast)
-    return Objective(
-        compositor, space, detector, labels, term, difficulty, attack.t_star, aim, attack.whole, attack.keep_mb
-    ), theta
+    return Objective(compositor, space, detector, attack, Difficulty(min_contrast=result.min_contrast)), theta
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
             check_scene(
                 perturbed.unperturbed(),
                 perturbed,
-                reach=change_limits(objective.space.budget, objective.space.parametrisation),
+                limits=change_limits(objective.space.budget, objective.space.parametrisation),
             )
         ),
         targets_benign=target_records(objective.benign.paper.targets, CLASSES, len(scene.objects)),
@@ -286,7 +286,13 @@ def _grade_fields(grades: FrameGrades | None, which: Literal["lost", "phantoms"]
 
 
 def target_records(targets: Targets, names: tuple[str, ...], objects: int) -> tuple[BoxRecord, ...]:
-    """Targets as records; the first `objects` of them are the scene's objects."""
+    """Targets as records.
+
+    Args:
+        targets: labels among `names`.
+        names: the classes.
+        objects: number of the scene's objects, which are the first targets.
+    """
     rows = zip(targets.boxes_xyxy, targets.labels.tolist(), targets.ignore.tolist(), strict=True)
     return tuple(
         BoxRecord(_xyxy(box), names[label], ignore=ignore, index=i if i < objects else None)

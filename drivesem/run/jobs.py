@@ -1,4 +1,4 @@
-"""What a process does that shares jobs with others, on this machine or on another one."""
+"""Jobs in a worker process, on this machine or another: start, errors, and memory."""
 
 from __future__ import annotations
 
@@ -26,105 +26,117 @@ R = TypeVar("R")
 _work: Callable[[Any], Any] | None = None
 
 
-class UnforeseenError(SceneError):
-    """A defect of drivesem that one job brought to light, and with which a night's work need not end."""
+class InternalError(SceneError):
+    """A defect of drivesem in one job; the others can go on."""
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
-    """How a process begins. build: makes what does a job; threads: of torch; keep_going: see `attempt`; url: of
-    the store to which it brings what it makes, None where another process does.
-    """
+class ProcessStart:
+    """Settings of a worker process."""
 
     build: Callable[[], Callable[[Any], Any]]
+    """Makes the function that does a job."""
     threads: int
+    """Number of torch's threads."""
     keep_going: bool
-    elsewhere: store.RemoteFolder | None = None
+    """See `try_job`."""
+    output: store.RemoteFolder | None = None
+    """Folder to upload results to; None where another process does."""
 
 
-def begin(start: Start) -> None:
-    """Once in a process, before its first job."""
+def start_process(start: ProcessStart) -> None:
+    """Prepare a process, once before its first job."""
     global _work
     keep_freed_memory()
     torch.set_num_threads(start.threads)
-    store.set_output_store(start.elsewhere)
-    _work = partial(attempt, start.build(), start.keep_going)
+    store.set_output_store(start.output)
+    _work = partial(try_job, start.build(), start.keep_going)
 
 
-def do(job: Any) -> Any:
-    """A job, in a process that has begun."""
+def run_job(job: Any) -> Any:
+    """Do a job, in a prepared process."""
     assert _work is not None
     result = _work(job)
-    if (elsewhere := store.output_store()) is not None:
-        elsewhere.upload(now=True)
+    if (output := store.output_store()) is not None:
+        output.upload(now=True)
     return result
 
 
-def attempt(work: Callable[[J], R], keep_going: bool, job: J) -> R:
-    """A job's result. SceneError where the device has no room for it, UsageError for what a user's own detector
-    raised. keep_going: this, and an error for which no input is to blame, becomes UnforeseenError, which says
-    where it arose.
+def try_job(work: Callable[[J], R], keep_going: bool, job: J) -> R:
+    """Do a job and translate its errors.
+
+    Args:
+        work: does the job.
+        keep_going: raise InternalError, with its location, for an error that no input explains, or that a user's own
+            detector raised.
+        job: the job.
+
+    Returns:
+        The job's result.
+
+    Raises:
+        SceneError: the input is bad, or the device is out of memory.
+        UsageError: a user's own detector raised an error.
     """
     try:
         result = work(job)
-        give_back()
+        release_freed_memory()
         return result
     except torch.OutOfMemoryError as error:
-        found = str(error).splitlines()[0]
+        actual = str(error).splitlines()[0]
     except (SceneError, UsageError, DetectorError, WriteError):
         raise
     except Exception as error:
         if not keep_going:
-            if (told := describe_user_error(error)) is not None:
-                raise UsageError("--detector", RAISES_NOTHING, told) from error
+            if (description := describe_user_error(error)) is not None:
+                raise UsageError("--detector", RAISES_NOTHING, description) from error
             raise
         last = traceback.extract_tb(error.__traceback__)[-1]
-        found = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"
-        raise UnforeseenError("drivesem", "no defect of its own", found) from error
-    # Not before the error is gone, which holds what the device has no room for.
+        actual = f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}: {error}"
+        raise InternalError("drivesem", "no defect of its own", actual) from error
+    # After the handler, because the exception holds tensors.
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
-    raise SceneError("--device", "one with memory for this", found)
+    raise SceneError("--device", "one with memory for this", actual)
 
 
-def give_back() -> None:
-    """Hand what is free to the system again: glibc keeps it, in pieces between what lives on from job to job.
-    Nothing happens where there is another C library.
+def release_freed_memory() -> None:
+    """Return free memory to the system: glibc keeps it in pieces between long-lived blocks. Does nothing with
+    another C library.
     """
-    trim = _trim()
+    trim = _malloc_trim()
     if trim is not None:
         trim(0)
 
 
 @cache
-def _trim() -> Callable[[int], int] | None:
+def _malloc_trim() -> Callable[[int], int] | None:
     return getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
 
-def ended() -> NoReturn:
-    """The outcome of a job at which processes ended."""
-    raise UnforeseenError(
-        "drivesem", "a process that lasts", "one that was ended twice, for want of memory perhaps"
-    )
+def raise_process_ended() -> NoReturn:
+    """Raise InternalError: the outcome of a job that ended its process twice."""
+    actual = "one that was ended twice, for want of memory perhaps"
+    raise InternalError("drivesem", "a process that lasts", actual)
 
 
-_LARGEST_MB, _KEPT_MB = 32, 256
-"""Blocks of a layer or a picture are smaller than the first, the most that glibc takes; of what is free, so much
-stays."""
+_MMAP_LIMIT_MB, _FREE_LIMIT_MB = 32, 256
+"""Maximum size of blocks that stay with the process (the most that glibc accepts; layers and pictures are smaller), and
+maximum of its free memory."""
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
 """Source: glibc's malloc.h."""
 
 
 def keep_freed_memory() -> None:
-    """Freed memory stays with the process, up to a limit. By default glibc gives large blocks back to the system,
-    which clears each page of them when the next pass asks for them: a tenth of what a detector's pass takes.
+    """Keep freed memory in the process, up to a limit. By default glibc returns large blocks to the system, which
+    clears each page on the next request: a tenth of the time of a detector pass.
 
-    Where there is another allocator, or the environment says how glibc's is to behave, all stays as it is.
+    Does nothing with another allocator, or where the environment configures glibc's.
     """
-    told = any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ)
-    if told or not sys.platform.startswith("linux"):
+    configured = any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ)
+    if configured or not sys.platform.startswith("linux"):
         return
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:
-        set_option(_MMAP_THRESHOLD, _LARGEST_MB << 20)
-        set_option(_TRIM_THRESHOLD, _KEPT_MB << 20)
+        set_option(_MMAP_THRESHOLD, _MMAP_LIMIT_MB << 20)
+        set_option(_TRIM_THRESHOLD, _FREE_LIMIT_MB << 20)

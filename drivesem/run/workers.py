@@ -22,7 +22,7 @@ import torch
 from drivesem import store
 from drivesem.config.options import WorkerOptions
 from drivesem.run.cluster import run_jobs_on_ray
-from drivesem.run.jobs import Start, attempt, begin, do, ended
+from drivesem.run.jobs import ProcessStart, raise_process_ended, run_job, start_process, try_job
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -37,7 +37,7 @@ def run_jobs(
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     """Yield each job, as it completes, with a function that returns its result or raises its error.
 
-    With `keep_going`, an error that no input explains is raised as UnforeseenError, which names its place. So is a
+    With `keep_going`, an error that no input explains is raised as InternalError, which names its place. So is a
     job that ended its process twice, the second time alone.
 
     Args:
@@ -68,7 +68,7 @@ def _run_jobs(
     apart: bool,
 ) -> Iterator[tuple[J, Callable[[], R]]]:
     if config.engine == "ray":
-        yield from run_jobs_on_ray(Start(build, 1, config.keep_going, store.output_store()), jobs, config)
+        yield from run_jobs_on_ray(ProcessStart(build, 1, config.keep_going, store.output_store()), jobs, config)
         return
     # The number of threads depends on the settings only, as it affects sums, and a resumed run must equal another.
     # It does not exceed torch's own, which OMP_NUM_THREADS limits.
@@ -78,10 +78,10 @@ def _run_jobs(
     try:
         count = min(config.processes, len(jobs))
         if count > 1 or apart:
-            yield from _run_in_processes(Start(build, threads, config.keep_going), jobs, count)
+            yield from _run_in_processes(ProcessStart(build, threads, config.keep_going), jobs, count)
             return
         for job in jobs:
-            yield job, partial(attempt, work, config.keep_going, job)
+            yield job, partial(try_job, work, config.keep_going, job)
     finally:
         torch.set_num_threads(before)  # what follows, such as training, uses all
 
@@ -103,7 +103,7 @@ def _make_plain_worker(work: Callable[[J], R]) -> Callable[[J], R]:
     return work
 
 
-def _run_in_processes(start: Start, jobs: Sequence[J], count: int) -> Iterator[tuple[J, Callable[[], Any]]]:
+def _run_in_processes(start: ProcessStart, jobs: Sequence[J], count: int) -> Iterator[tuple[J, Callable[[], Any]]]:
     left = list(jobs)
     while left:
         lost: list[J] = []
@@ -116,11 +116,11 @@ def _run_in_processes(start: Start, jobs: Sequence[J], count: int) -> Iterator[t
             again: list[J] = []
             yield from _run_in_pool(start, [job], 1, again)
             if again:
-                yield job, ended
+                yield job, raise_process_ended
 
 
 def _run_in_pool(
-    start: Start, jobs: Sequence[J], count: int, lost: list[J]
+    start: ProcessStart, jobs: Sequence[J], count: int, lost: list[J]
 ) -> Iterator[tuple[J, Callable[[], Any]]]:
     """Run jobs in `count` processes. If a process ends unexpectedly, all end, and their jobs are appended to
     `lost`.
@@ -134,12 +134,12 @@ def _run_in_pool(
     try:
         # submit no more jobs than processes, so that pending jobs are running jobs
         with _block_interrupts():
-            pending |= {pool.submit(do, job): job for job in islice(waiting, count)}
+            pending |= {pool.submit(run_job, job): job for job in islice(waiting, count)}
         while pending:
             done, _ = wait(pending, return_when=FIRST_COMPLETED)
             gone = {future for future in done if isinstance(future.exception(), TerminatedWorkerError)}
             if not gone:
-                pending |= {pool.submit(do, job): job for job in islice(waiting, len(done))}
+                pending |= {pool.submit(run_job, job): job for job in islice(waiting, len(done))}
             for future in done - gone:
                 yield pending.pop(future), future.result
             if gone:
@@ -166,10 +166,10 @@ def _block_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_process(parent: int, start: Start) -> None:
+def _start_process(parent: int, start: ProcessStart) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
-    begin(start)
+    start_process(start)
 
 
 def _exit_with_parent(parent: int) -> None:

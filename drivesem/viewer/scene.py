@@ -22,6 +22,7 @@ from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.objective import Objective, RenderEvaluation
 from drivesem.attack.space import Budget
+from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
 from drivesem.report.tables import format_count
 from drivesem.viewer.sliders import SceneSliders, State
@@ -72,7 +73,7 @@ class InteractiveScene:
         self.folder = folder
         self.sliders = SceneSliders(convert_scene(load_scene(folder), None, detector_device(detector)), budget)
         space = self.sliders.space
-        self.objective = Objective(Compositor(self.sliders.rest), space, detector, t_star=t_star)
+        self.objective = Objective(Compositor(self.sliders.rest), space, detector, AttackConfig(t_star=t_star))
         benign = self.objective.benign
         targets = self.objective.classes.map_targets(benign.paper.targets)
         self._found = failures.match_detections(targets, benign.detections, self.objective.t_star).detected

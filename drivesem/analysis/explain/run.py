@@ -323,7 +323,7 @@ def _describe_minimal_change(
         space.scene,
         rendered.scene,
         joint_weather=frame.result.joint_weather,
-        reach=change_limits(space.budget, space.parametrisation),
+        limits=change_limits(space.budget, space.parametrisation),
     )
     return MinimalChange(
         scan=shortened.scan,

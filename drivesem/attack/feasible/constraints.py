@@ -82,7 +82,13 @@ class ConstraintBounds:
 
     @classmethod
     def from_rest(cls, scene: MeasuredScene, cars: VehicleBoxes, limits: FeasibilityLimits) -> ConstraintBounds:
-        """Bounds for vehicles that stand like `cars` at theta = 0."""
+        """Bounds relative to the photographed scene.
+
+        Args:
+            scene: the scene's measures.
+            cars: its vehicles at theta = 0.
+            limits: the limits.
+        """
         everyone = np.arange(len(cars.turn))
         view = scene.camera.project(cars, everyone)
         road, sight = scene.road.measure_share(view), scene.sight.measure(cars, everyone)
@@ -207,7 +213,16 @@ def _parts(numbers: Turns) -> Array:
 
 
 def footprint_overlaps(cars: VehicleBoxes, i: Indices, j: Indices) -> Array:
-    """Areas (K,) m2 shared by the footprints of vehicles i and j (K,)."""
+    """Areas shared by the footprints of pairs of vehicles.
+
+    Args:
+        cars: the vehicles.
+        i: (K,), first vehicle of each pair.
+        j: (K,), second vehicle of each pair.
+
+    Returns:
+        (K,) m2.
+    """
     half, centre = 0.5 * (cars.high - cars.low), footprint_centres(cars)
     corners = half[:, :1] * [1, 1, -1, -1] + 1j * half[:, 2:] * [1, -1, -1, 1]
     corners = centre[:, None] + cars.turn.conj()[:, None] * corners

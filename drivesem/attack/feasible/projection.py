@@ -42,7 +42,6 @@ from drivesem.attack.feasible.vehicles import (
 from drivesem.attack.feasible.weather import FindInvisible, WeatherSet
 from drivesem.attack.space import Parameter, ParameterSpace, behind_camera, ground_axes
 from drivesem.attack.theta import ProjectedTheta
-from scene_ir.errors import RangeError
 
 _HALVINGS = 5
 """Bisection steps for the scale of a block, to 1/32."""
@@ -113,13 +112,8 @@ class FeasibleSet:
         rotation and translation are restored in turn as far as all constraints allow. Raises ShapeError;
         RangeError naming a coordinate that is not finite.
         """
-        self.space.unflatten(theta)
-        values = theta.detach().cpu().numpy()
-        finite = np.isfinite(values)
-        if not finite.all():
-            i = int(np.flatnonzero(~finite)[0])
-            raise RangeError(f"theta: {self.space.name(i)}", "a finite value", float(values[i]))
-        result, active = self._project(values)
+        self.space.check(theta)
+        result, active = self._project(theta.detach().cpu().numpy())
         # theta has the dtype and device of the scene.
         return ProjectedTheta(torch.from_numpy(result).to(theta), tuple(active))
 

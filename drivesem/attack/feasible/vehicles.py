@@ -45,7 +45,14 @@ class VehicleBoxes:
 
     @classmethod
     def from_poses(cls, low: Array, high: Array, yaw: Array, translation: Array) -> VehicleBoxes:
-        """Boxes with bounds low, high (N, 3) m at yaw (N,) rad and translation (N, 3) m."""
+        """Boxes of vehicles, not yet projected into a picture.
+
+        Args:
+            low: (N, 3) m, lower bounds in vehicle axes.
+            high: (N, 3) m, upper bounds.
+            yaw: (N,) rad.
+            translation: (N, 3) m.
+        """
         n = len(yaw)
         return cls(low, high, unit_complex(yaw), translation, np.zeros((n, 4)), np.zeros(n), np.zeros(n))
 

@@ -1,10 +1,9 @@
-"""A search for failures that hold: it lowers the expected margin of each object, not the loss of one picture.
+"""Climb: a search for failures that hold, which lowers the expected margin of each object over nuisance samples.
 
-What a camera does between two frames turns a margin by a good part of a logit, and a point gradient of a car's
-place is mostly the phase of its edges in the pixels. So margins are seen in draws (`Views`), first at corners and
-samples of all of the bounds, the best of each object put together; then downhill, by gradients where these tell
-what a wide step does, and by wide two-sided differences where they do not. Objects are nearly independent: one
-pass tries another change of each.
+Between two frames a camera's nuisances change a margin by a good part of a logit, and a point gradient of a car's
+position is mostly the phase of its edges in the pixels. So the search first samples all of the bounds and combines
+the best point of each object; then it descends, by gradients where they predict wide steps, and by wide two-sided
+differences elsewhere. Objects are nearly independent: one pass tests another change of each.
 """
 
 from __future__ import annotations
@@ -16,128 +15,135 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.methods.margin_search import (
-    FAR,
     FINAL_PASSES,
-    SURE,
+    MARGIN_CEILING,
+    MARGIN_FLOOR,
     MarginSearch,
     MarginSearchState,
     balanced_corners,
 )
 
-_SCOUTS = 0.4
-"""Share of the passes that look around."""
-_REACH = 0.2
+_START_SHARE = 0.4
+"""Share of the passes that choose the start."""
+_DIFFERENCE_REACH = 0.2
 """Half the width of differences, as a share of the bounds."""
 _STEP = 0.15
 """First step, as a share of the bounds; the last is a fifth of it."""
 _SMOOTHING = 0.05
 """Standard deviation of theta in gradients, as a share of the bounds."""
-_KEPT = 0.5
-"""Of a slope, what stays after each further estimate."""
+_DECAY = 0.5
+"""Weight of earlier estimates in a moving average."""
 
 
 @dataclass(frozen=True, slots=True)
 class Climb(MarginSearch):
-    """gradient: whether to ask for gradients at all; a detector without one is searched by differences alone."""
+    """Samples the bounds, then descends on margins."""
 
     gradient: bool = True
+    """Whether to use gradients where the detector has one."""
 
-    def _found(self, search: MarginSearchState) -> Tensor:
-        place = _look_around(search, max(int(_SCOUTS * self.passes), 1))
-        return _Descent(search, self.gradient and search.views.differentiable).descend(place)
-
-
-def _look_around(search: MarginSearchState, count: int) -> Tensor:
-    """Where to begin, u (K,): of `count` places, and of what the best of each object make together, the one with
-    the lowest margins.
-    """
-    starts = search.candidates(_scouts(search, count))
-    number = search.number()
-    tried = [search.value(search.margins(place, number)) for place in starts]
-    return starts[min(range(len(starts)), key=tried.__getitem__)]
+    def _search(self, search: MarginSearchState) -> Tensor:
+        start = _choose_start(search, max(int(_START_SHARE * self.passes), 1))
+        return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
 
 
-def _scouts(search: MarginSearchState, count: int) -> Tensor:
-    """Places (count, K): balanced corners and a scrambled Halton sequence in turn."""
-    from scipy.stats import qmc  # on use: it takes a third of a second to load
+def _choose_start(search: MarginSearchState, count: int) -> Tensor:
+    """The start u (K,): the best of the candidates that `count` points give."""
+    starts = search.candidates(_sample_points(search, count))
+    number = search.next_sample()
+    values = [search.objective(search.margins(point, number)) for point in starts]
+    return starts[min(range(len(starts)), key=values.__getitem__)]
 
-    at = search.at
+
+def _sample_points(search: MarginSearchState, count: int) -> Tensor:
+    """Points (count, K): balanced corners and a scrambled Halton sequence alternately."""
+    from scipy.stats import qmc  # imported on use: it takes a third of a second to load
+
+    box = search.box
     rng = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
-    places = torch.from_numpy(qmc.Halton(len(at.owner), scramble=True, rng=rng).random(count))
-    places[::2] = balanced_corners(at.owner, (count + 1) // 2, search.generator)
-    return places.to(at.start)
+    points = torch.from_numpy(qmc.Halton(len(box.owner), scramble=True, rng=rng).random(count))
+    points[::2] = balanced_corners(box.owner, (count + 1) // 2, search.generator)
+    return points.to(box.start)
 
 
 @dataclass(frozen=True, slots=True)
 class _Descent:
-    """The way downhill. gradient: whether to ask for gradients."""
+    """The descent from a start, with or without gradients."""
 
     search: MarginSearchState
     gradient: bool
 
-    def descend(self, place: Tensor) -> Tensor:
-        """From u (K,) downhill until the passes are used up; the last place, or where the search was on average
-        late on, or where it began: what has the lowest margins in draws of its own.
+    def descend(self, point: Tensor) -> Tensor:
+        """Descend from u (K,) until the passes are used up.
+
+        Returns:
+            Of the last point, the mean of the later ones, and the start: the best in held-out nuisance samples.
         """
-        search, at = self.search, self.search.at
-        start, wide = place, at.wide if self.gradient else torch.ones_like(at.wide)
-        cost = (3 if bool((~wide).any()) else 0) + (2 if bool(wide.any()) else 0)
-        steps = max((search.left - FINAL_PASSES) // cost, 0)
-        slope = torch.zeros_like(place)
+        search, box = self.search, self.search.box
+        start, rough = point, box.rough if self.gradient else torch.ones_like(box.rough)
+        any_rough, any_smooth = bool(rough.any()), bool((~rough).any())
+        cost = (3 if any_smooth else 0) + (2 if any_rough else 0)
+        steps = max((search.passes_left - FINAL_PASSES) // cost, 0)
+        slope = torch.zeros_like(point)
         track: list[Tensor] = []
-        margins = torch.full((len(search.views.counted_objects),), FAR, device=place.device)
+        margins = torch.full((len(search.oracle.counted_objects),), MARGIN_CEILING, device=point.device)
         for step in range(steps):
-            number, part = search.number(), torch.zeros_like(place)
-            if bool((~wide).any()):
-                seen, found = self._gradient(place, number, self._weights(margins))
-                part = torch.where(wide, part, found)
-                margins = _KEPT * margins + (1 - _KEPT) * seen.clamp(-FAR, FAR)
-            if bool(wide.any()):
-                part = torch.where(wide, self._differences(place, number, wide, margins), part)
-            slope = _KEPT * slope + (1 - _KEPT) * self._levelled(part)
+            number, estimate = search.next_sample(), torch.zeros_like(point)
+            if any_smooth:
+                step_margins, gradient = self._estimate_gradient(point, number, _object_weights(margins))
+                estimate = torch.where(rough, estimate, gradient)
+                clamped = step_margins.clamp(-MARGIN_CEILING, MARGIN_CEILING)
+                margins = _DECAY * margins + (1 - _DECAY) * clamped
+            if any_rough:
+                differences = self._estimate_differences(point, number, rough, margins)
+                estimate = torch.where(rough, differences, estimate)
+            slope = _DECAY * slope + (1 - _DECAY) * self._normalise_per_object(estimate)
             rate = _STEP * (1 - 0.8 * step / max(steps - 1, 1))
-            place = (place - rate * slope.sign() * slope.abs().clamp_max(1)).clamp(0, 1)
-            track.append(place)
+            point = (point - rate * slope.sign() * slope.abs().clamp_max(1)).clamp(0, 1)
+            track.append(point)
         late = torch.stack(track[len(track) // 2 :]).mean(dim=0) if track else start
-        return search.best([place, late, start])
+        return search.select_best([point, late, start])
 
-    def _gradient(self, place: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-        noise = torch.randn(len(place), generator=self.search.generator).to(place)
-        theta, _ = self.search.theta((place + _SMOOTHING * noise).clamp(0, 1))
-        margins, gradient = self.search.views.margins_and_grad(theta, number, weights)
-        return margins, self.search.at.slope(gradient)
+    def _estimate_gradient(self, point: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Margins (N,) and the gradient (K,) of their weighted sum near u (K,)."""
+        noise = torch.randn(len(point), generator=self.search.generator).to(point)
+        theta, _ = self.search.theta((point + _SMOOTHING * noise).clamp(0, 1))
+        margins, gradient = self.search.oracle.margins_and_grad(theta, number, weights)
+        return margins, self.search.box.slope(gradient)
 
-    def _differences(self, place: Tensor, number: int, wide: Tensor, margins: Tensor) -> Tensor:
-        """Slopes (K,) of each object's margin to its own coordinates, and of all to the scene's, by one step
-        either way in all of them at once: others' steps hardly matter to an object, and average out.
+    def _estimate_differences(self, point: Tensor, number: int, rough: Tensor, margins: Tensor) -> Tensor:
+        """Slopes (K,) of each object's margin in its own coordinates, and of all margins in the scene's.
+
+        One random step either way changes all rough coordinates at once: other objects' steps hardly matter to an
+        object, and average out.
         """
-        way = (torch.randint(0, 2, (len(place),), generator=self.search.generator) * 2.0 - 1).to(place) * wide.to(
-            place
+        owner = self.search.box.owner
+        signs = torch.randint(0, 2, (len(point),), generator=self.search.generator) * 2.0 - 1
+        direction = signs.to(point) * rough.to(point)
+        ahead, behind = ((point + sign * _DIFFERENCE_REACH * direction).clamp(0, 1) for sign in (1, -1))
+        margins_ahead, margins_behind = (
+            self.search.margins(side, number).clamp(-MARGIN_CEILING, MARGIN_CEILING) for side in (ahead, behind)
         )
-        ahead, back = (place + sign * _REACH * way for sign in (1, -1))
-        ahead, back = ahead.clamp(0, 1), back.clamp(0, 1)
-        one, two = (
-            self.search.views.margins(self.search.theta(p)[0], number).clamp(-FAR, FAR) for p in (ahead, back)
-        )
-        own = (one - two).to(place)
-        of_all = (own * self._weights(margins).to(own)).sum()
-        change = torch.where(self.search.at.owner < 0, of_all, own[self.search.at.owner.clamp_min(0)])
-        between = ahead - back
-        return torch.where(between != 0, change / between, 0)
+        differences = (margins_ahead - margins_behind).to(point)
+        weighted_sum = (differences * _object_weights(margins).to(differences)).sum()
+        change = torch.where(owner < 0, weighted_sum, differences[owner.clamp_min(0)])
+        distance = ahead - behind
+        return torch.where(distance != 0, change / distance, 0)
 
-    def _levelled(self, slope: Tensor) -> Tensor:
-        """A slope (K,), the largest of each object's, of either kind, made 1: objects move at one pace."""
-        levelled = torch.zeros_like(slope)
-        for owner in self.search.at.owner.unique():
-            for kind in (False, True):
-                where = (self.search.at.owner == owner) & (self.search.at.wide == kind)
+    def _normalise_per_object(self, slope: Tensor) -> Tensor:
+        """A slope (K,) divided by its largest value for each object, in rough and in smooth coordinates separately:
+        all objects move at one pace.
+        """
+        box, normalised = self.search.box, torch.zeros_like(slope)
+        for owner in box.owner.unique():
+            for rough in (False, True):
+                where = (box.owner == owner) & (box.rough == rough)
                 if bool(where.any()):
-                    levelled[where] = slope[where] / slope[where].abs().max().clamp_min(1e-9)
-        return levelled
+                    normalised[where] = slope[where] / slope[where].abs().max().clamp_min(1e-9)
+        return normalised
 
-    def _weights(self, margins: Tensor) -> Tensor:
-        """(N,): how much objects matter to what they share: those that are nearly lost most, those that are lost
-        for sure not.
-        """
-        held = margins.nan_to_num(FAR, FAR, -FAR)
-        return torch.sigmoid(2 * (held - SURE)) * torch.exp(-held.clamp_min(0) / 2)
+
+def _object_weights(margins: Tensor) -> Tensor:
+    """Weights (N,) of objects in shared coordinates: largest for nearly lost ones, near 0 for certainly lost ones."""
+    finite = margins.nan_to_num(MARGIN_CEILING, MARGIN_CEILING, -MARGIN_CEILING)
+    return torch.sigmoid(2 * (finite - MARGIN_FLOOR)) * torch.exp(-finite.clamp_min(0) / 2)

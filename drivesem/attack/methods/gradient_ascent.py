@@ -1,4 +1,4 @@
-"""What attacks that climb the loss step by step have in common."""
+"""Gradient ascent on the loss: si-FGSM, FGSM and SGD on semantic parameters, after the paper's equations."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from scene_ir.errors import RangeError
 
 @dataclass(frozen=True, slots=True)
 class GradientAscent(Attack):
-    """theta <- project(theta + rate * move(gradient)), `steps` times; a subclass writes `_move`.
+    """theta <- project(theta + rate * move(gradient)), `steps` times; a subclass defines `_move`.
 
-    early_stop: end at the first iterate that fails the detector under `moved` labels (one more render a step).
-    momentum: what is left after a step of the gradients before it, which are added up (Dong et al. 2018, MI-FGSM,
-    where it is 1); 0 forgets them. RangeError for fewer than 1 step, a momentum outside [0, 1], or a rate that is
-    not positive.
+    Raises RangeError for fewer than 1 step, a momentum outside [0, 1], or a rate that is not positive.
     """
 
     steps: int = 10
+    """Number of gradients."""
     early_stop: bool = False
+    """End at the first iterate that fails the network under `moved` labels (one more render a step)."""
     momentum: float = 0.0
+    """Weight of the sum of earlier gradients, in [0, 1] (Dong et al. 2018: MI-FGSM has 1)."""
     rate: float = 1.0
+    """Length of a step, in moves."""
 
     def __post_init__(self) -> None:
         check_counts(steps=self.steps)
@@ -37,72 +38,87 @@ class GradientAscent(Attack):
 
     @abstractmethod
     def _move(self, problem: Problem, gradient: Tensor) -> Tensor:
-        """How far to go (D,) at rate 1, by a gradient (D,) or what momentum made of several."""
+        """The move (D,) at rate 1, from a gradient (D,) or a sum of several."""
 
-    def _weighed(self, problem: Problem, gradient: Tensor) -> Tensor:
-        """A gradient (D,) as momentum adds it up: in each group divided by its L1 norm, so that early and late
-        gradients weigh the same, however steep the loss is there.
+    def _momentum_term(self, problem: Problem, gradient: Tensor) -> Tensor:
+        """A gradient (D,) as momentum adds it up: divided by its L1 norm in each group, so that early and late
+        gradients weigh the same.
         """
-        weighed = gradient.clone()
+        normalised = gradient.clone()
         for group in problem.groups:
-            block = weighed[group.where]
+            block = normalised[group.where]
             if bool(block.any()):
                 block /= block.abs().sum()
-        return weighed
+        return normalised
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         start = problem.project(theta0.detach())
         theta, active = start.theta, list(start.active)
         thetas: list[Tensor] = [theta]
         losses: list[float | None] = []
-        kept = torch.zeros_like(theta)
+        velocity = torch.zeros_like(theta)
         for _ in range(self.steps):
             loss, gradient = problem.loss_and_grad(theta)
             losses.append(loss)
             if self.momentum:
-                gradient = kept = self.momentum * kept + self._weighed(problem, gradient)
-            step = problem.project(theta + self.rate * self._move(problem, gradient))
-            theta = step.theta
+                gradient = velocity = self.momentum * velocity + self._momentum_term(problem, gradient)
+            projected = problem.project(theta + self.rate * self._move(problem, gradient))
+            theta = projected.theta
             thetas.append(theta)
-            active.extend(step.active)
+            active.extend(projected.active)
             if self.early_stop and problem.score(theta).success:
                 break
-        return Proposals(
-            thetas=tuple(thetas),
-            losses=(*losses, None),
-            queries=len(losses),
-            active_constraints=tuple(active),
-        )
+        return Proposals(tuple(thetas), (*losses, None), len(losses), tuple(active))
 
 
 @dataclass(frozen=True, slots=True)
 class SiFGSM(GradientAscent):
-    """theta <- project(theta + rate * step * sign(gradient)), `steps` times; step: the paper's alpha."""
+    """Iterative sign steps: the move is step * sign(gradient), with the paper's step alpha."""
 
     def _move(self, problem: Problem, gradient: Tensor) -> Tensor:
         return problem.step * torch.sign(gradient)
 
 
-Form = Literal["raw", "l2", "unit"]
+@dataclass(frozen=True, slots=True)
+class FGSM(Attack):
+    """One sign step, as long as all of si-FGSM's: project(theta0 + steps * step * sign(gradient)).
+
+    Raises RangeError for fewer than 1 step.
+    """
+
+    steps: int = 10
+    """Length of the step, in steps alpha."""
+
+    def __post_init__(self) -> None:
+        check_counts(steps=self.steps)
+
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        start = problem.project(theta0.detach())
+        loss, gradient = problem.loss_and_grad(start.theta)
+        end = problem.project(start.theta + self.steps * problem.step * torch.sign(gradient))
+        return Proposals((start.theta, end.theta), (loss, None), 1, (*start.active, *end.active))
+
+
+SGDStepForm = Literal["raw", "l2", "unit"]
 """raw: the gradient times the step alpha, as in the paper's equation; l2: its direction only, by group; unit:
-the same, but no longer than the step alpha, as the paper's program has it for classifiers."""
+the same, but no longer than the step alpha, as in the paper's code for classifiers."""
 
 
 @dataclass(frozen=True, slots=True)
 class SGD(GradientAscent):
-    """theta <- project(theta + rate * move), `steps` times.
+    """Gradient steps.
 
-    form raw: the move is step * gradient, so its length follows the loss's scale. Momentum adds up the gradients
-    as they are (Polyak's heavy ball). form l2: the gradient of each group, in steps alpha, divided by its L2 norm
-    and made as long as a sign step of that group (root mean square: one step), so that all groups go equally far
-    and a rate of 1 goes as far as si-FGSM, but mostly where the loss is steep. form unit: the gradient of each
-    group, in theta's own units, divided by its L2 norm, times step: of a thousand coordinates each moves a little.
+    raw: the move is step * gradient, so its length follows the scale of the loss; momentum is Polyak's heavy ball.
+    l2: each group's gradient, in steps alpha, divided by its L2 norm and as long as a sign step (root mean square:
+    one step alpha), so that all groups move equally far and a rate of 1 equals si-FGSM's. unit: each group's
+    gradient, in theta's own units, divided by its L2 norm, times step: a thousand coordinates move a little each.
     """
 
-    form: Form = "l2"
+    form: SGDStepForm = "l2"
+    """Form of the step."""
 
-    def _weighed(self, problem: Problem, gradient: Tensor) -> Tensor:
-        return gradient if self.form == "raw" else GradientAscent._weighed(self, problem, gradient)
+    def _momentum_term(self, problem: Problem, gradient: Tensor) -> Tensor:
+        return gradient if self.form == "raw" else GradientAscent._momentum_term(self, problem, gradient)
 
     def _move(self, problem: Problem, gradient: Tensor) -> Tensor:
         if self.form == "raw":

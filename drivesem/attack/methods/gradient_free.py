@@ -1,33 +1,32 @@
-"""What searches without a gradient have in common: they try thetas one by one and see how each is judged.
+"""Gradient-free searches, which project and score thetas one by one: random and Halton samples, CMA-ES.
 
-One by one, because several at once are not faster on a CPU: renders take the same time, and the detector's working
-set leaves the cache (measured: 97 ms for an image by itself, 123 ms in a batch of eight).
+Batches are not faster on a CPU: renders take the same time, and the detector's working set leaves the cache
+(measured: 97 ms for a single image, 123 ms for each in a batch of eight).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack, Problem, Proposals, Score, check_counts
+from drivesem.attack.methods.base import Attack, Problem, Proposals, QueryLog, check_counts
 
 
 @dataclass(frozen=True, slots=True)
-class Search(Attack):
-    """An attack that projects and judges `queries` thetas; the detector's gradient is not asked for.
-
-    steps: thetas lie within so many steps of theta0, or anywhere within the bounds where it is None. early_stop:
-    end at the first that fails the detector under `moved` labels. RangeError for fewer than 1 query or step.
-    """
+class QuerySearch(Attack):
+    """A search that scores `queries` thetas. Raises RangeError for fewer than 1 query or step."""
 
     queries: int = 64
+    """Number of thetas."""
     steps: int | None = None
+    """Maximum distance of thetas from theta0, in steps alpha; None: anywhere within the bounds."""
     early_stop: bool = False
+    """End at the first theta that fails the network under `moved` labels."""
 
     needs_gradient: ClassVar[bool] = False
 
@@ -35,123 +34,91 @@ class Search(Attack):
         check_counts(queries=self.queries, steps=self.steps)
 
 
-@dataclass(slots=True)
-class QueryBudget:
-    """At most `queries` thetas, projected and judged. early_stop: end at the first that fails the detector."""
-
-    problem: Problem
-    queries: int
-    early_stop: bool = False
-    _thetas: list[Tensor] = field(default_factory=list)
-    _losses: list[float | None] = field(default_factory=list)
-    _active: list[str] = field(default_factory=list)
-    _failed: bool = False
-
-    @property
-    def left(self) -> int:
-        """How many thetas may still be tried."""
-        return 0 if self.early_stop and self._failed else self.queries - len(self._thetas)
-
-    def judge(self, theta: Tensor) -> Score:
-        """What comes of the feasible theta (D,) nearest to this one. Costs a query."""
-        feasible = self.problem.project(theta)
-        score = self.problem.score(feasible.theta)
-        self._thetas.append(feasible.theta)
-        self._losses.append(score.loss)
-        self._active.extend(feasible.active)
-        self._failed |= score.success
-        return score
-
-    def proposals(self) -> Proposals:
-        """All that was tried, in order."""
-        return Proposals(
-            thetas=tuple(self._thetas),
-            losses=tuple(self._losses),
-            queries=len(self._thetas),
-            active_constraints=tuple(self._active),
-        )
-
-
-Kind = Literal["random", "halton"]
-"""random: independent and uniform; halton: a low-discrepancy sequence, scrambled (Owen 2017, as in
-scipy.stats.qmc)."""
+def _score_nearest(problem: Problem, theta: Tensor, log: QueryLog) -> float:
+    """Score the feasible theta nearest to theta (D,), and record it. Returns its loss."""
+    projected = problem.project(theta)
+    score = problem.score(projected.theta)
+    log.add(projected, score.loss, score.success)
+    return score.loss
 
 
 @dataclass(frozen=True, slots=True)
-class Sampling(Search):
-    """Thetas that do not depend on what was found before."""
+class Sampling(QuerySearch):
+    """Random samples, independent of earlier scores."""
 
-    kind: Kind = "random"
+    kind: Literal["random", "halton"] = "random"
+    """random: independent and uniform; halton: a low-discrepancy sequence, scrambled (Owen 2017, as in
+    scipy.stats.qmc).
+    """
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)
-        trials = QueryBudget(problem, self.queries, self.early_stop)
-        for place in self._places(len(theta0), generator).to(theta0):
-            if not trials.left:
+        log = QueryLog(self.queries, self.early_stop)
+        for point in self._unit_points(len(theta0), generator).to(theta0):
+            if not log.left:
                 break
-            trials.judge(lower + place * (upper - lower))
-        return trials.proposals()
+            _score_nearest(problem, lower + point * (upper - lower), log)
+        return log.proposals()
 
-    def _places(self, dimensions: int, generator: torch.Generator) -> Tensor:
-        """Where in the unit box to look: (queries, dimensions) float64."""
+    def _unit_points(self, dimensions: int, generator: torch.Generator) -> Tensor:
+        """Sample points (queries, dimensions) float64 in the unit box."""
         if self.kind == "random":
             return torch.rand(self.queries, dimensions, generator=generator, dtype=torch.float64)
-        from scipy.stats import qmc  # on use: it takes a third of a second to load
+        from scipy.stats import qmc  # imported on use: it takes a third of a second to load
 
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
         return torch.from_numpy(qmc.Halton(dimensions, scramble=True, rng=rng).random(self.queries))
 
 
 _SIGMA = 0.25
-"""First standard deviation, as a share of the box: the library's advice is a quarter of a search interval."""
-_GENERATIONS = 4
-"""At least so many generations, smaller ones where queries are few: one alone is a random sample."""
-_FEWEST = 4
-"""Smallest population in which the better half still says something (Hansen 2016, arXiv:1604.00772, its table 1
-for 1 dimension)."""
+"""First standard deviation, as a share of the box; the library recommends a quarter of the search interval."""
+_MIN_GENERATIONS = 4
+"""Minimum number of generations, smaller ones for small query budgets: a single one is a random sample."""
+_MIN_POPULATION = 4
+"""Minimum population size, that of one dimension (Hansen 2016, arXiv:1604.00772, table 1)."""
 _FULL_COVARIANCE = 64
-"""Dimensions up to which the whole covariance is learned: it has D (D + 1) / 2 numbers, which some hundred queries
-tell nothing about. Above, its diagonal (Ros and Hansen 2008)."""
-_FEWEST_DIMENSIONS = 2
-"""The library refuses to scale a single coordinate; a second one, which nothing follows, stands beside it."""
+"""Maximum dimension with a full covariance: its D (D + 1) / 2 numbers need many queries. Above, only the diagonal is
+learned (Ros and Hansen 2008)."""
+_MIN_DIMENSIONS = 2
+"""Minimum dimension that the library can scale; a single coordinate gets an unused second one."""
 
 
 @dataclass(frozen=True, slots=True)
-class CMAES(Search):
-    """Starts at theta0. The library sees the sample, and the loss of its projection."""
+class CMAES(QuerySearch):
+    """CMA-ES from theta0, restarted on convergence. The library gets each sample with the loss of its projection."""
 
     def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)
         size = upper - lower
         start = ((theta0 - lower) / size.clamp_min(torch.finfo(theta0.dtype).tiny)).detach().cpu().double().numpy()
         coordinates = len(start)
-        start = np.pad(start, (0, max(_FEWEST_DIMENSIONS - coordinates, 0)), constant_values=0.5)
+        start = np.pad(start, (0, max(_MIN_DIMENSIONS - coordinates, 0)), constant_values=0.5)
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
-        trials = QueryBudget(problem, self.queries, self.early_stop)
+        log = QueryLog(self.queries, self.early_stop)
         strategy = self._strategy(start, rng)
-        while trials.left:
-            if strategy.stop():  # it has converged; what is left looks elsewhere
+        while log.left:
+            if strategy.stop():  # it has converged; the remaining queries search elsewhere
                 strategy = self._strategy(rng.random(len(start)), rng)
-            places = strategy.ask()
+            points = strategy.ask()
             losses: list[float] = []
-            for place in places:
-                if trials.left:
-                    theta = lower + torch.from_numpy(np.asarray(place)[:coordinates]).to(theta0) * size
-                    losses.append(trials.judge(theta).loss)
-            if len(losses) == len(places):
-                strategy.tell(places, [-loss for loss in losses])
-        return trials.proposals()
+            for point in points:
+                if log.left:
+                    theta = lower + torch.from_numpy(np.asarray(point)[:coordinates]).to(theta0) * size
+                    losses.append(_score_nearest(problem, theta, log))
+            if len(losses) == len(points):
+                strategy.tell(points, [-loss for loss in losses])
+        return log.proposals()
 
     def _strategy(self, start: np.ndarray, rng: np.random.Generator) -> Any:
-        import cma  # it loads matplotlib's pyplot: two seconds
+        import cma  # imported on use: it loads matplotlib's pyplot, which takes two seconds
 
         dimensions = len(start)
-        usual = 4 + int(3 * math.log(dimensions))
+        default_size = 4 + int(3 * math.log(dimensions))
         options = {
             "bounds": [0.0, 1.0],
-            "popsize": min(usual, max(self.queries // _GENERATIONS, _FEWEST)),
+            "popsize": min(default_size, max(self.queries // _MIN_GENERATIONS, _MIN_POPULATION)),
             "CMA_diagonal": dimensions > _FULL_COVARIANCE,
-            # A generator of our own instead of numpy's global one, which then stays as it is.
+            # Instead of numpy's global generator.
             "randn": lambda *shape: rng.standard_normal(shape),
             "seed": math.nan,
             "verbose": -9,

@@ -1,6 +1,6 @@
-"""What searches on margins have in common: they see objects in draws (`Views`), and keep of each what did worst.
+"""Searches on margins, from the worst point of each object over nuisance samples: base class, unit box, corners.
 
-Objects are nearly independent, so that the worst place of each can be put together with the others'.
+Objects are nearly independent, so the worst points of all objects are combined into one.
 """
 
 from __future__ import annotations
@@ -16,155 +16,45 @@ from torch import Tensor
 from drivesem.attack.methods.base import Attack, MarginOracle, Problem, Proposals, check_counts
 from scene_ir.errors import RangeError
 
-LEAST_PASSES = 24
-"""With fewer there is nothing left to try after the last comparison."""
-FAR = 4.0
-"""Margin above which an object counts as no harder to lose."""
-SURE = -2.0
-"""Margin from which an object is lost for sure, and the others matter more."""
-_FINAL_DRAWS = 4
-"""Draws in which the last candidates are compared."""
-FINAL_PASSES = 3 * _FINAL_DRAWS
-"""What comparing three candidates takes."""
-_OTHERWISE = 4
-"""Passes that the benign pictures and the judging of what is found take."""
-_POOL = 8
-"""Draws that the search goes round in."""
-FIRST_HELD_OUT_SAMPLE = _POOL + _FINAL_DRAWS
-"""The first draw that no search looks at."""
+MIN_PASSES = 24
+"""Minimum number of passes; with fewer, none are left to search with after the final comparison."""
+MARGIN_CEILING = 4.0
+"""Margin above which objects count as equally hard to lose."""
+MARGIN_FLOOR = -2.0
+"""Margin below which an object is certainly lost, and the others matter more."""
+_FINAL_SAMPLES = 4
+"""Number of nuisance samples in which the last candidates are compared."""
+FINAL_PASSES = 3 * _FINAL_SAMPLES
+"""Passes of the comparison of three candidates."""
+_FIXED_PASSES = 4
+"""Passes of the benign pictures and the final score."""
+_SEARCH_SAMPLES = 8
+"""Number of nuisance samples that the search uses in turn."""
+FIRST_HELD_OUT_SAMPLE = _SEARCH_SAMPLES + _FINAL_SAMPLES
+"""Number of the first nuisance sample that no search uses."""
 
 
-def margin_objective(margins: Tensor, judged: Tensor) -> float:
-    """What a search lowers, of margins (N,) of objects of which judged (N,) count."""
-    known = margins[judged.to(margins.device)].clamp(SURE, FAR)
-    return float(torch.tanh(2 * known).sum() + 0.1 * known.sum())
+def margin_objective(margins: Tensor, counted: Tensor) -> float:
+    """The value that a search lowers: about a step down for each lost object, plus a small share of the margins.
 
-
-@dataclass
-class MarginSearchState:
-    """A search of the unit box within a number of passes. limit: passes in all."""
-
-    problem: Problem
-    views: MarginOracle
-    at: UnitBox
-    generator: torch.Generator
-    limit: int
-    _active: list[str] = field(default_factory=list)
-    _spent_before: int = field(init=False)
-    _next: int = 0
-
-    def __post_init__(self) -> None:
-        self._spent_before = self.views.passes
-
-    @classmethod
-    def of(
-        cls, problem: Problem, theta0: Tensor, generator: torch.Generator, passes: int
-    ) -> MarginSearchState | None:
-        """Within so many passes, the benign pictures and the final judgement included; None where there is nothing
-        to lose. RangeError for a problem without views.
-        """
-        if problem.margin_oracle is None:
-            raise RangeError("problem", "one with views of its objects", "none")
-        if not bool(problem.margin_oracle.counted_objects.any()):
-            return None
-        return cls(problem, problem.margin_oracle, UnitBox(problem, theta0), generator, passes - _OTHERWISE)
-
-    @property
-    def spent(self) -> int:
-        """Passes so far."""
-        return self.views.passes - self._spent_before
-
-    @property
-    def left(self) -> int:
-        """Passes that may still be taken."""
-        return self.limit - self.spent
-
-    def theta(self, place: Tensor) -> tuple[Tensor, tuple[str, ...]]:
-        """The feasible theta (D,) nearest to that of u (K,), and what held it back on the way there and before."""
-        feasible = self.problem.project(self.at.theta(place))
-        self._active.extend(feasible.active)
-        return feasible.theta, tuple(dict.fromkeys(self._active))
-
-    def number(self) -> int:
-        """Of the next draw."""
-        self._next += 1
-        return self._next % _POOL
-
-    def margins(self, place: Tensor, number: int) -> Tensor:
-        """(N,) of the objects at u (K,), in a draw."""
-        return self.views.margins(self.theta(place)[0], number)
-
-    def value(self, margins: Tensor) -> float:
-        """What is to be low: a step a lost object, and beyond that the margins themselves."""
-        return margin_objective(margins, self.views.counted_objects)
-
-    def candidates(self, places: Tensor) -> list[Tensor]:
-        """Of places (C, K), each seen in another draw: the best, and what the best of each object make together,
-        in the scenes of the best and of the second best. Costs C passes.
-        """
-        seen = torch.stack([self.margins(place, self.number()) for place in places])
-        values = [self.value(margins) for margins in seen]
-        order = sorted(range(len(places)), key=values.__getitem__)
-        return [places[order[0]], *(self._together(places, seen, scene) for scene in order[:2])]
-
-    def best(self, places: list[Tensor]) -> Tensor:
-        """The place with the lowest mean value in a few draws, the same for all and not seen before."""
-        draws = min(_FINAL_DRAWS, self.left // len(places))
-        values = []
-        for place in places:
-            theta, _ = self.theta(place)
-            values.append(sum(self.value(self.views.margins(theta, _POOL + draw)) for draw in range(draws)))
-        return places[min(range(len(places)), key=values.__getitem__)]
-
-    def _together(self, places: Tensor, seen: Tensor, scene: int) -> Tensor:
-        """The scene's coordinates of one place, and each object's own of where it did worst, for the scene's
-        sake: less what all the objects did there.
-        """
-        held = seen.clamp(-FAR, FAR)
-        if bool((self.at.owner < 0).any()) and held.shape[1] > 1:
-            held = held - held.mean(dim=1, keepdim=True)
-        best = held.argmin(dim=0)
-        row = torch.where(self.at.owner < 0, scene, best.to(self.at.owner.device)[self.at.owner.clamp_min(0)])
-        return places.gather(0, row[None].to(places.device))[0]
-
-
-@dataclass(frozen=True, slots=True)
-class MarginSearch(Attack):
-    """A search on margins, which proposes one place. passes: of the detector in all, a gradient counted as 3.
-    RangeError for fewer than LEAST_PASSES, and for a problem without views.
+    margins: (N,); counted: (N,) bool, which objects count.
     """
-
-    passes: int = 90
-
-    needs_gradient: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_counts(LEAST_PASSES, passes=self.passes)
-
-    @abstractmethod
-    def _found(self, search: MarginSearchState) -> Tensor:
-        """The place u (K,) that is proposed; the last comparison (`MarginSearchState.best`) takes FINAL_PASSES."""
-
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
-        search = MarginSearchState.of(problem, theta0, generator, self.passes)
-        if search is None:
-            return Proposals((), (), 0)
-        theta, active = search.theta(self._found(search))
-        return Proposals((theta,), (None,), search.spent, active)
+    clamped = margins[counted.to(margins.device)].clamp(MARGIN_FLOOR, MARGIN_CEILING)
+    return float(torch.tanh(2 * clamped).sum() + 0.1 * clamped.sum())
 
 
 class UnitBox:
-    """Places u (K,) in the unit box as thetas (D,): the bounds of each coordinate, or, in groups with modes, how
-    much of each mode. owner: (K,) the object that each belongs to, -1 for the scene; holder: (D,) the same of
-    theta's coordinates; wide: (K,) bool, where a gradient at a point says little; start: (K,) theta0's place.
+    """The unit box of a search: points u (K,) correspond to thetas (D,) within the bounds.
+
+    A coordinate of u spans the bounds of one coordinate of theta or, in groups with modes, the amount of one mode.
     """
 
     def __init__(self, problem: Problem, theta0: Tensor) -> None:
         self._problem = problem
         blocks: list[Tensor] = []
         owners: list[Tensor] = []
-        holders: list[Tensor] = []
-        wide: list[Tensor] = []
+        theta_owners: list[Tensor] = []
+        rough: list[Tensor] = []
         start: list[Tensor] = []
         span = problem.upper - problem.lower
         for group in problem.groups:
@@ -172,55 +62,177 @@ class UnitBox:
             size, count = len(width), max(group.owners, 1)
             if group.modes is None:
                 block = torch.diag(width)
-                at = (theta0[group.where] - lower) / width.clamp_min(1e-12)
+                group_start = (theta0[group.where] - lower) / width.clamp_min(1e-12)
             else:
                 half = 0.5 * width.reshape(count, -1)
                 block = torch.block_diag(*(2 * group.modes.to(half) * row for row in half))
-                at = torch.full((len(block),), 0.5).to(block)
-            first = torch.zeros(len(block), len(theta0)).to(block)
-            first[:, group.where] = block
-            blocks.append(first)
-            start.append(at)
-            own = (torch.arange(count) if group.owners else torch.tensor([-1])).to(block.device)
-            owners.append(own.repeat_interleave(len(block) // count))
-            holders.append(own.repeat_interleave(size // count))
-            wide.append(torch.full((len(block),), not group.smooth, device=block.device))
+                group_start = torch.full((len(block),), 0.5).to(block)
+            rows = torch.zeros(len(block), len(theta0)).to(block)
+            rows[:, group.where] = block
+            blocks.append(rows)
+            start.append(group_start)
+            group_owners = (torch.arange(count) if group.owners else torch.tensor([-1])).to(block.device)
+            owners.append(group_owners.repeat_interleave(len(block) // count))
+            theta_owners.append(group_owners.repeat_interleave(size // count))
+            rough.append(torch.full((len(block),), not group.smooth, device=block.device))
         self._matrix = torch.cat(blocks)
         self.start = torch.cat(start)
+        """(K,), the point of theta0."""
         self._offset = theta0 - self.start @ self._matrix
-        self.owner, self.holder, self.wide = torch.cat(owners), torch.cat(holders), torch.cat(wide)
+        self.owner, self.theta_owner = torch.cat(owners), torch.cat(theta_owners)
+        """(K,) and (D,), the object of each coordinate of u and of theta; -1 for the scene."""
+        self.rough = torch.cat(rough)
+        """(K,) bool: coordinates in which a point gradient does not predict wide steps."""
 
-    def theta(self, place: Tensor) -> Tensor:
+    def theta(self, point: Tensor) -> Tensor:
         """theta (D,) at u (K,), within the bounds; feasible or not."""
-        theta = self._offset + place @ self._matrix
+        theta = self._offset + point @ self._matrix
         return torch.minimum(torch.maximum(theta, self._problem.lower), self._problem.upper)
 
     def slope(self, gradient: Tensor) -> Tensor:
-        """Of a gradient (D,) to theta, that to u (K,)."""
+        """The gradient (K,) with respect to u, from the gradient (D,) with respect to theta."""
         return self._matrix @ gradient
+
+
+@dataclass
+class MarginSearchState:
+    """A search of the unit box within a pass budget."""
+
+    problem: Problem
+    """The scene and detector."""
+    oracle: MarginOracle
+    """Margins of the scene's objects."""
+    box: UnitBox
+    """The searched box."""
+    generator: torch.Generator
+    """Source of randomness."""
+    limit: int
+    """Maximum number of passes."""
+    _active: list[str] = field(default_factory=list)
+    """Constraints that were active so far."""
+    _passes_before: int = field(init=False)
+    """The oracle's passes before the search."""
+    _sample: int = 0
+    """Number of nuisance samples so far."""
+
+    def __post_init__(self) -> None:
+        self._passes_before = self.oracle.passes
+
+    @property
+    def passes_left(self) -> int:
+        """Number of passes that may still be taken."""
+        return self.limit - self.passes
+
+    @property
+    def passes(self) -> int:
+        """Number of passes so far."""
+        return self.oracle.passes - self._passes_before
+
+    def theta(self, point: Tensor) -> tuple[Tensor, tuple[str, ...]]:
+        """The feasible theta (D,) nearest to that of u (K,), and all constraints that were active so far."""
+        projected = self.problem.project(self.box.theta(point))
+        self._active.extend(projected.active)
+        return projected.theta, tuple(dict.fromkeys(self._active))
+
+    def next_sample(self) -> int:
+        """Number of the next nuisance sample."""
+        self._sample += 1
+        return self._sample % _SEARCH_SAMPLES
+
+    def margins(self, point: Tensor, number: int) -> Tensor:
+        """Margins (N,) of the objects at u (K,), in a nuisance sample."""
+        return self.oracle.margins(self.theta(point)[0], number)
+
+    def objective(self, margins: Tensor) -> float:
+        """See `margin_objective`."""
+        return margin_objective(margins, self.oracle.counted_objects)
+
+    def candidates(self, points: Tensor) -> list[Tensor]:
+        """The best of the points (C, K), and combinations of the best point of each object with the scene
+        coordinates of the best and second-best point. Each point gets another nuisance sample; costs C passes.
+        """
+        margins = torch.stack([self.margins(point, self.next_sample()) for point in points])
+        values = [self.objective(row) for row in margins]
+        order = sorted(range(len(points)), key=values.__getitem__)
+        return [points[order[0]], *(self._combine_objects(points, margins, row) for row in order[:2])]
+
+    def select_best(self, points: list[Tensor]) -> Tensor:
+        """The point with the lowest mean objective in nuisance samples that the search has not used."""
+        samples = min(_FINAL_SAMPLES, self.passes_left // len(points))
+        values = []
+        for point in points:
+            theta, _ = self.theta(point)
+            numbers = (_SEARCH_SAMPLES + sample for sample in range(samples))
+            values.append(sum(self.objective(self.oracle.margins(theta, number)) for number in numbers))
+        return points[min(range(len(points)), key=values.__getitem__)]
+
+    def _combine_objects(self, points: Tensor, margins: Tensor, scene_row: int) -> Tensor:
+        """The scene coordinates of one point, and each object's own from the point where its margin was lowest.
+
+        Where points differ in the scene too, margins are relative to the mean over objects at their point.
+        """
+        owner = self.box.owner
+        clamped = margins.clamp(-MARGIN_CEILING, MARGIN_CEILING)
+        if bool((owner < 0).any()) and clamped.shape[1] > 1:
+            clamped = clamped - clamped.mean(dim=1, keepdim=True)
+        lowest = clamped.argmin(dim=0)
+        rows = torch.where(owner < 0, scene_row, lowest.to(owner.device)[owner.clamp_min(0)])
+        return points.gather(0, rows[None].to(points.device))[0]
+
+
+@dataclass(frozen=True, slots=True)
+class MarginSearch(Attack):
+    """A search on margins, which proposes one theta. Raises RangeError for fewer than MIN_PASSES passes, and for a
+    problem without a margin oracle.
+    """
+
+    passes: int = 90
+    """Detector passes in all; a gradient counts as GRADIENT_PASSES."""
+
+    needs_gradient: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_counts(MIN_PASSES, passes=self.passes)
+
+    @abstractmethod
+    def _search(self, search: MarginSearchState) -> Tensor:
+        """The proposed point u (K,). The final `MarginSearchState.select_best` takes FINAL_PASSES."""
+
+    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+        oracle = problem.margin_oracle
+        if oracle is None:
+            raise RangeError("problem", "one with margins of its objects", "none")
+        if not bool(oracle.counted_objects.any()):
+            return Proposals((), (), 0)
+        limit = self.passes - _FIXED_PASSES
+        search = MarginSearchState(problem, oracle, UnitBox(problem, theta0), generator, limit)
+        theta, active = search.theta(self._search(search))
+        return Proposals((theta,), (None,), search.passes, active)
 
 
 @dataclass(frozen=True, slots=True)
 class Corners(MarginSearch):
-    """Sees objects at corners of the bounds, each in another draw, and puts the worst corner of each together.
+    """Evaluates corners of the bounds, each in another nuisance sample, and combines each object's worst corner."""
 
-    Proposed is the best of these and of the best corner, in draws of their own. What is not feasible is projected,
-    as everything is.
-    """
-
-    def _found(self, search: MarginSearchState) -> Tensor:
-        places = balanced_corners(search.at.owner, search.left - FINAL_PASSES, search.generator).to(
-            search.at.start
-        )
-        return search.best(search.candidates(places))
+    def _search(self, search: MarginSearchState) -> Tensor:
+        count = search.passes_left - FINAL_PASSES
+        corners = balanced_corners(search.box.owner, count, search.generator)
+        return search.select_best(search.candidates(corners.to(search.box.start)))
 
 
 def balanced_corners(owner: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Corners (count, K) of the unit box: rows of a Hadamard matrix, the first of which has all the scene's
-    coordinates at their upper end.
+    """Corners of the unit box from rows of a Hadamard matrix; the first has all scene coordinates at 1.
 
-    owner (K,): the object of each coordinate, -1 for the scene. Over all rows any two coordinates of one owner
-    stand at each of their four ends equally often; of `count` rows, drawn at random, nearly so.
+    Over all rows any two coordinates of one owner take each of their four combinations equally often; over `count`
+    random rows, nearly so.
+
+    Args:
+        owner: (K,), the object of each coordinate; -1 for the scene.
+        count: number of corners.
+        generator: selects the rows.
+
+    Returns:
+        (count, K) bool.
     """
     owners = owner.unique().tolist()
     most = max(int((owner == one).sum()) for one in owners)
@@ -230,7 +242,7 @@ def balanced_corners(owner: Tensor, count: int, generator: torch.Generator) -> T
     for one in owners:
         own = (owner == one).cpu().nonzero()[:, 0]
         columns = 1 + torch.randperm(size - 1, generator=generator)[: len(own)]  # the first is constant
-        turned = torch.randint(2, (len(own),), generator=generator).bool() & (one >= 0)
-        ends[:, own] = matrix[:, columns] ^ turned
+        flipped = torch.randint(2, (len(own),), generator=generator).bool() & (one >= 0)
+        ends[:, own] = matrix[:, columns] ^ flipped
     rows = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(size - 1, generator=generator)])
     return ends[rows[:count]].to(owner.device)

@@ -1,4 +1,4 @@
-"""A placebo: one random edit as large as a counterexample. What it breaks, any change of that size would."""
+"""Attacks that do not search: a random edit as large as a counterexample (placebo), and a fixed theta."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from scene_ir.errors import ShapeError
 if TYPE_CHECKING:
     from drivesem.attack.theta import ProjectedTheta
 
-_DRAWS = 8
-"""At most; after that nothing is changed."""
+_MAX_DRAWS = 8
+"""Maximum number of random edits; if all are infeasible, nothing is changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Placebo(Attack):
-    """Another change's values, shuffled within each group and with random signs: as large as that change in every
-    norm of every group, in a random direction. It is drawn once, and nothing is chosen by what the detector finds.
+    """A control: the values of another change, shuffled within each group and with random signs. The edit is as
+    large in every norm of every group, and does not depend on the detector.
 
-    like: the other change's theta (D,). A sign that would lead out of the bounds is turned round. Where the edit
-    is not feasible it is projected, and may be smaller then; where its render shows that it is not, another is
-    drawn. ShapeError where `like` is not of this scene.
+    Signs that would leave the bounds are flipped. The edit is projected, which may shrink it; if its render is not
+    feasible, another is drawn. Raises ShapeError where `like` belongs to another scene.
     """
 
     like: tuple[float, ...] = ()
+    """theta (D,) of the other change."""
 
     needs_gradient: ClassVar[bool] = False
 
@@ -36,14 +36,16 @@ class Placebo(Attack):
         if len(self.like) != len(theta0):
             raise ShapeError("like", f"({len(theta0)},)", (len(self.like),))
         like = torch.tensor(self.like, dtype=torch.float64).to(theta0) - theta0
-        edit = self._edit(problem, theta0, like, generator)
+        edit = self._random_edit(problem, theta0, like, generator)
         draws = 1
-        while draws < _DRAWS and problem.score(edit.theta).violations:
-            edit = self._edit(problem, theta0, like, generator)
+        while draws < _MAX_DRAWS and problem.score(edit.theta).violations:
+            edit = self._random_edit(problem, theta0, like, generator)
             draws += 1
         return Proposals(thetas=(edit.theta,), losses=(None,), queries=draws, active_constraints=edit.active)
 
-    def _edit(self, problem: Problem, theta0: Tensor, like: Tensor, generator: torch.Generator) -> ProjectedTheta:
+    def _random_edit(
+        self, problem: Problem, theta0: Tensor, like: Tensor, generator: torch.Generator
+    ) -> ProjectedTheta:
         change = like.clone()
         for group in problem.groups:
             block = change[group.where]
@@ -54,15 +56,16 @@ class Placebo(Attack):
         return problem.project(theta0 + torch.where(outside, -change, change))
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
-        # The edit stands whatever it does: the better of it and none would be an attack.
+        # The edit wins over theta0 regardless of its effect: choosing the better of the two would be an attack.
         return (float(bool((theta != 0).any())),)
 
 
 @dataclass(frozen=True, slots=True)
 class FixedTheta(Attack):
-    """theta: (D,)."""
+    """Proposes a given theta, which wins wherever it is feasible."""
 
     theta: Tensor
+    """(D,)."""
 
     needs_gradient: ClassVar[bool] = False
 
@@ -70,5 +73,4 @@ class FixedTheta(Attack):
         return Proposals((self.theta,), (None,), 0)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
-        # It stands, unless it cannot be.
         return (float(torch.equal(theta, self.theta)),)

@@ -25,7 +25,7 @@ def test_presets():
     assert parking == Budget(translate_m=0.5, rotate=math.radians(5))
 
 
-def test_a_file_says_what_is_tighter_than_the_papers(tmp_path: Path):
+def test_a_file_narrows_the_papers_budget(tmp_path: Path):
     path = tmp_path / "own.yaml"
     path.write_text("translate: 0.1\nrotate: 5deg\nmesh: 0.05\n")
     assert parse_budget(str(path)) == Budget(translate=0.1, rotate=math.radians(5), mesh=0.05)
@@ -113,7 +113,7 @@ def test_what_is_written_reads_back(preset: str, shares: dict[Parameter, float],
     assert parse_budget(format_budget(budget)) == budget
 
 
-def test_own_lengths_beside_the_metres_of_parking_are_written() -> None:
+def test_own_lengths_and_parkings_metres_are_written() -> None:
     budget = parse_budget("parking,translate=0.01")
     assert (budget.translate, budget.translate_m) == (0.01, 0.5)
     assert format_budget(budget) == "parking,translate=0.01"
@@ -159,7 +159,7 @@ def test_a_street_is_longer_along_than_across(street):
     assert not bool(wider[: where.start].any() or wider[where.stop :].any())
 
 
-def test_a_car_that_is_partly_shown_goes_no_farther_than_the_papers(street):
+def test_partly_visible_cars_have_the_papers_limits(street):
     scene = street().with_objects(
         occlusion=torch.tensor([0, 1, 0, 0]), truncation=torch.tensor([0.0, 0.0, 0.3, 0.1])
     )
@@ -173,7 +173,7 @@ def test_a_car_that_is_partly_shown_goes_no_farther_than_the_papers(street):
     )
     sizes = scene.objects.size_lhw.clone()
     sizes[1] *= 1.05
-    found = check_scene(scene, scene.with_objects(size_lhw=sizes), reach=change_limits(parse_budget("street")))
+    found = check_scene(scene, scene.with_objects(size_lhw=sizes), limits=change_limits(parse_budget("street")))
     assert found == ["objects[1]: size changed by 5.0 %"]
     # In the paper's budget it makes no difference.
     assert ParameterSpace(scene, ("translate",)).upper.tolist() == [0.25] * 8

@@ -1,4 +1,4 @@
-"""Vehicles that leave, park or come in others' places: what is proposed, what labels say, what is refused."""
+"""Vehicles that leave, park, or replace others: proposals, labels, refusals."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def scene() -> SceneIR:
     return ds.demo_scene(1).ir
 
 
-def beside(scene: SceneIR, place: torch.Tensor) -> SceneIR:
+def with_parked_car(scene: SceneIR, place: torch.Tensor) -> SceneIR:
     vehicle = Vehicle(template("suv"), Category.CAR, place, scene.objects.yaw[0], SIZE)
     return add_vehicle(scene, vehicle)
 
@@ -54,7 +54,7 @@ def proposed(scene: SceneIR) -> list[SceneIR]:
     return propose_scenes(scene, VehicleChangeSettings(tuple(VehicleChange)), 4, 7)
 
 
-def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR]) -> None:
+def test_kinds_take_turns_and_are_feasible(scene: SceneIR, proposed: list[SceneIR]) -> None:
     words = [made.provenance[CHANGE_KEY] for made in proposed]
     wanted = ("is gone", "parks as", "in the place of", "on the roof")
     assert all(word in text for word, text in zip(wanted, words, strict=True))
@@ -68,7 +68,7 @@ def test_kinds_take_turns_and_each_can_be(scene: SceneIR, proposed: list[SceneIR
 
 
 @pytest.mark.slow
-def test_what_cannot_be_is_not_proposed(scene: SceneIR) -> None:
+def test_proposals_are_feasible(scene: SceneIR) -> None:
     found = propose_scenes(scene, VehicleChangeSettings((VehicleChange.PARK,)), 6, 3)
     assert found
     assert not [line for made in found for line in check_exchange(made)]
@@ -108,7 +108,7 @@ def test_a_load_on_the_roof_is_part_of_its_cars_label(scene: SceneIR) -> None:
     assert check_exchange(loaded) == []
 
 
-def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
+def test_a_removed_car_is_no_failure(scene: SceneIR) -> None:
     left = remove_vehicle(scene, 6)
     labeller, labels = labels_of(left)
     assert labels.ignore[6]
@@ -118,7 +118,7 @@ def test_a_car_that_left_is_nobodys_failure(scene: SceneIR) -> None:
     assert len(to_kitti_labels(labeller.paper(), left.origin, left).kind) == 7
 
 
-def test_what_is_not_there_is_not_moved_and_violates_nothing(scene: SceneIR) -> None:
+def test_a_removed_vehicle_is_not_moved_and_violates_nothing(scene: SceneIR) -> None:
     space = ParameterSpace(remove_vehicle(scene, 6), ("translate", "rotate"), PRESETS["street"])
     for name in ("translate", "rotate"):
         upper = space.upper[space.blocks[Parameter(name)]].view(7, -1)
@@ -128,21 +128,21 @@ def test_what_is_not_there_is_not_moved_and_violates_nothing(scene: SceneIR) -> 
     assert FeasibleSet(space).violated_at_start == FeasibleSet(whole).violated_at_start
 
 
-def test_theta_is_carried_over_to_a_scene_with_one_more(scene: SceneIR) -> None:
+def test_theta_is_converted_to_a_scene_with_an_added_vehicle(scene: SceneIR) -> None:
     params = ("color", "weather", "translate", "rotate")
     place = scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0])
-    less, more = (ParameterSpace(s, params, PRESETS["street"]) for s in (scene, beside(scene, place)))
+    less, more = (ParameterSpace(s, params, PRESETS["street"]) for s in (scene, with_parked_car(scene, place)))
     theta = torch.linspace(-0.1, 0.1, less.dim)
     here = more.convert_theta(less, theta)
     for parameter in map(Parameter, params):
         block = here[more.blocks[parameter]]
-        kept = theta[less.blocks[parameter]]
-        assert torch.equal(block[: len(kept)], kept)
-        assert (block[len(kept) :] == 0).all()
+        combined = theta[less.blocks[parameter]]
+        assert torch.equal(block[: len(combined)], combined)
+        assert (block[len(combined) :] == 0).all()
 
 
-def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
-    more = beside(scene, scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0]))
+def test_an_added_vehicle_is_ignored_and_has_a_label(scene: SceneIR) -> None:
+    more = with_parked_car(scene, scene.objects.translation[5] + torch.tensor([6.0, 0.0, 0.0]))
     labeller, labels = labels_of(more)
     assert labels.ignore[-1]
     assert labels.in_view.all()
@@ -155,7 +155,7 @@ def test_one_more_is_not_judged_and_has_a_label(scene: SceneIR) -> None:
 
 
 @pytest.mark.parametrize(("column", "level"), [(0.0, 0), (1230.0, 0), (600.0, 2)])
-def test_labels_say_how_much_shows_of_one_more(column: float, level: int) -> None:
+def test_labels_of_an_added_vehicle_follow_its_visible_share(column: float, level: int) -> None:
     """Half of it beyond the border, or behind the only other car, which stands at 11 m in the middle."""
     scene = demo_scene(0, 0)
     scene = remove_objects(scene, range(1, len(scene.objects)))
@@ -171,7 +171,7 @@ def test_labels_say_how_much_shows_of_one_more(column: float, level: int) -> Non
 
 
 @pytest.mark.parametrize(("frame", "seed"), [(8, 0), (1, 1)])
-def test_a_place_beside_the_picture_is_passed_over(frame: int, seed: int) -> None:
+def test_positions_outside_the_picture_are_skipped(frame: int, seed: int) -> None:
     made = propose_scenes(demo_scene(0, frame), VehicleChangeSettings((VehicleChange.PARK,)), 6, seed)
     assert made
     for one in made:
@@ -182,17 +182,19 @@ def test_a_place_beside_the_picture_is_passed_over(frame: int, seed: int) -> Non
 
 def test_a_car_that_another_hides_is_not_counted(scene: SceneIR) -> None:
     target = scene.objects.translation[0]
-    _, labels = labels_of(beside(scene, 0.5 * target + torch.tensor([0.0, 0.5 * float(target[1]), 0.0])))
+    _, labels = labels_of(with_parked_car(scene, 0.5 * target + torch.tensor([0.0, 0.5 * float(target[1]), 0.0])))
     assert labels.became_ignored[0]
 
 
-@pytest.mark.parametrize(("shift", "said"), [((0.5, 0.0, 0.5), "collision"), ((16.0, 0.0, -4.0), "off the road")])
-def test_what_cannot_be_is_said(scene: SceneIR, shift: tuple[float, float, float], said: str) -> None:
+@pytest.mark.parametrize(
+    ("shift", "message"), [((0.5, 0.0, 0.5), "collision"), ((16.0, 0.0, -4.0), "off the road")]
+)
+def test_invalid_changes_are_named(scene: SceneIR, shift: tuple[float, float, float], message: str) -> None:
     place = scene.objects.translation[3] + torch.tensor(shift)
-    found = check_exchange(beside(scene, place))
-    assert any(said in line for line in found)
+    found = check_exchange(with_parked_car(scene, place))
+    assert any(message in line for line in found)
     assert all(line.startswith("exchange: objects[") for line in found)
-    changed = beside(scene, place)
+    changed = with_parked_car(scene, place)
     assert set(found) <= set(check_scene(changed.unperturbed(), changed))
 
 
@@ -205,16 +207,16 @@ def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])
-def test_what_is_no_change_is_named(text: str) -> None:
+def test_unknown_changes_are_named(text: str) -> None:
     with pytest.raises(FormatError, match="--changes: expected each at most once of leave, park, swap, load"):
         parse_vehicle_changes(text)
 
 
-def test_changes_by_name() -> None:
+def test_changes_are_parsed() -> None:
     assert parse_vehicle_changes("swap, leave") == (VehicleChange.LEAVE, VehicleChange.SWAP)
 
 
-def test_a_mesh_of_ones_own_parks_and_must_be_as_large_as_a_vehicle(scene: SceneIR, tmp_path: Path) -> None:
+def test_a_users_mesh_parks_and_must_have_a_vehicles_size(scene: SceneIR, tmp_path: Path) -> None:
     small = template("sedan")
     save_mesh(small, tmp_path / "unit.glb")
     with pytest.raises(FormatError, match=r"unit.glb: length: expected a vehicle's in metres, 1.5 to 20, found 1"):

@@ -109,15 +109,15 @@ def _sight(scene, cars, i):
     ]
     directions, centre = np.array(rays) @ inverse.T, -inverse @ matrix[:, 3]
     own = cars[i].entered(centre, directions)
-    met, shown, hiders = np.isfinite(own), np.isfinite(own), set()
+    met, visible, occluders = np.isfinite(own), np.isfinite(own), set()
     for j, other in enumerate(cars):
         meets = (box[:2] <= other.box.numpy()[2:]).all() and (other.box.numpy()[:2] <= box[2:]).all()
         if j != i and meets:
             before = (other.entered(centre, directions) < own) & met
-            shown &= ~before
-            hiders |= {j} if before.any() else set()
-    height = shown.reshape(10, 6).any(axis=1).mean() * (box[3] - box[1])
-    return float(height), shown.sum() / max(met.sum(), 1), hiders
+            visible &= ~before
+            occluders |= {j} if before.any() else set()
+    height = visible.reshape(10, 6).any(axis=1).mean() * (box[3] - box[1])
+    return float(height), visible.sum() / max(met.sum(), 1), occluders
 
 
 def _strain(offsets):
@@ -151,29 +151,34 @@ class PlainProjection:
         """What is violated, by name: pairs of cars, twice the same for what a car violates alone."""
         cars, sights, gaps, areas = self.measured(theta)
         cars0, sights0, gaps0, areas0 = self.start
-        limits, found = self.limits, {"road": set(), "frame": set(), "visibility": set(), "collision": set()}
+        limits, violations = self.limits, {"road": set(), "frame": set(), "visibility": set(), "collision": set()}
         for i, (car, car0) in enumerate(zip(cars, cars0, strict=True)):
             if car.road < car0.road - limits.road_loss - SLACK:
-                found["road"].add((i, i))
+                violations["road"].add((i, i))
             if (
                 car.in_frame < min(car0.in_frame, limits.in_frame) - SLACK
                 or bool((car.extent < car0.extent.clamp(max=limits.minimum_px) - SLACK).any())
-                or float(car.extent[1]) < limits.height_kept * float(car0.extent[1]) - SLACK
+                or float(car.extent[1]) < limits.min_height_share * float(car0.extent[1]) - SLACK
                 or car.near < min(car0.near, limits.near_m) - SLACK
             ):
-                found["frame"].add((i, i))
-            (height, area, hiders), (height0, area0, _) = sights[i], sights0[i]
-            if height < limits.height_kept * height0 - SLACK or area < min(area0, limits.area_kept) - SLACK:
-                found["visibility"] |= {(i, i), *((i, j) for j in hiders)}
+                violations["frame"].add((i, i))
+            (height, area, occluders), (height0, area0, _) = sights[i], sights0[i]
+            if (
+                height < limits.min_height_share * height0 - SLACK
+                or area < min(area0, limits.min_area_share) - SLACK
+            ):
+                violations["visibility"] |= {(i, i), *((i, j) for j in occluders)}
             for j in range(len(cars)):
                 nearer = gaps[i][j] < min(gaps0[i][j], limits.clearance_m) - SLACK
                 if i != j and (nearer or areas[i][j] > areas0[i][j] + SLACK):
-                    found["collision"].add((i, j))
-        return found
+                    violations["collision"].add((i, j))
+        return violations
 
     def wrong(self, theta):
-        found = self.violated(theta).values()
-        return np.array([any(i in pair for pairs in found for pair in pairs) for i in range(self.space.count)])
+        violations = self.violated(theta).values()
+        return np.array(
+            [any(i in pair for pairs in violations for pair in pairs) for i in range(self.space.count)]
+        )
 
     def strained(self, theta):
         mesh, low, high = self.block(theta, Parameter.MESH), self.limits.strain[0], self.limits.strain[1]
@@ -258,9 +263,9 @@ def test_projection_is_the_plain_one(street, positions, number, seed, reached):
     scene = street(positions_xz=positions, road_edge_x_m=4.0, tilt=0.01)
     space = ParameterSpace(scene, COMBOS[number])
     theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(seed)) * 10 * space.step
-    found = FeasibleSet(space).project(theta)
-    assert reached <= {name.split(": ")[1] for name in found.active}
-    torch.testing.assert_close(found.theta, PlainProjection(space).project(theta), atol=1e-6, rtol=1e-6)
+    violations = FeasibleSet(space).project(theta)
+    assert reached <= {name.split(": ")[1] for name in violations.active}
+    torch.testing.assert_close(violations.theta, PlainProjection(space).project(theta), atol=1e-6, rtol=1e-6)
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -41,7 +41,7 @@ def test_projection_is_idempotent_inside_and_feasible(street, seed, count, names
     assert torch.equal(twice.theta, once.theta)
     assert twice.active == ()
     changed = space.apply(scene, once.theta)
-    assert check_scene(scene, changed, reach=change_limits(PRESETS[budget])) == []
+    assert check_scene(scene, changed, limits=change_limits(PRESETS[budget])) == []
 
 
 @pytest.mark.parametrize(

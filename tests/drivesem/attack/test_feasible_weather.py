@@ -39,13 +39,13 @@ def _projected(street, theta, start=(0.0, 0.0, 0.0, 0.0), **budget) -> np.ndarra
 @example(point=[0.0, 1.0, 0.0, 0.0])
 @example(point=[2.0, 2.0, -0.5, -0.5])
 def test_the_projection_is_the_nearest_point(street, point):
-    found, asked = _projected(street, point), np.array(point)
+    found, requested = _projected(street, point), np.array(point)
     assert (CODE_SUMS @ found <= CODE_SUM_LIMITS + ROUNDING).all()
     assert ((found >= 0) & (found <= 1)).all()
     least = minimize(
-        lambda code: ((code - asked) ** 2).sum(),
+        lambda code: ((code - requested) ** 2).sum(),
         np.full(4, 0.2),
-        jac=lambda code: 2 * (code - asked),
+        jac=lambda code: 2 * (code - requested),
         bounds=[(0, 1)] * 4,
         constraints=LinearConstraint(CODE_SUMS, -np.inf, CODE_SUM_LIMITS),
         method="SLSQP",
@@ -116,7 +116,7 @@ def test_a_scene_that_has_such_weather_already_may_keep_it(street, start, change
 
 @lenient
 @given(code=CODE)
-def test_both_checks_say_the_same_of_any_weather(street, code):
+def test_projection_and_check_agree_on_weather(street, code):
     space = _space(street)
     theta = torch.tensor(code, dtype=torch.float32)
     beyond = (CODE_SUMS @ np.array(code) - CODE_SUM_LIMITS).max()
@@ -139,17 +139,17 @@ def test_bounding_together_is_a_limit(street):
     assert len(check_scene(space.scene, changed, joint_weather=True)) == 2
 
 
-def _fades_beyond(limit: float):
-    """Object 1 of 2 fades where fog and dusk come to more than `limit`."""
+def _invisible_beyond(limit: float):
+    """Object 1 of 2 becomes invisible where fog and dusk sum to more than `limit`."""
     return lambda weather: np.array([False, weather[0] + weather[2] > limit])
 
 
 @lenient
 @given(code=CODE, limit=st.floats(0.0, 1.5))
-def test_where_a_car_fades_weather_goes_back_towards_the_photograph(street, code, limit):
+def test_weather_is_scaled_back_where_a_car_becomes_invisible(street, code, limit):
     space = _space(street)
     together = FeasibleSet(space).project(torch.tensor(code)).theta
-    feasible = FeasibleSet(space, fades=_fades_beyond(limit))
+    feasible = FeasibleSet(space, find_invisible=_invisible_beyond(limit))
     found = feasible.project(torch.tensor(code))
     assert feasible.violations(found.theta) == ()
     assert torch.equal(feasible.project(found.theta).theta, found.theta)
@@ -163,7 +163,7 @@ def test_where_a_car_fades_weather_goes_back_towards_the_photograph(street, code
         assert limit / total - 1 / 32 - 1e-6 <= scale <= limit / total + 1e-6
 
 
-def test_the_second_check_knows_who_is_out_of_sight(street):
+def test_the_check_names_invisible_cars(street):
     scene = street(positions_xz=((0.0, 60.0),))
     x0, y0, x1, y1 = (round(v) for v in scene.objects.box2d[0].tolist())
     photograph = scene.photograph.clone()

@@ -13,6 +13,7 @@ from drivesem.attack.methods.gradient_ascent import SiFGSM
 from drivesem.attack.methods.gradient_free import Sampling
 from drivesem.attack.objective import Objective, compute_gradients
 from drivesem.attack.space import ParameterSpace
+from drivesem.config.commands import AttackConfig
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -25,7 +26,7 @@ ALL_TARGETS = Difficulty(min_height_px=0, max_occlusion=3, max_truncation=1, min
 class StubCompositor:
     """An image whose mean is a hundredth of the sum of the cars' z, and opacities without a meaning."""
 
-    fixed = None  # what `render_batch` asks for: nothing of this can be drawn together
+    fixed_geometry = None  # what `render_batch` asks for: nothing of this can be drawn together
 
     def render(self, scene) -> Render:
         h, w = scene.camera.height, scene.camera.width
@@ -64,8 +65,8 @@ class StubDetector(Detector):
 
 def _objective(scene, detector, mode="moved", **settings):
     space = ParameterSpace(scene, ("translate",))
-    settings = {"term": "confidence", "difficulty": ALL_TARGETS, **settings}
-    return Objective(StubCompositor(), space, detector, mode, **settings)
+    config = AttackConfig(objective_labels=mode, **{"objective": "confidence", **settings})
+    return Objective(StubCompositor(), space, detector, config, ALL_TARGETS)
 
 
 def test_loss_and_gradient_are_those_of_the_whole_chain(street):
@@ -99,11 +100,11 @@ def test_a_gradient_that_is_not_finite_names_the_coordinate(street):
 def test_an_unknown_term_is_named(street):
     scene = street(positions_xz=NEAR)
     with pytest.raises(RangeError, match=r"objective term: expected one of confidence, hide, .*, found 'class'"):
-        _objective(scene, StubDetector(scene.objects.box2d), term="class")
+        _objective(scene, StubDetector(scene.objects.box2d), objective="class")
 
 
 @pytest.mark.parametrize("mode", ["moved", "paper"])
-def test_the_loss_aims_at_the_labels_of_its_mode(street, mode):
+def test_the_loss_uses_the_labels_of_its_mode(street, mode):
     scene = street(positions_xz=NEAR)
     detector = StubDetector(scene.objects.box2d)
     objective = _objective(scene, detector, mode)
@@ -135,7 +136,7 @@ def test_a_theta_is_rendered_once(street):
     assert objective.evaluate(theta) is not first
 
 
-def test_both_label_modes_are_judged(street):
+def test_success_in_both_label_modes(street):
     scene = street(positions_xz=NEAR)
     # A detector that sees nothing any more fails both; one that stays where the cars were fails `moved` only.
     blind = _objective(scene, StubDetector(scene.objects.box2d, blind_above=0.222))
@@ -152,10 +153,10 @@ class Spotter:
     name, classes = "spotter", ("person", "Car")
 
     def __init__(self, boxes_xyxy) -> None:
-        self.boxes_xyxy, self.looks = boxes_xyxy, 0
+        self.boxes_xyxy, self.seen_images = boxes_xyxy, 0
 
     def forward(self, images):
-        self.looks += len(images)
+        self.seen_images += len(images)
         return images.mean(dim=(1, 2, 3)).tolist()
 
     def decode(self, raw):
@@ -172,9 +173,9 @@ class Spotter:
         ]
 
 
-def test_a_detector_without_gradient_is_judged_by_its_detections(street):
+def test_a_detector_without_gradient_is_scored_by_its_detections(street):
     scene = street(positions_xz=NEAR)
-    objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness")
+    objective = _objective(scene, Spotter(scene.objects.box2d), objective="objectness")
     assert objective.classes.names == ("Car",)
     assert objective.t_star == 0.3
     # mean 0.22 of the image, rounded to 8 bits: both cars are found with a score of 0.44
@@ -187,29 +188,29 @@ def test_a_detector_without_gradient_is_judged_by_its_detections(street):
     assert stayed.loss > objective.benign.loss
 
 
-def test_nothing_is_a_success_while_a_car_is_out_of_sight(street):
+def test_no_success_while_a_car_is_out_of_sight(street):
     scene = street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=-math.pi / 2)
     compositor = Compositor(scene, RenderSettings(backend="reference"))
     objective = Objective(compositor, ParameterSpace(scene, ("translate",)), Spotter(scene.objects.box2d))
-    beside = objective.score(torch.tensor([0.0, -0.25, 0.0, 0.0]))
+    other = objective.score(torch.tensor([0.0, -0.25, 0.0, 0.0]))
     behind = objective.score(torch.tensor([0.0, -0.25, 0.0, 0.25]))
-    assert beside.success
-    assert beside.violations == ()
+    assert other.success
+    assert other.violations == ()
     assert behind.violations == ("objects[1]: visibility",)
     assert behind.lost > 0
     assert not behind.success
     assert not behind.success_paper
 
 
-def test_a_threshold_of_choice(street):
+def test_the_threshold_can_be_set(street):
     scene = street(positions_xz=NEAR)
-    objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness", t_star=0.9)
+    objective = _objective(scene, Spotter(scene.objects.box2d), objective="objectness", t_star=0.9)
     assert not objective.score(torch.tensor([0.0, -0.25, 0.0, 0.0])).success
 
 
-def test_what_a_detector_without_gradient_lacks_is_named(street):
+def test_a_missing_gradient_or_term_is_named(street):
     scene = street(positions_xz=NEAR)
-    objective = _objective(scene, Spotter(scene.objects.box2d), term="objectness")
+    objective = _objective(scene, Spotter(scene.objects.box2d), objective="objectness")
     with pytest.raises(RangeError, match="detector: expected one with a gradient, found spotter"):
         objective.loss_and_grad(objective.space.theta0)
     with pytest.raises(
@@ -218,14 +219,14 @@ def test_what_a_detector_without_gradient_lacks_is_named(street):
         _objective(scene, Spotter(scene.objects.box2d))
 
 
-def test_a_search_pays_for_each_theta_once(street):
+def test_scores_are_cached(street):
     scene = street(positions_xz=NEAR)
     detector = Spotter(scene.objects.box2d)
-    objective = _objective(scene, detector, term="objectness")
+    objective = _objective(scene, detector, objective="objectness")
     problem = objective.problem(FeasibleSet(objective.space))
     result = Sampling(queries=6, kind="halton")(problem, objective.space.theta0, seed=1)
     assert result.queries == 6
-    assert detector.looks == 7
+    assert detector.seen_images == 7
     assert result.score == objective.score(result.theta)
 
 
@@ -298,7 +299,7 @@ def _pattern_objectives(street, detector, sizes) -> list[Objective]:
     return found
 
 
-def test_several_scenes_at_once_are_each_by_itself(street):
+def test_batched_scenes_are_independent(street):
     detector = _frozen_squeezedet()
     objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
     generator = torch.Generator().manual_seed(3)
@@ -312,7 +313,7 @@ def test_several_scenes_at_once_are_each_by_itself(street):
         assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm())
 
 
-def test_images_of_one_size_share_a_call_of_the_detector(street):
+def test_images_of_one_size_share_a_detector_pass(street):
     detector = _frozen_squeezedet()
     objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
     seen = []
@@ -321,7 +322,7 @@ def test_images_of_one_size_share_a_call_of_the_detector(street):
     assert seen == [(2, 3, 64, 96), (1, 3, 48, 80)]
 
 
-def test_several_thetas_at_once_are_independent(street):
+def test_batched_thetas_are_independent(street):
     objective = _real(street(positions_xz=NEAR, dtype=torch.float64), ("translate", "color"))
     space = objective.space
     noise = torch.randn(3, space.dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
@@ -332,7 +333,7 @@ def test_several_thetas_at_once_are_independent(street):
         assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm())
 
 
-def test_batches_that_do_not_fit_are_refused(street):
+def test_invalid_batches_are_refused(street):
     scene = street(positions_xz=NEAR)
     first, second = (_objective(scene, StubDetector(scene.objects.box2d)) for _ in range(2))
     with pytest.raises(RangeError, match="objectives: expected one detector for all, found 2 detectors"):
@@ -343,19 +344,19 @@ def test_batches_that_do_not_fit_are_refused(street):
         compute_gradients([first], [first.space.theta0] * 2)
 
 
-def test_a_gradient_pass_previews_what_the_score_will_say(street):
+def test_a_gradient_pass_previews_the_score(street):
     scene = street(positions_xz=NEAR)
     space = ParameterSpace(scene, ("translate",))
-    ways = [torch.full((4,), 0.2), torch.full((4,), -0.2)]
-    light = [float(StubCompositor().render(space.apply(scene, way)).image.mean()) for way in ways]
+    thetas = [torch.full((4,), 0.2), torch.full((4,), -0.2)]
+    light = [float(StubCompositor().render(space.apply(scene, theta)).image.mean()) for theta in thetas]
     benign = float(StubCompositor().render(scene).image.mean())
     # Blind at the brighter of the two only.
     objective = _objective(scene, StubDetector(scene.objects.box2d, blind_above=(benign + max(light)) / 2))
     lost = set()
-    for way in ways:
-        assert objective.preview(way) is None
-        objective.loss_and_grad(way)
-        preview, score = objective.preview(way), objective.score(way)
+    for theta in thetas:
+        assert objective.preview(theta) is None
+        objective.loss_and_grad(theta)
+        preview, score = objective.preview(theta), objective.score(theta)
         assert preview is not None
         assert (preview.lost, preview.phantoms) == (score.lost, score.phantoms)
         assert (preview.success, preview.success_paper) == (score.success, score.success_paper)
@@ -365,9 +366,9 @@ def test_a_gradient_pass_previews_what_the_score_will_say(street):
 
 
 @pytest.mark.parametrize("mode", ["moved", "paper"])
-def test_goals_are_raised_without_a_gradient_too(street, mode):
+def test_goals_without_a_gradient(street, mode):
     scene = street(positions_xz=NEAR)
-    objective = _objective(scene, Spotter(scene.objects.box2d), mode, term="failure")
+    objective = _objective(scene, Spotter(scene.objects.box2d), mode, objective="failure")
     certain = 2 * math.log(objective.t_star / (1 - objective.t_star))
     assert objective.benign.loss < certain
     with pytest.raises(RangeError, match="detector: expected one with a gradient"):

@@ -10,6 +10,7 @@ from detectors.base import AnchorPredictions, Detector
 from detectors.registry import load_detector
 from drivesem.attack.objective import Objective, compute_gradients
 from drivesem.attack.space import ParameterSpace
+from drivesem.config.commands import AttackConfig
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 
@@ -34,7 +35,7 @@ def pair() -> tuple[Objective, Objective]:
     scene = demo_scene(0, 0)
     space = ParameterSpace(scene, ("color", "translate", "rotate", "mesh"))
     detector, compositor = load_detector("squeezedet"), Compositor(scene)
-    return Objective(compositor, space, detector), Objective(compositor, space, detector, whole=True)
+    return Objective(compositor, space, detector), Objective(compositor, space, detector, AttackConfig(whole=True))
 
 
 def thetas(space: ParameterSpace, count: int) -> list[Tensor]:
@@ -77,7 +78,7 @@ def test_only_the_first_step_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     for theta in thetas(space, 2):
         objective.loss_and_grad(theta)
     assert counted.passes == 2
-    Objective(compositor, space, detector, whole=True).loss_and_grad(space.theta0)
+    Objective(compositor, space, detector, AttackConfig(whole=True)).loss_and_grad(space.theta0)
     assert counted.passes == 4
     foggy = ParameterSpace(scene, ("weather", "translate"))
     Objective(compositor, foggy, detector).loss_and_grad(foggy.theta0)

@@ -88,17 +88,17 @@ def test_projected_cars_keep_their_height_and_both_checks_agree(street, seed, sc
     plane = scene.environment.ground
     rise = (moved.objects.translation - scene.objects.translation) @ plane[:3]
     assert rise.abs().max() < 1e-4
-    assert check_scene(scene, moved, reach=ROI) == []
+    assert check_scene(scene, moved, limits=ROI) == []
 
 
-def test_without_projection_a_car_may_leave_the_ground_and_the_second_check_says_so(street):
+def test_without_projection_a_car_may_leave_the_ground_and_the_check_reports_it(street):
     scene = street(positions_xz=NEAR)
     space = _space(scene)
     theta = space.theta0.clone()
     theta[1] = -0.2
     assert torch.equal(FeasibleSet(space, only_bounds=True).project(theta).theta, theta)
     moved = space.apply(scene, theta)
-    assert any("off the ground" in line for line in check_scene(scene, moved, reach=ROI))
+    assert any("off the ground" in line for line in check_scene(scene, moved, limits=ROI))
     held = FeasibleSet(space).project(theta)
     assert held.theta[1].abs() < 1e-4
     assert "objects[0]: ground" in held.active
@@ -151,7 +151,7 @@ def test_a_way_to_the_ground_that_is_too_long_is_shortened(street):
     assert found[1].tolist() == [0, 0, 0]
     assert float(found[2, 2]) == 2.0
     assert bool((found[:, 1].abs() <= most).all())
-    assert (regions.shift(found) @ regions.ground).abs().max() < 1e-9
+    assert (regions.shift(found) @ regions.ground_normal).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("name", ["parking", "street"])

@@ -22,13 +22,13 @@ ALL = tuple(Parameter)
 WIDE = Budget(size=0.1, sun=1.0)
 
 
-def test_parse_params_is_in_thetas_order_whatever_is_typed():
+def test_parsed_parameters_are_in_thetas_order():
     assert parse_params("mesh, translate,rotate") == COMBOS[2]
     assert [p.value for p in parse_params("rotate")] == ["rotate"]
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (
             "translate,spin",
@@ -38,10 +38,10 @@ def test_parse_params_is_in_thetas_order_whatever_is_typed():
         ("mesh,mesh", "expected each parameter once"),
     ],
 )
-def test_parse_params_names_what_is_wrong(text, said):
+def test_parse_params_names_what_is_wrong(text, message):
     with pytest.raises(FormatError, match="params") as caught:
         parse_params(text)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_unknown_combo_and_budget():
@@ -221,7 +221,7 @@ def test_apply_has_the_gradient_of_its_differences(street):
     assert torch.autograd.gradcheck(functional, theta.requires_grad_(True))
 
 
-def test_a_size_is_a_share_of_its_own_and_shown_in_percent(street):
+def test_a_size_is_a_share_of_its_own_and_displayed_in_percent(street):
     scene = street(dtype=torch.float64)
     space = ParameterSpace(scene, ("size",), WIDE)
     theta = torch.tensor([0.1, -0.05, 0.0, 0.0], dtype=torch.float64)

@@ -130,7 +130,7 @@ def test_luminance_is_that_of_srgb():
 
 @pytest.mark.parametrize("weather", [(1.0, 0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0), (0.5, 0, 0.4, 0.7)])
 @pytest.mark.parametrize("away_m", [10.0, 40.0, 80.0, 120.0])
-def test_fading_says_of_a_car_what_its_picture_says(weather, away_m):
+def test_invisible_cars_agree_with_the_rendered_contrast(weather, away_m):
     render, codes = _seen(0.15, 0.5, 0.3, away_m), torch.tensor(weather)
     find_invisible = VisibilityUnderWeather(render, _environment(CLEAR), AIR, np.array([True]), MIN_CONTRAST)
     seen = compute_contrasts(_in_weather(render, codes))[0]
@@ -138,12 +138,14 @@ def test_fading_says_of_a_car_what_its_picture_says(weather, away_m):
         assert bool(find_invisible(codes.double().numpy())[0]) == (seen < 1.25 * MIN_CONTRAST)
 
 
-def test_who_is_not_asked_for_does_not_fade():
+def test_objects_not_in_question_stay_visible():
     thick = np.array([1.0, 0, 0, 0])
     render = _seen(0.15, 0.5, away_m=120.0)
-    for asked in (True, False):
-        find_invisible = VisibilityUnderWeather(render, _environment(CLEAR), AIR, np.array([asked]), MIN_CONTRAST)
-        assert find_invisible(thick).tolist() == [asked]
+    for requested in (True, False):
+        find_invisible = VisibilityUnderWeather(
+            render, _environment(CLEAR), AIR, np.array([requested]), MIN_CONTRAST
+        )
+        assert find_invisible(thick).tolist() == [requested]
         assert not find_invisible(np.zeros(4)).any()
 
 

@@ -132,7 +132,7 @@ def test_weather_has_no_regions(objective: Objective) -> None:
     assert cached == 0
 
 
-def test_no_more_layers_are_kept_than_there_is_room_for() -> None:
+def test_cached_layers_fit_the_limit() -> None:
     scene = demo_scene(0, 0)
     space = ParameterSpace(scene, ("translate",))
     objective = Objective(

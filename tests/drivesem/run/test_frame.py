@@ -17,7 +17,7 @@ from drivesem.synth.demo import demo_scene
 
 
 @pytest.mark.parametrize("options", [{"method": "climb", "passes": 40}, {"method": "random", "queries": 4}])
-def test_no_layers_are_kept_when_a_frame_ends(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_layers_are_released_after_a_frame(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[weakref.ref[ReferencePass]] = []
     megabytes: list[float] = []
     original_run = ReferencePass.run

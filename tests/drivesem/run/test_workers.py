@@ -19,7 +19,7 @@ import torch
 
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
-from drivesem.run.jobs import give_back
+from drivesem.run.jobs import release_freed_memory
 from drivesem.run.workers import run_jobs
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 from tools.hostile.trial import soon
@@ -290,7 +290,7 @@ def scatter(job: int) -> float:
 @_NO_PROC
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc's malloc_trim")
 def test_memory_that_is_free_goes_back_after_each_job() -> None:
-    give_back()  # what tests before this one let go of would be taken again
+    release_freed_memory()  # what tests before this one let go of would be taken again
     before = resident_mb()
     for _, outcome in run_jobs(scatter, stumbling, [1, 2, 3], WorkerOptions(workers=1)):
         assert outcome() > 150

@@ -24,7 +24,7 @@ WORDS = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--jso
 
 
 class Dazzled(Detector):
-    """Sees a car in a corner where there is none, surer the darker the picture is than the first it was shown."""
+    """Sees a car in a corner where there is none, surer the darker the picture is than the first it was displayed."""
 
     name, classes, t_star = "dazzled", CLASSES, 0.5
 
@@ -72,13 +72,13 @@ def dazzled(monkeypatch: pytest.MonkeyPatch) -> None:
         (["--method", "scw", "--queries", "5", "--norm", "1"], 5),
     ],
 )
-def test_methods_that_follow_the_gradient(
+def test_gradient_methods(
     words: list[str], queries: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    figures = attack(["--params", "weather,translate", *words], tmp_path, capsys)
-    assert figures["queries"] == queries
-    assert figures["feasible_fraction"] == 1.0
-    assert figures["attacked"]["moved"]["ap50"] is not None
+    metrics = attack(["--params", "weather,translate", *words], tmp_path, capsys)
+    assert metrics["queries"] == queries
+    assert metrics["feasible_fraction"] == 1.0
+    assert metrics["attacked"]["moved"]["ap50"] is not None
     result = load_frame(tmp_path / "frames" / "demo-000" / "result.json")
     assert result.success_moved
     assert [failure.kind for failure in result.failures] == ["phantom"]
@@ -100,18 +100,16 @@ def test_methods_that_follow_the_gradient(
     ],
     ids=" ".join,
 )
-def test_no_method_takes_more_passes_than_it_may(
+def test_no_method_exceeds_its_passes(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    figures = attack(["--params", "weather", "--passes", "40", *words], tmp_path, capsys)
-    assert 0 < figures["passes"] <= 40
+    metrics = attack(["--params", "weather", "--passes", "40", *words], tmp_path, capsys)
+    assert 0 < metrics["passes"] <= 40
     if words in ([], ["--method", "halton"]):
-        assert figures["passes"] > 30
+        assert metrics["passes"] > 30
 
 
-def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_budget_from_a_file_is_recorded_in_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = tmp_path / "own.yaml"
     own.write_text("translate: 0.02m\nweather: 0.125\n")
     out = tmp_path / "run"
@@ -123,8 +121,8 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
     assert theta["weather.time_of_day"]["value"] == pytest.approx(0.125)
     assert theta["objects[0].translate.along"]["bounds"][1] < 0.02
     assert theta["objects[0].yaw"]["bounds"] == pytest.approx([-0.35, 0.35])
-    shown = [float(c["display"].split()[0]) for name, c in theta.items() if "translate" in name]
-    assert max(map(abs, shown)) == pytest.approx(0.02, abs=1e-4)
+    displayed = [float(c["display"].split()[0]) for name, c in theta.items() if "translate" in name]
+    assert max(map(abs, displayed)) == pytest.approx(0.02, abs=1e-4)
     (run,) = load_runs([str(out)])
     assert (run.params, len(run.frames)) == ("weather,translate,rotate", 1)
     # The same numbers, written out, are the same run: it is finished already.
@@ -162,5 +160,5 @@ def test_a_budget_from_a_file_is_kept_to_and_carried_without_it(
         (["--budget", "street,rotate=21deg"], "--budget: rotate: expected a positive number of at most 0.35"),
     ],
 )
-def test_options_that_do_not_fit_are_named(words: list[str], message: str, refused: Callable[..., str]) -> None:
+def test_invalid_options_are_named(words: list[str], message: str, refused: Callable[..., str]) -> None:
     assert refused(*WORDS, *words).startswith(f"drivesem: {message}")
