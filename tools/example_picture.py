@@ -25,10 +25,10 @@ def example(run: Path, name: str) -> pictures.Image:
     folder = run / "frames" / name
     result = load_frame(folder / "result.json")
     threshold = float(json.loads(files.read_text(run / "metrics.json"))["t_star"])
-    before = pictures.overlay(
+    before = pictures.draw_overlay(
         files.read_image(folder / "benign.png"), result.targets_benign, result.detections_benign, (), threshold
     )
-    after = pictures.overlay(
+    after = pictures.draw_overlay(
         files.read_image(folder / "counterexample.png"),
         result.targets_moved,
         result.detections_attacked,

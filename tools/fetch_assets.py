@@ -33,7 +33,7 @@ import yaml
 from trimesh.remesh import subdivide_to_size
 from trimesh.visual.material import SimpleMaterial
 
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from drivesem.synth.render import rasterise
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
@@ -66,19 +66,24 @@ _FREE_DEG = 50.0
 
 @dataclass(frozen=True)
 class Model:
-    """How to read one model. kind: body; paint, glass, tyre, light: names of materials, all others are trim.
-    front: the axis that it looks along; plain: materials whose texture is too fine to keep; roof_m: what lies
-    wholly above this is left out (aerials).
-    """
+    """How to read one model."""
 
     kind: str
+    """Body."""
     paint: tuple[str, ...]
+    """Names of materials, all others are trim."""
     glass: tuple[str, ...] = ("glass",)
+    """Names of materials, all others are trim."""
     tyre: tuple[str, ...] = ("tires",)
+    """Names of materials, all others are trim."""
     light: tuple[str, ...] = ()
+    """Names of materials, all others are trim."""
     front: str = "+z"
+    """The axis that it looks along."""
     plain: tuple[str, ...] = ()
+    """Materials whose texture is too fine to keep."""
     roof_m: float | None = None
+    """What lies wholly above this is left out (aerials)."""
 
 
 _KATOR_01 = Model(
@@ -156,11 +161,12 @@ MODELS: Mapping[str, Model] = {
 
 @dataclass(frozen=True)
 class Entry:
-    """A model in a catalogue. size_lhw_m: of its bounds; folder and file: in the archive."""
+    """A model in a catalogue."""
 
     name: str
     file: str
     size_lhw_m: tuple[float, float, float]
+    """Of its bounds; folder and file: in the archive."""
     author: str
     licence: str
 
@@ -555,7 +561,7 @@ def fetch(out: Path, deb: Path | None, tarball: Path | None) -> Iterator[str]:
                 yield from add_skies(package, out)
     skies = sorted(path.name for path in (out / "skies").glob("*.npz"))
     files.write_text(out / "LICENCES.md", licences(pack, skies))
-    yield f"{out}: {number_of(len(pack.vehicles), 'vehicle')}, {number_of(len(skies), 'sky', 'skies')}"
+    yield f"{out}: {format_count(len(pack.vehicles), 'vehicle')}, {format_count(len(skies), 'sky', 'skies')}"
 
 
 def main() -> None:

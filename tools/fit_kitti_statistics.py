@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.data.kitti import read_calib, read_labels
+from drivesem.data.kitti import read_calibration, read_labels
 from drivesem.synth.compare import VEHICLES, histograms
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.files import write_json
@@ -103,7 +103,7 @@ def _cameras(folder: Path, paths: Sequence[Path], frames: Sequence[Labels]) -> l
     met: Counter[tuple[float, ...]] = Counter()
     ends: dict[tuple[float, ...], np.ndarray] = {}
     for path, labels in zip(paths, frames, strict=True):
-        projection = read_calib(folder / "calib" / path.name).projection.double()
+        projection = read_calibration(folder / "calib" / path.name).projection.double()
         key = tuple(np.round(projection.flatten().tolist(), 4).tolist())
         met[key] += 1
         boxes = np.concatenate([labels.boxes_xyxy.numpy(), labels.ignore_xyxy.numpy(), np.zeros((1, 4))])

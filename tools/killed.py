@@ -23,11 +23,10 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from drivesem.report.progress import progress_bar
-from drivesem.report.tables import number_of
-from drivesem.report.terminal import Console
+from drivesem.report.tables import format_count
+from drivesem.report.terminal import Console, progress_bar
 from scene_ir import files
-from tools.same import Hasher, differences, environment
+from tools.same import Hasher, command_words, differences, environment
 from tools.small_frames import small_frames
 
 RUN = "run"
@@ -39,30 +38,32 @@ COMMANDS = {
     "derender": f"derender {_FRAMES} --fast --workers 2",
     "train": "train --root ../../small --held-out ../../small --steps {count} --batch 2 --window 96x64"
     " --checkpoint-every 4 --evaluate-every 5 --semantic 0.5",
-    "study": f"study multi --quick {_FRAMES} --no-fit --steps 1 --bootstrap 20 --workers 1",
+    "multi": f"tools.experiments multi --quick {_FRAMES} --no-fit --steps 1 --bootstrap 20 --workers 1",
 }
 """What is killed, each in a folder of its own below the work folder."""
-KILLS = "attack=100,synth=25,derender=25,train=25,study=25"
+KILLS = "attack=100,synth=25,derender=25,train=25,multi=25"
 _MINUTES = 20
 """A command that takes longer is stopped."""
 
 
 @dataclass
 class Trial:
-    """What became of a command. unbroken_s: what it takes that nobody kills; kills: of these `begun` after it had
-    made its folder; runs: how many were killed until they were done; left: the most files and folders that kills
-    left behind of one; differing: files of such a run that are others than those of one that nobody killed.
-    """
+    """What became of a command."""
 
     name: str
     command: str
     unbroken_s: float = 0.0
+    """What it takes that nobody kills."""
     kills: int = 0
+    """Of these `begun` after it had made its folder."""
     begun: int = 0
     runs: int = 0
+    """How many were killed until they were done."""
     files: int = 0
     left: int = 0
+    """The most files and folders that kills left behind of one."""
     differing: list[str] = field(default_factory=list)
+    """Files of such a run that are others than those of one that nobody killed."""
 
 
 def run_unbroken(words: Sequence[str], folder: Path) -> None:
@@ -103,7 +104,7 @@ def _check(code: int, folder: Path) -> None:
 
 def hashes(folder: Path, trial: Trial) -> dict[str, str]:
     """Of what a run left in `folder`, less what kills left, which is removed."""
-    left = files.leftovers(folder / RUN)
+    left = files.find_leftovers(folder / RUN)
     trial.left = max(trial.left, len(left))
     for path in left:
         if path.is_dir():
@@ -161,15 +162,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         work = (given.work or Path(temporary)).resolve()
         work.mkdir(parents=True, exist_ok=True)
         if not (work / "small").is_dir():
-            with files.whole_folder(work / "small") as part:
+            with files.atomic_folder(work / "small") as part:
                 small_frames(part, given.frames)
         for name, kills in (one.split("=") for one in given.kills.split(",")):
             command = COMMANDS[name].format(count=given.frames) + f" --out {RUN}"
             trial = Trial(name, command)
             trials.append(trial)
             shutil.rmtree(work / name, ignore_errors=True)
-            words = [sys.executable, "-m", "drivesem.cli", *command.split()]
-            with progress_bar(console, stays=False) as progress:
+            words = [sys.executable, "-m", *command_words(command, work / name, work / name)]
+            with progress_bar(console, keep=False) as progress:
                 task = progress.add_task(f"kills of {name}", total=int(kills))
                 try:
                     try_out(
@@ -180,9 +181,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if given.out is not None:
                 files.write_json(given.out, [asdict(one) for one in trials])
             console.print(
-                f"{name}: {number_of(trial.kills, 'kill')} ({trial.begun} after the folder was made) in"
-                f" {number_of(trial.runs, 'run')} of {trial.unbroken_s:g} s and {number_of(trial.files, 'file')}:"
-                f" {number_of(len(trial.differing), 'difference')}",
+                f"{name}: {format_count(trial.kills, 'kill')} ({trial.begun} after the folder was made) in"
+                f" {format_count(trial.runs, 'run')} of {trial.unbroken_s:g} s and {format_count(trial.files, 'file')}:"
+                f" {format_count(len(trial.differing), 'difference')}",
                 *trial.differing[:20],
                 sep="\n",
                 soft_wrap=True,

@@ -21,7 +21,9 @@ from scene_ir.errors import FormatError
 
 ROOT = Path(__file__).parents[1]
 CONSTRAINTS, LOCK = ROOT / "constraints.txt", ROOT / "constraints.lock"
-_HEAD = "# constraints.txt with hashes (python -m tools.lock), CPython 3.11, Linux: docs/reliability.md\n"
+_HEAD = (
+    "# constraints.txt with hashes (python -m tools.lock), CPython 3.11, Linux: docs/reference/reliability.md\n"
+)
 
 
 def pinned(path: Path) -> dict[str, str]:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scene_ir import ffd
-from scene_ir.geometry import place, to_clip, vertex_normals
-from scene_ir.meshes.lod import detail
+from scene_ir.geometry import place_vertices, to_clip, vertex_normals
+from scene_ir.meshes.lod import level_of_detail
 from scene_ir.meshes.outlines import KINDS
 from scene_ir.meshes.templates import template, typical_size_lhw
 from scene_ir.raster import verbs
@@ -68,13 +68,15 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """Outline: mean, 99th percentile and largest distance, px; depth: mean, m; normals: mean angle, degrees."""
+    """Outline: mean, 99th percentile and largest distance, px."""
 
     outline_mean: float
     outline_p99: float
     outline_max: float
     depth: float
+    """Mean, m."""
     normals: float
+    """Mean angle, degrees."""
 
 
 def clip_coordinates(mesh: Mesh, view: View) -> tuple[Tensor, Tensor]:
@@ -83,7 +85,7 @@ def clip_coordinates(mesh: Mesh, view: View) -> tuple[Tensor, Tensor]:
     bent = unit + ffd.lattice_weights(unit) @ view.offsets
     size, yaw = torch.tensor(view.size_lhw), torch.tensor(view.yaw)
     z = FOCAL_PX * view.size_lhw[1] / view.height_px
-    points = place(bent, size, yaw, torch.tensor([0.0, CAMERA_HEIGHT_M, z]))
+    points = place_vertices(bent, size, yaw, torch.tensor([0.0, CAMERA_HEIGHT_M, z]))
     weld = torch.unique(unit, dim=0, return_inverse=True)[1]
     welded = torch.zeros(int(weld.max()) + 1, 3).index_copy(0, weld, points)
     normals = vertex_normals(welded, weld[mesh.faces])[weld]
@@ -93,7 +95,7 @@ def clip_coordinates(mesh: Mesh, view: View) -> tuple[Tensor, Tensor]:
 
 def draw(mesh: Mesh, clip: Tensor, normals: Tensor, rect: Sequence[int]) -> Picture:
     """The mesh inside a rectangle (x0, y0, x1, y1) px."""
-    layout = verbs.Layout.of(torch.tensor([list(rect)]))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([list(rect)]))
     fragments = verbs.rasterize(clip, mesh.faces, torch.tensor([[0, len(mesh.faces)]]), layout)
     values = verbs.interpolate(fragments, clip, mesh.faces, normals)
     shape = (rect[3] - rect[1], rect[2] - rect[0])
@@ -145,7 +147,7 @@ def bend(generator: torch.Generator, amplitude: float) -> Tensor:
 def measure(kind: str, height_px: float, amplitude: float) -> tuple[Mesh, list[Deviation]]:
     """The level of detail of a kind at a height, and its deviation at each yaw."""
     full = template(kind, 0)
-    coarse = detail(full, height_px)
+    coarse = level_of_detail(full, height_px)
     generator = torch.Generator().manual_seed(SEED)
     size = typical_size_lhw(kind, 0)
     views = [View(size, height_px, yaw, bend(generator, amplitude)) for yaw in YAWS_RAD]

@@ -29,7 +29,9 @@ def read_files(revision: str | None) -> Iterator[tuple[str, str]]:
         if not name.endswith((".py", ".md")):
             continue
         if revision:
-            shown = subprocess.run(["git", "show", f"{revision}:{name}"], cwd=ROOT, capture_output=True, check=True)
+            shown = subprocess.run(
+                ["git", "show", f"{revision}:{name}"], cwd=ROOT, capture_output=True, check=True
+            )
             yield name, shown.stdout.decode()
         elif (ROOT / name).is_file():
             yield name, (ROOT / name).read_text(encoding="utf-8")
@@ -71,9 +73,8 @@ def main() -> int:
     print(f"words of docs: {words:,}")
     if revision is None:
         from drivesem.config.commands import COMMANDS
-        from drivesem.config.help import command_help
 
-        options = sum(line.startswith("  --") for line in command_help("attack").splitlines())
+        options = len(COMMANDS["attack"].basic) + 1  # --config
         print(f"commands: {len(COMMANDS)}; options in attack --help: {options}")
     return 0
 

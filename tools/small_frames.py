@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from scene_ir import files
-from tools.same import copy_part, objects_of
+from tools.same import copy_crop, sort_labels
 
 STREETS = 20
 """Generated frames that the small ones are cut from, at different places."""
@@ -28,7 +28,7 @@ def small_frames(folder: Path, count: int, streets: int = STREETS) -> None:
         words = ["synth", "--frames", str(streets), "--seed", "11", "--workers", "2", "--out", temporary]
         subprocess.run([sys.executable, "-m", "drivesem.cli", *words], check=True, stdout=subprocess.DEVNULL)
         source = Path(temporary) / "training"
-        cars = {path.stem: objects_of(path) for path in sorted((source / "label_2").glob("*.txt"))}
+        cars = {path.stem: sort_labels(path) for path in sorted((source / "label_2").glob("*.txt"))}
         shown = [name for name, (car, *_) in cars.items() if car[0] == "Car" and _is_seen(car)]
         width, height = _WINDOW_WH
         for number in range(count):
@@ -38,7 +38,7 @@ def small_frames(folder: Path, count: int, streets: int = STREETS) -> None:
             down, across = divmod(turn, _ACROSS)
             x0 = round((left + right - width) / 2) + _SHIFT_PX * (across - _ACROSS // 2)
             y0 = round((top + bottom - height) / 2) + down
-            copy_part(source, folder / "training", name, 1.0, (x0, y0, x0 + width, y0 + height), slice(1))
+            copy_crop(source, folder / "training", name, 1.0, (x0, y0, x0 + width, y0 + height), slice(1))
             for path in sorted((folder / "training").glob(f"*/{name}.*")):
                 path.rename(path.with_stem(f"n{number:05d}"))
 
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("count", type=int, help="how many")
     parser.add_argument("folder", type=Path, help="folder to make")
     given = parser.parse_args(argv)
-    with files.whole_folder(given.folder) as part:
+    with files.atomic_folder(given.folder) as part:
         small_frames(part, given.count)
 
 

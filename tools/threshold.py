@@ -18,9 +18,9 @@ import numpy as np
 from detectors.registry import load_detector
 from drivesem.attack.labels import Difficulty
 from drivesem.data.registry import open_dataset
-from drivesem.report.tables import number_of
+from drivesem.report.tables import format_count
 from drivesem.training.frames import FrameStore
-from drivesem.training.judging import detect, judge
+from drivesem.training.validation import detect_in_store, score_detections
 
 DRAWS = 200
 
@@ -30,15 +30,17 @@ def told(name: str, folder: Path) -> str:
     detector, dataset = load_detector(name), open_dataset("kitti", folder)
     with tempfile.TemporaryDirectory() as cache:
         store = FrameStore(dataset, dataset.identifiers, Path(cache), detector.classes)
-        found, wanted = detect(detector, store, range(len(store))), store.judged(Difficulty())
-    best, generator, drawn = judge(found, wanted, detector.classes), np.random.default_rng(0), []
+        found, wanted = detect_in_store(detector, store, range(len(store))), store.evaluation_targets(Difficulty())
+    best, generator, drawn = score_detections(found, wanted, detector.classes), np.random.default_rng(0), []
     for _ in range(DRAWS):
         rows = generator.integers(len(store), size=len(store))
-        drawn.append(judge([found[i] for i in rows], [wanted[i] for i in rows], detector.classes).t_star)
+        drawn.append(
+            score_detections([found[i] for i in rows], [wanted[i] for i in rows], detector.classes).t_star
+        )
     low, high = np.quantile(drawn, [0.025, 0.975])
     objects = sum(int((~targets.ignore).sum()) for targets in wanted)
     return (
-        f"{name}, {number_of(len(store), 'frame')}, {number_of(objects, 'object')}: best F1 "
+        f"{name}, {format_count(len(store), 'frame')}, {format_count(objects, 'object')}: best F1 "
         f"{best.f1:.3f} at {best.t_star:.3f} [{low:.3f}, {high:.3f}]; its own t* is {detector.t_star:.3f}"
     )
 

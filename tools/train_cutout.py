@@ -40,7 +40,7 @@ from drivesem.synth.view import blocks
 from scene_ir import files
 from scene_ir.derender import cutout, silhouette
 from scene_ir.derender.cutout import CROP_HW, HALO, TILE, CutoutNet
-from scene_ir.derender.pose import crops_of
+from scene_ir.derender.pose import crop_boxes
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import project_boxes
 from scene_ir.meshes.outlines import KINDS
@@ -65,21 +65,27 @@ VEHICLES = ("Car", "Van", "Truck")
 
 @dataclass(frozen=True)
 class Cases:
-    """K vehicles. rect (K, 4): x0, y0, x1, y1 of what is kept, px; start (K,): its first byte; matrix (K, 3, 4);
-    ground (K, 4): plane; size_wh (K, 2): the photograph's; translation (K, 3), yaw (K,), size_lhw (K, 3): the true
-    pose; kind (K,): index into `VEHICLES`; visible (K,): share of its silhouette in the image.
-    """
+    """K vehicles."""
 
     rect: np.ndarray
+    """X0, y0, x1, y1 of what is kept, px, (K, 4)."""
     start: np.ndarray
+    """Its first byte; matrix (K, 3, 4), (K,)."""
     matrix: np.ndarray
     ground: np.ndarray
+    """Plane, (K, 4)."""
     size_wh: np.ndarray
+    """The photograph's, (K, 2)."""
     translation: np.ndarray
+    """The true pose, (K, 3)."""
     yaw: np.ndarray
+    """The true pose, (K,)."""
     size_lhw: np.ndarray
+    """The true pose, (K, 3)."""
     kind: np.ndarray
+    """Index into `VEHICLES`, (K,)."""
     visible: np.ndarray
+    """Share of its silhouette in the image, (K,)."""
 
 
 def settings_of(index: int, split: str, pack: Assets) -> SynthSettings:
@@ -248,11 +254,11 @@ class Store:
         place[1] -= far * (math.cos(angle) * normal[0] + math.sin(angle) * normal[2]) / normal[1]
         yaw = float(cases.yaw[index]) + amount * TURN_RAD * float(np.clip(rng.normal(0, 0.8), -1.5, 1.5))
         size = cases.size_lhw[index] * (1 + amount * STRETCH * np.clip(rng.normal(0, 0.8, 3), -1.5, 1.5))
-        kinds = silhouette.candidates(VEHICLES[int(cases.kind[index])], size.tolist())
+        kinds = silhouette.rank_template_kinds(VEHICLES[int(cases.kind[index])], size.tolist())
         if rng.random() < WRONG_SHARE:
             kinds = KINDS
         kind = kinds[0 if rng.random() < LIKELIEST_SHARE else int(rng.integers(len(kinds)))]
-        return silhouette.placed(
+        return silhouette.place_mesh(
             kind, torch.from_numpy(place).float(), torch.tensor(yaw), torch.from_numpy(size).float()
         )
 
@@ -293,7 +299,7 @@ def sample_of(store: Store, index: int, amount: float, rng: np.random.Generator 
     in what is kept."""
     camera = store.camera(index)
     placement = store.disturbed(index, amount, rng or np.random.default_rng(index))
-    rect = cutout.crop_rect(placement, camera)
+    rect = cutout.crop_rectangle(placement, camera)
     if rect is None:
         return None
     if rng is not None:
@@ -308,10 +314,10 @@ def sample_of(store: Store, index: int, amount: float, rng: np.random.Generator 
     if rng is not None:
         photograph, shares = looks(photograph, shares, rng)
     box = np.array([[rect[0] - left, rect[1] - top, rect[2] - left, rect[3] - top]], np.float32) - 0.5
-    inside = cutout.inside_of(rect, (left, top, right, bottom))
-    crop = crops_of(photograph, box, CROP_HW, 1.0)[0]
-    truth = crops_of(shares, box, CROP_HW, 1.0)[0] * (inside > 0)[..., None].astype(np.uint8)
-    others = crops_of(np.repeat(nearer[..., None], 3, 2), box, CROP_HW, 1.0)[0, ..., 0] * inside / 255
+    inside = cutout.inside_mask(rect, (left, top, right, bottom))
+    crop = crop_boxes(photograph, box, CROP_HW, 1.0)[0]
+    truth = crop_boxes(shares, box, CROP_HW, 1.0)[0] * (inside > 0)[..., None].astype(np.uint8)
+    others = crop_boxes(np.repeat(nearer[..., None], 3, 2), box, CROP_HW, 1.0)[0, ..., 0] * inside / 255
     if rng is not None:
         others = misjudged(others, rng)
     given = np.stack([others, inside]).astype(np.float32)
@@ -423,8 +429,8 @@ def first_inputs(samples: Sequence[Sample]) -> tuple[Tensor, Tensor]:
     """Crops (N, 3, 96, 160) and guides (N, 7, 96, 160)."""
     crops = torch.from_numpy(np.stack([s.crop for s in samples])).permute(0, 3, 1, 2).float() / 255
     given = np.stack([s.given for s in samples])
-    cameras = [cutout.zoomed(s.camera, s.rect) for s in samples]
-    return crops, cutout.guides([s.placement for s in samples], cameras, [s.ground for s in samples], given)
+    cameras = [cutout.crop_camera(s.camera, s.rect) for s in samples]
+    return crops, cutout.render_guides([s.placement for s in samples], cameras, [s.ground for s in samples], given)
 
 
 def weight_of(sample: Sample) -> NDArray[np.float32]:
@@ -438,7 +444,7 @@ def mirrored(
     crops: Tensor, said: Tensor, truth: Tensor, weight: Tensor, flip: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Some of the batch mirrored: what is left of a vehicle is right of it then."""
-    sign = torch.ones(cutout.GUIDES)
+    sign = torch.ones(cutout.GUIDE_CHANNELS)
     sign[3] = -1
     chosen = flip[:, None, None, None]
     return (
@@ -470,7 +476,7 @@ def tiles_of(
         hard[..., 2] = 0
         before = hard.transpose(2, 0, 1)
     else:
-        before = cutout.enlarged(said, size)[:, top : top + h, left : left + w]
+        before = cutout.resize_shares(said, size)[:, top : top + h, left : left + w]
     side = TILE + 2 * HALO
     both = np.concatenate([sample.photograph.transpose(2, 0, 1) / np.float32(255), before])
     truth = sample.shares[..., :2].transpose(2, 0, 1) / np.float32(255)
@@ -496,9 +502,10 @@ def second_loss(log_shares: Tensor, truth: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides on the result of a run. cycles: steps, and the rate from which each falls to nothing."""
+    """What decides on the result of a run."""
 
     cycles: tuple[tuple[int, float], ...] = ((1000, 3e-3), (900, 2e-3))
+    """Steps, and the rate from which each falls to nothing."""
     batch: int = 16
     weight_decay: float = 0.02
     average: float = 0.995
@@ -549,7 +556,7 @@ class Run(AveragedRun[CutoutNet]):
             both, wanted = (torch.from_numpy(np.stack(part)) for part in zip(*tiles, strict=True))
             both = both.contiguous(memory_format=torch.channels_last)
             with torch.autocast("cpu", torch.bfloat16):
-                change = self.network.look_again(both[:, :3], both[:, 3:])
+                change = self.network.refine(both[:, :3], both[:, 3:])
             terms["second"] = second_loss(change.float(), wanted)
             terms["total"] = terms["first"] + terms["second"]
             self.descend(terms["total"], settings.rate(step))
@@ -569,18 +576,18 @@ def judge(store: Store, network: CutoutNet, amount: float, most: int = 200) -> d
         shares = network(*first_inputs([sample])).softmax(1)[0, :3].numpy()
         (left, top), (h, w) = sample.offset, sample.photograph.shape[:2]
         size = (sample.rect[2] - sample.rect[0], sample.rect[3] - sample.rect[1])
-        parts = cutout.enlarged(shares, size)[:, top : top + h, left : left + w]
+        parts = cutout.resize_shares(shares, size)[:, top : top + h, left : left + w]
         first = cutout.Cutout(0, 0, *(np.ascontiguousarray(p) for p in parts))
-        found = cutout.refined(sample.photograph, [first], network)[0]
+        found = cutout.refine_cutouts(sample.photograph, [first], network)[0]
         truth = sample.shares.astype(np.float32) / 255
-        value = silhouette.iou(found.visible >= 0.5, truth[..., 0] >= 0.5)
+        value = silhouette.mask_iou(found.visible >= 0.5, truth[..., 0] >= 0.5)
         rows = np.flatnonzero((truth[..., 0] >= 0.5).any(1))
         if not len(rows):
             continue
         good = rows[-1] - rows[0] >= 40 and store.cases.visible[index] >= 0.7
         (large if good else small).append(value)
         if (truth[..., 1] >= 0.5).sum() > 30:
-            front.append(silhouette.iou(found.front >= 0.5, truth[..., 1] >= 0.5))
+            front.append(silhouette.mask_iou(found.front >= 0.5, truth[..., 1] >= 0.5))
         edge = cv2.dilate(truth[..., 0], np.ones((5, 5))) - cv2.erode(truth[..., 0], np.ones((5, 5))) > 0.5
         border.append(float(np.abs(found.visible - truth[..., 0])[edge].mean()) * 5)
     return {

@@ -39,9 +39,11 @@ from train_segmenter import (
 
 from drivesem.synth.frames import GENERATOR_VERSION, SynthFrame, render_frame
 from scene_ir import files
-from scene_ir.derender import depth, maps, segment, unet
+from scene_ir.derender import depth, unet
+from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import segmentation as segment
 from scene_ir.derender.depth import DepthNet
-from scene_ir.derender.segment import Class
+from scene_ir.derender.segmentation import StreetClass
 
 STREAM = 0xDE9
 """Keeps this tool's random numbers apart from the generator's."""
@@ -79,7 +81,7 @@ def pictures_of(frame: SynthFrame) -> dict[str, np.ndarray]:
     assert frame.background is not None
     assert frame.background_depth_m is not None
     ground, camera = frame.environment.ground, frame.camera
-    table = np.full(256, Class.OTHER, np.uint8)
+    table = np.full(256, StreetClass.OTHER, np.uint8)
     for material, kind in CLASS_OF.items():
         table[material] = kind
     height_m = float(ground[3])
@@ -89,8 +91,8 @@ def pictures_of(frame: SynthFrame) -> dict[str, np.ndarray]:
         "images": np.stack(list(images)),
         "classes": np.stack([shrunk(classes_of(frame)), shrunk(table[frame.ground_material])]),
         "nearness": np.stack([nearness_of(d, height_m) for d in (frame.depth_m, frame.background_depth_m)]),
-        "elevation": unet.elevation(ground, camera, STORE_HW).astype(np.float16),
-        "ground": nearness_of(maps.plane_depth(ground, camera), height_m),
+        "elevation": unet.compute_elevation(ground, camera, STORE_HW).astype(np.float16),
+        "ground": nearness_of(maps.compute_plane_depth(ground, camera), height_m),
         "focal": np.array(float(camera.intrinsics[0, 0]) * STORE_HW[0] / camera.height, np.float32),
     }
 
@@ -132,7 +134,7 @@ class Example:
     nearness: np.ndarray
 
 
-_LEVEL = (Class.ROAD, Class.GROUND, Class.GRASS)
+_LEVEL = (StreetClass.ROAD, StreetClass.GROUND, StreetClass.GRASS)
 
 
 def example(store: Store, index: int, rng: np.random.Generator) -> Example:
@@ -159,15 +161,17 @@ def example(store: Store, index: int, rng: np.random.Generator) -> Example:
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides on the result of a run. frames: of the training set; gradient: weight of the slopes' term."""
+    """What decides on the result of a run."""
 
     steps: int = 2600
     batch: int = 8
     frames: int = 500
+    """Of the training set."""
     rate: float = 2e-3
     weight_decay: float = 0.02
     average: float = 0.995
     gradient: float = 0.5
+    """Weight of the slopes' term."""
     seed: int = 0
 
 
@@ -191,7 +195,7 @@ def batch_of(store: Store, step: int, settings: Settings) -> Batch:
 def loss_of(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float) -> Tensor:
     """Mean difference () of the logarithms of nearness, and of their slopes at three scales. numbers (N, 1, h/2,
     w/2): the network's; ground, near (N, 1, h, w)."""
-    found = F.avg_pool2d(ground, 2) + depth.excess(numbers)
+    found = F.avg_pool2d(ground, 2) + depth.nearness_excess(numbers)
     apart = (found + LEAST_NEARNESS).log() - (F.avg_pool2d(near, 2) + LEAST_NEARNESS).log()
     loss = apart.abs().mean()
     for _ in range(3):
@@ -240,16 +244,16 @@ def judge(network: DepthNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[fl
         assert frame.background_depth_m is not None
         ground, camera = frame.environment.ground, frame.camera
         image = np.asarray(frame.background / 255, np.float32)
-        seen = segment.segment(image, ground, camera)
+        seen = segment.segment_photograph(image, ground, camera)
         nothing = np.zeros_like(seen.sky)
-        ties = depth.Ties(seen.sky, seen.ground, nothing, nothing)
-        outlook = depth.Outlook.of(image, ground, camera)
-        alone = depth.by_network(outlook, seen.ground, network)
+        ties = depth.DepthConstraints(seen.sky, seen.ground, nothing, nothing)
+        outlook = depth.GroundFrame.from_image(image, ground, camera)
+        alone = depth.nearness_by_network(outlook, seen.ground, network)
         horizon = maps.horizon_row(ground, camera)
         guesses = {
-            "walls by rule": maps.walls(outlook.plane_m, seen.ground, nothing, seen.sky, horizon),
+            "walls by rule": maps.compute_wall_depth(outlook.plane_m, seen.ground, nothing, seen.sky, horizon),
             "network": outlook.depth_m(alone * (1 - seen.sky)),
-            "both": depth.surroundings(image, ground, camera, ties, network),
+            "both": depth.estimate_depth(image, ground, camera, ties, network),
         }
         known = frame.background_depth_m < FAR_M
         true = frame.background_depth_m[known]
@@ -284,7 +288,7 @@ the truth is smaller. What a scene keeps is the mean of both, in logarithms.
 
 {table}
 
-Beside a laser, and in fog, on photographs: `python -m tools.bench depth`, docs/benchmarks.md.
+Beside a laser, and in fog, on photographs: `python -m tools.bench depth`, docs/research/benchmarks.md.
 
 ## Limits
 

@@ -28,11 +28,11 @@ from detectors.registry import load_detector
 from detectors.types import CLASSES
 from drivesem.data.classes import VEHICLES
 from drivesem.data.kitti import KittiDataset
-from drivesem.report.tables import number_of
-from drivesem.scenes.label_free import DETECTOR_LOOKS
+from drivesem.report.tables import format_count
+from drivesem.scenes.label_free import POSE_ROUNDS
 from scene_ir import files
 from scene_ir.derender import pose
-from scene_ir.derender.pose import KINDS, PoseNet, Said
+from scene_ir.derender.pose import KINDS, PoseNet, PosePrediction
 from scene_ir.types import Camera, Category, Frame, Labels
 
 STORE_HW = (128, 192)
@@ -61,8 +61,7 @@ def usable(labels: Labels) -> list[int]:
 @dataclass(frozen=True)
 class Truth:
     """What is known of K boxes. box (K, 4) px; centre (K, 2) px and depth (K,) m of the 3D centre; alpha (K,) rad;
-    size (K, 3) m; kind (K,) index into KINDS, -1 where not known; truck (K,) bool; camera (K, 6): focal lengths,
-    principal point, width, height.
+    size (K, 3) m; kind (K,) index into KINDS, -1 where not known; truck (K,) bool.
     """
 
     box: Tensor
@@ -73,6 +72,7 @@ class Truth:
     kind: Tensor
     truck: Tensor
     camera: Tensor
+    """Focal lengths, principal point, width, height, (K, 6)."""
 
     def rows(self, index: Tensor) -> Truth:
         """Those of an index."""
@@ -93,7 +93,7 @@ def truth_of(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Sequenc
         size,
         torch.tensor(kinds, dtype=torch.int64),
         pose.is_truck([labels.kind[i] for i in rows]),
-        pose.camera_numbers(camera).expand(len(rows), 6),
+        pose.camera_features(camera).expand(len(rows), 6),
     )
 
 
@@ -120,7 +120,7 @@ class CropStore:
                 kinds = [KINDS.index(models[i].rsplit("-", 1)[0]) for i in rows]
                 truths.append(truth_of(frame.labels, rows, frame.camera, kinds))
                 image = (frame.photograph.numpy().transpose(1, 2, 0) * 255).round().astype(np.uint8)
-                crops.append(pose.crops_of(image, truths[-1].box.numpy(), STORE_HW, STORE_CONTEXT))
+                crops.append(pose.crop_boxes(image, truths[-1].box.numpy(), STORE_HW, STORE_CONTEXT))
             np.save(crops_path, np.concatenate(crops))
             joined = {f.name: np.concatenate([getattr(t, f.name) for t in truths]) for f in fields(Truth)}
             files.write_npz(truth_path, joined)
@@ -168,13 +168,13 @@ def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, T
     grid = F.affine_grid(theta, [n, 3, *pose.CROP_HW], align_corners=False)
     crops = F.grid_sample(crops, grid, padding_mode="border", align_corners=False)
     kinds = ["Truck" if t else "Car" for t in truth.truck]
-    numbers = pose.box_numbers(box, truth.truck, truth.camera)
+    numbers = pose.box_features(box, truth.truck, truth.camera)
     offset = (truth.centre - middle) / size
     mean = truth.camera[:, 1] * pose.mean_sizes(kinds)[:, 1] / size[:, 1]
     alpha = truth.alpha
     flip = torch.from_numpy(rng.random(n) < 0.5)
     crops = torch.where(flip[:, None, None, None], crops.flip(3), crops)
-    numbers = torch.where(flip[:, None], pose.mirrored(numbers), numbers)
+    numbers = torch.where(flip[:, None], pose.mirror_features(numbers), numbers)
     alpha = torch.where(flip, math.pi - alpha, alpha)
     offset = torch.where(flip[:, None], offset * torch.tensor([-1.0, 1.0]), offset)
     targets = Targets(
@@ -212,7 +212,7 @@ def looks(crops: Tensor, rng: np.random.Generator) -> Tensor:
     return crops.clamp(0, 1)
 
 
-def loss_terms(said: Said, wanted: Targets) -> dict[str, Tensor]:
+def loss_terms(said: PosePrediction, wanted: Targets) -> dict[str, Tensor]:
     """Terms of the loss, means over boxes, and their weighted sum "total"."""
     centre = torch.arange(pose.BINS) * (2 * math.pi / pose.BINS)
     apart = wanted.alpha[:, None] - centre
@@ -272,15 +272,14 @@ class Run(AveragedRun[PoseNet]):
 
 @dataclass(frozen=True)
 class Errors:
-    """Of K vehicles: yaw (K,) rad, depth (K,) relative, size (K, 3) relative, right template (K,); moderate (K,):
-    whether KITTI's moderate level has it.
-    """
+    """Of K vehicles: yaw (K,) rad, depth (K,) relative, size (K, 3) relative, right template (K,)."""
 
     yaw: np.ndarray
     depth: np.ndarray
     size: np.ndarray
     kind: np.ndarray
     moderate: np.ndarray
+    """Whether KITTI's moderate level has it, (K,)."""
     place_m: np.ndarray
 
     def summary(self) -> dict[str, float]:
@@ -328,8 +327,8 @@ def judge(
                 int(best.indices[i]) if best is not None and float(best.values[i]) >= 0.5 else -1
                 for i in range(len(index))
             ]
-        looks = 1 if found is None else DETECTOR_LOOKS
-        poses = pose.estimate(frame.photograph, boxes, classes, frame.camera, network=network, looks=looks)
+        looks = 1 if found is None else POSE_ROUNDS
+        poses = pose.estimate_poses(frame.photograph, boxes, classes, frame.camera, network=network, rounds=looks)
         for row, answer in zip(index, answers, strict=True):
             if answer < 0:
                 continue
@@ -484,7 +483,7 @@ def main() -> None:
     torch.set_num_threads(1)
     settings = Settings(arguments.steps, arguments.batch, arguments.rate, seed=arguments.seed)
     store = CropStore(arguments.data, arguments.run / "train")
-    print(f"{number_of(len(store), 'vehicle')} in {number_of(store.frames, 'frame')}", flush=True)
+    print(f"{format_count(len(store), 'vehicle')} in {format_count(store.frames, 'frame')}", flush=True)
     run = Run(settings)
     checkpoint = arguments.run / "checkpoint.safetensors"
     if checkpoint.is_file():

@@ -1,4 +1,4 @@
-"""Train the network that tells sky, foliage and road apart (`scene_ir.derender.segment`) on generated streets.
+"""Train the network that tells sky, foliage and road apart (`scene_ir.derender.segmentation`) on generated streets.
 
     python tools/train_segmenter.py --run build/segment
 
@@ -30,16 +30,17 @@ from drivesem.synth.frames import (
     Plan,
     SynthFrame,
     SynthSettings,
+    apply_variation,
     plan_frame,
     render_frame,
-    variation_of,
 )
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.soup import Material, Semantic
 from drivesem.synth.variations import MIXED, VARIATIONS
 from scene_ir import files
-from scene_ir.derender import segment, unet
-from scene_ir.derender.segment import Class, SegmentNet
+from scene_ir.derender import segmentation as segment
+from scene_ir.derender import unet
+from scene_ir.derender.segmentation import SegmentNet, StreetClass
 
 STREAM = 0x5E6
 """Keeps this tool's random numbers apart from the generator's."""
@@ -52,28 +53,28 @@ STORE_HW = (192, 624)
 """Size at which frames are kept: KITTI's, halved."""
 STORE_FOCAL_PX = 361.0
 CLASS_OF = {
-    Material.SKY: Class.SKY,
-    Material.LEAF: Class.LEAVES,
-    Material.GRASS: Class.GRASS,
-    Material.ROAD: Class.ROAD,
-    Material.PARKING: Class.ROAD,
-    Material.PAVEMENT: Class.GROUND,
-    Material.KERB: Class.GROUND,
-    Material.GRAVEL: Class.GROUND,
+    Material.SKY: StreetClass.SKY,
+    Material.LEAF: StreetClass.LEAVES,
+    Material.GRASS: StreetClass.GRASS,
+    Material.ROAD: StreetClass.ROAD,
+    Material.PARKING: StreetClass.ROAD,
+    Material.PAVEMENT: StreetClass.GROUND,
+    Material.KERB: StreetClass.GROUND,
+    Material.GRAVEL: StreetClass.GROUND,
 }
 """What a material is, where no vehicle and no person is seen; all others are `Class.OTHER`."""
 ACTORS = {
-    Semantic.CAR: Class.VEHICLE,
-    Semantic.VAN: Class.VEHICLE,
-    Semantic.TRUCK: Class.VEHICLE,
-    Semantic.PEDESTRIAN: Class.PERSON,
-    Semantic.CYCLIST: Class.PERSON,
+    Semantic.CAR: StreetClass.VEHICLE,
+    Semantic.VAN: StreetClass.VEHICLE,
+    Semantic.TRUCK: StreetClass.VEHICLE,
+    Semantic.PEDESTRIAN: StreetClass.PERSON,
+    Semantic.CYCLIST: StreetClass.PERSON,
 }
 
 
 def classes_of(frame: SynthFrame) -> np.ndarray:
     """The `Class` (H, W) uint8 of each pixel. The frame is one without a background of its own."""
-    table = np.full(256, Class.OTHER, np.uint8)
+    table = np.full(256, StreetClass.OTHER, np.uint8)
     for material, kind in CLASS_OF.items():
         table[material] = kind
     found = table[frame.ground_material]
@@ -89,7 +90,7 @@ def planned(seed: int, index: int, split: str) -> Plan:
     plan = plan_frame(seed, index, split, SynthSettings(layout=layout, bent=True))
     name = MIXED if rng.random() < MIXED_SHARE else str(rng.choice(VARIATIONS))
     leaves = tuple(float(rng.uniform(*reach)) for reach in LEAVES)
-    return replace(variation_of(plan, name), foliage=leaves if rng.random() < LEAVES_SHARE else (0.0, 0.0, 0.0))
+    return replace(apply_variation(plan, name), foliage=leaves if rng.random() < LEAVES_SHARE else (0.0, 0.0, 0.0))
 
 
 def street(seed: int, index: int, split: str) -> SynthFrame:
@@ -104,7 +105,7 @@ def shrunk(classes: np.ndarray) -> np.ndarray:
     height, width = STORE_HW
     shares = [
         cv2.resize((classes == kind).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        for kind in Class
+        for kind in StreetClass
     ]
     return np.argmax(shares, axis=0).astype(np.uint8)
 
@@ -126,7 +127,7 @@ class Store:
         for index in range(found["frames"], frames):
             frame = street(seed, index, split)
             image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
-            height_of = unet.elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
+            height_of = unet.compute_elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
             files.write_npz(
                 folder / f"{index:05d}.npz",
                 {"image": image, "classes": shrunk(classes_of(frame)), "elevation": height_of},
@@ -198,18 +199,18 @@ def other_surfaces(
 def other_colours(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
     """Each kind of thing in colours of its own, other skies; in place."""
     if rng.random() < 0.4:
-        gains = np.exp(rng.normal(0, 0.25, (len(Class), 1)) + rng.normal(0, 0.06, (len(Class), 3)))
+        gains = np.exp(rng.normal(0, 0.25, (len(StreetClass), 1)) + rng.normal(0, 0.06, (len(StreetClass), 3)))
         image *= cv2.blur(gains.astype(np.float32)[classes], (5, 5))
     if rng.random() < 0.15:
         # walls in the sun, as white as the sky beside them
-        image *= 1 + (classes == Class.OTHER)[..., None] * _draw(rng, 0.5, 2.0)
+        image *= 1 + (classes == StreetClass.OTHER)[..., None] * _draw(rng, 0.5, 2.0)
     if rng.random() < 0.5:
         # leaves and grass in the sun: speckles
-        green = ((classes == Class.LEAVES) | (classes == Class.GRASS))[..., None]
+        green = ((classes == StreetClass.LEAVES) | (classes == StreetClass.GRASS))[..., None]
         speckles = np.exp(_draw(rng, 0.2, 0.7) * _smooth(rng, int(rng.integers(30, CROP_HW[0]))))[..., None]
         yellow = np.array([1.0, _draw(rng, 0.8, 1.0), _draw(rng, 0.3, 0.9)], np.float32) * _draw(rng, 0.8, 1.8)
         image *= 1 + green * (speckles * (yellow if rng.random() < 0.5 else 1.0) - 1)
-    sky = (classes == Class.SKY)[..., None]
+    sky = (classes == StreetClass.SKY)[..., None]
     if sky.any() and rng.random() < 0.6:
         top = np.array([_draw(rng, 0.2, 1.0), 0.0, 1.0], np.float32)
         top[1] = _draw(rng, float(top[0]), 1.0)
@@ -233,13 +234,15 @@ def unknown_things(image: np.ndarray, classes: np.ndarray, rng: np.random.Genera
         colour = rng.uniform(0, 1, 3) * rng.choice([0.25, 1.0]) if rng.random() < 0.6 else _draw(rng, 0, 1)
         grain = 1 + 0.25 * _smooth(rng, int(rng.integers(2, 24)))[y : y + h, x : x + w, None]
         image[y : y + h, x : x + w] = colour * grain
-        classes[y : y + h, x : x + w] = Class.OTHER
+        classes[y : y + h, x : x + w] = StreetClass.OTHER
 
 
 def other_light(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
     """Grain on the ground, shade from what is not in the picture; in place."""
-    sky = (classes == Class.SKY)[..., None]
-    ground = np.isin(classes, (Class.ROAD, Class.GROUND, Class.GRASS, Class.OTHER))[..., None]
+    sky = (classes == StreetClass.SKY)[..., None]
+    ground = np.isin(classes, (StreetClass.ROAD, StreetClass.GROUND, StreetClass.GRASS, StreetClass.OTHER))[
+        ..., None
+    ]
     if rng.random() < 0.4:
         image *= 1 + ground * _draw(rng, 0.05, 0.3) * _smooth(rng, int(rng.integers(8, 60)))[..., None]
     if rng.random() < 0.5:
@@ -279,11 +282,12 @@ def other_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides on the result of a run. frames: of the training set."""
+    """What decides on the result of a run."""
 
     steps: int = 1800
     batch: int = 8
     frames: int = 340
+    """Of the training set."""
     rate: float = 3e-3
     weight_decay: float = 0.02
     average: float = 0.99
@@ -321,7 +325,7 @@ WEIGHTS_OF_CLASSES = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0, 1.1, 2.0)
 
 def loss_of(logits: Tensor, classes: Tensor) -> Tensor:
     """Cross entropy () of logits (N, C, h/2, w/2) with the shares of the classes (N, h, w) in each 2x2 px."""
-    shares = F.avg_pool2d(F.one_hot(classes, len(Class)).permute(0, 3, 1, 2).float(), 2)
+    shares = F.avg_pool2d(F.one_hot(classes, len(StreetClass)).permute(0, 3, 1, 2).float(), 2)
     weights = logits.new_tensor(WEIGHTS_OF_CLASSES)[:, None, None]
     return -(shares * logits.log_softmax(1) * weights).sum(1).mean()
 
@@ -360,8 +364,8 @@ def judge(network: SegmentNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[
     for frame in frames:
         image = frame.image.astype(np.float32) / 255
         environment = frame.environment
-        seen = segment.segment(image, environment.ground, frame.camera, network=network)
-        vehicle = np.isin(frame.semantic, [kind for kind, found in ACTORS.items() if found == Class.VEHICLE])
+        seen = segment.segment_photograph(image, environment.ground, frame.camera, network=network)
+        vehicle = np.isin(frame.semantic, [kind for kind, found in ACTORS.items() if found == StreetClass.VEHICLE])
         truths = (environment.sky, environment.foliage_map, environment.road, torch.from_numpy(vehicle).float())
         for name, share in zip(JUDGED, truths, strict=True):
             found, truth = getattr(seen, name) > 0.5, share.numpy() > 0.5
@@ -381,7 +385,7 @@ def judge(network: SegmentNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[
 
 CARD = """# Sky, foliage and road in photographs, trained on generated streets
 
-- Architecture: `scene_ir.derender.segment.SegmentNet`, {parameters:,} parameters: a U-Net of 3x3 convolutions with
+- Architecture: `scene_ir.derender.segmentation.SegmentNet`, {parameters:,} parameters: a U-Net of 3x3 convolutions with
   a depthwise middle, on the picture at 0.4 of KITTI's size (focal length {focal:.0f} px) and the elevation of
   each pixel's ray above the horizon; half of the first stages' channels are normalised over the picture itself.
   Eight classes: {classes}.
@@ -482,7 +486,7 @@ def main() -> None:
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
         focal=unet.INPUT_FOCAL_PX,
-        classes=", ".join(kind.name.lower() for kind in Class),
+        classes=", ".join(kind.name.lower() for kind in StreetClass),
         file=arguments.out.name,
         frames=len(store),
         version=GENERATOR_VERSION,

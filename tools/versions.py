@@ -69,16 +69,18 @@ Run = Callable[[Sequence[str], Path], Ended]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one Python and one set of versions. failed: the step that failed, and why; empty where none.
-    found: versions of Python and `PACKAGES`; parts: what `drivesem doctor` says of each; figures: the attack's.
-    """
+    """What came of one Python and one set of versions."""
 
     python: str
     versions: str
     failed: str
+    """The step that failed, and why; empty where none."""
     found: Mapping[str, str] = field(default_factory=dict)
+    """Versions of Python and `PACKAGES`."""
     parts: Mapping[str, str] = field(default_factory=dict)
+    """What `drivesem doctor` says of each."""
     figures: Mapping[str, Any] = field(default_factory=dict)
+    """The attack's."""
 
 
 def lowest(pyproject: Path, python: str) -> list[str]:

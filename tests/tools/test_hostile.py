@@ -1,4 +1,4 @@
-"""Hostile inputs: is what a command does wrong told, and are quick ones clean?"""
+"""Hostile inputs: defects are reported, and some quick cases pass."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from tools.hostile import __main__ as command
 from tools.hostile.cases import FAMILIES, cases
 from tools.hostile.inputs import MARK, Ground, nothing, text
-from tools.hostile.trial import Case, Done, Signals, judge, notes, run, told
+from tools.hostile.trial import Case, Done, Signals, error_lines, judge, notes, run
 
 LINE = "drivesem: a.json: score: expected a number, found 'high'"
 REFUSED = Case("a", "tracebacks", nothing, "drivesem report run", ("a.json: score",))
@@ -27,7 +27,7 @@ AGAIN = Done(
 ENDED = Done(code=130, out="", err="drivesem: interrupted; the same\n", seconds=30, mb=300, ended_s=1.0)
 
 
-def test_what_is_right() -> None:
+def test_good_outcomes_pass() -> None:
     assert judge(REFUSED, DONE) == judge(VERIFIED, AGAIN) == judge(STOPPED, ENDED) == []
     before = "attacking ━━━━ 0/1\ndrivesem: --detector: runs the code in mine.py:Mine\nscenes are kept\n"
     assert judge(REFUSED, replace(DONE, err=before + DONE.err)) == []
@@ -43,33 +43,33 @@ def test_what_is_right() -> None:
         ({"err": f"{LINE}\n{LINE}\n"}, "2 lines of error, not one"),
         ({"err": f"{LINE}\nlater\n"}, "the line is not the last"),
         ({"err": LINE.replace("score", "box")}, "the line does not name 'a.json: score'"),
-        ({"err": "drivesem: a.json: score is odd"}, "the line does not say what was expected, and what found"),
-        ({"err": f"Traceback (most recent call last):\n{LINE}"}, "says 'Traceback (most recent call last)'"),
-        ({"err": f"a.py:3: UserWarning: words\n{LINE}"}, "says 'Warning:'"),
+        ({"err": "drivesem: a.json: score is odd"}, "the line does not state what was expected and found"),
+        ({"err": f"Traceback (most recent call last):\n{LINE}"}, "prints 'Traceback (most recent call last)'"),
+        ({"err": f"a.py:3: UserWarning: words\n{LINE}"}, "prints 'Warning:'"),
         ({"seconds": 5.1}, "5.1 s of the processor, more than 5"),
         ({"mb": 1100.0}, "1100 MB, more than 1024"),
         ({"mark": True}, "foreign code was run"),
         ({"left": 2}, "2 processes outlived it"),
     ],
 )
-def test_what_is_wrong(changed: dict[str, Any], wrong: str) -> None:
+def test_each_defect_is_listed(changed: dict[str, Any], wrong: str) -> None:
     assert judge(REFUSED, replace(DONE, **changed)) == [wrong]
 
 
 def test_verify_names_the_field_on_standard_output() -> None:
     other = replace(AGAIN, out=DIFFERENCE.replace("t_star", "ap50"))
     assert judge(VERIFIED, other) == ["no difference names metrics.json: t_star"]
-    assert judge(VERIFIED, replace(AGAIN, err=LINE)) == [f"an error beside the differences: {LINE}"]
-    assert judge(replace(VERIFIED, code=0, says=()), replace(AGAIN, code=0)) == []
+    assert judge(VERIFIED, replace(AGAIN, err=LINE)) == [f"an error besides the differences: {LINE}"]
+    assert judge(replace(VERIFIED, code=0, named=()), replace(AGAIN, code=0)) == []
 
 
-def test_what_works_on_after_a_signal_is_wrong() -> None:
+def test_a_command_must_end_soon_after_a_signal() -> None:
     assert judge(STOPPED, replace(ENDED, ended_s=2.5)) == ["ended 2.5 s after the last signal, more than 2"]
 
 
 def test_notes_are_neither_bars_nor_errors() -> None:
     done = replace(DONE, err=f"attacking ━━ 0/1\nscenes are kept\n\n{LINE}\n")
-    assert (notes(done), told(done)) == (["scenes are kept"], [LINE])
+    assert (notes(done), error_lines(done)) == (["scenes are kept"], [LINE])
 
 
 EATING = "import time\nhoard = bytearray(300 << 20)\nwhile time.process_time() < 1:\n    pass\n"
@@ -89,31 +89,31 @@ raise SystemExit(130)
 """
 
 
-def ran(content: str, folder: Path, **fields: Any) -> Done:
+def run_script(content: str, folder: Path, **fields: Any) -> Done:
     case = replace(REFUSED, make=text("a.py", content), words="python a.py", **fields)
     return run(case, folder / "case", Ground(folder))
 
 
 def test_a_command_is_measured(tmp_path: Path) -> None:
-    done = ran(EATING, tmp_path)
+    done = run_script(EATING, tmp_path)
     assert (done.code, done.mark, done.left) == (0, False, 0)
     assert 1 <= done.seconds < 3
     assert 300 <= done.mb < 400  # not this process's
 
 
-def test_what_it_leaves_is_found_and_ended(tmp_path: Path) -> None:
-    done = ran(LEAVING, tmp_path)
+def test_processes_left_behind_are_found_and_ended(tmp_path: Path) -> None:
+    done = run_script(LEAVING, tmp_path)
     assert (done.left, done.mark) == (1, True)
     assert MARK == "mark"
 
 
 def test_signals_are_sent_when_it_is_ready(tmp_path: Path) -> None:
-    done = ran(DEAF, tmp_path, signals=Signals("ready", (0.2, 0.4), signal.SIGINT))
+    done = run_script(DEAF, tmp_path, signals=Signals("ready", (0.2, 0.4), signal.SIGINT))
     assert (done.code, done.out) == (130, "again\nagain\n")
     assert 0.4 < done.ended_s < 2
 
 
-def test_cases_are_told_apart() -> None:
+def test_case_names_are_unique() -> None:
     names = [case.name for case in cases()]
     assert len(names) == len(set(names))
     assert {case.family for case in cases()} == set(FAMILIES)
@@ -121,19 +121,20 @@ def test_cases_are_told_apart() -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     raising = replace(REFUSED, make=text("a.py", "1 / 0"), words="python a.py")
-    saying = replace(raising, name="b", make=text("a.py", f"raise SystemExit({LINE!r})"), code=1, says=())
-    monkeypatch.setattr(command, "cases", lambda: [raising, replace(saying, family="trust")])
+    printing = replace(raising, name="b", make=text("a.py", f"raise SystemExit({LINE!r})"), code=1, named=())
+    monkeypatch.setattr(command, "cases", lambda: [raising, replace(printing, family="trust")])
     assert command.main(["--only", "tracebacks"]) == 1
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert (
-        "tracebacks: a\n  $ python a.py\n  exit code 1, not 2\n  says 'Traceback (most recent call last)'" in said
+        "tracebacks: a\n  $ python a.py\n  exit code 1, not 2\n  prints 'Traceback (most recent call last)'"
+        in output
     )
-    assert "  | ZeroDivisionError: division by zero" in said
-    assert "0 of 1 clean" in said
+    assert "  | ZeroDivisionError: division by zero" in output
+    assert "0 of 1 clean" in output
     assert command.main(["--json"]) == 1
     rows = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in rows] == ["a", "b"]
-    assert rows[1]["told"] == [LINE]
+    assert rows[1]["errors"] == [LINE]
     with pytest.raises(SystemExit):
         command.main(["--only", "nothing like it"])
 
@@ -143,5 +144,5 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     "name", ["COCO: images.id = [1]", "20,000 Darknet layers", "raises in decode: check", "verify: loss trace"]
 )
 def test_some_of_them(name: str) -> None:
-    """`python -m tools.hostile` runs all."""
+    """`python -m tools.hostile` runs all cases."""
     assert command.main(["--only", name]) == 0

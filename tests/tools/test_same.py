@@ -1,4 +1,4 @@
-"""What tools/same.py leaves out of its hashes, what it runs first, and what it tells of two tables."""
+"""The comparison of two versions: what its hashes ignore, the order of cases, renamed words."""
 
 from __future__ import annotations
 
@@ -75,11 +75,11 @@ def test_places_and_containers_do_not_count(tmp_path: Path) -> None:
 
 def test_every_case_can_begin() -> None:
     cases = same.suite()
-    order = same.in_order(cases, cases)
+    order = same.sort_cases(cases, cases)
     assert len(set(order)) == len(order) == len({*cases, *same.MADE})
     for place, name in enumerate(order):
-        assert same.needs(name, cases) <= set(order[:place])
-    assert same.in_order(["worth-table"], cases) == ["inputs", "worth-table"]
+        assert same.required_cases(name, cases) <= set(order[:place])
+    assert same.sort_cases(["worth-table"], cases) == ["inputs", "worth-table"]
     assert {"attack --combo 7", "render", ""} <= set(cases["refused"])
     assert {"--help", "retrain --help"} <= set(cases["help"])
 
@@ -87,8 +87,14 @@ def test_every_case_can_begin() -> None:
 def test_paths_are_seen_from_where_a_command_runs(tmp_path: Path) -> None:
     case = tmp_path / "edit"
     line = "edit @derender/scenes -o @/edit.png"
-    assert same.words_of(line, case, case) == ["edit", "../derender/scenes", "-o", "./edit.png"]
-    assert same.words_of(line, case, case / "empty")[1] == "../../derender/scenes"
+    assert same.command_words(line, case, case) == [
+        "drivesem.cli",
+        "edit",
+        "../derender/scenes",
+        "-o",
+        "./edit.png",
+    ]
+    assert same.command_words(line, case, case / "empty")[2] == "../../derender/scenes"
 
 
 def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,3 +105,40 @@ def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.splitlines() == ["gone: a/z", "new: b/w", "differs: b/x", "3 lines differ"]
     assert same.main(["--compare", str(before), str(after), "--only", "b"]) == 1
     assert same.main(["--compare", str(before), str(before)]) == 0
+
+
+def test_commands_of_tools_run_as_modules(tmp_path: Path) -> None:
+    assert same.command_words("tools.experiments worth @/run", tmp_path, tmp_path) == [
+        "tools.experiments",
+        "worth",
+        "./run",
+    ]
+
+
+def test_renamed_keys_columns_files_and_words_are_equal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {
+        "before/asked-run/peer.json": '{"asked": 1, "kind": "the peer", "seconds": 3}',
+        "after/asked-run/second.json": '{"kind": "the second", "samples": 1, "seconds": 4}',
+        "before/asked-run/a.csv": "asked,b\n1,2\n",
+        "after/asked-run/a.csv": "b,samples\n2,1\n",
+        "before/asked-run/config.yaml": "peer: null\nb: 1\n",
+        "after/asked-run/config.yaml": "b: 1\nsecond: null\n",
+        "before/asked-run/prose.md": "Asked",
+        "after/asked-run/prose.md": "Sampled",
+        "before/asked-run/said.out": "1 frame",
+        "after/asked-run/said.out": "2 frames",
+        "before/help/attack.txt": "old",
+        "after/help/attack.txt": "new",
+    }
+    for name, text in files.items():
+        path = tmp_path / name.replace("after/asked-run", "after/samples-run")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (tmp_path / "renamed.txt").write_text("asked samples\npeer second\n")
+    words = ["--compare", str(tmp_path / "before"), str(tmp_path / "after")]
+    assert same.main([*words, "--renamed", str(tmp_path / "renamed.txt")]) == 0
+    (tmp_path / "after/samples-run/a.csv").write_text("b,samples\n2,3\n")
+    assert same.main([*words, "--renamed", str(tmp_path / "renamed.txt")]) == 1
+    assert "differs: samples-run/a.csv" in capsys.readouterr().out

@@ -110,30 +110,33 @@ ABLATIONS = (
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One vehicle's edit. shift_m: (along, across); turn: rad; size: share by which it grows."""
+    """One vehicle's edit."""
 
     track: int
     shift_m: tuple[float, float]
+    """(along, across)."""
     turn: float
+    """Rad."""
     size: float = 0.0
+    """Share by which it grows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One street before and after the edit. move: what happens; moved: the generator's own frame of it."""
+    """One street before and after the edit."""
 
     plan: Plan
     before: SynthFrame
     move: Move
+    """What happens."""
     moved: SynthFrame
+    """The generator's own frame of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
     """One vehicle's silhouettes: IoU of the template at the disturbed label, the fitted mesh, and the matte; 0
-    where de-rendering made no object of it. template_iou is None where the scene comes from elsewhere. place_m: on
-    the ground, between its fitted and its true middle; yaw_deg: between its headings; stretch: largest relative
-    error of its sizes; all None without an object.
+    where de-rendering made no object of it. template_iou is None where the scene comes from elsewhere.
     """
 
     track: int
@@ -144,14 +147,16 @@ class Shape:
     mesh_iou: float
     matte_iou: float
     place_m: float | None = None
+    """On the ground, between its fitted and its true middle."""
     yaw_deg: float | None = None
+    """Between its headings."""
     stretch: float | None = None
+    """Largest relative error of its sizes; all None without an object."""
 
 
 @dataclass(frozen=True, slots=True)
 class Edited:
-    """A scene's edited picture beside the truth. zones: PSNR in each of `ZONES`, error: each one's share of the
-    squared error; none of a zone that is empty."""
+    """A scene's edited picture beside the truth."""
 
     psnr_db: float
     unchanged_db: float
@@ -159,16 +164,13 @@ class Edited:
     unchanged_perceptual: float
     pixels: int
     zones: dict[str, float] = field(default_factory=dict)
+    """PSNR in each of `ZONES`, error: each one's share of the squared error; none of a zone that is empty."""
     error: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class DerenderRow:
-    """What was found of one frame. identity_db: in the objects' boxes; exact: whether all pixels that no matte and
-    no shadow reaches are the photograph's. shadow_iou, sun_deg: see `shadows`; no sun but under a clear sky.
-    withheld: shapes where no vehicle's own kind of template may be chosen. ablations: PSNR of move and removal
-    with a part replaced by the truth.
-    """
+    """What was found of one frame."""
 
     index: int
     weather: str
@@ -182,25 +184,33 @@ class DerenderRow:
     move: Edited
     remove: Edited
     identity_db: float
+    """In the objects' boxes."""
     exact: bool
+    """Whether all pixels that no matte and no shadow reaches are the photograph's."""
     derender_s: float
     cpu_s: float
     peak_mb: float | None
     withheld: tuple[Shape, ...] = ()
+    """Shapes where no vehicle's own kind of template may be chosen."""
     ablations: dict[str, dict[str, float]] = field(default_factory=dict)
+    """PSNR of move and removal with a part replaced by the truth."""
     shadow_iou: float | None = None
+    """See `shadows`; no sun but under a clear sky."""
     sun_deg: float | None = None
+    """See `shadows`; no sun but under a clear sky."""
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One frame to measure. sheets: folder for its sheet, or None; settings: how it is taken apart."""
+    """One frame to measure."""
 
     seed: int
     index: int
     ablate: bool = False
     sheets: Path | None = None
+    """Folder for its sheet, or None."""
     settings: DerenderSettings = field(default_factory=DerenderSettings)
+    """How it is taken apart."""
 
 
 def measure(

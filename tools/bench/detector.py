@@ -50,9 +50,7 @@ _KB = 1024.0
 
 @dataclass(frozen=True, slots=True)
 class DetectorRow:
-    """One detector at one size, width x height. Times in ms, medians, and the fastest; peak_mb: MB above the
-    loaded detector, None where it is not measured; rounds: how often each was done. each: of `_BATCH` at once.
-    """
+    """One detector at one size, width x height. Times in ms, medians, and the fastest."""
 
     detector: str
     size: str
@@ -69,7 +67,9 @@ class DetectorRow:
     decode_min_ms: float
     decode_worst_ms: float
     peak_mb: float | None
+    """MB above the loaded detector, None where it is not measured."""
     rounds: int
+    """How often each was done. each: of `_BATCH` at once."""
 
 
 def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Iterator[DetectorRow]:

@@ -85,7 +85,7 @@ def measure(frames: int, detector: str, device: str) -> Iterator[list[DeviceRow]
         plan = generated.plan_frame(
             _SEED, number, SPLITS[number % len(SPLITS)], SynthSettings(bent=True, sunny=True)
         )
-        made = rendered(plan, generated.street_of(plan))
+        made = rendered(plan, generated.build_street(plan))
         scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
         yield [_row(state, scene, number, there, here, device) for state in STATES]
 

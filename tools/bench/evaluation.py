@@ -50,17 +50,18 @@ _START = "import sys; from drivesem.cli import main; sys.exit(main())"
 
 @dataclass(frozen=True, slots=True)
 class EvaluationRow:
-    """One way from files to figures. seconds: wall time; processor_s: of all threads; ratio: the latter over
-    pycocotools' own.
-    """
+    """One way from files to figures."""
 
     protocol: str
     engine: str
     frames: int
     detections: int
     seconds: float
+    """Wall time."""
     processor_s: float
+    """Of all threads."""
     ratio: float
+    """The latter over pycocotools' own."""
 
 
 def measure(frames: int, seed: int) -> Iterator[EvaluationRow]:

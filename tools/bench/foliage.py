@@ -68,7 +68,7 @@ def measure(frames: int, sheets: Path | None) -> Iterator[list[FoliageRow]]:
 
 def rows_of(pool: str, number: int, plan: Plan, sheets: Path | None = None) -> list[FoliageRow]:
     """The figures of one frame. sheets: folder for its pictures."""
-    made = rendered(plan, generated.street_of(plan))
+    made = rendered(plan, generated.build_street(plan))
     scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
     compositor = Compositor(scene)
     leaves = (scene.environment.foliage_map >= 0.5).numpy()
@@ -79,7 +79,7 @@ def rows_of(pool: str, number: int, plan: Plan, sheets: Path | None = None) -> l
         changed = scene.with_environment(foliage=scene.environment.foliage.new_tensor(edit.foliage))
         ours = to_uint8(compositor.render(changed).image)
         edited = apply_edit(plan, edit)
-        truth = rendered(edited, generated.street_of(edited)).image
+        truth = rendered(edited, generated.build_street(edited)).image
         figures = [
             round(psnr(picture, truth, zone), 4) if int(zone.sum()) >= _LEAST_PIXELS else None
             for zone in zones

@@ -66,11 +66,7 @@ _MORE_CUT = 0.05
 
 @dataclass(frozen=True, slots=True)
 class CarRow:
-    """One car of one frame. judged: high and visible enough. before: in the photograph; removed, removed_any: at
-    the old box in the emptied picture, as a car and as any vehicle; removed_faint: as a car at a tenth of a score;
-    ghost: the surest car that lies at least half in the old box and was not in the photograph; alone, together: at
-    the moved box, None where no move was possible. move: (m along the heading, rad).
-    """
+    """One car of one frame."""
 
     frame: str
     row: int
@@ -79,14 +75,23 @@ class CarRow:
     occlusion: int
     truncation: float
     judged: bool
+    """High and visible enough."""
     before: Sight
+    """In the photograph."""
     removed: Sight
+    """At the old box in the emptied picture, as a car and as any vehicle."""
     removed_any: Sight
+    """At the old box in the emptied picture, as a car and as any vehicle."""
     removed_faint: Sight
+    """As a car at a tenth of a score."""
     ghost: Sight
+    """The surest car that lies at least half in the old box and was not in the photograph."""
     move: tuple[float, float] | None
+    """(m along the heading, rad)."""
     alone: Sight | None
+    """At the moved box, None where no move was possible."""
     together: Sight | None
+    """At the moved box, None where no move was possible."""
 
 
 def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str, list[CarRow]]]:

@@ -106,31 +106,41 @@ _ROUNDING = 1e-15
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well a gradient agrees with differences of one step. step: in theta's units; cosine: of the two vectors;
-    relative_error: length of their difference over that of the differences.
-    """
+    """How well a gradient agrees with differences of one step."""
 
     step: float
+    """In theta's units."""
     cosine: float
+    """Of the two vectors."""
     relative_error: float
+    """Length of their difference over that of the differences."""
 
 
 @dataclass(frozen=True, slots=True)
 class GradcheckRow:
-    """One comparison. name: the parameter, or `combo 2 detector loss`; at, functional, backend, scene: of what.
-    cosine, relative_error, step: those of the step that agrees best, None where the parameter has no effect on the
-    functional by either account. steps: all three.
-    """
+    """One comparison."""
 
     name: str
+    """The parameter, or `combo 2 detector loss`."""
     at: Point
+    """Of what."""
     functional: str
+    """Of what."""
     backend: Backend
+    """Of what."""
     scene: str
+    """Of what."""
     cosine: float | None
+    """Those of the step that agrees best, None where the parameter has no effect on the functional by either
+    account."""
     relative_error: float | None
+    """Those of the step that agrees best, None where the parameter has no effect on the functional by either
+    account."""
     step: float | None
+    """Those of the step that agrees best, None where the parameter has no effect on the functional by either
+    account."""
     steps: tuple[Agreement, ...]
+    """All three."""
 
     def passes(self, least_cosine: float, largest_error: float) -> bool:
         """Whether it is inside the tolerance; so it is where there is nothing to compare."""
@@ -146,14 +156,14 @@ class GradcheckRow:
 
 @dataclass(frozen=True, slots=True)
 class Differences:
-    """Along some directions of one parameter. where: its coordinates in theta; directions (K, D'), orthonormal;
-    slopes (S, F + 1, K), by step; noise (S, F + 1, K): what rounding alone can make of them. All float64.
-    """
+    """Along some directions of one parameter."""
 
     where: slice
+    """Its coordinates in theta; directions (K, D'), orthonormal; slopes (S, F + 1, K), by step."""
     directions: Array
     slopes: Array
     noise: Array
+    """What rounding alone can make of them. All float64, (S, F + 1, K)."""
 
 
 Gradients = dict[Backend, Array]

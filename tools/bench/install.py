@@ -49,11 +49,12 @@ print(json.dumps([[one.name, one.version, size(one)] for one in distributions()]
 
 @dataclass(frozen=True, slots=True)
 class StepRow:
-    """A step. mb: of what it made."""
+    """A step."""
 
     step: str
     seconds: float
     mb: float
+    """Of what it made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +68,16 @@ class SizeRow:
 
 @dataclass(frozen=True, slots=True)
 class StartRow:
-    """A command that is started again and again. first: seconds of the first time; seconds, iqr: of the others."""
+    """A command that is started again and again."""
 
     command: str
     repetitions: int
     first: float
+    """Seconds of the first time."""
     seconds: float
+    """Of the others."""
     iqr: float
+    """Of the others."""
 
 
 Row = StepRow | SizeRow | StartRow

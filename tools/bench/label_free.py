@@ -67,13 +67,13 @@ class VehicleRow:
 
 @dataclass(frozen=True, slots=True)
 class FrameRows:
-    """A frame's vehicles. labelled: how many there were to be found. near: of each very near one, cut ones too,
-    1 - IoU of its box and the one placed that it meets best.
-    """
+    """A frame's vehicles."""
 
     labelled: int
+    """How many there were to be found."""
     rows: tuple[VehicleRow, ...]
     near: tuple[float, ...] = ()
+    """Of each very near one, cut ones too, 1 - IoU of its box and the one placed that it meets best."""
 
 
 def names(config: BenchTool) -> list[str]:
@@ -125,12 +125,12 @@ def frame_of(config: BenchTool, name: str) -> Frame:
 
 def judge(frame: Frame, labels: Labels) -> FrameRows:
     """Hold what is found of a frame's photograph against labels that were hidden from it."""
-    from drivesem.scenes.label_free import detect, label_free, settings_for
+    from drivesem.scenes.label_free import detect, detection_fit_settings, label_from_detections
 
     bare = Frame(frame.identifier, frame.photograph, frame.camera)
-    found = label_free(bare, detect(bare))
+    found = label_from_detections(bare, detect(bare))
     assert found.labels is not None
-    fitted = place_vehicles(found, settings_for(DerenderSettings()))
+    fitted = place_vehicles(found, detection_fit_settings(DerenderSettings()))
     guess = found.labels
     mine = [i for i, kind in enumerate(guess.kind) if kind in VEHICLE_CATEGORIES]
     wanted = judged(labels)

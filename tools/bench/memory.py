@@ -43,9 +43,10 @@ _ASKER = "bench memory"
 
 @dataclass(frozen=True, slots=True)
 class MemoryRow:
-    """What was measured; MB unless said otherwise. sweep: what this row is about, cars, batch or steps."""
+    """What was measured; MB unless said otherwise."""
 
     sweep: str
+    """What this row is about, cars, batch or steps."""
     cars: int
     triangles: int
     batch: int

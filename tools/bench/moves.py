@@ -85,9 +85,7 @@ _SHEET_CHANGES = 7
 
 @dataclass(frozen=True, slots=True)
 class MovedRow:
-    """One vehicle after one change. found, ours: the scores with which the detector finds it in the generator's
-    picture and in ours, None where it does not; invented: cars that only ours shows.
-    """
+    """One vehicle after one change."""
 
     split: Split
     index: int
@@ -100,8 +98,13 @@ class MovedRow:
     unchanged_db: float
     region_db: float
     found: float | None
+    """The scores with which the detector finds it in the generator's picture and in ours, None where it does not.
+    The scores with which the detector finds it in the generator's picture and in ours, None where it does not."""
     ours: float | None
+    """The scores with which the detector finds it in the generator's picture and in ours, None where it does not.
+    The scores with which the detector finds it in the generator's picture and in ours, None where it does not."""
     invented: int
+    """Cars that only ours shows."""
 
 
 def names(config: BenchTool, frames: int) -> list[str]:

@@ -26,14 +26,16 @@ _DETECTOR_STEPS = 12
 
 @dataclass(frozen=True, slots=True)
 class ProbeOrder:
-    """What to run. detector: name or file; threads: of torch; scene: its folder, or height and width, px, of a
-    random image for the detector alone; batch: images or thetas at once; steps; seed.
-    """
+    """What to run."""
 
     detector: str
+    """Name or file."""
     threads: int
+    """Of torch."""
     scene: str | tuple[int, int]
+    """Its folder, or height and width, px, of a random image for the detector alone."""
     batch: int = 1
+    """Images or thetas at once; steps; seed."""
     steps: int = _DETECTOR_STEPS
     seed: int = 0
 

@@ -54,20 +54,23 @@ METHOD = (
 
 @dataclass(frozen=True, slots=True)
 class FrameRow:
-    """One frame. cars: judged; photograph, ours, second: of these found in the pictures without a change; moved:
-    cars that were moved, and how many of these are found; None where nothing could be compared.
-    """
+    """One frame."""
 
     frame: str
     cars: int
+    """Judged."""
     apart: float | None
     psnr_db: float | None
     apart_beside: float
     psnr_moved_db: float | None
     photograph: int
+    """Of these found in the pictures without a change."""
     ours: int
+    """Of these found in the pictures without a change."""
     second: int
+    """Of these found in the pictures without a change."""
     moved: int
+    """Cars that were moved, and how many of these are found; None where nothing could be compared."""
     ours_moved: int
     second_moved: int
     made_s: float

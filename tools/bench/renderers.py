@@ -33,12 +33,14 @@ class UnavailableError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RenderTask:
-    """What to draw. colours (V, 3): random ones, one a vertex; weight (H, W, 3): the gradient that comes in."""
+    """What to draw."""
 
     placed: PackedMeshes
     camera: Camera
     colours: Tensor
+    """Random ones, one a vertex, (V, 3)."""
     weight: Tensor
+    """The gradient that comes in, (H, W, 3)."""
 
     @property
     def relative(self) -> np.ndarray:

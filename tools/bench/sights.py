@@ -45,7 +45,7 @@ UNSEEN = Sight()
 @dataclass(frozen=True, slots=True)
 class View:
     """A picture (H, W, 3), the boxes (N, 4) px of the scene's N objects in it, and what a detector found, classes
-    its labels' names. assigned: what was given to each object, as a car.
+    its labels' names.
     """
 
     picture: Picture
@@ -53,6 +53,7 @@ class View:
     detections: Detections
     classes: tuple[str, ...]
     assigned: list[Sight]
+    """What was given to each object, as a car."""
 
     def sight(self, row: int, names: Sequence[str], score: float = SCORE) -> Sight:
         """The best overlap with an object's box of all that is called so, whatever else it may belong to."""

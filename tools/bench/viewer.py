@@ -21,7 +21,7 @@ from drivesem.attack.budgets import PRESETS, STREET
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
 from drivesem.scenes.scene import demo_scene
-from drivesem.scenes.sources import scene_folders
+from drivesem.scenes.sources import find_scene_folders
 from drivesem.viewer.server import HOST, Server, Viewer, ViewerFrame
 from drivesem.viewer.sliders import Slider
 from scene_ir.io import save_scene
@@ -57,20 +57,20 @@ _ASK = """async ([name, value]) => {
 
 @dataclass(frozen=True, slots=True)
 class ViewerRow:
-    """One slider. where: HTTP or browser; cpu_ms: median of a state's, of the server; None where a browser shares
-    the processor's work.
-    """
+    """One slider."""
 
     slider: str
     size: str
     cars: int
     where: str
+    """HTTP or browser."""
     states: int
     picture_ms: float
     picture_iqr_ms: float
     detections_ms: float
     detections_iqr_ms: float
     cpu_ms: float | None
+    """Median of a state's, of the server; None where a browser shares the processor's work."""
 
 
 def measure(scene: Path | None, detector: Predictor, states: int, seed: int) -> Iterator[ViewerRow]:
@@ -80,7 +80,7 @@ def measure(scene: Path | None, detector: Predictor, states: int, seed: int) -> 
             name, folder = "demo", Path(made) / "demo"
             save_scene(demo_scene(seed=seed).ir, folder)
         else:
-            name, folder = next(iter(scene_folders(scene).items()))
+            name, folder = next(iter(find_scene_folders(scene).items()))
         viewer = Viewer(name, {name: ViewerFrame(folder)}, detector, PRESETS[STREET])
         with _served(viewer) as server:
             stage = viewer.scene(name)

@@ -123,7 +123,7 @@ def rows_of(
     pool: str, number: int, plan: Plan, detector: Predictor, sheets: Path | None = None
 ) -> list[WeatherRow]:
     """The figures of one frame. sheets: folder for its pictures."""
-    street = generated.street_of(plan)
+    street = generated.build_street(plan)
     made = rendered(plan, street)
     scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
     shown = [truth for truth in made.truths if _shown(truth)]

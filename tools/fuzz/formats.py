@@ -36,10 +36,10 @@ from drivesem.config.edits import read_edits, read_frame_edit
 from drivesem.config.options import to_yaml
 from drivesem.config.parsing import parse
 from drivesem.data import kitti
+from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation, TrackedObject
 from drivesem.data.layouts import read_table
 from drivesem.data.photographs import read_photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
-from drivesem.data.truth import SKY_CM, Exposure, FrameLocation, TrackedObject
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.finished import load_run
 from drivesem.run.report.runs import build_reports

@@ -38,7 +38,7 @@ _STATE = struct.Struct("<5q2d")
 
 @dataclass
 class Outcome:
-    """What became of a format's inputs. wrong: a line for each kind of fault, and the inputs that showed it."""
+    """What became of a format's inputs."""
 
     name: str
     tried: int = 0
@@ -47,6 +47,7 @@ class Outcome:
     seconds: float = 0.0
     mb: float = 0.0
     wrong: dict[str, list[int]] = field(default_factory=dict)
+    """A line for each kind of fault, and the inputs that showed it."""
 
 
 class TooSlowError(BaseException):

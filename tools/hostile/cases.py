@@ -1,4 +1,4 @@
-"""The cases: what was found once when the project was tried by hand, and its neighbours."""
+"""Hostile cases: defects once found by hand, and similar ones."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from tools.hostile.inputs import (
     run,
     scene,
     setting,
-    spoiled,
     text,
     weights,
 )
 from tools.hostile.trial import Case, Signals
 
 FAMILIES: Mapping[str, str] = {
-    "trust": "runs that were changed by hand, or name code",
-    "escapes": "links, devices, and names that lead out of their folder",
-    "allocation": "files that say or hold too much",
+    "trust": "runs that were edited by hand, or that name code",
+    "escapes": "links, devices, and names outside their folder",
+    "allocation": "files with huge contents, or that declare them",
     "tracebacks": "values that no reader expects",
-    "signals": "Ctrl-C and SIGTERM while two workers are at work",
-    "own detectors": "detectors of the user's own that raise, or find nothing",
+    "signals": "Ctrl-C and SIGTERM while two workers run",
+    "own detectors": "user detectors that raise, or detect nothing",
 }
-"""In the order in which they are told."""
+"""Families of cases, in the order of the table."""
 
 RESULT = f"run/{FRAME}/result.json"
 DERENDER = "drivesem derender --dataset kitti --root kitti --workers 1 --out out"
@@ -45,7 +44,7 @@ ATTACK = "drivesem attack --dataset kitti --root kitti --no-fit --params transla
 
 
 def cases() -> list[Case]:
-    """All of them, by family."""
+    """All cases by family."""
     return [*_trust(), *_escapes(), *_allocation(), *_tracebacks(), *_signals(), *_own()]
 
 
@@ -69,7 +68,7 @@ def _trust() -> Iterator[Case]:
         "a failure's index": (edited(RESULT, "failures", 0, "index", value=None), "result.json: failures"),
         "a failure that is a phantom": (edited(RESULT, "failures", 0, "kind", value="phantom"), "phantoms"),
         "a failure's grade": (edited(RESULT, "failures", 0, "grade", value="certain"), "failures[0].grade"),
-        "a peer's opinion": (
+        "a second detector's opinion": (
             edited(
                 RESULT, "failures", 0, "peer", value={"by": "yolov3-slim", "before": 8, "after": 8, "draws": 8}
             ),
@@ -98,26 +97,33 @@ def _trust() -> Iterator[Case]:
 
     evil = text("evil.py", inputs.EVIL)
     refused = ("run/config.yaml: {}", "--trust")
-    for words in ("verify run", "explain run", "confirm run", "retrain run", "holes run", "view run --no-browser"):
+    for command in (
+        "verify run",
+        "explain run",
+        "confirm run",
+        "retrain run",
+        "holes run",
+        "view run --no-browser",
+    ):
         make = both(run, evil, setting("detector", "module:evil.py:D"))
-        says = tuple(line.format("detector") for line in refused)
-        yield Case(f"code in a run: {words.partition(' ')[0]}", "trust", make, f"drivesem {words}", says)
+        named = tuple(line.format("detector") for line in refused)
+        yield Case(f"code in a run: {command.partition(' ')[0]}", "trust", make, f"drivesem {command}", named)
     for name, value in {
-        "peer": "module:evil.py:D",
-        "witness": "module:evil.py:D",
+        "second_detector": "module:evil.py:D",
+        "reference_detector": "module:evil.py:D",
         "detector": "planted:height_px=30:38@module:evil.py:D",
     }.items():
         make = both(run, evil, setting(name, value))
-        says = tuple(line.format(name) for line in refused)
+        named = tuple(line.format(name) for line in refused)
         yield Case(
-            f"code in a run: {value.partition(':')[0]} as {name}", "trust", make, "drivesem verify run", says
+            f"code in a run: {value.partition(':')[0]} as {name}", "trust", make, "drivesem verify run", named
         )
     tag = setting("steps", f"!!python/object/apply:os.mkdir [{inputs.MARK}]")
     yield Case("code in YAML", "trust", both(run, tag), "drivesem report run", ("run/config.yaml",))
     make = both(scene, inputs.pickled_arrays)
     yield Case("pickle in a scene", "trust", make, "drivesem render scene", ("arrays.npz", "pickle"))
     make = both(run, inputs.pickled_weights("weights/alexnet-owt-7be5be79.pth"))
-    words = "drivesem realism run --metrics lpips-alex --weights weights"
+    words = "tools.experiments realism run --metrics lpips-alex --weights weights"
     yield Case("pickle in weights", "trust", make, words, ("alexnet-owt-7be5be79.pth",))
 
 
@@ -144,14 +150,18 @@ def _escapes() -> Iterator[Case]:
     secret = text("secret.json", "{}")
     make = both(run, secret, linked(RESULT, "../../../secret.json"))
     yield Case(
-        "link out of a run", "escapes", make, "drivesem worth run --distance none", ("result.json", "a link to")
+        "link out of a run",
+        "escapes",
+        make,
+        "tools.experiments worth run --distance none",
+        ("result.json", "a link to"),
     )
     for name in ("../../secret.png", "/dev/zero"):
         make = coco("images", "file_name", name)
         words = "drivesem derender --dataset coco --root coco --out out"
         yield Case(f"COCO: file_name {name}", "escapes", make, words, ("images[0].file_name", name))
     for name in ("../secret", "/dev"):
-        make = both(inputs.layout("yolo"), spoiled("yolo/data.yaml", f"train: {name}\nnames: [Car]\n"))
+        make = both(inputs.layout("yolo"), text("yolo/data.yaml", f"train: {name}\nnames: [Car]\n"))
         words = "drivesem derender --dataset yolo --root yolo --out out"
         yield Case(f"YOLO: train {name}", "escapes", make, words, ("data.yaml: train", name))
 
@@ -168,9 +178,9 @@ def _allocation() -> Iterator[Case]:
     words = "drivesem eval --gt kitti --pred found --protocol kitti"
     yield Case("80,000 equal detections", "allocation", make, words, ("2,000 detections", "80,000"))
     for name, maker in {
-        "NPZ header of 10^12 floats": inputs.claiming_arrays,
+        "NPZ header of 10^12 floats": inputs.oversized_arrays,
         "zip bomb of 4 GB": inputs.bomb(),
-        "zip bomb that says 1,000 bytes": inputs.bomb(told=1000),
+        "zip bomb that declares 1,000 bytes": inputs.bomb(declared=1000),
     }.items():
         yield Case(name, "allocation", both(scene, maker), "drivesem render scene", ("scene/arrays.npz",))
     lines = [f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]" for a, b in zip("abcdefghijk", "bcdefghijkl", strict=True)]
@@ -178,7 +188,7 @@ def _allocation() -> Iterator[Case]:
     yield Case(
         "YAML alias bomb: a run",
         "allocation",
-        both(run, spoiled("run/config.yaml", content)),
+        both(run, text("run/config.yaml", content)),
         "drivesem report run",
         ("config.yaml", "alias"),
     )
@@ -195,7 +205,7 @@ def _allocation() -> Iterator[Case]:
     words = "drivesem check --detector weights.safetensors"
     many = weights(anchors=str([[10, 10]] * 100_000))
     yield Case("100,000 anchors: weights", "allocation", many, words, ("anchors", "100000"))
-    yield Case("2 GB in a header of 1 KB", "allocation", inputs.claiming_weights, words, ("weights.safetensors",))
+    yield Case("2 GB in a header of 1 KB", "allocation", inputs.oversized_weights, words, ("weights.safetensors",))
     make = both(kitti(), inputs.ply("meshes/car.ply", 10**9))
     yield Case("a mesh of 10^9 faces", "allocation", make, f"{DERENDER} --meshes meshes", ("car.ply",))
 
@@ -230,21 +240,21 @@ READERS: Mapping[str, tuple[Make, str, str]] = {
     "a survey's key": (
         text("answers.csv", "survey\n"),
         "key.json",
-        "drivesem survey-results answers.csv --survey key.json",
+        "tools.experiments survey-results answers.csv --survey key.json",
     ),
-    "a study": (inputs.nothing, "kept/study.json", "drivesem study single --kept kept --out out"),
+    "a study": (inputs.nothing, "results/study.json", "tools.experiments single --from results --out out"),
     "a run of classify": (inputs.nothing, "run/config.yaml", "drivesem classify confirm run"),
     "glTF": (kitti(), "meshes/car.gltf", f"{DERENDER} --meshes meshes"),
 }
-"""Every kind of JSON and YAML file that a command reads: its maker, the file, the command."""
+"""Every kind of JSON and YAML file that a command reads: maker, file, command."""
 
 
 def _tracebacks() -> Iterator[Case]:
     for name, (make, file, words) in READERS.items():
-        says = (file.rpartition("/")[2],)
+        named = (file.rpartition("/")[2],)
         digits = f'{{"a": {DIGITS}}}'
-        yield Case(f"deep nesting: {name}", "tracebacks", both(make, text(file, DEEP)), words, says)
-        yield Case(f"5,000 digits: {name}", "tracebacks", both(make, text(file, digits)), words, says)
+        yield Case(f"deep nesting: {name}", "tracebacks", both(make, text(file, DEEP)), words, named)
+        yield Case(f"5,000 digits: {name}", "tracebacks", both(make, text(file, digits)), words, named)
     words = "drivesem check --detector weights.safetensors"
     for name, value in {"deep nesting": DEEP, "5,000 digits": f"[[{DIGITS}, 1]]"}.items():
         yield Case(
@@ -267,7 +277,7 @@ def _tracebacks() -> Iterator[Case]:
         yield Case(
             f"crop x0 = {value:g}", "tracebacks", make, "drivesem render scene", ("scene.json", "foreground")
         )
-    for table, key, value, said in (
+    for table, key, value, named in (
         ("images", "id", [1], "images[0].id"),
         ("categories", "id", [1], "categories[0].id"),
         ("annotations", "image_id", [1], "annotations[0].image_id"),
@@ -278,13 +288,15 @@ def _tracebacks() -> Iterator[Case]:
     ):
         name = f"COCO: {table}.{key} = {value!a}"
         yield Case(
-            name, "tracebacks", coco(table, key, value), "drivesem convert coco --to kitti --out out", (said,)
+            name, "tracebacks", coco(table, key, value), "drivesem convert coco --to kitti --out out", (named,)
         )
     words = "drivesem check --detector darknet:net.cfg"
     yield Case(".names that is not UTF-8", "tracebacks", inputs.names, words, ("net.names",))
-    for command in ("report run", "worth run --distance none"):
-        name = command.partition(" ")[0]
-        for what, make, said in (
+    for name, command in {
+        "report": "drivesem report run",
+        "worth": "tools.experiments worth run --distance none",
+    }.items():
+        for what, make, named in (
             (
                 "box of three numbers",
                 edited(RESULT, "targets_benign", 0, "xyxy", value=[1, 2, 3]),
@@ -298,7 +310,7 @@ def _tracebacks() -> Iterator[Case]:
             ("t_star a text", edited("run/metrics.json", "t_star", value="half"), "metrics.json: t_star"),
             ("detector: 5", setting("detector", "5"), "config.yaml: detector"),
         ):
-            yield Case(f"{what}: {name}", "tracebacks", both(run, make), f"drivesem {command}", (said,))
+            yield Case(f"{what}: {name}", "tracebacks", both(run, make), command, (named,))
     make = both(run, setting("detector", "5"))
     yield Case("detector: 5: verify", "tracebacks", make, "drivesem verify run", ("config.yaml: detector",))
     for command in ("check --detector weights.safetensors", "attack --detector weights.safetensors --out out"):
@@ -307,30 +319,30 @@ def _tracebacks() -> Iterator[Case]:
             name, "tracebacks", weights(t_star="nan"), f"drivesem {command}", ("weights.safetensors", "t_star")
         )
     for command in ("convert kitti --to coco --out out", DERENDER.removeprefix("drivesem ")):
-        for what, lines, said in (
+        for what, lines, named in (
             ("height -1.5", {8: "-1.5"}, "height"),
             ("truncation -5", {1: "-5"}, "truncat"),
             ("truncation 1.5", {1: "1.5"}, "truncat"),
         ):
             name = f"{what}: {command.partition(' ')[0]}"
-            yield Case(name, "tracebacks", kitti(lines=lines), f"drivesem {command}", ("n00000", said))
+            yield Case(name, "tracebacks", kitti(lines=lines), f"drivesem {command}", ("n00000", named))
 
 
 def _signals() -> Iterator[Case]:
     attack = "drivesem attack --combo 2 --no-fit --steps 2 --no-grade --workers 2 --out out"
-    begun, first = "out/config.yaml", "out/frames/demo-*"
+    created, first = "out/config.yaml", "out/frames/demo-*"
     moments = [
         ("", 2.0),
         ("", 3.0),
-        (begun, 0.0),
-        (begun, 1.0),
-        (begun, 3.0),
-        (begun, 5.0),
+        (created, 0.0),
+        (created, 1.0),
+        (created, 3.0),
+        (created, 5.0),
         (first, 0.0),
         (first, 2.0),
     ]
     for ready, after in moments:
-        begin = {"": "the start", begun: "it made its folder", first: "its first frame"}[ready]
+        begin = {"": "the start", created: "it made its folder", first: "its first frame"}[ready]
         when = f"{after:g} s after {begin}"
         for name, sent, number, code in (
             ("Ctrl-C", (after,), signal.SIGINT, 130),
@@ -362,26 +374,26 @@ def _own() -> Iterator[Case]:
         yield Case(
             f"raises in {name}: check", "own detectors", make, CHECK_MINE, ("KeyError", f"mine.py:7, in {name}")
         )
-    make = detector(beside="import nowhere")
+    make = detector(module_code="import nowhere")
     yield Case("raises when imported: check", "own detectors", make, CHECK_MINE, ("nowhere",))
-    make = detector(beside="def broken(:")
+    make = detector(module_code="def broken(:")
     yield Case("no Python: check", "own detectors", make, CHECK_MINE, ("SyntaxError", "(mine.py:2)"))
-    mine, looks = "--detector module:mine.py:Mine", "drivesem eval --dataset kitti --root kitti --workers 1"
+    mine, evaluation = "--detector module:mine.py:Mine", "drivesem eval --dataset kitti --root kitti --workers 1"
     words = f"{ATTACK} {mine}"
     for name, method, command in (
         ("forward: attack", "def forward(self, images):", words),
         ("decode: attack", "def decode(self, raw):", words),
         ("loss: attack", "def loss(self, raw, targets):", words),
-        ("decode: eval", "def decode(self, raw):", f"{looks} {mine}"),
+        ("decode: eval", "def decode(self, raw):", f"{evaluation} {mine}"),
         ("decode: drive", "def decode(self, raw):", f"drivesem drive {mine} --limit 4 --out out"),
     ):
         make = both(kitti(), detector(method, 'raise KeyError("wheels")'))
-        says = ("--detector", "KeyError", f"mine.py:7, in {name.partition(':')[0]}")
-        works = "drive" in name  # a clip is taken apart before anybody looks at it
-        yield Case(f"raises in {name}", "own detectors", make, command, says, unlimited=works)
+        named = ("--detector", "KeyError", f"mine.py:7, in {name.partition(':')[0]}")
+        unlimited = "drive" in name  # de-rendering comes before the first detection
+        yield Case(f"raises in {name}", "own detectors", make, command, named, unlimited=unlimited)
     make = both(kitti(), detector("def decode(self, raw):", 'raise KeyError("wheels")'))
     two = words.replace("--workers 1", "--workers 2")
-    says = ("--detector", "mine.py:7, in decode")
-    yield Case("raises in decode: attack, two workers", "own detectors", make, two, says, unlimited=True)
+    named = ("--detector", "mine.py:7, in decode")
+    yield Case("raises in decode: attack, two workers", "own detectors", make, two, named, unlimited=True)
     make = both(kitti(), text("mine.py", inputs.BLIND))
     yield Case("finds no car: attack", "own detectors", make, words, ("--detector", "finds something"))

@@ -1,4 +1,4 @@
-"""What hostile commands are given: files that were made to break a reader, from data that is generated."""
+"""Hostile inputs: files made to break a reader, derived from generated data."""
 
 from __future__ import annotations
 
@@ -24,52 +24,52 @@ from tools.fuzz.formats import dataset, net
 from tools.small_frames import small_frames
 
 MARK = "mark"
-"""File that foreign code makes where it is run."""
+"""File that foreign code creates when it runs."""
 FRAME = "frames/n00000"
-"""The one frame of the run that is spoiled."""
+"""Folder of the frame of the run."""
 GIGABYTE = 1 << 30
 
 Make = Callable[["Ground", Path], object]
-"""Writes what a command is given into an empty folder."""
+"""Writes the input of a command into a folder."""
 
 
 class Ground:
-    """Valid data that inputs are made of, each when it is first needed. folder: a temporary one."""
+    """Valid data from which inputs are made, created on first use in a temporary folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     @cached_property
     def kitti(self) -> Path:
-        """Two generated frames of 192x112 px, a car in each, in KITTI's layout."""
-        with files.whole_folder(self._folder / "kitti") as part:
+        """Two generated KITTI frames of 192x112 px with one car each."""
+        with files.atomic_folder(self._folder / "kitti") as part:
             small_frames(part, 2, streets=3)
         return self._folder / "kitti"
 
     @cached_property
     def run(self) -> Path:
-        """An attack on the first of them, in which the car is lost."""
+        """A run on the first frame, in which the car is missed."""
         words = f"attack --dataset kitti --root {self.kitti} --no-fit --params weather,translate,rotate"
         words += " --method random --queries 8 --limit 1 --workers 1 --out"
         out = self._folder / "run"
-        whole = [sys.executable, "-m", "drivesem.cli", *words.split(), str(out)]
-        done = subprocess.run(whole, capture_output=True, text=True, check=False)
+        command = [sys.executable, "-m", "drivesem.cli", *words.split(), str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise RuntimeError(f"the run that is to be spoiled: exit code {done.returncode}: {done.stderr[-500:]}")
+            raise RuntimeError(f"the valid run: exit code {done.returncode}: {done.stderr[-500:]}")
         return out
 
 
 def nothing(ground: Ground, place: Path) -> None:
-    """For a command that needs no files."""
+    """No files."""
 
 
 def text(name: str, content: str) -> Make:
-    """A file."""
+    """A file with this text."""
     return lambda ground, place: files.write_text(place / name, content)
 
 
 def both(*makers: Make) -> Make:
-    """One after the other."""
+    """Call several makers in order."""
 
     def make(ground: Ground, place: Path) -> None:
         for maker in makers:
@@ -82,17 +82,17 @@ def both(*makers: Make) -> Make:
 
 
 def run(ground: Ground, place: Path) -> None:
-    """The run, as `run`."""
+    """The run in folder `run`."""
     shutil.copytree(ground.run, place / "run")
 
 
 def scene(ground: Ground, place: Path) -> None:
-    """The scene of its frame, as `scene`."""
+    """The scene of its frame in folder `scene`."""
     shutil.copytree(ground.run / FRAME / "scene", place / "scene")
 
 
 def edited(path: str, *keys: Any, value: Any) -> Make:
-    """Change one value of a JSON file, by the keys to it."""
+    """Change the value of a JSON file at the path of keys."""
 
     def make(ground: Ground, place: Path) -> None:
         data = json.loads((place / path).read_text())
@@ -100,7 +100,7 @@ def edited(path: str, *keys: Any, value: Any) -> Make:
         for key in keys[:-1]:
             inner = inner[key]
         if inner[keys[-1]] == value:
-            raise RuntimeError(f"{path}: {keys}: is {value!r} already")
+            raise RuntimeError(f"{path}: {keys}: already {value!r}")
         inner[keys[-1]] = value
         (place / path).write_text(json.dumps(data))
 
@@ -121,7 +121,7 @@ def setting(name: str, value: str) -> Make:
 
 
 def linked(path: str, target: str) -> Make:
-    """Put a link in the place of a file."""
+    """Replace a file by a link."""
 
     def make(ground: Ground, place: Path) -> None:
         (place / path).unlink(missing_ok=True)
@@ -131,7 +131,7 @@ def linked(path: str, target: str) -> Make:
 
 
 def brightened(ground: Ground, place: Path) -> None:
-    """One corner of the counterexample, by hand."""
+    """Change one corner of the counterexample."""
     path = place / "run" / FRAME / "counterexample.png"
     image = files.read_image(path)
     image[:20, :20] ^= 64
@@ -139,13 +139,13 @@ def brightened(ground: Ground, place: Path) -> None:
 
 
 def overlay(ground: Ground, place: Path) -> None:
-    """The photograph in place of the picture with boxes."""
+    """Replace the picture with boxes by the photograph."""
     frame = place / "run" / FRAME
     shutil.copy(frame / "benign.png", frame / "overlay.png")
 
 
 def labels(ground: Ground, place: Path) -> None:
-    """The moved label, 3 px to the side."""
+    """Shift the moved label by 3 px."""
     path = place / "run" / FRAME / "labels_moved.txt"
     words = path.read_text().split()
     words[4] = f"{float(words[4]) - 3:.2f}"
@@ -165,20 +165,20 @@ class D:
 
 
 class _Touching:
-    """Makes the mark where it is unpickled."""
+    """Creates MARK when it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return open, (MARK, "w")
 
 
 def pickled_arrays(ground: Ground, place: Path) -> None:
-    """Objects, which are pickles, in the arrays of a scene."""
+    """Put a pickled object into the arrays of a scene."""
     with (place / "scene" / "arrays.npz").open("wb") as file:
         np.savez(file, depth=np.array([_Touching()], dtype=object))
 
 
 def pickled_weights(name: str) -> Make:
-    """A state_dict with something else in it."""
+    """A state_dict with a pickled object."""
 
     def make(ground: Ground, place: Path) -> None:
         (place / name).parent.mkdir(parents=True, exist_ok=True)
@@ -191,7 +191,13 @@ def pickled_weights(name: str) -> Make:
 
 
 def png(name: str, width: int, height: int) -> Make:
-    """A PNG whose header says a size, with next to nothing behind it."""
+    """A PNG whose header declares a size that its data do not have.
+
+    Args:
+        name: File to write.
+        width: Declared width, px.
+        height: Declared height, px.
+    """
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -206,16 +212,16 @@ def one_pixel(name: str) -> Make:
     return lambda ground, place: files.write_png(place / name, np.zeros((1, 1, 3), np.uint8))
 
 
-def claiming_arrays(ground: Ground, place: Path) -> None:
-    """An array that says it has 10^12 numbers, and has none."""
+def oversized_arrays(ground: Ground, place: Path) -> None:
+    """An array that declares 10^12 numbers and has none."""
     head = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + "\n"
     member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
     with zipfile.ZipFile(place / "scene" / "arrays.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("depth.npy", member)
 
 
-def bomb(told: int | None = None) -> Make:
-    """4 GB of zeros in 4 MB. told: the size that the archive's list says instead, bytes."""
+def bomb(declared: int | None = None) -> Make:
+    """An archive of 4 MB that expands to 4 GB of zeros; its directory may declare another size, bytes."""
 
     def make(ground: Ground, place: Path) -> None:
         path = place / "scene" / "arrays.npz"
@@ -226,17 +232,17 @@ def bomb(told: int | None = None) -> Make:
         ):
             for _ in range(4 * GIGABYTE // len(zeros) - 1):
                 member.write(zeros)
-        if told is not None:
+        if declared is not None:
             data = bytearray(path.read_bytes())
             at = data.rindex(b"PK\x01\x02")
-            data[at + 24 : at + 28] = struct.pack("<I", told)
+            data[at + 24 : at + 28] = struct.pack("<I", declared)
             path.write_bytes(data)
 
     return make
 
 
 def ply(name: str, faces: int) -> Make:
-    """A mesh whose header says so many faces, and that has none."""
+    """A mesh that declares a number of faces and has none."""
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
     head += "".join(f"property float {axis}\n" for axis in "xyz")
     head += f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
@@ -247,8 +253,12 @@ def ply(name: str, faces: int) -> Make:
 
 
 def kitti(cars: int = 1, lines: Mapping[int, str] | None = None, focal: str | None = None) -> Make:
-    """The generated frames as `kitti`. cars: how often the first frame's label is written; lines: words of it by
-    place, that are others; focal: of its camera.
+    """The generated frames in folder `kitti`.
+
+    Args:
+        cars: Repetitions of the first frame's label.
+        lines: Words of this label to replace, by position.
+        focal: Focal length of its camera, px.
     """
 
     def make(ground: Ground, place: Path) -> None:
@@ -266,13 +276,13 @@ def kitti(cars: int = 1, lines: Mapping[int, str] | None = None, focal: str | No
 
 
 def equal_detections(ground: Ground, place: Path) -> None:
-    """80,000 times the same in a frame, as `found`."""
+    """80,000 equal detections in each frame, in folder `found`."""
     for path in (ground.kitti / "training" / "label_2").iterdir():
         files.write_text(place / "found" / path.name, f"{path.read_text().strip()} 0.5\n" * 80_000)
 
 
 def coco(table: str, key: str, value: Any) -> Make:
-    """The made picture and its labels as `coco`, one value changed."""
+    """A COCO data set in folder `coco` with one changed value."""
 
     def make(ground: Ground, place: Path) -> None:
         dataset("coco", place / "coco")
@@ -285,7 +295,7 @@ COCO = "coco/annotations/instances_train.json"
 
 
 def layout(name: str) -> Make:
-    """The made picture and its labels in a layout, as a folder of that name."""
+    """A data set in a layout, in a folder of that name."""
     return lambda ground, place: dataset(name, place / name)
 
 
@@ -293,7 +303,7 @@ def layout(name: str) -> Make:
 
 
 def weights(**changed: str) -> Make:
-    """SqueezeDet's, as `weights.safetensors`, with other metadata."""
+    """The weights of SqueezeDet with other metadata, in `weights.safetensors`."""
 
     def make(ground: Ground, place: Path) -> None:
         metadata, tensors = read_weights(SHIPPED["squeezedet"])
@@ -302,20 +312,20 @@ def weights(**changed: str) -> Make:
     return make
 
 
-def claiming_weights(ground: Ground, place: Path) -> None:
-    """A header of 1 KB that says there are 2 GB."""
-    told = {"weight": {"dtype": "F32", "shape": [1 << 29], "data_offsets": [0, 1 << 31]}}
-    header = json.dumps(told).encode().ljust(1024)
+def oversized_weights(ground: Ground, place: Path) -> None:
+    """A header of 1 KB that declares 2 GB."""
+    tensors = {"weight": {"dtype": "F32", "shape": [1 << 29], "data_offsets": [0, 1 << 31]}}
+    header = json.dumps(tensors).encode().ljust(1024)
     files.write_bytes(place / "weights.safetensors", struct.pack("<Q", len(header)) + header)
 
 
 def layers(ground: Ground, place: Path) -> None:
-    """A Darknet of 20,000 layers, as `net.cfg`."""
+    """A Darknet network of 20,000 layers, in `net.cfg`."""
     files.write_text(place / "net.cfg", "[net]\nchannels=3\n" + "[shortcut]\nfrom=-1\n" * 20_000)
 
 
 def anchors(ground: Ground, place: Path) -> None:
-    """A Darknet of 100,000 anchors, as `net.cfg`."""
+    """A Darknet network of 100,000 anchors, in `net.cfg`."""
     _darknet(place)
     path = place / "net.cfg"
     lines = path.read_text().splitlines()
@@ -323,7 +333,7 @@ def anchors(ground: Ground, place: Path) -> None:
 
 
 def names(ground: Ground, place: Path) -> None:
-    """A Darknet whose class names are no UTF-8."""
+    """A Darknet network with class names that are not UTF-8."""
     _darknet(place)
     (place / "net.names").write_bytes(b"\xff\xfe\n")
 
@@ -332,27 +342,27 @@ def _darknet(place: Path) -> None:
     darknet.save(net(), place / "net.cfg")
 
 
-# ---- what is in the wrong form ----
+# ---- malformed texts ----
 
 DEEP = "[" * 200_000
 DIGITS = "9" * 5000
 
 
-def spoiled(path: str, content: str) -> Make:
-    """Another text in the place of a file."""
-    return lambda ground, place: (place / path).write_text(content)
+# ---- user detectors ----
 
 
-# ---- detectors of the user's own ----
+def detector(method: str = "", body: str = "pass", module_code: str = "") -> Make:
+    """SqueezeDet with another method, as `mine.py:Mine`.
 
-
-def detector(method: str = "", does: str = "pass", beside: str = "") -> Make:
-    """SqueezeDet with another method, as `mine.py:Mine`. does: its first line, line 7 of the file; beside: what
-    else the file has.
+    Args:
+        method: Head of the method.
+        body: Its first line, line 7 of the file.
+        module_code: A line at the top of the module.
     """
-    body = f"    {method}\n        {does}\n" if method else "    pass\n"
+    members = f"    {method}\n        {body}\n" if method else "    pass\n"
     return text(
-        "mine.py", f"from detectors.squeezedet import SqueezeDet\n{beside}\n\n\nclass Mine(SqueezeDet):\n{body}"
+        "mine.py",
+        f"from detectors.squeezedet import SqueezeDet\n{module_code}\n\n\nclass Mine(SqueezeDet):\n{members}",
     )
 
 
@@ -368,7 +378,7 @@ class Mine(SqueezeDet):
         none = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
         return [none] * len(raw)
 """
-"""One that finds no car, in a file `mine.py`."""
+"""A detector that detects nothing, for `mine.py`."""
 
 MODULE = """
 import torch
@@ -384,4 +394,4 @@ from drivesem.cli import main
 code = main("derender --dataset kitti --root kitti --no-fit --workers 2 --out scenes".split())
 raise SystemExit(code)
 """
-"""Two workers, and no guard by the module's name."""
+"""A script with two workers and no main guard."""

@@ -58,17 +58,18 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True)
 class Planted:
-    """A fault of a detector. hit: share of Halton's pictures in which it hides a car; cars: of cars in them;
-    still: share of cars found as photographed that it hides there; sharp: of the cars in Halton's pictures that
-    lie in its bands by their labels, the share that it hides. A detector's boxes are not the labels: in a band
-    narrower than that difference few of them are lost.
-    """
+    """A fault of a detector."""
 
     fault: PlantedFault
     hit: float
+    """Share of Halton's pictures in which it hides a car."""
     cars: float
+    """Of cars in them."""
     still: float
+    """Share of cars found as photographed that it hides there."""
     sharp: float
+    """Of the cars in Halton's pictures that lie in its bands by their labels, the share that it hides. A
+    detector's boxes are not the labels: in a band narrower than that difference few of them are lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,26 +82,29 @@ class Looked:
 
 @dataclass(frozen=True, slots=True)
 class AcrossAttempt:
-    """A search in one frame. fault: its text, empty without one; certain: cars lost for certain; found: of these,
-    those that the detector without the fault sees in the same picture; passes: of the search; looked: around each
-    of the certain ones.
-    """
+    """A search in one frame."""
 
     frame: str
     fault: str
+    """Its text, empty without one."""
     method: str
     certain: int
+    """Cars lost for certain."""
     found: int
+    """Of these, those that the detector without the fault sees in the same picture."""
     passes: int
+    """Of the search."""
     looked: tuple[Looked, ...]
+    """Around each of the certain ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class AcrossFrame:
-    """What was found in one frame. asked: see `Across`."""
+    """What was found in one frame."""
 
     frame: str
     asked: str
+    """See `Across`."""
     attempts: tuple[AcrossAttempt, ...]
 
 
@@ -192,13 +196,15 @@ def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> Planted | None
 
 @dataclass(frozen=True)
 class Across:
-    """What one process needs. kept: folder of what is done; faults: in words."""
+    """What one process needs."""
 
     config: DetectorBenchConfig
     detector: Detector
     workers: dict[str, AttackWorker]
     kept: Path | None
+    """Folder of what is done."""
     faults: tuple[str, ...] = ()
+    """In words."""
 
     @classmethod
     def of(cls, config: DetectorBenchConfig, faults: tuple[str, ...] = ()) -> Across:

@@ -52,14 +52,14 @@ KINDS = (
 
 @dataclass(frozen=True, slots=True)
 class Planting:
-    """A fault of a kind in a frame. hit: share of Halton's draws in which it hides a car; sure: in which one is so
-    far inside that what a camera does between two pictures would not take it out.
-    """
+    """A fault of a kind in a frame."""
 
     kind: FaultKind
     fault: PlantedFault
     hit: float
+    """Share of Halton's draws in which it hides a car."""
     sure: float
+    """In which one is so far inside that what a camera does between two pictures would not take it out."""
 
 
 def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> Planting | None:

@@ -27,15 +27,16 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True)
 class SeenCar:
-    """One car in one picture. index: of the object; described: its features as `FramePool.names` has them; margin:
-    in logits beyond t*, below 0 where the detector without a fault does not find it; told: of each car that its
-    predictions are about, as faults group them, the best score and that car's FEATURES.
-    """
+    """One car in one picture."""
 
     index: int
+    """Of the object."""
     described: tuple[float, ...]
+    """Its features as `FramePool.names` has them."""
     margin: float
+    """In logits beyond t*, below 0 where the detector without a fault does not find it."""
     told: tuple[tuple[float, ...], ...]
+    """Of each car that its predictions are about, as faults group them, the best score and that car's FEATURES."""
 
     @property
     def best(self) -> tuple[float, ...] | None:
@@ -65,15 +66,16 @@ def hidden(cars: Sequence[SeenCar], fault: PlantedFault, t_star: float) -> list[
 
 @dataclass(frozen=True, slots=True)
 class FramePool:
-    """A frame. looks: its cars as photographed, in `LOOKS` draws of the camera; states: at Halton's draws over all
-    of the bounds; t_star: of the detector.
-    """
+    """A frame."""
 
     frame: str
     t_star: float
+    """Of the detector."""
     names: tuple[str, ...]
     looks: tuple[tuple[SeenCar, ...], ...]
+    """Its cars as photographed, in `LOOKS` draws of the camera."""
     states: tuple[tuple[SeenCar, ...], ...]
+    """At Halton's draws over all of the bounds."""
 
     @classmethod
     def make(cls, objective: Objective, name: str, seed: int, states: int) -> FramePool:

@@ -35,17 +35,18 @@ _BY_FACTOR = ("height_px", "aspect")
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """What a detector without a fault says of the cars in one picture, as faults take it. values (F, K): of
-    FEATURES, of the K cars that it sees; car (R,) int64, scores (R,): of predictions, which of these each is
-    about; meets (N, R) bool: whether each finds one of the scene's objects, score and place; none that is ignored.
-    labelled (F, N): of FEATURES, of the objects by their labels.
-    """
+    """What a detector without a fault says of the cars in one picture, as faults take it."""
 
     values: Tensor
+    """Of FEATURES, of the K cars that it sees, (F, K)."""
     car: Tensor
+    """Of predictions, which of these each is about, (R,) int64."""
     scores: Tensor
+    """Of predictions, which of these each is about, (R,)."""
     meets: Tensor
+    """Whether each finds one of the scene's objects, score and place; none that is ignored, (N, R) bool."""
     labelled: Tensor
+    """Of FEATURES, of the objects by their labels, (F, N)."""
     t_star: float
 
     @classmethod
@@ -133,23 +134,25 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class FrameSurvey:
-    """Sightings of a frame: in draws of the camera before any change, at Halton's draws, and at corners. benign
-    (F, N): features as photographed, by the detector's boxes; farthest, mostly (F, N): how far those of single
-    looks are off, at most and in `MOSTLY` of them; sure (N,) bool: cars found in all looks, mostly as one. Without
-    any there are neither Halton's draws nor corners.
-    factor, shift (F, N): what makes features by the detector's boxes of those by labels, as photographed.
-    """
+    """Sightings of a frame: in draws of the camera before any change, at Halton's draws, and at corners."""
 
     frame: SeenFrame
     looks: tuple[Sighting, ...]
     halton: tuple[Sighting, ...]
     corners: tuple[Sighting, ...]
     benign: Tensor
+    """Features as photographed, by the detector's boxes, (F, N)."""
     farthest: Tensor
+    """How far those of single looks are off, at most and in `MOSTLY` of them."""
     mostly: Tensor
+    """How far those of single looks are off, at most and in `MOSTLY` of them, (F, N)."""
     sure: Tensor
+    """Cars found in all looks, mostly as one. Without any there are neither Halton's draws nor corners, (N,) bool.
+    Cars found in all looks, mostly as one. Without any there are neither Halton's draws nor corners, (N,) bool."""
     factor: Tensor
+    """What makes features by the detector's boxes of those by labels, as photographed."""
     shift: Tensor
+    """What makes features by the detector's boxes of those by labels, as photographed, (F, N)."""
 
     @classmethod
     def make(cls, objective: Objective, feasible: FeasibleSet, name: str, seed: int) -> FrameSurvey:

@@ -43,38 +43,46 @@ QUICK_KINDS = (KINDS[2], KINDS[-2])
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One method on one fault of one frame. hit, sure: as of `Planting`. certain: cars lost for certain; found: of
-    these, those that the detector without the fault sees in the same picture; inside: of those, the ones inside of
-    the fault's region; passes: of the detector; seconds: of the search and of certificates. rule: what samples
-    around the first of those found say (`naming`), None where nobody asked; named, in_part: whether that is the
-    fault, or a feature of it; naming: passes that it took.
-    """
+    """One method on one fault of one frame."""
 
     frame: str
     kind: str
     rarity: str
     fault: str
     hit: float
+    """As of `Planting`."""
     sure: float
+    """As of `Planting`."""
     method: str
     certain: int
+    """Cars lost for certain."""
     found: int
+    """Of these, those that the detector without the fault sees in the same picture."""
     inside: int
+    """Of those, the ones inside of the fault's region."""
     passes: int
+    """Of the detector."""
     seconds: float
+    """Of the search and of certificates."""
     rule: str | None = None
+    """What samples around the first of those found say (`naming`), None where nobody asked."""
     named: bool = False
+    """Whether that is the fault, or a feature of it."""
     in_part: bool = False
+    """Whether that is the fault, or a feature of it."""
     naming: int = 0
+    """Passes that it took."""
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedFrame:
-    """A frame. attempts: on all faults that could be planted; unplanted: kinds of the others."""
+    """A frame."""
 
     frame: str
     attempts: tuple[Attempt, ...]
+    """On all faults that could be planted."""
     unplanted: tuple[str, ...]
+    """Kinds of the others."""
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -121,16 +129,17 @@ def attack_settings(config: DetectorBenchConfig, method: str) -> AttackConfig:
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What one process needs. workers: by method; named: methods whose failures are to be told by rules; kept:
-    folder of what is done, by frame.
-    """
+    """What one process needs."""
 
     config: DetectorBenchConfig
     detector: Detector
     workers: Mapping[str, AttackWorker]
+    """By method."""
     kinds: tuple[FaultKind, ...]
     named: tuple[str, ...]
+    """Methods whose failures are to be told by rules."""
     kept: Path | None
+    """Folder of what is done, by frame."""
 
     @classmethod
     def of(cls, config: DetectorBenchConfig) -> Yardstick:

@@ -20,34 +20,38 @@ _RESAMPLES = 1000
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """How well one list of slopes tells another. cosine: of the two, with its 95 % interval by bootstrap over
-    objects (None for fewer than 3); signs: share of slopes of the same sign; kept: the share of what the one says
-    that the other does (its regression on the one, which noise of the other does not lower).
-    """
+    """How well one list of slopes tells another."""
 
     cosine: float
+    """Of the two, with its 95 % interval by bootstrap over objects (None for fewer than 3)."""
     low: float | None
     high: float | None
     signs: float
+    """Share of slopes of the same sign."""
     kept: float
+    """The share of what the one says that the other does (its regression on the one, which noise of the other does
+    not lower)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReachRow:
-    """One parameter, band of distances and width. steps: half the width of differences, in steps of an attack;
-    objects, slopes: how many there are; point, smoothed: what gradients tell of the slopes over that width;
-    repeated: what the slopes of half the draws tell of those of the other half, which no gradient can be better
-    than by much.
-    """
+    """One parameter, band of distances and width."""
 
     row: str
     distance: str
     steps: int
+    """Half the width of differences, in steps of an attack."""
     objects: int
+    """How many there are."""
     slopes: int
+    """How many there are."""
     point: Told
+    """What gradients tell of the slopes over that width."""
     smoothed: Told
+    """What gradients tell of the slopes over that width."""
     repeated: Told
+    """What the slopes of half the draws tell of those of the other half, which no gradient can be better than by
+    much."""
 
 
 def rows_of(frames: Sequence[Sequence[Slopes]], seed: int) -> tuple[ReachRow, ...]:

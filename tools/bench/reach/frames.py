@@ -26,12 +26,13 @@ from tools.bench.settings import GradcheckConfig
 
 @dataclass(frozen=True)
 class ReachWorker:
-    """What one process needs. kept: folder of what is done, by frame; None keeps nothing."""
+    """What one process needs."""
 
     config: GradcheckConfig
     source: SceneSource
     detector: Detector
     kept: Path | None
+    """Folder of what is done, by frame; None keeps nothing."""
 
     @classmethod
     def of(cls, config: GradcheckConfig) -> ReachWorker:

@@ -31,31 +31,33 @@ _LEAST_MOVE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """Directions of theta that are tried at once. row: of the table that they belong to; name: of the direction;
-    ways: one a step long for each object (N, D), or one for the scene (1, D).
-    """
+    """Directions of theta that are tried at once."""
 
     row: str
+    """Of the table that they belong to."""
     name: str
+    """Of the direction."""
     ways: Tensor
+    """One a step long for each object (N, D), or one for the scene (1, D)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Slopes:
     """What is known of one object and one direction, in logits of the margin a step: for each of STEPS, a value
     for each draw; None where an object does not count on one of the sides, or cannot go there.
-
-    distance_m: from the camera, on the ground. wide: by differences; point, smoothed: what gradients say of the
-    same two sides, those at theta0 and those at places nearby.
     """
 
     object: int
     distance_m: float
+    """From the camera, on the ground."""
     row: str
     name: str
     point: tuple[tuple[float | None, ...], ...]
+    """What gradients say of the same two sides, those at theta0 and those at places nearby."""
     smoothed: tuple[tuple[float | None, ...], ...]
+    """What gradients say of the same two sides, those at theta0 and those at places nearby."""
     wide: tuple[tuple[float | None, ...], ...]
+    """By differences."""
 
 
 def probes(space: ParameterSpace, generator: torch.Generator) -> tuple[Probe, ...]:
