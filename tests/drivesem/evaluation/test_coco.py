@@ -47,7 +47,7 @@ def test_perfect_detections_give_one_everywhere():
     assert scores.overall.objects == 4
 
 
-def test_a_class_without_objects_has_no_score_and_json_says_null():
+def test_a_class_without_objects_has_no_score_and_null_in_json():
     scores = evaluate([_targets([A])], [_detections([A], [0.9])], CLASSES, 0.5)
     assert scores.per_class["Pedestrian"].ap50 is None
     text = json.dumps(scores.to_json(), allow_nan=False)

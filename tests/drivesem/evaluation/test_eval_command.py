@@ -144,7 +144,7 @@ def test_coco_without_detections(run: Run, tmp_path: Path):
     assert (code, data["stats"]) == (0, [0.0] * 12)
 
 
-def test_one_set_in_three_layouts_gives_the_same_figures(run: Run, kitti: tuple[Path, Path], tmp_path: Path):
+def test_one_set_in_three_layouts_gives_the_same_metrics(run: Run, kitti: tuple[Path, Path], tmp_path: Path):
     for source, more in ((kitti[0], []), (kitti[1], ["--scores"])):
         words = [str(source), "--to", "coco", "--out", str(tmp_path / f"{source.name}.json"), *more]
         assert main(["convert", *words, "--image-size", "1242x375"]) == 0
@@ -193,7 +193,7 @@ def test_some_frames(run: Run, kitti: tuple[Path, Path], tmp_path: Path):
     assert (data["frames"], data["objects"], data["detections"]) == (1, 1, 2)
 
 
-def test_frames_that_are_asked_for_must_be_there(run: Run, kitti: tuple[Path, Path], tmp_path: Path):
+def test_requested_frames_must_exist(run: Run, kitti: tuple[Path, Path], tmp_path: Path):
     (kitti[1] / "000000.txt").unlink()
     (tmp_path / "val.txt").write_text("000001\n")
     assert run("--gt", kitti[0], "--pred", kitti[1], "--frames", tmp_path / "val.txt")[0] == 0

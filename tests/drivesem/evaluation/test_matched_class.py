@@ -84,13 +84,13 @@ def random_frames(seed: int, frames: int) -> tuple[list[Targets], list[Detection
         times = 40 if frame == 0 else 3
         near = np.repeat(boxes, times, 0) + draw.normal(0, 4, (count * times, 4))
         scores = torch.tensor(draw.random(len(near)).round(1 if seed % 2 else 6)).float()
-        whose = torch.tensor(np.where(draw.random(len(near)) < 0.9, np.repeat(labels, times), 1))
-        found.append(Detections(torch.tensor(near).float(), whose, scores))
+        owner = torch.tensor(np.where(draw.random(len(near)) < 0.9, np.repeat(labels, times), 1))
+        found.append(Detections(torch.tensor(near).float(), owner, scores))
     return targets, found
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_figures_are_those_of_coco_to_the_last_bit(seed: int) -> None:
+def test_metrics_equal_coco_to_the_last_bit(seed: int) -> None:
     targets, found = random_frames(seed, 6)
     expected = evaluate(targets, found, CLASSES, 0.4)
     own = {
@@ -102,7 +102,7 @@ def test_figures_are_those_of_coco_to_the_last_bit(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_what_has_no_say_changes_no_figure(seed: int) -> None:
+def test_unaffecting_detections_change_no_metric(seed: int) -> None:
     """To the last bit, at any weights of the frames."""
     matches = ThresholdMatches.from_frames(*random_frames(seed, 6), 0)
     stored = matches.affects_metrics()

@@ -104,7 +104,7 @@ def test_recall_weighs_frames_and_counts_on():
     assert WeightedRecall(_tally(np.zeros(2, int), 2)).value(None) == 0
 
 
-def test_figures_without_objects():
+def test_metrics_without_objects():
     empty = NamedMetric("AP", (WeightedAveragePrecision(_tally(np.zeros(3, int), 3, per_frame=0), "coco"),))
     (one,) = bootstrap_intervals([empty], 3, 10, np.random.default_rng(0))
     assert (one.value, one.low, one.high) == (None, None, None)

@@ -42,7 +42,9 @@ class Still(NuisanceSample):
         return boxes_xyxy
 
 
-def make_outcome(found: bool, twice: bool = False, alarm: float | None = None, hidden: bool = False) -> SampleOutcome:
+def make_outcome(
+    found: bool, twice: bool = False, alarm: float | None = None, hidden: bool = False
+) -> SampleOutcome:
     boxes = PLACE if alarm is not None else PLACE[:0]
     scores = torch.tensor([] if alarm is None else [alarm])
     detections = Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), scores)
@@ -94,7 +96,7 @@ def test_what_a_draw_hides_is_not_missed_in_it() -> None:
     assert not CertificateRule().holds(counted(LOST, [FOUND] * 14 + [unseen] * 2, [GONE] * 16)[0])
 
 
-def test_no_more_looks_than_decide() -> None:
+def test_no_more_samples_than_decide() -> None:
     assert counted(LOST, [FOUND] * 16, [GONE] * 16)[1] == 32
     # Five draws in which it is found leave at most 11; nobody looks at the scene before the change then.
     count, taken = counted(LOST, [FOUND] * 16, [FOUND] * 16)
@@ -150,7 +152,7 @@ class Sees:
         return [Detections(box, torch.zeros(1, dtype=torch.int64), torch.ones(1))]
 
 
-def test_a_look_takes_labels_along() -> None:
+def test_a_sample_moves_the_labels() -> None:
     """The label of a car that alone is painted white is where the camera sees it, in every draw."""
     scene = demo_scene(0, 0)
     compositor = Compositor(scene)

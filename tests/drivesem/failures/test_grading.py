@@ -116,7 +116,7 @@ def position_renderer(case: GradingInput, honest: bool = True) -> PositionRender
     return PositionRenderer(case.renderer.of, "second", honest)
 
 
-def test_certain_where_nobody_else_is_asked(case: GradingInput) -> None:
+def test_certain_without_second_opinions(case: GradingInput) -> None:
     grades = graded(case)
     assert grades.lost[CAR].grade is Grade.CERTAIN
     assert grades.lost[CAR].count.after == grades.lost[CAR].count.before == 16
@@ -144,7 +144,7 @@ def test_shared_where_the_peer_loses_it_too(case: GradingInput) -> None:
     assert (fault.peer.before, fault.peer.after) == (4, 0)
 
 
-def test_no_second_renderer_is_said_and_nothing_is_lost(case: GradingInput) -> None:
+def test_a_missing_second_renderer_is_noted(case: GradingInput) -> None:
     def none(name: str, scene: SceneIR) -> SecondRenderer:
         raise NoSecondRendererError("EGL", "a driver (Debian: libegl1 libgl1-mesa-dri)", "none")
 
@@ -166,7 +166,7 @@ def test_a_failure_of_no_kind_has_no_grade_of_its_own(case: GradingInput) -> Non
     assert not Grader(Oracle(), 0.5, OFF).grade(found, LOST).lost
 
 
-def test_draws_of_the_scene_before_the_change_are_kept(case: GradingInput) -> None:
+def test_samples_before_the_change_are_cached(case: GradingInput) -> None:
     grader = Grader(Oracle(), 0.5, OFF)
     grader.grade(case, LOST)
     rendered: list[SceneIR] = []

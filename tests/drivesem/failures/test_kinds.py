@@ -62,7 +62,7 @@ def test_badly_placed() -> None:
     )
 
 
-def test_another_class_says_more_than_a_bad_frame() -> None:
+def test_a_class_error_outranks_a_bad_box() -> None:
     changed = view(BOTH, (FAR, CAR, 0.8), (BADLY, CAR, 0.7), (NEAR, TRUCK, 0.6))
     assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.CLASS, 0, 2),)
 
@@ -80,7 +80,7 @@ def test_background() -> None:
     assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.BACKGROUND, -1, 2),)
 
 
-def test_one_phantom_a_place_whatever_its_classes() -> None:
+def test_one_phantom_per_place_of_any_class() -> None:
     changed = view(BOTH, (NEAR, CAR, 0.9), (FAR, CAR, 0.8), (NOWHERE, CAR, 0.6), (NOWHERE, TRUCK, 0.7))
     assert find_faults(RIGHT, changed, T_STAR) == (Fault(Kind.BACKGROUND, -1, 3),)
 

@@ -49,7 +49,7 @@ def test_only_the_object_and_what_is_shared_move(objective: Objective, theta: to
         assert bool((state >= objective.space.lower - 1e-6).all() & (state <= objective.space.upper + 1e-6).all())
 
 
-def test_the_reach_is_kept_to(objective: Objective, theta: torch.Tensor) -> None:
+def test_states_stay_within_reach(objective: Objective, theta: torch.Tensor) -> None:
     span = objective.space.upper - objective.space.lower
     far, near = ([around(objective, theta, reach).theta(n) for n in range(4)] for reach in (1.0, 0.1))
     assert all(bool(((state - theta).abs() <= 0.1 * span + 0.01).all()) for state in near)
@@ -81,7 +81,7 @@ def test_features_are_those_of_the_state(objective: Objective, theta: torch.Tens
     assert isinstance(near.fails(sample), bool)
 
 
-def test_the_margin_says_whether_it_fails(objective: Objective, theta: torch.Tensor) -> None:
+def test_the_sign_of_the_margin_is_the_failure(objective: Objective, theta: torch.Tensor) -> None:
     near = around(objective, theta)
     samples = [near.sample(number) for number in range(6)]
     margins = [near.margin(sample) for sample in samples if sample is not None]
@@ -103,7 +103,7 @@ def test_a_place_in_a_draw_is_a_sample(objective: Objective, theta: torch.Tensor
     assert not torch.equal(numbered.image.image, moved.image.image)
 
 
-def test_everywhere_tells_of_all_objects_at_once(objective: Objective) -> None:
+def test_a_scene_sample_describes_all_objects(objective: Objective) -> None:
     def everywhere(name: str = "a") -> SceneSampler:
         return SceneSampler(objective, objective.feasible_set(), Nuisances.parse("off"), name)
 

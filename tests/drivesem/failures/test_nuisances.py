@@ -60,7 +60,7 @@ def test_ranges_hold(scene: SceneIR) -> None:
 
 
 @pytest.mark.parametrize("blur_px", [0.7, 2.0, 6.0])
-def test_a_blur_is_as_wide_as_it_says(blur_px: float) -> None:
+def test_a_blur_has_its_standard_deviation(blur_px: float) -> None:
     row = _warp_and_blur_axis(101, 0.0, 1.0, blur_px)[50]
     away = np.arange(101) - 50
     assert math.sqrt((row * away**2).sum()) == pytest.approx(blur_px, rel=0.08)
@@ -135,7 +135,7 @@ def test_the_picture_is_that_of_kornias_operations(scene: SceneIR, number: int) 
     torch.testing.assert_close(levels, expected.detach() * 255, atol=0.5 + 1e-4, rtol=0)
 
 
-def test_noise_is_kept_with_its_draw(scene: SceneIR) -> None:
+def test_noise_is_cached_with_its_sample(scene: SceneIR) -> None:
     draw = Nuisances().sample("kept", 0, scene)
     field = draw.noise_field.like(scene.photograph)
     assert draw.noise_field.like(scene.photograph) is field

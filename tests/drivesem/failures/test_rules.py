@@ -52,7 +52,7 @@ def test_two_features() -> None:
     assert named >= 6
 
 
-def test_nothing_is_told_of_chance() -> None:
+def test_chance_gives_no_rule() -> None:
     """At most one rule in twenty where failures follow nothing."""
     message = 0
     for seed in range(60):
@@ -69,7 +69,7 @@ def test_everything_fails_or_nothing() -> None:
         assert (rule.failures, rule.count) == (int(fails.sum()), 50)
 
 
-def test_a_feature_that_stands_still_tells_nothing() -> None:
+def test_a_constant_feature_gives_no_rule() -> None:
     features = samples(60, 3) | {"across": np.full(60, 0.4)}
     fails = features["height_px"] < 0.5
     assert set(fit_rule(features, fails, only=("across",)).intervals) == set()
@@ -117,7 +117,7 @@ def test_covering_finds_two_rules() -> None:
 
 
 @pytest.mark.parametrize("by_car", [True, False])
-def test_covering_tells_nothing_of_chance(by_car: bool) -> None:
+def test_chance_gives_no_rule_list(by_car: bool) -> None:
     """Nor of a few cars that fail for no reason: samples of one car are much alike, and would seem to tell it."""
     message = 0
     for seed in range(20):
@@ -140,7 +140,7 @@ def test_three_cars_are_enough(cars: int) -> None:
 
 
 @pytest.mark.parametrize("cars", [3, 4])
-def test_a_few_cars_tell_nothing_of_chance(cars: int) -> None:
+def test_chance_on_few_cars_gives_no_rule_list(cars: int) -> None:
     """Nor where each fails as often as it will."""
     message = 0
     for seed in range(30):
@@ -156,7 +156,7 @@ def test_what_fails_in_two_cars_alone_is_no_rule() -> None:
     assert fit_rule_list(features, objects < 2, objects) == []
 
 
-def test_a_description_is_shorter_where_a_rule_tells() -> None:
+def test_a_good_rule_shortens_the_description() -> None:
     features = samples(96, 0)
     truth = {"aspect": (0.2, 0.5)}
     fails = failing(contains(truth, features, 96), 0)

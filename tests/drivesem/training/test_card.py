@@ -61,7 +61,7 @@ def test_the_shipped_sets_share_no_street() -> None:
         apart({name: read(name) for name in SETS} | {"again": read("squeezedet_data")})
 
 
-def test_streets_that_a_card_names_are_told(weights: Path, tmp_path: Path) -> None:
+def test_lists_streets_that_a_card_names(weights: Path, tmp_path: Path) -> None:
     fresh = folder(tmp_path / "fresh", "heldout", 6)
     chosen = folder(tmp_path / "chosen", "heldout", 5, 7)
     assert list_overlaps(str(weights), str(fresh)) == []

@@ -89,7 +89,7 @@ def around(
     )
 
 
-def test_certain_failures_are_what_is_shown(frames: list[AttackedFrame], around: FailureNeighbourhoods) -> None:
+def test_samples_are_certain_failures(frames: list[AttackedFrame], around: FailureNeighbourhoods) -> None:
     assert [index for _, index in list_failures(frames)] == [0]
     assert len(around) == 1
 
@@ -109,7 +109,7 @@ def test_states_are_drawn_anew_and_again_the_same(around: FailureNeighbourhoods)
     assert np.array_equal(around.draw(0, 0, np.random.default_rng(5))[0], again)
 
 
-def test_the_pool_is_another_once_all_of_it_may_have_been_shown(around: FailureNeighbourhoods) -> None:
+def test_the_pool_is_replaced_once_used(around: FailureNeighbourhoods) -> None:
     """One view a step, one failure: after as many steps as it has states."""
     seen = [
         {around.draw_number(step, np.random.default_rng(i)) for i in range(40)} for step in range(2 * POOL_SIZE)
@@ -191,10 +191,13 @@ def test_consistency_on_real_pictures(around: FailureNeighbourhoods, monkeypatch
         margins = iter(map(torch.tensor, pair))
         with monkeypatch.context() as patch:
             patch.setattr(
-                "drivesem.training.failure_neighbourhoods.background_margin", lambda *_, margins=margins: next(margins)
+                "drivesem.training.failure_neighbourhoods.background_margin",
+                lambda *_, margins=margins: next(margins),
             )
             output[name] = float(once.term(detector, raw, 0).detach())
-    assert output["nearer"] == pytest.approx(output["alike"] + 2.5), "background is nearer to a phantom than it was"
+    assert output["nearer"] == pytest.approx(output["alike"] + 2.5), (
+        "background is nearer to a phantom than it was"
+    )
     assert output["farther"] == pytest.approx(output["alike"]), "which is no harm the other way round"
     value.backward()
     assert any(p.grad is not None and bool(p.grad.any()) for p in detector.parameters())

@@ -90,7 +90,7 @@ def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[
     assert (out / LOG).read_text() != before
 
 
-def test_frames_that_are_trained_on_and_judged_by_are_told(
+def test_warns_about_frames_used_for_training_and_evaluation(
     tmp_path: Path, kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, other = kitti_folder(tmp_path / "train", 2), kitti_folder(tmp_path / "other", 2, seed=1)

@@ -23,7 +23,9 @@ def clip_of(
     for frame in range(frames):
         there = [track for track in PLACES if not (frame == without and track == 9)]
         scene = street([(PLACES[t][0], PLACES[t][1] - STEP_M * frame) for t in there])
-        message = {"tracks": ",".join(map(str, there))} | {f"objects[{i}].label": str(i) for i in range(len(there))}
+        message = {"tracks": ",".join(map(str, there))} | {
+            f"objects[{i}].label": str(i) for i in range(len(there))
+        }
         scene = replace(scene, provenance=message)
         scenes.append(photograph_scene(scene) if drawn else scene)
         tracks.append(tuple(there))

@@ -110,7 +110,7 @@ def test_without_keep_going_no_frame_is_taken_apart_with_another_shape(
     assert not meshes
 
 
-def test_a_clip_whose_first_picture_is_damaged_has_a_camera(
+def test_a_damaged_first_image_leaves_a_camera(
     taker: Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]],
 ) -> None:
     camera = taker("a", keep_going=True)[0].frames.camera()

@@ -47,7 +47,7 @@ def finished(taken: DerenderedClip, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize("words", ["export --to kitti --out out", "retrain --out out", "verify", "explain"])
-def test_it_is_told_from_an_attack_that_was_killed(
+def test_a_clip_is_not_taken_for_an_interrupted_attack(
     words: str,
     finished: Path,
     tmp_path: Path,
@@ -99,7 +99,7 @@ def test_the_video_has_all_frames(finished: Path) -> None:
     assert (finished / "clip.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
 
 
-def test_a_second_command_tells_what_is_there(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_prints_the_finished_result(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert main([*WORDS, "--limit", "3", "--out", str(finished)]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((finished / "drive.json").read_text())

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from drivesem.attack.space import ParameterSpace
-from drivesem.synth.drives import drive_of
+from drivesem.synth.drives import make_drive
 from drivesem.video.clips import DerenderedClip, object_tracks
 from drivesem.video.space import ClipSpace
 from scene_ir.derender.silhouette import Placement
@@ -87,7 +87,7 @@ def test_cars_move_as_their_places_do(street: Callable[..., SceneIR]) -> None:
 
 @pytest.mark.slow
 def test_cars_of_the_embedded_drive_move_as_their_places_do() -> None:
-    drive = drive_of(0, 30)
+    drive = make_drive(0, 30)
     scenes = tuple(drive.scene(number) for number in range(5))
     clip = DerenderedClip(
         "drive", tuple(map(str, range(5))), scenes, tuple(object_tracks(scene) for scene in scenes)
@@ -96,7 +96,7 @@ def test_cars_of_the_embedded_drive_move_as_their_places_do() -> None:
     plain = (8, 20)  # in all of these frames, and hidden by nothing
     assert max(watched.trembling_px(meant, meant, *plain)) < STEADY_PX
     assert min(watched.trembling_px(changed(clip, NOISE_M), meant, *plain)) > 3 * STEADY_PX
-    assert drive == drive_of(0, 30)
+    assert drive == make_drive(0, 30)
     assert all(set(tracks) <= set(drive.tracks) for tracks in clip.tracks)
     by_track: dict[int, set[tuple[str, tuple[float, ...]]]] = {}
     for scene, tracks in zip(scenes, clip.tracks, strict=True):

@@ -50,7 +50,7 @@ def test_the_table_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
         assert [*name.split(), "139", "139", "139", "140", "139", *["139.0"] * 4, "1/2"] in lines
 
 
-def test_one_is_told_as_one(tmp_path: Path) -> None:
+def test_counts_of_one_are_singular(tmp_path: Path) -> None:
     output = format_summary(_result(tmp_path, 1, (3, "Car")))
     for part in ("of 1 sighting of 1 car missed", ", 1 phantom (", "in 1 of 1 frame; 1 query, 1 pass, "):
         assert part in output

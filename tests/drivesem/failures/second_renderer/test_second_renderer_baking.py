@@ -18,7 +18,7 @@ from scene_ir.geometry import place_vertices, project
 from scene_ir.types import Camera, SceneIR
 
 
-def test_points_are_where_the_conventions_say(street: Callable[..., SceneIR]) -> None:
+def test_points_follow_the_conventions(street: Callable[..., SceneIR]) -> None:
     scene = street()
     chance = torch.Generator().manual_seed(3)
     bend = ffd.symmetrise(0.05 * torch.randn(len(scene.objects), 64, 3, generator=chance))
@@ -86,7 +86,7 @@ def painted(code: list[float], rgb: np.ndarray, paint: float = 1.0) -> np.ndarra
     return shading.apply_paint(rgb, np.array(code, np.float32), paint * ONE, 0 * ONE, BASE)
 
 
-def test_paint_codes_mean_what_they_say() -> None:
+def test_paint_codes_have_their_effect() -> None:
     grey = texels(0.3, 0.3, 0.3)
     assert painted([0] * 5, grey) is grey
     assert (painted([0.5, 0, 0, 0, 0], grey) > grey).all()

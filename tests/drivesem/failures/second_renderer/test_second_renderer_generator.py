@@ -158,12 +158,12 @@ TURNED_RAD = 0.2
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    from drivesem.synth.variations import kept_in_world, turned
+    from drivesem.synth.variations import fix_light_in_world, turned
 
     settings = SynthSettings(LayoutSettings(people=False, vehicles=(6, 8)), sunny=True)
     found = plan_frame(9, 2, settings=settings)
     view = turned(found.setting.view, TURNED_RAD)
-    light = kept_in_world(found.setting.light, found.setting.view, view)
+    light = fix_light_in_world(found.setting.light, found.setting.view, view)
     from dataclasses import replace
 
     return replace(found, setting=replace(found.setting, view=view, light=light))

@@ -80,7 +80,7 @@ def test_another_renderer_of_the_process_may_come_and_go(screen: OpenGLContext) 
     np.testing.assert_array_equal(seen(), before)
 
 
-def test_without_egl_and_osmesa_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_egl_and_osmesa_one_line_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str, *_: object) -> None:
         raise OSError(f"{name}: cannot open shared object file")
 

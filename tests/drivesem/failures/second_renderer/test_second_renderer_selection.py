@@ -54,7 +54,7 @@ def test_attacks_on_one_scene_share_the_renderer() -> None:
 
 
 @pytest.mark.parametrize("confirm", [True, False])
-def test_runs_ask_the_second_renderer_if_they_are_to(confirm: bool) -> None:
+def test_runs_use_the_second_renderer_on_request(confirm: bool) -> None:
     assert (
         AttackWorker.from_config(AttackConfig(confirm=confirm)).grader.make_second_renderer is not None
     ) == confirm
