@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.config.errors import UsageError
-from drivesem.data.label_table import Written, to_coco
+from drivesem.data.label_table import WriteSummary, xyxy_to_coco
 from drivesem.failures.grades import Grade
 from drivesem.report.tables import rows_to_csv
 from drivesem.run.finished import AttackRun
@@ -38,7 +38,7 @@ def select_frames_by_grade(run: AttackRun, grade: str) -> list[FrameResult]:
 
 def export_dataset(
     run: AttackRun, out: Path, layout: str, grade: str, mapping: Mapping[str, str | None] | None = None
-) -> Written:
+) -> WriteSummary:
     """Write the counterexamples of a run as a data set: pictures, moved labels, and `PROVENANCE`.
 
     Args:
@@ -71,7 +71,7 @@ def export_dataset(
     if layout == "coco":
         _write_detections(out, results)
         count += 1
-    return Written(count, written.lost, written.assumed)
+    return WriteSummary(count, written.lost, written.assumed)
 
 
 def _write_detections(out: Path, results: Sequence[FrameResult]) -> None:
@@ -83,7 +83,7 @@ def _write_detections(out: Path, results: Sequence[FrameResult]) -> None:
         {
             "image_id": images[result.identifier],
             "category_id": categories[box.label],
-            "bbox": to_coco(np.array(box.xyxy, np.float64)).tolist(),
+            "bbox": xyxy_to_coco(np.array(box.xyxy, np.float64)).tolist(),
             "score": box.score,
         }
         for result in results

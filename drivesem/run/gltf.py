@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivesem.failures.second_renderer.geometry import PictureCamera
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
-from drivesem.scenes.sources import scene_folders
+from drivesem.scenes.sources import find_scene_folders
 from scene_ir import files
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import SceneIR
@@ -34,7 +34,7 @@ def export_scenes(source: Path, out: Path) -> list[str]:
     no scene, or no second renderer to bake textures with.
     """
     written: list[str] = []
-    for name, folder in scene_folders(source).items():
+    for name, folder in find_scene_folders(source).items():
         files.write_bytes(out / f"{name}.glb", scene_to_glb(name, load_scene(folder)))
         written.append(f"{name}.glb")
     return written

@@ -14,11 +14,11 @@ import torch
 
 from drivesem.config.errors import UsageError
 from drivesem.data import layouts
-from drivesem.data.frames import images_in, size_of_image
-from drivesem.data.kitti import read_calib
-from drivesem.data.kitti_labels import TYPES, label_folder, table_of
-from drivesem.data.label_table import REGION, LabelTable, Written, camera_entry, shortest
-from drivesem.data.registry import images_beside, write_table
+from drivesem.data.kitti import read_calibration
+from drivesem.data.kitti_labels import TYPES, find_label_folder, read_label_files
+from drivesem.data.label_table import REGION, LabelTable, WriteSummary, make_camera_entry, shortest_decimals
+from drivesem.data.photographs import match_images, read_image_size
+from drivesem.data.registry import find_images, write_table
 from drivesem.failures.grades import Grade
 from drivesem.run.results import BoxRecord, FrameResult, load_frame
 from scene_ir import files
@@ -60,7 +60,7 @@ def detect_labels_layout(path: Path) -> str:
     """Return "run" or the `layouts.LAYOUTS` entry that a path holds. Raises FormatError if it holds neither."""
     if list_frames(path):
         return "run"
-    layout = layouts.layout_of(path)
+    layout = layouts.detect_layout(path)
     if layout is None:
         expected = f"labels as one of {', '.join((*layouts.LAYOUTS, 'run'))}"
         raise FormatError(str(path), expected, "no label file (an empty folder?)")
@@ -102,7 +102,7 @@ def _read_run_table(path: Path, scored: bool, stage: str) -> LabelTable:
             chosen = result.targets_moved if stage == "attacked" else result.targets_benign
         records += [(i, record) for record in chosen]
     kinds = sorted({record.label for _, record in records})
-    return LabelTable.of(
+    return LabelTable.from_columns(
         [result.identifier for result in results],
         kinds,
         [i for i, _ in records],
@@ -136,7 +136,7 @@ class ConversionSettings:
     """Frames of a run; all if None."""
 
 
-def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> Written:
+def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> WriteSummary:
     """Write the labels or detections of `source` to `out` in another layout.
 
     Args:
@@ -161,11 +161,11 @@ def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> Wri
         table = rename_classes(table, settings.mapping)
     if layout == "run":
         table = _turn_unsupported_into_regions(table, settings)
-    image_paths = images_in([settings.images], table.frames) if settings.images is not None else {}
+    image_paths = match_images([settings.images], table.frames) if settings.images is not None else {}
     if settings.images is None and (
         settings.copy_images or (not table.sizes_wh.all() and settings.size_wh is None)
     ):
-        find_images = find_counterexamples if layout == "run" else partial(images_beside, layout=layout)
+        find_images = find_counterexamples if layout == "run" else partial(find_images, layout=layout)
         image_paths = find_images(source, frames=table.frames)
     if settings.size_wh is not None:
         table = replace(table, sizes_wh=np.tile(np.array(settings.size_wh, np.int64), (len(table.frames), 1)))
@@ -173,7 +173,7 @@ def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> Wri
         sizes = table.sizes_wh.copy()
         for i, name in enumerate(table.frames):
             if not sizes[i].all() and name in image_paths:
-                sizes[i] = size_of_image(image_paths[name])
+                sizes[i] = read_image_size(image_paths[name])
         table = replace(table, sizes_wh=sizes)
     names = {i: "_".join(name.split("/")) for i, name in enumerate(table.frames) if name in image_paths}
     image_files = {i: f"{name}{image_paths[table.frames[i]].suffix}" for i, name in names.items()}
@@ -196,7 +196,7 @@ def rename_classes(table: LabelTable, mapping: Mapping[str, str | None]) -> Labe
     places = np.array([*(dropped if n is None else kinds.index(n) for n in names), REGION], np.int64)
     kind = places[table.kind]
     table = replace(table, kinds=tuple(kinds), kind=kind, kind_ids=None)
-    return table.rows(kind != dropped)
+    return table.select(kind != dropped)
 
 
 def _turn_unsupported_into_regions(table: LabelTable, how: ConversionSettings) -> LabelTable:
@@ -214,14 +214,14 @@ def _turn_unsupported_into_regions(table: LabelTable, how: ConversionSettings) -
 
 def _read_cameras(source: Path, table: LabelTable) -> dict[int, dict[str, Any]]:
     """Return COCO's "camera" entries, by frame, from the calibrations next to KITTI's labels, if there are any."""
-    folder = label_folder(source)
+    folder = find_label_folder(source)
     cameras: dict[int, dict[str, Any]] = {}
     if folder is None or folder.name != "label_2":
         return cameras
     for i, name in enumerate(table.frames):
         path = folder.parent / "calib" / f"{name}.txt"
         if path.is_file():
-            cameras[i] = camera_entry(read_calib(path).projection)
+            cameras[i] = make_camera_entry(read_calibration(path).projection)
     return cameras
 
 
@@ -247,12 +247,14 @@ def read_training_labels(run: Path, frames: Sequence[str] | None = None) -> Labe
     if not names:
         raise FormatError(str(run / "frames"), f"frames with {RESULT}", "none")
     folders = [run / "frames" / name for name in names]
-    table = table_of({name: str(folder / MOVED_LABELS) for name, folder in zip(names, folders, strict=True)})
+    table = read_label_files(
+        {name: str(folder / MOVED_LABELS) for name, folder in zip(names, folders, strict=True)}
+    )
     table = _with_unchanged_objects(table, folders)
     results = [load_frame(folder / RESULT) for folder in folders]
-    sizes = [size_of_image(folder / COUNTEREXAMPLE) for folder in folders]
+    sizes = [read_image_size(folder / COUNTEREXAMPLE) for folder in folders]
     failure: list[str | None] = [None] * len(table)
-    for result, rows in zip(results, table.by_frame(), strict=True):
+    for result, rows in zip(results, table.rows_by_frame(), strict=True):
         for lost in (one for one in result.failures if one.kind == "lost"):
             near = [row for row in rows if np.abs(table.boxes[row] - lost.xyxy).max() < _ROUNDING_PX]
             if near:
@@ -261,9 +263,9 @@ def read_training_labels(run: Path, frames: Sequence[str] | None = None) -> Labe
         table,
         sizes_wh=np.array(sizes, np.int64).reshape(-1, 2),
         extra={**table.extra, "failure": failure},
-        cameras={i: camera_entry(load_camera(folder / "scene").matrix) for i, folder in enumerate(folders)},
+        cameras={i: make_camera_entry(load_camera(folder / "scene").matrix) for i, folder in enumerate(folders)},
         image_files={i: f"{name}/{COUNTEREXAMPLE}" for i, name in enumerate(names)},
-        told={i: provenance(run, result) for i, result in enumerate(results)},
+        frame_attributes={i: provenance(run, result) for i, result in enumerate(results)},
     )
 
 
@@ -276,7 +278,7 @@ def _with_unchanged_objects(table: LabelTable, folders: Sequence[Path]) -> Label
     names = ("ignore", "truncation", "occlusion", "pose")
     columns = {name: getattr(table, name).copy() for name in names}
     kind = np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind]
-    for folder, others, rows in zip(folders, labels, table.by_frame(), strict=True):
+    for folder, others, rows in zip(folders, labels, table.rows_by_frame(), strict=True):
         if others is None:
             continue
         count = len(others.kind)
@@ -287,10 +289,10 @@ def _with_unchanged_objects(table: LabelTable, folders: Sequence[Path]) -> Label
             )
         kind[own] = [kinds.index(name) for name in others.kind]
         columns["ignore"][own] = False
-        columns["truncation"][own] = np.nan_to_num(shortest(others.truncation), nan=-1)
+        columns["truncation"][own] = np.nan_to_num(shortest_decimals(others.truncation), nan=-1)
         columns["occlusion"][own] = others.occlusion.numpy()
         pose = torch.cat([others.size_lhw, others.translation, others.yaw[:, None]], dim=1)
-        columns["pose"][own] = np.reshape(shortest(pose), (count, 7))
+        columns["pose"][own] = np.reshape(shortest_decimals(pose), (count, 7))
     return replace(table, kinds=tuple(kinds), kind=kind, **columns)
 
 

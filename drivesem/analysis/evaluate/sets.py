@@ -66,9 +66,9 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
         table = _aligned(table, truth, path, needed)
         tables.append(table)
     if wanted is not None:
-        truth, tables = truth.over(wanted), [table.over(wanted) for table in tables]
+        truth, tables = truth.reindex(wanted), [table.reindex(wanted) for table in tables]
     else:
-        tables = [t if t.frames == truth.frames else t.over(truth.frames) for t in tables]
+        tables = [t if t.frames == truth.frames else t.reindex(truth.frames) for t in tables]
     classes = _classes(config, truth, tables, gt_known)
     chosen = _chosen(config, classes)
     truths, ids = _truths(
@@ -76,7 +76,9 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
     )
     found = [
         _found(
-            _renamed(table, parse_class_map("--map", config.map), classes, path, "--map").in_edges(truth.edges),
+            _renamed(table, parse_class_map("--map", config.map), classes, path, "--map").with_box_format(
+                truth.box_format
+            ),
             chosen,
         )
         for table, path in zip(tables, paths, strict=True)
@@ -200,7 +202,7 @@ def _renamed(
         places[i] = place
     kind = places[table.kind]  # REGION, -1, is the last place
     table = replace(table, kinds=tuple(classes), kind=kind)
-    return table.rows(kind != out) if (kind == out).any() else table
+    return table.select(kind != out) if (kind == out).any() else table
 
 
 def _selection(
@@ -219,7 +221,7 @@ def _selection(
 
 def _truths(table: LabelTable, chosen: Sequence[str] | None) -> tuple[GroundTruthTable, np.ndarray | None]:
     keep, labels = _selection(table.kind, table.kinds, chosen)
-    boxes = boxes_from_xywh(table.boxes) if table.edges == "xywh" else boxes_from_xyxy(table.boxes)
+    boxes = boxes_from_xywh(table.boxes) if table.box_format == "xywh" else boxes_from_xyxy(table.boxes)
     truths = GroundTruthTable(
         frames=len(table.frames),
         frame=table.frame,
@@ -237,7 +239,7 @@ def _truths(table: LabelTable, chosen: Sequence[str] | None) -> tuple[GroundTrut
 
 def _found(table: LabelTable, chosen: Sequence[str] | None) -> DetectionTable:
     keep, labels = _selection(table.kind, table.kinds, chosen)
-    boxes = boxes_from_xywh(table.boxes) if table.edges == "xywh" else boxes_from_xyxy(table.boxes)
+    boxes = boxes_from_xywh(table.boxes) if table.box_format == "xywh" else boxes_from_xyxy(table.boxes)
     return DetectionTable(table.frame, labels, boxes, table.score).select(keep & (labels >= 0))
 
 

@@ -154,8 +154,8 @@ def build_explain_notes(draws: int) -> list[str]:
 
 
 def exchange_note(names: Sequence[str]) -> str:
-    """Explain why frames are left out."""
-    return f"left out because they fail by the exchange of vehicles alone: {', '.join(names)}"
+    """Name the frames that cannot be explained."""
+    return f"frames that fail by the exchange of vehicles alone: {', '.join(names)}"
 
 
 def build_explain_report(
@@ -191,7 +191,7 @@ def build_explain_report(
         tables=tables,
         notes=[
             *build_explain_notes(draws),
-            *([f"Frames {exchange_note(left_out)}."] if left_out else []),
+            *([f"Left out: {exchange_note(left_out)}."] if left_out else []),
         ],
         text_columns=[name for table in tables for name in table.columns],
         printed_text_columns=_TEXT_COLUMNS,

@@ -160,7 +160,8 @@ def check_frame(identifier: str, folder: Path, settings: RecordedSettings) -> Fr
             log, "detections", field, getattr(result, field), detection_records(detections[name], names)
         )
     _check_success(log, folder, result, rerender.labels, _SceneChange(base, perturbed), detections, settings)
-    _check_grades(log, result, rerender, _SceneChange(base, perturbed), detections, settings)
+    if result.graded:
+        _check_grades(log, result, rerender, _SceneChange(base, perturbed), detections, settings)
     return FrameCheck(identifier, log.compared, tuple(log.differences), rerender.levels)
 
 

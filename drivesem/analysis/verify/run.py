@@ -190,5 +190,6 @@ def _to_json(
         },
         "tolerances": {"levels": LEVELS, "box_px": BOX_PX, "score": SCORE, "label": LABEL, "draws": DRAWS},
         "differences": [{"frame": name, **asdict(d)} for name, d in differences],
+        "frames_ungraded": sum(not frame.result.graded for frame in run.frames),
         "frames_failed": failed,
     }

@@ -14,7 +14,7 @@ from drivesem.attack.targets import EvaluatedClasses
 from drivesem.config.commands import COMBO_NUMBERS, AttackConfig, ReportConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import format_command_line
-from drivesem.data.label_table import WEATHERS
+from drivesem.data.label_table import WEATHER_VARIATIONS
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.matched_class import MatchedClass
 from drivesem.failures.certificate import CertificateRule
@@ -290,7 +290,7 @@ def _paper_figure(params: tuple[str, ...]) -> PaperFigure | None:
 
 def _find_weather(identifier: str) -> str | None:
     """Return Virtual KITTI's weather in a frame's name, if there is one."""
-    return next((word for word in identifier.replace("_", "/").split("/") if word in WEATHERS), None)
+    return next((word for word in identifier.replace("_", "/").split("/") if word in WEATHER_VARIATIONS), None)
 
 
 def _precision_recall_line(run: ReportedRun, labels: str, seen: str, name: str) -> ChartLine | None:

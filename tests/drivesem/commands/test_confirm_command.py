@@ -94,8 +94,8 @@ def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
 ) -> None:
     before = json.loads((run / "confirm" / "confirm.json").read_text())
     draws: list[int] = []
-    draw = GeneratorRenderer.redraw
-    monkeypatch.setattr(GeneratorRenderer, "redraw", lambda self, scene: draws.append(1) or draw(self, scene))
+    draw = GeneratorRenderer.render
+    monkeypatch.setattr(GeneratorRenderer, "render", lambda self, scene: draws.append(1) or draw(self, scene))
     again = confirm(run)
     assert again == before | {"run": str(run)}
     assert draws == []

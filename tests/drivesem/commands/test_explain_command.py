@@ -212,7 +212,7 @@ def test_files(explained: Path) -> None:
     assert rows[0]["unit"] == "m"
     assert rows[1]["unit"] == "deg"
     page = (out / "explain.md").read_text()
-    assert "| everything |" in page
+    assert "| whole change |" in page
     for picture in ("explain.png", *(f"frames/demo-000/{n}.png" for n in ("shapley", "sensitivity", "minimal"))):
         assert min(cv2.imread(str(out / picture)).shape[:2]) > 150
         assert f"({picture})" in page or picture.endswith("minimal.png")
@@ -279,7 +279,7 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(
     assert (data["frames"], data["frames_failed"]) == (1, {})
     assert data["rows"] == alone["rows"]
     page = (run / "explain" / "explain.md").read_text()
-    assert "the exchange of vehicles alone makes them fail: demo-001, demo-002." in page
+    assert "Left out: frames that fail by the exchange of vehicles alone: demo-001, demo-002." in page
     for name, theta in (("demo-001", 0), ("demo-002", 1)):
         found = load_record(run / "explain" / "frames" / name / "explain.json", Explanation, SCHEMA)
         assert found.benign.success
@@ -290,7 +290,7 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(
     capsys.readouterr()
     assert main(["explain", "--run", str(run), "--workers", "1", "--frame", "demo-001", "--points", "4"]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert said.endswith("found left out, as the exchange of vehicles alone makes them fail: demo-001")
+    assert said.endswith("found frames that fail by the exchange of vehicles alone: demo-001")
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

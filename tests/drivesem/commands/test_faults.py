@@ -22,7 +22,7 @@ from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run.frame import AttackedScene
 from drivesem.run.results import FrameResult
-from drivesem.scenes.sources import PhotographSource
+from drivesem.scenes.sources import DatasetSource
 from scene_ir import files
 from scene_ir.types import SceneIR
 from tools.same import copy_part, objects_of
@@ -160,10 +160,10 @@ def test_a_picture_in_the_middle_of_a_data_set(
     picture = kitti / "training" / "image_2" / f"{NAMES[1]}.png"
     whole = picture.read_bytes()
     ends = picture.with_name(f"{NAMES[1]}.png")
-    scene = PhotographSource.scene
+    scene = DatasetSource.scene
     vanishing = damage is Path.unlink  # between listing and reading, in which it would not be a frame at all
 
-    def first(self: PhotographSource, identifier: str) -> SceneIR:
+    def first(self: DatasetSource, identifier: str) -> SceneIR:
         if vanishing and ends.exists():
             ends.unlink()
         return scene(self, identifier)
@@ -171,7 +171,7 @@ def test_a_picture_in_the_middle_of_a_data_set(
     if not vanishing:
         damage(picture)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PhotographSource, "scene", first)
+        patch.setattr(DatasetSource, "scene", first)
         out = tmp_path / "run"
         assert attack(kitti, out) == 2
         (line,) = capsys.readouterr().err.splitlines()[-1:]
@@ -222,14 +222,14 @@ def test_a_clock_that_jumps_changes_nothing(
 def test_a_frame_for_which_the_device_has_no_memory(
     tiny_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scene = PhotographSource.scene
+    scene = DatasetSource.scene
 
-    def second_is_large(self: PhotographSource, identifier: str) -> SceneIR:
+    def second_is_large(self: DatasetSource, identifier: str) -> SceneIR:
         if identifier == NAMES[1]:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 80.00 GiB.\nSee documentation")
         return scene(self, identifier)
 
-    monkeypatch.setattr(PhotographSource, "scene", second_is_large)
+    monkeypatch.setattr(DatasetSource, "scene", second_is_large)
     out, told = tmp_path / "run", "--device: expected one with memory for this, found CUDA out of memory. Tried to"
     assert attack(tiny_kitti, out) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"drivesem: {told}")

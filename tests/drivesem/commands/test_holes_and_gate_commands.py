@@ -278,7 +278,7 @@ def test_a_run_without_certain_failures(
         assert main([*ATTACK, *STILL, "--out", str(tmp_path / "fine")]) == 0
     found = holes([str(tmp_path / "fine"), *HOLES], capsys)
     assert found["holes"] == []
-    assert "No certain failure" in (tmp_path / "fine" / "holes" / "holes.md").read_text()
+    assert "no certain failure" in (tmp_path / "fine" / "holes" / "holes.md").read_text()
 
 
 @pytest.fixture
@@ -368,7 +368,7 @@ def test_frames_that_cannot_be_compared_do_not_pass(
     assert error.attrib["message"] == reason
     page = (out / "gate.md").read_text()
     assert "1 frame could not be compared, so the gate is not passed." in page
-    assert "No certain failure" not in page
+    assert "no certain failure" not in page
 
 
 @pytest.fixture
@@ -392,14 +392,14 @@ def test_other_classes_are_no_comparison(attacked: Path, said: Callable[..., str
     assert fewer == "--after: expected the classes of --before, found no Bus"
 
 
-def test_a_gate_has_to_be_told_the_new_detector(attacked: Path, said: Callable[..., str]) -> None:
-    """The old one contrast itself would pass for ever."""
-    wanted = "the detector that is to take the place of --before"
+def test_the_gate_needs_the_new_detector(attacked: Path, said: Callable[..., str]) -> None:
+    """The old detector compared with itself would always pass."""
+    wanted = "the detector that replaces --before"
     assert said(attacked) == f"--after: expected {wanted}, found nothing"
     assert not (attacked / "gate").exists()
 
 
-def test_before_is_the_runs_own_detector(
+def test_before_defaults_to_the_detector_of_the_runs(
     gate: Callable[[str], tuple[int, dict[str, Any]]],
     attacked: Path,
     tmp_path: Path,
@@ -413,7 +413,7 @@ def test_before_is_the_runs_own_detector(
     assert "before: any" in (tmp_path / "own" / "config.yaml").read_text()
 
 
-def test_runs_whose_detector_cannot_be_taken_for_the_old_one(
+def test_runs_without_a_usable_detector_need_before(
     attacked: Path, tmp_path: Path, said: Callable[..., str]
 ) -> None:
     run = shutil.copytree(attacked, tmp_path / "run")
@@ -423,7 +423,7 @@ def test_runs_whose_detector_cannot_be_taken_for_the_old_one(
         config.write_text(as_it_was.replace("detector: any\n", f"detector: {detector}\n"))
 
     of("better")
-    several = "the detector that stands: these runs have several"
+    several = "the current detector, as these runs have several"
     assert said(attacked, run, "--after", "worse") == f"--before: expected {several}, found any, better"
     of("module:evil.py:D")
     trusted = f"{config}: detector: expected a detector that is data alone, or --trust"
@@ -442,9 +442,9 @@ def test_runs_whose_detector_cannot_be_taken_for_the_old_one(
     [
         ([], "RUN: expected folders of drivesem attack"),
         (["nowhere"], "RUN: expected a folder of drivesem attack, found nowhere"),
-        (["nowhere", "--samples", "9"], "--samples: expected at least 24, of which a rule can be made, found 9"),
+        (["nowhere", "--samples", "9"], "--samples: expected at least 24, which a rule needs, found 9"),
         (["nowhere", "--recheck", "0"], "--recheck: expected at least 1, found 0"),
-        (["nowhere", "--reach", "0"], "--reach: expected a share above 0, up to 1, found 0"),
+        (["nowhere", "--reach", "0"], "--reach: expected a fraction above 0, up to 1, found 0"),
     ],
 )
 def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:

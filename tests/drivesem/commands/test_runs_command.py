@@ -139,7 +139,7 @@ def test_list_and_show(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert rows["whole"]["params"] == "color"
     assert rows["whole"]["finished"]
     (shown,) = told(["show", str(parts / "whole")], capsys)["runs"]
-    assert shown["settings"] == {"params": "color", "method": "fgsm", "peer": "off"}
+    assert shown["settings"] == {"params": "color", "method": "fgsm", "second_detector": "off"}
     assert main(["runs", "list", str(parts)]) == 0
     said = capsys.readouterr().out
     assert "whole: 3 frames, " in said
@@ -188,8 +188,8 @@ def test_prune_removes_what_a_killed_command_left(
 _HOLDER = """
 import sys
 from pathlib import Path
-from drivesem.run.lock import hold
-hold(Path(sys.argv[1]))
+from drivesem.run.lock import acquire_folder_lock
+acquire_folder_lock(Path(sys.argv[1]))
 print("held", flush=True)
 sys.stdin.read()
 """

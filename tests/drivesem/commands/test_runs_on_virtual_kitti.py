@@ -74,17 +74,17 @@ def test_frames_that_are_held_out_are_not_trained_on(
     assert open_dataset("vkitti2", data).identifiers == tuple(NAMES)
     trained, judged = [], []
 
-    def store(dataset: Dataset, names: Sequence[str], cache: Path, classes: Sequence[str]) -> FrameStore:
+    def make_store(dataset: Dataset, names: Sequence[str], cache: Path, classes: Sequence[str]) -> FrameStore:
         trained.extend(names)
         return FrameStore(dataset, names, cache, classes)
 
-    def look(detector: object, frames: Sequence[AttackedFrame], *_: object) -> None:
+    def detect_in_frames(detector: object, frames: Sequence[AttackedFrame], *_: object) -> None:
         judged.extend(frame.name for frame in frames)
         raise KeyboardInterrupt  # it has been trained
 
-    monkeypatch.setattr(retrain, "FrameStore", store)
-    monkeypatch.setattr(retrain, "train_on", lambda *_: None)
-    monkeypatch.setattr(retrain, "look", look)
+    monkeypatch.setattr(retrain, "FrameStore", make_store)
+    monkeypatch.setattr(retrain, "fine_tune", lambda *_: None)
+    monkeypatch.setattr(retrain, "detect_in_frames", detect_in_frames)
     words = ["--dataset", "vkitti2", "--root", str(data), "--validation", "0.5", "--out", str(tmp_path / "out")]
     assert main(["retrain", "--run", str(run), *words]) != 0
     assert len(judged) == 2

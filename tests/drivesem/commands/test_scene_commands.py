@@ -22,7 +22,7 @@ from drivesem.config.parsing import parse
 from drivesem.data.registry import DATASETS as READERS
 from drivesem.data.registry import open_dataset
 from drivesem.run.lock import LOCK
-from drivesem.scenes.sheet import GAIN, PANEL_PX, scene_sheet
+from drivesem.scenes.scene_sheet import GAIN, PANEL_PX, scene_sheet
 from scene_ir import files
 from scene_ir.derender.silhouette import mask_bounds, place_mesh, render_silhouettes
 from scene_ir.errors import RangeError

@@ -59,7 +59,7 @@ def foreign(tmp_path: Path) -> Callable[[str], Path]:
     return make
 
 
-@pytest.mark.parametrize("setting", ["detector", "peer", "witness"])
+@pytest.mark.parametrize("setting", ["detector", "second_detector", "reference_detector"])
 def test_each_setting_that_names_a_detector(foreign: Callable[[str], Path], setting: str) -> None:
     run = foreign(setting)
     with pytest.raises(UsageError, match=rf"config\.yaml: {setting}: expected .*--trust.*evil\.py:D"):

@@ -118,7 +118,7 @@ def test_processes_that_never_come_back_end_it_all(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(clusters, "_PAUSE_S", 0.01)
     monkeypatch.setattr(clusters, "_LOST_S", 0.05)
     with pytest.raises(UsageError, match="--engine: expected a Ray cluster that lasts"):
-        list(clusters._shared(Gone(), [Actor(), Actor()], deque([(1, 0)])))  # type: ignore[arg-type]
+        list(clusters._distribute_jobs(Gone(), [Actor(), Actor()], deque([(1, 0)])))  # type: ignore[arg-type]
 
 
 def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,7 +56,7 @@ def test_a_run_that_is_being_made_is_no_run_that_stopped(
         assert f"found {folder}, into which an attack is still writing" in capsys.readouterr().err
         (folder / "frames").mkdir()
         assert main(["runs", "list", str(tmp_path)]) == 0
-        assert "run: 0 frames, being made now; combo 2 by si-fgsm" in capsys.readouterr().out
+        assert "run: 0 frames, running; combo 2 by si-fgsm" in capsys.readouterr().out
     assert not is_locked_elsewhere(folder)
     assert main(["explain", str(folder)]) == 2
     assert f"found {folder}, which stopped early" in capsys.readouterr().err

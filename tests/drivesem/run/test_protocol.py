@@ -42,7 +42,7 @@ def test_the_preset_is_the_protocol() -> None:
         {"project": "feasible"},
         {"budget": "parking"},
         {"rate": 0.5},
-        {"scouts": 4},
+        {"momentum": 0.5},
         {"passes": 300},
     ],
 )

@@ -68,7 +68,7 @@ def test_the_page_begins_with_the_highest_grade(run: Path, parse: Callable[[Path
     # by the highest grade, then how many of it
     assert [a["data-name"] for a in found.having("article")] == ["c", "e", "b", "a", "d"]
     assert [a["data-grade"] for a in found.having("article")] == ["3", "2", "2", "1", "0"]
-    shots = text[text.index("Failures in close-up") : text.index("Meaning of the grades")]
+    shots = text[text.index("Failures in close-up") : text.index("Failures by kind")]
     assert shots.index("confirmed") < shots.index("certain")
     assert "threshold" not in shots  # there are enough that are surer
 
