@@ -47,8 +47,8 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
     out: FolderOrUrl = None
     """Folder for the results, or its URL (docs/guide/scale.md); a second run with the same goes on where it stopped."""
     results: Annotated[str | None, ExistingFolder(), tyro.conf.arg(aliases=["--from"])] = None
-    """The folder OUT/kept of such a study, whose tables are told again; it
-    needs no data, and runs nothing. Beside it only --out, --bootstrap and --json."""
+    """Folder of stored results, such as OUT/results or docs/data/NAME: report them again without data or attacks. Only
+    --out, --bootstrap and --json go with it."""
     quick: Flag = False
     """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
     retrain, which trains on other frames, in another."""
@@ -148,7 +148,8 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
         if self.results is not None:
             for field in fields(self):
                 value, alone = getattr(self, field.name), "none with --from, which uses the study's own settings"
-                refuse(field.name not in _REPORT_SETTINGS and value != field.default, option_name(field.name), alone, value)
+                changed = field.name not in _REPORT_SETTINGS and value != field.default
+                refuse(changed, option_name(field.name), alone, value)
         refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
         divided = self.split is not None and self.name == "retrain"
         refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)

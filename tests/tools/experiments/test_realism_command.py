@@ -48,7 +48,7 @@ def test_identity(write_run: Callable[..., Path], tmp_path: Path, realism: Calla
     assert {row["pictures"] for row in rows_of(data, region="boxes")} == {6}
 
 
-def test_figures(write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]) -> None:
+def test_metrics(write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]) -> None:
     runs = [write_run(tmp_path / name, params=params) for name, params in (("one", "rotate"), ("two", "mesh"))]
     data = realism(*runs, "--metrics", "psnr,ssim,perceptual,frechet", "--out", tmp_path / "out")
     assert json.loads((tmp_path / "out" / "realism.json").read_text()) == data
@@ -97,9 +97,9 @@ def test_a_table_for_people(
 ) -> None:
     run = write_run(tmp_path / "run")
     assert main(["realism", str(run), "--metrics", "ssim", "--bootstrap", "0"]) == 0
-    said = capsys.readouterr()
-    assert "distances between pictures" in said.out
-    assert str(run / "realism") in said.err.replace("\n", "")
+    output = capsys.readouterr()
+    assert "distances between pictures" in output.out
+    assert str(run / "realism") in output.err.replace("\n", "")
 
 
 def test_windows() -> None:

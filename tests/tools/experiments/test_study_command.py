@@ -22,7 +22,7 @@ from tools.experiments.detection.arms import AttackArm, build_arms
 from tools.experiments.settings import StudyConfig
 
 WORDS = ["multi", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
-ASKED = (
+REQUIRED_KEYS = (
     *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
     *("recall_moved", "reference"),
 )
@@ -63,7 +63,7 @@ def result(folder: Path) -> dict[str, Any]:
 def test_files(finished: Path) -> None:
     data = json.loads((finished / "study.json").read_text())
     (row,) = data["rows"]
-    assert set(ASKED) <= set(row)
+    assert set(REQUIRED_KEYS) <= set(row)
     assert (row["name"], row["reference"]) == ("combo 1", None)  # the paper takes more steps
     assert row["drop_moved"] == pytest.approx(row["benign_ap50"] - row["moved_ap50"], abs=1e-9)
     assert (data["frames"], data["feasible_fraction"], data["frames_without_vehicles"]) == (1, 1.0, 0)
@@ -75,7 +75,7 @@ def test_files(finished: Path) -> None:
     assert (settings["name"], settings["steps"]) == ("multi", 1)
 
 
-def test_tables_come_again_from_what_is_kept(
+def test_tables_come_again_from_what_is_stored(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rows, intervals and p values to the last bit; and other draws give other intervals."""
@@ -91,7 +91,7 @@ def test_tables_come_again_from_what_is_kept(
     assert "combo 1" in capsys.readouterr().out
 
 
-def test_labels_come_again_from_what_is_kept(
+def test_labels_come_again_from_what_is_stored(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(study_module, "build_arms", lambda config, out: build_arms(config, out)[:1])
@@ -109,7 +109,7 @@ def test_labels_come_again_from_what_is_kept(
         (["multi", "--steps", "7"], "--steps: expected none with --from, which uses the study's own settings"),
     ],
 )
-def test_what_cannot_be_told_again(
+def test_what_cannot_be_reported_again(
     words: list[str], message: str, finished: Path, refused: Callable[..., str]
 ) -> None:
     assert message in refused(*words, "--from", str(finished / "results"))
@@ -187,14 +187,14 @@ def test_a_stopped_study_goes_on(finished: Path, tmp_path: Path, capsys: pytest.
     out = Path(shutil.copytree(finished, tmp_path / "stopped"))
     shutil.rmtree(out / "arms" / "combo-1-random" / "frames" / "demo-000")
     (out / "study.json").unlink()
-    kept = out / "arms" / "combo-1" / "frames" / "demo-000" / "result.json"
+    stored = out / "arms" / "combo-1" / "frames" / "demo-000" / "result.json"
     # the placebo's size is of a run at another place: as it was set
     for folder in out.glob("arms/*-placebo"):
         text = (folder / "config.yaml").read_text()
         (folder / "config.yaml").write_text(text.replace(str(finished), str(out)))
-    before = kept.stat().st_mtime_ns
+    before = stored.stat().st_mtime_ns
     data = study([*WORDS, "--out", str(out), "--json"], capsys)
-    assert kept.stat().st_mtime_ns == before
+    assert stored.stat().st_mtime_ns == before
     assert data == json.loads((finished / "study.json").read_text())
 
 

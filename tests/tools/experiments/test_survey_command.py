@@ -82,7 +82,7 @@ def test_the_same_command_makes_the_same_survey(survey: Path, tmp_path: Path) ->
     assert key_of(tmp_path / "other")["survey"] != key_of(survey)["survey"]
 
 
-def test_of_vehicles_that_left_or_parked_those_are_shown_that_the_picture_has(
+def test_of_vehicles_that_left_or_parked_those_are_given_that_the_picture_has(
     write_run: Callable[..., Path], tmp_path: Path
 ) -> None:
     """The first car left and a lorry parked; people are asked about the lorry, where it stands, and of the picture
@@ -108,13 +108,13 @@ def test_of_vehicles_that_left_or_parked_those_are_shown_that_the_picture_has(
         draw_items([load_run(folder, limit=1)], 1, 1, 0)
 
 
-def test_fewer_frames_than_asked_for(
+def test_fewer_frames_than_requested_for(
     write_run: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["survey", str(write_run(tmp_path / "run")), "--json"]) == 0
-    said = capsys.readouterr()
-    assert json.loads(said.out)["counterexample"] == 3
-    assert "only 3 of 15 pictures" in said.err
+    output = capsys.readouterr()
+    assert json.loads(output.out)["counterexample"] == 3
+    assert "only 3 of 15 pictures" in output.err
 
 
 def test_results(survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -189,11 +189,11 @@ def test_bad_input(survey: Path, tmp_path: Path, refused: Callable[..., str]) ->
 def test_the_page_in_a_browser(survey: Path, tmp_path: Path, chromium: Any) -> None:
     """By keyboard alone: names, ratings, a file that survey-results takes; no error, no request."""
     faults: list[str] = []
-    asked: list[str] = []
+    requested: list[str] = []
     page = chromium.new_page(viewport={"width": 390, "height": 800})
     page.on("console", lambda message: faults.append(message.text))
     page.on("pageerror", lambda error: faults.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
+    page.on("request", lambda request: requested.append(request.url))
     page.goto((survey / "survey.html").as_uri())
     page.keyboard.press("Tab")
     page.keyboard.type('Ann, "A"')
@@ -215,8 +215,8 @@ def test_the_page_in_a_browser(survey: Path, tmp_path: Path, chromium: Any) -> N
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     page.close()
     assert not faults
-    assert asked
-    assert not [url for url in asked if not url.startswith(("file:", "data:", "blob:"))]
+    assert requested
+    assert not [url for url in requested if not url.startswith(("file:", "data:", "blob:"))]
     assert main(["survey-results", str(tmp_path / "answers.csv"), "--survey", str(survey), "--json"]) == 0
     rows = list(csv.DictReader((tmp_path / "answers.csv").read_text().splitlines()))
     assert {row["participant"] for row in rows} == {'Ann, "A"'}

@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from drivesem.classify.objects.folders import SHAPENET
 from scene_ir import files
 
 NETWORKS = {"vgg16": "paper, VGG-16", "resnet50": "paper, ResNet-50"}
@@ -33,5 +34,6 @@ REMARKS: dict[str, tuple[str, ...]] = {
 
 @cache
 def paper_tables() -> dict[str, Any]:
-    """Load the paper's tables by name from `paper.yaml`."""
-    return files.read_yaml(Path(__file__).with_name("paper.yaml"))
+    """Load the paper's tables by name; "sizes" has the numbers of objects to test, train and validate on, by class."""
+    tables = files.read_yaml(Path(__file__).with_name("paper.yaml"))
+    return {**tables, "sizes": {name: sizes for name, (_, sizes) in SHAPENET.items()}}

@@ -365,7 +365,7 @@ def _order(
     paper: Mapping[str, float],
     ours: Mapping[str, Predictions],
 ) -> Iterator[Row]:
-    """Each two of the paper's numbers that differ, and whether ours differ in the same direction, paired over pictures."""
+    """Each two of the paper's numbers that differ, and whether ours differ in the same direction; paired."""
     for first, second in combinations(paper, 2):
         difference = paper[second] - paper[first]
         if difference:

@@ -26,11 +26,10 @@ from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS, RETRAINED
 from drivesem.run.frame import detection_records, detections_from_records
 from drivesem.run.results import BoxRecord
-from drivesem.training.validation import detect_in_store
 from drivesem.training.frames import FrameStore
 from drivesem.training.retrain import discard_stale_run, load_start
 from drivesem.training.samples import AttackedFrame
-from drivesem.training.validation import score_detections
+from drivesem.training.validation import detect_in_store, score_detections
 from scene_ir import files
 from tools.experiments.detection.arms import ArmRun, AttackArm, AttackTotals, build_workers, run_arms
 from tools.experiments.detection.counts import ArmCounts

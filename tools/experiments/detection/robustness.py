@@ -115,7 +115,7 @@ class StateEvaluator(FrameAnalyser[FrameStateCounts]):
         self.detectors: list[Predictor] = [load_detector(name) for name in detectors]
         self.second = SecondRenderers(attack.dataset, attack.root)
 
-    def analyse(self, name: str, source: str, folder: Path) -> FrameStateCounts:
+    def analyse(self, name: str, folder: Path) -> FrameStateCounts:
         """See `FrameAnalyser`."""
         frame_folder = self.run_folder / FRAMES / name
         result = load_frame(frame_folder / RESULT)
@@ -142,7 +142,7 @@ class StateEvaluator(FrameAnalyser[FrameStateCounts]):
             samples = (near.sample(n, 1.0 if n % 2 == 0 else NEAR_REACH) for n in range(self.states))
             around += [(one.image, [index]) for one in samples if one is not None]
         counts[AROUND] = _count_failures(cameras, around)
-        return FrameStateCounts(name, source, counts, note)
+        return FrameStateCounts(name, self.source_digest(name), counts, note)
 
 
 def _count_failures(

@@ -19,13 +19,12 @@ from torch import Tensor
 from drivesem.attack.feasible.weather import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
 from drivesem.attack.space import behind_camera
 from drivesem.config.errors import UsageError
-from drivesem.synth.compare import VEHICLES
 from drivesem.data.kitti import read_labels
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.finished import AttackRun, RunFrame, load_runs
 from drivesem.run.folder import FRAMES, resolve_output_folder
 from drivesem.run.results import FrameResult
-from drivesem.synth.compare import QUANTITIES, Histograms, Quantity, reference, values_of
+from drivesem.synth.compare import QUANTITIES, VEHICLES, Histograms, Quantity, measure_labels, reference
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.io import load_scene
 from scene_ir.types import Labels
@@ -139,7 +138,7 @@ def vehicle_plausibility(
     """
     scales = kitti_scales() if scales is None else scales
     count = sum(kind in VEHICLES for kind in labels.kind)
-    values = values_of(labels)
+    values = measure_labels(labels)
     if len(values["depth_m"]) != count:
         raise RangeError("labels", f"{count} vehicles with poses", len(values["depth_m"]))
     # a single vehicle has no neighbour

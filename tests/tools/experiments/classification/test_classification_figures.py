@@ -1,5 +1,3 @@
-from tools.experiments.classification.results import Predictions, RatioBootstrap, sample_stratified
-
 """Accuracies by class and overall, pictures that keep shares, and whether an order is the paper's."""
 
 import numpy as np
@@ -10,6 +8,7 @@ from hypothesis import strategies as st
 from drivesem.classify.objects.types import CLASSES
 from drivesem.evaluation.resampling import Interval
 from tools.experiments.classification.paper import paper_tables
+from tools.experiments.classification.results import Predictions, RatioBootstrap, sample_stratified
 from tools.experiments.classification.tables import _judge_order
 
 DRAWING = RatioBootstrap(50, 0)
@@ -76,7 +75,7 @@ def test_a_subset_is_as_large_as_requested_and_no_class_is_off_by_one(labels, si
 
 
 @pytest.mark.parametrize(
-    ("theirs", "value", "low", "high", "said"),
+    ("theirs", "value", "low", "high", "output"),
     [
         (0.1, 0.2, 0.1, 0.3, "holds"),
         (-0.1, 0.2, 0.1, 0.3, "reversed"),

@@ -1,7 +1,3 @@
-from tools.experiments.classification.arms import STRATEGIES
-from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT, attack_pixels, has_pixel_attacks
-from tools.experiments.classification.study import TABLES, classify_features, draw_half, retrain_last_layer
-
 """`drivesem study classification` as it is typed, on objects that are known."""
 
 import functools
@@ -18,13 +14,16 @@ from drivesem.classify.networks import loading
 from drivesem.classify.training import train_last_layer
 from drivesem.config.commands import ClassifyConfig
 from scene_ir import files
-from tests.drivesem.classify.conftest import Colours
-from tests.drivesem.classify.standins import KINDS, StandIns
+from tests.drivesem.classify.conftest import KINDS, ColourClassifier, SolidObjects
 from tools.experiments.__main__ import main
+from tools.experiments.classification import study as study_module
+from tools.experiments.classification.arms import STRATEGIES
+from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT, attack_pixels, has_pixel_attacks
+from tools.experiments.classification.study import TABLES, classify_features, draw_half, retrain_last_layer
 
 
-class Tints(Colours):
-    """As `Colours`, with a last layer as others have."""
+class Tints(ColourClassifier):
+    """As `ColourClassifier`, with a last layer as others have."""
 
     architecture = "tints"
 
@@ -37,9 +36,6 @@ class Tints(Colours):
             self.score.bias.zero_()
 
 
-from tools.experiments.classification import study as study_module
-
-
 @pytest.fixture
 def two_networks(monkeypatch, tmp_path):
     """Small pictures of boxes, balls and poles; the files of two networks that go by colour."""
@@ -47,7 +43,7 @@ def two_networks(monkeypatch, tmp_path):
         monkeypatch.setattr(scenes, name, size)
     monkeypatch.setattr(scenes, "picture_camera", functools.partial(scenes.picture_camera, 96))
     for module in (pictures, study_module):
-        monkeypatch.setattr(module, "open_objects", lambda source: StandIns())
+        monkeypatch.setattr(module, "open_objects", lambda source: SolidObjects())
     monkeypatch.setitem(loading.ARCHITECTURES, Tints.architecture, Tints)
     paths = []
     for name in ("one", "two"):

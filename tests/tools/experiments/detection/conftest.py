@@ -86,7 +86,7 @@ def arm() -> Callable[..., AttackArm]:
     def make(
         name: str, reference: float | None = None, control: tuple[str, str] | None = None, **of: object
     ) -> AttackArm:
-        kind, beside = control or (None, None)
-        return AttackArm(name, name, AttackConfig(**of), reference, kind, beside)  # pyright: ignore[reportArgumentType]
+        kind, control_rows = control or (None, None)
+        return AttackArm(name, name, AttackConfig(**of), reference, kind, control_rows)  # pyright: ignore[reportArgumentType]
 
     return make

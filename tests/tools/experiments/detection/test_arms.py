@@ -60,9 +60,9 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
         theirs = arm.name.endswith(PAPER_PROTOCOL)
         assert (arm.reference is not None) == theirs
         assert matching_control(arm.config) == (PLACEBO if theirs else RANDOM)
-        beside = [other for other in arms.values() if other.control_of == arm.name]
-        assert [other.config.seed for other in beside] == ([0, 1] if theirs else [0, 1, 0, 1])
-        for control in beside:
+        control_rows = [other for other in arms.values() if other.control_of == arm.name]
+        assert [other.config.seed for other in control_rows] == ([0, 1] if theirs else [0, 1, 0, 1])
+        for control in control_rows:
             assert (control.config.params, control.config.combo) == (arm.config.params, arm.config.combo)
             assert list(arms).index(control.name) > list(arms).index(arm.name)
             searched = (control.config.method, control.config.range, control.config.queries, control.config.like)
@@ -77,7 +77,7 @@ def test_controls_have_the_same_box_queries_and_size(name: str, count: int) -> N
 
 
 @pytest.mark.parametrize("name", ["single", "multi"])
-def test_the_papers_protocol_stands_beside_where_the_detector_has_its_loss(name: str) -> None:
+def test_the_papers_protocol_stands_next_to_where_the_detector_has_its_loss(name: str) -> None:
     def theirs(**settings: Any) -> list[AttackArm]:
         arms = build_arms(StudyConfig(name=name, controls=False, **settings), OUT)
         return [arm for arm in arms if arm.name.endswith(PAPER_PROTOCOL)]
@@ -90,7 +90,7 @@ def test_the_papers_protocol_stands_beside_where_the_detector_has_its_loss(name:
     assert theirs(detector="module:mine.py") == theirs(paper_protocol=False) == theirs(**THEIRS) == []
 
 
-def test_the_papers_figures_stand_beside_its_own_protocol_only() -> None:
+def test_the_papers_metrics_stand_next_to_its_own_protocol_only() -> None:
     theirs = THEIRS | {"controls": False, "paper_protocol": False}
     multi = build_arms(StudyConfig(name="multi", **theirs), OUT)  # pyright: ignore[reportArgumentType]
     assert [arm.reference for arm in multi] == [*PAPER_COMBOS.values(), None]  # the last is Auto-PGD's

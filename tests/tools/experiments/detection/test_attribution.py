@@ -74,7 +74,7 @@ def found(frame: Callable[..., Any], counted: Callable[..., Any]) -> Attribution
     return attribute_drop(StudyConfig(name="attribution", bootstrap=DRAWS), counts)
 
 
-def test_points_sum_to_the_difference_on_both_ways_and_in_the_mean(found: Attribution) -> None:
+def test_points_sum_to_the_difference_on_both_paths_and_in_the_mean(found: Attribution) -> None:
     assert found.ours == 0
     difference = found.papers - found.ours
     assert difference > 0.4

@@ -54,7 +54,7 @@ def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
     assert flat["feasible_fraction"] == 1.0
 
 
-def test_figures_are_those_of_pycocotools(frame, arm_run, arm) -> None:
+def test_metrics_are_those_of_pycocotools(frame, arm_run, arm) -> None:
     """As the run itself tells them, of detections that are true at some overlaps and false at others."""
     run = arm_run(arm("a"), [frame(f"{i}", moved_by=4.0 * i, found=i != 3) for i in range(FRAMES)])
     (row,) = compare_arms([ArmCounts.from_run(run)], draws=0, seed=0)
@@ -70,7 +70,7 @@ def test_figures_are_those_of_pycocotools(frame, arm_run, arm) -> None:
     assert row.to_row()["objects"] == run.summary.benign.headline.objects
 
 
-def test_drops_are_those_of_the_figures(runs) -> None:
+def test_drops_are_those_of_the_metrics(runs) -> None:
     (row,) = compare_arms(runs, draws=0, seed=0)
     flat = row.to_row()
     for mode in ("paper", "moved"):
@@ -81,7 +81,7 @@ def test_drops_are_those_of_the_figures(runs) -> None:
     assert flat["drop_moved_low"] is None
 
 
-def test_the_controls_stand_beside(runs) -> None:
+def test_the_controls_stand_next_to(runs) -> None:
     (row,) = compare_arms(runs, draws=50, seed=0)
     flat = row.to_row()
     assert flat["placebo_drop_moved"] == 0
@@ -130,9 +130,9 @@ def test_seeds_of_a_control_count_as_their_mean(runs, frame, counted, arm) -> No
     assert both["random_size"] == pytest.approx((0.5 + 0.5) / 2)
 
 
-def test_the_effect_is_beside_the_control_with_as_many_chances(runs) -> None:
+def test_the_effect_is_compared_with_the_control_with_as_many_chances(runs) -> None:
     """Random where the best is kept, the placebo where the last is; p is Holm's over the rows."""
-    kept_last = [
+    keeping_last = [
         replace(
             run,
             arm=replace(
@@ -143,8 +143,8 @@ def test_the_effect_is_beside_the_control_with_as_many_chances(runs) -> None:
         )
         for run in runs
     ]
-    kept_last[0] = replace(kept_last[0], arm=replace(kept_last[0].arm, config=AttackConfig(keep="last")))
-    best, last = compare_arms([*runs, *kept_last], draws=30, seed=0)
+    keeping_last[0] = replace(keeping_last[0], arm=replace(keeping_last[0].arm, config=AttackConfig(keep="last")))
+    best, last = compare_arms([*runs, *keeping_last], draws=30, seed=0)
     assert (best.matching_control, last.matching_control) == (RANDOM, PLACEBO)
     ps = [best.effects[RANDOM]["moved"].p, last.effects[PLACEBO]["moved"].p]
     assert [best.p, last.p] == holm(ps)

@@ -32,7 +32,7 @@ from tools.experiments.detection.report import StudyResults, build_notes, report
 from tools.experiments.settings import StudyConfig
 
 DRAWS = 200
-ASKED = SecondOpinion("generator", 4, 1, 4)
+REQUIRED_KEYS = SecondOpinion("generator", 4, 1, 4)
 
 
 def failure(grade: Grade, kind: Kind = Kind.MISSED, second: SecondOpinion | None = None) -> Failure:
@@ -43,9 +43,9 @@ def failure(grade: Grade, kind: Kind = Kind.MISSED, second: SecondOpinion | None
 def graded_runs(frame, counted, arm) -> list:
     """Four frames of two cars, failures of each grade in the first three; a control fails by threshold."""
     of = [
-        (failure(Grade.THRESHOLD), failure(Grade.CERTAIN, second=ASKED)),
-        (failure(Grade.CONFIRMED, Kind.CLASS, replace(ASKED, after=4)),),
-        (failure(Grade.SHARED, second=replace(ASKED, after=3)),),
+        (failure(Grade.THRESHOLD), failure(Grade.CERTAIN, second=REQUIRED_KEYS)),
+        (failure(Grade.CONFIRMED, Kind.CLASS, replace(REQUIRED_KEYS, after=4)),),
+        (failure(Grade.SHARED, second=replace(REQUIRED_KEYS, after=3)),),
         (),
     ]
     frames = [replace(frame(str(i)), failures=failures, passes=30) for i, failures in enumerate(of)]
@@ -70,7 +70,7 @@ def test_a_grade_holds_those_above_it(grades: ArmGrades) -> None:
     assert grades.kinds[Kind.MISSED][Grade.THRESHOLD] == 3
 
 
-def test_what_survives_is_a_share_of_what_was_asked(grades: ArmGrades) -> None:
+def test_what_survives_is_a_share_of_what_was_requested(grades: ArmGrades) -> None:
     assert grades.second_rendered == 3
     assert grades.survive.value == pytest.approx(2 / 3)
     low, high = grades.survive.low, grades.survive.high
@@ -257,8 +257,8 @@ def test_one_arm_against_the_end_of_another(success_runs) -> None:
 
 
 def test_how_many_queries_an_arm_may_take(frame, counted, arm) -> None:
-    asked = {"si-fgsm": 7, "fgsm": 1, "halton": 32}
-    for method, most in asked.items():
+    requested = {"si-fgsm": 7, "fgsm": 1, "halton": 32}
+    for method, most in requested.items():
         queries = 32 if method == "halton" else None
         run = counted(arm(method, method=method, steps=7, queries=queries), [frame("0")])
         assert query_limit(run) == most

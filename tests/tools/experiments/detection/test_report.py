@@ -84,16 +84,16 @@ def cells(found: StudyResults, title: str, arm: str) -> dict[str, str]:
     return dict(zip(sheet.columns, next(row for row in sheet.rows if row[0] == arm), strict=True))
 
 
-def test_the_papers_figures_stand_beside(controlled: StudyResults) -> None:
+def test_the_papers_metrics_stand_next_to(controlled: StudyResults) -> None:
     row = cells(controlled, "Car AP50", "rotate")
     assert (row["benign"], row["paper's mAP"], row["paper's drop"]) == ("100.00", "98.20", "1.2")
     # 7 of 8 cars: 88 of 101 samples of recall
     assert row["drop, moved"].startswith(f"{100 * 13 / 101:.1f} [")
     assert cells(controlled, "Controls", "mesh")["placebo drop"] == "0.0 [0.0, 0.0]"
-    beside = cells(controlled, "Controls", "rotate")
-    assert beside["attack less random"].endswith("] *")
-    assert not beside["attack less placebo"].endswith("*")
-    assert float(beside["p of *"]) == pytest.approx(controlled.rows[0].p, abs=1e-3)
+    control_rows = cells(controlled, "Controls", "rotate")
+    assert control_rows["attack less random"].endswith("] *")
+    assert not control_rows["attack less placebo"].endswith("*")
+    assert float(control_rows["p of *"]) == pytest.approx(controlled.rows[0].p, abs=1e-3)
     frames = cells(controlled, "Frames", "rotate")
     assert (frames["moved"], frames[RANDOM], frames[PLACEBO], frames["queries"]) == ("1", "0", "0", "40")
     text = " ".join(build_notes(controlled))
@@ -102,7 +102,7 @@ def test_the_papers_figures_stand_beside(controlled: StudyResults) -> None:
     assert "check: 100.00 % of all" in text
 
 
-def test_what_survives_the_second_renderer_stands_beside(controlled: StudyResults) -> None:
+def test_what_survives_the_second_renderer_stands_next_to(controlled: StudyResults) -> None:
     shares = tuple(
         SurvivalRate.from_outcomes(name, outcomes)
         for name, outcomes in (("frames", [True, True, False]), ("lost", []))
@@ -178,7 +178,7 @@ def test_nothing_to_attack(frame, counted, arm, tmp_path: Path) -> None:
     write_plot(tmp_path / "study.png", found)
 
 
-def test_more_series_than_colours_are_told_apart() -> None:
+def test_more_series_than_colours_are_reported_apart() -> None:
     """Each has a look of its own, by colour or hatch."""
     axes = Figure().add_subplot()
     draw_bars(axes, {f"detector {i}": [Interval("ap50", 0.5, 0.4, 0.6)] for i in range(2 * len(PLOT_COLOURS) + 1)})
@@ -210,14 +210,14 @@ def test_each_frame_once_by_the_arm_that_changed_it_most(runs) -> None:
     assert found[0].folder == Path("out", ARMS, "turned", "frames", "000")
 
 
-def test_what_was_not_changed_is_not_shown(frame, arm_run, arm, tmp_path: Path) -> None:
+def test_what_was_not_changed_is_not_given(frame, arm_run, arm, tmp_path: Path) -> None:
     still = arm_run(arm("still"), [frame("000", yaw=0.0)])
     assert find_largest_changes([still], tmp_path) == []
     write_largest_changes(tmp_path / "largest.png", [])
     assert not (tmp_path / "largest.png").exists()
 
 
-def test_the_sheet_shows_photographs_beside_counterexamples(runs, tmp_path: Path) -> None:
+def test_the_sheet_shows_photographs_next_to_counterexamples(runs, tmp_path: Path) -> None:
     changes = find_largest_changes(runs, tmp_path)[:2]
     for level, change in enumerate(changes, start=1):
         for name, value in (("benign.png", 20), ("counterexample.png", 20 + 50 * level)):

@@ -57,7 +57,7 @@ from tools.experiments.settings import StudyConfig
 FRAMES, DRAWS = 8, 40
 THEIRS = {name: value for name, value in PROTOCOL.items() if name != "early_stop"}
 """The paper's protocol, as a study is told it."""
-ASKED = (
+REQUIRED_KEYS = (
     *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
     *("recall_moved", "reference"),
 )
@@ -78,7 +78,7 @@ def seen(missed: Sequence[int] = ()) -> BenignMatches:
     return BenignMatches(ThresholdMatches.from_frames(wanted, found, 0), 0.5)
 
 
-def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferCounts:
+def known(name: str, results: Sequence[FrameResult], stored: int) -> TransferCounts:
     """A detector that finds the first car of the attacked picture in the first `kept` frames, others always."""
     source = SourceRun(BENIGN, "squeezedet", "si-fgsm", "rotate")
     target = TransferTarget(name, name, CLASSES, 0.5)
@@ -86,7 +86,7 @@ def known(name: str, results: Sequence[FrameResult], kept: int) -> TransferCount
         "benign": [detections_from_records(r.detections_benign, CLASSES) for r in results],
         "rerendered": [detections_from_records(r.detections_benign, CLASSES) for r in results],
         "attacked": [
-            detections_from_records(r.detections_benign if i < kept else r.detections_attacked, CLASSES)
+            detections_from_records(r.detections_benign if i < stored else r.detections_attacked, CLASSES)
             for i, r in enumerate(results)
         ],
     }
@@ -161,7 +161,7 @@ def test_gains_are_over_the_detector_as_it_was(found: RetrainingResults) -> None
     assert after["drop_moved"] == pytest.approx(after["photographs_ap50"] - after["moved_ap50"])
 
 
-def test_the_papers_figures_stand_beside_its_protocol_only(found: RetrainingResults) -> None:
+def test_the_papers_metrics_stand_next_to_its_protocol_only(found: RetrainingResults) -> None:
     study = StudyConfig(name="retrain", **THEIRS)  # pyright: ignore[reportArgumentType]
     plan = build_retraining_arms(study)
     assert paper_reference("retrained, paper's protocol", plan, study) == (0.7276, 0.8473)
@@ -173,19 +173,19 @@ def test_the_papers_figures_stand_beside_its_protocol_only(found: RetrainingResu
     assert not any("paper's" in column for table in report.tables for column in table.columns)
 
 
-def test_what_is_told(found: RetrainingResults, tmp_path: Path) -> None:
+def test_what_is_reported(found: RetrainingResults, tmp_path: Path) -> None:
     data = found.to_json()
     json.dumps(data, allow_nan=False)
-    assert [set(ASKED) - set(r) for r in data["rows"]] == [set()] * 3
+    assert [set(REQUIRED_KEYS) - set(r) for r in data["rows"]] == [set()] * 3
     assert [(r["reference"], r["reference_benign"]) for r in data["rows"]] == [
         (0.659, 0.994),
         (0.659, 0.994),
         (None, None),  # which is trained in another way than the paper's
     ]
     assert (data["frames"], data["benign_frames"], data["feasible_fraction"]) == (4, FRAMES, 1.0)
-    shown = {name: (t["pictures"], t["labels"]) for name, t in data["training"].items()}
-    assert shown["retrained, ours"] == ("counterexample", "moved")
-    assert shown["retrained on benign re-rendered images"] == ("rerender", "benign")
+    given_frames = {name: (t["pictures"], t["labels"]) for name, t in data["training"].items()}
+    assert given_frames["retrained, ours"] == ("counterexample", "moved")
+    assert given_frames["retrained on benign re-rendered images"] == ("rerender", "benign")
     report = retraining_report(found, tmp_path)
     report.write()
     text = (tmp_path / "study.md").read_text()
@@ -206,7 +206,7 @@ def test_what_is_told(found: RetrainingResults, tmp_path: Path) -> None:
     assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
 
 
-def test_the_picture_is_of_failures_where_states_were_shown(
+def test_the_picture_is_of_failures_where_states_were_given(
     found: RetrainingResults, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Groups without any bar are left out; AP50 has no groups of states."""
@@ -216,8 +216,10 @@ def test_the_picture_is_of_failures_where_states_were_shown(
         retraining_report_file, "draw_bars", lambda axes, series: (drawn.append(series), draw(axes, series))
     )
     monkeypatch.setattr(files, "write_bytes", lambda *_: None)
-    told = Interval("", 0.2, 0.1, 0.3)
-    row = RobustnessRow("certain", "ours", dict.fromkeys(KINDS, told), {}, replace(told, value=0.5), None, None)
+    printed = Interval("", 0.2, 0.1, 0.3)
+    row = RobustnessRow(
+        "certain", "ours", dict.fromkeys(KINDS, printed), {}, replace(printed, value=0.5), None, None
+    )
     write_retraining_plot(Path("a.png"), replace(found, robustness=[row]))
     assert [one.value for one in drawn[0]["ours"] if one] == [0.2, 0.2, 0.2, 0.5]
     write_retraining_plot(Path("a.png"), found)
@@ -226,7 +228,7 @@ def test_the_picture_is_of_failures_where_states_were_shown(
     assert [len(series[BENIGN]) for series in drawn[1:]] == [3, 2]
 
 
-def test_benign_frames_are_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_benign_frames_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Store:
         names = ("a", "b")
         digest = "of their pictures"

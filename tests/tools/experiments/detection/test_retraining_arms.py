@@ -231,7 +231,7 @@ def test_a_source_among_names() -> None:
 
 
 @pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> list[TrainingMixture]:
+def given_frames(monkeypatch: pytest.MonkeyPatch) -> list[TrainingMixture]:
     """What each training was given, in the place of the training."""
     found: list[TrainingMixture] = []
 
@@ -278,21 +278,21 @@ def pictures(mixture: TrainingMixture) -> set[tuple[int, float]]:
     ],
     ids=["re-rendered", "moved", "paper", "re-rendered, paper", "benign", "random"],
 )
-def test_what_is_shown(
+def test_what_is_given(
     kind: int | str,
     settings: dict[str, object],
     expected: set[tuple[int, float]],
     attacked: list[AttackedFrame],
-    shown: list[TrainingMixture],
+    given_frames: list[TrainingMixture],
     tmp_path: Path,
 ) -> None:
     """Benign photographs of all frames, and of those that broke the detector what the lesson is about."""
     taught(lesson(kind, fraction=0.5, **settings), attacked, tmp_path / "out")
-    assert pictures(shown[0]) == {(10, 10.0), (11, 10.0), (12, 10.0)} | expected
+    assert pictures(given_frames[0]) == {(10, 10.0), (11, 10.0), (12, 10.0)} | expected
 
 
 def test_what_is_learned_is_not_learned_twice(
-    attacked: list[AttackedFrame], shown: list[TrainingMixture], tmp_path: Path
+    attacked: list[AttackedFrame], given_frames: list[TrainingMixture], tmp_path: Path
 ) -> None:
     weights = taught(lesson(1), attacked, tmp_path)
     facts, _ = read_weights(weights)
@@ -300,10 +300,10 @@ def test_what_is_learned_is_not_learned_twice(
     assert load_detector(weights).name == "squeezedet"
     before = weights.stat().st_mtime_ns
     assert taught(lesson(1), attacked, tmp_path) == weights
-    assert (len(shown), weights.stat().st_mtime_ns) == (1, before)
+    assert (len(given_frames), weights.stat().st_mtime_ns) == (1, before)
 
 
-def test_lessons_that_cannot_be_held_say_why(attacked: list[AttackedFrame], tmp_path: Path) -> None:
+def test_lessons_that_cannot_be_held_state_why(attacked: list[AttackedFrame], tmp_path: Path) -> None:
     """No failure of these frames is certain, and no generator made them."""
     taken = TrainingPictures(attacked, attacked, WORKER, SecondRenderers("kitti", str(tmp_path)), tmp_path, 0, 0.5)
     reasons = {

@@ -111,7 +111,7 @@ def test_seeds_count_together() -> None:
     assert row.title == "ours"
 
 
-def test_without_the_controls_no_goal_is_told() -> None:
+def test_without_the_controls_no_goal_is_reported() -> None:
     arms = [ARMS[0], ARMS[3]]
     rows = by_arm((20, 8), arms)
     assert rows["certain"].short_of is None
@@ -139,8 +139,8 @@ def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> N
     """The same detector twice loses the same cars; going on asks nothing again."""
     study, attack = StudyConfig(name="retrain", states=4, workers=1), load_attack_config(small_run)
     (run,) = load_runs([str(small_run)])
-    asked = ["squeezedet", "squeezedet", "yolov3-slim"]
-    (one,), failed = evaluate_states(run, attack, asked, study, tmp_path)
+    requested = ["squeezedet", "squeezedet", "yolov3-slim"]
+    (one,), failed = evaluate_states(run, attack, requested, study, tmp_path)
     assert not failed
     assert one.note == ""
     anywhere, redrawn = one.counts[ANYWHERE], one.counts[REDRAWN]
@@ -151,9 +151,9 @@ def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> N
     assert len(anywhere.lost) == len(anywhere.phantoms) == 3
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StateEvaluator, "analyse", None)
-        assert evaluate_states(run, attack, asked, study, tmp_path)[0] == [one]
+        assert evaluate_states(run, attack, requested, study, tmp_path)[0] == [one]
         with pytest.raises(TypeError):
-            evaluate_states(run, attack, asked[:2], study, tmp_path)
+            evaluate_states(run, attack, requested[:2], study, tmp_path)
 
 
 def test_as_many_are_drawn_again_as_grading_has_drawn() -> None:

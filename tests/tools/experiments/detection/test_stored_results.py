@@ -18,7 +18,6 @@ from detectors.types import CLASSES
 from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
 from drivesem.analysis.transfer.matrix import SourceRun, TransferCounts, TransferTarget
 from drivesem.config.commands import AttackConfig
-from drivesem.data.vkitti import KINDS
 from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.matched_class import FALSE, IGNORED, TRUE, ThresholdMatches
 from drivesem.failures.grades import Grade, Kind, SecondOpinion
@@ -31,7 +30,7 @@ from tools.experiments.detection.labels import compare_frame_labels, compare_lab
 from tools.experiments.detection.report import build_results
 from tools.experiments.detection.retraining_arms import BENIGN, build_retraining_arms
 from tools.experiments.detection.retraining_results import BenignMatches, RetrainingCounts, summarise_retraining
-from tools.experiments.detection.robustness import ANYWHERE, AROUND, FailureCounts, FrameStateCounts
+from tools.experiments.detection.robustness import ANYWHERE, AROUND, KINDS, FailureCounts, FrameStateCounts
 from tools.experiments.detection.stored_results import (
     load_retraining,
     load_study,

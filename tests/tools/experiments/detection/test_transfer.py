@@ -24,7 +24,7 @@ from tools.experiments.detection.report import OWN_PROTOCOL
 from tools.experiments.settings import StudyConfig
 
 WORDS = ["transfer", "--quick", "--limit", "1", "--steps", "1", "--workers", "1", "--bootstrap", "5"]
-ASKED = (
+REQUIRED_KEYS = (
     *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
     *("recall_moved", "reference"),
 )
@@ -48,7 +48,7 @@ def test_rows_and_references(finished: Path) -> None:
     data = json.loads((finished / "study.json").read_text())
     rows = {row["name"]: row for row in data["rows"]}
     assert list(rows) == ["squeezedet -> squeezedet", "squeezedet -> yolov3-slim"]
-    assert all(set(ASKED) <= set(row) for row in rows.values())
+    assert all(set(REQUIRED_KEYS) <= set(row) for row in rows.values())
     own, other = rows.values()
     assert own["reference"] is other["reference"] is None  # the study's attack is not the paper's
     for row in rows.values():
@@ -76,7 +76,7 @@ def test_files(finished: Path) -> None:
     assert (finished / "detections").is_dir()
 
 
-def test_under_the_papers_protocol_its_figures_stand_beside(
+def test_under_the_papers_protocol_its_metrics_stand_next_to(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = Path(shutil.copytree(finished, tmp_path / "transfer"))
@@ -89,7 +89,7 @@ def test_under_the_papers_protocol_its_figures_stand_beside(
     assert "91.28 to 87.50" in text
 
 
-def test_asked_again_nothing_is_attacked_or_looked_at(
+def test_requested_again_nothing_is_attacked_or_evaluated(
     finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The order of the detectors may change, and others may come."""
@@ -104,7 +104,7 @@ def test_asked_again_nothing_is_attacked_or_looked_at(
     assert studied(capsys, "--out", finished, "--detectors", "yolov3-slim") == before
 
 
-def test_what_is_kept_tells_the_same_without_a_run(
+def test_what_is_stored_tells_the_same_without_a_run(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (finished / "study.json").read_bytes()

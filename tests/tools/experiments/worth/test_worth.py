@@ -150,15 +150,15 @@ def test_intervals_hold_what_all_pictures_are_worth() -> None:
     held, below, drawn = 0, 0, 0
     for _ in range(100):
         answer = np.array([rng.choice(classes, p=answers[one]) for one in label])
-        shown = points_from_probabilities(one_hot(answer, classes), label)
-        found = worth_interval(replace(shown, unit=unit), setting)
+        given_frames = points_from_probabilities(one_hot(answer, classes), label)
+        found = worth_interval(replace(given_frames, unit=unit), setting)
         assert found.value is not None
         assert found.low is not None
         assert found.high is not None
         held += found.low <= true <= found.high
         resampled = [
             information_worth(
-                shown.binary,
+                given_frames.binary,
                 label,
                 np.bincount(rng.integers(0, units, units), minlength=units)[unit].astype(np.float64),
             ).value
