@@ -94,7 +94,7 @@ class MinimalObjectChangeAnalyser(FailureAnalyser[MinimalObjectChange]):
 
     command, file, kind = "explain", "least.json", MinimalObjectChange
 
-    def analyse(self, name: str, source: str, folder: Path) -> MinimalObjectChange:
+    def analyse(self, name: str, folder: Path) -> MinimalObjectChange:
         """See `FrameAnalyser.analyse`."""
         objective, theta = self.run.load_objective(self.attacker, name)
         space, problem = objective.space, objective.problem()
@@ -112,7 +112,7 @@ class MinimalObjectChangeAnalyser(FailureAnalyser[MinimalObjectChange]):
         largest = space.max_changes(minimal.theta)
         return MinimalObjectChange(
             identifier=name,
-            source=source,
+            source=self.source_digest(name),
             label=self.run.results[name].label,
             predicted=self.attacker.network.classes[objective.evaluate(minimal.theta).predicted],
             share=round(search.size(minimal.theta) / search.size(theta), 6),

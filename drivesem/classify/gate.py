@@ -48,7 +48,7 @@ class NetworkGateAnalyser(FailureAnalyser[PairedPoseSamples]):
         super().__init__(config, run, out)
         self.new_network = open_network(config.network, self.attacker.network.classes, config.device)
 
-    def analyse(self, name: str, source: str, folder: Path) -> PairedPoseSamples:
+    def analyse(self, name: str, folder: Path) -> PairedPoseSamples:
         """See `FrameAnalyser.analyse`."""
         sampler = PoseSampler(self, name)
         objective = sampler.objective
@@ -61,7 +61,7 @@ class NetworkGateAnalyser(FailureAnalyser[PairedPoseSamples]):
             wrong.append((not objective.classify(picture).correct, not new.correct))
         before, after = zip(*wrong, strict=True)
         label = self.run.results[name].label
-        return PairedPoseSamples(name, source, PairedSamples(None, label, label, before, after))
+        return PairedPoseSamples(name, self.source_digest(name), PairedSamples(None, label, label, before, after))
 
 
 def compare_networks(config: ClassifyConfig) -> AnalysisReport:

@@ -102,7 +102,7 @@ class PoseRegionAnalyser(FailureAnalyser[PoseFailureRegion]):
 
     command, file, kind = "holes", "hole.json", PoseFailureRegion
 
-    def analyse(self, name: str, source: str, folder: Path) -> PoseFailureRegion:
+    def analyse(self, name: str, folder: Path) -> PoseFailureRegion:
         """See `FrameAnalyser.analyse`."""
         sampler, config = PoseSampler(self, name), self.config
         label, bounds = sampler.objective.scene.model.label, sampler.bounds(config.reach)
@@ -117,7 +117,7 @@ class PoseRegionAnalyser(FailureAnalyser[PoseFailureRegion]):
         result, classes = self.run.results[name], self.attacker.network.classes
         return PoseFailureRegion(
             identifier=name,
-            source=source,
+            source=self.source_digest(name),
             label=result.label,
             predicted=classes[Counter(wrong).most_common(1)[0][0]] if wrong else result.attacked.predicted,
             where=_add_view_angles(rule.intervals, result.view),

@@ -16,36 +16,21 @@ from drivesem.classify.objects.types import CLASSES, SPLITS, ObjectModel, Split
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
-_SYNSETS = {
-    "02691156": "airplane",
-    "02828884": "bench",
-    "02747177": "trashcan",
-    "02924116": "bus",
-    "02958343": "car",
-    "03513137": "helmet",
-    "03710193": "mailbox",
-    "03790512": "motorcycle",
-    "04225987": "skateboard",
-    "04460130": "tower",
-    "04468005": "train",
-    "04530566": "boat",
+SHAPENET = {
+    "airplane": ("02691156", (775, 2713, 388)),
+    "bench": ("02828884", (464, 1624, 232)),
+    "trashcan": ("02747177", (119, 417, 60)),
+    "bus": ("02924116", (127, 445, 64)),
+    "car": ("02958343", (1549, 5421, 774)),
+    "helmet": ("03513137", (60, 210, 30)),
+    "mailbox": ("03710193", (15, 53, 8)),
+    "motorcycle": ("03790512", (73, 258, 37)),
+    "skateboard": ("04225987", (49, 171, 24)),
+    "tower": ("04460130", (25, 87, 12)),
+    "train": ("04468005", (99, 344, 49)),
+    "boat": ("04530566", (315, 1100, 157)),
 }
-"""Classes by ShapeNetCore's folder, which is a WordNet number."""
-_PAPER_SIZES = {
-    "airplane": (775, 2713, 388),
-    "bench": (464, 1624, 232),
-    "trashcan": (119, 417, 60),
-    "bus": (127, 445, 64),
-    "car": (1549, 5421, 774),
-    "helmet": (60, 210, 30),
-    "mailbox": (15, 53, 8),
-    "motorcycle": (73, 258, 37),
-    "skateboard": (49, 171, 24),
-    "tower": (25, 87, 12),
-    "train": (99, 344, 49),
-    "boat": (315, 1100, 157),
-}
-"""Objects that the paper tests, trains and validates on, by class."""
+"""ShapeNetCore's folder of each class, and numbers of objects that the paper tests, trains and validates on."""
 _SHARES = (0.7, 0.1)
 """Shares of training and validation if a class has fewer objects than in the paper: the paper's own."""
 _MODELS = ("models/model_normalized.obj", "model.obj")
@@ -78,7 +63,8 @@ class FolderObjects:
         self._root, self._seed, self._max_triangles = Path(folder), seed, max_triangles
         if not self._root.is_dir():
             raise FormatError(str(folder), "a folder of objects", "no such folder")
-        self._synsets = {name: self._root / s for s, name in _SYNSETS.items() if (self._root / s).is_dir()}
+        synsets = {name: self._root / synset for name, (synset, _) in SHAPENET.items()}
+        self._synsets = {name: path for name, path in synsets.items() if path.is_dir()}
         self._paths = self._find_shapenet_objects() if self._synsets else self._find_meshes_by_class()
         if not self._paths:
             expected = f"ShapeNetCore's folders, or folders of {', '.join(_SUFFIXES)} by class"
@@ -163,11 +149,10 @@ class FolderObjects:
     def _draw_splits(self) -> dict[Split, tuple[str, ...]]:
         """Draw splits at random."""
         splits: dict[Split, list[str]] = {split: [] for split in SPLITS}
-        sizes = _PAPER_SIZES if self._synsets else {}
         for kind in self.classes:
             own = sorted(name for name in self._paths if name.partition("/")[0] == kind)
             order = np.random.default_rng([self._seed, crc32(kind.encode())]).permutation(len(own))
-            test, train, val = sizes.get(kind, (1, len(own), 0))
+            test, train, val = SHAPENET[kind][1] if self._synsets else (1, len(own), 0)
             if train + val + test > len(own):
                 train, val = (round(share * len(own)) for share in _SHARES)
                 test = len(own) - train - val

@@ -1,25 +1,24 @@
-"""Other renderers than the own one: the same object at the same place, in nearly the same colours."""
+"""Second renderers show the same object at the same place in nearly the same colours."""
 
 import numpy as np
 import pytest
 import torch
 
-from drivesem.classify.confirm import open_second_renderer
+from drivesem.classify import second_renderer
 from drivesem.classify.objects.embedded import EmbeddedObjects
-from drivesem.classify.redraw import mitsuba
-from drivesem.classify.second_renderer import PosedObject, measure_agreement
 from drivesem.classify.results import RendererAgreement
-from drivesem.classify.scenes import DRAWN_PX, VIEWS, ObjectScene, camera, generate_background
-from drivesem.classify.space import Change
+from drivesem.classify.scenes import DRAWN_PX, VIEWS, ObjectScene, generate_background, picture_camera
+from drivesem.classify.second_renderer import PosedObject, measure_agreement, open_second_renderer
+from drivesem.classify.space import ObjectChange
 from drivesem.failures.second_renderer.base import NoSecondRendererError
-from tests.drivesem.classify.standins import model
+from tests.drivesem.classify.conftest import make_model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)
-CHANGE = Change(
+CHANGE = ObjectChange(
     offsets=None, angles=torch.tensor([0.3, 0.5, -0.2]), light=torch.tensor([-0.3, 0.4, -0.6, 0.2, 0.1])
 )
 MOST_COLOUR = {"mitsuba": 15.0, "pyrender": 8.0}
-"""Mean Delta E of an object: Mitsuba's surfaces shade each other, which neither of the others' do."""
+"""Mean Delta E of an object: Mitsuba's surfaces shade each other, which the other renderers do not compute."""
 
 
 @pytest.fixture(params=MOST_COLOUR)
@@ -32,7 +31,7 @@ def renderer(request):
 
 def both(renderer, scene, change=None):
     with torch.no_grad():
-        own = scene.mesh.render(scene.camera_vertices(change), camera(), scene.lights(change))
+        own = scene.mesh.render(scene.camera_vertices(change), picture_camera(), scene.lights(change))
     return own, renderer.render(PosedObject.from_scene(scene, change))
 
 
@@ -40,7 +39,7 @@ def both(renderer, scene, change=None):
 @pytest.mark.parametrize("kind", ["box", "ball"])
 def test_the_same_place_and_the_same_light(renderer, kind, change):
     """Nothing shades a convex object but itself: all renderers add up the same lamp, sky and gloss."""
-    scene = ObjectScene(kind, model(kind), "left", GREY)
+    scene = ObjectScene(kind, make_model(kind), "left", GREY)
     own, other = both(renderer, scene, change)
     assert other.shape == own.shape
     assert float(other.min()) >= 0
@@ -51,10 +50,12 @@ def test_the_same_place_and_the_same_light(renderer, kind, change):
 
 
 def test_a_lamp_that_moves_lights_the_other_side(renderer):
-    scene = ObjectScene("ball", model("ball"), "forward", GREY)
+    scene = ObjectScene("ball", make_model("ball"), "forward", GREY)
     sides = []
     for x in (-1.0, 1.0):
-        drawn = renderer.render(PosedObject.from_scene(scene, Change(light=torch.tensor([0, 0, 3 * x, 0.8, -0.2]))))
+        drawn = renderer.render(
+            PosedObject.from_scene(scene, ObjectChange(light=torch.tensor([0, 0, 3 * x, 0.8, -0.2])))
+        )
         left, right = (drawn[:3, 256, column].mean() for column in (176, 336))
         sides.append(float(right - left))
     assert sides[0] < -0.05
@@ -75,7 +76,7 @@ def test_two_renderers_agree_on_24_views(renderer):
 
 
 def test_likeness_by_hand():
-    scene = ObjectScene("box", model("box"), "forward", GREY)
+    scene = ObjectScene("box", make_model("box"), "forward", GREY)
     one = torch.zeros(4, DRAWN_PX, DRAWN_PX)
     one[:, 100:300, 100:300] = 1.0
     assert measure_agreement(scene, one, one) == RendererAgreement(1.0, 0.0)
@@ -87,8 +88,8 @@ def test_likeness_by_hand():
     assert black.colour == pytest.approx(100.0, abs=0.1)  # black from white
 
 
-def test_faces_and_normals_look_towards_the_camera():
-    scene = ObjectScene("box", model("box"), "right", GREY)
+def test_faces_and_normals_face_the_camera():
+    scene = ObjectScene("box", make_model("box"), "right", GREY)
     solid = PosedObject.from_scene(scene)
     corners = solid.points.reshape(-1, 3, 3)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -97,12 +98,12 @@ def test_faces_and_normals_look_towards_the_camera():
     assert np.einsum("fk,fck->fc", across, normals).min() > 0
 
 
-def test_what_is_not_installed_is_told(monkeypatch):
+def test_a_missing_renderer(monkeypatch):
     def missing(name):
         raise ImportError(f"No module named {name!r}")
 
-    mitsuba._mitsuba.cache_clear()
-    monkeypatch.setattr(mitsuba.importlib, "import_module", missing)
+    second_renderer._load_mitsuba.cache_clear()
+    monkeypatch.setattr(second_renderer.importlib, "import_module", missing)
     with pytest.raises(NoSecondRendererError, match=r"mitsuba: .*drivesem\[mitsuba\]"):
         open_second_renderer("mitsuba")
-    mitsuba._mitsuba.cache_clear()
+    second_renderer._load_mitsuba.cache_clear()

@@ -1,4 +1,4 @@
-"""What a classifier is attacked for, by hand; and attacks on networks that are known."""
+"""Losses by hand, and attacks on networks with known outcomes."""
 
 import math
 
@@ -9,11 +9,11 @@ from torch import nn
 from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
 from drivesem.attack.methods.gradient_free import Sampling
 from drivesem.attack.methods.scw import SCW
-from drivesem.classify.objective import ClassifierObjective, ClassLogits, ahead, aim
+from drivesem.classify.objective import ClassifierObjective, ClassLogits, class_margin, compute_attack_loss
 from drivesem.classify.scenes import DRAWN_PX, ObjectScene
-from drivesem.classify.space import ParameterAmounts, ObjectSpace, parse_parameters
+from drivesem.classify.space import ObjectSpace, ParameterAmounts, parse_parameters
 from scene_ir.errors import RangeError
-from tests.drivesem.classify.standins import model
+from tests.drivesem.classify.conftest import make_model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.5)
 WIDE = ParameterAmounts(0.5, 3.0, 0.9)
@@ -21,7 +21,7 @@ SCORES = torch.tensor([2.0, 3.0, -1.0])
 
 
 def objective_of(network, aimed="logit", params="pose", kind="box", reach=WIDE):
-    scene = ObjectScene(kind, model(kind), "forward", GREY)
+    scene = ObjectScene(kind, make_model(kind), "forward", GREY)
     space = ObjectSpace(scene.vertices, parse_parameters(params), ParameterAmounts(0.002, 0.15, 0.2), reach)
     return ClassifierObjective(scene, space, network, aimed)
 
@@ -33,21 +33,21 @@ def test_aims_by_hand():
     chances = [math.exp(s) / (math.exp(2) + math.exp(3) + math.exp(-1)) for s in (2, 3, -1)]
     assert float(compute_attack_loss(SCORES, 1, "softmax")) == pytest.approx(chances[0])
     assert float(compute_attack_loss(SCORES, 2, "softmax")) == pytest.approx(chances[1])
-    assert (float(ahead(SCORES, 1)), float(ahead(SCORES, 2))) == (1, -4)
+    assert (float(class_margin(SCORES, 1)), float(class_margin(SCORES, 2))) == (1, -4)
 
 
-def test_what_is_said_of_a_picture():
+def test_prediction_confidence_and_margin():
     seen = ClassLogits(SCORES, 1)
-    assert (seen.predicted, seen.right, seen.margin) == (1, True, 1.0)
+    assert (seen.predicted, seen.correct, seen.margin) == (1, True, 1.0)
     assert seen.confidence == pytest.approx(float(SCORES.softmax(0)[1]))
-    assert not ClassLogits(SCORES, 0).right
+    assert not ClassLogits(SCORES, 0).correct
 
 
 def test_loss_and_gradient(colours):
     objective = objective_of(colours)
     loss, gradient = objective.loss_and_grad(torch.tensor([0.1, 0.2, 0.0]))
     seen = objective.evaluate(torch.tensor([0.1, 0.2, 0.0]))
-    assert loss == pytest.approx(-float(seen.scores[0]), abs=0.02)  # what is judged is rounded to 8 bits
+    assert loss == pytest.approx(-float(seen.logits[0]), abs=0.02)  # what is judged is rounded to 8 bits
     assert gradient.shape == (3,)
     assert objective.passes == 1 + 3 + 1
 
@@ -57,7 +57,7 @@ def test_a_picture_that_is_wrong_from_the_start_is_no_failure(colours):
     object.__setattr__(objective.scene.model, "label", 2)
     objective = ClassifierObjective(objective.scene, objective.space, colours, "logit")
     score = objective.score(torch.zeros(3))
-    assert not objective.benign.right
+    assert not objective.benign.correct
     assert (score.lost, score.phantoms, score.success, score.failures) == (0, 0, False, 0)
 
 
@@ -96,7 +96,7 @@ def test_the_papers_methods_find_a_failure_and_stop_at_it(name, colours):
     objective = objective_of(Narrow(colours, 0.02), aimed, params, reach=ParameterAmounts(0.05, 0.75, 0.9))
     result = method(objective.problem(), objective.space.theta0, seed=0)
     assert result.success_moved
-    assert not objective.evaluate(result.theta).right
+    assert not objective.evaluate(result.theta).correct
     assert result.queries == 5 if name == "halton" else result.queries < 5
     again = method(objective.problem(), objective.space.theta0, seed=0)
     assert torch.equal(again.theta, result.theta)
@@ -116,16 +116,16 @@ class Chosen:
     """A problem in which wrong answers are known by theta: (theta, misclassified, softmax of the wrong class)."""
 
     def __init__(self, outcomes):
-        self.outcomes, self.asked = outcomes, []
+        self.outcomes, self.samples = outcomes, []
 
     def score(self, theta):
         from drivesem.attack.methods.base import Score
 
         if not bool(theta.any()):
             return Score(0.05, 0, 0, False, False)
-        if not any(torch.equal(theta, t) for t in self.asked):
-            self.asked.append(theta.clone())
-        place = next(i for i, t in enumerate(self.asked) if torch.equal(t, theta))
+        if not any(torch.equal(theta, t) for t in self.samples):
+            self.samples.append(theta.clone())
+        place = next(i for i, t in enumerate(self.samples) if torch.equal(t, theta))
         wrong, softmax = self.outcomes[place]
         return Score(softmax, int(wrong), 0, wrong, wrong)
 
@@ -145,7 +145,7 @@ def test_of_five_samples_the_misclassified_one_with_the_highest_wrong_softmax(ki
     objective, known = objective_of(colours, "softmax", reach=ParameterAmounts(0.05, 0.75, 0.5)), Chosen(outcomes)
     problem = replace(objective.problem(), score=known.score)
     result = Sampling(5, kind=kind)(problem, objective.space.theta0, seed=1)
-    assert len(known.asked) == 5
-    assert torch.equal(result.theta, known.asked[winner])
+    assert len(known.samples) == 5
+    assert torch.equal(result.theta, known.samples[winner])
     assert float(result.theta.abs().max()) <= 0.75
-    assert max(float(theta.abs().max()) for theta in known.asked) > 0.3
+    assert max(float(theta.abs().max()) for theta in known.samples) > 0.3

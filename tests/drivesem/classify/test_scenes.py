@@ -1,4 +1,4 @@
-"""Objects before a camera: views, gradients to what moves, backgrounds."""
+"""Views, pictures and their gradients, and backgrounds."""
 
 import numpy as np
 import pytest
@@ -6,28 +6,28 @@ import torch
 
 from drivesem.classify import scenes
 from drivesem.classify.objects.embedded import open_objects
+from drivesem.classify.pictures import interleave_classes
 from drivesem.classify.scenes import (
     DRAWN_PX,
     SEEN_PX,
     VIEWS,
     ObjectScene,
-    camera,
     generate_background,
-    interleave_classes,
     open_backgrounds,
-    rotation,
+    picture_camera,
+    rotation_matrix,
 )
-from drivesem.classify.space import ParameterAmounts, Change, ObjectSpace, parse_parameters
+from drivesem.classify.space import ObjectChange, ObjectSpace, ParameterAmounts, parse_parameters
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.render.lit_mesh import composite_over
-from tests.drivesem.classify.standins import model
+from tests.drivesem.classify.conftest import make_model
 
 GREY = torch.full((3, DRAWN_PX, DRAWN_PX), 0.4)
 
 
 def test_the_front_faces_the_camera_and_up_is_up():
-    scene = ObjectScene("box", model("box"), "forward", GREY)
+    scene = ObjectScene("box", make_model("box"), "forward", GREY)
     placed, rest = scene.camera_vertices(), scene.vertices
     front, top = rest[:, 2] < 0, rest[:, 1] > 0
     assert float(placed[front, 2].max()) < float(placed[~front, 2].min())
@@ -35,8 +35,8 @@ def test_the_front_faces_the_camera_and_up_is_up():
 
 
 def test_views():
-    placed = {view: ObjectScene("box", model("box"), view, GREY).placed() for view in VIEWS}
-    rest = model("box").mesh.vertices
+    placed = {view: ObjectScene("box", make_model("box"), view, GREY).camera_vertices() for view in VIEWS}
+    rest = make_model("box").mesh.vertices
     corner = (rest[:, 1] > 0) & (rest[:, 2] < 0)  # the upper edge of the front
     assert float(placed["top"][corner, 1].mean()) > float(placed["forward"][corner, 1].mean())
     sides = [float(placed[view][rest[:, 2] < 0, 0].mean()) for view in ("left", "forward", "right")]
@@ -46,15 +46,17 @@ def test_views():
 
 
 def test_a_rotation_is_one_and_angles_add_to_the_view():
-    turn = rotation(torch.tensor([0.3, -0.5, 0.2]))
+    turn = rotation_matrix(torch.tensor([0.3, -0.5, 0.2]))
     torch.testing.assert_close(turn @ turn.T, torch.eye(3))
     assert float(torch.linalg.det(turn)) == pytest.approx(1)
-    forward, left = (ObjectScene("box", model("box"), view, GREY) for view in ("forward", "left"))
-    torch.testing.assert_close(forward.placed(Change(angles=torch.tensor([0.0, 0.5, 0.0]))), left.placed())
+    forward, left = (ObjectScene("box", make_model("box"), view, GREY) for view in ("forward", "left"))
+    torch.testing.assert_close(
+        forward.camera_vertices(ObjectChange(angles=torch.tensor([0.0, 0.5, 0.0]))), left.camera_vertices()
+    )
 
 
 def test_a_picture_has_its_background_around_the_object():
-    picture = ObjectScene("ball", model("ball"), "forward", GREY).picture()
+    picture = ObjectScene("ball", make_model("ball"), "forward", GREY).render()
     assert picture.shape == (3, SEEN_PX, SEEN_PX)
     torch.testing.assert_close(picture[:, 0, 0], torch.full((3,), 0.4))
     middle = picture[:, SEEN_PX // 2, SEEN_PX // 2]
@@ -67,7 +69,7 @@ def test_only_what_is_around_an_object_is_drawn_smaller(drawn_px, along, monkeyp
     """As if all of the picture were; the object in the middle, over two borders, or out of it."""
     monkeypatch.setattr(scenes, "DRAWN_PX", drawn_px)
     behind = torch.rand(3, drawn_px, drawn_px, generator=torch.Generator().manual_seed(0))
-    scene, view = ObjectScene("ball", model("ball"), "forward", behind), camera(drawn_px)
+    scene, view = ObjectScene("ball", make_model("ball"), "forward", behind), picture_camera(drawn_px)
     vertices = (scene.camera_vertices() + torch.tensor([*along, 0.0])).requires_grad_(True)
     weight = torch.randn(3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(1))
     drawn = scene.mesh.render(vertices, view, scene.lights())
@@ -94,7 +96,7 @@ def smooth_noise():
 @pytest.mark.parametrize("params", ["pose", pytest.param("vertex", marks=pytest.mark.slow), "lighting"])
 def test_gradients_through_the_picture_and_through_a_score(params, colours):
     """512 px drawn, 224 seen, and what a network makes of it."""
-    scene = ObjectScene("box", model("box"), "left", generate_background("box"))
+    scene = ObjectScene("box", make_model("box"), "left", generate_background("box"))
     space = ObjectSpace(scene.vertices, parse_parameters(params), ParameterAmounts(0.002, 0.15, 0.2))
     weight = smooth_noise()
     step = 1e-2 if params == "lighting" else 2e-3

@@ -10,19 +10,20 @@ from drivesem.classify.networks import loading
 from drivesem.classify.networks.loading import load_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import CLASSES
-from drivesem.classify.scenes import ObjectScene, generate_background, interleave_classes
+from drivesem.classify.pictures import interleave_classes
+from drivesem.classify.scenes import ObjectScene, generate_background
 from scene_ir.errors import FormatError
 
 
 @pytest.mark.slow
 @torch.no_grad()
-def test_held_out_objects_are_told_apart():
+def test_accuracy_on_held_out_objects():
     objects = open_objects(None)
     network = load_classifier("squeezenet", objects.classes)
     right = []
     for i, name in enumerate(interleave_classes(objects.names("test"))[-24:]):
         model, view = objects.load(name), ("left", "right", "top", "forward")[i % 4]
-        picture = ObjectScene(name, model, view, generate_background(f"{name}-{view}")).picture().clamp(0, 1)
+        picture = ObjectScene(name, model, view, generate_background(f"{name}-{view}")).render().clamp(0, 1)
         right.append(int(network(picture[None])[0].argmax()) == model.label)
     assert sum(right) / len(right) >= 0.95
 

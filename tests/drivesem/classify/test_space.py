@@ -1,4 +1,4 @@
-"""theta of an object: its blocks, names and bounds, and what it does."""
+"""theta of an object: blocks, names, bounds, and its effect."""
 
 import math
 
@@ -7,7 +7,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.classify.space import WIDEST_BOUNDS, ParameterAmounts, ClassifyParameter, ObjectSpace, parse_parameters
+from drivesem.classify.space import (
+    WIDEST_BOUNDS,
+    ClassifyParameter,
+    ObjectSpace,
+    ParameterAmounts,
+    parse_parameters,
+)
 from scene_ir.errors import FormatError, RangeError, ShapeError
 
 TRIANGLE = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
@@ -15,7 +21,9 @@ STEPS = ParameterAmounts(0.002, 0.15, 0.2)
 
 
 def test_blocks_names_bounds_and_steps():
-    space = ObjectSpace(TRIANGLE, parse_parameters("lighting,pose,vertex"), STEPS, ParameterAmounts(0.05, 1.0, math.inf))
+    space = ObjectSpace(
+        TRIANGLE, parse_parameters("lighting,pose,vertex"), STEPS, ParameterAmounts(0.05, 1.0, math.inf)
+    )
     assert list(space.blocks) == [ClassifyParameter.VERTEX, ClassifyParameter.POSE, ClassifyParameter.LIGHTING]
     assert space.dim == 9 + 3 + 5
     assert space.describe(4) == "vertices[1].y, object sizes, [-0.05, 0.05]"
@@ -31,7 +39,7 @@ def test_blocks_names_bounds_and_steps():
     )
 
 
-def test_what_theta_does():
+def test_the_change_of_theta():
     space = ObjectSpace(TRIANGLE, parse_parameters("vertex,pose"), STEPS)
     theta = torch.arange(12.0)
     change = space.change(theta)
@@ -59,7 +67,7 @@ def test_vertices_at_one_place_move_as_one():
 
 def test_smooth_changes_move_neighbours_alike():
     line = torch.stack([torch.linspace(-0.5, 0.5, 50)] * 3, dim=1)
-    space = ObjectSpace(line, parse_parameters("vertex"), STEPS, shape="smooth")
+    space = ObjectSpace(line, parse_parameters("vertex"), STEPS, motion="smooth")
     assert space.dim == 192
     assert space.name(0) == "lattice[0,0,0].x"
     offsets = space.change(torch.ones(192)).offsets
@@ -90,7 +98,7 @@ def test_projection_keeps_to_the_bounds_and_is_idempotent(values):
         ("yaw", "names among vertex, pose, lighting, found 'yaw'"),
     ],
 )
-def test_what_are_no_parameters(text, message):
+def test_invalid_parameters(text, message):
     with pytest.raises(FormatError, match=message):
         parse_parameters(text)
 

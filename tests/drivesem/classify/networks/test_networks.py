@@ -12,17 +12,17 @@ from safetensors.torch import save_file
 from torch import nn
 
 from detectors.base import DetectorError
-from drivesem.classify.networks import libraries as libraries_module
+from drivesem.classify.networks import architectures
+from drivesem.classify.networks.architectures import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
 from drivesem.classify.networks.loading import (
     ARCHITECTURES,
     load_classifier,
+    load_for_training,
     prepare_for_inference,
     save_classifier,
-    load_for_training,
 )
 from drivesem.classify.networks.onnx import OnnxClassifier
-from drivesem.classify.networks.architectures import VGG16, PooledVGG16, ResNet50, SqueezeNet
 from scene_ir.errors import FormatError, RangeError
 from tools.onnx_graph import constant_graph
 
@@ -99,7 +99,9 @@ def test_torchvisions_names_of_resnet50(tmp_path):
     file = {name: torch.zeros(shape) for name, shape in resnet_names().items()}
     file = {name: t + ("running_var" in name) for name, t in file.items()}
     torch.save(file | {name: torch.tensor(0) for name in counted}, tmp_path / "resnet50.pth")
-    network = prepare_for_inference(load_for_training("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded()))
+    network = prepare_for_inference(
+        load_for_training("resnet50", str(tmp_path / "resnet50.pth"), CLASSES, seeded())
+    )
     assert network.classes == CLASSES
     assert torch.equal(network(torch.rand(1, 3, 64, 64)), torch.zeros(1, 3))
 
@@ -116,14 +118,16 @@ def test_a_block_of_resnet50_by_hand():
     inner = F.relu(norm(F.conv2d(x, block.conv1.weight), block.bn1))
     inner = F.relu(norm(F.conv2d(inner, block.conv2.weight, stride=2, padding=1), block.bn2))
     inner = norm(F.conv2d(inner, block.conv3.weight), block.bn3)
-    beside = norm(F.conv2d(x, block.downsample[0].weight, stride=2), block.downsample[1])
+    shortcut = norm(F.conv2d(x, block.downsample[0].weight, stride=2), block.downsample[1])
     with torch.no_grad():
-        torch.testing.assert_close(block(x), F.relu(inner + beside), rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(block(x), F.relu(inner + shortcut), rtol=1e-3, atol=1e-4)
 
 
 def test_vggs_convolutions_alone(tmp_path):
     save_file(vgg_file(small=True), tmp_path / "vgg.safetensors")
-    network = prepare_for_inference(load_for_training("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded()))
+    network = prepare_for_inference(
+        load_for_training("vgg16-pooled", str(tmp_path / "vgg.safetensors"), CLASSES, seeded())
+    )
     assert isinstance(network, PooledVGG16)
     assert network.embed(torch.rand(2, 3, 64, 64)).shape == (2, 1024)
 
@@ -245,9 +249,9 @@ def test_a_file_for_something_else(tmp_path, metadata, message):
         load_classifier(str(tmp_path / "other.safetensors"), CLASSES)
 
 
-@pytest.mark.parametrize("told", [["squeezenet"], {"classes": 5}, "squeezenet"])
-def test_a_file_that_says_nothing_readable_of_itself(tmp_path, told):
-    header = json.dumps({"__metadata__": told}).encode()
+@pytest.mark.parametrize("metadata", [["squeezenet"], {"classes": 5}, "squeezenet"])
+def test_unreadable_metadata(tmp_path, metadata):
+    header = json.dumps({"__metadata__": metadata}).encode()
     path = tmp_path / "other.safetensors"
     path.write_bytes(len(header).to_bytes(8, "little") + header)
     with pytest.raises(FormatError, match=r"other.safetensors: __metadata__: expected texts by name"):
@@ -260,9 +264,11 @@ def test_parameters_of_the_published_networks():
     assert counts == {VGG16: 138_357_544, ResNet50: 25_557_032}
 
 
-def test_a_network_begins_anew_without_a_file():
+def test_random_weights_without_a_file():
     one, again, other = (
-        load_for_training("vgg16-pooled", None, ("cat", "dog"), torch.Generator().manual_seed(seed), anew=True)
+        load_for_training(
+            "vgg16-pooled", None, ("cat", "dog"), torch.Generator().manual_seed(seed), random_weights=True
+        )
         for seed in (0, 0, 1)
     )
     name = "features.0.weight"
@@ -286,19 +292,19 @@ class Body(nn.Module):
 
 @pytest.fixture
 def libraries(monkeypatch):
-    """timm and torchvision, as far as they are asked."""
-    asked = []
+    """timm and torchvision, reduced to what is called."""
+    calls = []
 
     def create(name, **options):
         if name != "tiny":
             raise RuntimeError(f"Unknown model ({name})")
-        asked.append(options)
+        calls.append(options)
         torch.manual_seed(0)
         return Body()
 
     found = {"timm": SimpleNamespace(create_model=create), "torchvision.models": SimpleNamespace(get_model=create)}
-    monkeypatch.setattr(libraries_module.importlib, "import_module", lambda name: found[name])
-    return asked
+    monkeypatch.setattr(architectures.importlib, "import_module", lambda name: found[name])
+    return calls
 
 
 @pytest.mark.parametrize("library", ["timm", "torchvision"])
@@ -326,13 +332,13 @@ def test_weights_by_a_librarys_names(libraries, tmp_path):
 def test_libraries_that_are_not_there_and_names_they_do_not_know(libraries, monkeypatch):
     with pytest.raises(FormatError, match="--network: expected a network of timm, found timm:huge: RuntimeError"):
         load_for_training("timm:huge", None, CLASSES, seeded())
-    with pytest.raises(FormatError, match="found timm:tiny, which tells ImageNet's classes apart: train it"):
+    with pytest.raises(FormatError, match="found timm:tiny, which has ImageNet's classes: train it"):
         load_classifier("timm:tiny", CLASSES)
 
     def missing(name):
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr(libraries_module.importlib, "import_module", missing)
+    monkeypatch.setattr(architectures.importlib, "import_module", missing)
     with pytest.raises(FormatError, match="--network: expected timm installed, for timm:tiny, found No module"):
         load_for_training("timm:tiny", None, CLASSES, seeded())
 
@@ -350,7 +356,7 @@ def test_an_onnx_file(tmp_path):
     assert OnnxClassifier(path, CLASSES)(torch.rand(1, 3, 16, 16)).tolist() == [[3.0, 2.0, 1.0]]
 
 
-def test_scores_that_are_no_numbers_are_told(tmp_path):
+def test_scores_that_are_not_finite(tmp_path):
     path = tmp_path / "net.onnx"
     path.write_bytes(constant_graph((1, 3, 8, 8), {"scores": np.full((1, 3), np.nan)}))
     with pytest.raises(RangeError, match="scores: expected finite numbers"):

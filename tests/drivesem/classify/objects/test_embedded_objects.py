@@ -68,20 +68,21 @@ def measured(model: ObjectModel) -> list[float]:
     vertices, faces = model.mesh.vertices.double(), model.mesh.faces
     order = float(vertices[:, 1] @ torch.linspace(0, 1, len(vertices), dtype=torch.float64))
     winding = float((faces @ torch.tensor([1, 2, 3])).double() @ torch.linspace(0, 1, len(faces)).double())
-    looks = [float(values.double().mean()) for values in (model.diffuse, model.specular, model.shininess)]
-    return [len(vertices), len(faces), *vertices.abs().mean(0).tolist(), order, winding, *looks]
+    materials = [float(values.double().mean()) for values in (model.diffuse, model.specular, model.shininess)]
+    return [len(vertices), len(faces), *vertices.abs().mean(0).tolist(), order, winding, *materials]
 
 
 def test_objects_are_those_that_were_published() -> None:
-    """An object of each kind, as the table beside this file has it: networks were trained on these, and figures
-    are told of them. `measured` of each name gives its row. Sines differ in the last bit between kinds of
-    processors, by which two vertices in order of rounded places may change theirs.
+    """One object of each kind equals its row of embedded.csv: networks were trained on these objects.
+
+    `measured` gives a row. Sines differ in the last bit between processors, which may swap two vertices that are
+    ordered by rounded coordinates.
     """
     rows = (Path(__file__).parent / "embedded.csv").read_text().splitlines()
     assert len(rows) == sum(len(kinds) for kinds in KINDS.values())
     for row in rows:
-        name, *figures = row.split(",")
-        expected = pytest.approx([float(figure) for figure in figures], rel=1e-5)
+        name, *numbers = row.split(",")
+        expected = pytest.approx([float(number) for number in numbers], rel=1e-5)
         assert measured(OBJECTS.load(name)) == expected, name
 
 

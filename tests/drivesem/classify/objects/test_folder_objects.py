@@ -11,9 +11,8 @@ import trimesh
 from PIL import Image
 
 from drivesem.classify.objects.embedded import open_objects
-from drivesem.classify.objects.folders import FolderObjects
+from drivesem.classify.objects.folders import SHAPENET, FolderObjects
 from drivesem.classify.objects.types import CLASSES
-from tools.experiments.classification.paper import figures
 from scene_ir.errors import FormatError, RangeError
 
 BUS, CAR = "02924116", "02958343"
@@ -71,7 +70,7 @@ def test_an_object_with_its_materials(tmp_path: Path) -> None:
         ("Kd a b c\nKs 1 1\n", 0.5, 0.1, 10.0),
     ],
 )
-def test_materials_that_say_little_or_nonsense(
+def test_missing_and_invalid_materials(
     tmp_path: Path, lines: str, diffuse: float, specular: float, shininess: float
 ) -> None:
     shapenet(tmp_path, BUS, "abc", mtl=f"newmtl red\n{lines}newmtl blue\n{lines}")
@@ -81,7 +80,7 @@ def test_materials_that_say_little_or_nonsense(
     assert model.shininess.unique().tolist() == [shininess]
 
 
-def test_a_texture_beside_the_models_is_averaged(tmp_path: Path) -> None:
+def test_a_texture_in_another_folder_is_averaged(tmp_path: Path) -> None:
     text = "mtllib model_normalized.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0.1 0.1\nvt 0.4 0.1\nvt 0.1 0.4\n"
     text += "usemtl red\nf 1/1 3/2 2/3\nf 1/1 2/2 4/3\nf 1/1 4/2 3/3\nf 2/1 3/2 4/3\n"
     shapenet(tmp_path, BUS, "abc", text, "newmtl red\nKd 1 1 1\nmap_Kd ../images/texture0.png\n")
@@ -134,7 +133,7 @@ def test_a_file_that_is_no_object(tmp_path: Path, what: str) -> None:
     assert "\n" not in message
 
 
-def test_missing_and_odd_files_are_told(tmp_path: Path) -> None:
+def test_missing_and_odd_files(tmp_path: Path) -> None:
     folder = shapenet(tmp_path, CAR, "abc")
     (folder / "model_normalized.obj").unlink()
     with pytest.raises(FormatError, match=r"model_normalized\.obj: expected a mesh file, found no such file"):
@@ -165,7 +164,7 @@ def test_a_folder_without_objects(tmp_path: Path, content: str | None) -> None:
 
 
 @pytest.mark.parametrize("listed", ["bus/a", f"{BUS}/a", "a"])
-def test_lists_beside_the_objects(tmp_path: Path, listed: str) -> None:
+def test_lists_of_splits(tmp_path: Path, listed: str) -> None:
     for code in "abc":
         shapenet(tmp_path, BUS, code)
     (tmp_path / "splits.json").write_text(json.dumps({"train": [listed], "test": ["b"]}))
@@ -188,11 +187,11 @@ def test_names_with_blanks_have_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (("cat/one", "cat/two"), "expected objects of two classes at least, found of cat alone"),
+        (("cat/one", "cat/two"), "expected objects of at least two classes, found only cat"),
         (("fire/truck-3", "fire-truck/3"), "names that differ with - for /, found fire-truck-3 twice"),
     ],
 )
-def test_folders_that_cannot_be_told_apart(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
+def test_folders_without_distinct_names_or_classes(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         CUBE.export(tmp_path / f"{name}.ply")
@@ -232,8 +231,8 @@ def test_the_papers_sizes_where_there_are_enough(tmp_path: Path) -> None:
     for code in range(80):
         (tmp_path / "03710193" / f"{code:03d}").mkdir(parents=True)
     objects = FolderObjects(tmp_path)
-    sizes = figures()["sizes"]
-    assert [len(objects.names(split)) for split in ("test", "train", "val")] == sizes["mailbox"] == [15, 53, 8]
+    sizes = {name: numbers for name, (_, numbers) in SHAPENET.items()}
+    assert [len(objects.names(split)) for split in ("test", "train", "val")] == [15, 53, 8]
     assert np.array(list(sizes.values())).sum(axis=0).tolist() == [3670, 12843, 1835]
     assert tuple(sizes) == CLASSES
 
@@ -254,7 +253,7 @@ def test_meshes_by_class(tmp_path: Path) -> None:
     with pytest.raises(RangeError, match="max_triangles: expected at least 4"):
         FolderObjects(tmp_path, max_triangles=3)
     CUBE.export(tmp_path / "cat" / "one.obj")
-    with pytest.raises(FormatError, match=r"expected one mesh of a name, found one\.obj too"):
+    with pytest.raises(FormatError, match=r"expected one mesh per name, found also one\.obj"):
         open_objects(str(tmp_path))
 
 

@@ -185,7 +185,7 @@ def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
     }
     for words, message in cases.items():
         code, _, output = study(capsys, "--out", str(tmp_path / "out"), *words)
-        lines = [line for line in output.splitlines() if line.startswith("drivesem: ")]
+        lines = [line for line in output.splitlines() if line.startswith("python -m tools.experiments: ")]
         assert (code, len(lines)) == (2, 1), words
         assert message in lines[0]
 
@@ -211,7 +211,7 @@ def test_training_on_begins_where_the_network_is():
         before = network.last(features)
     known, truth = dict.fromkeys(("train", "val"), features), dict.fromkeys(("train", "val"), labels)
     config = ClassifyConfig(what="train", epochs=1, rate=1e-9)
-    train_last_layer(network, known, truth, config, generator, onward=True)
+    train_last_layer(network, known, truth, config, generator, continued=True)
     assert torch.allclose(network.last(features), before, atol=1e-4)
     train_last_layer(network, known, truth, config, generator)
     assert not torch.allclose(network.last(features), before, atol=1e-2)
