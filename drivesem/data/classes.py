@@ -1,4 +1,4 @@
-"""Which of a data set's types are which of the detectors' classes, and what nothing is judged on."""
+"""Mapping from the object types of data sets to the detectors' classes, and which types are ignored."""
 
 from __future__ import annotations
 
@@ -14,14 +14,12 @@ from scene_ir.types import Category, Labels
 
 @dataclass(frozen=True, slots=True)
 class ClassMap:
-    """How a data set's types are read.
-
-    classes: type -> one of `detectors.types.CLASSES`. ignored: type -> the class it is ignored for, or None for
-    every class: such objects are neither missed nor a hit.
-    """
+    """How the object types of a data set map to the detectors' classes."""
 
     classes: Mapping[str, str]
+    """Maps a type to one of `detectors.types.CLASSES`."""
     ignored: Mapping[str, str | None] = field(default_factory=dict)
+    """Maps a type to the class for which it is ignored, neither a miss nor a hit; None: for every class."""
 
     def __post_init__(self) -> None:
         for kind, name in (*self.classes.items(), *self.ignored.items()):
@@ -32,25 +30,25 @@ class ClassMap:
             raise RangeError(f"class map: {both[0]}", "a class or to be ignored", "both")
 
     def category(self, kind: str) -> Category | None:
-        """The class that a type counts as; None where it is ignored. FormatError for a type in neither table."""
+        """Return the class of a type; None if it is ignored. Raises FormatError for a type in neither table."""
         if kind in self.classes:
             return Category(CLASSES.index(self.classes[kind]))
         if kind in self.ignored:
             return None
         raise FormatError("type", f"one of {', '.join((*self.classes, *self.ignored))}", kind)
 
-    def known(self, labels: Labels) -> Labels:
-        """The labels without objects of types in neither table: they are background."""
+    def drop_unknown(self, labels: Labels) -> Labels:
+        """Return the labels without objects of types in neither table, which are background."""
         rows = [i for i, kind in enumerate(labels.kind) if kind in self.classes or kind in self.ignored]
         if len(rows) == len(labels.kind):
             return labels
-        return labels.rows(rows)
+        return labels.select(rows)
 
     def targets(self, labels: Labels) -> Targets:
-        """What a detector is trained on and judged by.
+        """Return the targets for training and evaluation: objects in file order, then DontCare regions.
 
-        Objects in file order, then the DontCare regions. What is ignored for every class carries the label 0: an
-        ignored target's label says nothing. An object whose box has no area is ignored: nothing can meet it.
+        Targets that are ignored for every class have the label 0. Objects with boxes without area are ignored, since
+        no detection can match them.
         """
         categories = [self.category(kind) for kind in labels.kind]
         named = [self.ignored.get(kind) for kind in labels.kind]
@@ -72,30 +70,29 @@ KITTI = ClassMap(
     classes={"Car": "Car", "Van": "Car", "Truck": "Truck", "Pedestrian": "Pedestrian", "Cyclist": "Cyclist"},
     ignored={"Person_sitting": "Pedestrian", "Tram": None, "Misc": None},
 )
-"""KITTI's types. Vans count as cars and sitting people are ignored; trams and the miscellaneous look like nothing
-the detectors know."""
+"""KITTI's types. Vans count as cars; sitting people, trams and miscellaneous objects are ignored."""
 
 COCO_ROAD_USERS = ClassMap(
     classes={"car": "Car", "truck": "Truck", "person": "Pedestrian"},
     ignored={"bus": None, "train": None, "bicycle": "Cyclist", "motorcycle": "Cyclist"},
 )
-"""The classes of COCO 2017 that are on the road. A KITTI cyclist includes the bicycle, so that a bicycle alone is
-neither; buses and trains look like nothing the detectors know."""
+"""Road users among the classes of COCO 2017. Buses and trains are ignored, and so are bicycles: a KITTI cyclist
+includes the rider."""
 ROAD_USERS = ClassMap(
     classes={**KITTI.classes, **COCO_ROAD_USERS.classes}, ignored={**KITTI.ignored, **COCO_ROAD_USERS.ignored}
 )
-"""KITTI's types and COCO's classes: they differ in letter case at least."""
+"""KITTI's types and COCO's classes, which differ at least in letter case."""
 
 VEHICLES: Mapping[str, Category] = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
-"""Types that are de-rendered into objects that can be moved."""
+"""Types that are de-rendered into movable objects."""
 
 
-def as_kitti(labels: Labels) -> Labels:
-    """The labels with COCO's classes by the names of KITTI's types; those that are ignored keep their own."""
+def to_kitti_kinds(labels: Labels) -> Labels:
+    """Rename COCO's classes to KITTI's types; ignored classes keep their names."""
     names = COCO_ROAD_USERS.classes
     return replace(labels, kind=tuple(names.get(kind, kind) for kind in labels.kind))
 
 
-def vehicle_count(labels: Labels | None) -> int:
-    """How many objects of a frame can be moved."""
-    return 0 if labels is None else sum(kind in VEHICLES for kind in as_kitti(labels).kind)
+def count_vehicles(labels: Labels | None) -> int:
+    """Count the movable objects of a frame."""
+    return 0 if labels is None else sum(kind in VEHICLES for kind in to_kitti_kinds(labels).kind)

@@ -1,13 +1,13 @@
-"""KITTI's object folders: `training/{image_2,label_2,calib,velodyne}/000000.*`, read and written.
+"""KITTI's object folders, `training/{image_2,label_2,calib,velodyne}/000000.*`: reader and writer.
 
-Two folders more, in the words of KITTI's other benchmarks, hold ground truth that the object benchmark has not:
+Two more folders, as in KITTI's other benchmarks, hold ground truth that the object benchmark lacks:
 `depth_2` (uint16 PNG, 256 times the depth in metres, 0: none; Uhrig et al. 2017) and `instance_2` (uint16 PNG, 256
 times the semantic id plus the instance's number, Cityscapes' ids; Abu Alhaija et al. 2018). The instance's number
-is here the object's line in `label_2`, from 1; objects without a line have higher numbers; 0 is no instance.
+is the object's line in `label_2`, from 1; objects without a line have higher numbers; 0 means no instance.
 
 Labels follow the object development kit (Geiger et al. 2012): `type truncated occluded alpha left top right bottom
-h w l x y z ry`, results have the score as a 16th field. A label table takes any type and any finite number; a
-scene needs more, which `read_labels` says. Errors name the file, the line or key, and the field.
+h w l x y z ry`, results have the score as a 16th field. A label table accepts any type and any finite number;
+a scene requires more, see `read_labels`. Errors name the file, the line or key, and the field.
 """
 
 from __future__ import annotations
@@ -21,77 +21,90 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.data.frames import (
-    PNG_COMPRESSION,
-    Frames,
-    as_photograph,
-    check_size,
-    images_by_place,
-    images_of,
-    in_front,
+from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
+from drivesem.data.kitti_labels import (
+    TYPES,
+    UNKNOWN_POSE,
+    UNKNOWN_POSITION,
+    UNKNOWN_SIZE,
+    KittiLabelLines,
+    finite_number,
 )
-from drivesem.data.kitti_labels import TYPES, UNKNOWN_POSE, UNKNOWN_POSITION, UNKNOWN_SIZE, Lines, finite_number
 from drivesem.data.label_table import (
     REGION,
     UNKNOWN_OCCLUSION,
     LabelTable,
-    Written,
+    WriteSummary,
     copy_images,
-    known_pose,
-    matrix_of,
-    number_text,
-    positional,
+    format_number,
+    format_shortest,
+    is_known_pose,
+    parse_camera_entry,
 )
-from drivesem.data.truth import SKY_CM, Exposure, Place
+from drivesem.data.photographs import (
+    PNG_COMPRESSION,
+    FrameIndex,
+    check_image_size,
+    is_in_front,
+    list_images,
+    match_images_below,
+)
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
+from scene_ir.io import to_tensor
 from scene_ir.types import FOCAL_PX, Camera, Frame, Labels
 
 DEPTH_SCALE = 256
-"""Values a metre in `depth_2`."""
-_MOST_LINES = 10_000
-"""Of one frame: KITTI's have at most some 30."""
+"""Values per metre in `depth_2`."""
+_MAX_LINES = 10_000
+"""Limit of one frame; KITTI's have at most about 30."""
 INSTANCES = 256
-"""Values a semantic id in `instance_2`: the lower byte is the instance."""
+"""Values per semantic id in `instance_2`; the lower byte is the instance."""
 SEMANTIC_NAMES = (
     *("Undefined", "EgoVehicle", "Border", "OutOfRoi", "Misc", "Dynamic", "Ground", "Road", "Sidewalk", "Parking"),
     *("RailTrack", "Building", "Wall", "Fence", "GuardRail", "Bridge", "Tunnel", "Pole", "PoleGroup"),
     *("TrafficLight", "TrafficSign", "Vegetation", "Terrain", "Sky", "Pedestrian", "Rider", "Car", "Truck", "Bus"),
     *("Caravan", "Trailer", "Train", "Motorcycle", "Bicycle"),
 )
-"""Cityscapes' classes in the order of their ids, which KITTI's semantic benchmark uses, in Virtual KITTI's words
-where it has them (github.com/mcordts/cityscapesScripts, helpers/labels.py; "Undefined" is "unlabeled", "Misc"
+"""Cityscapes' classes in the order of their ids, as in KITTI's semantic benchmark, by Virtual KITTI's names where
+it has them (github.com/mcordts/cityscapesScripts, helpers/labels.py; "Undefined" is "unlabeled", "Misc"
 "static", "Vegetation" includes trees, "Pedestrian" is "person")."""
-_MERGED = {"tree": "vegetation", "van": "car", "cyclist": "rider", "tram": "train", "personsitting": "pedestrian"}
-"""What Cityscapes has no id for, and what it is there."""
+_CITYSCAPES_NAMES = {
+    "tree": "vegetation",
+    "van": "car",
+    "cyclist": "rider",
+    "tram": "train",
+    "personsitting": "pedestrian",
+}
+"""Cityscapes' names of classes without an id of their own."""
 
 
 def read_labels(path: Path, scored: bool = False) -> Labels:
-    """The labels of one frame, or a detector's results where `scored`. An empty file is a frame without objects.
+    """Read the labels of one frame, or a detector's results if `scored`. An empty file has no objects.
 
-    A 3D box that the file marks as unknown (sizes -1, position -1000) is NaN in translation, yaw and size_lhw; in
-    results truncation and occlusion may be unknown too. Raises FormatError naming file, line and field: wrong
-    field count, a value that is no finite number or out of its range, an unknown type, a box that ends before it
-    begins, a 3D box wholly behind the camera.
+    A 3D box that is marked as unknown (sizes -1, position -1000) is NaN in translation, yaw and size_lhw; in results
+    truncation and occlusion may be unknown too. Raises FormatError naming file, line and field: a wrong number of
+    fields, a value that is not finite or out of range, an unknown type, a box that ends before it begins, a 3D box
+    wholly behind the camera.
     """
-    return _scene_labels(str(path), files.read_text(path), scored)
+    return _parse_labels(str(path), files.read_text(path), scored)
 
 
-def _scene_labels(name: str, text: str, scored: bool) -> Labels:
-    if text.count("\n") > _MOST_LINES:
-        raise FormatError(name, f"at most {_MOST_LINES:,} lines", f"{text.count(chr(10)):,}")
-    lines = Lines([name], [text], scored)
+def _parse_labels(name: str, text: str, scored: bool) -> Labels:
+    if text.count("\n") > _MAX_LINES:
+        raise FormatError(name, f"at most {_MAX_LINES:,} lines", f"{text.count(chr(10)):,}")
+    lines = KittiLabelLines([name], [text], scored)
     check_scene(lines, scored)
-    return lines.table([name], scored).labels()
+    return lines.to_table([name], scored).to_labels()
 
 
-def check_scene(lines: Lines, scored: bool = False) -> None:
-    """FormatError for what a scene cannot use: see `read_labels`."""
+def check_scene(lines: KittiLabelLines, scored: bool = False) -> None:
+    """Raise FormatError for lines that a scene cannot use; see `read_labels`."""
     for row, (kind, values) in enumerate(zip(lines.kinds, lines.values.tolist(), strict=True)):
 
         def require(good: bool, field: str, expected: str, found: str, row: int = row) -> None:
             if not good:
-                raise FormatError(lines.where(row, field), expected, found)
+                raise FormatError(lines.locate(row, field), expected, found)
 
         require(kind in TYPES, "type", f"one of {', '.join(TYPES)}", repr(kind))
         if kind == "DontCare":
@@ -107,10 +120,10 @@ def check_scene(lines: Lines, scored: bool = False) -> None:
             require(size > 0, name, "positive metres", f"{size:g}")
         require(abs(yaw) <= 2 * math.pi + 0.01, "rotation_y", "rad in [-2 pi, 2 pi]", f"{yaw:g}")
         behind = f"{z:g} m, wholly behind it"
-        require(in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
+        require(is_in_front(z, l, w, yaw), "z", "a 3D box in front of the camera", behind)
 
 
-def _line(
+def _format_line(
     kind: str,
     truncation: float,
     occlusion: int,
@@ -119,33 +132,32 @@ def _line(
     pose: Sequence[float] | None,
     score: str | None,
 ) -> str:
-    """A line of a label file. pose: length, height, width, x, y, z, yaw; what is not known is NaN or None."""
-    fields = [kind, number_text(truncation) if truncation >= 0 else "-1", str(occlusion)]
-    fields += ["-10" if math.isnan(alpha) else number_text(alpha), *map(number_text, box)]
+    """Format a line of a label file. `pose` is length, height, width, x, y, z, yaw; unknown values are NaN or None."""
+    fields = [kind, format_number(truncation) if truncation >= 0 else "-1", str(occlusion)]
+    fields += ["-10" if math.isnan(alpha) else format_number(alpha), *map(format_number, box)]
     if pose is None:
         fields += UNKNOWN_POSE
     else:
         length, height, width, *rest = pose
-        fields += map(number_text, (height, width, length, *rest))
+        fields += map(format_number, (height, width, length, *rest))
     return " ".join(fields if score is None else [*fields, score])
 
 
-def _rounded(values: Sequence[float]) -> list[float]:
+def _round(values: Sequence[float]) -> list[float]:
     return [round(v, 3) for v in values]
 
 
-def _angle(value: float) -> float:
-    """An angle in [-pi, pi] as KITTI's angles are, to 0.001, also after rounding."""
+def _wrap_angle(value: float) -> float:
+    """Wrap an angle to [-pi, pi], rounded to 0.001."""
     turned = round(math.remainder(value, 2 * math.pi), 3)
     return math.copysign(min(abs(turned), 3.141), turned)
 
 
 def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
-    """KITTI's lines for labels, or for results where scores (M,) are given.
+    """Format labels, or results if scores (M,) are given.
 
-    Values are written to 0.001 (scores to 1e-6); alpha follows from yaw and translation. Unknown (NaN) 3D boxes
-    become -1 and -1000. Angles are wrapped to [-pi, pi]. Raises FormatError for what `read_labels` would not read
-    back.
+    Values are rounded to 0.001 (scores to 1e-6); alpha follows from yaw and translation. Unknown (NaN) 3D boxes
+    become -1 and -1000. Angles are wrapped to [-pi, pi]. Raises FormatError if `read_labels` would refuse the text.
     """
     if scores is not None and tuple(scores.shape) != (len(labels.kind),):
         raise ShapeError("scores", f"shape {(len(labels.kind),)}", tuple(scores.shape))
@@ -154,55 +166,74 @@ def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
         x, y, z = labels.translation[i].tolist()
         yaw = float(labels.yaw[i])
         pose, alpha = None, math.nan
-        if known_pose((*labels.size_lhw[i].tolist(), x, y, z, yaw)):
-            pose = [*_rounded([*labels.size_lhw[i].tolist(), x, y, z]), _angle(yaw)]
-            alpha = _angle(yaw - math.atan2(x, z))
-        truncation, box = round(float(labels.truncation[i]), 3), _rounded(labels.boxes_xyxy[i].tolist())
+        if is_known_pose((*labels.size_lhw[i].tolist(), x, y, z, yaw)):
+            pose = [*_round([*labels.size_lhw[i].tolist(), x, y, z]), _wrap_angle(yaw)]
+            alpha = _wrap_angle(yaw - math.atan2(x, z))
+        truncation, box = round(float(labels.truncation[i]), 3), _round(labels.boxes_xyxy[i].tolist())
         score = None if scores is None else f"{float(scores[i]):.6f}"
-        text.append(_line(kind, truncation, int(labels.occlusion[i]), alpha, box, pose, score))
+        text.append(_format_line(kind, truncation, int(labels.occlusion[i]), alpha, box, pose, score))
     if scores is None:
         regions = labels.ignore_xyxy.tolist()
-        text += [_line("DontCare", -1, -1, math.nan, _rounded(box), None, None) for box in regions]
+        text += [_format_line("DontCare", -1, -1, math.nan, _round(box), None, None) for box in regions]
     whole = "".join(f"{line}\n" for line in text)
-    _scene_labels("labels", whole, scores is not None)
+    _parse_labels("labels", whole, scores is not None)
     return whole
 
 
 def write_labels(path: Path, labels: Labels, scores: Tensor | None = None) -> None:
-    """Write labels, or results where scores (M,) are given, atomically: see `format_labels`."""
+    """Write labels or results atomically; see `format_labels`.
+
+    Args:
+        path: Label file.
+        labels: Labels of one frame.
+        scores: Scores (M,) of results.
+
+    Raises:
+        FormatError: `read_labels` would refuse the text.
+    """
     files.write_text(path, format_labels(labels, scores))
 
 
-def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Written:
-    """Write label files right into `out`, or a whole `training` folder where there are images or calibrations.
-    Numbers are written so that they read back as they were.
+def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> WriteSummary:
+    """Write a table as label files; numbers read back unchanged.
+
+    Args:
+        table: Labels or detections.
+        out: Folder of the label files; with images or cameras, it gets a `training` folder with all of them.
+        images: Images to copy, by frame identifier.
+
+    Returns:
+        Counts of files, lost and assumed values.
+
+    Raises:
+        FormatError: A class is not one of KITTI's types.
     """
-    table = table.in_edges("xyxy")
-    kinds = [_type_of(kind, int((table.kind == i).sum())) for i, kind in enumerate(table.kinds)]
+    table = table.with_box_format("xyxy")
+    kinds = [_kitti_type(kind, int((table.kind == i).sum())) for i, kind in enumerate(table.kinds)]
     names, renamed = table.file_names()
     scored = table.scored
-    whole = out / "training" if images or table.cameras else out
-    folder = whole / "label_2" if whole != out else out
-    for name, rows in zip(names, table.by_frame(), strict=True):
-        kept = [row for row in rows if not (scored and table.kind[row] == REGION)]
-        text = "".join(f"{_row_text(table, row, kinds, scored)}\n" for row in kept)
+    root = out / "training" if images or table.cameras else out
+    folder = root / "label_2" if root != out else out
+    for name, rows in zip(names, table.rows_by_frame(), strict=True):
+        written = [row for row in rows if not (scored and table.kind[row] == REGION)]
+        text = "".join(f"{_format_row(table, row, kinds, scored)}\n" for row in written)
         files.write_text(folder / f"{name}.txt", text)
     for i, camera in table.cameras.items():
-        calibration = format_calib(torch.from_numpy(matrix_of(camera)))
-        files.write_text(whole / "calib" / f"{names[i]}.txt", calibration)
-    places = {identifier: whole / "image_2" / name for identifier, name in zip(table.frames, names, strict=True)}
-    count = len(names) + copy_images(places, images)
-    had, objects = table.known(), table.kind != REGION
-    held = ("truncation", "occlusion", "alpha", "3D box", "score", "region", "camera")
-    lost = table.lost(held, renamed | ({"region": int((~objects).sum())} if scored else {}))
+        calibration = format_calibration(torch.from_numpy(parse_camera_entry(camera)))
+        files.write_text(root / "calib" / f"{names[i]}.txt", calibration)
+    targets = {identifier: root / "image_2" / name for identifier, name in zip(table.frames, names, strict=True)}
+    count = len(names) + copy_images(targets, images)
+    known, objects = table.known_fields(), table.kind != REGION
+    supported = ("truncation", "occlusion", "alpha", "3D box", "score", "region", "camera")
+    lost = table.count_lost(supported, renamed | ({"region": int((~objects).sum())} if scored else {}))
     assumed = {
-        "occlusion (3, unknown)": int((objects & ~had["occlusion"]).sum()),
-        "truncation (0)": int((objects & ~had["truncation"]).sum()),
+        "occlusion (3, unknown)": int((objects & ~known["occlusion"]).sum()),
+        "truncation (0)": int((objects & ~known["truncation"]).sum()),
     }
-    return Written.of(count, lost, {} if scored else assumed)
+    return WriteSummary.from_counts(count, lost, {} if scored else assumed)
 
 
-def _type_of(kind: str, boxes: int) -> str:
+def _kitti_type(kind: str, boxes: int) -> str:
     by_name = {name.lower(): name for name in TYPES}
     if kind.lower() in by_name:
         return by_name[kind.lower()]
@@ -212,37 +243,38 @@ def _type_of(kind: str, boxes: int) -> str:
     return kind
 
 
-def _row_text(table: LabelTable, row: int, kinds: Sequence[str], scored: bool) -> str:
+def _format_row(table: LabelTable, row: int, kinds: Sequence[str], scored: bool) -> str:
     region = table.kind[row] == REGION or bool(table.ignore[row])
     truncation, occlusion, alpha = float(table.truncation[row]), int(table.occlusion[row]), float(table.alpha[row])
     pose = table.pose[row].tolist()
-    pose = pose if known_pose(pose) and not region else None
+    pose = pose if is_known_pose(pose) and not region else None
     if pose is not None and not math.isfinite(alpha):
         alpha = math.remainder(pose[6] - math.atan2(pose[3], pose[5]), 2 * math.pi)
     if not region and not scored:
-        # labels have a code for an unknown occlusion, and none for truncation
+        # KITTI has a code for unknown occlusion, but none for unknown truncation
         occlusion = UNKNOWN_OCCLUSION if occlusion < 0 else occlusion
         truncation = max(truncation, 0.0)
-    score = positional(float(table.score[row])) if scored else None
+    score = format_shortest(float(table.score[row])) if scored else None
     kind = "DontCare" if region else kinds[int(table.kind[row])]
-    return _line(kind, truncation, occlusion, alpha, table.boxes[row].tolist(), pose, score)
+    return _format_line(kind, truncation, occlusion, alpha, table.boxes[row].tolist(), pose, score)
 
 
-def images_beside(path: Path, frames: Sequence[str]) -> dict[str, Path]:
-    """The images of label files in a folder, where they are in KITTI's own place."""
-    places = (path / "training" / "image_2", path / "image_2", path.parent / "image_2")
-    return images_by_place(places, frames)
+def find_images(path: Path, frames: Sequence[str]) -> dict[str, Path]:
+    """Find the images of a folder of label files next to it, in KITTI's layout."""
+    folders = (path / "training" / "image_2", path / "image_2", path.parent / "image_2")
+    return match_images_below(folders, frames)
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
-    """One frame's calibration. projection: (3, 4) px, P2, of rectified camera points to the left colour image.
-    rectification (3, 3) and velodyne_to_camera (3, 4), R0_rect and Tr_velo_to_cam, where the file has them.
-    """
+class KittiCalibration:
+    """One frame's calibration."""
 
     projection: Tensor
+    """P2 (3, 4) px: from rectified camera points to the left colour image."""
     rectification: Tensor | None = None
+    """R0_rect (3, 3)."""
     velodyne_to_camera: Tensor | None = None
+    """Tr_velo_to_cam (3, 4) m."""
 
 
 _CALIBRATION_COUNTS = {
@@ -250,18 +282,18 @@ _CALIBRATION_COUNTS = {
     "R0_rect": 9,
 }
 
-_WITHOUT_COLON = ("R_rect", "Tr_velo_cam", "Tr_imu_velo")
-"""Keys of the tracking benchmark's files, which nobody asks for."""
+_KEYS_WITHOUT_COLON = ("R_rect", "Tr_velo_cam", "Tr_imu_velo")
+"""Keys of the tracking benchmark's files that are not used."""
 
 
-def read_calib(path: Path) -> Calibration:
-    """A calibration file. FormatError naming file and key: P2 missing, wrong count, not finite, said twice."""
-    found: dict[str, Tensor] = {}
+def read_calibration(path: Path) -> KittiCalibration:
+    """Read a calibration file. Raises FormatError naming file and key: missing P2, wrong, not finite, or repeated."""
+    matrices: dict[str, Tensor] = {}
     for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
         key, colon, rest = line.partition(":")
-        if not colon and line.split()[0] in _WITHOUT_COLON:
+        if not colon and line.split()[0] in _KEYS_WITHOUT_COLON:
             continue
         if not colon:
             raise FormatError(f"{path}:{number}: line", "'KEY: numbers'", repr(line[:40]))
@@ -269,32 +301,32 @@ def read_calib(path: Path) -> Calibration:
         if key not in _CALIBRATION_COUNTS:
             continue
         where = f"{path}:{number}: {key}"
-        if key in found:
-            raise FormatError(where, "the key once", "it twice")
+        if key in matrices:
+            raise FormatError(where, "the key once", "twice")
         values = [finite_number(where, part) for part in rest.split()]
         if len(values) != _CALIBRATION_COUNTS[key]:
             raise FormatError(where, f"{_CALIBRATION_COUNTS[key]} numbers", len(values))
-        found[key] = torch.tensor(values, dtype=torch.float32).reshape(3, -1)
-    if "P2" not in found:
-        raise FormatError(f"{path}: P2", "12 numbers", f"no such key (only {', '.join(found) or 'none'})")
-    projection = found["P2"]
+        matrices[key] = torch.tensor(values, dtype=torch.float32).reshape(3, -1)
+    if "P2" not in matrices:
+        raise FormatError(f"{path}: P2", "12 numbers", f"no such key (only {', '.join(matrices) or 'none'})")
+    projection = matrices["P2"]
     least, most = FOCAL_PX
     if not (least <= projection[0, 0] <= most and least <= projection[1, 1] <= most and projection[2, 2] > 0):
         expected = f"positive focal lengths, {least:g} to {most:g} px"
         raise FormatError(f"{path}: P2", expected, projection.diagonal().tolist())
-    return Calibration(projection, found.get("R0_rect"), found.get("Tr_velo_to_cam"))
+    return KittiCalibration(projection, matrices.get("R0_rect"), matrices.get("Tr_velo_to_cam"))
 
 
-def format_calib(projection: Tensor) -> str:
-    """KITTI's calibration lines for one camera: P0 to P3 are `projection` (3, 4), the rest is identity."""
+def format_calibration(projection: Tensor) -> str:
+    """Format a calibration of one camera: P0 to P3 are `projection` (3, 4), the others are identity."""
     identity = torch.eye(3, 4)
     rows = [(f"P{i}", projection) for i in range(4)]
     rows += [("R0_rect", identity[:, :3]), ("Tr_velo_to_cam", identity), ("Tr_imu_to_velo", identity)]
     return "".join(f"{key}: {' '.join(f'{v:.12e}' for v in m.flatten().tolist())}\n" for key, m in rows)
 
 
-def read_points(path: Path, calibration: Calibration) -> Tensor:
-    """Laser points (P, 3) m in rectified camera axes, as the labels are, from float32 x y z reflectance."""
+def read_points(path: Path, calibration: KittiCalibration) -> Tensor:
+    """Read laser points (P, 3) m in rectified camera axes, as the labels', from float32 x y z reflectance."""
     if calibration.rectification is None or calibration.velodyne_to_camera is None:
         raise FormatError(f"calibration for {path}", "R0_rect and Tr_velo_to_cam", "not both")
     data = files.read_bytes(path)
@@ -307,12 +339,17 @@ def read_points(path: Path, calibration: Calibration) -> Tensor:
     return (points @ transform[:, :3].T + transform[:, 3]) @ calibration.rectification.T
 
 
-class KittiDataset(Frames[Path | None]):
+class KittiDataset(FrameIndex[Path | None]):
     """The frames of a KITTI object folder: every image and every label file.
 
-    root: the folder that holds `split`, or `split` itself. with_points: read the laser's points where a frame has
-    them. Raises FormatError naming the folder where there is no image_2 or it is empty, or no velodyne for points;
-    a frame's own faults are raised by `labels` and `frame`, so that the other frames can be used.
+    Args:
+        root: Folder that contains `split`, or that folder itself.
+        split: Name of the folder of frames.
+        with_points: Read laser points of frames that have them.
+
+    Raises:
+        FormatError: No or an empty image_2, or no velodyne for points. A frame's own faults are raised by `labels`
+            and `frame` only.
     """
 
     def __init__(self, root: Path, split: str = "training", with_points: bool = False) -> None:
@@ -320,7 +357,7 @@ class KittiDataset(Frames[Path | None]):
         self.folder = root if (root / "image_2").is_dir() and not (root / split).is_dir() else root / split
         if not root.is_dir():
             raise FormatError(str(root), "a KITTI folder", "no such folder")
-        images = {path.stem: path for path in images_of(self.folder / "image_2")}
+        images = {path.stem: path for path in list_images(self.folder / "image_2")}
         if with_points and not (self.folder / "velodyne").is_dir():
             raise FormatError(str(self.folder / "velodyne"), "a folder of a laser's points", "no such folder")
         self.with_points = with_points
@@ -331,34 +368,34 @@ class KittiDataset(Frames[Path | None]):
         super().__init__(self.folder, {name: images.get(name) for name in sorted({*images, *labelled})})
 
     def labels(self, identifier: str) -> Labels | None:
-        """The labels of one frame; None where the folder has no label_2 (test split)."""
+        """Read the labels of one frame; None if the folder has no label_2 (test split)."""
         self._entry(identifier)
         return read_labels(self.folder / "label_2" / f"{identifier}.txt") if self._has_labels else None
 
     def frame(self, identifier: str) -> Frame:
-        """One frame: photograph (3, H, W) float32, 8-bit values over 255, camera with P2, labels, points.
+        """Read one frame: photograph, camera with P2, labels, points.
 
-        Also depth m, inf where there is none, and classes and masks, where the folder has depth_2 and instance_2.
-        Raises FormatError naming the file and what is wrong: an image, label or calibration that is missing or
-        does not read; an image whose size does not go with its labels or its calibration.
+        Reads depth (inf where unknown) from depth_2, and classes and masks from instance_2, if they exist. Raises
+        FormatError naming the file and the fault: a missing or damaged image, label file or calibration; an image
+        of a size that does not fit its labels or its calibration.
         """
         image_path = self._entry(identifier)
         if image_path is None:
             raise FormatError(str(self.folder / "image_2" / f"{identifier}.png"), "an image", "no such file")
         calib_path = self.folder / "calib" / f"{identifier}.txt"
         labels = self.labels(identifier)
-        calibration = read_calib(calib_path)
+        calibration = read_calibration(calib_path)
         image = files.read_image(image_path)
         height, width = image.shape[:2]
         camera = Camera(calibration.projection[:, :3].clone(), height, width, calibration.projection)
-        check_size(image_path, camera, labels)
+        check_image_size(image_path, camera, labels)
         points_path = self.folder / "velodyne" / f"{identifier}.bin"
         points = read_points(points_path, calibration) if self.with_points and points_path.exists() else None
         size_hw = (height, width)
         classes, masks = _read_instances(self.folder / "instance_2" / f"{identifier}.png", size_hw, labels)
         return Frame(
             identifier=identifier,
-            photograph=as_photograph(image),
+            photograph=to_tensor(image),
             camera=camera,
             labels=labels,
             masks=masks,
@@ -371,7 +408,7 @@ class KittiDataset(Frames[Path | None]):
 
 
 def _read_depth(path: Path, size_hw: tuple[int, int]) -> Tensor | None:
-    """Depth (H, W) float32 m, inf where there is none."""
+    """Read depth (H, W) float32 m, inf where unknown."""
     if not path.exists():
         return None
     depth = torch.from_numpy(files.read_uint16(path, size_hw).astype(np.float32)) / DEPTH_SCALE
@@ -381,47 +418,47 @@ def _read_depth(path: Path, size_hw: tuple[int, int]) -> Tensor | None:
 def _read_instances(
     path: Path, size_hw: tuple[int, int], labels: Labels | None
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Classes (H, W) int64 into SEMANTIC_NAMES, and the labels' masks (M, H, W) float32."""
+    """Read classes (H, W) int64, indices into SEMANTIC_NAMES, and the labels' masks (M, H, W) float32."""
     if not path.exists():
         return None, None
     values = files.read_uint16(path, size_hw).astype(np.int64)
-    classes, number = values // INSTANCES, torch.from_numpy(values % INSTANCES)
+    classes, instances = values // INSTANCES, torch.from_numpy(values % INSTANCES)
     if classes.max(initial=0) >= len(SEMANTIC_NAMES):
         raise FormatError(f"{path}: semantic id", f"0 to {len(SEMANTIC_NAMES) - 1}", int(classes.max()))
     masks = None
     if labels is not None:
-        masks = (number == torch.arange(1, len(labels.kind) + 1)[:, None, None]).float()
+        masks = (instances == torch.arange(1, len(labels.kind) + 1)[:, None, None]).float()
     return torch.from_numpy(classes), masks
 
 
-def _plain(name: str) -> str:
+def _normalise_name(name: str) -> str:
     return name.replace("_", "").lower()
 
 
 def semantic_ids(class_names: Sequence[str]) -> np.ndarray:
-    """Cityscapes' ids (C,) uint16 of classes named as Virtual KITTI does. FormatError for an unknown name."""
-    known = {_plain(name): i for i, name in enumerate(SEMANTIC_NAMES)}
-    plain = [_MERGED.get(_plain(name), _plain(name)) for name in class_names]
-    for name, key in zip(class_names, plain, strict=True):
+    """Convert Virtual KITTI's class names to Cityscapes' ids (C,) uint16. Raises FormatError for an unknown name."""
+    known = {_normalise_name(name): i for i, name in enumerate(SEMANTIC_NAMES)}
+    keys = [_CITYSCAPES_NAMES.get(_normalise_name(name), _normalise_name(name)) for name in class_names]
+    for name, key in zip(class_names, keys, strict=True):
         if key not in known:
             raise FormatError("class", f"one of {', '.join(SEMANTIC_NAMES)}", repr(name))
-    return np.array([known[key] for key in plain], np.uint16)
+    return np.array([known[key] for key in keys], np.uint16)
 
 
 def _instance_map(exposure: Exposure) -> np.ndarray:
-    """`instance_2` (H, W) uint16 of an exposure: lines of the label file first, then objects without a line."""
+    """Make `instance_2` (H, W) uint16: lines of the label file first, then objects without a line."""
     ordered = sorted(exposure.objects, key=lambda o: not o.labelled)  # stable: file order within both
     if len(exposure.labels.kind) >= INSTANCES:
         raise RangeError("labels of one frame", f"at most {INSTANCES - 1}", len(exposure.labels.kind))
     highest = max([int(exposure.instances.max(initial=0)), *(o.track + 1 for o in ordered)])
     number = np.zeros(highest + 1, np.uint16)
-    for i, thing in enumerate(ordered[: INSTANCES - 1]):
-        number[thing.track + 1] = i + 1
+    for i, tracked in enumerate(ordered[: INSTANCES - 1]):
+        number[tracked.track + 1] = i + 1
     return semantic_ids(exposure.class_names)[exposure.classes] * np.uint16(INSTANCES) + number[exposure.instances]
 
 
 def _depth_map(depth_cm: np.ndarray) -> np.ndarray:
-    """`depth_2` (H, W) uint16 of centimetres. 0, none: the sky and what lies beyond 255.99 m."""
+    """Convert centimetres to `depth_2` (H, W) uint16; 0 (unknown) for the sky and beyond 255.99 m."""
     values = (depth_cm.astype(np.uint32) * DEPTH_SCALE + 50) // 100
     return np.where((depth_cm == SKY_CM) | (values > np.iinfo(np.uint16).max), 0, values).astype(np.uint16)
 
@@ -429,9 +466,9 @@ def _depth_map(depth_cm: np.ndarray) -> np.ndarray:
 class KittiWriter:
     """Writes frames in KITTI's layout under `root / split`, each file atomically, and `root/ImageSets`.
 
-    extras: also `depth_2` and `instance_2`. What KITTI cannot hold: tracks, extrinsics, the visible share beyond
-    its four levels; poses and boxes are rounded to 0.001 m, rad and px. In `instance_2`, trees and vegetation are
-    one class, and so are cars and vans.
+    With `extras`, also `depth_2` and `instance_2`. KITTI cannot hold tracks, extrinsics, and visible shares beyond
+    four levels; poses and boxes are rounded to 0.001 m, rad and px. In `instance_2`, trees and vegetation are one
+    class, and so are cars and vans.
     """
 
     def __init__(self, root: Path, split: str = "training", extras: bool = True) -> None:
@@ -442,13 +479,13 @@ class KittiWriter:
     def _image(self, identifier: str) -> Path:
         return self.folder / "image_2" / f"{identifier}.png"
 
-    def exists(self, place: Place) -> bool:
-        """Whether the frame is there: its image is written last."""
-        return self._image(f"{place.number:06d}").exists()
+    def exists(self, location: FrameLocation) -> bool:
+        """Whether the frame exists; its image is written last."""
+        return self._image(f"{location.number:06d}").exists()
 
-    def write(self, place: Place, exposure: Exposure) -> dict[str, object]:
-        """Write one frame; the image comes last. The entry says which of the lists in ImageSets it belongs to."""
-        identifier = f"{place.number:06d}"
+    def write(self, location: FrameLocation, exposure: Exposure) -> dict[str, object]:
+        """Write one frame, its image last. Returns its number and part for the lists in ImageSets."""
+        identifier = f"{location.number:06d}"
         if self.extras:
             for name, values in (
                 ("depth_2", _depth_map(exposure.depth_cm)),
@@ -456,16 +493,23 @@ class KittiWriter:
             ):
                 files.write_png(self.folder / name / f"{identifier}.png", values, PNG_COMPRESSION)
         self.write_photograph(identifier, exposure.image, exposure.labels, exposure.camera.matrix)
-        return {"number": place.number, "part": place.part}
+        return {"number": location.number, "part": location.part}
 
     def write_photograph(self, identifier: str, image_rgb: np.ndarray, labels: Labels, projection: Tensor) -> None:
-        """Calibration, labels, and last the image. image_rgb: (H, W, 3) uint8; projection: (3, 4) px, as P2."""
-        files.write_text(self.folder / "calib" / f"{identifier}.txt", format_calib(projection))
+        """Write calibration, labels, and the image last.
+
+        Args:
+            identifier: Name of the files.
+            image_rgb: Image (H, W, 3) uint8.
+            labels: Labels.
+            projection: P2 (3, 4) px.
+        """
+        files.write_text(self.folder / "calib" / f"{identifier}.txt", format_calibration(projection))
         write_labels(self.folder / "label_2" / f"{identifier}.txt", labels)
         files.write_png(self._image(identifier), image_rgb, PNG_COMPRESSION)
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> None:
-        """Write `ImageSets/{train,val,trainval}.txt`, one identifier a line, as KITTI's loaders read them."""
+        """Write `ImageSets/{train,val,trainval}.txt`, one identifier per line, as KITTI's loaders read them."""
         for name, parts in (("train", ("train",)), ("val", ("val",)), ("trainval", ("train", "val"))):
             lines = [f"{entry['number']:06d}\n" for entry in entries if entry["part"] in parts]
             files.write_text(self.root / "ImageSets" / f"{name}.txt", "".join(lines))

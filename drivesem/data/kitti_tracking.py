@@ -1,8 +1,8 @@
 """KITTI's tracking folders: `training/image_02/0000/000000.png`, `label_02/0000.txt`, `calib/0000.txt`.
 
 A line of labels is the object benchmark's (`drivesem.data.kitti`) after two more fields, the frame and the track.
-By the development kit (Geiger et al. 2012) truncation is a level, 0 to 2, for which shares in the middle of what
-they mean are taken here. "Person" is "Person_sitting". Errors name the file, the line and the field.
+Truncation is a level from 0 to 2 (development kit, Geiger et al. 2012), read as the mean share of the level. "Person"
+is "Person_sitting". Errors name the file, the line and the field.
 """
 
 from __future__ import annotations
@@ -12,61 +12,62 @@ from functools import cached_property
 from pathlib import Path
 
 from drivesem.data import kitti
-from drivesem.data.frames import Frames, as_photograph, check_size, images_of
-from drivesem.data.kitti_labels import Lines, finite_number
+from drivesem.data.kitti_labels import KittiLabelLines, finite_number
+from drivesem.data.photographs import FrameIndex, check_image_size, list_images
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.io import to_tensor
 from scene_ir.types import Camera, Frame, Labels
 
 IMAGES, LABELS = "image_02", "label_02"
 _TRUNCATION = {"0": "0", "1": "0.2", "2": "0.6"}
-"""Shares for the levels "not", "partly", "largely" cut by the picture's border."""
+"""Shares of the levels "not", "partly" and "largely" truncated."""
 _KINDS = {"Person": "Person_sitting"}
-_MOST_LINES = 200_000
-"""Of one sequence: KITTI's longest have some ten thousand."""
+_MAX_LINES = 200_000
+"""Limit of one sequence; KITTI's longest have about ten thousand."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Rows:
-    """The lines of one frame. text: of the whole file, other frames' lines left empty, so that numbers of lines
-    stay; tracks: of what is no region, in the lines' order.
-    """
+class _FrameLines:
+    """Label lines of one frame."""
 
     text: str
+    """Text of the file with other frames' lines left empty, so that line numbers stay."""
     tracks: tuple[int, ...]
+    """Tracks of the objects, in the order of the lines, without regions."""
 
 
-def folder_of(root: Path) -> Path | None:
-    """The folder with image_02: the root or its `training`; None where there is none."""
+def find_tracking_folder(root: Path) -> Path | None:
+    """Find the folder with image_02: the root or its `training`; None if there is none."""
     return next((f for f in (root / "training", root) if (f / IMAGES).is_dir()), None)
 
 
-def sequences_of(root: Path) -> tuple[str, ...]:
-    """Names of the sequences. FormatError where there is none."""
-    folder = folder_of(root)
-    found = () if folder is None else tuple(sorted(p.name for p in (folder / IMAGES).iterdir() if p.is_dir()))
-    if not found:
-        raise FormatError(str(root), f"a KITTI tracking folder, with {IMAGES}/0000 and its kin", "no sequence")
-    return found
+def list_sequences(root: Path) -> tuple[str, ...]:
+    """List the names of the sequences. Raises FormatError if there is none."""
+    folder = find_tracking_folder(root)
+    names = () if folder is None else tuple(sorted(p.name for p in (folder / IMAGES).iterdir() if p.is_dir()))
+    if not names:
+        raise FormatError(str(root), f"a KITTI tracking folder with {IMAGES}/0000", "no sequence")
+    return names
 
 
-class KittiTracking(Frames[Path]):
+class KittiTrackingDataset(FrameIndex[Path]):
     """The frames of one sequence, by the names of their images.
 
-    root: the folder that holds `training`, or that itself. FormatError naming the folder or file where something
-    is missing, RangeError for a sequence that is not there.
+    `root` contains `training`, or is that folder. Raises FormatError naming a missing folder or file, RangeError for
+    an unknown sequence.
     """
 
     def __init__(self, root: Path, sequence: str) -> None:
-        known = sequences_of(root)
+        known = list_sequences(root)
         if sequence not in known:
             raise RangeError(f"sequence of {root}", f"one of {', '.join(known)}", sequence)
-        folder = folder_of(root)
+        folder = find_tracking_folder(root)
         assert folder is not None
         self._labels = folder / LABELS / f"{sequence}.txt"
         self._calib = folder / "calib" / f"{sequence}.txt"
         self._sequence = sequence
-        images = images_of(folder / IMAGES / sequence)
+        images = list_images(folder / IMAGES / sequence)
         for image in images:
             if not image.stem.isdecimal():
                 raise FormatError(str(image), "the frame's number as its name", image.stem)
@@ -75,36 +76,36 @@ class KittiTracking(Frames[Path]):
         super().__init__(folder / IMAGES / sequence, {image.stem: image for image in images})
 
     def labels(self, identifier: str) -> Labels:
-        """The labels of one frame. FormatError naming file, line and field."""
-        rows = self._rows(identifier)
-        lines = Lines([str(self._labels)], [rows.text], scored=False)
+        """Read the labels of one frame. Raises FormatError naming file, line and field."""
+        rows = self._frame_lines(identifier)
+        lines = KittiLabelLines([str(self._labels)], [rows.text], scored=False)
         kitti.check_scene(lines)
-        return lines.table([identifier], scored=False).labels()
+        return lines.to_table([identifier], scored=False).to_labels()
 
     def tracks(self, identifier: str) -> tuple[int, ...]:
-        """The track of each label of `labels`, in its order."""
-        return self._rows(identifier).tracks
+        """Return the track of each label, in the order of `labels`."""
+        return self._frame_lines(identifier).tracks
 
     def frame(self, identifier: str) -> Frame:
-        """One frame: photograph (3, H, W) float32, camera, labels. FormatError naming the file and the fault."""
+        """Read one frame: photograph, camera, labels. Raises FormatError naming the file and the fault."""
         path = self._entry(identifier)
-        labels, projection = self.labels(identifier), kitti.read_calib(self._calib).projection
+        labels, projection = self.labels(identifier), kitti.read_calibration(self._calib).projection
         image = files.read_image(path)
         height, width = image.shape[:2]
         camera = Camera(projection[:, :3].clone(), height, width, projection)
-        check_size(path, camera, labels)
-        told = {"dataset": "kitti-tracking", "sequence": self._sequence, "image": path.name}
-        return Frame(identifier, as_photograph(image), camera, labels, provenance=told)
+        check_image_size(path, camera, labels)
+        provenance = {"dataset": "kitti-tracking", "sequence": self._sequence, "image": path.name}
+        return Frame(identifier, to_tensor(image), camera, labels, provenance=provenance)
 
-    def _rows(self, identifier: str) -> _Rows:
-        return self._by_frame.get(int(self._entry(identifier).stem), _Rows("", ()))
+    def _frame_lines(self, identifier: str) -> _FrameLines:
+        return self._by_frame.get(int(self._entry(identifier).stem), _FrameLines("", ()))
 
     @cached_property
-    def _by_frame(self) -> dict[int, _Rows]:
+    def _by_frame(self) -> dict[int, _FrameLines]:
         lines = files.read_text(self._labels).splitlines()
-        if len(lines) > _MOST_LINES:
-            raise FormatError(str(self._labels), f"at most {_MOST_LINES:,} lines", f"{len(lines):,}")
-        found: dict[int, tuple[list[tuple[int, str]], list[int]]] = {}
+        if len(lines) > _MAX_LINES:
+            raise FormatError(str(self._labels), f"at most {_MAX_LINES:,} lines", f"{len(lines):,}")
+        by_frame: dict[int, tuple[list[tuple[int, str]], list[int]]] = {}
         for number, line in enumerate(lines):
             parts = line.split()
             if not parts:
@@ -112,29 +113,29 @@ class KittiTracking(Frames[Path]):
             where = f"{self._labels}:{number + 1}"
             if len(parts) not in (17, 18):
                 raise FormatError(where, "17 fields, or 18 with a score", len(parts))
-            frame, track = _whole(f"{where}: frame", parts[0]), _whole(f"{where}: track", parts[1])
+            frame, track = _parse_integer(f"{where}: frame", parts[0]), _parse_integer(f"{where}: track", parts[1])
             kind, truncated, *rest = parts[2:]
             region = kind == "DontCare"
             if not region and truncated not in _TRUNCATION:
                 raise FormatError(f"{where}: truncated", "0, 1 or 2", truncated)
-            rows, tracks = found.setdefault(frame, ([], []))
+            rows, tracks = by_frame.setdefault(frame, ([], []))
             if not region:
                 if track in tracks:
                     raise FormatError(f"{where}: track", f"each once in frame {frame}", track)
                 tracks.append(track)
             rows.append((number, " ".join([_KINDS.get(kind, kind), _TRUNCATION.get(truncated, "-1"), *rest])))
-        return {frame: _Rows(_spread(rows), tuple(tracks)) for frame, (rows, tracks) in found.items()}
+        return {frame: _FrameLines(_pad_lines(rows), tuple(tracks)) for frame, (rows, tracks) in by_frame.items()}
 
 
-def _spread(rows: list[tuple[int, str]]) -> str:
-    """Lines at their numbers, from 0, and empty ones before and between them."""
+def _pad_lines(rows: list[tuple[int, str]]) -> str:
+    """Join lines at their numbers, from 0, with empty lines in the gaps."""
     lines = [""] * (rows[-1][0] + 1)
     for number, line in rows:
         lines[number] = line
     return "\n".join(lines)
 
 
-def _whole(where: str, text: str) -> int:
+def _parse_integer(where: str, text: str) -> int:
     value = finite_number(where, text)
     if value != int(value):
         raise FormatError(where, "a whole number", text)

@@ -1,10 +1,11 @@
-"""Labels or detections of many frames in columns, as every layout's reader makes them and its writer takes them:
-each value as its file has it, in float64, and nothing of images. A frame's `Labels` are made of them.
+"""Label tables: labels or detections of many frames in columns, the common form of all layouts' readers and writers.
 
-**Boxes without an area.** A box may end where it begins (left == right): a thin object that fills one column of
-pixels, or a detection that was cut at the image's edge. Every layout reads such boxes. None can be met: as a label
-it is a miss, as a detection a false positive, as pycocotools and KITTI's development kit count; what a detector is
-trained on ignores it (`ClassMap.targets`). A box that ends before it begins is a mistake, and refused.
+Values are those of the files, in float64.
+
+**Boxes without area.** A box may end where it begins (left == right): a thin object that fills one column of
+pixels, or a detection that was clipped at the image's edge. All layouts read such boxes, and nothing can match them:
+such a label is a miss, such a detection a false positive, as in pycocotools and KITTI's development kit; training
+ignores them (`ClassMap.targets`). A box that ends before it begins is an error.
 """
 
 from __future__ import annotations
@@ -21,90 +22,113 @@ from numpy.typing import NDArray
 
 from scene_ir.errors import FormatError
 
-if TYPE_CHECKING:  # torch takes a second to load, and most of what reads label files needs none
+if TYPE_CHECKING:  # torch takes a second to load; most readers of label files do not need it
     from torch import Tensor
 
     from scene_ir.types import Labels
 
-Edges = Literal["xyxy", "xywh"]
-"""How boxes are held: left, top, right, bottom where pixel centres are whole numbers (KITTI), or left, top, width,
-height where pixel edges are (COCO)."""
+BoxFormat = Literal["xyxy", "xywh"]
+"""Box format: left, top, right, bottom with pixel centres at integers (KITTI), or left, top, width, height with
+pixel edges at integers (COCO)."""
 REGION = -1
-"""Kind of a region in which nothing is judged (DontCare)."""
+"""Kind of a DontCare region, in which detections do not count."""
 HALF_PX = 0.5
-"""From pixel centres at whole numbers to COCO's pixel edges at whole numbers."""
+"""Offset from pixel centres at integers to COCO's pixel edges at integers."""
 DECIMALS = 9
-"""Of px, after a change of edges: the noise of a sum of decimals lies far below."""
+"""Decimals of px after a conversion, above the rounding noise of float64."""
 UNKNOWN_OCCLUSION = 3
-"""KITTI's own code for an occlusion that is not known, which `Labels` have too."""
-WEATHERS = ("clone", "fog", "morning", "overcast", "rain", "sunset")
-"""Virtual KITTI's variations that are weather or time of day; the others turn the camera."""
+"""Code of an unknown occlusion in KITTI's files and in `Labels`."""
+WEATHER_VARIATIONS = ("clone", "fog", "morning", "overcast", "rain", "sunset")
+"""Virtual KITTI's variations of weather or time of day; the others turn the camera."""
 
 
-def to_coco(boxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x, y, width, height (..., 4) in COCO's pixels of left, top, right, bottom."""
+def xyxy_to_coco(boxes_xyxy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert left, top, right, bottom (..., 4) to COCO's x, y, width, height."""
     low, high = boxes_xyxy[..., :2], boxes_xyxy[..., 2:]
     return np.concatenate([low + HALF_PX, high - low], axis=-1)
 
 
-def from_coco(boxes_xywh: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Left, top, right, bottom (..., 4) of x, y, width, height in COCO's pixels."""
+def coco_to_xyxy(boxes_xywh: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert COCO's x, y, width, height (..., 4) to left, top, right, bottom."""
     low, size = boxes_xywh[..., :2] - HALF_PX, boxes_xywh[..., 2:]
     return np.concatenate([low, low + size], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
 class LabelTable:
-    """N boxes of F frames, by frame, then in file order.
-
-    frames: identifiers. kinds: types that occur or may. frame, kind (N,): indices into them, kind REGION for
-    DontCare. boxes (N, 4) float64 px in `edges`; ignore (N,): crowds and regions. score (N,), NaN for labels;
-    truncation (N,), -1 where unknown; occlusion (N,) 0 to 3, -1 where unknown; alpha (N,) rad, NaN where unknown;
-    pose (N, 7): length, height, width, x, y, z m, yaw rad, NaN where unknown; area (N,) px^2, NaN where unknown.
-    sizes_wh (F, 2) px, 0 where unknown; image_ids (F,), box_ids (N,), kind_ids: COCO's ids, where known, of images
-    also texts.
-    extra: further columns (N) by name, None where a box has none; cameras: by frame, COCO's "camera" entries;
-    image_files: by frame, where its image lies if it is not named after the frame; told: by frame, what else is
-    known of it, as JSON.
-    """
+    """N boxes of F frames, sorted by frame, then in file order."""
 
     frames: tuple[str, ...]
+    """Identifiers of the frames (F,)."""
     kinds: tuple[str, ...]
+    """Types that occur or may occur."""
     frame: NDArray[np.int64]
+    """Index of each box's frame (N,)."""
     kind: NDArray[np.int64]
+    """Index of each box's type (N,); REGION for DontCare."""
     boxes: NDArray[np.float64]
-    edges: Edges
+    """Boxes (N, 4) px in `box_format`."""
+    box_format: BoxFormat
+    """Format of the boxes."""
     ignore: NDArray[np.bool_]
+    """Whether a box is a crowd or a region (N,)."""
     score: NDArray[np.float64]
+    """Scores (N,); NaN for labels."""
     truncation: NDArray[np.float64]
+    """Truncation (N,); -1 where unknown."""
     occlusion: NDArray[np.int64]
+    """KITTI's occlusion code (N,), 0 to 3; -1 where unknown."""
     alpha: NDArray[np.float64]
+    """Observation angle (N,) rad; NaN where unknown."""
     pose: NDArray[np.float64]
+    """Length, height, width, x, y, z m, yaw rad (N, 7); NaN where unknown."""
     area: NDArray[np.float64]
+    """Area (N,) px^2; NaN where unknown."""
     sizes_wh: NDArray[np.int64]
+    """Width and height of the images (F, 2) px; 0 where unknown."""
     image_ids: NDArray[np.int64] | NDArray[np.str_] | None = None
+    """COCO's ids of the images (F,), numbers or texts."""
     box_ids: NDArray[np.int64] | None = None
+    """COCO's ids of the boxes (N,)."""
     kind_ids: NDArray[np.int64] | None = None
+    """COCO's ids of `kinds`."""
     extra: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    """Further columns (N,) by name; None where a box has no value."""
     cameras: Mapping[int, Any] = field(default_factory=dict)
+    """COCO's "camera" entries by frame index."""
     image_files: Mapping[int, str] = field(default_factory=dict)
-    told: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
+    """Image files by frame index, where not named after the frame."""
+    frame_attributes: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
+    """Further attributes of frames as JSON, by frame index."""
 
     def __len__(self) -> int:
         return len(self.frame)
 
     @classmethod
-    def of(
+    def from_columns(
         cls,
         frames: Sequence[str],
         kinds: Sequence[str],
         frame: Sequence[int] | NDArray[np.int64],
         kind: Sequence[int] | NDArray[np.int64],
         boxes: NDArray[np.float64],
-        edges: Edges,
+        box_format: BoxFormat,
         **columns: Any,
     ) -> LabelTable:
-        """A table in which all that is not given is unknown."""
+        """Make a table; values that are not given are unknown.
+
+        Args:
+            frames: Identifiers (F,).
+            kinds: Types.
+            frame: Frame index of each box (N,).
+            kind: Type index of each box (N,), or REGION.
+            boxes: Boxes (N, 4) px.
+            box_format: Format of the boxes.
+            columns: Other fields of the table.
+
+        Returns:
+            The table.
+        """
         n = len(boxes)
         kind = np.asarray(kind, np.int64)
         unknown: dict[str, Any] = {
@@ -118,17 +142,17 @@ class LabelTable:
             "sizes_wh": np.zeros((len(frames), 2), np.int64),
         }
         frame = np.asarray(frame, np.int64)
-        return cls(tuple(frames), tuple(kinds), frame, kind, boxes, edges, **(unknown | columns))
+        return cls(tuple(frames), tuple(kinds), frame, kind, boxes, box_format, **(unknown | columns))
 
-    def in_edges(self, edges: Edges) -> LabelTable:
-        """The same boxes in other edges; areas, which COCO measures in its own way, are kept."""
-        if edges == self.edges:
+    def with_box_format(self, edges: BoxFormat) -> LabelTable:
+        """Convert the boxes to a format. Areas do not change: COCO measures them by masks."""
+        if edges == self.box_format:
             return self
-        boxes = to_coco(self.boxes) if edges == "xywh" else from_coco(self.boxes)
-        return replace(self, boxes=np.round(boxes, DECIMALS), edges=edges)
+        boxes = xyxy_to_coco(self.boxes) if edges == "xywh" else coco_to_xyxy(self.boxes)
+        return replace(self, boxes=np.round(boxes, DECIMALS), box_format=edges)
 
-    def rows(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> LabelTable:
-        """Some of the boxes, ascending by frame; all frames are kept."""
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> LabelTable:
+        """Select boxes by mask or indices, ascending by frame; the frames stay."""
         columns = ("frame", "kind", "boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area")
         index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
         return replace(
@@ -138,15 +162,13 @@ class LabelTable:
             extra={name: [values[i] for i in index.tolist()] for name, values in self.extra.items()},
         )
 
-    def over(self, frames: Sequence[str]) -> LabelTable:
-        """The boxes of other frames: those of `frames` that the table does not know have none; those of its own
-        that are not among them are left out.
-        """
-        place = {name: i for i, name in enumerate(frames)}
-        new = np.array([place.get(name, -1) for name in self.frames], np.int64)
+    def reindex(self, frames: Sequence[str]) -> LabelTable:
+        """Return the table for other frames: unknown ones have no boxes, boxes of missing ones are dropped."""
+        position = {name: i for i, name in enumerate(frames)}
+        new = np.array([position.get(name, -1) for name in self.frames], np.int64)
         index = np.flatnonzero(new[self.frame] >= 0) if len(self) else np.zeros(0, np.int64)
         index = index[np.argsort(new[self.frame[index]], kind="stable")]
-        kept = self.rows(index)
+        selected = self.select(index)
         old = np.flatnonzero(new >= 0)
         sizes = np.zeros((len(frames), 2), np.int64)
         sizes[new[old]] = self.sizes_wh[old]
@@ -155,25 +177,26 @@ class LabelTable:
             ids = np.zeros(len(frames), self.image_ids.dtype)
             ids[new[old]] = self.image_ids[old]
         return replace(
-            kept,
+            selected,
             frames=tuple(frames),
-            frame=new[kept.frame],
+            frame=new[selected.frame],
             sizes_wh=sizes,
             image_ids=ids,
             cameras={int(new[i]): camera for i, camera in self.cameras.items() if new[i] >= 0},
             image_files={int(new[i]): name for i, name in self.image_files.items() if new[i] >= 0},
-            told={int(new[i]): words for i, words in self.told.items() if new[i] >= 0},
+            frame_attributes={int(new[i]): values for i, values in self.frame_attributes.items() if new[i] >= 0},
         )
 
-    def labels(self) -> Labels:
-        """All boxes as a scene takes them, float32: objects in file order, and what is ignored as regions. Unknown
-        are NaN, and an occlusion of 3.
+    def to_labels(self) -> Labels:
+        """Convert to float32 labels: objects in file order, ignored boxes as regions.
+
+        Unknown values are NaN; an unknown occlusion is 3.
         """
         import torch
 
         from scene_ir.types import Labels
 
-        boxes = torch.from_numpy(self.boxes if self.edges == "xyxy" else from_coco(self.boxes)).float()
+        boxes = torch.from_numpy(self.boxes if self.box_format == "xyxy" else coco_to_xyxy(self.boxes)).float()
         objects = ~self.ignore
         pose = torch.from_numpy(self.pose[objects]).float()
         truncation, occlusion = self.truncation[objects], self.occlusion[objects]
@@ -189,26 +212,24 @@ class LabelTable:
         )
 
     def weather(self) -> list[str | None]:
-        """Virtual KITTI's variation in a frame's identifier, where that says something of the weather."""
+        """Return the weather in each frame's identifier, one of WEATHER_VARIATIONS; None where there is none."""
         parts = [name.replace("_", "/").split("/") for name in self.frames]
-        return [next((word for word in words if word in WEATHERS), None) for words in parts]
-
-    # ---- what writers of any layout ask ----
+        return [next((word for word in words if word in WEATHER_VARIATIONS), None) for words in parts]
 
     @property
     def scored(self) -> bool:
-        """Whether these are detections: there is something besides regions, and all of it has a score."""
+        """Whether these are detections: there is at least one object, and all objects have scores."""
         scores = self.score[self.kind != REGION]
         return len(scores) > 0 and bool(np.isfinite(scores).all())
 
-    def by_frame(self) -> list[range]:
-        """The rows of each frame."""
+    def rows_by_frame(self) -> list[range]:
+        """Return the rows of each frame."""
         ends = np.cumsum(np.bincount(self.frame, minlength=len(self.frames))).tolist()
         return [range(a, b) for a, b in zip([0, *ends], ends, strict=False)]
 
-    def known(self) -> dict[str, NDArray[np.bool_]]:
-        """Which boxes (N,) have a value, by field."""
-        found = {
+    def known_fields(self) -> dict[str, NDArray[np.bool_]]:
+        """Return which boxes (N,) have a value, by field."""
+        known = {
             "truncation": self.truncation >= 0,
             "occlusion": self.occlusion >= 0,
             "alpha": np.isfinite(self.alpha),
@@ -218,22 +239,22 @@ class LabelTable:
             "crowd": self.ignore & (self.kind != REGION),
         }
         columns = self.extra.items()
-        return found | {name: np.array([v is not None for v in values], np.bool_) for name, values in columns}
+        return known | {name: np.array([v is not None for v in values], np.bool_) for name, values in columns}
 
-    def lost(self, kept: Sequence[str], more: Mapping[str, int]) -> dict[str, int]:
-        """Boxes by field that is not among `kept`, cameras, and what `more` counts."""
-        counts = {name: int(rows.sum()) for name, rows in self.known().items() if name not in kept}
-        return counts | ({} if "camera" in kept else {"camera": len(self.cameras)}) | dict(more)
+    def count_lost(self, supported: Sequence[str], more: Mapping[str, int]) -> dict[str, int]:
+        """Count boxes with a value, and cameras, by field that is not `supported`; add the counts `more`."""
+        counts = {name: int(rows.sum()) for name, rows in self.known_fields().items() if name not in supported}
+        return counts | ({} if "camera" in supported else {"camera": len(self.cameras)}) | dict(more)
 
     def file_names(self) -> tuple[list[str], dict[str, int]]:
-        """Identifiers as file names, and how many had to change, as a loss."""
+        """Return identifiers as file names, and the number of changed ones, as a loss."""
         names = ["_".join(name.split("/")) for name in self.frames]
         if len(set(names)) != len(names):
             raise FormatError("frames", "names that differ when / becomes _", "two alike")
         return names, {"/ in frame names": sum(a != b for a, b in zip(names, self.frames, strict=True))}
 
-    def need_sizes(self, layout: str) -> None:
-        """FormatError where the size of an image is not known."""
+    def require_sizes(self, layout: str) -> None:
+        """Raise FormatError if the size of an image is unknown."""
         missing = int((self.sizes_wh <= 0).any(axis=1).sum())
         if missing:
             expected = "--images FOLDER or --image-size WIDTHxHEIGHT"
@@ -241,24 +262,48 @@ class LabelTable:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
-    """What became of a table. files: how many were written; lost: boxes (or frames) by field that the layout has
-    no place for; assumed: those for which a value had to be made up, by field.
-    """
+class WriteSummary:
+    """Summary of a written table."""
 
     files: int
+    """Number of written files."""
     lost: Mapping[str, int]
+    """Number of boxes or frames with a value that the layout cannot hold, by field."""
     assumed: Mapping[str, int]
+    """Number of boxes or frames with an assumed value, by field."""
 
     @classmethod
-    def of(cls, files: int, lost: Mapping[str, int], assumed: Mapping[str, int] | None = None) -> Written:
-        """Counts of 0 are left out."""
-        kept = ({name: int(count) for name, count in c.items() if count} for c in (lost, assumed or {}))
-        return cls(files, *kept)
+    def from_counts(
+        cls, files: int, lost: Mapping[str, int], assumed: Mapping[str, int] | None = None
+    ) -> WriteSummary:
+        """Make a summary without counts of 0.
+
+        Args:
+            files: Number of written files.
+            lost: Lost values by field.
+            assumed: Assumed values by field.
+
+        Returns:
+            The summary.
+        """
+        counts = ({name: int(count) for name, count in c.items() if count} for c in (lost, assumed or {}))
+        return cls(files, *counts)
 
 
 def copy_images(targets: Mapping[str, Path], images: Mapping[str, Path], only: str | None = None) -> int:
-    """Copy each frame's image to its place, which has no suffix yet; how many. FormatError for all but `only`."""
+    """Copy images.
+
+    Args:
+        targets: Target without suffix, by frame identifier.
+        images: Source, by frame identifier.
+        only: The only suffix that the layout can hold, if any.
+
+    Returns:
+        Number of copied images.
+
+    Raises:
+        FormatError: An image has another suffix than `only`.
+    """
     for identifier, source in images.items():
         target, suffix = targets[identifier], source.suffix.lower()
         if only not in (None, suffix):
@@ -268,25 +313,25 @@ def copy_images(targets: Mapping[str, Path], images: Mapping[str, Path], only: s
     return len(images)
 
 
-def number_text(value: float) -> str:
-    """Two decimals as KITTI writes where they are enough, else all that are needed."""
+def format_number(value: float) -> str:
+    """Format a number with two decimals, as KITTI does, or with more if it needs them."""
     value += 0.0  # no "-0.00"
     text = f"{value:.2f}"
-    return text if float(text) == value else positional(value)
+    return text if float(text) == value else format_shortest(value)
 
 
-def positional(value: float) -> str:
-    """The shortest decimals that read back as the same number, without an exponent."""
+def format_shortest(value: float) -> str:
+    """Format a number with the fewest decimals that read back unchanged, without an exponent."""
     return np.format_float_positional(value, trim="-")
 
 
-def matrix_of(camera: Any) -> NDArray[np.float64]:
-    """The projection (3, 4) px of a COCO "camera" entry of this project. FormatError for another's."""
-    told = camera if isinstance(camera, dict) else {}
-    if "projection" in told:
-        values = told["projection"]
+def parse_camera_entry(camera: Any) -> NDArray[np.float64]:
+    """Return the projection (3, 4) px of a COCO "camera" entry of this project; FormatError for another's."""
+    entry = camera if isinstance(camera, dict) else {}
+    if "projection" in entry:
+        values = entry["projection"]
     else:
-        fx, fy, cx, cy = (told.get(k) for k in ("fx", "fy", "cx", "cy"))
+        fx, fy, cx, cy = (entry.get(k) for k in ("fx", "fy", "cx", "cy"))
         values = [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]
     good = isinstance(values, list) and all(type(v) in (int, float) and math.isfinite(v) for v in values)
     if not good or len(values) != 12:
@@ -294,18 +339,18 @@ def matrix_of(camera: Any) -> NDArray[np.float64]:
     return np.array(values, np.float64).reshape(3, 4)
 
 
-def camera_entry(projection: Tensor) -> dict[str, Any]:
-    """COCO's "camera" entry of a projection (3, 4) px."""
-    values = shortest(projection)
-    places = {"fx": 0, "fy": 5, "cx": 2, "cy": 6}
-    return {**{name: values[i] for name, i in places.items()}, "projection": values}
+def make_camera_entry(projection: Tensor) -> dict[str, Any]:
+    """Make COCO's "camera" entry of a projection (3, 4) px."""
+    values = shortest_decimals(projection)
+    index = {"fx": 0, "fy": 5, "cx": 2, "cy": 6}
+    return {**{name: values[i] for name, i in index.items()}, "projection": values}
 
 
-def shortest(values: Tensor) -> list[float]:
-    """float32 values as the shortest decimals that read back as the same float32."""
+def shortest_decimals(values: Tensor) -> list[float]:
+    """Round float32 values to the fewest decimals that read back as the same float32."""
     return [float(str(v)) for v in values.float().flatten().numpy()]
 
 
-def known_pose(pose: Sequence[float]) -> bool:
-    """Whether a row of `pose` is known."""
+def is_known_pose(pose: Sequence[float]) -> bool:
+    """Whether a row of `LabelTable.pose` is known."""
     return all(map(math.isfinite, pose))

@@ -1,4 +1,4 @@
-"""Label files by the layout of what lies at a path. Those of KITTI and COCO are read without torch."""
+"""Detection of a path's layout, and reading of its labels; KITTI's and COCO's are read without torch."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
 _VKITTI2 = re.compile("Scene[0-9]|vkitti_2")
-"""How the names of Virtual KITTI 2's folders begin."""
+"""Beginnings of the names of Virtual KITTI 2's folders."""
 LAYOUTS = ("kitti", "coco", "yolo", "vkitti1", "vkitti2")
 
 
-def layout_of(path: Path) -> str | None:
-    """One of LAYOUTS by what lies there; None for a folder of none. FormatError for a file of none, or nothing."""
+def detect_layout(path: Path) -> str | None:
+    """Return a path's layout; None for a folder of none. Raises FormatError for other files and missing paths."""
     if path.is_file():
         if path.suffix.lower() == ".json":
             return "coco"
@@ -35,18 +35,32 @@ def layout_of(path: Path) -> str | None:
     with os.scandir(path) as entries:
         if any(_VKITTI2.match(entry.name) and entry.is_dir() for entry in entries):
             return "vkitti2"
-    folder = kitti_labels.label_folder(path)
+    folder = kitti_labels.find_label_folder(path)
     if folder is None:
         return None
     # YOLO's lines begin with a class number, KITTI's with a name
-    begins = (files.read_text(folder / name).split(None, 1)[:1] for name in kitti_labels.text_files(folder))
-    first = next((words[0] for words in begins if words), "")
+    beginnings = (
+        files.read_text(folder / name).split(None, 1)[:1] for name in kitti_labels.list_text_files(folder)
+    )
+    first = next((words[0] for words in beginnings if words), "")
     return "yolo" if first.isdecimal() else "kitti"
 
 
 def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:
-    """The labels, or detections where `scored`, of a path. truth: the labels beside which detections are read, for
-    COCO's ids, YOLO's classes and image sizes. FormatError naming file, line or entry, and field.
+    """Read labels or detections.
+
+    Args:
+        path: File or folder.
+        layout: One of LAYOUTS.
+        scored: Read detections with scores.
+        truth: Labels of the same frames, which give detections COCO's ids, YOLO's classes and image sizes.
+
+    Returns:
+        The labels or detections.
+
+    Raises:
+        FormatError: Names file, line or entry, and field.
+        RangeError: Unknown layout.
     """
     if not path.exists():
         raise FormatError(str(path), "a file or folder of labels", "nothing there")

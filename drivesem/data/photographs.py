@@ -1,46 +1,174 @@
-"""Photographs of which nothing is told but the file: their pixels, and a camera from EXIF or from a usual view."""
+"""Photographs and indices of frames: image files, pixels, cameras from EXIF, and checks against calibrations."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+import torch
 
-from drivesem.data.frames import pinhole
 from scene_ir import files
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import FormatError, RangeError, make_printable
 from scene_ir.io import to_tensor
-from scene_ir.types import Camera, Frame
+from scene_ir.types import Camera, Frame, Labels
 
+T = TypeVar("T")
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+PNG_COMPRESSION = 1
+"""zlib level for images: several times as fast as the best compression."""
+BOX_MARGIN_PX = 2.0
+"""How far a label's box may reach beyond the image. KITTI's never do (checked on all 7,481); rounding may."""
+CENTRE_RANGE = (0.25, 0.75)
+"""Range of the principal point, as a fraction of the image; KITTI's lie at 0.46 to 0.50. Beyond it, image and
+calibration do not belong together."""
+NEAR_M = 0.1
+"""Near plane of projected boxes; nothing nearer is visible."""
 DEFAULT_FOCAL = 0.58
-"""Focal length in image widths where nothing tells it: KITTI's 721 px of 1242, a view 81 degrees wide."""
+"""Default focal length in image widths: KITTI's 721 px of 1242, a field of view of 81 degrees."""
 FILM_MM = 36.0
-"""Width of the film that EXIF's "focal length in 35 mm film" speaks of; its longer side."""
+"""Longer side of the film to which EXIF's "focal length in 35 mm film" refers."""
 _EXIF, _FOCAL, _FOCAL_35 = 0x8769, 0x920A, 0xA405
 _PLANE_X, _PLANE_Y, _PLANE_UNIT, _ORIENTATION = 0xA20E, 0xA20F, 0xA210, 0x0112
-"""Tags of EXIF 2.32: its own directory, focal length in mm and in 35 mm film, pixels a unit on the sensor."""
+"""Tags of EXIF 2.32: sub-directory, focal length in mm and in 35 mm film, sensor pixels per unit."""
 _UNIT_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0}
-_TURNED: dict[float, int] = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
-"""EXIF's orientations, and quarter turns to the left that put them upright."""
+_QUARTER_TURNS: dict[float, int] = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
+"""Quarter turns to the left that make an image of each EXIF orientation upright."""
 _MIRRORED = (2, 4, 5, 7)
-"""Of these orientations those that left and right are to be swapped in, after the turns."""
-_OTHER_CHANNELS = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
-"""Pillow's modes of 8 bits that are not red, green and blue, but can be."""
+"""Orientations that are also mirrored left to right, after the turns."""
+_CONVERTIBLE_MODES = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
+"""Pillow's 8-bit modes that convert to RGB."""
+
+
+class FrameIndex(Generic[T]):
+    """Entries of a data set's frames, known before their files are read, by identifier."""
+
+    def __init__(self, name: object, entries: Mapping[str, T]) -> None:
+        self._name = name  # of the data set, for errors
+        self._entries = dict(entries)
+
+    @property
+    def identifiers(self) -> tuple[str, ...]:
+        """Identifiers of the frames, sorted."""
+        return tuple(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def _entry(self, identifier: str) -> T:
+        if identifier not in self._entries:
+            raise RangeError(f"frame of {self._name}", f"one of {len(self)} identifiers", repr(identifier))
+        return self._entries[identifier]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """List the images in a folder, sorted. Raises FormatError if there is no such folder."""
+    try:
+        exists = folder.is_dir()
+    except OSError as error:  # such as a name that is too long
+        raise FormatError(make_printable(str(folder)), "a folder of images", f"{error.strerror}") from None
+    if not exists:
+        raise FormatError(str(folder), "a folder of images", "no such folder")
+    return [p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."]
+
+
+def read_image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image, from its header. FormatError."""
+    with files.open_image(path) as image:
+        return image.size
+
+
+def pinhole_camera(height: int, width: int, focal_px: float) -> Camera:
+    """Make a camera with a centred principal point.
+
+    Args:
+        height: Image height, px.
+        width: Image width, px.
+        focal_px: Focal length.
+
+    Returns:
+        The camera.
+    """
+    centre = [(width - 1) / 2, (height - 1) / 2]
+    intrinsics = torch.tensor([[focal_px, 0.0, centre[0]], [0.0, focal_px, centre[1]], [0.0, 0.0, 1.0]])
+    return Camera(intrinsics, height, width)
+
+
+def check_focal(focal_px: float | None) -> None:
+    """Raise RangeError unless a focal length is None or positive."""
+    if focal_px is not None and not (math.isfinite(focal_px) and focal_px > 0):
+        raise RangeError("focal_px", "positive px", focal_px)
+
+
+def check_image_size(image_path: Path, camera: Camera, labels: Labels | None) -> None:
+    """Check that an image's size fits its calibration and its labels.
+
+    Args:
+        image_path: The image, for errors.
+        camera: Camera with the image's size.
+        labels: Labels with boxes that the image must contain, if any.
+
+    Raises:
+        FormatError: The size contradicts the calibration or the labels.
+    """
+    size_text = f"{camera.width}x{camera.height} px"
+    low, high = CENTRE_RANGE
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        centre = float(camera.intrinsics[axis, 2])
+        if not low * size <= centre <= high * size:
+            name = ("wide", "high")[axis]
+            expected = f"{centre / high:.0f} to {centre / low:.0f} px {name} (principal point of the calibration)"
+            raise FormatError(str(image_path), expected, size_text)
+    if labels is None:
+        return
+    boxes = torch.cat([labels.boxes_xyxy, labels.ignore_xyxy])
+    limit = torch.tensor([camera.width, camera.height], dtype=boxes.dtype) - 1 + BOX_MARGIN_PX
+    outside = ((boxes[:, 2:] > limit) | (boxes[:, :2] < -BOX_MARGIN_PX)).any(dim=1)
+    if bool(outside.any()):
+        box = [round(v, 2) for v in boxes[outside][0].tolist()]
+        raise FormatError(str(image_path), f"an image that holds the label's box {box}", size_text)
+
+
+def is_in_front(z: float, length: float, width: float, yaw: float) -> bool:
+    """Whether any part of a 3D box lies beyond the near plane.
+
+    Args:
+        z: Distance of the box's centre, m.
+        length: Length, m.
+        width: Width, m.
+        yaw: Yaw, rad.
+
+    Returns:
+        False if no pixel can show the box.
+    """
+    return z + 0.5 * (length * abs(math.sin(yaw)) + width * abs(math.cos(yaw))) > NEAR_M
+
+
+def match_images(folders: Sequence[Path], frames: Sequence[str]) -> dict[str, Path]:
+    """Find the image of each frame in one of the folders; frames without an image are left out."""
+    images = {p.stem: p for folder in reversed(folders) for p in list_images(folder)}
+    return {name: images[name] for name in frames if name in images}
+
+
+def match_images_below(folders: Sequence[Path], frames: Sequence[str]) -> dict[str, Path]:
+    """As `match_images`, in those folders that exist and in their direct subfolders."""
+    parents = [folder for folder in folders if folder.is_dir()]
+    return match_images([f for p in parents for f in (p, *sorted(c for c in p.iterdir() if c.is_dir()))], frames)
 
 
 def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
-    """A photograph of 8 bits as (H, W, 3) RGB uint8: grey becomes three equal channels, and opacity is left out.
+    """Read an 8-bit photograph as (H, W, 3) RGB uint8; grey becomes three equal channels, opacity is dropped.
 
-    FormatError where the file is missing, does not decode, has more bits, or is not of `size_hw`.
+    Raises FormatError where the file is missing, does not decode, has more bits, or is not of `size_hw`.
     """
-    files.check_text(f"{path.parent}: name of a photograph", path.name)
-    with files.opened_image(path, files.read_bytes(path)) as image:
+    files.check_utf8(f"{path.parent}: name of a photograph", path.name)
+    with files.open_image(path, files.read_bytes(path)) as image:
         width, height = image.size
-        if image.mode not in _OTHER_CHANNELS:
+        if image.mode not in _CONVERTIBLE_MODES:
             return files.read_image(path, size_hw)
         pixels = np.array(image.convert("RGB"))
     if size_hw is not None and (height, width) != size_hw:
@@ -49,71 +177,75 @@ def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
 
 
 @dataclass(frozen=True, slots=True)
-class Focal:
-    """A focal length, px, and where it is from: "given", "EXIF" or "default"."""
+class FocalLength:
+    """A focal length and its source."""
 
     length_px: float
+    """Focal length, px."""
     source: str
+    """"given", "EXIF" or "default"."""
 
     def __str__(self) -> str:
         return f"{self.length_px:.1f} px, {self.source}"
 
 
-def upright_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
-    """As `read_pixels`, turned as EXIF says: as viewers show it, and OpenCV reads it. Where only the stored image
-    is of `size_hw`, that is meant, and stays as it is.
+def read_upright(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
+    """Read pixels as `read_pixels`, turned upright by EXIF, as viewers and OpenCV do.
+
+    If only the stored image has the size `size_hw`, it is not turned.
     """
-    told, _, _ = _header(path)
-    pixels = np.rot90(read_pixels(path), _turns(told))
+    tags, _, _ = _read_header(path)
+    pixels = np.rot90(read_pixels(path), _quarter_turns(tags))
     if size_hw not in (None, pixels.shape[:2]):
         return read_pixels(path, size_hw)
-    return np.ascontiguousarray(pixels[:, ::-1] if _positive(told.get(_ORIENTATION)) in _MIRRORED else pixels)
+    return np.ascontiguousarray(pixels[:, ::-1] if _to_positive(tags.get(_ORIENTATION)) in _MIRRORED else pixels)
 
 
-def upright_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as seen upright, from its header. FormatError."""
-    return _header(path)[1:]
+def read_upright_size(path: Path) -> tuple[int, int]:
+    """Read width and height of the upright image from its header. Raises FormatError."""
+    return _read_header(path)[1:]
 
 
-def camera_of(image_path: Path, focal_px: float | None = None) -> Camera:
-    """The camera of a photograph: its axis through the middle, focal length as `focal_of` has it."""
-    _, width, height = _header(image_path)
-    return pinhole(height, width, focal_of(image_path, focal_px).length_px)
+def read_focal_length(image_path: Path, focal_px: float | None = None) -> FocalLength:
+    """Return the focal length of a photograph: `focal_px`, else EXIF's, else 0.58 of the image's longer side.
 
-
-def focal_of(image_path: Path, focal_px: float | None = None) -> Focal:
-    """The focal length of a photograph: `focal_px`, otherwise EXIF's, otherwise 0.58 of the image's longer side.
-
-    RangeError for a focal_px that is no positive number, FormatError naming a file that is no image.
+    Raises RangeError unless focal_px is positive, FormatError naming a file that is no image.
     """
-    told, width, height = _header(image_path)
+    tags, width, height = _read_header(image_path)
     if focal_px is not None:
-        return Focal(_checked(focal_px), "given")
+        check_focal(focal_px)
+        return FocalLength(float(focal_px), "given")
     longer = max(width, height)
-    film = _positive(told.get(_FOCAL_35))
+    film = _to_positive(tags.get(_FOCAL_35))
     if film:
-        return Focal(film / FILM_MM * longer, "EXIF")
-    unit = _UNIT_MM.get(_positive(told.get(_PLANE_UNIT, 2)))
-    length, density = _positive(told.get(_FOCAL)), _positive(told.get(_PLANE_X)) or _positive(told.get(_PLANE_Y))
+        return FocalLength(film / FILM_MM * longer, "EXIF")
+    unit = _UNIT_MM.get(_to_positive(tags.get(_PLANE_UNIT, 2)))
+    length, density = (
+        _to_positive(tags.get(_FOCAL)),
+        _to_positive(tags.get(_PLANE_X)) or _to_positive(tags.get(_PLANE_Y)),
+    )
     if unit and length and density:
-        return Focal(length / unit * density, "EXIF")
-    return Focal(DEFAULT_FOCAL * longer, "default")
+        return FocalLength(length / unit * density, "EXIF")
+    return FocalLength(DEFAULT_FOCAL * longer, "default")
 
 
-def camera_for(height: int, width: int, focal_px: float | None = None) -> Camera:
-    """The camera of pixels that nothing is told of: 0.58 of the longer side where no focal length is given."""
-    focal = DEFAULT_FOCAL * max(width, height) if focal_px is None else _checked(focal_px)
-    return pinhole(height, width, focal)
+def default_camera(height: int, width: int, focal_px: float | None = None) -> Camera:
+    """Make a camera for an image without metadata.
+
+    Args:
+        height: Image height, px.
+        width: Image width, px.
+        focal_px: Focal length; by default 0.58 of the longer side.
+
+    Raises:
+        RangeError: Unless focal_px is positive.
+    """
+    check_focal(focal_px)
+    return pinhole_camera(height, width, DEFAULT_FOCAL * max(width, height) if focal_px is None else focal_px)
 
 
-def _checked(focal_px: float) -> float:
-    if not (math.isfinite(focal_px) and focal_px > 0):
-        raise RangeError("focal", "positive px", focal_px)
-    return float(focal_px)
-
-
-def _positive(value: Any) -> float:
-    """A value of EXIF as a positive number; 0 where it is none: cameras write 0 for what they do not know."""
+def _to_positive(value: Any) -> float:
+    """Convert an EXIF value to a positive number; 0 if it is none. Cameras write 0 for unknown values."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -121,24 +253,25 @@ def _positive(value: Any) -> float:
     return number if math.isfinite(number) and number > 0 else 0.0
 
 
-def _header(path: Path) -> tuple[dict[int, Any], int, int]:
-    """EXIF's values by tag, and width and height as seen upright. FormatError."""
+def _read_header(path: Path) -> tuple[dict[int, Any], int, int]:
+    """Read EXIF values by tag, and width and height of the upright image. Raises FormatError."""
     from PIL import Image
 
-    with files.opened_image(path) as image:  # Pillow reads EXIF when it is asked for, and then says what is wrong
-        exif = Image.Image.getexif(image)  # a PNG's own way decodes the pixels, behind which EXIF hardly ever is
-        told = {_ORIENTATION: exif.get(_ORIENTATION), **exif.get_ifd(_EXIF)}
+    with files.open_image(path) as image:  # Pillow reads EXIF on demand and raises then
+        exif = Image.Image.getexif(image)  # PngImageFile's method would decode all pixels first
+        tags = {_ORIENTATION: exif.get(_ORIENTATION), **exif.get_ifd(_EXIF)}
         width, height = image.size
-    return (told, height, width) if _turns(told) % 2 else (told, width, height)
+    return (tags, height, width) if _quarter_turns(tags) % 2 else (tags, width, height)
 
 
-def _turns(told: Mapping[int, Any]) -> int:
-    return _TURNED.get(_positive(told.get(_ORIENTATION)), 0)
+def _quarter_turns(tags: Mapping[int, Any]) -> int:
+    return _QUARTER_TURNS.get(_to_positive(tags.get(_ORIENTATION)), 0)
 
 
-def photograph(path: Path, focal_px: float | None = None) -> Frame:
-    """A photograph, upright, with its camera, without labels. FormatError naming the file; RangeError."""
-    focal = focal_of(path, focal_px)
-    image = to_tensor(upright_pixels(path))
+def read_photograph(path: Path, focal_px: float | None = None) -> Frame:
+    """Read an upright photograph with its camera, without labels. Raises FormatError or RangeError."""
+    focal = read_focal_length(path, focal_px)
+    image = to_tensor(read_upright(path))
     provenance = {"dataset": "photograph", "image": path.name, "focal": str(focal)}
-    return Frame(path.stem, image, pinhole(image.shape[1], image.shape[2], focal.length_px), provenance=provenance)
+    camera = pinhole_camera(image.shape[1], image.shape[2], focal.length_px)
+    return Frame(path.stem, image, camera, provenance=provenance)

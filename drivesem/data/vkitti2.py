@@ -1,4 +1,4 @@
-"""Virtual KITTI 2 (2.0.3): `SceneXX/<variation>/frames/{rgb,depth,...}/Camera_N/` and tables, read and written.
+"""Virtual KITTI 2 (2.0.3), `SceneXX/<variation>/frames/{rgb,depth,...}/Camera_N/` and tables: reader and writer.
 
 Source of the layout: the data set's own text files' headers (Cabon, Murray, Humenberger 2020). Errors name the
 file, the line, the field, what was expected and what was found.
@@ -17,12 +17,21 @@ import cv2
 import numpy as np
 import torch
 
-from drivesem.data import virtual
-from drivesem.data.label_table import LabelTable, Written, copy_images, matrix_of
-from drivesem.data.pixels import Colours, read_indices, write_indices
-from drivesem.data.tables import Recent, Table, TableRow, decimal, one_word, text_of
-from drivesem.data.truth import Exposure, Place, TrackedObject, occlusion_of
-from drivesem.data.virtual import COLOURS, KINDS, Segments, Shot, VirtualDataset
+from drivesem.data import vkitti
+from drivesem.data.ground_truth import Exposure, FrameLocation, TrackedObject, occlusion_from_visible
+from drivesem.data.label_table import LabelTable, WriteSummary, copy_images, parse_camera_entry
+from drivesem.data.vkitti import COLOURS, KINDS, PixelLabels, VirtualKittiDataset, VirtualKittiImage
+from drivesem.data.vkitti_files import (
+    ColourTable,
+    FileCache,
+    TableRow,
+    TextTable,
+    format_decimal,
+    format_table,
+    read_indices,
+    to_word,
+    write_indices,
+)
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Camera
@@ -39,11 +48,11 @@ INTRINSIC = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
 EXTRINSIC = "frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"
 COLORS = "Category r g b"
 MAX_TRACK = 254
-"""The instance image holds the track's number plus 1 in 8 bits."""
+"""The instance image holds track + 1 in 8 bits."""
 _JPEG_QUALITY = 95
 _IMAGE_NAME = re.compile(r"rgb_(\d+)\.(jpg|jpeg|png)$")
 _OWN_INTRINSIC = (725.0087, 725.0087, 620.5, 187.0)
-"""fx, fy, cx, cy px of the data set's own camera, where a table knows none."""
+"""fx, fy, cx, cy px of the data set's camera, for tables without cameras."""
 _MODALITIES = {
     "rgb": ("rgb", "rgb"),
     "depth": ("depth", "depth"),
@@ -53,46 +62,76 @@ _MODALITIES = {
 """Folder under `frames` and prefix of the file names."""
 
 
-def format_bbox(frame: int, camera: int, thing: TrackedObject) -> str:
-    """A row of bbox.txt. Shares are written so that they come back to the last bit."""
-    left, top, right, bottom = thing.box_ltrb
-    shares = (repr(float(thing.truncation)), repr(float(thing.visible)))
-    fields = (frame, camera, thing.track, left, right, top, bottom, thing.pixels, *shares, bool(thing.moving))
+def format_bbox(frame: int, camera: int, tracked: TrackedObject) -> str:
+    """Format a row of bbox.txt; shares read back to the last bit.
+
+    Args:
+        frame: Number of the frame.
+        camera: Number of the camera.
+        tracked: Object.
+
+    Returns:
+        The row.
+    """
+    left, top, right, bottom = tracked.box_ltrb
+    shares = (repr(float(tracked.truncation)), repr(float(tracked.visible)))
+    fields = (
+        frame,
+        camera,
+        tracked.track,
+        left,
+        right,
+        top,
+        bottom,
+        tracked.pixels,
+        *shares,
+        bool(tracked.moving),
+    )
     return " ".join(map(str, fields))
 
 
-def format_pose(frame: int, camera: int, thing: TrackedObject) -> str:
-    """A row of pose.txt. In camera axes objects stand upright: their rotations about x and z are 0."""
-    length, height, width = thing.size_lhw
-    numbers = (virtual.alpha(thing), width, height, length, *thing.world, *thing.world_yxz)
-    numbers += (*thing.translation, thing.yaw)
-    return " ".join([str(frame), str(camera), str(thing.track), *map(decimal, numbers), "0", "0"])
+def format_pose(frame: int, camera: int, tracked: TrackedObject) -> str:
+    """Format a row of pose.txt; in camera axes, rotations about x and z are 0.
+
+    Args:
+        frame: Number of the frame.
+        camera: Number of the camera.
+        tracked: Object.
+
+    Returns:
+        The row.
+    """
+    length, height, width = tracked.size_lhw
+    numbers = (vkitti.observation_angle(tracked), width, height, length, *tracked.world, *tracked.world_yxz)
+    numbers += (*tracked.translation, tracked.yaw)
+    return " ".join([str(frame), str(camera), str(tracked.track), *map(format_decimal, numbers), "0", "0"])
 
 
-def _entry(
-    place: Place, camera: int, things: Sequence[TrackedObject], intrinsic: Sequence[float], extrinsic: np.ndarray
+def _make_entry(
+    location: FrameLocation,
+    camera: int,
+    objects: Sequence[TrackedObject],
+    intrinsic: Sequence[float],
+    extrinsic: np.ndarray,
 ) -> dict[str, object]:
-    """A frame's rows of each table. intrinsic: fx, fy, cx, cy px."""
-    frame = place.frame
+    """Make a frame's rows of each table. `intrinsic` is fx, fy, cx, cy px."""
+    frame = location.frame
     return {
-        "number": place.number,
-        "scene": place.scene,
-        "variation": place.variation,
+        "number": location.number,
+        "scene": location.scene,
+        "variation": location.variation,
         "frame": frame,
         "camera": camera,
-        "intrinsic": " ".join([str(frame), str(camera), *(decimal(float(v)) for v in intrinsic)]),
-        "extrinsic": f"{frame} {camera} {virtual.matrix_text(extrinsic)}",
-        "bbox": [format_bbox(frame, camera, thing) for thing in things],
-        "pose": [format_pose(frame, camera, thing) for thing in things],
-        "tracks": [[t.track, f"{t.kind} {one_word(t.model)} {one_word(t.paint)}"] for t in things],
+        "intrinsic": " ".join([str(frame), str(camera), *(format_decimal(float(v)) for v in intrinsic)]),
+        "extrinsic": f"{frame} {camera} {vkitti.format_extrinsic(extrinsic)}",
+        "bbox": [format_bbox(frame, camera, tracked) for tracked in objects],
+        "pose": [format_pose(frame, camera, tracked) for tracked in objects],
+        "tracks": [[t.track, f"{t.kind} {to_word(t.model)} {to_word(t.paint)}"] for t in objects],
     }
 
 
 class Vkitti2Writer:
-    """Writes frames in the layout of Virtual KITTI 2.
-
-    root: the folder that gets SceneXX folders. cameras: how many images a place has, 1 or 2.
-    """
+    """Writes frames in the layout of Virtual KITTI 2 to SceneXX folders under `root`, with 1 or 2 cameras."""
 
     def __init__(self, root: Path, cameras: int = 1) -> None:
         if cameras not in (1, 2):
@@ -100,65 +139,84 @@ class Vkitti2Writer:
         self.root = Path(root)
         self.cameras = cameras
 
-    def _clip(self, scene: str, variation: str) -> Path:
+    def _clip_folder(self, scene: str, variation: str) -> Path:
         return self.root / f"Scene{scene}" / variation
 
-    def image(self, place: Place, modality: str, camera: int, suffix: str = "png") -> Path:
-        """The file of one of a place's images."""
+    def image_path(self, location: FrameLocation, modality: str, camera: int, suffix: str = "png") -> Path:
+        """Return the file of an image.
+
+        Args:
+            location: Location of the frame.
+            modality: Key of `_MODALITIES`.
+            camera: Number of the camera.
+            suffix: Suffix without dot.
+
+        Returns:
+            The path.
+        """
         folder, prefix = _MODALITIES[modality]
-        frames = self._clip(place.scene, place.variation) / "frames"
-        return frames / folder / f"Camera_{camera}" / f"{prefix}_{place.frame:05d}.{suffix}"
+        frames = self._clip_folder(location.scene, location.variation) / "frames"
+        return frames / folder / f"Camera_{camera}" / f"{prefix}_{location.frame:05d}.{suffix}"
 
-    def exists(self, place: Place) -> bool:
-        """Whether the frame's images are there, of all cameras."""
-        return all(self.image(place, "rgb", camera, "jpg").exists() for camera in range(self.cameras))
+    def exists(self, location: FrameLocation) -> bool:
+        """Whether the images of all cameras exist."""
+        return all(self.image_path(location, "rgb", camera, "jpg").exists() for camera in range(self.cameras))
 
-    def write(self, place: Place, exposure: Exposure, camera: int = 0) -> dict[str, object]:
-        """Write one camera's images of a frame, each atomically, the photograph last -> an entry for `finish`.
+    def write(self, location: FrameLocation, exposure: Exposure, camera: int = 0) -> dict[str, object]:
+        """Write one camera's images of a frame, each atomically, the photograph last.
 
-        FormatError for a track above 254; RangeError for what the layout cannot hold: a camera's offset or skew,
-        an unknown class.
+        Args:
+            location: Location of the frame.
+            exposure: Image with ground truth.
+            camera: Number of the camera.
+
+        Returns:
+            Entry for `finish`.
+
+        Raises:
+            FormatError: A track above 254.
+            RangeError: A camera with offset or skew, or an unknown class.
         """
         if not 0 <= camera < self.cameras:
             raise RangeError("vkitti2 camera", f"0 to {self.cameras - 1}", camera)
-        virtual.check_camera(exposure.camera)
-        virtual.check_tracks(exposure)
-        highest = max((int(exposure.instances.max()) - 1, *(thing.track for thing in exposure.objects)))
+        vkitti.check_camera(exposure.camera)
+        vkitti.check_tracks(exposure)
+        highest = max((int(exposure.instances.max()) - 1, *(tracked.track for tracked in exposure.objects)))
         if highest > MAX_TRACK:
             raise FormatError(
-                f"scene {place.scene}, {place.variation}, frame {place.frame}",
+                f"scene {location.scene}, {location.variation}, frame {location.frame}",
                 f"tracks of at most {MAX_TRACK}, as an indexed image has 256 values",
                 highest,
             )
-        colours = np.array([COLOURS[virtual.category(name)] for name in exposure.class_names], np.uint8)
-        files.write_png(self.image(place, "depth", camera), exposure.depth_cm)
-        files.write_png(self.image(place, "classes", camera), colours[exposure.classes])
-        write_indices(self.image(place, "instances", camera), exposure.instances)
-        things = sorted(exposure.objects, key=lambda thing: thing.track)
+        colours = np.array([COLOURS[vkitti.written_category(name)] for name in exposure.class_names], np.uint8)
+        files.write_png(self.image_path(location, "depth", camera), exposure.depth_cm)
+        files.write_png(self.image_path(location, "classes", camera), colours[exposure.classes])
+        write_indices(self.image_path(location, "instances", camera), exposure.instances)
+        objects = sorted(exposure.objects, key=lambda tracked: tracked.track)
         k = exposure.camera.intrinsics
         focal = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-        entry = _entry(place, camera, things, [float(v) for v in focal], exposure.extrinsic)
+        entry = _make_entry(location, camera, objects, [float(v) for v in focal], exposure.extrinsic)
         options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         _, data = cv2.imencode(".jpg", exposure.image[..., ::-1], options)
-        files.write_bytes(self.image(place, "rgb", camera, "jpg"), data.tobytes())
+        files.write_bytes(self.image_path(location, "rgb", camera, "jpg"), data.tobytes())
         return entry
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> None:
         """Write the tables of every scene and variation from the entries of all its images, in any order.
 
-        FormatError where two entries are of one image, or where a track is not the same object in all frames.
+        Raises FormatError for two entries of one image, and for a track that is not the same object in all frames.
         """
         self.write_tables(entries)
         lines = [f"{name} {r} {g} {b}" for name, (r, g, b) in COLOURS.items()]
-        for scene, variation, _ in virtual.clips_of(entries):
-            files.write_text(self._clip(scene, variation) / "colors.txt", text_of(COLORS, lines))
+        for scene, variation, _ in vkitti.group_by_clip(entries):
+            files.write_text(self._clip_folder(scene, variation) / "colors.txt", format_table(COLORS, lines))
 
     def write_tables(self, entries: Sequence[Mapping[str, object]]) -> int:
-        """Write the tables but for the colours of classes; how many."""
+        """Write the tables except for the colours. Returns their number."""
         count = 0
-        for scene, variation, group in virtual.clips_of(entries):
-            clip = self._clip(scene, variation)
-            tracks = virtual.tracks_of(clip / "info.txt", group)
+        for scene, variation, group in vkitti.group_by_clip(entries):
+            clip = self._clip_folder(scene, variation)
+            tracks = vkitti.collect_tracks(clip / "info.txt", group)
             tables = {
                 "info": (INFO, [f"{track} {text}" for track, text in tracks.items()]),
                 "bbox": (BBOX, [line for entry in group for line in cast(list[str], entry["bbox"])]),
@@ -167,39 +225,53 @@ class Vkitti2Writer:
                 "extrinsic": (EXTRINSIC, [str(entry["extrinsic"]) for entry in group]),
             }
             for name, (header, lines) in tables.items():
-                files.write_text(clip / f"{name}.txt", text_of(header, lines))
+                files.write_text(clip / f"{name}.txt", format_table(header, lines))
             count += len(tables)
         return count
 
 
-def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Written:
-    """Write a table's objects, which all need a 3D box. FormatError."""
-    places, changed = virtual.places_of(table, "01")
-    frames, lost, assumed = virtual.objects_in(table)
+def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> WriteSummary:
+    """Write a table's objects, which all need a 3D box.
+
+    Args:
+        table: Labels.
+        out: Output folder.
+        images: Images to copy, by frame identifier.
+
+    Returns:
+        Counts of files, lost and assumed values.
+
+    Raises:
+        FormatError: An object without a 3D box, or an unknown class.
+    """
+    locations, changed = vkitti.locate_frames(table, "01")
+    frames, lost, assumed = vkitti.make_tracked_objects(table)
     writer = Vkitti2Writer(out)
     offsets: Counter[tuple[str, str]] = Counter()
     entries: list[Mapping[str, object]] = []
-    for place in sorted(places, key=lambda p: p.frame):
-        things, clip = frames[place.number], (place.scene, place.variation)
-        if "track" not in table.extra:  # numbers that say nothing must not be one object in two frames
-            things = [replace(thing, track=thing.track + offsets[clip]) for thing in things]
-            offsets[clip] += len(things)
+    for location in sorted(locations, key=lambda p: p.frame):
+        objects, clip = frames[location.number], (location.scene, location.variation)
+        if "track" not in table.extra:  # arbitrary tracks must not join objects of different frames
+            objects = [replace(tracked, track=tracked.track + offsets[clip]) for tracked in objects]
+            offsets[clip] += len(objects)
         focal = _OWN_INTRINSIC
-        if place.number in table.cameras:
-            focal = matrix_of(table.cameras[place.number])[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        entries.append(_entry(place, 0, things, focal, np.eye(4)))
+        if location.number in table.cameras:
+            focal = parse_camera_entry(table.cameras[location.number])[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        entries.append(_make_entry(location, 0, objects, focal, np.eye(4)))
     count = writer.write_tables(entries)
-    targets = {table.frames[p.number]: writer.image(p, "rgb", 0, "jpg").with_suffix("") for p in places}
-    shifted = sum(bool(matrix_of(camera)[:, 3].any()) for camera in table.cameras.values())
-    held = (*virtual.HELD, "pixels", "world", "world_yxz", "camera")
+    targets = {table.frames[p.number]: writer.image_path(p, "rgb", 0, "jpg").with_suffix("") for p in locations}
+    shifted = sum(bool(parse_camera_entry(camera)[:, 3].any()) for camera in table.cameras.values())
+    supported = (*vkitti.SUPPORTED_FIELDS, "pixels", "world", "world_yxz", "camera")
     more = {"frame names": changed, "camera's offset": shifted}
     without = {"camera": len(table.frames) - len(table.cameras)}
     copied = copy_images(targets, images)
-    return Written.of(count + copied, lost | more | table.lost(held, {}), assumed | without)
+    return WriteSummary.from_counts(
+        count + copied, lost | more | table.count_lost(supported, {}), assumed | without
+    )
 
 
-def _child(parent: Path, name: str) -> Path | None:
-    """The folder `name` in `parent`, in any letter case."""
+def _find_folder(parent: Path, name: str) -> Path | None:
+    """Find the folder `name` in `parent`, in any letter case."""
     if (parent / name).is_dir():
         return parent / name
     if not parent.is_dir():
@@ -207,14 +279,20 @@ def _child(parent: Path, name: str) -> Path | None:
     return next((p for p in sorted(parent.iterdir()) if p.name.lower() == name.lower() and p.is_dir()), None)
 
 
-class Vkitti2Dataset(VirtualDataset):
+class Vkitti2Dataset(VirtualKittiDataset):
     """The frames of a Virtual KITTI 2 folder, named `Scene01/clone/Camera_0/00003`.
 
-    root: holds SceneXX folders, or one folder a download (`vkitti_2.0.3_rgb`, ...) that do, or both; folders
-    under `frames` may be in any letter case. Images and tables are needed, depth and both segmentations are used
-    where they are. cameras: which to read; variations: which to read, None for all. Raises FormatError where there
-    is no image, RangeError for a camera or variation of which there is none; a frame's own faults are raised by
-    `labels` and `frame`.
+    Images and tables are required, depth and both segmentations optional.
+
+    Args:
+        root: Folder with SceneXX folders, or with a folder for each download (`vkitti_2.0.3_rgb`, ...), or both;
+            folders under `frames` may be in any letter case.
+        cameras: Cameras to read.
+        variations: Variations to read; None: all.
+
+    Raises:
+        FormatError: No image. A frame's own faults are raised by `labels` and `frame` only.
+        RangeError: A camera or variation without images.
     """
 
     layout = "vkitti2"
@@ -225,85 +303,84 @@ class Vkitti2Dataset(VirtualDataset):
             raise FormatError(str(root), "a Virtual KITTI 2 folder", "no such folder")
         prefixed = sorted(p for p in root.iterdir() if p.name.lower().startswith("vkitti_2") and p.is_dir())
         self._bases = (root, *prefixed)
-        shots: dict[str, Shot] = {}
-        for shot in self._scan():
-            identifier = f"{shot.scene}/{shot.variation}/Camera_{shot.camera}/{shot.digits}"
-            shots.setdefault(identifier, shot)
-        if not shots:
+        images: dict[str, VirtualKittiImage] = {}
+        for image in self._scan():
+            identifier = f"{image.scene}/{image.variation}/Camera_{image.camera}/{image.digits}"
+            images.setdefault(identifier, image)
+        if not images:
             raise FormatError(str(root), "SceneXX/<variation>/frames/rgb/Camera_N/rgb_NNNNN.jpg", "none")
-        super().__init__(root, shots, cameras, variations)
-        self._colours = Recent[Colours](virtual.CACHED_TABLES)
+        super().__init__(root, images, cameras, variations)
+        self._colours = FileCache[ColourTable](vkitti.CACHED_TABLES)
 
-    def _scan(self) -> Iterator[Shot]:
-        """Every image under every base."""
+    def _scan(self) -> Iterator[VirtualKittiImage]:
+        """Yield every image under every base."""
         for base in self._bases:
             clips = [v for s in sorted(base.glob("Scene*")) if s.is_dir() for v in sorted(s.iterdir())]
             for clip in clips:
-                rgb = _child(clip / "frames", "rgb")
+                rgb = _find_folder(clip / "frames", "rgb")
                 for folder in sorted(f for f in rgb.glob("Camera_[0-9]") if f.is_dir()) if rgb else ():
                     camera = int(folder.name.removeprefix("Camera_"))
                     for path in sorted(folder.iterdir()):
                         if match := _IMAGE_NAME.match(path.name):
-                            yield Shot(clip.parent.name, clip.name, camera, match[1], path)
+                            yield VirtualKittiImage(clip.parent.name, clip.name, camera, match[1], path)
 
-    def _text(self, shot: Shot, name: str) -> Path:
-        """A table's file; where no folder has it, the place where it should be."""
-        paths = [base / shot.scene / shot.variation / f"{name}.txt" for base in self._bases]
+    def _table_path(self, image: VirtualKittiImage, name: str) -> Path:
+        """Return a table's file; if no folder has it, the first path where it may be."""
+        paths = [base / image.scene / image.variation / f"{name}.txt" for base in self._bases]
         return next((path for path in paths if path.is_file()), paths[0])
 
-    def _read(self, shot: Shot, name: str, header: str, keys: int = 2) -> Table:
+    def _read_table(self, image: VirtualKittiImage, name: str, header: str, keys: int = 2) -> TextTable:
         columns = list(dict.fromkeys(c for c in header.split() if c not in ("0", "1")))
-        return self._table(self._text(shot, name), columns[:keys], columns[keys:])
+        return self._table(self._table_path(image, name), columns[:keys], columns[keys:])
 
-    def _image(self, shot: Shot, modality: str) -> Path | None:
+    def _image(self, image: VirtualKittiImage, modality: str) -> Path | None:
         name, prefix = _MODALITIES[modality]
         for base in self._bases:
-            folder = _child(base / shot.scene / shot.variation / "frames", name)
-            if folder is not None and (folder / f"Camera_{shot.camera}").is_dir():
-                return folder / f"Camera_{shot.camera}" / f"{prefix}_{shot.digits}.png"
+            folder = _find_folder(base / image.scene / image.variation / "frames", name)
+            if folder is not None and (folder / f"Camera_{image.camera}").is_dir():
+                return folder / f"Camera_{image.camera}" / f"{prefix}_{image.digits}.png"
         return None
 
     def objects(self, identifier: str) -> tuple[TrackedObject, ...]:
-        """All that the tables say of the objects in one frame, in the order of bbox.txt.
+        """Read the objects of one frame, in the order of bbox.txt.
 
-        All count as labelled; rotations about x and z in camera axes are left out. FormatError naming file, line
-        and field: a track without a pose or without a type, a value out of its range, a box that ends before it
-        begins.
+        All are labelled; rotations about x and z in camera axes are dropped. Raises FormatError naming file, line and
+        field: a track without a pose or a type, a value out of range, a box that ends before it begins.
         """
-        shot = self._entry(identifier)
-        boxes = self._read(shot, "bbox", BBOX).unique("trackID", shot.frame, shot.camera or 0)
-        poses_table = self._read(shot, "pose", POSE)
-        poses = poses_table.unique("trackID", shot.frame, shot.camera or 0)
-        info = self._read(shot, "info", INFO, 1)
+        image = self._entry(identifier)
+        boxes = self._read_table(image, "bbox", BBOX).rows_by("trackID", image.frame, image.camera or 0)
+        poses_table = self._read_table(image, "pose", POSE)
+        poses = poses_table.rows_by("trackID", image.frame, image.camera or 0)
+        info = self._read_table(image, "info", INFO, 1)
         for track in boxes:
             if track not in poses:
-                what = f"a row of frame {shot.frame} cameraID {shot.camera} trackID {track}"
+                what = f"a row of frame {image.frame} cameraID {image.camera} trackID {track}"
                 raise FormatError(str(poses_table.path), what, "none")
-        return tuple(_object(track, box, poses[track], info.row(track)) for track, box in boxes.items())
+        return tuple(_parse_object(track, box, poses[track], info.row(track)) for track, box in boxes.items())
 
-    def _extrinsic(self, shot: Shot) -> TableRow:
-        return self._read(shot, "extrinsic", EXTRINSIC).row(shot.frame, shot.camera or 0)
+    def _extrinsic(self, image: VirtualKittiImage) -> TableRow:
+        return self._read_table(image, "extrinsic", EXTRINSIC).row(image.frame, image.camera or 0)
 
-    def _segments(self, shot: Shot, size_hw: tuple[int, int]) -> Segments:
-        instances, classes = (self._image(shot, modality) for modality in ("instances", "classes"))
+    def _segments(self, image: VirtualKittiImage, size_hw: tuple[int, int]) -> PixelLabels:
+        instances, classes = (self._image(image, modality) for modality in ("instances", "classes"))
         tracks = None if instances is None else read_indices(instances, size_hw)
         if classes is None:
-            return Segments(tracks, None, ())
-        colours = self._colours.get(self._text(shot, "colors"), lambda path: Colours(path, "Category"))
-        return Segments(tracks, colours.read(classes, size_hw), colours.names)
+            return PixelLabels(tracks, None, ())
+        colours = self._colours.get(self._table_path(image, "colors"), lambda path: ColourTable(path, "Category"))
+        return PixelLabels(tracks, colours.read(classes, size_hw), colours.names)
 
-    def _camera(self, shot: Shot, size_hw: tuple[int, int]) -> Camera:
-        row = self._read(shot, "intrinsic", INTRINSIC).row(shot.frame, shot.camera or 0)
+    def _camera(self, image: VirtualKittiImage, size_hw: tuple[int, int]) -> Camera:
+        row = self._read_table(image, "intrinsic", INTRINSIC).row(image.frame, image.camera or 0)
         fx, fy = row.positive("K[0,0]"), row.positive("K[1,1]")
         k = [[fx, 0.0, row.number("K[0,2]")], [0.0, fy, row.number("K[1,2]")], [0.0, 0.0, 1.0]]
         return Camera(torch.tensor(k), *size_hw)
 
 
-def _object(track: int, box: TableRow, pose: TableRow, info: TableRow) -> TrackedObject:
-    """One object from its rows in bbox.txt, pose.txt and info.txt."""
+def _parse_object(track: int, box: TableRow, pose: TableRow, info: TableRow) -> TrackedObject:
+    """Parse an object from its rows in bbox.txt, pose.txt and info.txt."""
     camera = [f"camera_space_{axis}" for axis in "XYZ"]
     sizes = ("length", "height", "width")
-    translation, size, yaw = virtual.pose_of(pose, camera, sizes, "rotation_camera_space_y")
+    translation, size, yaw = vkitti.parse_pose(pose, camera, sizes, "rotation_camera_space_y")
     visible = box.number("occupancy_ratio", 0, 1)
     world = [pose.number(f"world_space_{axis}") for axis in "XYZ"]
     turn = [pose.number(f"rotation_world_space_{axis}") for axis in "yxz"]
@@ -313,11 +390,11 @@ def _object(track: int, box: TableRow, pose: TableRow, info: TableRow) -> Tracke
         model=info.word("model"),
         paint=info.word("color"),
         moving=box.word("isMoving", ("True", "False", "1", "0")) in ("True", "1"),
-        box_ltrb=virtual.box_of(box, ("left", "top", "right", "bottom")),
+        box_ltrb=vkitti.parse_box(box, ("left", "top", "right", "bottom")),
         pixels=box.integer("number_pixels"),
         truncation=box.number("truncation_ratio", 0, 1),
         visible=visible,
-        occlusion=occlusion_of(visible),
+        occlusion=occlusion_from_visible(visible),
         translation=translation,
         yaw=yaw,
         size_lhw=size,

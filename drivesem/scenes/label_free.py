@@ -1,7 +1,7 @@
-"""A photograph without 3D boxes as a frame with them: vehicles found, or labelled in 2D, and placed on the ground.
+"""3D labels for photographs without them, from detections or 2D labels.
 
-A detector or a data set's labels say where vehicles are in the picture, `scene_ir.derender.pose` places them. What
-comes out is what a reader of 3D boxes gives, so that `scene_ir.derender.derender` takes it.
+`scene_ir.derender.pose` estimates the poses of vehicles from their boxes. The result has the form of a frame with 3D
+labels, the input of `scene_ir.derender.derender`.
 """
 
 from __future__ import annotations
@@ -19,223 +19,234 @@ from detectors.base import Predictor, predict
 from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections
-from drivesem.attack.judging import t_star_of
-from drivesem.data.classes import VEHICLES, as_kitti
+from drivesem.attack.targets import resolve_t_star
+from drivesem.data.classes import VEHICLES, to_kitti_kinds
+from drivesem.data.ground_truth import occlusion_from_visible
 from drivesem.data.label_table import UNKNOWN_OCCLUSION
-from drivesem.data.truth import occlusion_of
 from scene_ir.derender.derender import DerenderSettings
-from scene_ir.derender.pose import BORDER_PX, Poses, back_project, estimate
+from scene_ir.derender.pose import BORDER_PX, VehiclePoses, back_project, estimate_poses
 from scene_ir.derender.silhouette import FitSettings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import clip_boxes, ground_footprint, project_boxes
 from scene_ir.types import Camera, Frame, Labels
 
 _DETECTOR_FOCAL_PX = 721.0
-"""Of the pictures that the detector was trained on: others are resized so that cars are as large."""
+"""Focal length of the detector's training images; others are resized to it."""
 _SAME_SCALE = 1.3
-"""Up to this ratio of focal lengths they are not."""
+"""Ratio of focal lengths up to which images are not resized."""
 _NEAR_PX, _NEAR_SCALE = 100.0, 0.6
-"""Boxes of vehicles that are so high in the detector's picture are taken from one so much smaller: the detector
-knows few that are nearer, and ends their boxes too early (`python -m tools.bench label-free` has its error)."""
+"""Height from which boxes of vehicles come from an image scaled by the second value: the detector's boxes of very
+near vehicles are too small (`python -m tools.bench label-free` measures the error)."""
 _SAME_IOU = 0.4
-"""Boxes in both pictures that overlap so much are one vehicle. So are two that meet the same one in the smaller
-picture: they then stand in one place, and one is left out."""
+"""IoU from which boxes in both images are one vehicle. Two boxes with the same match in the smaller image are also
+one vehicle: they get the same pose, and one is dropped."""
 _TWICE_IOU = 0.6
-"""Boxes of a car and a truck that overlap more than this are one vehicle."""
+"""IoU above which boxes of a car and a truck are one vehicle."""
 VEHICLE_CLASSES = ("Car", "Truck")
 _PEOPLE_LHW = {"Pedestrian": (0.8, 1.75, 0.65), "Cyclist": (1.75, 1.75, 0.6)}
-"""m, of KITTI's people, about: they only have to hide what is behind them."""
-
+"""Typical sizes of KITTI's people, m; they serve as occluders only."""
 _AFLOAT = (0.8, 0.02)
-"""m, and m a metre of distance: what stands higher above or deeper below the ground than this is no vehicle."""
+"""Allowed distance of a vehicle from the ground: m, plus m per metre of depth."""
 _INSIDE = 0.35
-"""Share of the smaller footprint from which on two vehicles cannot both be where they are."""
+"""Shared fraction of the smaller footprint from which two vehicles contradict each other."""
 _NEAR_BORDER = 0.05
-"""A detector's box that ends nearer to the image's border than this share of its side is cut by it. Of 260 such
-ends in 400 generated frames 183 were within BORDER_PX, and 207 within this; of 3,523 others 7."""
-DETECTOR_LOOKS = 2
-"""A detector's boxes are not tight: the network looks again at those of what it found."""
-FITTING = FitSettings(max_shift_m=0.4, max_turn_rad=0.17, max_stretch=0.12, box=0.0)
-"""How far the fit to the outlines may leave the estimate: farther than it may leave a data set's labels, in
-heading above all. Outlines hardly tell distances: more shift made those no better. The boxes say nothing of their
-own, they are the estimate's."""
+"""Distance from the image's border, as a share of the box's side, within which a detected box is truncated. Of 260
+truncated sides in 400 generated frames, 183 were within BORDER_PX and 207 within this; of 3,523 others, 7."""
+POSE_ROUNDS = 2
+"""Rounds of pose estimation for detected boxes, which are not tight."""
+FIT_TO_DETECTIONS = FitSettings(max_shift_m=0.4, max_turn_rad=0.17, max_stretch=0.12, box=0.0)
+"""Limits of the outline fit around an estimate: wider than around labels, above all in heading. Outlines hardly
+determine distance; more shift did not improve it. The boxes carry no evidence: they are the estimate's own."""
+FIT_TO_LABELS = replace(FIT_TO_DETECTIONS, box=FitSettings().box)
+"""The same for labelled boxes, which are evidence of the outline."""
 
 
-LABELLED = replace(FITTING, box=FitSettings().box)
-"""The same where a data set says the boxes: these do say something of the outline."""
-
-
-def settings_for(settings: DerenderSettings) -> DerenderSettings:
-    """The settings for poses that were estimated from a detector's boxes."""
-    return replace(settings, fitting=FITTING)
+def detection_fit_settings(settings: DerenderSettings) -> DerenderSettings:
+    """Adapt settings to poses that were estimated from a detector's boxes."""
+    return replace(settings, fitting=FIT_TO_DETECTIONS)
 
 
 @torch.no_grad()
 def detect(frame: Frame, detector: Predictor | None = None) -> Detections:
-    """What a detector finds from its t* on, the shipped one by default; a vehicle that is both car and truck once.
+    """Detect objects with scores of at least t*, by default with the shipped detector.
 
-    Pictures of much longer or shorter focal length than the detector knows are resized for it. Vehicles that are
-    very near are looked at again in a smaller picture, which tells where they end.
+    A vehicle that is detected as both car and truck is returned once. Photographs with other focal lengths than the
+    training images' are resized. The boxes of very near vehicles come from a smaller image.
     """
     detector = detector or load_detector("squeezedet")
     scale = _DETECTOR_FOCAL_PX / float(frame.camera.intrinsics[0, 0])
     if 1 / _SAME_SCALE < scale < _SAME_SCALE:
         scale = 1.0
-    found = _seen(frame, detector, scale)
-    boxes = found.boxes_xyxy
+    detections = _detect_at_scale(frame, detector, scale)
+    boxes = detections.boxes_xyxy
     vehicle = torch.tensor(
-        [detector.classes[int(label)] in VEHICLE_CLASSES for label in found.labels], dtype=torch.bool
+        [detector.classes[int(label)] in VEHICLE_CLASSES for label in detections.labels], dtype=torch.bool
     )
     near = vehicle & (scale * (boxes[:, 3] - boxes[:, 1]) >= _NEAR_PX)
     if not near.any():
-        return found
-    smaller = _seen(frame, detector, _NEAR_SCALE * scale)
+        return detections
+    smaller = _detect_at_scale(frame, detector, _NEAR_SCALE * scale)
     if len(smaller):
-        overlap = iou_matrix(boxes, smaller.boxes_xyxy) * (found.labels[:, None] == smaller.labels)
+        overlap = iou_matrix(boxes, smaller.boxes_xyxy) * (detections.labels[:, None] == smaller.labels)
         same = near & (overlap >= _SAME_IOU).any(dim=1)
         boxes[same] = smaller.boxes_xyxy[overlap[same].argmax(dim=1)]
-    return found
+    return detections
 
 
-def _seen(frame: Frame, detector: Predictor, scale: float) -> Detections:
-    """What a detector finds in a frame's picture resized by `scale`, in px of the frame."""
-    t_star = t_star_of(detector)
+def _detect_at_scale(frame: Frame, detector: Predictor, scale: float) -> Detections:
+    """Detect objects in a photograph resized by `scale`; boxes in px of the frame."""
+    t_star = resolve_t_star(detector)
     image = frame.photograph[None].float()
     if scale != 1:
         size = [max(round(scale * side), 32) for side in image.shape[2:]]
         image = torch.nn.functional.interpolate(image, size, mode="bilinear", antialias=True, align_corners=False)
-    found = predict(detector, image)[0]
+    detections = predict(detector, image)[0]
     # pixel centres at integers: column j of the resized image is column (j + 1/2) / scale - 1/2
     ratio = torch.tensor([image.shape[3] / frame.camera.width, image.shape[2] / frame.camera.height]).repeat(2)
-    boxes = (found.boxes_xyxy + 0.5) / ratio - 0.5
+    boxes = (detections.boxes_xyxy + 0.5) / ratio - 0.5
     boxes = clip_boxes(boxes, frame.camera.height, frame.camera.width)
-    keep: list[int] = []
-    vehicle = [detector.classes[int(label)] in VEHICLE_CLASSES for label in found.labels]
+    selected: list[int] = []
+    vehicle = [detector.classes[int(label)] in VEHICLE_CLASSES for label in detections.labels]
     overlap = iou_matrix(boxes, boxes)
-    for i in range(len(found)):  # best first
+    for i in range(len(detections)):  # best first
         sides = boxes[i, 2:] - boxes[i, :2]
-        if float(found.scores[i]) < t_star or float(sides.min()) < 2:
+        if float(detections.scores[i]) < t_star or float(sides.min()) < 2:
             continue
-        if not any(vehicle[i] and vehicle[j] and float(overlap[i, j]) > _TWICE_IOU for j in keep):
-            keep.append(i)
-    return Detections(boxes[keep], found.labels[keep], found.scores[keep])
+        if not any(vehicle[i] and vehicle[j] and float(overlap[i, j]) > _TWICE_IOU for j in selected):
+            selected.append(i)
+    return Detections(boxes[selected], detections.labels[selected], detections.scores[selected])
 
 
-def label_free(
+def label_from_detections(
     frame: Frame, detections: Detections, classes: tuple[str, ...] = CLASSES, ground: Tensor | None = None
 ) -> Frame:
-    """The frame with labels made from a detector's boxes: poses by `scene_ir.derender.pose`, people where they
-    stand, occlusion by what is nearer, truncation by the image's border. Vehicles' boxes are their poses'.
+    """Label a frame with the 3D boxes of detections.
 
-    detections: in their order; labels are indices into `classes`, of which all but cars, trucks, pedestrians and
-    cyclists are left out. So are vehicles that would float above the ground or stand where a surer one does.
-    ground (4,): the road's plane, where it is known. What is hidden is estimated from boxes, so that it is more
-    than is really hidden. Raises RangeError for a label beyond `classes` and for boxes without area.
+    Poses come from `scene_ir.derender.pose`; vehicles' boxes are the projections of their poses. Occlusion is
+    estimated from nearer boxes, so it is an upper bound; truncation from the image's border. Other objects than
+    cars, trucks, pedestrians and cyclists are dropped, and so are vehicles off the ground or in the place of one
+    with a higher score.
+
+    Args:
+        frame: Photograph and camera.
+        detections: Detections; labels are indices into `classes`.
+        classes: Names of the classes.
+        ground: Plane of the road (4,), if known.
+
+    Returns:
+        The frame with labels, in the order of the detections.
+
+    Raises:
+        RangeError: A label beyond `classes`, or a box without area.
     """
     names = [_class_name(int(label), classes) for label in detections.labels]
     boxes = detections.boxes_xyxy.float()
-    mine = torch.tensor([name in VEHICLES for name in names], dtype=torch.bool)
-    boxes = torch.where(mine[:, None], _to_border(boxes, frame.camera), boxes)
-    placed = _place(frame, boxes, names, detections.scores, ground, DETECTOR_LOOKS)
+    is_vehicle = torch.tensor([name in VEHICLES for name in names], dtype=torch.bool)
+    boxes = torch.where(is_vehicle[:, None], _snap_to_border(boxes, frame.camera), boxes)
+    placed = _place_objects(frame, boxes, names, detections.scores, ground, POSE_ROUNDS)
     vehicles, poses = placed.vehicles, placed.poses
     boxes = boxes.clone()
     boxes[vehicles] = placed.inside[vehicles]
-    kept = [i for i, possible in enumerate(placed.possible.tolist()) if possible]
+    selected = [i for i, possible in enumerate(placed.possible.tolist()) if possible]
     labels = Labels(
-        kind=tuple(names[i] for i in kept),
-        boxes_xyxy=boxes[kept],
-        truncation=_truncation(placed.full[kept], placed.inside[kept]),
-        occlusion=_occlusion(boxes[kept], placed.translation[kept, 2]),
-        translation=placed.translation[kept],
-        yaw=placed.yaw[kept],
-        size_lhw=placed.size_lhw[kept],
+        kind=tuple(names[i] for i in selected),
+        boxes_xyxy=boxes[selected],
+        truncation=_estimate_truncation(placed.full[selected], placed.inside[selected]),
+        occlusion=_estimate_occlusion(boxes[selected], placed.translation[selected, 2]),
+        translation=placed.translation[selected],
+        yaw=placed.yaw[selected],
+        size_lhw=placed.size_lhw[selected],
         ignore_xyxy=torch.zeros(0, 4),
     )
     row = {i: n for n, i in enumerate(vehicles)}
-    told = {"labels": "estimated"}
-    for n, i in enumerate(kept):
+    provenance = {"labels": "estimated"}
+    for n, i in enumerate(selected):
         if i in row:
-            told[f"labels[{n}].score"] = f"{float(detections.scores[i]):.3f}"
-            told[f"labels[{n}].depth_sigma"] = f"{float(poses.log_depth_sigma[row[i]]):.3f}"
-            told[f"labels[{n}].facing"] = f"{float(poses.facing[row[i]]):.3f}"
-    return replace(frame, labels=labels, provenance={**frame.provenance, **told})
+            provenance[f"labels[{n}].score"] = f"{float(detections.scores[i]):.3f}"
+            provenance[f"labels[{n}].depth_sigma"] = f"{float(poses.log_depth_sigma[row[i]]):.3f}"
+            provenance[f"labels[{n}].facing"] = f"{float(poses.facing[row[i]]):.3f}"
+    return replace(frame, labels=labels, provenance={**frame.provenance, **provenance})
 
 
-def has_places(labels: Labels) -> bool:
-    """Whether a data set says where any of the vehicles stands."""
+def has_poses(labels: Labels) -> bool:
+    """Whether labels have the position of at least one object."""
     return any(math.isfinite(float(z)) for z in labels.translation[:, 2])
 
 
-def placed_by_boxes(frame: Frame) -> Frame:
-    """The frame with the places of vehicles and people estimated from the 2D boxes of its labels, which stay as
-    they are, with masks; types are KITTI's. Occlusion and truncation are estimated where the labels do not say.
+def estimate_label_poses(frame: Frame) -> Frame:
+    """Estimate the poses of vehicles and people from the 2D boxes of a frame's labels.
 
-    A vehicle that would float above the ground, or stand where a larger one does, has no place: it stays in the
-    picture, and is neither missed nor a hit.
+    Boxes and masks stay; types become KITTI's. Unknown occlusion and truncation are estimated. A vehicle off the
+    ground, or in the place of a larger one, gets no pose: it stays in the photograph and is ignored.
     """
     assert frame.labels is not None
-    labels = as_kitti(frame.labels)
+    labels = to_kitti_kinds(frame.labels)
     boxes = labels.boxes_xyxy.float()
     flat = (boxes[:, 2:] <= boxes[:, :2]).any(1).tolist()
     names = ["" if thin else name for name, thin in zip(labels.kind, flat, strict=True)]
-    # nearer vehicles, which are higher in the picture, are surer
-    placed = _place(frame, boxes, names, boxes[:, 3] - boxes[:, 1], None, looks=1)
-    gone = ~placed.possible
-    depth = torch.where(gone, math.inf, placed.translation[:, 2])
+    # poses of nearer vehicles, which have higher boxes, are more reliable
+    placed = _place_objects(frame, boxes, names, boxes[:, 3] - boxes[:, 1], None, rounds=1)
+    dropped = ~placed.possible
+    depth = torch.where(dropped, math.inf, placed.translation[:, 2])
     unknown = labels.occlusion == UNKNOWN_OCCLUSION
-    told = torch.isfinite(labels.truncation)
-    estimated = _truncation(placed.full, placed.inside)
+    known = torch.isfinite(labels.truncation)
+    estimated = _estimate_truncation(placed.full, placed.inside)
     labels = replace(
         labels,
-        translation=placed.translation.masked_fill(gone[:, None], math.nan),
-        yaw=placed.yaw.masked_fill(gone, math.nan),
-        size_lhw=placed.size_lhw.masked_fill(gone[:, None], math.nan),
-        occlusion=torch.where(unknown & ~gone, _occlusion(boxes, depth), labels.occlusion),
-        truncation=torch.where(~told & ~gone, estimated, labels.truncation),
+        translation=placed.translation.masked_fill(dropped[:, None], math.nan),
+        yaw=placed.yaw.masked_fill(dropped, math.nan),
+        size_lhw=placed.size_lhw.masked_fill(dropped[:, None], math.nan),
+        occlusion=torch.where(unknown & ~dropped, _estimate_occlusion(boxes, depth), labels.occlusion),
+        truncation=torch.where(~known & ~dropped, estimated, labels.truncation),
     )
     return replace(frame, labels=labels, provenance={**frame.provenance, "places": "estimated"})
 
 
 @dataclass(frozen=True, slots=True)
-class _Placed:
-    """N boxes and what stands in them. vehicles: their places among the boxes, one a row of poses. translation
-    (N, 3) m, yaw (N,) rad, size_lhw (N, 3) m: NaN for what is neither vehicle nor person; full, inside (N, 4) px:
-    around the 3D box, and as much of that as the image has. possible (N,): stands on the ground, and shows.
-    """
+class _PlacedObjects:
+    """Poses of the objects in N boxes; NaN for objects that are neither vehicles nor people."""
 
     vehicles: list[int]
-    poses: Poses
+    """Indices of the vehicles."""
+    poses: VehiclePoses
+    """Estimated poses, one for each vehicle."""
     translation: Tensor
+    """Bottom-face centres (N, 3) m."""
     yaw: Tensor
+    """Yaw (N,) rad."""
     size_lhw: Tensor
+    """Length, height, width (N, 3) m."""
     full: Tensor
+    """Boxes (N, 4) px around the projected 3D boxes."""
     inside: Tensor
+    """The same, clipped to the image."""
     possible: Tensor
+    """Whether an object stands on the ground and is visible (N,)."""
 
 
-def _place(
-    frame: Frame, boxes: Tensor, names: Sequence[str], scores: Tensor, ground: Tensor | None, looks: int
-) -> _Placed:
-    """names: KITTI's types; scores (N,): of two vehicles in one place the higher stays."""
+def _place_objects(
+    frame: Frame, boxes: Tensor, names: Sequence[str], scores: Tensor, ground: Tensor | None, rounds: int
+) -> _PlacedObjects:
+    """Estimate poses. `names` are KITTI's types; of two vehicles in one place, the one with the higher score stays."""
     vehicles = [i for i, name in enumerate(names) if name in VEHICLES]
     people = [i for i, name in enumerate(names) if name in _PEOPLE_LHW]
     kinds = [names[i] for i in vehicles]
-    poses = estimate(frame.photograph, boxes[vehicles], kinds, frame.camera, ground, looks=looks)
-    places = _people(boxes[people], [names[i] for i in people], frame.camera, poses)
+    poses = estimate_poses(frame.photograph, boxes[vehicles], kinds, frame.camera, ground, rounds=rounds)
+    people_positions = _place_people(boxes[people], [names[i] for i in people], frame.camera, poses)
     translation, yaw, size = (torch.full((len(names), *s), math.nan) for s in ((3,), (), (3,)))
     translation[vehicles], yaw[vehicles], size[vehicles] = poses.translation, poses.yaw, poses.size_lhw
     if people:
-        translation[people], size[people] = places, torch.tensor([_PEOPLE_LHW[names[i]] for i in people])
+        translation[people], size[people] = people_positions, torch.tensor([_PEOPLE_LHW[names[i]] for i in people])
         yaw[people] = 0.0
     full = project_boxes(size, yaw, translation, frame.camera.matrix.float())
     inside = clip_boxes(full, frame.camera.height, frame.camera.width)
-    seen = torch.isfinite(full).all(1) & (inside[:, 2:] - inside[:, :2] >= 1).all(1)
-    seen[vehicles] &= _possible(poses, scores[vehicles])
-    return _Placed(vehicles, poses, translation, yaw, size, full, inside, seen)
+    visible = torch.isfinite(full).all(1) & (inside[:, 2:] - inside[:, :2] >= 1).all(1)
+    visible[vehicles] &= _find_plausible(poses, scores[vehicles])
+    return _PlacedObjects(vehicles, poses, translation, yaw, size, full, inside, visible)
 
 
-def _to_border(boxes: Tensor, camera: Camera) -> Tensor:
-    """Boxes (N, 4) px whose sides near the image's border lie on it."""
+def _snap_to_border(boxes: Tensor, camera: Camera) -> Tensor:
+    """Move sides of boxes (N, 4) px near the image's border onto it."""
     near = (_NEAR_BORDER * (boxes[:, 2:] - boxes[:, :2])).clamp_min(BORDER_PX)
     low, high = boxes[:, :2], boxes[:, 2:]
     end = boxes.new_tensor([camera.width - 1, camera.height - 1])
@@ -248,43 +259,43 @@ def _class_name(label: int, classes: tuple[str, ...]) -> str:
     return classes[label]
 
 
-def _people(boxes: Tensor, kinds: list[str], camera: Camera, poses: Poses) -> Tensor:
-    """Where people (N, 3) m stand: their boxes' bottoms on the ground, or as far away as they are small."""
+def _place_people(boxes: Tensor, kinds: list[str], camera: Camera, poses: VehiclePoses) -> Tensor:
+    """Return positions of people (N, 3) m: on the ground below their boxes, or at the distance of their height."""
     if not kinds:
         return torch.zeros(0, 3)
     foot = torch.stack([(boxes[:, 0] + boxes[:, 2]) / 2, boxes[:, 3]], 1)
     height = boxes.new_tensor([_PEOPLE_LHW[kind][1] for kind in kinds])
-    small = back_project(foot, camera.intrinsics[1, 1] * height / (boxes[:, 3] - boxes[:, 1]), camera)
-    scale = -poses.ground[3] / (small @ poses.ground[:3])
-    believable = (scale > 0.6) & (scale < 1.6) & (boxes[:, 3] < camera.height - 1 - BORDER_PX)
-    return small * torch.where(believable, scale, torch.ones(()))[:, None]
+    by_height = back_project(foot, camera.intrinsics[1, 1] * height / (boxes[:, 3] - boxes[:, 1]), camera)
+    scale = -poses.ground[3] / (by_height @ poses.ground[:3])
+    plausible = (scale > 0.6) & (scale < 1.6) & (boxes[:, 3] < camera.height - 1 - BORDER_PX)
+    return by_height * torch.where(plausible, scale, torch.ones(()))[:, None]
 
 
-def _possible(poses: Poses, scores: Tensor) -> Tensor:
-    """Which vehicles (N,) can stand where they are: on the ground, and not inside one of a higher score."""
+def _find_plausible(poses: VehiclePoses, scores: Tensor) -> Tensor:
+    """Return which vehicles (N,) stand on the ground and not inside one with a higher score."""
     above = (poses.translation @ poses.ground[:3] + poses.ground[3]).abs()
     possible = above <= _AFLOAT[0] + _AFLOAT[1] * poses.translation[:, 2]
     feet = ground_footprint(poses.size_lhw, poses.yaw, poses.translation).numpy()
     order = [int(i) for i in scores.argsort(descending=True, stable=True) if bool(possible[i])]
-    kept: list[int] = []
+    selected: list[int] = []
     for i in order:
-        smaller = [min(cv2.contourArea(feet[i]), cv2.contourArea(feet[j])) for j in kept]
-        shared = [cv2.intersectConvexConvex(feet[i], feet[j])[0] for j in kept]
+        smaller = [min(cv2.contourArea(feet[i]), cv2.contourArea(feet[j])) for j in selected]
+        shared = [cv2.intersectConvexConvex(feet[i], feet[j])[0] for j in selected]
         if all(s < _INSIDE * area for s, area in zip(shared, smaller, strict=True)):
-            kept.append(i)
+            selected.append(i)
         else:
             possible[i] = False
     return possible
 
 
-def _truncation(full: Tensor, inside: Tensor) -> Tensor:
-    """Share (N,) of each box in the image's plane that the border cuts off."""
+def _estimate_truncation(full: Tensor, inside: Tensor) -> Tensor:
+    """Return the share (N,) of each box outside the image."""
     area, whole = ((b[:, 2:] - b[:, :2]).prod(1) for b in (inside, full))
     return (1 - area / whole.clamp(min=1e-6)).clamp(0, 1)
 
 
-def _occlusion(boxes: Tensor, depth: Tensor) -> Tensor:
-    """KITTI's code (N,) of what boxes of nearer things cover."""
+def _estimate_occlusion(boxes: Tensor, depth: Tensor) -> Tensor:
+    """Return KITTI's codes (N,) of the share covered by boxes of nearer objects."""
     codes = []
     for i, (x0, y0, x1, y1) in enumerate(boxes.tolist()):
         columns, rows = np.linspace(x0, x1, 64), np.linspace(y0, y1, 64)
@@ -292,5 +303,5 @@ def _occlusion(boxes: Tensor, depth: Tensor) -> Tensor:
         for j, (left, top, right, bottom) in enumerate(boxes.tolist()):
             if float(depth[j]) < float(depth[i]):
                 hidden |= np.outer((rows >= top) & (rows <= bottom), (columns >= left) & (columns <= right))
-        codes.append(occlusion_of(1 - float(hidden.mean())))
+        codes.append(occlusion_from_visible(1 - float(hidden.mean())))
     return torch.tensor(codes, dtype=torch.int64)

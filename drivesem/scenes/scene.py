@@ -1,4 +1,4 @@
-"""Scenes as a notebook holds them: a photograph taken apart, changed, rendered; nothing touches the disk unasked.
+"""Scenes for notebooks: de-render a photograph, edit the scene, render it, in memory.
 
 ```pycon
 >>> import drivesem as ds
@@ -25,12 +25,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.attack.scene_edits import edited
-from drivesem.config.edits import ALL, frame_edit, merged, parse_setting
+from drivesem.attack.scene_edits import apply_edit
+from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.errors import UsageError
 from drivesem.data import kitti, registry
-from drivesem.data.photographs import camera_for, photograph, read_pixels
-from drivesem.scenes.sources import derender_settings, placed
+from drivesem.data.photographs import check_image_size, default_camera, read_photograph, read_pixels
+from drivesem.scenes.sources import derender_settings, place_vehicles
 from scene_ir import io
 from scene_ir.io import to_tensor, to_uint8
 from scene_ir.render.compositor import render
@@ -47,32 +47,34 @@ Calib: TypeAlias = "str | Path | Camera | NDArray[np.floating[Any]] | Tensor"
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A photograph taken apart: vehicles, their shadows, what stood behind them, weather and foliage.
+    """A de-rendered photograph: vehicles, their shadows, the background behind them, weather and foliage.
 
-    ir: the scene itself, as all rooms of the project take it. notes: what the last edit did that no car can do,
-    such as `objects[2]: left the road, ...`. A notebook shows the rendered picture.
+    A notebook displays the rendered image.
     """
 
     ir: SceneIR
+    """The scene in the form that all parts of the project use."""
     name: str = "scene"
+    """Name, for example of the photograph."""
     notes: tuple[str, ...] = ()
+    """Infeasible parts of the last edit, such as `objects[2]: left the road, ...`."""
 
     def __len__(self) -> int:
-        """How many vehicles can be moved."""
+        """Number of movable vehicles."""
         return len(self.ir.objects)
 
     @property
     def photograph(self) -> NDArray[np.uint8]:
-        """The photograph (H, W, 3) RGB that the scene was taken from."""
+        """The original photograph (H, W, 3) RGB."""
         return to_uint8(self.ir.photograph)
 
     def render(self) -> NDArray[np.uint8]:
-        """The scene as it stands, (H, W, 3) RGB."""
+        """Render the scene, (H, W, 3) RGB."""
         return to_uint8(self.tensor())
 
     @torch.no_grad()
     def tensor(self) -> Tensor:
-        """The scene as it stands, (3, H, W) RGB in [0, 1]."""
+        """Render the scene, (3, H, W) RGB in [0, 1]."""
         return render([self.ir])[0].image
 
     def edit(
@@ -83,31 +85,40 @@ class Scene:
         objects: Mapping[int | Literal["all"], Mapping[str, Any]] | None = None,
         remove: Iterable[int] | Literal["all"] = (),
     ) -> Scene:
-        """A changed copy, by the words of `drivesem edit --set`.
+        """Return an edited copy.
 
             scene.edit("objects[1].translate=0.5m,0m", "foliage.hue=0.4", weather="fog", remove=[3])
             scene.edit(objects={1: {"translate": ["0.5m", "0m"], "rotate": "10deg"}})
 
-        weather: a name (fog, rain, sunset, overcast, twilight) or codes; foliage: codes; objects: changes by row;
-        remove: rows. What is said later of the same thing counts. Raises FormatError, UsageError or RangeError.
+        Later changes override earlier ones.
+
+        Args:
+            settings: Changes in the syntax of `drivesem edit --set`.
+            weather: A name (fog, rain, sunset, overcast, twilight) or codes.
+            foliage: Codes.
+            objects: Changes by row.
+            remove: Rows to remove.
+
+        Raises:
+            FormatError, UsageError, RangeError: A change that cannot be applied.
         """
         changes: dict[Any, Any] = {}
         for text in settings:
-            changes = merged(changes, parse_setting(text, "edit"))
+            changes = merge_edits(changes, parse_setting(text, "edit"))
         named = {"weather": weather, "foliage": foliage, "objects": objects}
-        changes = merged(changes, {name: value for name, value in named.items() if value is not None})
+        changes = merge_edits(changes, {name: value for name, value in named.items() if value is not None})
         rows = [ALL] if isinstance(remove, str) else [int(row) for row in remove]
         if isinstance(remove, str) and remove != ALL:
             raise UsageError("remove", "rows from 0, or 'all'", repr(remove))
         for row in rows:
-            changes = merged(changes, {"objects": {row: {"remove": True}}})
+            changes = merge_edits(changes, {"objects": {row: {"remove": True}}})
         if not changes:
             raise UsageError("edit", "a change: settings, weather, foliage, objects or remove", "none")
-        result = edited(self.ir, frame_edit("edit", changes))
+        result = apply_edit(self.ir, parse_frame_edit("edit", changes))
         return Scene(result.scene, self.name, result.notes)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The vehicles as flat dicts, for `pandas.DataFrame`: `row` is what `edit` counts by; metres, degrees."""
+        """Return the vehicles as dicts for `pandas.DataFrame`, in metres and degrees; `edit` counts by `row`."""
         objects = self.ir.objects
         return [
             {
@@ -124,36 +135,37 @@ class Scene:
         ]
 
     def save(self, folder: str | Path) -> None:
-        """Write the scene as a folder that `load_scene` and all commands read; in place of one that is there."""
-        io.save_scene(self.ir, free_folder(Path(folder), "folder"))
+        """Write the scene to a folder for `load_scene` and all commands; replaces a scene in it."""
+        io.save_scene(self.ir, check_scene_folder(Path(folder), "folder"))
 
     def _repr_png_(self) -> bytes:
-        return png(self.render())
+        return encode_png(self.render())
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """The scene of a folder that `Scene.save`, `drivesem derender` or `drivesem attack` wrote. FormatError."""
+    """Load a scene from a folder of `Scene.save`, `drivesem derender` or `drivesem attack`. Raises FormatError."""
     return Scene(io.load_scene(Path(folder)), Path(folder).resolve().name)
 
 
 def demo_scene(index: int = 0, seed: int = 0) -> Scene:
-    """One of the embedded scenes, which `drivesem attack` takes where no data set is named. Made by code."""
-    from drivesem.synth.demo import demo_scene as made
+    """Generate one of the embedded scenes, the default of `drivesem attack`."""
+    from drivesem.synth.demo import demo_scene as generate
 
     if index < 0:
         raise UsageError("index", "at least 0", index)
-    return Scene(made(seed, index), f"demo-{index:03d}")
+    return Scene(generate(seed, index), f"demo-{index:03d}")
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """The frames of a data set: by name, or one after the other. Each is read when it is asked for."""
+    """The frames of a data set, by name or by iteration, read on demand."""
 
     dataset: Dataset
+    """Reader of the frames."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The frames' names, sorted."""
+        """Sorted names of the frames."""
         return self.dataset.identifiers
 
     def __len__(self) -> int:
@@ -163,18 +175,25 @@ class Frames:
         return map(self.dataset.frame, self.names)
 
     def __getitem__(self, name: str) -> Frame:
-        """One frame. RangeError for a name that is none, FormatError naming a file that is not as it should be."""
+        """Read one frame. Raises RangeError for an unknown name, FormatError naming a damaged file."""
         return self.dataset.frame(name)
 
 
 def open_dataset(name: str, root: str | Path, *, velodyne: bool = False) -> Frames:
-    """A data set: kitti, vkitti1, vkitti2, coco or yolo, under `root`, a folder or its URL.
+    """Open a data set.
 
         for frame in ds.open_dataset("kitti", "PATH_TO_KITTI"):
             scene = ds.derender(frame)
 
-    velodyne: read the laser's points too, which only KITTI has. RangeError for an unknown name, FormatError for a
-    folder that is none of the kind, UsageError for a URL that cannot be read.
+    Args:
+        name: Layout: kitti, vkitti1, vkitti2, coco or yolo.
+        root: Folder or URL.
+        velodyne: Read laser points, which only KITTI has.
+
+    Raises:
+        RangeError: Unknown name.
+        FormatError: The folder is not of this layout.
+        UsageError: The URL cannot be read.
     """
     return Frames(registry.open_dataset(name, root, with_points=velodyne))
 
@@ -189,61 +208,72 @@ def derender(
     meshes: str | Path | None = None,
     segmenter: str | Path | None = None,
 ) -> Scene:
-    """Take a photograph apart into a scene.
+    """De-render a photograph into a scene.
 
         scene = ds.derender("000008.png", labels="label_2/000008.txt", calib="calib/000008.txt")
-        scene = ds.derender(photo)                          # no labels: networks find and place the vehicles
+        scene = ds.derender(photo)                          # no labels: vehicles are detected
         scene = ds.derender(ds.open_dataset("kitti", root)["000008"])
 
-    photo: a file, an array, a tensor, or a frame of a data set, which brings labels and camera along. labels: a
-    file as KITTI's, which needs a calib. focal: px, where there is no calib; by default EXIF's, or 0.58 of the
-    longer side. fit, meshes, segmenter: as of `drivesem derender`. Raises UsageError naming the argument,
-    FormatError naming the file, ShapeError or RangeError.
+    Args:
+        photo: A file, an array, a tensor, or a frame of a data set with labels and camera.
+        labels: Labels, or a label file in KITTI's format; requires `calib`.
+        calib: Calibration of the camera.
+        focal: Focal length without `calib`, px; by default EXIF's, or 0.58 of the longer side.
+        fit: Fit vehicles to their outlines.
+        meshes: Folder of additional meshes.
+        segmenter: ONNX file of a segmentation network.
+
+    Raises:
+        UsageError: Names the argument.
+        FormatError: Names the file.
+        ShapeError, RangeError: An array or a number that does not fit.
     """
-    from scene_ir.derender.derender import derender as taken_apart
+    from scene_ir.derender.derender import derender as derender_frame
 
     if meshes is not None and not Path(meshes).is_dir():
         raise UsageError("meshes", "a folder", meshes)
     settings = derender_settings(fit, meshes, segmenter)
     if isinstance(photo, Frame):
         if labels is not None or calib is not None or focal is not None:
-            raise UsageError("labels, calib, focal", "none beside a frame of a data set", "one")
+            raise UsageError("labels, calib, focal", "none for a frame of a data set", "one")
         frame = photo
     else:
         if labels is not None and calib is None:
-            raise UsageError("calib", "a calibration beside labels", "none")
+            raise UsageError("calib", "a calibration for labels", "none")
         if calib is not None and focal is not None:
-            raise UsageError("focal", "none beside a calib", focal)
-        frame = _frame(photo, labels, calib, focal)
+            raise UsageError("focal", "none with calib", focal)
+        frame = _make_frame(photo, labels, calib, focal)
     if frame.labels is None:
-        from drivesem.scenes.label_free import detect, label_free, settings_for
+        from drivesem.scenes.label_free import detect, detection_fit_settings, label_from_detections
 
-        frame, settings = label_free(frame, detect(frame)), settings_for(settings)
-    frame, settings = placed(frame, settings)
-    return Scene(taken_apart(frame, settings), frame.identifier)
+        frame, settings = label_from_detections(frame, detect(frame)), detection_fit_settings(settings)
+    frame, settings = place_vehicles(frame, settings)
+    return Scene(derender_frame(frame, settings), frame.identifier)
 
 
-def _frame(photo: Photo, labels: str | Path | Labels | None, calib: Calib | None, focal: float | None) -> Frame:
-    """A photograph with its camera, and with labels where they are given."""
+def _make_frame(
+    photo: Photo, labels: str | Path | Labels | None, calib: Calib | None, focal: float | None
+) -> Frame:
+    """Make a frame of a photograph with its camera, and labels if given."""
     if isinstance(photo, str | Path):
         if calib is None:
-            return photograph(Path(photo), focal)
+            return read_photograph(Path(photo), focal)
         path = Path(photo)
         image = to_tensor(read_pixels(path))
         name = path.stem
         provenance = {"dataset": "photograph", "image": path.name}
     else:
         path, name, provenance = Path("photo"), "photo", {"dataset": "photograph"}
-        image = image_of(photo)
+        image = to_image_tensor(photo)
     height, width = image.shape[1:]
-    camera = camera_for(height, width, focal) if calib is None else _camera(calib, height, width)
-    given = labels if labels is None or isinstance(labels, Labels) else kitti.read_labels(Path(labels))
-    kitti.check_size(path, camera, given)
-    return Frame(name, image, camera, given, provenance=provenance)
+    camera = default_camera(height, width, focal) if calib is None else _parse_calib(calib, height, width)
+    frame_labels = labels if labels is None or isinstance(labels, Labels) else kitti.read_labels(Path(labels))
+    check_image_size(path, camera, frame_labels)
+    return Frame(name, image, camera, frame_labels, provenance=provenance)
 
 
-def image_of(photo: NDArray[np.uint8] | Tensor) -> Tensor:
-    """An array (H, W, 3) of uint8 or a tensor (3, H, W) of floats in [0, 1] as such a tensor. UsageError."""
+def to_image_tensor(photo: NDArray[np.uint8] | Tensor) -> Tensor:
+    """Convert an array (H, W, 3) uint8 or a tensor (3, H, W) in [0, 1] to a float32 tensor. Raises UsageError."""
     if isinstance(photo, Tensor):
         if photo.ndim != 3 or photo.shape[0] != 3 or not photo.is_floating_point():
             raise UsageError("photo", "a tensor (3, H, W) of floats", f"{tuple(photo.shape)} of {photo.dtype}")
@@ -257,11 +287,11 @@ def image_of(photo: NDArray[np.uint8] | Tensor) -> Tensor:
     return to_tensor(photo)
 
 
-def _camera(calib: Calib, height: int, width: int) -> Camera:
+def _parse_calib(calib: Calib, height: int, width: int) -> Camera:
     if isinstance(calib, Camera):
         return calib
     if isinstance(calib, str | Path):
-        projection = kitti.read_calib(Path(calib)).projection
+        projection = kitti.read_calibration(Path(calib)).projection
     else:
         projection = torch.as_tensor(calib).float()
         if tuple(projection.shape) not in ((3, 3), (3, 4)):
@@ -270,14 +300,14 @@ def _camera(calib: Calib, height: int, width: int) -> Camera:
     return Camera(intrinsics, height, width, projection if projection.shape[1] == 4 else None)
 
 
-def png(picture: NDArray[np.uint8]) -> bytes:
-    """A picture (H, W, 3) RGB as a PNG file's bytes."""
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """Encode an image (H, W, 3) RGB as PNG."""
     _, encoded = cv2.imencode(".png", picture[..., ::-1])
     return encoded.tobytes()
 
 
-def free_folder(folder: Path, setting: str) -> Path:
-    """Where a scene goes. UsageError naming the setting where that would destroy something else than a scene."""
+def check_scene_folder(folder: Path, setting: str) -> Path:
+    """Return the folder. Raises UsageError naming the setting if the folder holds anything but a scene."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "scene.json").is_file()):
         raise UsageError(setting, "a new folder, or one of a scene", folder)
     return folder

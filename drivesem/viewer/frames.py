@@ -17,7 +17,7 @@ from drivesem.report.tables import format_count
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import CONFIG, load_run_detector, load_trusted_config
 from drivesem.run.results import FrameResult
-from drivesem.scenes.sources import scene_folders
+from drivesem.scenes.sources import find_scene_folders
 from drivesem.viewer.server import ViewerFrame
 from scene_ir import files
 from scene_ir.io import count_objects
@@ -62,7 +62,7 @@ def open_viewer_frames(config: ViewConfig) -> ViewerFrames:
     else:
         if not path.is_dir():
             raise UsageError(_SETTING, "a scene of drivesem derender, a folder of some, or a run", config.scene)
-        frames = {name: ViewerFrame(folder) for name, folder in scene_folders(path).items()}
+        frames = {name: ViewerFrame(folder) for name, folder in find_scene_folders(path).items()}
         detector = _load_detector(config)
     if config.frame is not None and config.frame not in frames:
         raise UsageError("--frame", f"a frame of {config.scene}", config.frame)

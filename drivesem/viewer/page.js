@@ -1,6 +1,6 @@
 "use strict";
 /* One state, many views of it: sliders, picture, boxes, street, failure map, link, command. What belongs to the state
-   is in `values` (by knob, in its unit, zeros left out) and `shown` (car, axes, before); all else follows. */
+   is in `values` (by slider, in its unit, zeros left out) and `selection` (car, axes, before); all else follows. */
 
 const $ = id => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
@@ -12,9 +12,9 @@ const MEANING = {along: "forwards, along its photographed heading", across: "to 
   a: "from green to red", b: "from blue to yellow", shape: "share of the shape that was found"};
 const STATUS = {found: "found", lost: "lost", missed: "missed as photographed too", ignored: "not judged"};
 
-let overview = null, frame = null, values = new Map(), knobs = new Map(), sliders = new Map();
-let shown = {car: 0, x: "", y: "", before: false, boxes: true};
-let seen = null;          // what the detector last said
+let overview = null, frame = null, values = new Map(), sliders = new Map(), widgets = new Map();
+let selection = {car: 0, x: "", y: "", before: false, boxes: true};
+let detected = null;          // latest detections
 let serial = 1;           // of states: an answer about an earlier one is dropped
 let started = 0;          // when the state last changed
 
@@ -36,20 +36,20 @@ const valueOf = name => values.get(name) ?? 0;
 
 /* ---- asking the server ---------------------------------------------------------------------------------------- */
 
-async function ask(path, more = {}) {
+async function request(path, more = {}) {
   const answer = await fetch(`${path}?${new URLSearchParams(more)}`);
   if (answer.status === 409) return null;
   if (!answer.ok) throw new Error((await answer.text()).trim());
   return answer;
 }
-const asked = () => ({...Object.fromEntries(values), frame: frame.name, page: PAGE, n: serial});
+const stateQuery = () => ({...Object.fromEntries(values), frame: frame.name, page: PAGE, n: serial});
 
 function complain(error) {
   toast(error instanceof TypeError ? "no answer: drivesem view has ended" : error.message);
 }
 
 /* A loop a kind of answer: one request at a time, and the next is about the state as it is then. pick: another state
-   to ask about, such as one that is drawn already, while the newest is under way. */
+   to request, such as one that is drawn already, while the newest is under way. */
 function follow(work, pick = () => null) {
   let done = 0, busy = false;
   return async function next() {
@@ -57,7 +57,7 @@ function follow(work, pick = () => null) {
     busy = true;
     try {
       while (done !== serial) {
-        const picked = pick(), state = picked !== null && picked.n > done ? picked : asked();
+        const picked = pick(), state = picked !== null && picked.n > done ? picked : stateQuery();
         await work(state);
         done = state.n;
       }
@@ -70,7 +70,7 @@ function follow(work, pick = () => null) {
 
 let url = "", pictured = null;
 const followPicture = follow(async state => {
-  const answer = await ask("/picture", state);
+  const answer = await request("/picture", state);
   if (answer === null) return;
   const next = URL.createObjectURL(await answer.blob()), image = new Image();
   image.src = next;
@@ -82,22 +82,22 @@ const followPicture = follow(async state => {
   arrived("picture", state.n);
 });
 const followDetections = follow(async state => {
-  const answer = await ask("/detections", state);
+  const answer = await request("/detections", state);
   if (answer === null) return;
-  seen = await answer.json();
-  showSeen();
+  detected = await answer.json();
+  showDetections();
   arrived("detections", state.n);
   if (state.n === serial) settled(serial);
 }, () => pictured);
-/* Tell, for styles and tests, when what is shown is of the state as it stands. */
+/* Marks, for styles and tests, when the page shows the current state. */
 let latest = {};
 function arrived(what, now) {
   latest[what] = now;
   $("times").dataset[what] = Math.round(performance.now() - started);
-  tellTimes();
+  showTimes();
   if (latest.picture === serial && latest.detections === serial) $("view").dataset.settled = serial;
 }
-function tellTimes() {
+function showTimes() {
   const {picture, detections} = $("times").dataset;
   $("times").textContent = `picture ${picture ?? "–"} ms, detections ${detections ?? "–"} ms`;
 }
@@ -108,7 +108,7 @@ async function settled(now) {
   resting = setTimeout(async () => {
     if (now !== serial) return;
     try {
-      const answer = await ask("/notes", asked());
+      const answer = await request("/notes", stateQuery());
       if (answer === null || now !== serial) return;
       const notes = await answer.json();
       $("notes").textContent = notes.length ? `No car can do that: ${notes.join("; ")}` : "";
@@ -129,25 +129,25 @@ function changed({keepMap = false} = {}) {
   followDetections();
 }
 function refresh() {
-  for (const [name, slider] of sliders) slider.show(valueOf(name));
+  for (const [name, slider] of widgets) slider.show(valueOf(name));
   drawStreet();
   drawMap();
   writeLink();
 }
 function put(name, value) {
-  const knob = knobs.get(name);
-  if (knob === undefined) return;
-  const kept = clamp(value, knob.low, knob.high);
-  if (kept === 0) values.delete(name); else values.set(name, kept);
+  const slider = sliders.get(name);
+  if (slider === undefined) return;
+  const clamped = clamp(value, slider.low, slider.high);
+  if (clamped === 0) values.delete(name); else values.set(name, clamped);
 }
 function move(changes, {exact = false} = {}) {
   const before = new Map(values);
   for (const [name, value] of Object.entries(changes)) {
-    const knob = knobs.get(name);
-    if (knob) put(name, exact ? value : rounded(value, knob.step));
+    const slider = sliders.get(name);
+    if (slider) put(name, exact ? value : rounded(value, slider.step));
   }
   const names = new Set([...before.keys(), ...values.keys()].filter(n => before.get(n) !== values.get(n)));
-  if (names.size) changed({keepMap: [...names].every(n => n === shown.x || n === shown.y)});
+  if (names.size) changed({keepMap: [...names].every(n => n === selection.x || n === selection.y)});
 }
 function become(state) {
   values = new Map();
@@ -157,38 +157,38 @@ function become(state) {
 const named = (car, last) => `objects[${car}].${last}`;
 
 function writeLink() {
-  const told = new URLSearchParams({frame: frame.name, car: shown.car, x: shown.x, y: shown.y});
-  if (shown.before) told.set("show", "before");
-  for (const [name, value] of values) told.set(name, value);
-  history.replaceState(null, "", `#${told}`);
+  const params = new URLSearchParams({frame: frame.name, car: selection.car, x: selection.x, y: selection.y});
+  if (selection.before) params.set("show", "before");
+  for (const [name, value] of values) params.set(name, value);
+  history.replaceState(null, "", `#${params}`);
 }
 /* A link's state. Values without any: what the scene holds. */
 function readLink() {
-  const told = new URLSearchParams(location.hash.slice(1));
-  const name = told.get("frame");
-  const wanted = {frame: overview.frames.some(f => f.name === name) ? name : overview.frames[0].name, told};
+  const params = new URLSearchParams(location.hash.slice(1));
+  const name = params.get("frame");
+  const wanted = {frame: overview.frames.some(f => f.name === name) ? name : overview.frames[0].name, params};
   return wanted;
 }
-function take(told) {
-  const had = told.has("frame");
+function take(params) {
+  const had = params.has("frame");
   const reserved = new Set(["frame", "car", "x", "y", "show"]);
   values = new Map();
   if (had) {
-    for (const [name, text] of told) if (!reserved.has(name) && text.trim() !== "" && Number.isFinite(Number(text))) put(name, Number(text));
+    for (const [name, text] of params) if (!reserved.has(name) && text.trim() !== "" && Number.isFinite(Number(text))) put(name, Number(text));
   } else for (const [name, value] of Object.entries(frame.found)) put(name, value);
-  const car = Number(told.get("car") ?? NaN);
-  shown.before = told.get("show") === "before";
-  choose(Number.isInteger(car) && frame.cars[car] ? car : -1, told.get("x"), told.get("y"), false);
+  const car = Number(params.get("car") ?? NaN);
+  selection.before = params.get("show") === "before";
+  choose(Number.isInteger(car) && frame.cars[car] ? car : -1, params.get("x"), params.get("y"), false);
 }
 
 /* ---- frames, cars, sliders ------------------------------------------------------------------------------------ */
 
-async function load(name, told) {
+async function load(name, params) {
   $("words").textContent = "loading";
-  const answer = await ask("/frame", {frame: name});
+  const answer = await request("/frame", {frame: name});
   frame = await answer.json();
-  knobs = new Map(frame.sliders.map(knob => [knob.name, knob]));
-  seen = pictured = null;
+  sliders = new Map(frame.sliders.map(slider => [slider.name, slider]));
+  detected = pictured = null;
   $("title").textContent = [overview.title, overview.detector, frame.change].filter(Boolean).join(" · ");
   $("frame").value = name;
   const where = new URLSearchParams({frame: name});
@@ -196,35 +196,35 @@ async function load(name, told) {
   $("boxes").setAttribute("viewBox", `0 0 ${frame.width} ${frame.height}`);
   for (const id of ["after", "before"]) { $(id).setAttribute("width", frame.width); $(id).setAttribute("height", frame.height); }
   $("found").classList.toggle("hidden", Object.keys(frame.found).length === 0);
-  $("cars").replaceChildren(...frame.cars.filter(car => carKnobs(car.car).length).map(car => {
+  $("cars").replaceChildren(...frame.cars.filter(car => carSliders(car.car).length).map(car => {
     const chip = element("button", {type: "button", "data-car": car.car}, element("span", {class: "dot"}), `${car.car} ${car.class}`, element("small", {class: "soft"}));
     chip.addEventListener("click", () => choose(car.car));
     return chip;
   }));
-  sliders = new Map();
-  fill($("scene-knobs"), frame.sliders.filter(knob => knob.car === null));
+  widgets = new Map();
+  fill($("scene-sliders"), frame.sliders.filter(slider => slider.car === null));
   $("street").replaceChildren();
-  take(told);
+  take(params);
   changed();
 }
-const carKnobs = car => frame.sliders.filter(knob => knob.car === car);
-const movable = () => frame.cars.filter(car => carKnobs(car.car).length).map(car => car.car);
+const carSliders = car => frame.sliders.filter(slider => slider.car === car);
+const movable = () => frame.cars.filter(car => carSliders(car.car).length).map(car => car.car);
 
 /* The car that sliders, keys and the map are about; -1: the one to begin with. */
-function choose(car, x = null, y = null, tell = true) {
+function choose(car, x = null, y = null, redraw = true) {
   if (!movable().includes(car)) car = frame.focus;
-  const last = shown.x.startsWith("objects[") ? [shown.x, shown.y].map(n => n.slice(n.indexOf("].") + 2)) : null;
-  const axes = frame.sliders.filter(knob => knob.car === null || knob.car === car).map(knob => knob.name);
+  const last = selection.x.startsWith("objects[") ? [selection.x, selection.y].map(n => n.slice(n.indexOf("].") + 2)) : null;
+  const axes = frame.sliders.filter(slider => slider.car === null || slider.car === car).map(slider => slider.name);
   const first = [x, last && named(car, last[0]), named(car, "translate.across"), axes[0]].find(n => n && axes.includes(n));
   const second = [y, last && named(car, last[1]), named(car, "translate.along"), ...axes].find(n => n && n !== first && axes.includes(n));
-  if (shown.car !== car || shown.x !== first || shown.y !== second || $("map-x").dataset.of !== `${frame.name} ${car}`) {
-    shown = {...shown, car, x: first ?? "", y: second ?? ""};
+  if (selection.car !== car || selection.x !== first || selection.y !== second || $("map-x").dataset.of !== `${frame.name} ${car}`) {
+    selection = {...selection, car, x: first ?? "", y: second ?? ""};
     forgetMap();
-    for (const [name] of sliders) if (knobs.get(name)?.car !== null) sliders.delete(name);
-    fill($("car-knobs"), carKnobs(car), carLine());
+    for (const [name] of widgets) if (sliders.get(name)?.car !== null) widgets.delete(name);
+    fill($("car-sliders"), carSliders(car), carLine());
     fillAxes(axes);
   }
-  if (tell) { refresh(); showSeen(); settled(serial); }
+  if (redraw) { refresh(); showDetections(); settled(serial); }
 }
 function carLine() {
   if (!frame.cars.length) return element("p", {class: "soft small"}, "The scene has no vehicle that can be moved.");
@@ -233,42 +233,42 @@ function carLine() {
   return element("p", {class: "chosen-line"}, element("span", {id: "chosen"}), reset);
 }
 function restCar() {
-  move(Object.fromEntries(carKnobs(shown.car).map(knob => [knob.name, 0])), {exact: true});
+  move(Object.fromEntries(carSliders(selection.car).map(slider => [slider.name, 0])), {exact: true});
 }
 function fill(place, list, ...first) {
   const groups = new Map();
-  for (const knob of list) {
-    const title = GROUPS[knob.group] ?? knob.group;
+  for (const slider of list) {
+    const title = GROUPS[slider.group] ?? slider.group;
     if (!groups.has(title)) groups.set(title, []);
-    groups.get(title).push(knob);
+    groups.get(title).push(slider);
   }
   const sets = ORDER.filter(title => groups.has(title)).map(title =>
-    element("fieldset", {}, element("legend", {}, title), element("div", {}, ...groups.get(title).map(slider))));
+    element("fieldset", {}, element("legend", {}, title), element("div", {}, ...groups.get(title).map(makeSlider))));
   place.replaceChildren(...first, ...sets);
 }
-function words(knob, value) {
-  const digits = knob.unit === "m" || knob.unit === "" ? 2 : 1;
+function formatValue(slider, value) {
+  const digits = slider.unit === "m" || slider.unit === "" ? 2 : 1;
   const text = value.toFixed(digits).replace("-", "−");
-  return knob.unit === "" ? text : `${text} ${knob.unit === "deg" ? "°" : knob.unit}`.replace(" °", "°");
+  return slider.unit === "" ? text : `${text} ${slider.unit === "deg" ? "°" : slider.unit}`.replace(" °", "°");
 }
-function slider(knob) {
-  const id = `knob-${knob.name}`;
-  const input = element("input", {type: "range", id, min: knob.low, max: knob.high, step: "any", "data-name": knob.name});
+function makeSlider(slider) {
+  const id = `slider-${slider.name}`;
+  const input = element("input", {type: "range", id, min: slider.low, max: slider.high, step: "any", "data-name": slider.name});
   const output = element("output", {for: id});
-  const back = element("button", {type: "button", title: "as photographed", "aria-label": `${knob.title} as photographed`}, "×");
-  const row = element("div", {class: "knob"}, element("label", {for: id, title: MEANING[knob.title] ?? ""}, knob.title), input, output, back);
-  input.addEventListener("input", () => move({[knob.name]: Number(input.value)}));
+  const back = element("button", {type: "button", title: "as photographed", "aria-label": `${slider.title} as photographed`}, "×");
+  const row = element("div", {class: "slider"}, element("label", {for: id, title: MEANING[slider.title] ?? ""}, slider.title), input, output, back);
+  input.addEventListener("input", () => move({[slider.name]: Number(input.value)}));
   input.addEventListener("keydown", event => {
     const step = {ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10}[event.key];
     if (step === undefined) return;
     event.preventDefault();
-    move({[knob.name]: valueOf(knob.name) + step * knob.step * (event.shiftKey ? 10 : 1)});
+    move({[slider.name]: valueOf(slider.name) + step * slider.step * (event.shiftKey ? 10 : 1)});
   });
-  back.addEventListener("click", () => { move({[knob.name]: 0}); input.focus(); });
-  sliders.set(knob.name, {show(value) {
+  back.addEventListener("click", () => { move({[slider.name]: 0}); input.focus(); });
+  widgets.set(slider.name, {show(value) {
     if (Number(input.value) !== value) input.value = value;
-    input.setAttribute("aria-valuetext", words(knob, value));
-    output.textContent = words(knob, value);
+    input.setAttribute("aria-valuetext", formatValue(slider, value));
+    output.textContent = formatValue(slider, value);
     row.classList.toggle("moved", value !== 0);
   }});
   return row;
@@ -276,17 +276,17 @@ function slider(knob) {
 
 /* ---- the picture ---------------------------------------------------------------------------------------------- */
 
-function showSeen() {
-  const told = shown.before || seen === null ? {boxes: frame.boxes, cars: frame.cars, words: seen?.words, lost: seen?.lost} : seen;
+function showDetections() {
+  const current = selection.before || detected === null ? {boxes: frame.boxes, cars: frame.cars, words: detected?.words, lost: detected?.lost} : detected;
   const rects = [], labels = [];
-  for (const mark of told.boxes) {
+  for (const mark of current.boxes) {
     const [x0, y0, x1, y1] = mark.xyxy;
-    const group = drawing("g", {class: `box ${mark.kind}${mark.car === shown.car ? " chosen" : ""}`});
+    const group = drawing("g", {class: `box ${mark.kind}${mark.car === selection.car ? " chosen" : ""}`});
     for (const ink of ["under", "ink"]) group.append(drawing("rect", {class: ink, x: x0, y: y0, width: Math.max(x1 - x0, 0), height: Math.max(y1 - y0, 0)}));
     if (mark.car !== null) group.addEventListener("click", () => choose(mark.car));
     rects.push(group);
-    if (mark.kind === "true" && mark.car !== shown.car) continue;
-    if (mark.kind === "ignored" && mark.car !== shown.car) continue;
+    if (mark.kind === "true" && mark.car !== selection.car) continue;
+    if (mark.kind === "ignored" && mark.car !== selection.car) continue;
     const late = x0 > 0.85 * frame.width, low = mark.kind !== "found" && mark.kind !== "phantom";
     const label = element("span", {class: `name-of ${mark.kind}${late ? " late" : ""}${low ? " low" : ""}`}, mark.text);
     label.style.left = `${100 * clamp((late ? x1 : x0) / frame.width, 0, 1)}%`;
@@ -295,24 +295,24 @@ function showSeen() {
   }
   $("boxes").replaceChildren(...rects);
   $("names").replaceChildren(...labels);
-  for (const [id, on] of [["after", !shown.before], ["before", shown.before]]) $(id).classList.toggle("hidden", !on);
-  $("side").textContent = shown.before ? "photograph" : "after";
-  $("flip").setAttribute("aria-pressed", shown.before);
-  $("marks").setAttribute("aria-pressed", shown.boxes);
-  $("view").classList.toggle("bare", !shown.boxes);
-  if (seen === null) return;
-  $("words").textContent = seen.words[0].toUpperCase() + seen.words.slice(1);
-  $("words").parentElement.classList.toggle("lost", seen.lost + seen.phantoms > 0);
-  $("command").textContent = seen.command;
+  for (const [id, on] of [["after", !selection.before], ["before", selection.before]]) $(id).classList.toggle("hidden", !on);
+  $("side").textContent = selection.before ? "photograph" : "after";
+  $("flip").setAttribute("aria-pressed", selection.before);
+  $("marks").setAttribute("aria-pressed", selection.boxes);
+  $("view").classList.toggle("bare", !selection.boxes);
+  if (detected === null) return;
+  $("words").textContent = detected.words[0].toUpperCase() + detected.words.slice(1);
+  $("words").parentElement.classList.toggle("lost", detected.lost + detected.phantoms > 0);
+  $("command").textContent = detected.command;
   for (const chip of $("cars").children) {
-    const car = Number(chip.dataset.car), status = seen.cars[car].status;
+    const car = Number(chip.dataset.car), status = detected.cars[car].status;
     chip.className = status;
-    chip.setAttribute("aria-pressed", car === shown.car);
+    chip.setAttribute("aria-pressed", car === selection.car);
     chip.title = STATUS[status];
-    chip.lastChild.textContent = status === "ignored" ? "" : seen.cars[car].score.toFixed(2);
+    chip.lastChild.textContent = status === "ignored" ? "" : detected.cars[car].score.toFixed(2);
   }
-  const car = seen.cars[shown.car];
-  if ($("chosen") && car) $("chosen").textContent = `${shown.car}: ${STATUS[car.status]}, score ${car.score.toFixed(2)} (t* ${frame.t_star.toFixed(2)}, was ${frame.cars[shown.car].score.toFixed(2)})`;
+  const car = detected.cars[selection.car];
+  if ($("chosen") && car) $("chosen").textContent = `${selection.car}: ${STATUS[car.status]}, score ${car.score.toFixed(2)} (t* ${frame.t_star.toFixed(2)}, was ${frame.cars[selection.car].score.toFixed(2)})`;
   drawStreet();
 }
 
@@ -348,10 +348,10 @@ function drawStreet() {
     svg.append(drawing("path", {class: "camera", d: "M-.9 .9L0 -.6L.9 .9Z"}));
     svg.append(drawing("g", {id: "cars-above"}));
   }
-  const status = car => (seen ?? frame).cars[car].status;
+  const status = car => (detected ?? frame).cars[car].status;
   const parts = [];
-  const chosen = frame.cars[shown.car];
-  if (chosen && movable().includes(shown.car)) {
+  const chosen = frame.cars[selection.car];
+  if (chosen && movable().includes(selection.car)) {
     parts.push(reachOf(chosen));
     for (const car of frame.cars.filter(c => movable().includes(c.car)))
       parts.push(drawing("polygon", {class: "was", points: corners(car.x, car.z, car.yaw, car.length, car.width)}));
@@ -359,14 +359,14 @@ function drawStreet() {
   const size = Math.max(1.1, (z1 + 1) / 30);
   for (const car of frame.cars.filter(c => movable().includes(c.car))) {
     const here = placed(car), length = car.length * here.grown, width = car.width * here.grown;
-    const group = drawing("g", {class: `car ${status(car.car)}${car.car === shown.car ? " chosen" : ""}`, "data-car": car.car});
+    const group = drawing("g", {class: `car ${status(car.car)}${car.car === selection.car ? " chosen" : ""}`, "data-car": car.car});
     group.append(drawing("title", {}, `${car.class} ${car.car}: ${STATUS[status(car.car)]}`));
     group.append(drawing("polygon", {class: "body", points: corners(here.x, here.z, here.yaw, length, width)}));
     const [cos, sin] = [Math.cos(here.yaw), Math.sin(here.yaw)], nose = .34 * length;
     group.append(drawing("polygon", {class: "nose", points: corners(here.x + nose * cos, here.z - nose * sin, here.yaw, .1 * length, .8 * width)}));
     group.append(drawing("text", {x: here.x, y: -here.z, "font-size": size}, car.car));
     parts.push(group);
-    if (car.car === shown.car && knobs.has(named(car.car, "yaw"))) {
+    if (car.car === selection.car && sliders.has(named(car.car, "yaw"))) {
       const far = .5 * length + 1.6, at = {x: here.x + far * cos, z: here.z - far * sin};
       parts.push(drawing("line", {class: "stick", x1: here.x + .5 * length * cos, y1: -(here.z - .5 * length * sin), x2: at.x, y2: -at.z}));
       parts.push(drawing("circle", {class: "turn", cx: at.x, cy: -at.z, r: .62, "data-car": car.car}));
@@ -375,7 +375,7 @@ function drawStreet() {
   $("cars-above").replaceChildren(...parts);
 }
 function reachOf(car) {
-  const along = knobs.get(named(car.car, "translate.along")), across = knobs.get(named(car.car, "translate.across"));
+  const along = sliders.get(named(car.car, "translate.along")), across = sliders.get(named(car.car, "translate.across"));
   if (!along || !across) return drawing("g");
   const [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
   const points = [[along.low, across.low], [along.high, across.low], [along.high, across.high], [along.low, across.high]];
@@ -390,7 +390,7 @@ $("street").addEventListener("pointerdown", event => {
   if (!grip) return;
   event.preventDefault();
   const car = Number(grip.dataset.car);
-  if (car !== shown.car) choose(car);
+  if (car !== selection.car) choose(car);
   const at = metres(event), here = placed(frame.cars[car]);
   dragged = {car, turns: grip.classList.contains("turn"), dx: at.x - here.x, dz: at.z - here.z};
   $("street").setPointerCapture(event.pointerId);
@@ -416,25 +416,25 @@ function forgetMap() { map = {cells: new Map(), run: map.run + 1}; }
 function fillAxes(axes) {
   for (const [id, of] of [["map-x", "x"], ["map-y", "y"]]) {
     $(id).replaceChildren(...axes.map(name => {
-      const knob = knobs.get(name);
-      const title = `${GROUPS[knob.group].toLowerCase()}: ${knob.title}`;
+      const slider = sliders.get(name);
+      const title = `${GROUPS[slider.group].toLowerCase()}: ${slider.title}`;
       return element("option", {value: name}, title);
     }));
-    $(id).value = shown[of];
-    $(id).dataset.of = `${frame.name} ${shown.car}`;
+    $(id).value = selection[of];
+    $(id).dataset.of = `${frame.name} ${selection.car}`;
   }
-  const car = frame.cars[shown.car];
-  $("map-car").textContent = car ? `${car.class} ${shown.car}` : "";
+  const car = frame.cars[selection.car];
+  $("map-car").textContent = car ? `${car.class} ${selection.car}` : "";
 }
 for (const [id, of, other] of [["map-x", "x", "y"], ["map-y", "y", "x"]]) $(id).addEventListener("change", event => {
-  const before = shown[of];
-  shown[of] = event.target.value;
-  if (shown.x === shown.y) { shown[other] = before; $(`map-${other}`).value = before; }
+  const before = selection[of];
+  selection[of] = event.target.value;
+  if (selection.x === selection.y) { selection[other] = before; $(`map-${other}`).value = before; }
   forgetMap();
   refresh();
   settled(serial);
 });
-const at = (knob, i) => knob.low + (knob.high - knob.low) * i / (overview.grid - 1);
+const at = (slider, i) => slider.low + (slider.high - slider.low) * i / (overview.grid - 1);
 /* Every other cell first: a rough map soon, a fine one a little later. */
 function order() {
   const all = [];
@@ -442,13 +442,13 @@ function order() {
   return all.sort((a, b) => a[2] - b[2]);
 }
 async function fillMap(now) {
-  const x = knobs.get(shown.x), y = knobs.get(shown.y), mine = map, car = shown.car;
+  const x = sliders.get(selection.x), y = sliders.get(selection.y), mine = map, car = selection.car;
   if (!x || !y || !movable().includes(car) || document.hidden) return;
   for (const [i, j] of order()) {
     if (mine !== map || now !== serial) return;
     if (mine.cells.has(`${i} ${j}`)) continue;
-    const state = {...asked(), [x.name]: rounded(at(x, i), 1e-6), [y.name]: rounded(at(y, j), 1e-6), car};
-    const answer = await ask("/score", state);
+    const state = {...stateQuery(), [x.name]: rounded(at(x, i), 1e-6), [y.name]: rounded(at(y, j), 1e-6), car};
+    const answer = await request("/score", state);
     if (answer === null || mine !== map) return;
     mine.cells.set(`${i} ${j}`, await answer.json());
     drawMap();
@@ -469,7 +469,7 @@ function nearest(i, j) {
   return [null, false];
 }
 function drawMap() {
-  const x = knobs.get(shown.x), y = knobs.get(shown.y), svg = $("map");
+  const x = sliders.get(selection.x), y = sliders.get(selection.y), svg = $("map");
   const [width, height] = [400, 330], [left, bottom, top, right] = [52, 42, 6, 8];
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   if (!x || !y) { svg.replaceChildren(); return; }
@@ -479,35 +479,35 @@ function drawMap() {
     const rect = drawing("rect", {class: `cell ${cell ? cell.status : "waits"}${rough ? " rough" : ""}`, x: px, y: py, width: w, height: h, "data-i": i, "data-j": j});
     if (cell) {
       rect.setAttribute("fill", colour(cell));
-      rect.append(drawing("title", {}, `${words(x, at(x, i))}, ${words(y, at(y, j))}: ${STATUS[cell.status]}, score ${cell.score.toFixed(2)}`));
+      rect.append(drawing("title", {}, `${formatValue(x, at(x, i))}, ${formatValue(y, at(y, j))}: ${STATUS[cell.status]}, score ${cell.score.toFixed(2)}`));
     }
     parts.push(rect);
     if (cell && !rough && (cell.status === "lost" || cell.status === "missed"))
       parts.push(drawing("path", {class: "cross", d: `M${px + .3 * w} ${py + .3 * h}l${.4 * w} ${.4 * h}m0 ${-.4 * h}l${-.4 * w} ${.4 * h}`}));
   }
-  const place = (knob, value, from, size) => from + size / 2 + (value - knob.low) / (knob.high - knob.low) * (overview.grid - 1) * size;
+  const place = (slider, value, from, size) => from + size / 2 + (value - slider.low) / (slider.high - slider.low) * (overview.grid - 1) * size;
   const zeroX = place(x, 0, left, w), zeroY = height - bottom - place(y, 0, 0, h);
   if (x.low <= 0 && x.high >= 0) parts.push(drawing("line", {class: "zero", x1: zeroX, x2: zeroX, y1: top, y2: height - bottom}));
   if (y.low <= 0 && y.high >= 0) parts.push(drawing("line", {class: "zero", x1: left, x2: width - right, y1: zeroY, y2: zeroY}));
   const cx = place(x, valueOf(x.name), left, w), cy = height - bottom - place(y, valueOf(y.name), 0, h);
   for (const name of ["under-here", "here"]) parts.push(drawing("circle", {class: name, cx, cy, r: 7}));
   for (const [value, px, anchor] of [[x.low, left + w / 2, "middle"], [x.high, width - right - w / 2, "middle"]])
-    parts.push(drawing("text", {x: px, y: height - bottom + 15, "text-anchor": anchor}, words(x, value)));
+    parts.push(drawing("text", {x: px, y: height - bottom + 15, "text-anchor": anchor}, formatValue(x, value)));
   for (const [value, py] of [[y.low, height - bottom - h / 2], [y.high, top + h / 2]])
-    parts.push(drawing("text", {x: left - 5, y: py + 4, "text-anchor": "end"}, words(y, value)));
+    parts.push(drawing("text", {x: left - 5, y: py + 4, "text-anchor": "end"}, formatValue(y, value)));
   parts.push(drawing("text", {class: "axis", x: left + (width - left - right) / 2, y: height - 8, "text-anchor": "middle"}, `${x.title} →`));
   parts.push(drawing("text", {class: "axis", x: 0, y: 0, "text-anchor": "middle", transform: `translate(13 ${top + (height - top - bottom) / 2}) rotate(-90)`}, `${y.title} →`));
   svg.replaceChildren(...parts);
   const cells = [...map.cells.values()], lost = cells.filter(c => c.status === "lost" || c.status === "missed").length;
-  const none = !movable().includes(shown.car);
-  $("map-said").textContent = none ? "no vehicle to ask about" : `${lost} of ${cells.length} not found${cells.length < overview.grid * overview.grid ? ", still looking" : ""}`;
+  const none = !movable().includes(selection.car);
+  $("map-status").textContent = none ? "no vehicle selected" : `${lost} of ${cells.length} not found${cells.length < overview.grid * overview.grid ? ", in progress" : ""}`;
   $("map").dataset.cells = cells.length;
 }
 let aiming = false;
 function aim(event) {
   const target = document.elementFromPoint(event.clientX, event.clientY)?.closest("#map .cell");
   if (!target) return;
-  const x = knobs.get(shown.x), y = knobs.get(shown.y);
+  const x = sliders.get(selection.x), y = sliders.get(selection.y);
   move({[x.name]: at(x, Number(target.dataset.i)), [y.name]: at(y, Number(target.dataset.j))});
 }
 $("map").addEventListener("pointerdown", event => { aiming = true; aim(event); });
@@ -539,14 +539,14 @@ async function copy(text, what) {
     toast("select and copy it by hand: this browser does not let pages copy");
   }
 }
-function flip() { shown.before = !shown.before; showSeen(); writeLink(); }
+function flip() { selection.before = !selection.before; showDetections(); writeLink(); }
 function nextCar(step) {
   const all = movable();
-  if (all.length) choose(all[(all.indexOf(shown.car) + step + all.length) % all.length]);
+  if (all.length) choose(all[(all.indexOf(selection.car) + step + all.length) % all.length]);
 }
 function nudge(last, sign, event) {
-  const knob = knobs.get(named(shown.car, last)), step = {m: .05, deg: .5}[knob?.unit] ?? 0;
-  if (knob) move({[knob.name]: valueOf(knob.name) + sign * step * (event.shiftKey ? 10 : 1)});
+  const slider = sliders.get(named(selection.car, last)), step = {m: .05, deg: .5}[slider?.unit] ?? 0;
+  if (slider) move({[slider.name]: valueOf(slider.name) + sign * step * (event.shiftKey ? 10 : 1)});
 }
 const copyCommand = () => copy($("command").textContent, "Command"), copyLink = () => copy(location.href, "Link");
 function showKeys() {
@@ -555,7 +555,7 @@ function showKeys() {
 }
 /* Arrows as one sees them: to the right and away; which of its axes that is depends on how the car stands. */
 function push(right, away, event) {
-  const car = frame.cars[shown.car];
+  const car = frame.cars[selection.car];
   if (!car) return;
   const [cos, sin] = [Math.cos(car.yaw), Math.sin(car.yaw)];
   const along = right * cos - away * sin, across = right * sin + away * cos;
@@ -563,7 +563,7 @@ function push(right, away, event) {
   else nudge("translate.across", Math.sign(across), event);
 }
 const KEYS = {
-  b: flip, d: () => { shown.boxes = !shown.boxes; showSeen(); }, n: () => nextCar(1), p: () => nextCar(-1), r: restCar,
+  b: flip, d: () => { selection.boxes = !selection.boxes; showDetections(); }, n: () => nextCar(1), p: () => nextCar(-1), r: restCar,
   0: () => become({}), f: () => become(frame.found), c: copyCommand, l: copyLink, "?": showKeys,
   arrowup: e => push(0, 1, e), arrowdown: e => push(0, -1, e), arrowright: e => push(1, 0, e), arrowleft: e => push(-1, 0, e),
   q: e => nudge("yaw", -1, e), e: e => nudge("yaw", 1, e),
@@ -579,17 +579,17 @@ for (const [id, act] of [["flip", flip], ["marks", KEYS.d], ["rest", KEYS[0]], [
   ["copy-command", copyCommand], ["show-keys", showKeys]]) $(id).addEventListener("click", act);
 $("frame").addEventListener("change", event => load(event.target.value, new URLSearchParams()).catch(complain));
 addEventListener("hashchange", () => {
-  const {frame: name, told} = readLink();
-  if (name !== frame?.name) load(name, told).catch(complain);
-  else { take(told); changed(); showSeen(); }
+  const {frame: name, params} = readLink();
+  if (name !== frame?.name) load(name, params).catch(complain);
+  else { take(params); changed(); showDetections(); }
 });
 document.addEventListener("visibilitychange", () => { if (!document.hidden && frame) settled(serial); });
 
 (async () => {
-  overview = await (await ask("/overview")).json();
+  overview = await (await request("/overview")).json();
   document.title = `${overview.title} - drivesem view`;
-  $("frame").replaceChildren(...overview.frames.map(({name, words: told}) => element("option", {value: name}, told ? `${name} (${told})` : name)));
-  const {frame: name, told} = readLink();
-  await load(name, told);
+  $("frame").replaceChildren(...overview.frames.map(({name, words: summary}) => element("option", {value: name}, summary ? `${name} (${summary})` : name)));
+  const {frame: name, params} = readLink();
+  await load(name, params);
   drawRamp();
 })().catch(complain);

@@ -149,13 +149,26 @@ class Viewer:
         return scene.encode_picture(rendered)
 
     def detections(self, name: str, values: Mapping[str, float], order: RequestOrder) -> dict[str, Any]:
-        """Detections in a state, as JSON values; arguments as `picture`."""
+        """Detections in a state, as JSON values.
+
+        Args:
+            name: Name of the frame.
+            values: Slider values.
+            order: Position of the request.
+        """
         scene, state = self._register_request(name, values, order, "detections")
         rendered = self._run_latest(self._render_pool, lambda: scene.render_state(state), order, "detections")
         return self._run_latest(self._detect_pool, lambda: scene.detect(state, rendered), order, "detections")
 
     def score(self, name: str, values: Mapping[str, float], order: RequestOrder, car: int) -> dict[str, Any]:
-        """Status and score of one vehicle (row `car`) in a state; other arguments as `picture`."""
+        """Status and score of one vehicle in a state, as JSON values.
+
+        Args:
+            name: Name of the frame.
+            values: Slider values.
+            order: Position of the request.
+            car: Row of the vehicle.
+        """
         scene, state = self._register_request(name, values, order, _BACKGROUND)
         if not 0 <= car < len(scene.sliders.rest.objects):
             raise RefusedError(f"car: expected a row of the scene, found {car}")
@@ -168,7 +181,13 @@ class Viewer:
         return self._run_latest(self._detect_pool, lambda: scene.score(state, car, rendered), order, _BACKGROUND)
 
     def notes(self, name: str, values: Mapping[str, float], order: RequestOrder) -> list[str]:
-        """Violated constraints in a state; arguments as `picture`."""
+        """Violated constraints in a state.
+
+        Args:
+            name: Name of the frame.
+            values: Slider values.
+            order: Position of the request.
+        """
         scene, state = self._register_request(name, values, order, _BACKGROUND)
         rendered = self._run_latest(self._render_pool, lambda: scene.render_state(state), order, _BACKGROUND)
         return self._run_latest(self._detect_pool, lambda: scene.notes(rendered), order, _BACKGROUND)

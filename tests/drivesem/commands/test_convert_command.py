@@ -297,7 +297,7 @@ def test_regions_alone_are_no_detections(convert: Convert, tmp_path: Path):
     assert (tmp_path / "out/000000.txt").read_text().startswith("DontCare -1 -1 -10 240.79 112.01 260.53 118.90")
 
 
-def test_pictures_beside_kittis_labels_keep_their_suffix(convert: Convert, kitti: Path, tmp_path: Path):
+def test_images_of_kitti_labels_keep_their_suffix(convert: Convert, kitti: Path, tmp_path: Path):
     for path in (kitti / "training/image_2").glob("*.png"):
         Image.open(path).save(path.with_suffix(".jpg"))
         path.unlink()

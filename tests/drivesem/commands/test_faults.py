@@ -102,7 +102,7 @@ COMMANDS = {
 }
 
 
-def say(name: str, kitti: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
+def run_refused(name: str, kitti: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """The last line of a command that is refused."""
     words = [word.format(kitti=kitti) for word in COMMANDS[name]]
     assert main([*words, "--out", str(out)]) == 2
@@ -125,7 +125,7 @@ def test_a_place_that_cannot_be_written_is_one_line(
         mkdir(self, *words, **options)  # pyright: ignore[reportArgumentType]
 
     monkeypatch.setattr(Path, "mkdir", reads_only)
-    line = say(name, tiny_kitti, tmp_path / "a" / "run", capsys)
+    line = run_refused(name, tiny_kitti, tmp_path / "a" / "run", capsys)
     assert line.startswith(f"drivesem: {tmp_path}")
     assert line.endswith("expected a place that can be written, found read-only file system")
 
@@ -140,7 +140,7 @@ def test_a_full_disk_leaves_no_half(
 ) -> None:
     out = tmp_path / "run"
     with full_disk(20_000):
-        line = say(name, tiny_kitti, out, capsys)
+        line = run_refused(name, tiny_kitti, out, capsys)
     assert "expected a place that can be written, found file too large" in line
     assert not files.find_leftovers(out)
     assert not [path for path in out.rglob("*") if path.suffix in (".png", ".npz", ".safetensors")]
@@ -230,12 +230,15 @@ def test_a_frame_for_which_the_device_has_no_memory(
         return scene(self, identifier)
 
     monkeypatch.setattr(DatasetSource, "scene", second_is_large)
-    out, told = tmp_path / "run", "--device: expected one with memory for this, found CUDA out of memory. Tried to"
+    out, message = (
+        tmp_path / "run",
+        "--device: expected one with memory for this, found CUDA out of memory. Tried to",
+    )
     assert attack(tiny_kitti, out) == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith(f"drivesem: {told}")
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"drivesem: {message}")
     assert attack(tiny_kitti, out, "--keep-going") == 0
     assert done(out) == [NAMES[0], NAMES[2]]
-    assert listed(out)[NAMES[1]].startswith(told)
+    assert listed(out)[NAMES[1]].startswith(message)
 
 
 def test_results_are_in_their_folders_alone(

@@ -23,7 +23,7 @@ CAR = "Car {truncated} 0 1.50 120 40 200 80 {height} 1.60 4.00 0.00 1.65 15.00 0
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """The last line of a command that refuses its input; before it there may be a bar of progress."""
 
     def call(*words: object) -> str:
@@ -60,17 +60,17 @@ def folder(tmp_path: Path) -> Callable[..., Path]:
     ],
 )
 def test_frames(
-    folder: Callable[..., Path], said: Callable[..., str], given: Any, message: str, tmp_path: Path
+    folder: Callable[..., Path], refusal: Callable[..., str], given: Any, message: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    line = said("derender", "--dataset", "kitti", "--root", folder(**given), "--workers", "1", "--out", out)
+    line = refusal("derender", "--dataset", "kitti", "--root", folder(**given), "--workers", "1", "--out", out)
     assert message in line
 
 
-def test_photographs(folder: Callable[..., Path], said: Callable[..., str], tmp_path: Path) -> None:
+def test_photographs(folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     files.write_png(tmp_path / "one.png", np.zeros((1, 1, 3), np.uint8))
-    assert "expected at least 16x16 px, found 1x1 px" in said("derender", tmp_path / "one.png", "--out", out)
+    assert "expected at least 16x16 px, found 1x1 px" in refusal("derender", tmp_path / "one.png", "--out", out)
     picture = folder() / "training" / "image_2" / "000000.png"
     picture.unlink()
     picture.symlink_to("/dev/zero")
@@ -85,7 +85,7 @@ def test_photographs(folder: Callable[..., Path], said: Callable[..., str], tmp_
         "--out",
         tmp_path / "b",
     )
-    assert "000000.png: expected a regular file" in said(*words)
+    assert "000000.png: expected a regular file" in refusal(*words)
 
 
 @pytest.mark.parametrize(
@@ -100,9 +100,9 @@ def test_photographs(folder: Callable[..., Path], said: Callable[..., str], tmp_
     ],
 )
 def test_labels_that_are_converted(
-    folder: Callable[..., Path], said: Callable[..., str], given: Any, message: str, tmp_path: Path
+    folder: Callable[..., Path], refusal: Callable[..., str], given: Any, message: str, tmp_path: Path
 ) -> None:
-    assert message in said("convert", folder(**given), "--to", "coco", "--out", tmp_path / "out")
+    assert message in refusal("convert", folder(**given), "--to", "coco", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -120,7 +120,7 @@ def test_labels_that_are_converted(
         ("images", "id", 10**30, "an integer of 31 digits"),
     ],
 )
-def test_coco(said: Callable[..., str], tmp_path: Path, table: str, key: str, value: Any, message: str) -> None:
+def test_coco(refusal: Callable[..., str], tmp_path: Path, table: str, key: str, value: Any, message: str) -> None:
     content = {
         "images": [{"id": 1, "file_name": "a.png", "height": 96, "width": 320}],
         "categories": [{"id": 1, "name": "Car"}],
@@ -129,11 +129,11 @@ def test_coco(said: Callable[..., str], tmp_path: Path, table: str, key: str, va
     content[table][0][key] = value
     path = tmp_path / "labels.json"
     path.write_text(json.dumps(content))
-    assert message in said("convert", path, "--to", "kitti", "--out", tmp_path / "out")
+    assert message in refusal("convert", path, "--to", "kitti", "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize("name", ["../../secret.png", "/dev/zero"])
-def test_coco_names_stay_in_their_folder(said: Callable[..., str], tmp_path: Path, name: str) -> None:
+def test_coco_names_stay_in_their_folder(refusal: Callable[..., str], tmp_path: Path, name: str) -> None:
     content = {
         "images": [{"id": 1, "file_name": name, "height": 96, "width": 320}],
         "categories": [],
@@ -143,14 +143,14 @@ def test_coco_names_stay_in_their_folder(said: Callable[..., str], tmp_path: Pat
     path.parent.mkdir()
     path.write_text(json.dumps(content))
     words = ("derender", "--dataset", "coco", "--root", tmp_path, "--out", tmp_path / "out")
-    assert "images[0].file_name: expected a file in" in said(*words)
+    assert "images[0].file_name: expected a file in" in refusal(*words)
 
 
-def test_many_equal_detections(folder: Callable[..., Path], said: Callable[..., str], tmp_path: Path) -> None:
+def test_many_equal_detections(folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path) -> None:
     line = CAR.format(truncated="0", height="1.5").strip() + " 0.5\n"
     files.write_text(tmp_path / "found" / "000000.txt", line * 80_000)
     words = ("eval", "--gt", folder(), "--pred", tmp_path / "found", "--protocol", "kitti")
-    assert "at most 2,000 detections of a class in a frame" in said(*words)
+    assert "at most 2,000 detections of a class in a frame" in refusal(*words)
 
 
 def edit(path: Path, *keys: Any, value: Any) -> None:
@@ -183,7 +183,7 @@ def edit(path: Path, *keys: Any, value: Any) -> None:
 )
 def test_runs(
     write_run: Callable[..., Path],
-    said: Callable[..., str],
+    refusal: Callable[..., str],
     tmp_path: Path,
     file: str,
     keys: tuple[Any, ...],
@@ -193,7 +193,7 @@ def test_runs(
     run = write_run(tmp_path / "run")
     places = {"result": run / "frames" / "a" / "result.json"}
     edit(places.get(file, run / f"{file}.json"), *keys, value=value)
-    assert message in said("holes", run)
+    assert message in refusal("holes", run)
 
 
 @pytest.mark.parametrize(
@@ -206,15 +206,15 @@ def test_runs(
     ],
 )
 def test_settings_of_runs(
-    write_run: Callable[..., Path], said: Callable[..., str], tmp_path: Path, old: str, new: str, message: str
+    write_run: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     run = write_run(tmp_path / "run")
     text = (run / "config.yaml").read_text()
     assert old in text
     (run / "config.yaml").write_text(text.replace(old, new))
-    assert message in said("verify", "--run", run)
+    assert message in refusal("verify", "--run", run)
     if "detector" in old:
-        assert message in said("holes", run)
+        assert message in refusal("holes", run)
 
 
 RAISING = """
@@ -241,12 +241,12 @@ def broken(:
         ("Net", "(mine.py:12, in forward)"),
     ],
 )
-def test_a_detector_that_raises(said: Callable[..., str], tmp_path: Path, name: str, message: str) -> None:
+def test_a_detector_that_raises(refusal: Callable[..., str], tmp_path: Path, name: str, message: str) -> None:
     path = tmp_path / "mine.py"
     path.write_text(RAISING.replace("def broken(:", ""))
-    assert message in said("check", "--detector", f"module:{path}:{name}")
+    assert message in refusal("check", "--detector", f"module:{path}:{name}")
     path.write_text(RAISING)
-    line = said("check", "--detector", f"module:{path}:{name}")
+    line = refusal("check", "--detector", f"module:{path}:{name}")
     assert line.endswith("SyntaxError: invalid syntax (mine.py:14)")
 
 
@@ -260,12 +260,12 @@ class Late(SqueezeDet):
 
 
 def test_a_detector_that_raises_when_it_is_attacked(
-    said: Callable[..., str], small_kitti: Path, tmp_path: Path
+    refusal: Callable[..., str], small_kitti: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.py"
     path.write_text(LATE)
     words = ("attack", "--dataset", "kitti", "--root", small_kitti, "--no-fit", "--params", "translate")
-    line = said(*words, "--workers", "1", "--out", tmp_path / "out", "--detector", f"module:{path}:Late")
+    line = refusal(*words, "--workers", "1", "--out", tmp_path / "out", "--detector", f"module:{path}:Late")
     expected = "--detector: expected methods that raise nothing, found KeyError: 'wheels' (mine.py:6, in decode)"
     assert line == f"drivesem: {expected}"
 
@@ -279,26 +279,26 @@ def test_a_detector_that_raises_when_it_is_attacked(
         ({"anchors": "[" * 100_000}, "recursion"),
     ],
 )
-def test_weights(said: Callable[..., str], tmp_path: Path, changed: dict[str, str], message: str) -> None:
+def test_weights(refusal: Callable[..., str], tmp_path: Path, changed: dict[str, str], message: str) -> None:
     metadata, tensors = read_weights(SHIPPED["squeezedet"])
     path = tmp_path / "weights.safetensors"
     write_weights(path, metadata | changed, tensors)
-    assert message in said("check", "--detector", path)
+    assert message in refusal("check", "--detector", path)
 
 
-def test_darknet_files(said: Callable[..., str], tmp_path: Path) -> None:
+def test_darknet_files(refusal: Callable[..., str], tmp_path: Path) -> None:
     path = tmp_path / "net.cfg"
     path.write_text("[net]\nchannels=3\n" + "[shortcut]\nfrom=-1\n" * 20_000)
     words = ("check", "--detector", f"darknet:{path}")
-    assert "net.cfg: expected at most 1000 sections, found 20001" in said(*words)
+    assert "net.cfg: expected at most 1000 sections, found 20001" in refusal(*words)
     path.unlink()
     path.symlink_to("/dev/zero")
-    assert "net.cfg: expected a Darknet .cfg, found no regular file" in said(*words)
+    assert "net.cfg: expected a Darknet .cfg, found no regular file" in refusal(*words)
     path.unlink()
     head = "[convolutional]\nfilters=18\nsize=1\nstride=1\nactivation=linear\n[yolo]\nclasses=1\nmask=0,1,2\n"
     path.write_text(f"[net]\nchannels=3\n{head}anchors=1,1,2,2,3,3\nnum=3\n")
     (tmp_path / "net.names").write_bytes(b"\xff\xfe\n")
-    assert "net.names: expected class names, found bytes that are no text" in said(*words)
+    assert "net.names: expected class names, found bytes that are no text" in refusal(*words)
 
 
 class Blind:
@@ -315,11 +315,11 @@ class Blind:
 
 
 def test_a_detector_that_finds_nothing_is_not_attacked(
-    said: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    refusal: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blind())
     words = ("attack", "--method", "random", "--queries", "1", "--workers", "1", "--params", "weather")
-    line = said(*words, "--limit", "2", "--out", tmp_path / "run")
+    line = refusal(*words, "--limit", "2", "--out", tmp_path / "run")
     assert line.startswith("drivesem: --detector: expected one that finds something, with a score of 0.5 or more")
     assert "no detection at all in 2 photographs" in line
     assert not (tmp_path / "run" / "metrics.json").exists()
@@ -344,10 +344,10 @@ def test_names_that_a_terminal_or_a_table_would_obey(
     (tmp_path / "found.json").write_text(json.dumps(found))
     words = ["--gt", str(tmp_path / "true.json"), "--pred", str(tmp_path / "found.json"), "--classes", name]
     assert main(["eval", *words]) == 0
-    told = capsys.readouterr()
-    said = told.out + told.err
-    assert said.replace("\n", "").isprintable()
-    assert name.encode("unicode_escape").decode() in said
+    output = capsys.readouterr()
+    refusal = output.out + output.err
+    assert refusal.replace("\n", "").isprintable()
+    assert name.encode("unicode_escape").decode() in refusal
     assert main(["convert", str(tmp_path / "true.json"), "--to", "kitti", "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err[:-1].isprintable()
 
@@ -363,20 +363,22 @@ def test_names_that_a_terminal_or_a_table_would_obey(
     ],
 )
 def test_numbers_that_no_column_holds(
-    folder: Callable[..., Path], said: Callable[..., str], tmp_path: Path, line: str, message: str
+    folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path, line: str, message: str
 ) -> None:
     files.write_text(tmp_path / "found" / "000000.txt", line + "\n")
-    told = said("eval", "--gt", folder(), "--pred", tmp_path / "found")
-    assert message in told
-    assert len(told) < 2000
+    output = refusal("eval", "--gt", folder(), "--pred", tmp_path / "found")
+    assert message in output
+    assert len(output) < 2000
 
 
-def test_a_frame_of_a_million_lines(folder: Callable[..., Path], said: Callable[..., str], tmp_path: Path) -> None:
+def test_a_frame_of_a_million_lines(
+    folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path
+) -> None:
     words = ("derender", "--dataset", "kitti", "--workers", "1", "--out", tmp_path / "out", "--root")
-    assert "000000.txt: expected at most 10,000 lines, found 1,000,000" in said(*words, folder(cars=10**6))
+    assert "000000.txt: expected at most 10,000 lines, found 1,000,000" in refusal(*words, folder(cars=10**6))
 
 
-def test_coco_s_cameras_of_other_projects(said: Callable[..., str], tmp_path: Path) -> None:
+def test_coco_s_cameras_of_other_projects(refusal: Callable[..., str], tmp_path: Path) -> None:
     content: dict[str, Any] = {
         "images": [
             {"id": 1, "file_name": "a.png", "height": 96, "width": 320, "camera": {"projection": [[1], 2]}}
@@ -387,22 +389,22 @@ def test_coco_s_cameras_of_other_projects(said: Callable[..., str], tmp_path: Pa
     path = tmp_path / "labels.json"
     path.write_text(json.dumps(content))
     message = "camera: expected projection (12 numbers), or fx, fy, cx, cy"
-    assert message in said("convert", path, "--to", "kitti", "--out", tmp_path / "out")
+    assert message in refusal("convert", path, "--to", "kitti", "--out", tmp_path / "out")
 
 
-def test_coco_s_own_keys_that_json_cannot_say(said: Callable[..., str], tmp_path: Path) -> None:
+def test_coco_keys_with_values_beyond_json(refusal: Callable[..., str], tmp_path: Path) -> None:
     row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 5, 4], "area": 20, "mood": float("nan")}
     image = {"id": 1, "file_name": "a.png", "height": 96, "width": 320}
     content = {"images": [image], "categories": [{"id": 1, "name": "Car"}], "annotations": [row]}
     path = tmp_path / "labels.json"
     path.write_text(json.dumps(content))
     message = "annotations[0]: expected finite numbers, found NaN or infinity"
-    assert message in said("convert", path, "--to", "coco", "--out", tmp_path / "out")
+    assert message in refusal("convert", path, "--to", "coco", "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize("name", ["result.json", "scene/depth.bin", "counterexample.png"])
 def test_links_of_a_run_stay_in_it(
-    write_run: Callable[..., Path], said: Callable[..., str], tmp_path: Path, name: str
+    write_run: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path, name: str
 ) -> None:
     run = write_run(tmp_path / "run")
     path = run / "frames" / "b" / name
@@ -410,22 +412,22 @@ def test_links_of_a_run_stay_in_it(
     path.unlink(missing_ok=True)
     (tmp_path / "secret").write_text("secret")
     path.symlink_to(tmp_path / "secret")
-    line = said("holes", run)
+    line = refusal("holes", run)
     assert f"{path}: expected a file in {run / 'frames' / 'b'}, found a link to" in line
     (run / "metrics.json").unlink()
     (run / "metrics.json").symlink_to("/etc/passwd")
-    assert "metrics.json: expected a file in" in said("holes", run)
+    assert "metrics.json: expected a file in" in refusal("holes", run)
     (run / "config.yaml").unlink()
     (run / "config.yaml").symlink_to("/dev/zero")
-    assert "config.yaml: expected a file in" in said("holes", run)
+    assert "config.yaml: expected a file in" in refusal("holes", run)
 
 
-def test_a_command_says_whose_code_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_names_the_code_that_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.py"
     path.write_text("class A:\n    pass\n")
     assert main(["check", "--detector", f"planted:height_px=30:38@module:{path}:A"]) == 2
     first, _ = capsys.readouterr().err.splitlines()
     assert first == f"drivesem: --detector: runs the code in {path}:A"
     for kind in registry.KINDS:
-        said = program.RUNS_CODE.findall(f"squeezedet,{kind}:a.b")
-        assert said == (["a.b"] if kind in registry.RUNS_CODE else [])
+        refusal = program.RUNS_CODE.findall(f"squeezedet,{kind}:a.b")
+        assert refusal == (["a.b"] if kind in registry.RUNS_CODE else [])

@@ -91,10 +91,10 @@ def test_data_sets_are_those_that_can_be_read() -> None:
 
 @pytest.mark.parametrize("command", ["derender", "attack", "bench"])
 def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    said = fail([command, "--dataset", "kitty", "--root", "."], capsys)
+    output = fail([command, "--dataset", "kitty", "--root", "."], capsys)
     assert (
         "--dataset: expected one of demo, kitti, vkitti1, vkitti2, coco, yolo, photographs, scenes, found 'kitty'"
-        in said
+        in output
     )
 
 
@@ -161,7 +161,7 @@ def test_processes_do_not_matter(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert list(found["2"]["frames"]) == ["000000", "000002"]
 
 
-def test_what_it_tells_of_each_frame(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_are_summarised(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "S"
     words = ["derender", "--limit", "1", "--workers", "1", "--sheet", "--out", str(out)]
     found, _ = succeed(words, capsys)
@@ -202,15 +202,15 @@ def test_a_scene_of_another_version_is_refused(
     shutil.copytree(taken, out)
     record = out / "demo-001" / "scene.json"
     record.write_text(record.read_text().replace(f'"version": {VERSION}', '"version": 99'))
-    said = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
-    assert f"scene.json: version: expected version {VERSION}, found version 99" in said
+    output = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
+    assert f"scene.json: version: expected version {VERSION}, found version 99" in output
 
 
 def test_other_settings_need_another_folder(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = fail(["derender", "--limit", "2", "--out", str(taken), "--seed", "1"], capsys)
-    assert "other values of seed" in said
-    said = fail(["derender", "--limit", "2", "--out", str(taken), "--fast"], capsys)
-    assert "other values of fit" in said
+    output = fail(["derender", "--limit", "2", "--out", str(taken), "--seed", "1"], capsys)
+    assert "other values of seed" in output
+    output = fail(["derender", "--limit", "2", "--out", str(taken), "--fast"], capsys)
+    assert "other values of fit" in output
     assert "which holds other files" in fail(["derender", "--out", str(taken / "demo-000")], capsys)
 
 
@@ -290,8 +290,8 @@ def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path, capsys: pytes
         chosen[name] = load_scene(tmp_path / name / "000000").provenance["objects[0].mesh"]
     assert chosen["A"] != chosen["B"] == "my-pickup"
     assert '"my-pickup"' in (tmp_path / "B" / "000000" / "scene.json").read_text()
-    said = fail([*words, "--out", str(tmp_path / "B")], capsys)
-    assert "other values of meshes" in said
+    output = fail([*words, "--out", str(tmp_path / "B")], capsys)
+    assert "other values of meshes" in output
 
 
 def test_points_are_kittis(tmp_path: Path) -> None:
@@ -366,7 +366,7 @@ def test_an_edit_begins_with_the_photograph_again(
     assert not np.array_equal(files.read_image(once), files.read_image(still))
 
 
-def test_what_an_edit_removed_stays_so_and_that_is_said(
+def test_removed_vehicles_stay_removed_and_are_reported(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changed, still = tmp_path / "S", tmp_path / "still.png"
@@ -375,9 +375,9 @@ def test_what_an_edit_removed_stays_so_and_that_is_said(
     left = len(load_scene(demo).objects) - 1
     assert f"S: {left} vehicles, 1 removed (" in capsys.readouterr().out
     words = ["edit", str(changed), "--photographed", "-o", str(still)]
-    found, said = succeed(words, capsys)
+    found, output = succeed(words, capsys)
     note = "not the photograph: vehicles that were removed, exchanged, added, loaded or taken away stay so"
-    assert said == f"drivesem: {note}\n"
+    assert output == f"drivesem: {note}\n"
     assert (found["notes"], found["objects"]) == ([note], left)
     assert main(words) == 0
     assert f"still.png: {left} vehicles (" in capsys.readouterr().out
@@ -400,7 +400,7 @@ def test_without_vehicles_the_background_is_left(
     assert found["objects"] == len(load_scene(demo).objects) - 3
 
 
-def test_impossible_places_are_said_and_drawn(
+def test_infeasible_positions_are_reported_and_rendered(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = load_scene(demo)
@@ -410,14 +410,14 @@ def test_impossible_places_are_said_and_drawn(
     x, z = gap[other - 1][[0, 2]].tolist()
     onto = f"objects[0].translate={c * x - s * z}m,{s * x + c * z}m"
     words = ["edit", str(demo), "--set", onto, "-o", str(tmp_path / "a.png")]
-    found, said = succeed(words, capsys)
-    lines = said.splitlines()
+    found, output = succeed(words, capsys)
+    lines = output.splitlines()
     assert lines
     assert all(line.startswith("drivesem: objects[") for line in lines)
-    assert f"objects[{other}]: collision with objects[0]" in said
+    assert f"objects[{other}]: collision with objects[0]" in output
     assert found["notes"] == [line.removeprefix("drivesem: ") for line in lines]
-    _, said = succeed([*words, "--remove", str(other)], capsys)
-    assert f"objects[{other}]" not in said
+    _, output = succeed([*words, "--remove", str(other)], capsys)
+    assert f"objects[{other}]" not in output
 
 
 @pytest.mark.parametrize(
@@ -489,7 +489,7 @@ def test_the_sheet_shows_photograph_background_and_no_difference(taken: Path) ->
         assert panel.std() > 1
 
 
-def test_the_sheet_tells_of_a_difference(taken: Path) -> None:
+def test_the_sheet_states_the_difference(taken: Path) -> None:
     scene = load_scene(taken / "demo-001")
     still = scene_sheet(scene, "t")
     source = scene.objects.source[0]
@@ -510,6 +510,6 @@ def test_a_photograph_of_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert list(found["frames"]) == ["000000", "000001"]
     for name in found["frames"]:
         succeed(["render", str(out / name)], capsys)
-        shown, photograph = (files.read_image(out / name / f"{n}.png") for n in ("render", "photograph"))
-        assert np.abs(shown.astype(int) - photograph).max() <= 1
+        picture, photograph = (files.read_image(out / name / f"{n}.png") for n in ("render", "photograph"))
+        assert np.abs(picture.astype(int) - photograph).max() <= 1
         assert np.array_equal(photograph, files.read_image(KITTI / "training" / "image_2" / f"{name}.png"))

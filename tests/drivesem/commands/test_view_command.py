@@ -44,12 +44,12 @@ def test_defaults() -> None:
 
 
 def test_a_run_shows_its_frames_to_its_detector(small_run: Path) -> None:
-    shown = frames.open_viewer_frames(ViewConfig(scene=str(small_run)))
-    assert list(shown.frames) == ["demo-000"]
-    assert shown.frames["demo-000"].words == "withstood"
-    assert shown.frames["demo-000"].folder == small_run / "frames" / "demo-000" / "scene"
-    assert shown.detector.name == "squeezedet"
-    assert shown.title == "a"
+    viewer_frames = frames.open_viewer_frames(ViewConfig(scene=str(small_run)))
+    assert list(viewer_frames.frames) == ["demo-000"]
+    assert viewer_frames.frames["demo-000"].words == "withstood"
+    assert viewer_frames.frames["demo-000"].folder == small_run / "frames" / "demo-000" / "scene"
+    assert viewer_frames.detector.name == "squeezedet"
+    assert viewer_frames.title == "a"
 
 
 def test_scenes_of_derender_are_no_run(two_scenes: Path) -> None:
@@ -81,8 +81,8 @@ def test_refuses(words: list[str], message: str, refused: Refused) -> None:
 
 
 def test_refuses_what_a_folder_lacks(two_scenes: Path, small_run: Path, refused: Refused) -> None:
-    said = refused("view", str(two_scenes), "--frame", "c")
-    assert said == f"drivesem: --frame: expected a frame of {two_scenes}, found c"
+    output = refused("view", str(two_scenes), "--frame", "c")
+    assert output == f"drivesem: --frame: expected a frame of {two_scenes}, found c"
 
 
 def test_refuses_a_detector_that_is_none(two_scenes: Path, refused: Refused) -> None:
@@ -102,8 +102,8 @@ def test_refuses_a_port_that_is_taken(two_scenes: Path, refused: Refused) -> Non
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        said = refused("view", str(two_scenes), "--port", str(port), "--no-browser")
-    assert said == f"drivesem: --port: expected a free port of 127.0.0.1, found {port}, which cannot be had"
+        output = refused("view", str(two_scenes), "--port", str(port), "--no-browser")
+    assert output == f"drivesem: --port: expected a free port of 127.0.0.1, found {port}, which cannot be had"
 
 
 def test_the_next_port_that_is_free(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,9 +133,9 @@ def test_it_serves_until_ctrl_c(small_run: Path) -> None:
     )
     assert child.stdout is not None
     try:
-        told = json.loads(child.stdout.readline())
-        assert (told["frames"], told["detector"]) == (1, "squeezedet")
-        with urllib.request.urlopen(f"{told['url']}picture?frame=demo-000&weather.fog=0.5", timeout=60) as answer:
+        content = json.loads(child.stdout.readline())
+        assert (content["frames"], content["detector"]) == (1, "squeezedet")
+        with urllib.request.urlopen(f"{content['url']}picture?frame=demo-000&weather.fog=0.5", timeout=60) as answer:
             assert answer.read(2) == b"\xff\xd8", "a JPEG"
     finally:
         child.send_signal(signal.SIGINT)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.data.truth import SKY_CM, Exposure, TrackedObject
+from drivesem.data.ground_truth import SKY_CM, Exposure, TrackedObject
 from scene_ir.types import Camera, Labels
-from tests.drivesem.data.shots import shot, thing
+from tests.drivesem.data.shots import make_object as build_object
+from tests.drivesem.data.shots import shot
 
 HEIGHT, WIDTH = 40, 80
 CLASS_NAMES = (
@@ -16,7 +17,7 @@ CLASS_NAMES = (
     *("TrafficLight", "Pole", "Misc", "Truck", "Car", "Van", "Pedestrian", "Cyclist"),
 )
 # track, kind, rows, columns, labelled; the van stands before the car, the truck shows a corner
-THINGS = (
+OBJECTS = (
     (7, "Car", (12, 24), (5, 25), True),
     (2, "Truck", (10, 13), (40, 46), False),
     (3, "Van", (14, 30), (20, 40), True),
@@ -24,17 +25,17 @@ THINGS = (
 )
 
 
-def _exposure(seed: int = 0, things: Sequence[tuple] = THINGS, empty_box: bool = True) -> Exposure:
+def _exposure(seed: int = 0, specification: Sequence[tuple] = OBJECTS, empty_box: bool = True) -> Exposure:
     generator = np.random.default_rng(seed)
     instances = np.zeros((HEIGHT, WIDTH), np.uint16)
     classes = generator.integers(0, 11, (HEIGHT, WIDTH)).astype(np.uint8)
     depth_cm = generator.integers(1, 25_599, (HEIGHT, WIDTH)).astype(np.uint16)
-    for track, kind, (top, bottom), (left, right), _ in things:
+    for track, kind, (top, bottom), (left, right), _ in specification:
         instances[top:bottom, left:right] = track + 1
         classes[top:bottom, left:right] = CLASS_NAMES.index(kind)
     depth_cm[classes == 2] = SKY_CM
     objects = []
-    for track, kind, (top, bottom), (left, right), labelled in things:
+    for track, kind, (top, bottom), (left, right), labelled in specification:
         pixels = int((instances == track + 1).sum())
         visible = pixels / ((bottom - top) * (right - left))
         x, z = generator.uniform(-5, 5), generator.uniform(8, 40)
@@ -58,13 +59,13 @@ def _exposure(seed: int = 0, things: Sequence[tuple] = THINGS, empty_box: bool =
                 labelled=labelled,
             )
         )
-    kept = [o for o in objects if o.labelled]
+    labelled_objects = [o for o in objects if o.labelled]
 
     def table(rows: list, width: int) -> torch.Tensor:
         return torch.tensor(rows, dtype=torch.float32).reshape(-1, width)
 
-    def edges(thing: TrackedObject) -> list[float]:
-        left, top, right, bottom = thing.box_ltrb
+    def edges(tracked: TrackedObject) -> list[float]:
+        left, top, right, bottom = tracked.box_ltrb
         return [max(left - 0.5, 0), max(top - 0.5, 0), min(right + 0.5, WIDTH - 1), min(bottom + 0.5, HEIGHT - 1)]
 
     return Exposure(
@@ -82,13 +83,13 @@ def _exposure(seed: int = 0, things: Sequence[tuple] = THINGS, empty_box: bool =
         extrinsic=np.eye(4),
         objects=tuple(objects),
         labels=Labels(
-            kind=tuple(o.kind for o in kept),
-            boxes_xyxy=table([edges(o) for o in kept], 4),
-            truncation=torch.tensor([o.truncation for o in kept]),
-            occlusion=torch.tensor([o.occlusion for o in kept], dtype=torch.int64),
-            translation=table([o.translation for o in kept], 3),
-            yaw=torch.tensor([o.yaw for o in kept]),
-            size_lhw=table([o.size_lhw for o in kept], 3),
+            kind=tuple(o.kind for o in labelled_objects),
+            boxes_xyxy=table([edges(o) for o in labelled_objects], 4),
+            truncation=torch.tensor([o.truncation for o in labelled_objects]),
+            occlusion=torch.tensor([o.occlusion for o in labelled_objects], dtype=torch.int64),
+            translation=table([o.translation for o in labelled_objects], 3),
+            yaw=torch.tensor([o.yaw for o in labelled_objects]),
+            size_lhw=table([o.size_lhw for o in labelled_objects], 3),
             ignore_xyxy=table(
                 [edges(o) for o in objects if not o.labelled] + [[70.0, 2.0, 76.0, 8.5]] * empty_box, 4
             ),
@@ -104,9 +105,9 @@ def make_exposure() -> Callable[..., Exposure]:
 
 
 @pytest.fixture(scope="session")
-def make_thing() -> Callable[..., TrackedObject]:
+def make_object() -> Callable[..., TrackedObject]:
     """The factory of objects, by track, kind and whatever else is to differ."""
-    return thing
+    return build_object
 
 
 @pytest.fixture(scope="session")

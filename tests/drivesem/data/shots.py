@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesem.data.truth import SKY_CM, Exposure, TrackedObject, occlusion_of
+from drivesem.data.ground_truth import SKY_CM, Exposure, TrackedObject, occlusion_from_visible
 from scene_ir.types import Camera, Labels
 
 CLASS_NAMES = ("Undefined", "Sky", "Road", "Tree", "Car", "Van", "Pedestrian", "GuardRail")
 
 
-def thing(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
+def make_object(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
     """A car a little to the right of the camera, changed as asked."""
     base = TrackedObject(
         track=track,
@@ -33,7 +33,7 @@ def thing(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
         labelled=True,
     )
     changed = replace(base, **changes)
-    return replace(changed, occlusion=occlusion_of(changed.visible))
+    return replace(changed, occlusion=occlusion_from_visible(changed.visible))
 
 
 def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: int = 0) -> Exposure:
@@ -48,17 +48,17 @@ def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: 
     depth = rng.integers(300, 65534, (height, width)).astype(np.uint16)
     depth[classes == CLASS_NAMES.index("Sky")] = SKY_CM
     depth[-1, -1] = SKY_CM - 1
-    far = thing(7, "Van", box_ltrb=(18, 12, 33, 22), visible=0.6, truncation=0.0)
-    near = thing(0, "Car", box_ltrb=(10, 14, 27, 24))
-    cut = thing(3, "Car", box_ltrb=(70, 15, 79, 39), truncation=0.3123456789, visible=1.0, yaw=3.1)
-    walker = thing(12, "Pedestrian", box_ltrb=(50, 18, 50, 18), visible=0.1, pixels=1, labelled=False)
+    far = make_object(7, "Van", box_ltrb=(18, 12, 33, 22), visible=0.6, truncation=0.0)
+    near = make_object(0, "Car", box_ltrb=(10, 14, 27, 24))
+    cut = make_object(3, "Car", box_ltrb=(70, 15, 79, 39), truncation=0.3123456789, visible=1.0, yaw=3.1)
+    walker = make_object(12, "Pedestrian", box_ltrb=(50, 18, 50, 18), visible=0.1, pixels=1, labelled=False)
     for item in (far, near, cut, walker):  # the nearer ones last
         left, top, right, bottom = item.box_ltrb
         instances[top : bottom + 1, left : right + 1] = item.track + 1
         classes[top : bottom + 1, left : right + 1] = CLASS_NAMES.index(item.kind)
-    things = (near, cut, far, walker)
-    labelled = [t for t in things if t.labelled]
-    small = torch.tensor([t.box_ltrb for t in things if not t.labelled], dtype=torch.float32)
+    tracked_objects = (near, cut, far, walker)
+    labelled = [t for t in tracked_objects if t.labelled]
+    small = torch.tensor([t.box_ltrb for t in tracked_objects if not t.labelled], dtype=torch.float32)
     k = torch.tensor([[72.00087, 0, 39.5], [0, 72.5, 18.25], [0, 0, 1]])
     turn, shift = np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]]), np.array([1.25, -1.7, 300.123456])
     extrinsic = np.eye(4)
@@ -71,7 +71,7 @@ def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: 
         instances=instances,
         camera=camera or Camera(k, height, width),
         extrinsic=extrinsic,
-        objects=things,
+        objects=tracked_objects,
         labels=Labels(
             kind=tuple(t.kind for t in labelled),
             boxes_xyxy=torch.tensor([t.box_ltrb for t in labelled], dtype=torch.float32),

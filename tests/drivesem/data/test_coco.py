@@ -20,9 +20,9 @@ from pycocotools.cocoeval import COCOeval
 
 from drivesem.data import coco, coco_labels
 from drivesem.data.classes import COCO_ROAD_USERS
-from drivesem.data.label_table import from_coco, shortest, to_coco
+from drivesem.data.ground_truth import Exposure, FrameLocation
+from drivesem.data.label_table import coco_to_xyxy, shortest_decimals, xyxy_to_coco
 from drivesem.data.registry import WRITERS, open_dataset
-from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import to_uint8
@@ -34,8 +34,8 @@ LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "
 pycocotools_and_numpy_2 = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 
 
-def place(number: int, part: str = "train") -> Place:
-    return Place(number, "01", "clone", number, part)
+def place(number: int, part: str = "train") -> FrameLocation:
+    return FrameLocation(number, "01", "clone", number, part)
 
 
 def quiet(call: Callable[..., Any], *args: Any) -> Any:
@@ -51,7 +51,7 @@ def folder(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     entries = [
         writer.write(place(0), make_exposure(0)),
         writer.write(place(1), make_exposure(1)),
-        writer.write(place(2, "val"), make_exposure(2, things=(), empty_box=False)),
+        writer.write(place(2, "val"), make_exposure(2, tracked_objects=(), empty_box=False)),
     ]
     assert writer.exists(place(0))
     writer.finish(json.loads(json.dumps(entries)))
@@ -71,10 +71,10 @@ def test_layout(folder: Path) -> None:
         "images/train/000001.png",
         "images/val/000002.png",
     ]
-    told = content(folder)
-    assert [row["id"] for row in told["images"]] == [1, 2]
-    assert [row["id"] for row in told["annotations"]] == list(range(1, len(told["annotations"]) + 1))
-    names = {row["name"]: row["id"] for row in told["categories"]}
+    record = content(folder)
+    assert [row["id"] for row in record["images"]] == [1, 2]
+    assert [row["id"] for row in record["annotations"]] == list(range(1, len(record["annotations"]) + 1))
+    names = {row["name"]: row["id"] for row in record["categories"]}
     assert [names[n] for n in ("Car", "Van", "Truck", "Pedestrian", "Cyclist")] == [1, 2, 3, 4, 5]
 
 
@@ -106,8 +106,8 @@ def test_what_is_written_reads_back(folder: Path, make_exposure: Callable[..., E
         for name in LABEL_FIELDS:
             assert torch.equal(getattr(frame.labels, name), getattr(made.labels, name)), name
         assert frame.masks is not None
-        for mask, thing in zip(frame.masks, (o for o in made.objects if o.labelled), strict=True):
-            assert np.array_equal(mask.numpy(), made.instances == thing.track + 1)
+        for mask, tracked in zip(frame.masks, (o for o in made.objects if o.labelled), strict=True):
+            assert np.array_equal(mask.numpy(), made.instances == tracked.track + 1)
     empty = dataset.frame("000002")
     assert empty.labels is not None
     assert empty.labels.kind == ()
@@ -119,7 +119,7 @@ def test_the_same_entries_give_the_same_bytes(
     folder: Path, tmp_path: Path, make_exposure: Callable[..., Exposure]
 ) -> None:
     writer = coco.CocoWriter(tmp_path / "again")
-    last = writer.write(place(2, "val"), make_exposure(2, things=(), empty_box=False))
+    last = writer.write(place(2, "val"), make_exposure(2, tracked_objects=(), empty_box=False))
     entries = [coco.CocoWriter(tmp_path / "again").write(place(i), make_exposure(i)) for i in (0, 1)]
     writer.finish([*entries, last])
     for path in (p for p in folder.rglob("*") if p.is_file()):
@@ -133,14 +133,14 @@ def test_pycocotools_loads_it_and_evaluates_on_it(folder: Path) -> None:
     assert len(truth.getAnnIds(iscrowd=False)) == 6
     for row in truth.loadAnns(truth.getAnnIds(iscrowd=False)):
         assert int(truth.annToMask(row).sum()) == row["area"]
-    things = [row for row in truth.dataset["annotations"] if not row["iscrowd"]]
+    tracked_objects = [row for row in truth.dataset["annotations"] if not row["iscrowd"]]
     crowds = [row for row in truth.dataset["annotations"] if row["iscrowd"]]
     # every object found, and every region reported too: ignored, it does not count as false
     for kind in ("bbox", "segm"):
         found = [
             {"image_id": r["image_id"], "category_id": r["category_id"], "score": 0.9 - 0.4 * r["iscrowd"]}
             | {"bbox": r["bbox"], "segmentation": dict(r["segmentation"])}
-            for r in (*things, *crowds)
+            for r in (*tracked_objects, *crowds)
         ]
         if kind == "bbox":
             found = [{k: v for k, v in r.items() if k != "segmentation"} for r in found]
@@ -163,9 +163,9 @@ def test_boxes_round_trip(rows: list[tuple[float, float, float]]) -> None:
     for x, y, size in rows:
         box = torch.tensor([x, y, x + size, y + 2 * size], dtype=torch.float32)
         if box[0] < box[2] and box[1] < box[3]:
-            written = json.loads(json.dumps(to_coco(box.double().numpy()).tolist()))
+            written = json.loads(json.dumps(xyxy_to_coco(box.double().numpy()).tolist()))
             # 1e-12 px: what 0.5 and back costs a coordinate next to nothing
-            back = torch.from_numpy(from_coco(np.array(written))).float()
+            back = torch.from_numpy(coco_to_xyxy(np.array(written))).float()
             torch.testing.assert_close(back, box, atol=1e-12, rtol=0)
 
 
@@ -173,23 +173,23 @@ def test_boxes_round_trip(rows: list[tuple[float, float, float]]) -> None:
 @given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 40), st.floats(0, 1))
 def test_run_lengths_are_those_of_pycocotools(seed: int, height: int, width: int, share: float) -> None:
     mask = np.random.default_rng(seed).random((height, width)) < share
-    encoded = coco._encode(mask)
+    encoded = coco._encode_mask(mask)
     assert np.array_equal(run_length.decode(encoded), mask)
-    assert np.array_equal(coco._decode("here", encoded, (height, width)), mask)
-    plain = {"size": [height, width], "counts": coco._runs(encoded["counts"])}
-    assert np.array_equal(coco._decode("here", plain, (height, width)), mask)
+    assert np.array_equal(coco._decode_mask("here", encoded, (height, width)), mask)
+    plain = {"size": [height, width], "counts": coco._decode_runs(encoded["counts"])}
+    assert np.array_equal(coco._decode_mask("here", plain, (height, width)), mask)
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_floats_are_short_and_exact(value: float) -> None:
-    (text,) = shortest(torch.tensor([value]))
+    (text,) = shortest_decimals(torch.tensor([value]))
     assert torch.tensor(text, dtype=torch.float32) == torch.tensor(value, dtype=torch.float32)
 
 
 def foreign(root: Path, **changes: Any) -> Path:
     """A plain COCO folder, as COCO 2017 is laid out."""
     files.write_png(root / "val2017" / "000000000139.png", np.zeros((40, 80, 3), np.uint8))
-    told = {
+    record = {
         "images": [{"id": 139, "file_name": "000000000139.png", "height": 40, "width": 80}],
         "categories": [{"id": 1, "name": "person"}, {"id": 3, "name": "car"}, {"id": 62, "name": "chair"}],
         "annotations": [
@@ -213,7 +213,7 @@ def foreign(root: Path, **changes: Any) -> Path:
         ],
     }
     path = root / "annotations" / "instances_val2017.json"
-    files.write_json(path, told | changes)
+    files.write_json(path, record | changes)
     return path
 
 
@@ -293,8 +293,8 @@ BAD_FILES = [
         r"json: images\[0\]\.file_name: expected a value, found none",
     ),
     ({"images": [IMAGE | {"height": 0}]}, r"images\[0\]\.height: expected a positive integer, found 0"),
-    ({"images": [IMAGE, IMAGE]}, r"images\[1\]\.id: expected an id of its own, found 139"),
-    ({"images": [IMAGE, IMAGE | {"id": 200}]}, r"images\[1\]\.file_name: expected a name of its own"),
+    ({"images": [IMAGE, IMAGE]}, r"images\[1\]\.id: expected a unique id, found 139"),
+    ({"images": [IMAGE, IMAGE | {"id": 200}]}, r"images\[1\]\.file_name: expected a unique name"),
     (annotation(image_id="gone"), r"annotations\[0\]\.image_id: expected a whole number, found null"),
     (annotation(image_id=3), r"annotations\[0\]\.image_id: expected ids of the 1 images, found 1 others \(3\)"),
     (
@@ -386,30 +386,30 @@ def test_bad_requests(tmp_path: Path) -> None:
 
 
 def test_regions_are_of_the_object_they_lie_on(make_exposure: Callable[..., Exposure]) -> None:
-    things = make_exposure().objects
-    assert coco._kinds_of_region([39.5, 9.5, 45.5, 12.5], things) == ("Truck",)
-    assert coco._kinds_of_region([5, 12, 24, 23], things) == tuple(coco.CATEGORIES)  # the car has a label
+    tracked_objects = make_exposure().objects
+    assert coco._region_kinds([39.5, 9.5, 45.5, 12.5], tracked_objects) == ("Truck",)
+    assert coco._region_kinds([5, 12, 24, 23], tracked_objects) == tuple(coco.CATEGORIES)  # the car has a label
 
 
 @given(st.text(st.sampled_from("ab. /\\:"), min_size=1, max_size=7))
 def test_a_frame_is_called_as_its_file_without_suffix(name: str) -> None:
     try:
-        told = "_".join(Path(name).with_suffix("").parts)
+        record = "_".join(Path(name).with_suffix("").parts)
     except ValueError:
         with pytest.raises(ValueError, match="empty name"):
-            coco_labels.identifier_of({"file_name": name})
+            coco_labels.frame_identifier({"file_name": name})
         return
-    assert coco_labels.identifier_of({"file_name": name}) == told
+    assert coco_labels.frame_identifier({"file_name": name}) == record
 
 
 @pytest.mark.parametrize(
     ("orientation", "size_wh", "turned"), [(3, (80, 40), 2), (6, (40, 80), 3), (6, (80, 40), 0)]
 )
-def test_a_turned_picture_is_upright_where_the_file_says_no_other_size(
+def test_images_are_upright_unless_the_file_has_the_stored_size(
     orientation: int, size_wh: tuple[int, int], turned: int, tmp_path: Path
 ) -> None:
-    told = IMAGE | {"width": size_wh[0], "height": size_wh[1]}
-    path = foreign(tmp_path, images=[told], annotations=[])
+    record = IMAGE | {"width": size_wh[0], "height": size_wh[1]}
+    path = foreign(tmp_path, images=[record], annotations=[])
     exif = Image.Exif()
     exif[0x0112] = orientation
     pixels = np.random.default_rng(0).integers(0, 256, (40, 80, 3)).astype(np.uint8)
@@ -419,7 +419,7 @@ def test_a_turned_picture_is_upright_where_the_file_says_no_other_size(
 
 
 @pytest.mark.parametrize("name", [".", "/", "./"])
-def test_an_image_whose_file_has_no_name_is_refused(name: str, tmp_path: Path) -> None:
+def test_an_image_without_a_file_name_is_refused(name: str, tmp_path: Path) -> None:
     path = foreign(tmp_path, images=[IMAGE | {"file_name": name}])
     for read in (coco.CocoDataset, lambda path: coco_labels.read_table(path, False, None)):
         with pytest.raises(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.data.joined import open_folders
 from drivesem.data.kitti import KittiDataset
+from drivesem.data.subsets import open_folders
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivesem.data import kitti, kitti_labels
-from drivesem.data.classes import KITTI, VEHICLES, ClassMap, vehicle_count
+from drivesem.data.classes import KITTI, VEHICLES, ClassMap, count_vehicles
+from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
 from drivesem.data.registry import WRITERS, open_dataset
-from drivesem.data.truth import SKY_CM, Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import project_boxes
@@ -30,7 +30,7 @@ PROJECTION = torch.tensor([[72.0, 0, 39.5, 4.5], [0, 72, 18.25, 0.2], [0, 0, 1, 
 CAR = "Car 0.25 1 -1.33 10.00 12.50 30.25 28.00 1.47 1.60 3.66 1.07 1.55 14.44 -1.25"
 DONT_CARE = "DontCare -1 -1 -10 50.00 10.00 60.00 20.00 -1 -1 -1 -1000 -1000 -1000 -10"
 SITTING = "Person_sitting 0.00 0 1.50 40.00 10.00 45.00 20.00 1.20 0.60 0.80 3.00 1.50 12.00 1.60"
-CALIB = kitti.format_calib(PROJECTION)
+CALIB = kitti.format_calibration(PROJECTION)
 
 
 def image(seed: int = 0, height: int = H, width: int = W) -> np.ndarray:
@@ -112,14 +112,14 @@ def test_lines_read_together_are_as_read_one_by_one(data: st.DataObject) -> None
 
     def read() -> tuple[list[str], list[list[float]], list[int]] | str:
         try:
-            found = kitti_labels.Lines(["a"], [text], scored)
+            found = kitti_labels.KittiLabelLines(["a"], [text], scored)
         except FormatError as error:
             return str(error)
         return found.kinds, found.values.tolist(), found.counts.tolist()
 
     together = read()
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(kitti_labels, "_plain_columns", lambda lines, fields: None)
+        patched.setattr(kitti_labels, "_parse_uniform", lambda lines, fields: None)
         assert read() == together
 
 
@@ -133,7 +133,7 @@ def test_results_of_a_2d_detector(tmp_path: Path) -> None:
     assert labels.occlusion.tolist() == [kitti.UNKNOWN_OCCLUSION]
 
 
-def test_a_box_whose_centre_is_behind_but_whose_front_is_not_is_accepted(tmp_path: Path) -> None:
+def test_a_box_partly_behind_the_camera_is_accepted(tmp_path: Path) -> None:
     """Eight of KITTI's own labels are such."""
     line = "Truck 1.00 0 -2.72 26.58 0.00 53.86 30.00 4.05 2.50 16.44 -3.47 1.59 -1.87 -1.58"
     assert labels_of(line, folder=tmp_path).kind == ("Truck",)
@@ -215,8 +215,8 @@ def test_written_labels_read_back_to_half_a_hundredth(seed: int, as_results: boo
         ignore_xyxy=torch.cat([regions, regions + 1], dim=1),
     )
     scores = rand(count) if as_results else None
-    lines = kitti_labels.Lines(["text"], [kitti.format_labels(labels, scores)], as_results)
-    back = lines.table(["text"], as_results).labels()
+    lines = kitti_labels.KittiLabelLines(["text"], [kitti.format_labels(labels, scores)], as_results)
+    back = lines.to_table(["text"], as_results).to_labels()
     assert back.kind == labels.kind
     assert torch.equal(back.occlusion, labels.occlusion)
     for name in ("boxes_xyxy", "truncation", "translation", "yaw", "size_lhw", "ignore_xyxy"):
@@ -254,8 +254,8 @@ def test_nothing_is_written_that_would_not_be_read(tmp_path: Path) -> None:
 
 def test_calibration_round_trips_to_the_bit(tmp_path: Path) -> None:
     projection = torch.rand(3, 4, generator=torch.Generator().manual_seed(0)) * 1000 / 3
-    (tmp_path / "a.txt").write_text(kitti.format_calib(projection))
-    calibration = kitti.read_calib(tmp_path / "a.txt")
+    (tmp_path / "a.txt").write_text(kitti.format_calibration(projection))
+    calibration = kitti.read_calibration(tmp_path / "a.txt")
     assert torch.equal(calibration.projection, projection)
     assert calibration.rectification is not None
     assert torch.equal(calibration.rectification, torch.eye(3))
@@ -270,7 +270,7 @@ BAD_CALIBRATIONS = [
     (P2.replace("0.2", "nan"), r"a\.txt:1: P2: expected a finite number, found nan"),
     (P2.replace("0.2", "x"), r"a\.txt:1: P2: expected a number, found 'x'"),
     (P2.replace(":", ""), r"a\.txt:1: line: expected 'KEY: numbers'"),
-    (f"{P2}\n\n{P2}", r"a\.txt:3: P2: expected the key once, found it twice"),
+    (f"{P2}\n\n{P2}", r"a\.txt:3: P2: expected the key once, found twice"),
     (P2.replace("72", "0"), r"a\.txt: P2: expected positive focal lengths"),
     (f"{P2}\nR0_rect: 1 0 0", r"a\.txt:2: R0_rect: expected 9 numbers, found 3"),
 ]
@@ -280,7 +280,7 @@ BAD_CALIBRATIONS = [
 def test_bad_calibration_is_named(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(FormatError, match=message) as caught:
-        kitti.read_calib(tmp_path / "a.txt")
+        kitti.read_calibration(tmp_path / "a.txt")
     assert "\n" not in str(caught.value)
 
 
@@ -298,8 +298,8 @@ def test_frames_of_a_folder(folder: Path, below: bool) -> None:
     assert (frame.camera.height, frame.camera.width) == (H, W)
     assert frame.labels is not None
     assert frame.labels.kind == ("Car", "Person_sitting")
-    assert vehicle_count(frame.labels) == 1
-    assert vehicle_count(dataset.labels("000007")) == 0
+    assert count_vehicles(frame.labels) == 1
+    assert count_vehicles(dataset.labels("000007")) == 0
 
 
 def test_order_of_the_identifiers_does_not_depend_on_the_file_system(folder: Path) -> None:
@@ -312,7 +312,7 @@ def test_a_folder_without_labels_has_frames_without_labels(folder: Path) -> None
     shutil.rmtree(folder / "training" / "label_2")
     dataset = kitti.KittiDataset(folder)
     assert dataset.frame("000000").labels is None
-    assert vehicle_count(dataset.labels("000000")) == 0
+    assert count_vehicles(dataset.labels("000000")) == 0
 
 
 def test_points_are_in_the_axes_of_the_labels(folder: Path) -> None:
@@ -469,12 +469,14 @@ def test_what_the_writer_writes_the_reader_reads(tmp_path: Path) -> None:
 def written(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     """A folder of two exposures, the second without objects and to validate."""
     writer = WRITERS["kitti"](tmp_path / "out")
-    assert not writer.exists(Place(0, "01", "clone", 0, "train"))
+    assert not writer.exists(FrameLocation(0, "01", "clone", 0, "train"))
     entries = [
-        writer.write(Place(0, "01", "clone", 0, "train"), make_exposure(0)),
-        writer.write(Place(1, "01", "fog", 0, "val"), make_exposure(1, things=(), empty_box=False)),
+        writer.write(FrameLocation(0, "01", "clone", 0, "train"), make_exposure(0)),
+        writer.write(
+            FrameLocation(1, "01", "fog", 0, "val"), make_exposure(1, tracked_objects=(), empty_box=False)
+        ),
     ]
-    assert writer.exists(Place(0, "01", "clone", 0, "train"))
+    assert writer.exists(FrameLocation(0, "01", "clone", 0, "train"))
     writer.finish(entries)
     return tmp_path / "out"
 
@@ -488,8 +490,8 @@ def test_an_exposure_reads_back(written: Path, make_exposure: Callable[..., Expo
     for name in ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw", "ignore_xyxy"):
         torch.testing.assert_close(getattr(frame.labels, name), getattr(made.labels, name), atol=6e-4, rtol=0)
     assert frame.masks is not None
-    for mask, thing in zip(frame.masks, (o for o in made.objects if o.labelled), strict=True):
-        assert np.array_equal(mask.numpy(), made.instances == thing.track + 1)
+    for mask, tracked in zip(frame.masks, (o for o in made.objects if o.labelled), strict=True):
+        assert np.array_equal(mask.numpy(), made.instances == tracked.track + 1)
     assert frame.depth is not None
     sky = made.depth_cm == SKY_CM
     assert np.array_equal(np.isinf(frame.depth.numpy()), sky)
@@ -524,7 +526,7 @@ def test_labels_keep_to_the_ranges_of_the_development_kit(
         made = make_exposure(i)
         yaw = [math.pi, -math.pi, 3.5 * (-1) ** i]
         made = replace(made, labels=replace(made.labels, yaw=torch.tensor(yaw)))
-        writer.write(Place(i, "01", "clone", i, "train"), made)
+        writer.write(FrameLocation(i, "01", "clone", i, "train"), made)
         lines = (tmp_path / f"training/label_2/{i:06d}.txt").read_text().splitlines()
         assert len(lines) == 5
         for line in lines:
@@ -590,7 +592,7 @@ def test_kitti_classes_as_targets(tmp_path: Path) -> None:
     assert targets.labels[~targets.ignore].tolist() == [0, 0, 1, 2, 3]
     assert int(targets.labels[4]) == Category.PEDESTRIAN
     assert targets.boxes_xyxy[-1].tolist() == [50, 10, 60, 20]
-    assert vehicle_count(labels) == 3
+    assert count_vehicles(labels) == 3
     assert all(KITTI.category(kind) == category for kind, category in VEHICLES.items())
 
 
@@ -607,7 +609,7 @@ def test_class_map_refuses_what_it_cannot_mean() -> None:
 def test_real_frames() -> None:
     dataset = kitti.KittiDataset(SHARED, with_points=True)
     assert len(dataset.identifiers) == 14
-    assert sum(vehicle_count(dataset.labels(i)) > 0 for i in dataset.identifiers) == 12
+    assert sum(count_vehicles(dataset.labels(i)) > 0 for i in dataset.identifiers) == 12
     frame = dataset.frame("000008")
     assert frame.labels is not None
     assert frame.points is not None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.data.clips import clip_of, clips_in
-from drivesem.data.kitti_tracking import KittiTracking, sequences_of
+from drivesem.data.kitti_tracking import KittiTrackingDataset, list_sequences
+from drivesem.data.subsets import find_clips, select_clip
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 
@@ -42,8 +42,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_sequence_reads(folder: Path) -> None:
-    assert sequences_of(folder) == sequences_of(folder / "training") == ("0001", "0004")
-    sequence = KittiTracking(folder, "0001")
+    assert list_sequences(folder) == list_sequences(folder / "training") == ("0001", "0004")
+    sequence = KittiTrackingDataset(folder, "0001")
     assert sequence.identifiers == ("000000", "000001", "000002")
     assert sequence.tracks("000000") == (3, 9)
     assert sequence.tracks("000001") == ()
@@ -64,13 +64,13 @@ def test_a_sequence_reads(folder: Path) -> None:
 
 
 def test_clips_of_a_folder(folder: Path) -> None:
-    clips = clips_in(folder)
+    clips = find_clips(folder)
     assert list(clips) == ["0001", "0004"]
-    assert clip_of(clips, None).name == "0001"
-    clip = clip_of(clips, "0004")
+    assert select_clip(clips, None).name == "0001"
+    clip = select_clip(clips, "0004")
     assert [clip.tracks(name) for name in clip.frames] == [(3, 9), (), (9, 3)]
     with pytest.raises(FormatError, match="--sequence: expected one of 0001, 0004, found 0009"):
-        clip_of(clips, "0009")
+        select_clip(clips, "0009")
 
 
 @pytest.mark.parametrize(
@@ -88,21 +88,21 @@ def test_clips_of_a_folder(folder: Path) -> None:
         (LINES.splitlines()[0].replace("0 3", "0 4").replace(" 14 -1.5", " far -1.5"), r"7: z: expected a number"),
     ],
 )
-def test_faults_are_told_by_line(folder: Path, line: str, message: str) -> None:
+def test_errors_name_the_line(folder: Path, line: str, message: str) -> None:
     path = folder / "training" / "label_02" / "0001.txt"
     files.write_text(path, LINES + line + "\n")
     with pytest.raises(FormatError, match=message):
-        KittiTracking(folder, "0001").labels("000000")
+        KittiTrackingDataset(folder, "0001").labels("000000")
 
 
-def test_what_is_missing_is_told(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_errors_name_missing_files(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     with pytest.raises(RangeError, match=r"one of 0001, 0004, found 0003"):
-        KittiTracking(folder, "0003")
+        KittiTrackingDataset(folder, "0003")
     (folder / "training" / "calib" / "0001.txt").unlink()
     with pytest.raises(FormatError, match=r"calib/0001.txt"):
-        KittiTracking(folder, "0001").frame("000000")
+        KittiTrackingDataset(folder, "0001").frame("000000")
     empty = tmp_path_factory.mktemp("empty")
     with pytest.raises(FormatError, match="expected Virtual KITTI, a KITTI tracking folder"):
-        clips_in(empty)
+        find_clips(empty)
     with pytest.raises(FormatError, match="no such folder"):
-        clips_in(empty / "none")
+        find_clips(empty / "none")

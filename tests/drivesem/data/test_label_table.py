@@ -24,12 +24,12 @@ def _kitti(root: Path, right: float) -> None:
 
 
 def _coco(root: Path, right: float) -> None:
-    told = {
+    content = {
         "images": [{"id": 1, "file_name": "000000.png", "width": SIZE[0], "height": SIZE[1]}],
         "categories": [{"id": 1, "name": "Car"}],
         "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "bbox": [10.5, 20.5, right - 10, 40]}],
     }
-    files.write_text(root / "annotations/instances_all.json", json.dumps(told))
+    files.write_text(root / "annotations/instances_all.json", json.dumps(content))
 
 
 def _yolo(root: Path, right: float) -> None:
@@ -61,7 +61,7 @@ LAYOUTS = {"kitti": _kitti, "coco": _coco, "yolo": _yolo, "vkitti1": _vkitti1, "
 
 def _both(layout: str, root: Path, right: float) -> tuple[Labels, LabelTable]:
     LAYOUTS[layout](root, right)
-    assert layouts.layout_of(root / "training/label_2" if layout == "kitti" else root) == layout
+    assert layouts.detect_layout(root / "training/label_2" if layout == "kitti" else root) == layout
     dataset = registry.open_dataset(layout, root)
     labels = dataset.labels(dataset.identifiers[0])
     assert labels is not None
@@ -72,7 +72,7 @@ def _both(layout: str, root: Path, right: float) -> tuple[Labels, LabelTable]:
 def test_a_box_without_an_area_is_read_and_never_trained_on(layout: str, tmp_path: Path) -> None:
     labels, table = _both(layout, tmp_path, 10)
     assert labels.boxes_xyxy.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
-    assert table.in_edges("xyxy").boxes.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
+    assert table.with_box_format("xyxy").boxes.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
     targets: Targets = KITTI.targets(labels)
     assert targets.ignore.tolist() == [True]
 
@@ -80,7 +80,7 @@ def test_a_box_without_an_area_is_read_and_never_trained_on(layout: str, tmp_pat
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_scenes_and_tables_read_alike(layout: str, tmp_path: Path) -> None:
     labels, table = _both(layout, tmp_path, 50)
-    again = table.labels()
+    again = table.to_labels()
     for name in Labels.__slots__:
         mine, other = getattr(labels, name), getattr(again, name)
         assert mine == other if name == "kind" else np.array_equal(mine, other, equal_nan=True), name
@@ -100,4 +100,4 @@ def test_a_turned_box_is_refused_by_both(layout: str, tmp_path: Path) -> None:
 
 def test_a_layout_of_none() -> None:
     with pytest.raises(FormatError, match="expected a file or folder of labels, found nothing there"):
-        layouts.layout_of(Path("/nowhere"))
+        layouts.detect_layout(Path("/nowhere"))

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from drivesem.config.blocks import Scenes
-from drivesem.config.commands import Train
+from drivesem.config.commands import TrainConfig
 from drivesem.config.errors import UsageError
+from drivesem.config.options import SceneOptions
+from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.registry import open_dataset
-from drivesem.data.splits import PUBLISHED, chosen
-from drivesem.data.truth import Exposure, Place
+from drivesem.data.subsets import PUBLISHED_SPLITS, select_split
 from drivesem.data.vkitti1 import Vkitti1Writer
 from drivesem.scenes.sources import open_source
 from scene_ir.errors import FormatError
@@ -46,7 +46,7 @@ def virtual(layout: str) -> list[str]:
 @pytest.mark.parametrize("layout", ["vkitti1", "vkitti2"])
 def test_3d_sdns_split_has_its_published_sizes_and_ends(layout: str) -> None:
     dataset = Named(virtual(layout))
-    tested, trained = (chosen(dataset, split).identifiers for split in PUBLISHED)
+    tested, trained = (select_split(dataset, split).identifiers for split in PUBLISHED_SPLITS)
     assert (len(tested), len(trained)) == (2 * 444, 2 * 1682)  # of 4,440 and 16,820 in ten variations
     assert set(tested) | set(trained) == set(dataset.identifiers)
     assert not set(tested) & set(trained)
@@ -60,63 +60,67 @@ def test_generated_worlds_are_divided_and_read(tmp_path: Path, make_shot: Callab
     """Two frames on both sides of where 3D-SDN divides world 6."""
     writer = Vkitti1Writer(tmp_path)
     camera = Camera(torch.tensor([[725.0, 0, 620.5], [0, 725, 187], [0, 0, 1]]), 375, 1242)
-    places = [Place(i, "06", "clone", 68 + i, "train") for i in range(2)]
+    places = [FrameLocation(i, "06", "clone", 68 + i, "train") for i in range(2)]
     writer.finish([writer.write(place, make_shot(375, 1242, camera, place.number)) for place in places])
     dataset = open_dataset("vkitti1", tmp_path)
-    tested, trained = (chosen(dataset, split) for split in PUBLISHED)
+    tested, trained = (select_split(dataset, split) for split in PUBLISHED_SPLITS)
     assert (tested.identifiers, trained.identifiers) == (("0006/clone/00068",), ("0006/clone/00069",))
     labels = tested.labels("0006/clone/00068")
     assert labels is not None
     assert labels.kind == ("Car", "Car", "Van")
     assert tested.frame("0006/clone/00068").photograph.shape == (3, 375, 1242)
-    source = open_source(Scenes(dataset="vkitti1", root=str(tmp_path), split="3d-sdn-train"))
+    source = open_source(SceneOptions(dataset="vkitti1", root=str(tmp_path), split="3d-sdn-train"))
     assert list(source.identifiers()) == ["0006/clone/00069"]
 
 
 def test_a_share_at_random_and_all_others_are_the_whole_in_its_order() -> None:
     dataset = Named(virtual("vkitti1"))
-    some, others = (chosen(dataset, f"random:0.75{rest}").identifiers for rest in ("", ":rest"))
+    some, others = (select_split(dataset, f"random:0.75{rest}").identifiers for rest in ("", ":rest"))
     assert len(some) == round(0.75 * len(dataset.identifiers))
     assert sorted((*some, *others)) == sorted(dataset.identifiers)
-    assert some == tuple(sorted(some, key=dataset.identifiers.index)) == chosen(dataset, "random:.75").identifiers
+    assert (
+        some
+        == tuple(sorted(some, key=dataset.identifiers.index))
+        == select_split(dataset, "random:.75").identifiers
+    )
     worlds = [{name[:10] for name in part} for part in (some, others)]
     assert worlds[0] == worlds[1]  # the same drives
     with pytest.raises(FormatError):
-        chosen(dataset, "random:1.5")
+        select_split(dataset, "random:1.5")
 
 
 def test_names_in_a_file_are_taken_in_the_data_sets_order(tmp_path: Path) -> None:
     dataset = Named(["0001/clone/00000", "0001/clone/00001", "a.b"])
     listed = tmp_path / "names.txt"
     listed.write_text("a.b\n\n0001/clone/00000.png\n")
-    found = chosen(dataset, str(listed))
+    found = select_split(dataset, str(listed))
     assert found.identifiers == ("0001/clone/00000", "a.b")
     assert found.labels("a.b") == "labels of a.b"
     assert found.frame("a.b") == "frame a.b"
 
 
-def test_what_is_no_split_is_told(tmp_path: Path) -> None:
+def test_invalid_splits_are_refused(tmp_path: Path) -> None:
     listed = tmp_path / "names.txt"
     listed.write_text("000000\n000009\n")
     with pytest.raises(FormatError, match=r"names\.txt:2: expected a frame such as 000000, found '000009'"):
-        chosen(Named(["000000"]), str(listed))
+        select_split(Named(["000000"]), str(listed))
     for name in (".", "/"):
         listed.write_text(f"{name}\n")
         with pytest.raises(FormatError, match=r"names\.txt:1: expected a frame such as 000000, found '[./]'"):
-            chosen(Named(["000000"]), str(listed))
+            select_split(Named(["000000"]), str(listed))
     listed.write_text("\n")
     with pytest.raises(FormatError, match=r"--split .*: expected at least one frame of the data set"):
-        chosen(Named(["000000"]), str(listed))
+        select_split(Named(["000000"]), str(listed))
     with pytest.raises(FormatError, match=r"--split: expected frames of Virtual KITTI's worlds 1, 2, 6, 18, 20"):
-        chosen(Named(["000000"]), "3d-sdn")
+        select_split(Named(["000000"]), "3d-sdn")
     with pytest.raises(FormatError, match="found '0003/clone/00000'"):
-        chosen(Named(["0003/clone/00000"]), "3d-sdn")
+        select_split(Named(["0003/clone/00000"]), "3d-sdn")
     with pytest.raises(FormatError, match=r"absent\.txt"):
-        chosen(Named(["000000"]), str(tmp_path / "absent.txt"))
+        select_split(Named(["000000"]), str(tmp_path / "absent.txt"))
 
 
 def test_a_split_needs_a_labelled_data_set(refused: Callable[..., str]) -> None:
     assert "--split: expected --dataset kitti" in refused("attack", "--split", "3d-sdn")
     with pytest.raises(UsageError, match="--split, --held-out-split: expected none with --dataset synth"):
-        Train(dataset="synth", held_out_split="3d-sdn").check()
-    Train(dataset="vkitti1", root="x", held_out_split="3d-sdn").check()
+        TrainConfig(dataset="synth", held_out_split="3d-sdn").check()
+    TrainConfig(dataset="vkitti1", root="x", held_out_split="3d-sdn").check()

@@ -17,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivesem.data import vkitti1
+from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation, TrackedObject
 from drivesem.data.registry import open_dataset
-from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
 from drivesem.data.vkitti1 import Vkitti1Dataset, Vkitti1Writer
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Camera
@@ -29,11 +29,11 @@ SIZE = (375, 1242)
 CAMERA = Camera(torch.tensor([[725.0, 0, 620.5], [0, 725, 187], [0, 0, 1]]), *SIZE)
 FIRST = "0001/clone/00000"
 MakeShot = Callable[..., Exposure]
-MakeThing = Callable[..., TrackedObject]
+MakeObject = Callable[..., TrackedObject]
 
 
-def place(frame: int = 0, variation: str = "clone", scene: str = "01") -> Place:
-    return Place(frame, scene, variation, frame, "train")
+def place(frame: int = 0, variation: str = "clone", scene: str = "01") -> FrameLocation:
+    return FrameLocation(frame, scene, variation, frame, "train")
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_headers_are_those_of_the_data_set() -> None:
     assert vkitti1.EXTRINSICS.endswith(end)
 
 
-def test_the_tables_say_what_the_objects_are(folder: Path) -> None:
+def test_tables_hold_the_objects(folder: Path) -> None:
     lines = (folder / "vkitti_1.3.1_motgt/0001_clone.txt").read_text().splitlines()
     assert lines[1] == (
         "0 0 Car 0 0 -1.30700076 10 14 27 24 1.7654321 1.5078125 4.125 1.04719755 1.6500001 14.4321987 "
@@ -106,7 +106,7 @@ def test_objects_have_colours_of_their_own() -> None:
     """Up to the highest track, and none is a category's."""
     colours = {vkitti1.object_colour(track) for track in range(vkitti1.MAX_TRACK + 1)}
     assert len(colours) == vkitti1.MAX_TRACK + 1
-    assert not colours & set(vkitti1.COLOURS_1.values())
+    assert not colours & set(vkitti1.CATEGORY_COLOURS.values())
     assert all(0 <= value <= 255 for colour in colours for value in colour)
 
 
@@ -116,21 +116,21 @@ def test_what_the_writer_writes_the_reader_reads(with_dont_care: bool, folder: P
     dataset = Vkitti1Dataset(folder, with_dont_care=with_dont_care)
     assert dataset.identifiers == (FIRST, "0001/fog/00001")
     frame = dataset.frame(FIRST)
-    things = [t for t in sorted(shot.objects, key=lambda t: t.track) if t.labelled or with_dont_care]
+    tracked_objects = [t for t in sorted(shot.objects, key=lambda t: t.track) if t.labelled or with_dont_care]
     labels = frame.labels
     assert labels is not None
     assert frame.masks is not None
     assert frame.depth is not None
     assert frame.classes is not None
-    assert labels.kind == tuple(t.kind for t in things)
-    assert labels.boxes_xyxy.tolist() == [list(map(float, t.box_ltrb)) for t in things]
+    assert labels.kind == tuple(t.kind for t in tracked_objects)
+    assert labels.boxes_xyxy.tolist() == [list(map(float, t.box_ltrb)) for t in tracked_objects]
     assert labels.ignore_xyxy.tolist() == ([] if with_dont_care else [[50, 18, 50, 18]])
     for name, tolerance in (("translation", 1e-5), ("size_lhw", 1e-5), ("yaw", 1e-6), ("truncation", 0)):
-        wanted = torch.tensor([getattr(t, name) for t in things], dtype=torch.float32)
+        wanted = torch.tensor([getattr(t, name) for t in tracked_objects], dtype=torch.float32)
         torch.testing.assert_close(getattr(labels, name), wanted, atol=tolerance, rtol=0)
-    assert labels.occlusion.tolist() == [min(t.occlusion, 2) for t in things]
-    for mask, thing in zip(frame.masks, things, strict=True):
-        assert np.array_equal(mask.numpy() > 0, shot.instances == thing.track + 1)
+    assert labels.occlusion.tolist() == [min(t.occlusion, 2) for t in tracked_objects]
+    for mask, tracked in zip(frame.masks, tracked_objects, strict=True):
+        assert np.array_equal(mask.numpy() > 0, shot.instances == tracked.track + 1)
     sky = shot.depth_cm == SKY_CM
     assert np.array_equal(np.isinf(frame.depth.numpy()), sky)
     assert np.array_equal(np.rint(frame.depth.numpy()[~sky] * 100), shot.depth_cm[~sky])
@@ -146,7 +146,7 @@ def test_what_the_writer_writes_the_reader_reads(with_dont_care: bool, folder: P
         "image": "vkitti_1.3.1_rgb/0001/clone/00000.png",
         "scene": "0001",
         "variation": "clone",
-        "tracks": ",".join(str(t.track) for t in things),
+        "tracks": ",".join(str(t.track) for t in tracked_objects),
     }
     assert np.allclose(dataset.extrinsic(FIRST).numpy(), shot.extrinsic, atol=1e-6, rtol=0)
 
@@ -264,7 +264,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "encoding-id": (
         edit(ENCODING, "Car:3", "Car:x"),
-        r"Car:x: expected a whole number behind the colon, found 'x'",
+        r"Car:x: expected a whole number after the colon, found 'x'",
     ),
     "encoding-value": (edit(ENCODING, "210 0 200", "210 0"), r"encoding\.txt:2: expected 4 fields, found 3"),
     "no-colour": (
@@ -320,7 +320,7 @@ def test_bad_folders(tmp_path: Path, folder: Path) -> None:
 
 
 def test_what_the_layout_cannot_hold_is_refused(
-    tmp_path: Path, make_shot: MakeShot, make_thing: MakeThing
+    tmp_path: Path, make_shot: MakeShot, make_object: MakeObject
 ) -> None:
     writer, shot = Vkitti1Writer(tmp_path), make_shot(*SIZE, CAMERA)
     other = Camera(torch.tensor([[721.5, 0, 620.5], [0, 725, 187], [0, 0, 1]]), *SIZE)
@@ -332,7 +332,7 @@ def test_what_the_layout_cannot_hold_is_refused(
     stray[0, 0] = 42
     with pytest.raises(RangeError, match=r"exposure\.instances: expected tracks of .*objects, found 41"):
         writer.write(place(), replace(shot, instances=stray))
-    high = (*shot.objects, make_thing(10_000, labelled=False))
+    high = (*shot.objects, make_object(10_000, labelled=False))
     with pytest.raises(RangeError, match=r"exposure\.objects: track: expected at most 9999, found 10000"):
         writer.write(place(), replace(shot, objects=high))
     assert not list(tmp_path.iterdir())
@@ -380,14 +380,14 @@ number = st.floats(-500, 500)
     yaw=st.floats(-3.15, 3.15),
 )
 def test_any_object_comes_back(
-    tmp_path_factory: pytest.TempPathFactory, make_thing: MakeThing, **values: Any
+    tmp_path_factory: pytest.TempPathFactory, make_object: MakeObject, **values: Any
 ) -> None:
     x, z, track = values.pop("x"), values.pop("z"), values.pop("track")
-    thing = make_thing(track, "Truck", translation=(x, 1.5, z), **values)
-    dataset = write_rows(tmp_path_factory.mktemp("rows"), vkitti1.format_row(0, thing))
+    tracked = make_object(track, "Truck", translation=(x, 1.5, z), **values)
+    dataset = write_rows(tmp_path_factory.mktemp("rows"), vkitti1.format_motgt_row(0, tracked))
     (back,) = dataset.objects(FIRST)
     for name in ("track", "kind", "model", "moving", "box_ltrb", "truncation", "visible", "labelled"):
-        assert getattr(back, name) == getattr(thing, name), name
+        assert getattr(back, name) == getattr(tracked, name), name
     for name in ("translation", "yaw", "size_lhw"):
-        assert getattr(back, name) == pytest.approx(getattr(thing, name), abs=1e-3), name
-    assert back.occlusion == min(thing.occlusion, 2)
+        assert getattr(back, name) == pytest.approx(getattr(tracked, name), abs=1e-3), name
+    assert back.occlusion == min(tracked.occlusion, 2)

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from drivesem.data import vkitti2
+from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation, TrackedObject
 from drivesem.data.registry import DATASETS, WRITERS, open_dataset
-from drivesem.data.truth import SKY_CM, Exposure, Place, TrackedObject
-from drivesem.data.virtual import CACHED_TABLES, KINDS
+from drivesem.data.vkitti import CACHED_TABLES, KINDS
 from drivesem.data.vkitti1 import Vkitti1Dataset
 from drivesem.data.vkitti2 import Vkitti2Dataset, Vkitti2Writer
 from drivesem.synth.exposure import expose
@@ -33,11 +33,11 @@ from scene_ir.types import Camera
 ROOT = Path(__file__).resolve().parents[3]
 FIRST = "Scene01/clone/Camera_0/00000"
 MakeShot = Callable[..., Exposure]
-MakeThing = Callable[..., TrackedObject]
+MakeObject = Callable[..., TrackedObject]
 
 
-def place(frame: int = 0, variation: str = "clone", scene: str = "01") -> Place:
-    return Place(frame, scene, variation, frame, "train")
+def place(frame: int = 0, variation: str = "clone", scene: str = "01") -> FrameLocation:
+    return FrameLocation(frame, scene, variation, frame, "train")
 
 
 def write_folder(root: Path, make_shot: MakeShot) -> Path:
@@ -88,7 +88,7 @@ def test_the_layout_is_virtual_kittis(folder: Path) -> None:
     assert len(files) == 4 * 4 + 3 * 6
 
 
-def test_the_tables_say_what_the_objects_are(folder: Path) -> None:
+def test_tables_hold_the_objects(folder: Path) -> None:
     clip = folder / "Scene01" / "clone"
     lines = (clip / "bbox.txt").read_text().splitlines()
     assert [line.split()[:3] for line in lines[1:]] == [
@@ -166,18 +166,18 @@ def test_the_images_are_as_others_read_them(folder: Path, make_shot: MakeShot) -
 
 def check_frame(frame: Any, shot: Exposure, image_loss: float = 60) -> None:
     """Everything of the exposure is in the frame."""
-    things = sorted(shot.objects, key=lambda t: t.track)
-    assert frame.labels.kind == tuple(t.kind for t in things)
-    assert frame.labels.boxes_xyxy.tolist() == [list(map(float, t.box_ltrb)) for t in things]
+    tracked_objects = sorted(shot.objects, key=lambda t: t.track)
+    assert frame.labels.kind == tuple(t.kind for t in tracked_objects)
+    assert frame.labels.boxes_xyxy.tolist() == [list(map(float, t.box_ltrb)) for t in tracked_objects]
     for name, tolerance in (("translation", 1e-5), ("size_lhw", 1e-5), ("yaw", 1e-6)):
-        wanted = torch.tensor([getattr(t, name) for t in things], dtype=torch.float32)
+        wanted = torch.tensor([getattr(t, name) for t in tracked_objects], dtype=torch.float32)
         torch.testing.assert_close(getattr(frame.labels, name), wanted, atol=tolerance, rtol=0)
-    assert frame.labels.occlusion.tolist() == [t.occlusion for t in things]
-    truncation = torch.tensor([t.truncation for t in things], dtype=torch.float32)
+    assert frame.labels.occlusion.tolist() == [t.occlusion for t in tracked_objects]
+    truncation = torch.tensor([t.truncation for t in tracked_objects], dtype=torch.float32)
     assert torch.equal(frame.labels.truncation, truncation)
     assert frame.labels.ignore_xyxy.shape == (0, 4)
-    for mask, thing in zip(frame.masks, things, strict=True):
-        assert np.array_equal(mask.numpy(), (shot.instances == thing.track + 1).astype(np.float32))
+    for mask, tracked in zip(frame.masks, tracked_objects, strict=True):
+        assert np.array_equal(mask.numpy(), (shot.instances == tracked.track + 1).astype(np.float32))
     sky = shot.depth_cm == SKY_CM
     assert np.array_equal(np.isinf(frame.depth.numpy()), sky)
     assert np.array_equal(np.rint(frame.depth.numpy()[~sky] * 100), shot.depth_cm[~sky])
@@ -188,7 +188,7 @@ def check_frame(frame: Any, shot: Exposure, image_loss: float = 60) -> None:
     photograph = frame.photograph.permute(1, 2, 0).numpy() * 255
     assert np.abs(photograph - shot.image).mean() < image_loss  # JPEG of pure noise
     assert torch.equal(frame.camera.intrinsics, shot.camera.intrinsics)
-    assert frame.provenance["tracks"] == ",".join(str(t.track) for t in things)
+    assert frame.provenance["tracks"] == ",".join(str(t.track) for t in tracked_objects)
 
 
 def test_what_the_writer_writes_the_reader_reads(folder: Path, make_shot: MakeShot) -> None:
@@ -210,11 +210,11 @@ def test_what_the_writer_writes_the_reader_reads(folder: Path, make_shot: MakeSh
 def test_objects_come_back_whole(folder: Path, make_shot: MakeShot) -> None:
     """World poses, shares, names and motion too."""
     dataset, shot = Vkitti2Dataset(folder), make_shot()
-    for found, thing in zip(dataset.objects(FIRST), sorted(shot.objects, key=lambda t: t.track), strict=True):
+    for found, tracked in zip(dataset.objects(FIRST), sorted(shot.objects, key=lambda t: t.track), strict=True):
         for name in ("translation", "yaw", "size_lhw", "world", "world_yxz"):
-            assert getattr(found, name) == pytest.approx(getattr(thing, name), abs=1e-5), name
-        same = {n: getattr(thing, n) for n in ("translation", "yaw", "size_lhw", "world", "world_yxz")}
-        assert replace(found, **same) == replace(thing, paint="dark_red", labelled=True)
+            assert getattr(found, name) == pytest.approx(getattr(tracked, name), abs=1e-5), name
+        same = {n: getattr(tracked, n) for n in ("translation", "yaw", "size_lhw", "world", "world_yxz")}
+        assert replace(found, **same) == replace(tracked, paint="dark_red", labelled=True)
     assert np.allclose(dataset.extrinsic(FIRST).numpy(), shot.extrinsic, atol=1e-6, rtol=0)
 
 
@@ -232,21 +232,23 @@ def test_a_generated_frame_comes_back(layout: str, tmp_path: Path, street: Expos
     assert frame.depth is not None
     assert np.array_equal(np.isinf(frame.depth.numpy()), sky)
     assert np.array_equal(np.rint(frame.depth.numpy()[~sky] * 100), street.depth_cm[~sky])
-    things = [t for t in sorted(street.objects, key=lambda t: t.track) if t.labelled or layout == "vkitti2"]
-    assert len(things) > 5
+    tracked_objects = [
+        t for t in sorted(street.objects, key=lambda t: t.track) if t.labelled or layout == "vkitti2"
+    ]
+    assert len(tracked_objects) > 5
     full = project_boxes(frame.labels.size_lhw, frame.labels.yaw, frame.labels.translation, frame.camera.matrix)
     cut = clip_boxes(full, frame.camera.height, frame.camera.width)
-    for i, thing in enumerate(things):
-        assert frame.labels.boxes_xyxy[i].tolist() == list(thing.box_ltrb)
-        assert frame.labels.translation[i].tolist() == pytest.approx(thing.translation, abs=1e-3)
-        assert float(frame.labels.yaw[i]) == pytest.approx(thing.yaw, abs=1e-3)
-        assert np.array_equal(frame.masks[i].numpy() > 0, street.instances == thing.track + 1)
-        seen = (extrinsic @ torch.tensor([*thing.world, 1.0], dtype=torch.float64))[:3]
-        assert seen.tolist() == pytest.approx(thing.translation, abs=1e-3)
+    for i, tracked in enumerate(tracked_objects):
+        assert frame.labels.boxes_xyxy[i].tolist() == list(tracked.box_ltrb)
+        assert frame.labels.translation[i].tolist() == pytest.approx(tracked.translation, abs=1e-3)
+        assert float(frame.labels.yaw[i]) == pytest.approx(tracked.yaw, abs=1e-3)
+        assert np.array_equal(frame.masks[i].numpy() > 0, street.instances == tracked.track + 1)
+        seen = (extrinsic @ torch.tensor([*tracked.world, 1.0], dtype=torch.float64))[:3]
+        assert seen.tolist() == pytest.approx(tracked.translation, abs=1e-3)
         slack = 3 + 0.12 * float(cut[i, 3] - cut[i, 1])
         inside = frame.labels.boxes_xyxy[i] - cut[i]
-        assert float(inside[:2].min()) > -slack, thing
-        assert float(inside[2:].max()) < slack, thing
+        assert float(inside[:2].min()) > -slack, tracked
+        assert float(inside[2:].max()) < slack, tracked
 
 
 def test_photographs_are_good_jpegs(tmp_path: Path, make_shot: MakeShot) -> None:
@@ -529,7 +531,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "colour-twice": (
         edit("colors", "255 127 80", "0 0 0"),
-        r"colors\.txt:16: r g b: expected a colour of its own",
+        r"colors\.txt:16: r g b: expected a unique colour",
     ),
     "name-twice": (edit("colors", "Van", "Car"), r"colors\.txt:15: Category: expected each once, found Car twice"),
     "no-colour": (
@@ -559,7 +561,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "jpeg-instances": (
         lambda c: (c / "frames/instanceSegmentation/Camera_0/instancegt_00000.png").write_bytes(b"\xff\xd8\xff"),
-        r"instancegt_00000\.png: expected a PNG, found 3 bytes of another kind",
+        r"instancegt_00000\.png: expected a PNG, found 3 bytes of another format",
     ),
     "colour-instances": (
         png(*INSTANCES, np.zeros((40, 80, 3), np.uint8)),
@@ -633,14 +635,14 @@ def test_what_the_layout_cannot_hold_is_refused(fault: str, tmp_path: Path, make
     assert not writer.exists(place(4))
 
 
-def test_tracks_end_at_254(tmp_path: Path, make_shot: MakeShot, make_thing: MakeThing) -> None:
+def test_tracks_end_at_254(tmp_path: Path, make_shot: MakeShot, make_object: MakeObject) -> None:
     shot = make_shot()
     writer = Vkitti2Writer(tmp_path)
     instances = np.full_like(shot.instances, 255)
 
     def with_track(track: int) -> Exposure:
-        things = (*shot.objects, make_thing(track, labelled=False))
-        return replace(shot, objects=things, instances=instances)
+        tracked_objects = (*shot.objects, make_object(track, labelled=False))
+        return replace(shot, objects=tracked_objects, instances=instances)
 
     writer.finish([writer.write(place(), with_track(254))])
     frame = Vkitti2Dataset(tmp_path).frame(FIRST)
@@ -649,18 +651,18 @@ def test_tracks_end_at_254(tmp_path: Path, make_shot: MakeShot, make_thing: Make
     with pytest.raises(FormatError, match=r"tracks of at most 254.* found 255"):
         writer.write(place(), with_track(255))
     with pytest.raises(RangeError, match=r"exposure\.objects: track: expected each once in a frame"):
-        writer.write(place(), replace(shot, objects=(*shot.objects, make_thing(0, labelled=False))))
+        writer.write(place(), replace(shot, objects=(*shot.objects, make_object(0, labelled=False))))
 
 
 def test_entries_that_contradict_each_other_are_refused(
-    tmp_path: Path, make_shot: MakeShot, make_thing: MakeThing
+    tmp_path: Path, make_shot: MakeShot, make_object: MakeObject
 ) -> None:
     writer, shot = Vkitti2Writer(tmp_path), make_shot()
     first = writer.write(place(0), shot)
     with pytest.raises(FormatError, match="scene 01, clone, frame 0, camera 0: expected one entry, found two"):
         writer.finish([first, first])
-    things = (*shot.objects[1:], make_thing(0, "Truck"))
-    second = writer.write(place(1), replace(shot, objects=things))
+    tracked_objects = (*shot.objects[1:], make_object(0, "Truck"))
+    second = writer.write(place(1), replace(shot, objects=tracked_objects))
     with pytest.raises(
         FormatError, match=r"info\.txt: track 0: expected Car car000 dark_red, as .* found Truck truck000"
     ):
@@ -704,7 +706,7 @@ whole = st.integers(0, 5000)
 metres = st.floats(-2000, 2000, width=32)
 share = st.floats(0, 1)
 angle = st.floats(-3.15, 3.15)
-THINGS = st.builds(
+OBJECTS = st.builds(
     TrackedObject,
     track=st.integers(0, 254),
     kind=st.sampled_from(KINDS),
@@ -739,23 +741,25 @@ def write_rows(clip: Path, bbox: str, pose: str, info: str) -> Vkitti2Dataset:
     return Vkitti2Dataset(clip.parents[1])
 
 
-@given(st.lists(THINGS, max_size=4, unique_by=lambda t: t.track))
-def test_any_objects_come_back(tmp_path_factory: pytest.TempPathFactory, things: list[TrackedObject]) -> None:
+@given(st.lists(OBJECTS, max_size=4, unique_by=lambda t: t.track))
+def test_any_objects_come_back(
+    tmp_path_factory: pytest.TempPathFactory, tracked_objects: list[TrackedObject]
+) -> None:
     dataset = write_rows(
         tmp_path_factory.mktemp("rows") / "Scene01" / "clone",
-        "\n".join(vkitti2.format_bbox(0, 0, t) for t in things),
-        "\n".join(vkitti2.format_pose(0, 0, t) for t in reversed(things)),
-        "\n".join(f"{t.track} {t.kind} {t.model} {t.paint}" for t in things),
+        "\n".join(vkitti2.format_bbox(0, 0, t) for t in tracked_objects),
+        "\n".join(vkitti2.format_pose(0, 0, t) for t in reversed(tracked_objects)),
+        "\n".join(f"{t.track} {t.kind} {t.model} {t.paint}" for t in tracked_objects),
     )
     found = dataset.objects(FIRST)
-    assert [f.track for f in found] == [t.track for t in things]
-    for back, thing in zip(found, things, strict=True):
+    assert [f.track for f in found] == [t.track for t in tracked_objects]
+    for back, tracked in zip(found, tracked_objects, strict=True):
         for name in ("kind", "model", "paint", "moving", "box_ltrb", "pixels", "truncation", "visible"):
-            assert getattr(back, name) == getattr(thing, name), name
+            assert getattr(back, name) == getattr(tracked, name), name
         for name in ("translation", "yaw", "size_lhw", "world", "world_yxz"):
-            assert getattr(back, name) == pytest.approx(getattr(thing, name), abs=1e-3), name
-        assert back.occlusion == sum(thing.visible <= step for step in (0.9, 0.5, 0.1))
-    assert dataset.labels(FIRST).kind == tuple(t.kind for t in things)
+            assert getattr(back, name) == pytest.approx(getattr(tracked, name), abs=1e-3), name
+        assert back.occlusion == sum(tracked.visible <= step for step in (0.9, 0.5, 0.1))
+    assert dataset.labels(FIRST).kind == tuple(t.kind for t in tracked_objects)
 
 
 WORDS = st.sampled_from(

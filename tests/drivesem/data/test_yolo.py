@@ -15,16 +15,16 @@ from PIL import Image
 
 from drivesem.data import yolo
 from drivesem.data.coco import CATEGORIES
-from drivesem.data.label_table import LabelTable, to_coco
+from drivesem.data.ground_truth import Exposure, FrameLocation
+from drivesem.data.label_table import LabelTable, xyxy_to_coco
 from drivesem.data.registry import WRITERS, open_dataset
-from drivesem.data.truth import Exposure, Place
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import to_uint8
 
 
-def place(number: int, part: str = "train") -> Place:
-    return Place(number, "01", "clone", number, part)
+def place(number: int, part: str = "train") -> FrameLocation:
+    return FrameLocation(number, "01", "clone", number, part)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def folder(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     assert not writer.exists(place(0))
     entries = [
         writer.write(place(0), make_exposure(0)),
-        writer.write(place(1, "val"), make_exposure(1, things=())),
+        writer.write(place(1, "val"), make_exposure(1, tracked_objects=())),
     ]
     assert writer.exists(place(0))
     assert not writer.exists(place(0, "val"))
@@ -54,11 +54,11 @@ def test_layout_and_values(folder: Path) -> None:
     assert [line.split()[0] for line in lines] == ["0", "1", "3"]
     assert all(re.fullmatch(r"\d+( [01]\.\d{6,}){4}", line) for line in lines)
     assert (folder / "labels/val/000001.txt").read_text() == ""
-    told = yaml.safe_load((folder / "data.yaml").read_text())
-    assert told["train"] == "images/train"
-    assert told["val"] == "images/val"
-    assert told["nc"] == len(told["names"]) == 8
-    assert list(told["names"].values()) == list(CATEGORIES)
+    content = yaml.safe_load((folder / "data.yaml").read_text())
+    assert content["train"] == "images/train"
+    assert content["val"] == "images/val"
+    assert content["nc"] == len(content["names"]) == 8
+    assert list(content["names"].values()) == list(CATEGORIES)
 
 
 def test_what_is_written_reads_back(folder: Path, make_exposure: Callable[..., Exposure]) -> None:
@@ -90,12 +90,12 @@ def test_boxes_round_trip(
     y0, y1 = (v * (height - 1) for v in sorted(shares[2:]))
     if min((x1 - x0) / width, (y1 - y0) / height) < 1e-7:
         return
-    box = to_coco(np.array([x0, y0, x1, y1]))
+    box = xyxy_to_coco(np.array([x0, y0, x1, y1]))
     path = tmp_path_factory.getbasetemp() / "box.txt"
-    path.write_text(yolo._line(2, box.tolist(), size_wh, yolo.DECIMALS))
-    told = yolo._read_text(path, {2: "Truck"}, size_wh, scored=False)
-    assert (told.kinds, told.scores) == ([2], [])
-    assert told.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
+    path.write_text(yolo._format_line(2, box.tolist(), size_wh, yolo.DECIMALS))
+    content = yolo._read_labels(path, {2: "Truck"}, size_wh, scored=False)
+    assert (content.kinds, content.scores) == ([2], [])
+    assert content.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
 
 
 def test_without_a_calibration_a_usual_focal_length_is_taken(folder: Path) -> None:
@@ -182,7 +182,7 @@ def test_other_bad_requests(folder: Path) -> None:
     with pytest.raises(FormatError, match=r"images/train/000000\.png: expected an image"):
         yolo.YoloDataset(folder).labels("000000")
     files.write_png(folder / "images/train/000001.png", np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(FormatError, match=r"images/val/000001\.png: expected a name of its own, found the"):
+    with pytest.raises(FormatError, match=r"images/val/000001\.png: expected a unique name, found the"):
         yolo.YoloDataset(folder)
 
 
@@ -215,7 +215,7 @@ def test_pictures_are_upright_as_opencv_reads_them(orientation: int, suffix: str
     assert (frame.camera.width, frame.camera.height) == (width, height)
 
 
-def test_boxes_beyond_the_image_are_cut_and_told(tmp_path: Path) -> None:
+def test_boxes_beyond_the_image_are_clipped_and_counted(tmp_path: Path) -> None:
     """A reader takes no share above 1; what is only rounded beyond stays as it is."""
     boxes = [
         [-30, 5, 50, 20],
@@ -225,7 +225,7 @@ def test_boxes_beyond_the_image_are_cut_and_told(tmp_path: Path) -> None:
         [0, 0, 100.004, 50],
         [1, 2, 3, 4],
     ]
-    table = LabelTable.of(
+    table = LabelTable.from_columns(
         ["a"], ["Car"], [0] * 6, [0] * 6, np.array(boxes, float), "xywh", sizes_wh=np.array([[100, 50]])
     )
     written = yolo.write_table(table, tmp_path, {})

@@ -17,7 +17,14 @@ from detectors.types import CLASSES, Detections
 from drivesem.cli import main
 from drivesem.data.kitti import KittiDataset
 from drivesem.data.registry import open_dataset
-from drivesem.scenes.label_free import FITTING, detect, has_places, label_free, placed_by_boxes, settings_for
+from drivesem.scenes.label_free import (
+    FIT_TO_DETECTIONS,
+    detect,
+    detection_fit_settings,
+    estimate_label_poses,
+    has_poses,
+    label_from_detections,
+)
 from drivesem.synth.frames import SynthFrame, generate_frame
 from scene_ir.derender import pose
 from scene_ir.derender.derender import DerenderSettings
@@ -45,7 +52,7 @@ def seen(boxes: list[list[float]], labels: list[int]) -> Detections:
 def test_detections_become_labels() -> None:
     frame = frame_of()
     boxes = [[550.0, 170, 650, 240], [0, 170, 120, 320], [560, 150, 590, 260], [700, 120, 800, 230]]
-    found = label_free(frame, seen(boxes, [CAR, CAR, PEDESTRIAN, TRUCK]))
+    found = label_from_detections(frame, seen(boxes, [CAR, CAR, PEDESTRIAN, TRUCK]))
     labels = found.labels
     assert labels is not None
     assert labels.kind == ("Car", "Car", "Pedestrian", "Truck")
@@ -63,12 +70,12 @@ def test_detections_become_labels() -> None:
     assert float(labels.translation[2, 2]) == pytest.approx(720 * 1.75 / 110, rel=0.6)
 
 
-def known(places: torch.Tensor) -> Callable[..., pose.Poses]:
+def known(places: torch.Tensor) -> Callable[..., pose.VehiclePoses]:
     """An estimate that puts cars, all heading away, at these places on a level road."""
     count = len(places)
     one, ground = torch.ones(count), torch.tensor([0.0, -1, 0, 1.65])
     size = torch.tensor([4.0, 1.5, 1.7]).expand(count, 3)
-    poses = pose.Poses(places, one * math.pi / 2, size, ("sedan",) * count, 0.05 * one, one, ground)
+    poses = pose.VehiclePoses(places, one * math.pi / 2, size, ("sedan",) * count, 0.05 * one, one, ground)
     return lambda *_, **__: poses
 
 
@@ -80,7 +87,7 @@ def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: 
     """One car behind another, one beside, one half out of the image, one behind the camera."""
     places = torch.tensor([[0.0, 1.65, 10], [0.3, 1.65, 20], [9, 1.65, 20], [-8, 1.65, 9.5], [0, 1.65, -5]])
     monkeypatch.setattr("drivesem.scenes.label_free.estimate", known(places))
-    labels = label_free(frame_of(), cars(5)).labels
+    labels = label_from_detections(frame_of(), cars(5)).labels
     assert labels is not None
     assert torch.equal(labels.translation, places[:4])
     assert labels.occlusion.tolist() == [0, 3, 0, 0]
@@ -89,9 +96,9 @@ def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: 
     assert float(labels.boxes_xyxy[3, 0]) == 0
 
 
-def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_near_vehicles_are_detected_in_a_smaller_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is high, and what is seen there of the same class at about the same place; all else stays."""
-    shown: list[tuple[int, int]] = []
+    pictures: list[tuple[int, int]] = []
     large = [[100.0, 100, 400, 250], [500, 100, 700, 199], [800, 100, 1000, 260], [1100, 100, 1150, 240]]
     small = [
         [80.0, 90, 450, 290],
@@ -103,7 +110,7 @@ def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pyt
 
     def predict(_: object, images: torch.Tensor) -> list[Detections]:
         height, width = images.shape[2:]
-        shown.append((height, width))
+        pictures.append((height, width))
         boxes = torch.tensor(large if width == 1242 else small).reshape(-1, 4)
         labels = torch.tensor([CAR, CAR, CAR, PEDESTRIAN] if width == 1242 else [CAR, CAR, CAR, TRUCK, PEDESTRIAN])
         labels = labels[: len(boxes)]
@@ -112,26 +119,26 @@ def test_near_vehicles_are_looked_at_again_in_a_smaller_picture(monkeypatch: pyt
 
     monkeypatch.setattr("drivesem.scenes.label_free.predict", predict)
     found = detect(frame_of())
-    assert shown == [(375, 1242), (225, 745)]
+    assert pictures == [(375, 1242), (225, 745)]
     torch.testing.assert_close(found.boxes_xyxy, torch.tensor([small[0], *large[1:]]), atol=1e-3, rtol=0)
     small.clear()  # nothing is seen there
     torch.testing.assert_close(detect(frame_of()).boxes_xyxy, torch.tensor(large))
-    shown.clear()
+    pictures.clear()
     large[:] = large[1:2]
     monkeypatch.setattr(
         "drivesem.scenes.label_free.predict",
-        lambda _, images: shown.append(images.shape[2:]) or [seen(large, [CAR])],
+        lambda _, images: pictures.append(images.shape[2:]) or [seen(large, [CAR])],
     )
     assert torch.equal(detect(frame_of()).boxes_xyxy, torch.tensor(large))
-    assert len(shown) == 1
+    assert len(pictures) == 1
 
 
 def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Within a twentieth of their sides, or 2 px; people's boxes stay as they are."""
-    asked: list[torch.Tensor] = []
+    requested: list[torch.Tensor] = []
 
-    def estimate(_: torch.Tensor, boxes_xyxy: torch.Tensor, *words: object, **more: object) -> pose.Poses:
-        asked.append(boxes_xyxy)
+    def estimate(_: torch.Tensor, boxes_xyxy: torch.Tensor, *words: object, **more: object) -> pose.VehiclePoses:
+        requested.append(boxes_xyxy)
         return known(torch.tensor([[4.0 * i, 1.65, 20] for i in range(len(boxes_xyxy))]))()
 
     monkeypatch.setattr("drivesem.scenes.label_free.estimate", estimate)
@@ -142,9 +149,11 @@ def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.Monkey
         [1.5, 1.5, 30, 30],
         [3, 9, 60, 180],
     ]
-    label_free(frame_of(), seen([*boxes, [900, 100, 1240, 374]], [CAR, CAR, CAR, TRUCK, CAR, PEDESTRIAN]))
+    label_from_detections(
+        frame_of(), seen([*boxes, [900, 100, 1240, 374]], [CAR, CAR, CAR, TRUCK, CAR, PEDESTRIAN])
+    )
     cut = [[902.0, 232, 1241, 374], [0, 100, 210, 200], [11, 100, 211, 200], [0, 0, 30, 30], [3, 9, 60, 180]]
-    assert asked[0].tolist() == cut
+    assert requested[0].tolist() == cut
 
 
 def test_vehicles_that_cannot_stand_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,27 +162,27 @@ def test_vehicles_that_cannot_stand_there_are_left_out(monkeypatch: pytest.Monke
     monkeypatch.setattr("drivesem.scenes.label_free.estimate", known(places))
     found = cars(5)
     found.scores[1] = 0.95
-    labels = label_free(frame_of(), found).labels
+    labels = label_from_detections(frame_of(), found).labels
     assert labels is not None
     assert torch.equal(labels.translation, places[[1, 2, 4]])
 
 
 def test_no_detections_and_wrong_labels() -> None:
-    none = label_free(frame_of(), seen([], []))
+    none = label_from_detections(frame_of(), seen([], []))
     assert none.labels is not None
     assert none.labels.kind == ()
     with pytest.raises(RangeError, match="labels"):
-        label_free(frame_of(), seen([[0.0, 0, 50, 50]], [9]))
+        label_from_detections(frame_of(), seen([[0.0, 0, 50, 50]], [9]))
     with pytest.raises(RangeError, match="boxes_xyxy"):
-        label_free(frame_of(), seen([[50.0, 0, 50, 50]], [CAR]))
+        label_from_detections(frame_of(), seen([[50.0, 0, 50, 50]], [CAR]))
 
 
 def test_the_fit_may_go_farther_than_from_labels() -> None:
-    settings = settings_for(DerenderSettings(fit=False, seed=3))
-    assert (settings.fit, settings.seed, settings.fitting) == (False, 3, FITTING)
+    settings = detection_fit_settings(DerenderSettings(fit=False, seed=3))
+    assert (settings.fit, settings.seed, settings.fitting) == (False, 3, FIT_TO_DETECTIONS)
     usual = DerenderSettings().fitting
-    assert FITTING.max_shift_m > usual.max_shift_m
-    assert FITTING.max_turn_rad > usual.max_turn_rad
+    assert FIT_TO_DETECTIONS.max_shift_m > usual.max_shift_m
+    assert FIT_TO_DETECTIONS.max_turn_rad > usual.max_turn_rad
 
 
 @pytest.fixture(scope="module")
@@ -193,12 +202,12 @@ def clear(frame: SynthFrame) -> list[int]:
     return [i for i in range(len(labels.kind)) if labels.kind[i] in ("Car", "Van", "Truck") and bool(good[i])]
 
 
-def test_shipped_weights_keep_what_their_card_says(streets: list[SynthFrame]) -> None:
+def test_shipped_weights_match_their_card(streets: list[SynthFrame]) -> None:
     turn, depth, size, kind = [], [], [], []
     for street in streets:
         labels, rows = street.labels, clear(street)
         kinds = ["Truck" if labels.kind[i] == "Truck" else "Car" for i in rows]
-        found = pose.estimate(plain(street).photograph, labels.boxes_xyxy[rows], kinds, street.camera)
+        found = pose.estimate_poses(plain(street).photograph, labels.boxes_xyxy[rows], kinds, street.camera)
         turn += [
             abs(math.remainder(float(a - b), 2 * math.pi))
             for a, b in zip(found.yaw, labels.yaw[rows], strict=False)
@@ -219,7 +228,7 @@ def test_found_vehicles_are_placed(streets: list[SynthFrame]) -> None:
     near = []
     for street in streets[:3]:
         frame = plain(street)
-        found = label_free(frame, detect(frame)).labels
+        found = label_from_detections(frame, detect(frame)).labels
         assert found is not None
         places = found.translation[[i for i, kind in enumerate(found.kind) if kind in ("Car", "Truck")]]
         for row in clear(street):
@@ -269,10 +278,10 @@ def test_labelled_boxes_are_placed_and_stay() -> None:
     ]
     frame = boxed(frame_of(), ("car", "person", "truck", "dog"), boxes)
     assert frame.labels is not None
-    assert not has_places(frame.labels)
-    labels = placed_by_boxes(frame).labels
+    assert not has_poses(frame.labels)
+    labels = estimate_label_poses(frame).labels
     assert labels is not None
-    assert has_places(labels)
+    assert has_poses(labels)
     assert labels.kind == ("Car", "Pedestrian", "Truck", "dog")
     assert torch.equal(labels.boxes_xyxy, frame.labels.boxes_xyxy)
     assert torch.equal(labels.ignore_xyxy, frame.labels.ignore_xyxy)
@@ -282,19 +291,19 @@ def test_labelled_boxes_are_placed_and_stay() -> None:
     assert 5 < float(labels.translation[0, 2]) < 60
     assert int(labels.occlusion[0]) == 0
     assert 0 <= float(labels.truncation[0]) < 0.2
-    assert placed_by_boxes(frame).provenance["places"] == "estimated"
+    assert estimate_label_poses(frame).provenance["places"] == "estimated"
 
 
-def test_what_labels_say_is_not_estimated() -> None:
-    told = {"truncation": torch.tensor([0.4]), "occlusion": torch.tensor([1])}
-    labels = placed_by_boxes(boxed(frame_of(), ("Car",), [[600.0, 180.0, 700.0, 240.0]], **told)).labels
+def test_known_labels_are_not_estimated() -> None:
+    expected = {"truncation": torch.tensor([0.4]), "occlusion": torch.tensor([1])}
+    labels = estimate_label_poses(boxed(frame_of(), ("Car",), [[600.0, 180.0, 700.0, 240.0]], **expected)).labels
     assert labels is not None
     assert (float(labels.truncation[0]), int(labels.occlusion[0])) == (pytest.approx(0.4), 1)
 
 
 def test_of_two_cars_in_one_place_the_larger_stays() -> None:
     boxes = [[602.0, 182.0, 698.0, 239.0], [600.0, 180.0, 700.0, 240.0]]
-    labels = placed_by_boxes(boxed(frame_of(), ("car", "car"), boxes)).labels
+    labels = estimate_label_poses(boxed(frame_of(), ("car", "car"), boxes)).labels
     assert labels is not None
     assert torch.isfinite(labels.translation[:, 2]).tolist() == [False, True]
     assert bool(torch.isnan(labels.size_lhw[0]).all())
@@ -309,9 +318,9 @@ def test_derender_takes_a_photograph(
     assert main([*words, "--out", str(tmp_path / "S")]) == 0
     captured = capsys.readouterr()
     assert f"focal length {focal:.0f} px (given)" in captured.err
-    told = json.loads(captured.out)["frames"]["street"]
+    expected = json.loads(captured.out)["frames"]["street"]
     scene = load_scene(tmp_path / "S" / "street")
-    assert told["objects"] == len(scene.objects) > 0
+    assert expected["objects"] == len(scene.objects) > 0
     assert scene.provenance["labels"] == "estimated"
     assert torch.equal(
         (scene.photograph * 255).round().byte(), torch.from_numpy(streets[0].image).permute(2, 0, 1)
@@ -352,7 +361,7 @@ def test_cars_of_real_photographs_are_placed() -> None:
         labels = frame.labels
         assert labels is not None
         rows = [i for i, k in enumerate(labels.kind) if k == "Car" and int(labels.occlusion[i]) <= 1]
-        found = pose.estimate(frame.photograph, labels.boxes_xyxy[rows], ["Car"] * len(rows), frame.camera)
+        found = pose.estimate_poses(frame.photograph, labels.boxes_xyxy[rows], ["Car"] * len(rows), frame.camera)
         turn += [
             abs(math.remainder(float(a - b), math.pi)) for a, b in zip(found.yaw, labels.yaw[rows], strict=False)
         ]

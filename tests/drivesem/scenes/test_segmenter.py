@@ -16,7 +16,7 @@ from drivesem.cli import main
 from drivesem.scenes import label_free
 from drivesem.scenes.segmenter import CITYSCAPES, OnnxSegmenter
 from scene_ir import files
-from scene_ir.derender import segment
+from scene_ir.derender import segmentation as segment
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera
 
@@ -81,14 +81,14 @@ def network(
         (11, value_info("image", kind, (1, weights.shape[1], *sides))),
         (12, value_info(out, out_kind, shape)),
     )
-    told = [(14, message((1, k), (2, v))) for k, v in (metadata or {}).items()]
-    files.write_bytes(path, message((1, 8), (7, graph), (8, message((2, 13))), *told))
+    metadata_entries = [(14, message((1, k), (2, v))) for k, v in (metadata or {}).items()]
+    files.write_bytes(path, message((1, 8), (7, graph), (8, message((2, 13))), *metadata_entries))
     return path
 
 
 COLOURS = np.array([[-9, -9, 18], [-9, 18, -9], [6, 6, 6], [18, -9, -9]], np.float32)
 """Blue is sky, green is foliage, red is a building, grey is road."""
-TOLD = {"classes": json.dumps(NAMES)}
+METADATA = {"classes": json.dumps(NAMES)}
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +103,8 @@ def picture() -> np.ndarray:
 
 
 @pytest.mark.parametrize("last", ["", "Softmax", "ArgMax"])
-def test_logits_probabilities_and_numbers_say_the_same(tmp_path, picture, last):
-    own = OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, last, metadata=TOLD))
+def test_logits_probabilities_and_numbers_are_equivalent(tmp_path, picture, last):
+    own = OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, last, metadata=METADATA))
     shares, names = own(picture)
     assert names == NAMES
     assert shares.shape == (4, 128, 192)
@@ -116,9 +116,9 @@ def test_logits_probabilities_and_numbers_say_the_same(tmp_path, picture, last):
 
 
 def test_it_fills_the_maps(tmp_path, picture):
-    own = OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, metadata=TOLD))
+    own = OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, metadata=METADATA))
     camera = Camera(torch.tensor([[150.0, 0, 96], [0, 150.0, 62], [0, 0, 1]]), 128, 192)
-    found = segment.segment(picture, torch.tensor([0.0, -1.0, 0.0, 1.65]), camera, own)
+    found = segment.segment_photograph(picture, torch.tensor([0.0, -1.0, 0.0, 1.65]), camera, own)
     assert found.sky[:40].min() > 0.99
     assert found.foliage[54:58].min() > 0.99
     assert found.road[80:, :150].min() > 0.99
@@ -126,8 +126,8 @@ def test_it_fills_the_maps(tmp_path, picture):
 
 
 def test_a_fixed_size_and_its_own_normalisation(tmp_path, picture):
-    told = TOLD | {"mean": "[0.5, 0.5, 0.5]", "std": "[0.5, 0.25, 0.5]"}
-    own = OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, "", (32, 64), metadata=told))
+    metadata_entries = METADATA | {"mean": "[0.5, 0.5, 0.5]", "std": "[0.5, 0.25, 0.5]"}
+    own = OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, "", (32, 64), metadata=metadata_entries))
     shares, _ = own(picture)
     assert shares.shape == (4, 32, 64)
     logits = COLOURS @ ((np.array([0, 0, 1.0]) - 0.5) / [0.5, 0.25, 0.5])
@@ -145,21 +145,21 @@ def test_without_names_they_are_cityscapes(tmp_path, picture):
 
 
 def test_names_by_number(tmp_path):
-    told = {"names": str(dict(reversed(list(enumerate(NAMES)))))}
-    assert OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, metadata=told)).names == NAMES
+    metadata_entries = {"names": str(dict(reversed(list(enumerate(NAMES)))))}
+    assert OnnxSegmenter(network(tmp_path / "own.onnx", COLOURS, metadata=metadata_entries)).names == NAMES
 
 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
         ({"metadata": {"classes": "sky; road"}}, "metadata classes: expected a list of names, found sky; road"),
-        ({"metadata": TOLD | {"mean": "[1, 2]"}}, r"metadata mean: expected three numbers, found \[1, 2\]"),
-        ({"metadata": TOLD | {"std": "[1, 0, 1]"}}, "metadata std: expected positive numbers"),
+        ({"metadata": METADATA | {"mean": "[1, 2]"}}, r"metadata mean: expected three numbers, found \[1, 2\]"),
+        ({"metadata": METADATA | {"std": "[1, 0, 1]"}}, "metadata std: expected positive numbers"),
         ({"weights": np.zeros((4, 5), np.float32)}, r"inputs: expected one of shape \(1, 3, H, W\), found image"),
     ],
 )
 def test_a_network_that_cannot_be_used_is_an_error_that_names_it(tmp_path, change, text):
-    settings = {"weights": COLOURS, "metadata": TOLD} | change
+    settings = {"weights": COLOURS, "metadata": METADATA} | change
     path = network(tmp_path / "own.onnx", settings.pop("weights"), **settings)
     with pytest.raises(FormatError, match=rf"own\.onnx: {text}"):
         OnnxSegmenter(path)
@@ -179,10 +179,10 @@ def test_no_network_and_no_file_are_errors(tmp_path):
         OnnxSegmenter(tmp_path / "none.onnx")
 
 
-def test_onnxruntime_is_asked_for_where_it_is_missing(tmp_path, monkeypatch):
-    path = network(tmp_path / "own.onnx", COLOURS, metadata=TOLD)
+def test_missing_onnxruntime_is_named(tmp_path, monkeypatch):
+    path = network(tmp_path / "own.onnx", COLOURS, metadata=METADATA)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(FormatError, match=r"own\.onnx: expected onnxruntime beside it"):
+    with pytest.raises(FormatError, match=r"own\.onnx: expected onnxruntime \(pip"):
         OnnxSegmenter(path)
 
 
@@ -191,7 +191,7 @@ def test_the_command_takes_it(tmp_path, capsys, monkeypatch, picture):
     monkeypatch.setattr(label_free, "detect", lambda *_: nothing)
     photo, out = tmp_path / "plain.png", tmp_path / "scenes"
     files.write_png(photo, np.rint(picture * 255).astype(np.uint8))
-    path = network(tmp_path / "own.onnx", COLOURS, metadata=TOLD)
+    path = network(tmp_path / "own.onnx", COLOURS, metadata=METADATA)
     assert main(["derender", str(photo), "--segmenter", str(path), "--out", str(out)]) == 0
     arrays = files.read_npz(out / "plain" / "arrays.npz")
     assert arrays["sky"][:40].min() > 0.9

@@ -74,6 +74,6 @@ def test_meshes_that_are_left_out_are_named(
     turned = shape.vertices.numpy() * np.array([4.5, -1.5, -1.8])
     trimesh.Trimesh(turned, shape.faces.numpy(), process=False).export(place / "bad" / "sedan.obj")
     assert main(["derender", "photo.png", "--meshes", "bad", "--workers", "1", "--out", "S"]) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("--meshes")]
-    assert len(said) == 1
-    assert said[0].startswith("--meshes: car.obj is left out: ")
+    output = [line for line in capsys.readouterr().err.splitlines() if line.startswith("--meshes")]
+    assert len(output) == 1
+    assert output[0].startswith("--meshes: car.obj is left out: ")

@@ -28,7 +28,7 @@ FAITHFUL_DB = 34.0
 def opened(chromium: Any, server: Server) -> Iterator[Callable[..., Any]]:
     """Opens the page at a link; at the end there must have been no error, and no request but to the server."""
     complaints: list[str] = []
-    asked: list[str] = []
+    requested: list[str] = []
     contexts = []
 
     def at(width: int = 1400, height: int = 900, **link: Any) -> Any:
@@ -38,7 +38,7 @@ def opened(chromium: Any, server: Server) -> Iterator[Callable[..., Any]]:
         page = context.new_page()
         page.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
+        page.on("request", lambda request: requested.append(request.url))
         page.goto(f"{server.url}#{urlencode(link)}" if link else server.url)
         settle(page)
         return page
@@ -47,9 +47,9 @@ def opened(chromium: Any, server: Server) -> Iterator[Callable[..., Any]]:
     for context in contexts:
         context.close()
     there = (server.url, f"blob:{server.url}", "data:,")
-    assert not [url for url in asked if not url.startswith(there)]
+    assert not [url for url in requested if not url.startswith(there)]
     dropped = "409"  # what a later request superseded
-    assert not [told for told in complaints if dropped not in told]
+    assert not [shortcuts for shortcuts in complaints if dropped not in shortcuts]
 
 
 def settle(page: Any) -> None:
@@ -62,7 +62,7 @@ def state(page: Any) -> dict[str, str]:
     return {name: values[0] for name, values in parse_qs(urlsplit(page.url).fragment).items()}
 
 
-def knob(page: Any, name: str) -> Any:
+def slider_of(page: Any, name: str) -> Any:
     return page.locator(f'input[data-name="{name}"]')
 
 
@@ -82,14 +82,14 @@ def pixels(page: Any) -> np.ndarray:
 def test_a_slider_moves_picture_boxes_link_and_command(opened: Callable[..., Any], viewer: Viewer) -> None:
     page = opened(frame="still", car=0)
     before = page.locator("#after").get_attribute("src")
-    slider = knob(page, "objects[0].translate.along")
+    slider = slider_of(page, "objects[0].translate.along")
     slider.fill("0.5")
     page.wait_for_selector("#view:not([data-settled])", state="attached")
     settle(page)
     assert page.locator("#after").get_attribute("src") != before
     assert state(page)["objects[0].translate.along"] == "0.5"
     assert "'objects[0].translate=0.5m,0m'" in page.inner_text("#command")
-    assert page.locator("output[for='knob-objects[0].translate.along']").inner_text() == "0.50 m"
+    assert page.locator("output[for='slider-objects[0].translate.along']").inner_text() == "0.50 m"
     stage = viewer.scene("still")
     expected, still = (
         to_uint8(stage.render_state(values).render.image) for values in ({"objects[0].translate.along": 0.5}, {})
@@ -98,7 +98,7 @@ def test_a_slider_moves_picture_boxes_link_and_command(opened: Callable[..., Any
     slider.focus()
     page.keyboard.press("ArrowRight")
     assert state(page)["objects[0].translate.along"] == "0.51"
-    page.locator(".knob.moved button").first.click()
+    page.locator(".slider.moved button").first.click()
     settle(page)
     assert "objects[0].translate.along" not in state(page)
     assert page.inner_text("#command").startswith("drivesem render ")
@@ -124,7 +124,7 @@ def test_a_link_brings_everything_back(opened: Callable[..., Any]) -> None:
     assert state(page) == link | {"objects[1].yaw": "5", "weather.fog": "0.25"}
     assert page.locator("#before").is_visible()
     assert page.input_value("#map-x") == "weather.fog"
-    assert float(knob(page, "objects[1].yaw").input_value()) == 5
+    assert float(slider_of(page, "objects[1].yaw").input_value()) == 5
     assert page.locator('#cars [aria-pressed="true"]').inner_text().startswith("1 ")
     page.keyboard.press("l")
     page.wait_for_selector("#toast:not(:empty)")
@@ -166,11 +166,11 @@ def test_keys(opened: Callable[..., Any]) -> None:
     page.keyboard.press("p")
     assert state(page)["car"] == "0"
     page.keyboard.press("?")
-    told = page.inner_text("#keys").lower()
-    assert all(words in told for words in ("before / after", "boxes on / off", "turn it", "copy the command"))
+    shortcuts = page.inner_text("#keys").lower()
+    assert all(words in shortcuts for words in ("before / after", "boxes on / off", "turn it", "copy the command"))
 
 
-def test_arrows_go_where_one_looks(opened: Callable[..., Any], viewer: Viewer) -> None:
+def test_arrows_follow_the_view(opened: Callable[..., Any], viewer: Viewer) -> None:
     page = opened(frame="still", car=0)
     rest = viewer.scene("still").sliders
     for key, axis, sign in (("ArrowUp", 2, 1), ("ArrowDown", 2, -1), ("ArrowRight", 0, 1), ("ArrowLeft", 0, -1)):
@@ -195,9 +195,9 @@ def test_cars_are_dragged_from_above(opened: Callable[..., Any], viewer: Viewer)
     page.mouse.move(x + 0.3 * scale, y - 0.5 * scale, steps=3)
     page.mouse.up()
     settle(page)
-    told = state(page)
-    assert told["car"] == "0"
-    values = {name: float(text) for name, text in told.items() if name.startswith("objects[0]")}
+    shortcuts = state(page)
+    assert shortcuts["car"] == "0"
+    values = {name: float(text) for name, text in shortcuts.items() if name.startswith("objects[0]")}
     shift = scene.apply(scene.state(values)).objects.translation[0] - scene.rest.objects.translation[0]
     assert shift[[0, 2]].tolist() == pytest.approx([0.3, 0.5], abs=0.05)
     handle = page.locator("#street .turn").bounding_box()
@@ -212,17 +212,17 @@ def test_cars_are_dragged_from_above(opened: Callable[..., Any], viewer: Viewer)
 def test_the_map_is_filled_and_sets_both_values(opened: Callable[..., Any]) -> None:
     page = opened(frame="still", car=0, x="objects[0].yaw", y="objects[0].paint.gloss")
     page.wait_for_selector('#map[data-cells="25"]', timeout=60000, state="attached")
-    assert re.fullmatch(r"\d+ of 25 not found", page.inner_text("#map-said"))
+    assert re.fullmatch(r"\d+ of 25 not found", page.inner_text("#map-status"))
     assert page.locator("#map .cell title").count() == 25
     cell = page.locator('#map .cell[data-i="4"][data-j="3"]')
     cell.scroll_into_view_if_needed()
     box = cell.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     settle(page)
-    told = state(page)
-    assert (told["objects[0].yaw"], told["objects[0].paint.gloss"]) == ("20", "0.5")
+    shortcuts = state(page)
+    assert (shortcuts["objects[0].yaw"], shortcuts["objects[0].paint.gloss"]) == ("20", "0.5")
     assert page.get_attribute("#map", "data-cells") == "25", "it does not depend on what is on its axes"
-    knob(page, "weather.fog").fill("0.2")
+    slider_of(page, "weather.fog").fill("0.2")
     assert page.get_attribute("#map", "data-cells") == "0"
 
 
@@ -267,7 +267,7 @@ def test_names_are_text(opened: Callable[..., Any]) -> None:
 def test_everything_fits(width: int, height: int, opened: Callable[..., Any]) -> None:
     page = opened(width, height, frame="still", car=0)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    for selector in ("#view", "#street", "#map", "#car-knobs", "#scene-knobs", "#command", "#cars"):
+    for selector in ("#view", "#street", "#map", "#car-sliders", "#scene-sliders", "#command", "#cars"):
         box = page.locator(selector).bounding_box()
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= width + 1

@@ -32,20 +32,20 @@ def pixels(encoded: bytes) -> np.ndarray:
 def judged(stage: InteractiveScene) -> int:
     """A vehicle that is found as photographed, and may go a metre."""
     cars = stage.facts()["cars"]
-    reach = {knob.car: knob.high for knob in stage.sliders.sliders.values() if knob.name.endswith("along")}
+    reach = {slider.car: slider.high for slider in stage.sliders.sliders.values() if slider.name.endswith("along")}
     return next(car["car"] for car in cars if car["status"] == "found" and reach.get(car["car"], 0) >= 1)
 
 
 def test_at_rest_it_is_the_photograph(stage: InteractiveScene) -> None:
     drawn = stage.render_state({})
     assert (to_uint8(drawn.render.image) == to_uint8(stage.sliders.rest.photograph)).all()
-    shown = pixels(stage.encode_picture(drawn))[..., ::-1]
-    assert shown.shape == (stage.sliders.rest.camera.height, stage.sliders.rest.camera.width, 3)
-    assert cv2.PSNR(shown, to_uint8(stage.sliders.rest.photograph)) > 35
-    assert (pixels(stage.encode_photograph())[..., ::-1] == shown).all()
+    picture = pixels(stage.encode_picture(drawn))[..., ::-1]
+    assert picture.shape == (stage.sliders.rest.camera.height, stage.sliders.rest.camera.width, 3)
+    assert cv2.PSNR(picture, to_uint8(stage.sliders.rest.photograph)) > 35
+    assert (pixels(stage.encode_photograph())[..., ::-1] == picture).all()
 
 
-def test_a_drawn_state_is_kept_and_few_are(stage: InteractiveScene) -> None:
+def test_few_rendered_states_are_cached(stage: InteractiveScene) -> None:
     first = stage.render_state({"weather.fog": 0.5})
     assert stage.render_state({"weather.fog": 0.5}) is first
     assert stage.render_state({"weather.fog": 0.4}, keep=False) is not stage.render_state(
@@ -56,7 +56,7 @@ def test_a_drawn_state_is_kept_and_few_are(stage: InteractiveScene) -> None:
     assert stage.render_state({"weather.fog": 0.5}) is not first
 
 
-def test_who_is_driven_from_where_it_is_looked_for_is_lost(stage: InteractiveScene) -> None:
+def test_a_vehicle_beyond_the_match_distance_is_lost(stage: InteractiveScene) -> None:
     car = judged(stage)
     state = stage.sliders.state({f"objects[{car}].translate.along": 1.0, f"objects[{car}].yaw": 20.0})
     still, after = stage.detect({}, stage.render_state({})), stage.detect(state, stage.render_state(state))
@@ -97,27 +97,27 @@ def test_far_away_it_is_lost_for_certain(still: Path) -> None:
     assert seen["lost"] >= 1
     assert seen["words"].startswith(f"{seen['lost']} object")
     assert stage.known_score(state, car) is None
-    told = stage.score(state, car, stage.render_state(state))
-    assert told == seen["cars"][car] == stage.known_score(state, car)
+    result = stage.score(state, car, stage.render_state(state))
+    assert result == seen["cars"][car] == stage.known_score(state, car)
 
 
-def test_the_detector_looks_where_something_changed(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_changed_regions_are_detected_again(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = InteractiveScene(still, load_detector("squeezedet"), PRESETS["street"], None)
     car = judged(stage)
     drawn = stage.render_state({f"objects[{car}].translate.along": 0.5})
     objective, seen = stage.objective, []
     everywhere = objective.evaluate_render(drawn.scene, drawn.render)
 
-    def look(scene: SceneIR, render: Render) -> RenderEvaluation:
+    def evaluate(scene: SceneIR, render: Render) -> RenderEvaluation:
         seen.append(render.vehicle_regions)
         return Objective.evaluate_render(objective, scene, render)
 
-    monkeypatch.setattr(objective, "look", look)
-    told = stage.detect({f"objects[{car}].translate.along": 0.5}, drawn)
+    monkeypatch.setattr(objective, "evaluate_render", evaluate)
+    result = stage.detect({f"objects[{car}].translate.along": 0.5}, drawn)
     assert drawn.render.vehicle_regions is not None
     assert 0 < len(seen[0]) < len(drawn.render.vehicle_regions)
     first = everywhere.detections
-    marks = [mark for mark in told["boxes"] if mark["kind"] in ("found", "phantom")]
+    marks = [mark for mark in result["boxes"] if mark["kind"] in ("found", "phantom")]
     above = first.scores >= objective.t_star
     boxes = torch.tensor([mark["xyxy"] for mark in marks])
     torch.testing.assert_close(boxes, first.boxes_xyxy[above], atol=0.01, rtol=0)
@@ -140,10 +140,10 @@ def test_best_score_is_of_what_meets_the_target() -> None:
     assert best_score(targets, nothing, 0) == 0
 
 
-def test_what_no_car_can_do_is_said(stage: InteractiveScene) -> None:
+def test_infeasible_states_have_notes(stage: InteractiveScene) -> None:
     assert stage.notes(stage.render_state({})) == []
-    knobs = [k for k in stage.sliders.sliders.values() if k.name.endswith(("along", "across"))]
-    for state in ({k.name: k.high for k in knobs}, {k.name: k.low for k in knobs}):
+    sliders_of_position = [k for k in stage.sliders.sliders.values() if k.name.endswith(("along", "across"))]
+    for state in ({k.name: k.high for k in sliders_of_position}, {k.name: k.low for k in sliders_of_position}):
         drawn = stage.render_state(state)
         rows = range(len(stage.sliders.rest.objects))
         assert stage.notes(drawn) == check_places(stage.sliders.rest, drawn.scene, rows)

@@ -44,8 +44,8 @@ def get(server: Server, path: str, method: str = "GET", **headers: str) -> Answe
     with closing(http.client.HTTPConnection(HOST, server.server_port, timeout=60)) as connection:
         connection.request(method, path, headers={name.replace("_", "-"): text for name, text in headers.items()})
         answer = connection.getresponse()
-        told = {name.lower(): text for name, text in answer.getheaders()}
-        return Answer(answer.status, told, answer.read())
+        content = {name.lower(): text for name, text in answer.getheaders()}
+        return Answer(answer.status, content, answer.read())
 
 
 def query(path: str, **values: Any) -> str:
@@ -73,16 +73,16 @@ def test_the_page_and_what_belongs_to_it(path: str, kind: str, server: Server) -
 
 
 def test_the_policy_lets_no_other_script_in() -> None:
-    told = dict(part.strip().split(" ", 1) for part in POLICY.split(";"))
-    assert told["default-src"] == "'none'"
-    assert told["script-src"] == "'self'"
+    content = dict(part.strip().split(" ", 1) for part in POLICY.split(";"))
+    assert content["default-src"] == "'none'"
+    assert content["script-src"] == "'self'"
     assert "unsafe" not in POLICY
     assert "http" not in POLICY
 
 
 def test_what_there_is_to_see(server: Server) -> None:
-    told = json.loads(get(server, "/overview").body)
-    assert told == {
+    content = json.loads(get(server, "/overview").body)
+    assert content == {
         "title": "<script>title</script>",
         "detector": "stubborn",
         "grid": GRID,
@@ -99,11 +99,11 @@ def test_a_state_as_picture_and_as_what_is_found(server: Server, viewer: Viewer)
     values = STILL | {SLIDER: 0.5, "weather.fog": "0.25"}
     answer = get(server, query("/picture", **values))
     assert (answer.status, answer.kind) == (200, "image/jpeg")
-    shown = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR)
     photograph = get(server, query("/photograph", **STILL))
     before = cv2.imdecode(np.frombuffer(photograph.body, np.uint8), cv2.IMREAD_COLOR)
-    assert shown.shape == before.shape
-    assert np.abs(shown.astype(int) - before).mean() > 1
+    assert picture.shape == before.shape
+    assert np.abs(picture.astype(int) - before).mean() > 1
     found = json.loads(get(server, query("/detections", **values)).body)
     assert found["command"] == viewer.scene("still").sliders.command(
         viewer.frames["still"].folder.resolve(), {SLIDER: 0.5, "weather.fog": 0.25}
@@ -169,7 +169,7 @@ def test_localhost_is_this_machine(server: Server) -> None:
     assert get(server, "/overview", Host=f"localhost:{server.server_port}").status == 200
 
 
-def test_other_sites_may_link_here_but_not_ask(server: Server) -> None:
+def test_other_sites_may_link_but_not_request(server: Server) -> None:
     assert get(server, "/", Sec_Fetch_Site="cross-site").status == 200
     assert get(server, "/overview", Sec_Fetch_Site="same-origin").status == 200
     for site in ("cross-site", "same-site"):
@@ -222,11 +222,11 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
     statuses: dict[int, int] = {}
     with served(viewer) as server:
 
-        def ask(number: int) -> None:
+        def send(number: int) -> None:
             values = STILL | {"page": "p", "n": number, "weather.fog": number / 100}
             statuses[number] = get(server, query("/picture", **values)).status
 
-        threads = [threading.Thread(target=ask, args=(number,)) for number in range(1, 21)]
+        threads = [threading.Thread(target=send, args=(number,)) for number in range(1, 21)]
         threads[0].start()
         assert begun.wait(30)
         for thread in threads[1:]:
@@ -268,8 +268,8 @@ def test_the_end_waits_for_what_is_being_answered(
     with served(viewer) as server, closing(http.client.HTTPConnection(HOST, server.server_port)) as open_still:
         open_still.request("GET", "/page.css")
         open_still.getresponse().read()
-        asking = threading.Thread(target=lambda: answers.append(get(server, "/overview")))
-        asking.start()
+        requesting = threading.Thread(target=lambda: answers.append(get(server, "/overview")))
+        requesting.start()
         assert begun.wait(30)
         server.shutdown()
         ending = threading.Thread(target=server.server_close)
@@ -280,13 +280,13 @@ def test_the_end_waits_for_what_is_being_answered(
         late = open_still.getresponse()
         assert (late.status, late.read()) == (503, b"drivesem view has ended\n")
         go_on.set()
-        for thread in (ending, asking):
+        for thread in (ending, requesting):
             thread.join(30)
     viewer.close()
     assert [answer.status for answer in answers] == [200]
 
 
-def test_few_frames_and_pages_are_kept(
+def test_few_frames_and_pages_are_cached(
     still: Path, changed: Path, stubborn: Stubborn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[Path] = []

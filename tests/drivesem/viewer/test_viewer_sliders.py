@@ -29,7 +29,7 @@ STREET = PRESETS["street"]
 
 
 @pytest.fixture(scope="module")
-def knobs(still: Path) -> SceneSliders:
+def scene_sliders(still: Path) -> SceneSliders:
     return SceneSliders(load_scene(still), STREET)
 
 
@@ -67,31 +67,33 @@ def assert_alike(one: SceneIR, other: SceneIR) -> None:
         torch.testing.assert_close(mine, theirs, atol=2e-6, rtol=0)
 
 
-def test_knobs_are_thetas_coordinates_in_peoples_units(knobs: SceneSliders) -> None:
-    space = knobs.space
+def test_sliders_are_coordinates_of_theta_in_physical_units(scene_sliders: SceneSliders) -> None:
+    space = scene_sliders.space
     assert set(space.params) == set(Parameter) - {Parameter.MESH}
     for i in range(space.dim):
         factor, unit = space.physical(i, 1.0) or (1.0, "")
         low, high = float(space.lower[i]) * factor, float(space.upper[i]) * factor
         if low == high:
-            assert space.name(i) not in knobs.sliders, "nothing to move"
+            assert space.name(i) not in scene_sliders.sliders, "nothing to move"
             continue
-        knob = knobs.sliders[space.name(i)]
-        assert knob.unit == unit
-        assert low - 1e-4 <= knob.low < knob.high <= high + 1e-4
-        assert (high - knob.high, knob.low - low) == pytest.approx((0, 0), abs=knob.step)
-    assert {knob.unit for knob in knobs.sliders.values()} == {"m", "deg", "%", ""}
+        slider = scene_sliders.sliders[space.name(i)]
+        assert slider.unit == unit
+        assert low - 1e-4 <= slider.low < slider.high <= high + 1e-4
+        assert (high - slider.high, slider.low - low) == pytest.approx((0, 0), abs=slider.step)
+    assert {slider.unit for slider in scene_sliders.sliders.values()} == {"m", "deg", "%", ""}
 
 
-def test_as_photographed_nothing_is_found_and_all_is_drawn_by_render(knobs: SceneSliders, still: Path) -> None:
-    assert knobs.found == {}
-    assert_alike(knobs.apply({}), load_scene(still))
-    assert knobs.command(still, {}) == shlex.join(["drivesem", "render", str(still), "--out", PICTURE])
+def test_as_photographed_nothing_is_found_and_all_is_drawn_by_render(
+    scene_sliders: SceneSliders, still: Path
+) -> None:
+    assert scene_sliders.found == {}
+    assert_alike(scene_sliders.apply({}), load_scene(still))
+    assert scene_sliders.command(still, {}) == shlex.join(["drivesem", "render", str(still), "--out", PICTURE])
 
 
 def test_what_a_scene_holds_is_found(bent: SceneIR) -> None:
-    knobs = SceneSliders(bent, STREET)
-    found = knobs.found
+    scene_sliders = SceneSliders(bent, STREET)
+    found = scene_sliders.found
     expected = {
         "objects[0].translate.along": 1.25,
         "objects[0].translate.across": -0.5,
@@ -101,50 +103,50 @@ def test_what_a_scene_holds_is_found(bent: SceneIR) -> None:
         "weather.fog": 0.25,
     }
     assert found == pytest.approx(expected, abs=1e-4)
-    assert_alike(knobs.apply(found), bent)
+    assert_alike(scene_sliders.apply(found), bent)
 
 
 def test_a_shape_goes_by_its_share(bent: SceneIR, still: Path) -> None:
-    knobs, rest = SceneSliders(bent, STREET), load_scene(still).objects.ffd
-    half = knobs.apply(knobs.state({"objects[1].shape": 50.0})).objects.ffd
+    scene_sliders, rest = SceneSliders(bent, STREET), load_scene(still).objects.ffd
+    half = scene_sliders.apply(scene_sliders.state({"objects[1].shape": 50.0})).objects.ffd
     torch.testing.assert_close(half, rest + 0.5 * (bent.objects.ffd - rest))
-    command = knobs.command(Path("S"), {"objects[1].shape": 50.0})
+    command = scene_sliders.command(Path("S"), {"objects[1].shape": 50.0})
     assert command == "drivesem edit S --photographed --set 'objects[1].mesh=50%' --out view.png"
-    assert_alike(drawn_by(command, bent), knobs.apply({"objects[1].shape": 50.0}))
+    assert_alike(drawn_by(command, bent), scene_sliders.apply({"objects[1].shape": 50.0}))
 
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_the_command_says_the_state(data: st.DataObject, knobs: SceneSliders, bent: SceneIR) -> None:
-    mine = data.draw(st.sampled_from([knobs, SceneSliders(bent, STREET)]))
+def test_the_command_reproduces_the_state(data: st.DataObject, scene_sliders: SceneSliders, bent: SceneIR) -> None:
+    mine = data.draw(st.sampled_from([scene_sliders, SceneSliders(bent, STREET)]))
     names = data.draw(st.lists(st.sampled_from(sorted(mine.sliders)), max_size=6, unique=True))
     values = {}
     for name in names:
-        knob = mine.sliders[name]
-        values[name] = round(data.draw(st.floats(knob.low, knob.high)), 5)
-        values[name] = min(max(values[name], knob.low), knob.high)
+        slider = mine.sliders[name]
+        values[name] = round(data.draw(st.floats(slider.low, slider.high)), 5)
+        values[name] = min(max(values[name], slider.low), slider.high)
     state = mine.state(values)
     assert_alike(drawn_by(mine.command(Path("a b"), state), mine.scene), mine.apply(state))
 
 
 def test_a_narrow_budget_reaches_what_is_there(bent: SceneIR) -> None:
-    knobs = SceneSliders(bent, parse_budget("translate=0.5m,color=0.1,weather=0.1"))
-    along = knobs.sliders["objects[0].translate.along"]
+    scene_sliders = SceneSliders(bent, parse_budget("translate=0.5m,color=0.1,weather=0.1"))
+    along = scene_sliders.sliders["objects[0].translate.along"]
     assert (along.low, along.high) == pytest.approx((-0.5, 1.25), abs=1e-4)
-    assert knobs.sliders["objects[1].paint.lightness"].low == -0.5
+    assert scene_sliders.sliders["objects[1].paint.lightness"].low == -0.5
     held = ("size", "sun")
-    assert not any(knob.group in held for knob in knobs.sliders.values()), "by the paper's budget"
-    assert_alike(knobs.apply(knobs.found), bent)
+    assert not any(slider.group in held for slider in scene_sliders.sliders.values()), "by the paper's budget"
+    assert_alike(scene_sliders.apply(scene_sliders.found), bent)
 
 
 def test_what_is_not_there_cannot_be_moved(still: Path) -> None:
     scene = load_scene(still)
-    knobs = SceneSliders(remove_vehicle(scene, 0), STREET)
-    assert {knob.car for knob in knobs.sliders.values()} == {None, *range(1, len(scene.objects))}
+    scene_sliders = SceneSliders(remove_vehicle(scene, 0), STREET)
+    assert {slider.car for slider in scene_sliders.sliders.values()} == {None, *range(1, len(scene.objects))}
     objects = scene.objects
     nobody = {entry.name: getattr(objects, entry.name)[:0] for entry in fields(objects)}
     empty = SceneSliders(replace(scene, objects=replace(objects, **nobody)), STREET)
-    assert {knob.car for knob in empty.sliders.values()} == {None}
+    assert {slider.car for slider in empty.sliders.values()} == {None}
     assert float(empty.apply({"weather.rain": 0.5}).environment.weather[1]) == 0.5
 
 
@@ -161,9 +163,9 @@ def test_what_is_not_there_cannot_be_moved(still: Path) -> None:
         ({"weather.fog": float("nan")}, "weather.fog: expected 0 to 1, found nan"),
     ],
 )
-def test_values_that_are_none(values: dict[str, float], message: str, knobs: SceneSliders) -> None:
+def test_values_that_are_none(values: dict[str, float], message: str, scene_sliders: SceneSliders) -> None:
     with pytest.raises(RangeError, match=message):
-        knobs.state(values)
+        scene_sliders.state(values)
 
 
 def test_meshes_alone_are_refused(street: Any) -> None:

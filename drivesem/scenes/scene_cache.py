@@ -1,6 +1,4 @@
-"""Scenes that are kept from one command to the next: a photograph is taken apart once, for the same labels,
-settings and code.
-"""
+"""Cache of de-rendered scenes: each photograph is de-rendered once for the same labels, settings and code."""
 
 from __future__ import annotations
 
@@ -24,43 +22,43 @@ from scene_ir.io import load_scene, save_scene
 from scene_ir.types import SceneIR
 
 _GB = 1e9
-_WRITING_S = 3600.0
-"""A scene is written within it: what is older and not whole was left by a process that was killed."""
+_MAX_WRITING_S = 3600.0
+"""Age from which an unfinished scene belongs to a killed process."""
 
 
 @dataclass(frozen=True, slots=True)
-class KeptScenes:
-    """A folder of scenes by what they were made of. limit_gb: beyond it those that nobody asked for longest go."""
+class SceneCache:
+    """A folder of scenes by the digest of their inputs."""
 
     folder: Path
+    """The folder."""
     limit_gb: float
+    """Size limit; the least recently used scenes are removed."""
 
-    def scene(self, made_of: object, make: Callable[[], SceneIR]) -> SceneIR:
-        """What `make` gives, or gave for the same before. A kept scene that cannot be read is made again.
+    def get_or_make(self, inputs: object, make: Callable[[], SceneIR]) -> SceneIR:
+        """Return the cached scene of these inputs, or make it. A damaged scene is made again.
 
-        made_of: dataclasses, tuples, mappings, tensors and plain values; TypeError for anything else.
+        `inputs` are dataclasses, tuples, mappings, tensors and plain values; TypeError for anything else.
         """
-        path = self.folder / digest_of((_code(), made_of))
+        path = self.folder / content_digest((_code_digest(), inputs))
         with contextlib.suppress(SceneError):
             scene = load_scene(path)
             with contextlib.suppress(OSError):
                 os.utime(path)
             return scene
         scene = make()
-        with files.whole_folder(path) as part:
+        with files.atomic_folder(path) as part:
             save_scene(scene, part)
-        self.make_room(path)
+        self.evict(path)
         return scene
 
-    def make_room(self, newest: Path | None = None) -> None:
-        """Remove what is beyond the limit, but for the `newest` scene and what another process is writing. Several
-        processes may do so at once: what is gone already is no error.
-        """
+    def evict(self, newest: Path | None = None) -> None:
+        """Remove scenes beyond the limit, except the `newest` and unfinished ones. Safe with several processes."""
         sizes: list[tuple[float, float, Path]] = []
         for path in self.folder.iterdir() if self.folder.is_dir() else ():
             with contextlib.suppress(OSError):
                 changed = path.stat().st_mtime
-                if path.match(".*.tmp") and time.time() - changed < _WRITING_S:
+                if path.match(".*.tmp") and time.time() - changed < _MAX_WRITING_S:
                     continue
                 size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
                 sizes.append((changed, size, path))
@@ -72,16 +70,16 @@ class KeptScenes:
             total -= size
 
 
-def digest_of(value: object) -> str:
-    """SHA-256 of a value's content, hexadecimal; equal content, equal digest. TypeError for what has none."""
-    known = hashlib.sha256()
-    for part in _parts(value):
-        known.update(len(part).to_bytes(8, "big"))
-        known.update(part)
-    return known.hexdigest()
+def content_digest(value: object) -> str:
+    """Return the hexadecimal SHA-256 of a value's content. Raises TypeError for other objects."""
+    digest = hashlib.sha256()
+    for part in _content_parts(value):
+        digest.update(len(part).to_bytes(8, "big"))
+        digest.update(part)
+    return digest.hexdigest()
 
 
-def _parts(value: object) -> Iterator[bytes]:
+def _content_parts(value: object) -> Iterator[bytes]:
     yield type(value).__name__.encode()
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
@@ -91,15 +89,15 @@ def _parts(value: object) -> Iterator[bytes]:
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield field.name.encode()
-            yield from _parts(getattr(value, field.name))
+            yield from _content_parts(getattr(value, field.name))
     elif isinstance(value, dict):
         for key in sorted(value, key=repr):
-            yield from _parts(key)
-            yield from _parts(value[key])
+            yield from _content_parts(key)
+            yield from _content_parts(value[key])
     elif isinstance(value, list | tuple):
         yield str(len(value)).encode()
         for item in value:
-            yield from _parts(item)
+            yield from _content_parts(item)
     elif value is None or isinstance(value, str | int | float | bool | bytes):
         yield repr(value).encode()
     else:
@@ -107,9 +105,9 @@ def _parts(value: object) -> Iterator[bytes]:
 
 
 @cache
-def _code() -> str:
-    """Of what takes photographs apart, with its networks: other code makes other scenes."""
+def _code_digest() -> str:
+    """Return the digest of the de-rendering code and its networks."""
     root = Path(scene_ir.__file__).parent
-    return digest_of(
-        [files.digest(path) for path in sorted(root.rglob("*")) if path.suffix in (".py", ".safetensors")]
+    return content_digest(
+        [files.sha256_digest(path) for path in sorted(root.rglob("*")) if path.suffix in (".py", ".safetensors")]
     )

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from drivesem.cli import main
-from drivesem.config.commands import Attack
-from drivesem.scenes.kept import KeptScenes, digest_of
-from drivesem.scenes.sources import PhotographSource, _kept_scenes
+from drivesem.config.commands import AttackConfig
+from drivesem.scenes.scene_cache import SceneCache, content_digest
+from drivesem.scenes.sources import DatasetSource, _open_cache
 from drivesem.synth.demo import demo_scene
 from scene_ir import files
 from scene_ir.derender import derender as derendering
@@ -21,7 +21,7 @@ from scene_ir.types import SceneIR
 
 
 @dataclass(frozen=True)
-class Thing:
+class CachedInput:
     name: str
     at: torch.Tensor
 
@@ -42,73 +42,73 @@ class Maker:
 
 
 def test_the_same_content_has_the_same_digest() -> None:
-    thing = Thing("a", torch.tensor([1.0, 2.0]))
-    assert digest_of(thing) == digest_of(replace(thing, at=thing.at.clone()))
+    cached_input = CachedInput("a", torch.tensor([1.0, 2.0]))
+    assert content_digest(cached_input) == content_digest(replace(cached_input, at=cached_input.at.clone()))
     others = [
-        replace(thing, name="b"),
-        replace(thing, at=torch.tensor([1.0, 2.5])),
-        replace(thing, at=torch.tensor([1.0, 2.0], dtype=torch.float64)),
-        replace(thing, at=torch.tensor([[1.0, 2.0]])),
-        (thing,),
-        {"a": thing},
+        replace(cached_input, name="b"),
+        replace(cached_input, at=torch.tensor([1.0, 2.5])),
+        replace(cached_input, at=torch.tensor([1.0, 2.0], dtype=torch.float64)),
+        replace(cached_input, at=torch.tensor([[1.0, 2.0]])),
+        (cached_input,),
+        {"a": cached_input},
     ]
-    assert len({digest_of(one) for one in [thing, *others]}) == 1 + len(others)
-    assert digest_of(["ab", "c"]) != digest_of(["a", "bc"])
-    assert digest_of({"a": 1, "b": 2}) == digest_of({"b": 2, "a": 1})
+    assert len({content_digest(one) for one in [cached_input, *others]}) == 1 + len(others)
+    assert content_digest(["ab", "c"]) != content_digest(["a", "bc"])
+    assert content_digest({"a": 1, "b": 2}) == content_digest({"b": 2, "a": 1})
     with pytest.raises(TypeError, match="plain values"):
-        digest_of(object())
+        content_digest(object())
 
 
 def test_a_scene_is_made_once(scene: SceneIR, tmp_path: Path) -> None:
-    kept, make = KeptScenes(tmp_path / "kept", 1.0), Maker(scene)
-    first, second = kept.scene(("a", 1), make), kept.scene(("a", 1), make)
+    cached, make = SceneCache(tmp_path / "kept", 1.0), Maker(scene)
+    first, second = cached.get_or_make(("a", 1), make), cached.get_or_make(("a", 1), make)
     assert make.calls == 1
     torch.testing.assert_close(second.photograph, first.photograph, rtol=0, atol=0)
     torch.testing.assert_close(second.objects.translation, first.objects.translation, rtol=0, atol=0)
-    kept.scene(("a", 2), make)
+    cached.get_or_make(("a", 2), make)
     assert make.calls == 2
 
 
 def test_a_damaged_scene_is_made_again(scene: SceneIR, tmp_path: Path) -> None:
-    kept, make = KeptScenes(tmp_path, 1.0), Maker(scene)
-    kept.scene("a", make)
+    cached, make = SceneCache(tmp_path, 1.0), Maker(scene)
+    cached.get_or_make("a", make)
     (folder,) = tmp_path.iterdir()
     (folder / "scene.json").write_text("{")
-    kept.scene("a", make)
-    kept.scene("a", make)
+    cached.get_or_make("a", make)
+    cached.get_or_make("a", make)
     assert make.calls == 2
 
 
-def test_what_was_not_asked_for_longest_goes_first(scene: SceneIR, tmp_path: Path) -> None:
+def test_least_recently_used_scenes_are_removed_first(scene: SceneIR, tmp_path: Path) -> None:
     make = Maker(scene)
-    KeptScenes(tmp_path, 1.0).scene("old", make)
+    SceneCache(tmp_path, 1.0).get_or_make("old", make)
     (old,) = tmp_path.iterdir()
     size = sum(file.stat().st_size for file in old.rglob("*") if file.is_file()) / 1e9
-    KeptScenes(tmp_path, 1.0).scene("asked for", make)
+    SceneCache(tmp_path, 1.0).get_or_make("asked for", make)
     for age, path in enumerate(tmp_path.iterdir()):
         os.utime(path, (age, 1000 if path == old else 0))
-    kept = KeptScenes(tmp_path, 2.5 * size)
-    kept.scene("old", make)
-    kept.scene("new", make)
+    cached = SceneCache(tmp_path, 2.5 * size)
+    cached.get_or_make("old", make)
+    cached.get_or_make("new", make)
     assert make.calls == 3
-    kept.scene("old", make)
-    kept.scene("new", make)
+    cached.get_or_make("old", make)
+    cached.get_or_make("new", make)
     assert make.calls == 3, "both are there"
     assert len(list(tmp_path.iterdir())) == 2
-    KeptScenes(tmp_path, 1e-9).scene("newest", make)
+    SceneCache(tmp_path, 1e-9).get_or_make("newest", make)
     assert len(list(tmp_path.iterdir())) == 1, "the newest stays, however large"
 
 
 def test_a_lower_limit_holds_for_a_command_that_adds_nothing(scene: SceneIR, tmp_path: Path) -> None:
     make = Maker(scene)
     for name in ("a", "b"):
-        KeptScenes(tmp_path / "kept", 1.0).scene(name, make)
-    config = Attack(dataset="kitti", root=str(tmp_path), cache=str(tmp_path / "kept"), cache_gb=1.0)
-    _kept_scenes(config)
+        SceneCache(tmp_path / "kept", 1.0).get_or_make(name, make)
+    config = AttackConfig(dataset="kitti", root=str(tmp_path), cache=str(tmp_path / "kept"), cache_gb=1.0)
+    _open_cache(config)
     assert len(list((tmp_path / "kept").iterdir())) == 2
-    _kept_scenes(replace(config, cache_gb=1e-9))
+    _open_cache(replace(config, cache_gb=1e-9))
     assert not list((tmp_path / "kept").iterdir())
-    assert _kept_scenes(replace(config, cache=str(tmp_path / "none"))) is not None
+    assert _open_cache(replace(config, cache=str(tmp_path / "none"))) is not None
 
 
 def test_photographs_are_taken_apart_once(scene: SceneIR, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,16 +120,16 @@ def test_photographs_are_taken_apart_once(scene: SceneIR, tmp_path: Path, monkey
     files.write_text(folder / "calib/000000.txt", "P2: 90 0 100 0 0 90 30 0 0 0 1 0\n")
     make = Maker(scene)
     monkeypatch.setattr(derendering, "derender", lambda *_: make())
-    config = Attack(dataset="kitti", root=str(tmp_path / "D"), cache=str(tmp_path / "kept"))
-    PhotographSource(config).scene("000000")
-    PhotographSource(config).scene("000000")
+    config = AttackConfig(dataset="kitti", root=str(tmp_path / "D"), cache=str(tmp_path / "kept"))
+    DatasetSource(config).scene("000000")
+    DatasetSource(config).scene("000000")
     assert make.calls == 1
-    PhotographSource(replace(config, fit=False)).scene("000000")
+    DatasetSource(replace(config, fit=False)).scene("000000")
     assert make.calls == 2
     files.write_text(folder / "label_2/000000.txt", "DontCare -1 -1 -10 5 5 9 9 -1 -1 -1 -1000 -1000 -1000 -10\n")
-    PhotographSource(config).scene("000000")
+    DatasetSource(config).scene("000000")
     assert make.calls == 3
-    PhotographSource(replace(config, cache=None)).scene("000000")
+    DatasetSource(replace(config, cache=None)).scene("000000")
     assert make.calls == 4
 
 
@@ -152,5 +152,5 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
     for path in (writing, left, scene):
         files.write_text(path / "scene.json", "{}")
     os.utime(left, (0, 0))
-    KeptScenes(tmp_path, 1e-9).make_room()
+    SceneCache(tmp_path, 1e-9).evict()
     assert list(tmp_path.iterdir()) == [writing]

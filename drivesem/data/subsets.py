@@ -1,0 +1,192 @@
+"""Parts and combinations of data sets: splits, several folders as one data set, and clips of consecutive frames."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivesem.data import kitti_tracking
+from drivesem.data.kitti import KittiDataset
+from drivesem.data.layouts import detect_layout
+from drivesem.data.registry import DATASETS, Dataset, open_dataset
+from drivesem.data.vkitti import VirtualKittiDataset
+from drivesem.store import local_copy
+from scene_ir import files
+from scene_ir.errors import FormatError
+from scene_ir.types import Frame, Labels
+
+PUBLISHED_SPLITS = ("3d-sdn", "3d-sdn-train")
+"""Published splits by name: the frames to test on, and those to train on."""
+_TEST_FRAMES = {1: range(356, 447), 2: range(185, 233), 6: range(69), 18: range(270, 339), 20: range(167)}
+"""Frames of each world that 3D-SDN tests on, in all ten variations; it trains on all others (Yao et al. 2018,
+`get_lists` of their code): 4,440 and 16,820 of 21,260 images."""
+_RANDOM_SPLIT = re.compile(r"random:(0?\.\d+)(:rest)?")
+_SPLIT_SEED = 20261125
+"""Seed of the random order, the same for both parts."""
+_MANIFEST = "manifest.json"
+_CLIP_FOLDERS = (
+    "Virtual KITTI, a KITTI tracking folder, or the output of drivesem synth --sequence (layout kitti or vkitti2)"
+)
+
+
+class DatasetSubset:
+    """Some frames of a data set, in its order."""
+
+    def __init__(self, dataset: Dataset, identifiers: Sequence[str]) -> None:
+        self._dataset, self._identifiers = dataset, tuple(identifiers)
+
+    @property
+    def identifiers(self) -> tuple[str, ...]:
+        """Identifiers of the selected frames."""
+        return self._identifiers
+
+    def labels(self, identifier: str) -> Labels | None:
+        """Read the labels of one frame; None where the data set has none."""
+        return self._dataset.labels(identifier)
+
+    def frame(self, identifier: str) -> Frame:
+        """Read one frame. Raises FormatError naming a damaged file."""
+        return self._dataset.frame(identifier)
+
+
+def select_split(dataset: Dataset, split: str) -> Dataset:
+    """Select the frames of a split.
+
+    `split` is one of PUBLISHED_SPLITS (Virtual KITTI only), `random:0.75` (a fixed random share),
+    `random:0.75:rest` (all others), or a text file with one name a line, with or without a suffix such as .png.
+    Raises FormatError for a data set without that split, a name without a frame, and an empty selection.
+    """
+    identifiers, share = dataset.identifiers, _RANDOM_SPLIT.fullmatch(split)
+    if split in PUBLISHED_SPLITS:
+        selected = {name for name in identifiers if _is_test_frame(name) == (split == PUBLISHED_SPLITS[0])}
+    elif share is not None:
+        order = np.random.default_rng(_SPLIT_SEED).permutation(len(identifiers))
+        count = round(float(share[1]) * len(identifiers))
+        selected = {identifiers[i] for i in (order[count:] if share[2] else order[:count])}
+    else:
+        selected = _read_names(Path(split), identifiers)
+    if not selected:
+        raise FormatError(f"--split {split}", "at least one frame of the data set", f"none of {len(identifiers)}")
+    return DatasetSubset(dataset, [name for name in identifiers if name in selected])
+
+
+def _is_test_frame(name: str) -> bool:
+    """Whether 3D-SDN tests on a frame, `0001/clone/00003` or `Scene01/clone/Camera_0/00003`."""
+    world, number = name.split("/")[0].removeprefix("Scene"), name.split("/")[-1]
+    if "/" not in name or not (world.isdecimal() and number.isdecimal()) or int(world) not in _TEST_FRAMES:
+        worlds = ", ".join(map(str, _TEST_FRAMES))
+        raise FormatError("--split", f"frames of Virtual KITTI's worlds {worlds} (vkitti1, vkitti2)", repr(name))
+    return int(number) in _TEST_FRAMES[int(world)]
+
+
+def _read_names(path: Path, identifiers: Sequence[str]) -> set[str]:
+    known = set(identifiers)
+    names: set[str] = set()
+    for number, line in enumerate(files.read_text(path).splitlines(), start=1):
+        name = line.strip()
+        if name and name not in known:
+            name = str(Path(name).with_suffix("")) if Path(name).name else name  # "." and "/" have none
+            if name not in known:
+                expected = f"a frame such as {identifiers[0]}" if identifiers else "nothing"
+                raise FormatError(f"{path}:{number}", expected, repr(line))
+        names |= {name} - {""}
+    return names
+
+
+class JoinedDataset:
+    """The frames of several data sets, one after the other. Identifiers: "NUMBER/IDENTIFIER", numbers from 0."""
+
+    def __init__(self, datasets: Sequence[Dataset]) -> None:
+        self._datasets = tuple(datasets)
+
+    @property
+    def identifiers(self) -> tuple[str, ...]:
+        """Identifiers of the frames, in the order of the data sets, each sorted."""
+        return tuple(f"{i}/{name}" for i, dataset in enumerate(self._datasets) for name in dataset.identifiers)
+
+    def labels(self, identifier: str) -> Labels | None:
+        """Read the labels of one frame; None where its data set has none."""
+        dataset, name = self._locate(identifier)
+        return dataset.labels(name)
+
+    def frame(self, identifier: str) -> Frame:
+        """Read one frame. Raises FormatError naming a damaged file."""
+        dataset, name = self._locate(identifier)
+        return dataset.frame(name)
+
+    def _locate(self, identifier: str) -> tuple[Dataset, str]:
+        number, _, name = identifier.partition("/")
+        return self._datasets[int(number)], name
+
+
+def open_folders(name: str, roots: str) -> Dataset:
+    """Open the data set `name` in one folder, or in several separated by commas. Raises as `open_dataset`."""
+    folders = [Path(part) for part in roots.split(",") if part]
+    if len(folders) < 2:
+        return open_dataset(name, roots)
+    return JoinedDataset([open_dataset(name, folder) for folder in folders])
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """Consecutive frames of one drive."""
+
+    name: str
+    """Name, unique in its folder."""
+    dataset: Dataset
+    """Data set that reads the frames."""
+    frames: tuple[str, ...]
+    """Identifiers in the data set, in temporal order."""
+    tracks: Callable[[str], tuple[int, ...]]
+    """Maps a frame's identifier to the track of each of its labels, in their order."""
+
+
+def find_clips(root: Path | str) -> dict[str, Clip]:
+    """Find the clips of a folder or URL, by name, in order. Raises FormatError for a folder without clips."""
+    folder = local_copy(root)
+    if not folder.is_dir():
+        raise FormatError(str(root), f"a folder of clips: {_CLIP_FOLDERS}", "no such folder")
+    if kitti_tracking.find_tracking_folder(folder) is not None:
+        names = kitti_tracking.list_sequences(folder)
+        sequences = {name: kitti_tracking.KittiTrackingDataset(folder, name) for name in names}
+        return {name: Clip(name, reader, reader.identifiers, reader.tracks) for name, reader in sequences.items()}
+    layout = detect_layout(folder)
+    if layout in ("vkitti1", "vkitti2"):
+        dataset = DATASETS[layout](folder)
+        assert isinstance(dataset, VirtualKittiDataset)
+        return {name: Clip(name, dataset, frames, dataset.tracks) for name, frames in dataset.clips().items()}
+    if layout == "kitti" and (folder / _MANIFEST).is_file():
+        return _find_generated_clips(folder)
+    raise FormatError(str(root), _CLIP_FOLDERS, f"{layout or 'none of them'}, without tracks")
+
+
+def _find_generated_clips(folder: Path) -> dict[str, Clip]:
+    """Find the clips that the generator wrote in KITTI's layout; its manifest has the tracks."""
+    path = folder / _MANIFEST
+    manifest = files.read_json(path)
+    try:
+        length, entries = int(manifest["sequence"]), list(manifest["frames"])
+        tracks = {
+            f"{int(entry['number']):06d}": tuple(int(o["track"]) for o in entry["objects"] if o["labelled"])
+            for entry in entries
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(str(path), "a manifest of drivesem synth", f"{type(error).__name__} {error}") from error
+    if length < 2:
+        raise FormatError(f"{path}: sequence", "at least 2 frames of one drive (synth --sequence)", length)
+    dataset, names = KittiDataset(folder), list(tracks)
+    drives = {f"{i // length:02d}": tuple(names[i : i + length]) for i in range(0, len(names), length)}
+    return {name: Clip(name, dataset, frames, tracks.__getitem__) for name, frames in drives.items()}
+
+
+def select_clip(clips: Mapping[str, Clip], name: str | None) -> Clip:
+    """Return the clip of a name, by default the first. Raises FormatError for an unknown name."""
+    if name is None:
+        return next(iter(clips.values()))
+    if name not in clips:
+        raise FormatError("--sequence", f"one of {', '.join(clips)}", name)
+    return clips[name]
