@@ -96,26 +96,19 @@ class Objective:
         with torch.no_grad():
             base_render = compositor.render(space.apply(space.scene, space.theta0).origin)
         base = space.scene.origin
-        self._labeller = Labeller(base, base_render, self.difficulty)
+        self.labeller = Labeller(base, base_render, self.difficulty)
+        """Labels states of the scene."""
         self.keep_mb = config.keep_mb
-        self._whole = True  # the reference comes first
+        self.whole = True  # the reference comes first
+        """Whether the detector always evaluates whole pictures."""
         self._reference: ReferencePass | None = None
-        self._benign = self.evaluate_render(base, base_render)
-        self._whole = config.whole
+        self.benign = self.evaluate_render(base, base_render)
+        """The scene at theta = 0, re-rendered; the one before, where vehicles were exchanged, added or removed."""
+        self.whole = config.whole
         self.passes = 1
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
         self._previews: dict[bytes, Score] = {}
-
-    @property
-    def labeller(self) -> Labeller:
-        """Labels states of the scene."""
-        return self._labeller
-
-    @property
-    def benign(self) -> RenderEvaluation:
-        """The scene at theta = 0, re-rendered; the one before, where vehicles were exchanged, added or removed."""
-        return self._benign
 
     @classmethod
     def from_config(
@@ -152,7 +145,7 @@ class Objective:
     def evaluate(self, theta: Tensor) -> RenderEvaluation:
         """Render, detect and label at theta (D,), without gradients."""
         if self.space.scene.before is None and torch.equal(theta, self.space.theta0):
-            return self._benign
+            return self.benign
         for recent_theta, evaluation in self._recent:
             if torch.equal(theta, recent_theta):
                 return evaluation
@@ -169,8 +162,8 @@ class Objective:
 
     def _failures(self, labels: SceneLabels, detections: Detections) -> failures.FrameFailures:
         all_failures = failures.find_failures(
-            self.classes.map_targets(self._benign.paper.targets),
-            self._benign.detections,
+            self.classes.map_targets(self.benign.paper.targets),
+            self.benign.detections,
             self.classes.map_targets(labels.targets),
             detections,
             self.t_star,
@@ -203,7 +196,7 @@ class Objective:
             lost=len(failed.lost),
             phantoms=len(failed.phantoms),
             success=failed.success and not hidden,
-            success_paper=self._failures(self._labeller.paper(), detections).success and not hidden,
+            success_paper=self._failures(self.labeller.paper(), detections).success and not hidden,
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
 
@@ -211,10 +204,10 @@ class Objective:
         """The feasible set of the scene; weather keeps objects visible as far as `difficulty` requires."""
         find_invisible, min_contrast = None, self.difficulty.min_contrast
         if min_contrast > 0 and Parameter.WEATHER in self.space.params:
-            visible = ~self._labeller.paper().ignore.cpu().numpy()
+            visible = ~self.labeller.paper().ignore.cpu().numpy()
             environment = self.space.scene.environment
             air = self.compositor.air
-            find_invisible = VisibilityUnderWeather(self._benign.render, environment, air, visible, min_contrast)
+            find_invisible = VisibilityUnderWeather(self.benign.render, environment, air, visible, min_contrast)
         return FeasibleSet(self.space, limits, only_bounds, find_invisible)
 
     def problem(
@@ -250,16 +243,15 @@ class Objective:
         """Raw predictions for a render of the scene, with a gradient wherever vehicles are drawn. Raises
         RangeError for a detector without one.
         """
-        image = render.image[None]
-        reference = None if render.vehicle_regions is None else self._reference_layers()
-        if reference is None or render.vehicle_regions is None:
-            return self.differentiable(image)
-        return reference(image, [Rect(y0, y1, x0, x1) for x0, y0, x1, y1 in render.vehicle_regions.tolist()])
+        predictions = self._predict_regions(render)
+        return self.differentiable(render.image[None]) if predictions is None else predictions
 
-    @property
-    def whole(self) -> bool:
-        """Whether the detector always evaluates whole pictures."""
-        return self._whole
+    def _predict_regions(self, render: Render) -> AnchorPredictions | None:
+        """Predictions from the regions that differ from the benign picture; None where pictures are evaluated whole."""
+        if render.vehicle_regions is None or (reference := self._reference_layers()) is None:
+            return None
+        regions = [Rect(y0, y1, x0, x1) for x0, y0, x1, y1 in render.vehicle_regions.tolist()]
+        return reference(render.image[None], regions)
 
     @property
     def layer_limit_mb(self) -> float:
@@ -277,11 +269,11 @@ class Objective:
 
     def _reference_layers(self) -> ReferencePass | None:
         """The benign picture's layers; None where pictures are evaluated whole."""
-        if self._reference is None and not self._whole:
+        if self._reference is None and not self.whole:
             self._reference = ReferencePass.run(
-                self.differentiable, self._benign.render.image[None], self.layer_limit_mb
+                self.differentiable, self.benign.render.image[None], self.layer_limit_mb
             )
-            self._whole = self._reference is None
+            self.whole = self._reference is None
         return self._reference
 
     @property
@@ -304,7 +296,7 @@ class Objective:
             scene: the state that the image shows.
             render: its render.
         """
-        labels = self._labeller.labels(self.label_mode, scene, render)
+        labels = self.labeller.labels(self.label_mode, scene, render)
         return self._loss(self.differentiable, raw, labels.targets)
 
     @torch.no_grad()
@@ -312,7 +304,7 @@ class Objective:
         """Detect and label a rendered state of the scene."""
         # Evaluate what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=round_to_8bit(render.image))
-        paper, moved = self._labeller.paper(), self._labeller.moved(scene, render)
+        paper, moved = self.labeller.paper(), self.labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):
             raw = self.predict(render)
@@ -392,10 +384,11 @@ def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -
     predictions: dict[int, AnchorPredictions] = {}
     whole_images: dict[torch.Size, list[int]] = {}
     for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
-        if render.vehicle_regions is not None and objective._reference_layers() is not None:
-            predictions[i] = objective.predict(render)
-        else:
+        region_predictions = objective._predict_regions(render)
+        if region_predictions is None:
             whole_images.setdefault(render.image.shape, []).append(i)
+        else:
+            predictions[i] = region_predictions
     for rows in whole_images.values():
         images = [renders[i].image for i in rows]
         raw = objectives[rows[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))

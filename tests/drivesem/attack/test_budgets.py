@@ -1,4 +1,4 @@
-"""Budgets as people write them, and the bounds that come of them."""
+"""Budgets as text, and the bounds of theta that follow."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_bad_file_is_one_line(tmp_path: Path, text: str, message: str):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_budget_is_named(tmp_path: Path):
+def test_invalid_budgets_are_named(tmp_path: Path):
     with pytest.raises(UsageError, match="--budget: expected paper, parking, street, a YAML file, or NAME=VALUE"):
         parse_budget("generous")
     with pytest.raises(FormatError, match=r"nowhere\.yaml: expected a readable file"):
@@ -102,8 +102,8 @@ def test_sizes_and_the_sun_change_in_street_alone():
     shares=st.dictionaries(st.sampled_from(list(Parameter)), st.floats(1e-6, 1)),
     metres=st.none() | st.floats(1e-6, 0.5),
 )
-def test_what_is_written_reads_back(preset: str, shares: dict[Parameter, float], metres: float | None) -> None:
-    """Of every preset, narrowed in all ways that a text can say. shares: of what the preset allows."""
+def test_a_formatted_budget_parses_back(preset: str, shares: dict[Parameter, float], metres: float | None) -> None:
+    """Every preset, narrowed in all possible ways; `shares` are shares of its limits."""
     widest = PRESETS[preset]
     limits = {p.value: repr(share * getattr(widest, p.value)) for p, share in shares.items()}
     if metres is not None:
@@ -122,10 +122,14 @@ def test_own_lengths_and_parkings_metres_are_written() -> None:
     assert format_budget(parse_budget("parking,rotate=2deg")).startswith("rotate=0.0349")
 
 
+def _cars_of_different_lengths(street):
+    scene, length_m = street(), torch.tensor([4.0, 12.0, 1.6, 5.0])
+    size_lhw = torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1)
+    return scene.with_objects(size_lhw=size_lhw), length_m
+
+
 def test_metres_are_the_same_for_long_and_short_cars(street):
-    scene = street()
-    length_m = torch.tensor([4.0, 12.0, 1.6, 5.0])
-    scene = scene.with_objects(size_lhw=torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1))
+    scene, length_m = _cars_of_different_lengths(street)
     space = ParameterSpace(scene, ("translate", "rotate"), parse_budget("parking"))
     reach_m = (space.upper[:8].reshape(4, 2) * length_m[:, None]).tolist()
     # A quarter of the third car's own length is less than half a metre.
@@ -139,9 +143,7 @@ def test_metres_are_the_same_for_long_and_short_cars(street):
 
 
 def test_a_street_is_longer_along_than_across(street):
-    scene = street()
-    length_m = torch.tensor([4.0, 12.0, 1.6, 5.0])
-    scene = scene.with_objects(size_lhw=torch.cat([length_m[:, None], scene.objects.size_lhw[:, 1:]], dim=1))
+    scene, length_m = _cars_of_different_lengths(street)
     budget = parse_budget("street")
     space = ParameterSpace(scene, tuple(Parameter), budget)
     where = space.blocks.get(Parameter.TRANSLATE)

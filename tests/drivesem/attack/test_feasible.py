@@ -29,11 +29,28 @@ from drivesem.attack.space import COMBOS, Budget, ParameterSpace, ground_axes
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 
+AHEAD = -math.pi / 2
+"""Yaw of a car that points away from the camera."""
 CROWDED = ((-2.2, 8.0), (-2.2, 12.9), (0.2, 8.3), (2.4, 10.0), (2.4, 15.2), (0.1, 14.0))
 
 
 def _names(lines) -> set[str]:
     return {line.split(": ")[1] for line in lines}
+
+
+def _feasible(scene, *params, **settings_) -> FeasibleSet:
+    return FeasibleSet(ParameterSpace(scene, params), **settings_)
+
+
+def _random_theta(space, seed, scale):
+    return torch.randn(space.dim, generator=torch.Generator().manual_seed(seed)) * scale
+
+
+def _pair_and_hidden(street):
+    """Two cars, and the same with the second behind the first, which is taller than the camera stands."""
+    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=AHEAD)
+    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
+    return pair, pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13, 0, 0]]))
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -42,8 +59,9 @@ def test_projection_is_inside_idempotent_and_confirmed_by_the_check(street, seed
     scene = street(positions_xz=CROWDED, road_edge_x_m=4.0)
     space = ParameterSpace(scene, COMBOS[number])
     feasible = FeasibleSet(space)
-    theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(seed)) * 10 * scale * space.step
+    theta = _random_theta(space, seed, 10 * scale * space.step)
     once = feasible.project(theta)
+    assert torch.equal(FeasibleSet(space).project(theta).theta, once.theta)
     assert feasible.violations(once.theta) == ()
     assert bool((once.theta >= space.lower).all())
     assert bool((once.theta <= space.upper).all())
@@ -51,13 +69,6 @@ def test_projection_is_inside_idempotent_and_confirmed_by_the_check(street, seed
     assert torch.equal(twice.theta, once.theta)
     assert twice.active == ()
     assert check_scene(scene, space.apply(scene, once.theta)) == []
-
-
-def test_projection_is_deterministic(street):
-    scene = street(positions_xz=CROWDED)
-    space = ParameterSpace(scene, COMBOS[2])
-    theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(1)) * 10 * space.step
-    assert torch.equal(FeasibleSet(space).project(theta).theta, FeasibleSet(space).project(theta).theta)
 
 
 def test_theta0_is_feasible_even_where_labels_overlap_and_meshes_are_strained(street):
@@ -81,11 +92,11 @@ def test_violations_at_the_start_stay_and_are_named(street):
         return set(feasible.violated_at_start)
 
     assert named() == set()
-    overlapping = {"positions_xz": ((0.0, 10.0), (1.0, 13.0), (6.0, 20.0)), "yaw": -math.pi / 2}
+    overlapping = {"positions_xz": ((0.0, 10.0), (1.0, 13.0), (6.0, 20.0)), "yaw": AHEAD}
     assert {"objects[0]: collision", "objects[1]: collision"} <= named(**overlapping)
     assert not any(name.startswith("objects[2]") for name in named(**overlapping))
     # Footprints 2 cm apart: less than the clearance.
-    assert named(positions_xz=((0.0, 10.0), (0.0, 14.22)), yaw=-math.pi / 2) >= {"objects[0]: collision"}
+    assert named(positions_xz=((0.0, 10.0), (0.0, 14.22)), yaw=AHEAD) >= {"objects[0]: collision"}
     assert named(positions_xz=((0.0, 10.0), (6.0, 14.0)), road_edge_x_m=2.0) == {"objects[1]: road"}
     assert "objects[0]: frame" in named(positions_xz=((9.5, 9.0),), yaw=0.0)
     assert "objects[1]: visibility" in named(positions_xz=((0.0, 10.0), (0.5, 11.5)))
@@ -100,28 +111,21 @@ def test_a_mesh_that_is_strained_at_the_start_is_named(street):
 
 
 def test_a_feasible_theta_is_returned_to_the_bit(street):
-    scene = street()
-    space = ParameterSpace(scene, ("translate", "rotate"))
-    theta = 3 * space.step
-    assert torch.equal(FeasibleSet(space).project(theta).theta, theta)
+    feasible = _feasible(street(), "translate", "rotate")
+    theta = 3 * feasible.space.step
+    assert torch.equal(feasible.project(theta).theta, theta)
 
 
 def test_bounds_are_named(street):
-    scene = street()
-    space = ParameterSpace(scene, ("rotate",))
-    theta = space.theta0.clone()
-    theta[2] = 1.0
-    result = FeasibleSet(space).project(theta)
+    feasible, theta = _feasible(street(), "rotate"), torch.tensor([0.0, 0.0, 1.0, 0.0])
+    result = feasible.project(theta)
     assert float(result.theta[2]) == pytest.approx(0.35)
-    assert result.active == ("objects[2].yaw: bounds",)
-    assert FeasibleSet(space).violations(theta) == ("objects[2].yaw: bounds",)
+    assert result.active == feasible.violations(theta) == ("objects[2].yaw: bounds",)
 
 
 def test_strain_and_the_lowest_layer(street):
-    scene = street()
-    space = ParameterSpace(scene, ("mesh",))
-    theta = torch.randn(space.dim, generator=torch.Generator().manual_seed(4)) * 0.15
-    result = FeasibleSet(space).project(theta)
+    feasible = _feasible(street(), "mesh")
+    result = feasible.project(_random_theta(feasible.space, 4, 0.15))
     offsets = ffd.from_symmetric(result.theta.reshape(4, 96)).double()
     assert float(offsets.reshape(4, 4, 4, 4, 3)[:, :, -1, :, 1].abs().max()) == 0
     axis = torch.linspace(0, 1, 9, dtype=torch.float64)
@@ -136,7 +140,7 @@ def test_strain_and_the_lowest_layer(street):
 
 
 def test_cars_that_would_collide_stop_short_of_each_other(street):
-    scene = street(positions_xz=((0.0, 10.0), (0.0, 15.0), (6.0, 14.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((0.0, 10.0), (0.0, 15.0), (6.0, 14.0)), yaw=AHEAD)
     space = ParameterSpace(scene, ("translate",))
     theta = space.theta0.clone()
     theta[0], theta[2], theta[4] = 0.25, -0.25, 0.2  # 1.05 m each, with 0.8 m between them; the third is free
@@ -152,9 +156,8 @@ def test_cars_that_would_collide_stop_short_of_each_other(street):
 
 
 def test_a_kerb_stops_the_car_across_but_not_along(street):
-    scene = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
-    space = ParameterSpace(scene, ("translate",))
-    result = FeasibleSet(space).project(torch.tensor([0.2, 0.25]))
+    scene = street(positions_xz=((0.0, 10.0),), yaw=AHEAD, road_edge_x_m=0.9)
+    result = _feasible(scene, "translate").project(torch.tensor([0.2, 0.25]))
     assert result.active == ("objects[0]: road",)
     assert float(result.theta[0]) == pytest.approx(0.2)
     assert 0 < float(result.theta[1]) < 0.12
@@ -162,35 +165,32 @@ def test_a_kerb_stops_the_car_across_but_not_along(street):
 
 def test_a_car_off_the_road_may_move_anywhere(street):
     scene = street(positions_xz=((8.0, 14.0),), road_edge_x_m=3.0)
-    space = ParameterSpace(scene, ("translate",))
-    assert FeasibleSet(space).project(torch.tensor([0.25, 0.25])).active == ()
+    assert _feasible(scene, "translate").project(torch.tensor([0.25, 0.25])).active == ()
 
 
 def test_a_car_stays_in_the_picture(street):
     scene = street(positions_xz=((6.9, 9.0),), yaw=0.0)
-    space = ParameterSpace(scene, ("translate",))
-    theta = torch.tensor([0.25, 0.0])
-    assert _names(FeasibleSet(space).violations(theta)) == {"frame"}
-    assert check_scene(scene, space.apply(scene, theta)) != []
-    result = FeasibleSet(space).project(theta)
+    feasible, theta = _feasible(scene, "translate"), torch.tensor([0.25, 0.0])
+    assert _names(feasible.violations(theta)) == {"frame"}
+    assert check_scene(scene, feasible.space.apply(scene, theta)) != []
+    result = feasible.project(theta)
     assert 0 < float(result.theta[0]) < 0.25
-    assert FeasibleSet(space).violations(result.theta) == ()
+    assert feasible.violations(result.theta) == ()
 
 
 def test_a_car_is_not_hidden_by_another(street):
     # The far car looks out on one side of the near one and would go behind it.
-    scene = street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=-math.pi / 2)
-    space = ParameterSpace(scene, ("translate",))
+    feasible = _feasible(street(positions_xz=((0.0, 7.0), (3.0, 13.0)), yaw=AHEAD), "translate")
     theta = torch.tensor([0.0, -0.2, 0.0, 0.25])  # across is towards -x: both move to one another in the picture
-    assert "visibility" in _names(FeasibleSet(space).violations(theta))
-    result = FeasibleSet(space).project(theta)
-    assert FeasibleSet(space).violations(result.theta) == ()
+    assert "visibility" in _names(feasible.violations(theta))
+    result = feasible.project(theta)
+    assert feasible.violations(result.theta) == ()
     assert "visibility" in _names(result.active)
     assert float(result.theta.abs().max()) > 0.02
 
 
 def test_a_growing_mesh_does_not_reach_into_a_neighbour(street):
-    scene = street(positions_xz=((0.0, 10.0), (1.9, 10.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((0.0, 10.0), (1.9, 10.0)), yaw=AHEAD)
     space = ParameterSpace(scene, ("mesh",))
     wide = torch.zeros(2, 4, 4, 2, 3)
     wide[..., 2] = -0.09  # the half at z < 0 goes outwards, and the other with it
@@ -202,9 +202,7 @@ def test_a_growing_mesh_does_not_reach_into_a_neighbour(street):
 
 
 def test_invalid_thetas_are_named(street):
-    scene = street()
-    space = ParameterSpace(scene, ("rotate",))
-    feasible = FeasibleSet(space)
+    feasible = _feasible(street(), "rotate")
     with pytest.raises(ShapeError, match="theta"):
         feasible.project(torch.zeros(3))
     with pytest.raises(RangeError, match=r"objects\[1\]\.yaw: expected a finite value"):
@@ -213,19 +211,19 @@ def test_invalid_thetas_are_named(street):
 
 def test_a_scene_without_cars_is_projected_onto_its_bounds(street):
     scene = street(positions_xz=())
-    space = ParameterSpace(scene, ("weather", "translate"))
-    result = FeasibleSet(space).project(torch.tensor([2.0, -1.0, 0.5, 0.0]))
+    feasible = _feasible(scene, "weather", "translate")
+    result = feasible.project(torch.tensor([2.0, -1.0, 0.5, 0.0]))
     assert result.theta.tolist() == [1.0, 0.0, 0.5, 0.0]
-    assert check_scene(scene, space.apply(scene, result.theta)) == []
+    assert check_scene(scene, feasible.space.apply(scene, result.theta)) == []
 
 
 def test_limits_are_settings(street):
-    scene = street()
-    space = ParameterSpace(scene, ("mesh",))
-    theta = 0.1 * torch.randn(space.dim, generator=torch.Generator().manual_seed(4))
-    loose = FeasibleSet(space, FeasibilityLimits(strain=(0.5, 2.0))).project(theta)
-    tight = FeasibleSet(space, FeasibilityLimits(strain=(0.95, 1.05))).project(theta)
-    assert float(tight.theta.norm()) < 0.5 * float(loose.theta.norm())
+    loose, tight = (
+        _feasible(street(), "mesh", limits=FeasibilityLimits(strain=strain))
+        for strain in ((0.5, 2.0), (0.95, 1.05))
+    )
+    sizes = [float(each.project(_random_theta(each.space, 4, 0.1)).theta.norm()) for each in (loose, tight)]
+    assert sizes[1] < 0.5 * sizes[0]
 
 
 # The independent check.
@@ -253,7 +251,7 @@ def test_the_check_shares_no_code():
         (lambda o: {"yaw": o.yaw + 0.5}, "turned by 0.500 rad"),
         (lambda o: {"size_lhw": o.size_lhw * 1.1}, "size changed by 10.0 %"),
         (lambda o: {"texture_code": o.texture_code + 2}, "objects.texture_code: outside"),
-        (lambda o: {"ffd": o.ffd + 0.3 * torch.randn(o.ffd.shape, generator=_generator())}, "strain in"),
+        (lambda o: {"ffd": o.ffd + 0.3 * torch.randn(o.ffd.shape, generator=torch.Generator())}, "strain in"),
         (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.05, 0.0])}, "lowest lattice layer"),
         (lambda o: {"ffd": -2 * _stretch(o)}, "mesh inverted"),
         (lambda o: {"ffd": o.ffd + torch.tensor([0.0, 0.0, 0.05])}, "mesh not symmetric"),
@@ -266,10 +264,6 @@ def test_the_check_finds_what_is_wrong(street, change, message):
     assert any(message in line for line in found), found
 
 
-def _generator():
-    return torch.Generator().manual_seed(0)
-
-
 def _stretch(objects):
     """Offsets that double the length."""
     along = torch.linspace(-0.5, 0.5, 4).reshape(4, 1, 1).expand(4, 4, 4).reshape(64)
@@ -279,16 +273,13 @@ def _stretch(objects):
 
 
 def test_the_check_finds_collisions_roads_and_hiding(street):
-    scene = street(positions_xz=((0.0, 10.0), (0.0, 15.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((0.0, 10.0), (0.0, 15.0)), yaw=AHEAD)
     near = scene.with_objects(translation=scene.objects.translation - torch.tensor([[0.0, 0, 0], [0, 0, 1.0]]))
     assert any("collision with objects[0]" in line for line in check_scene(scene, near))
-    narrow = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
+    narrow = street(positions_xz=((0.0, 10.0),), yaw=AHEAD, road_edge_x_m=0.9)
     left = narrow.with_objects(translation=narrow.objects.translation + torch.tensor([0.9, 0.0, 0.0]))
     assert any("left the road" in line for line in check_scene(narrow, left))
-    # The near one is taller than the camera stands, so that it can hide the far one.
-    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
-    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
-    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
+    pair, hidden = _pair_and_hidden(street)
     assert any("objects[1]: hidden" in line for line in check_scene(pair, hidden))
 
 
@@ -325,7 +316,7 @@ def test_the_check_bounds_the_sun_by_the_budget(street):
 
 def test_a_car_grows_until_it_meets_another(street):
     # They stand 0.3 m apart, side by side, each 1.75 m wide.
-    scene = street(positions_xz=((-1.025, 12.0), (1.025, 12.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((-1.025, 12.0), (1.025, 12.0)), yaw=AHEAD)
     budget = Budget(size=0.4)
     feasible = FeasibleSet(ParameterSpace(scene, ("size",), budget))
     once = feasible.project(torch.tensor([0.35, 0.35]))
@@ -347,7 +338,7 @@ def _moved(scene, along=0.0, across=0.0):
 
 
 def test_the_check_follows_the_budget(street):
-    scene = street(positions_xz=((0.0, 14.0), (3.0, 30.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((0.0, 14.0), (3.0, 30.0)), yaw=AHEAD)
     for along in (3.0, -3.0):
         far = _moved(scene, along)
         (line,) = check_scene(scene, far)
@@ -360,14 +351,14 @@ def test_the_check_follows_the_budget(street):
     assert check_scene(scene, _moved(scene, across=0.99), limits=STREET) == []
     assert "moved by 4.100" in check_scene(scene, _moved(scene, 4.1), limits=STREET)[0]
     # Of its distance from the camera, a car goes no more than a share.
-    near = street(positions_xz=((0.0, 10.0), (3.0, 30.0)), yaw=-math.pi / 2)
+    near = street(positions_xz=((0.0, 10.0), (3.0, 30.0)), yaw=AHEAD)
     assert check_scene(near, _moved(near, 3.0), limits=STREET) == []
     assert "moved by 3.100" in check_scene(near, _moved(near, 3.1), limits=STREET)[0]
 
 
 @pytest.mark.parametrize("partly", [{"occlusion": torch.tensor([1, 0])}, {"truncation": torch.tensor([0.2, 0])}])
 def test_the_check_limits_partly_visible_cars_to_the_papers_bounds(street, partly):
-    scene = street(positions_xz=((0.0, 14.0), (3.0, 30.0)), yaw=-math.pi / 2).with_objects(**partly)
+    scene = street(positions_xz=((0.0, 14.0), (3.0, 30.0)), yaw=AHEAD).with_objects(**partly)
     (line,) = check_scene(scene, _moved(scene, 2.0), limits=STREET)
     assert line.startswith("objects[0]: moved by")
     assert check_scene(scene, _moved(scene, 1.0), limits=STREET) == []
@@ -375,15 +366,15 @@ def test_the_check_limits_partly_visible_cars_to_the_papers_bounds(street, partl
 
 @pytest.mark.parametrize("limits", [PAPER_LIMITS, STREET])
 def test_no_budget_lets_a_car_into_another_or_off_the_road(street, limits):
-    row = street(positions_xz=((0.0, 10.0), (0.0, 15.0)), yaw=-math.pi / 2)
+    row = street(positions_xz=((0.0, 10.0), (0.0, 15.0)), yaw=AHEAD)
     assert any("collision with objects[0]" in line for line in check_scene(row, _moved(row, 3.0), limits=limits))
-    narrow = street(positions_xz=((0.0, 10.0),), yaw=-math.pi / 2, road_edge_x_m=0.9)
+    narrow = street(positions_xz=((0.0, 10.0),), yaw=AHEAD, road_edge_x_m=0.9)
     left = check_scene(narrow, _moved(narrow, across=0.9), limits=limits)
     assert any("left the road" in line for line in left)
 
 
 def test_the_projection_keeps_a_street_s_cars_apart(street):
-    scene = street(positions_xz=((0.0, 14.0), (0.0, 21.0)), yaw=-math.pi / 2)
+    scene = street(positions_xz=((0.0, 14.0), (0.0, 21.0)), yaw=AHEAD)
     # The far one is higher, so that it stays in sight.
     scene = scene.with_objects(size_lhw=torch.tensor([[4.2, 1.5, 1.75], [4.2, 2.6, 1.75]]))
     space = ParameterSpace(scene, COMBOS[1], PRESETS["street"])
@@ -476,9 +467,7 @@ def test_rays_find_a_mesh_in_another_and_a_car_behind_another(street, rays):
     before[1].vertices = _spindle(before[1])
     (line,) = _collisions(dict(enumerate(before)), dict(enumerate(after)), rays)
     assert line.startswith("objects[1]: mesh runs into that of objects[0]")
-    pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
-    pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
-    hidden = pair.with_objects(translation=pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]]))
+    pair, hidden = _pair_and_hidden(street)
     assert "objects[1]: hidden" in check_scene(pair, hidden, "open3d")
 
 
@@ -488,10 +477,8 @@ def test_without_open3d_outlines_are_used(street, monkeypatch, method):
     drivesem.attack.feasibility_check._open3d.cache_clear()
     try:
         assert available_check_method() == "outlines"
-        pair = street(positions_xz=((0.0, 6.0), (13.0, 40.0)), yaw=-math.pi / 2)
-        pair = pair.with_objects(size_lhw=torch.tensor([[4.2, 2.6, 1.9], [4.2, 1.5, 1.75]]))
-        moved = pair.objects.translation - torch.tensor([[0.0, 0, 0], [13.0, 0, 0]])
-        assert "objects[1]: hidden" in check_scene(pair, pair.with_objects(translation=moved), method)
+        pair, hidden = _pair_and_hidden(street)
+        assert "objects[1]: hidden" in check_scene(pair, hidden, method)
         assert check_scene(pair, pair, method) == []
     finally:
         drivesem.attack.feasibility_check._open3d.cache_clear()

@@ -84,7 +84,7 @@ def test_a_car_that_grows_has_a_larger_box_on_the_same_ground(street):
     assert torch.equal(kitti.translation[:, 1], scene.objects.translation[:, 1])
 
 
-def test_paper_labels_stay_and_moved_ones_go_along(street):
+def test_paper_labels_stay_and_moved_ones_follow(street):
     scene = street(yaw=-math.pi / 2, dtype=torch.float64)
     space = ParameterSpace(scene, ("translate",))
     theta = space.theta0.clone()
@@ -162,7 +162,7 @@ def test_a_car_that_vanishes_is_ignored(street):
     ("before", "after", "out_of_sight"),
     [(0, 18, False), (0, 19, True), (15, 19, True), (15, 18, False), (16, 20, False), (19, 20, False)],
 )
-def test_a_car_that_showed_may_not_go_out_of_sight(street, before: int, after: int, out_of_sight: bool):
+def test_a_visible_car_that_goes_out_of_sight_is_reported(street, before: int, after: int, out_of_sight: bool):
     scene = street(positions_xz=((0.0, 8.0), (2.0, 12.0)))
     labeller = Labeller(scene, _two_cars(scene, before), EASY)  # of the car's 20 columns so many are hidden
     assert labeller.moved(scene, _two_cars(scene, after)).out_of_sight.tolist() == [False, out_of_sight]
@@ -175,14 +175,14 @@ def test_difficulty_and_regions(street):
     scene = replace(scene, ignore=torch.tensor([[1.0, 2, 30, 40]]))
     labels = label_scene(scene, scene, "paper")
     assert labels.ignore.tolist() == [False, True, True, True]
-    given = labels.targets
-    assert len(given) == 4 + len(CLASSES)
-    assert given.labels[4:].tolist() == list(range(len(CLASSES)))
-    assert bool(given.ignore[4:].all())
-    assert given.boxes_xyxy[4:].tolist() == [[1.0, 2, 30, 40]] * len(CLASSES)
+    targets = labels.targets
+    assert len(targets) == 4 + len(CLASSES)
+    assert targets.labels[4:].tolist() == list(range(len(CLASSES)))
+    assert bool(targets.ignore[4:].all())
+    assert targets.boxes_xyxy[4:].tolist() == [[1.0, 2, 30, 40]] * len(CLASSES)
 
 
-def test_what_was_ignored_stays_ignored_and_is_reported(street):
+def test_ignored_objects_stay_ignored_and_changes_are_reported(street):
     scene = street(positions_xz=((0.0, 27.0),), yaw=-math.pi / 2)
     height = float(scene.objects.box2d[0, 3] - scene.objects.box2d[0, 1])
     labeller = Labeller(scene, difficulty=Difficulty(min_height_px=height + 0.2))
@@ -242,7 +242,7 @@ def _plain_box(scene, i):
 
 
 @pytest.mark.parametrize("nearest_m", [7.0, 0.5, -20.0])
-def test_boxes_are_those_of_every_vertex(street, nearest_m):
+def test_boxes_enclose_every_vertex(street, nearest_m):
     scene = street(positions_xz=((1.5, nearest_m), (-2.0, 12.0)), dtype=torch.float64)
     generator = torch.Generator().manual_seed(3)
     offsets = 0.05 * torch.randn(2, 64, 3, generator=generator, dtype=torch.float64)  # not symmetric
