@@ -30,7 +30,7 @@ QUICK = [
     "detectors/adapters/test_formats.py",
     "detectors/yolov3/test_yolov3_cfg.py",
     "drivesem/config/test_edits.py",
-    "drivesem/data/test_joined.py",
+    "drivesem/data/test_subsets.py",
     "drivesem/data/test_label_table.py",
     "drivesem/evaluation/test_voc_matching.py",
     "drivesem/evaluation/test_resampling.py",

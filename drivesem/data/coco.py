@@ -65,10 +65,8 @@ CATEGORY_IDS = {name: i + 1 for i, name in enumerate(CATEGORIES)}
 
 def _encode_mask(mask: np.ndarray) -> dict[str, Any]:
     """Encode a mask (H, W) bool as COCO's compressed run lengths."""
-    return {
-        "size": list(mask.shape),
-        "counts": _decode_counts(run_length.encode(np.asfortranarray(mask, np.uint8))),
-    }
+    encoded = run_length.encode(np.asfortranarray(mask, np.uint8))
+    return {"size": list(mask.shape), "counts": _decode_counts(encoded)}
 
 
 def _decode_counts(encoded: Any) -> str:
@@ -393,9 +391,8 @@ class CocoDataset(FrameIndex[_CocoImage]):
         rows, table, objects = self._frame_annotations(identifier)
         rows.select(objects.tolist()).check_scene()
         places = enumerate(zip(table.boxes.tolist(), table.ignore.tolist(), strict=True))
-        return table.select(
-            first_occurrences(tuple(box) if ignored else i for i, (box, ignored) in places)
-        ).to_labels()
+        first = first_occurrences(tuple(box) if ignored else i for i, (box, ignored) in places)
+        return table.select(first).to_labels()
 
     def frame(self, identifier: str) -> Frame:
         """Read one frame: photograph, camera, labels, and masks (M, H, W) if every object has a segmentation.

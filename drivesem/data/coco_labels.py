@@ -23,7 +23,7 @@ _FOLDER_OR_HIDDEN = re.compile(r"[/\\:]|^\.")
 Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _MAX_VALUE = 2**31
 """Exclusive limit of occlusions, box coordinates and image sides."""
-_MAX_IDS_IN_ERROR = 3
+_MAX_EXAMPLES = 3
 """Number of unknown ids that an error names."""
 
 
@@ -180,8 +180,8 @@ class JsonRows:
             missing = ids[index] != values
         if missing.any():
             unknown = np.unique(values[missing])
-            examples = ", ".join(map(str, unknown[:_MAX_IDS_IN_ERROR])) + (
-                ", ..." if len(unknown) > _MAX_IDS_IN_ERROR else ""
+            examples = ", ".join(map(str, unknown[:_MAX_EXAMPLES])) + (
+                ", ..." if len(unknown) > _MAX_EXAMPLES else ""
             )
             where = self.locate(int(np.flatnonzero(missing)[0]), key)
             raise FormatError(where, f"ids of the {len(ids)} {what}", f"{len(unknown)} others ({examples})")

@@ -69,13 +69,7 @@ SEMANTIC_NAMES = (
 """Cityscapes' classes in the order of their ids, as in KITTI's semantic benchmark, by Virtual KITTI's names where
 it has them (github.com/mcordts/cityscapesScripts, helpers/labels.py; "Undefined" is "unlabeled", "Misc"
 "static", "Vegetation" includes trees, "Pedestrian" is "person")."""
-_CITYSCAPES_NAMES = {
-    "tree": "vegetation",
-    "van": "car",
-    "cyclist": "rider",
-    "tram": "train",
-    "personsitting": "pedestrian",
-}
+_ALIASES = {"tree": "vegetation", "van": "car", "cyclist": "rider", "tram": "train", "personsitting": "pedestrian"}
 """Cityscapes' names of classes without an id of their own."""
 
 
@@ -438,7 +432,7 @@ def _normalise_name(name: str) -> str:
 def semantic_ids(class_names: Sequence[str]) -> np.ndarray:
     """Convert Virtual KITTI's class names to Cityscapes' ids (C,) uint16. Raises FormatError for an unknown name."""
     known = {_normalise_name(name): i for i, name in enumerate(SEMANTIC_NAMES)}
-    keys = [_CITYSCAPES_NAMES.get(_normalise_name(name), _normalise_name(name)) for name in class_names]
+    keys = [_ALIASES.get(_normalise_name(name), _normalise_name(name)) for name in class_names]
     for name, key in zip(class_names, keys, strict=True):
         if key not in known:
             raise FormatError("class", f"one of {', '.join(SEMANTIC_NAMES)}", repr(name))

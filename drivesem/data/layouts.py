@@ -39,10 +39,8 @@ def detect_layout(path: Path) -> str | None:
     if folder is None:
         return None
     # YOLO's lines begin with a class number, KITTI's with a name
-    beginnings = (
-        files.read_text(folder / name).split(None, 1)[:1] for name in kitti_labels.list_text_files(folder)
-    )
-    first = next((words[0] for words in beginnings if words), "")
+    starts = (files.read_text(folder / name).split(None, 1)[:1] for name in kitti_labels.list_text_files(folder))
+    first = next((words[0] for words in starts if words), "")
     return "yolo" if first.isdecimal() else "kitti"
 
 

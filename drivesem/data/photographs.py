@@ -220,10 +220,8 @@ def read_focal_length(image_path: Path, focal_px: float | None = None) -> FocalL
     if film:
         return FocalLength(film / FILM_MM * longer, "EXIF")
     unit = _UNIT_MM.get(_to_positive(tags.get(_PLANE_UNIT, 2)))
-    length, density = (
-        _to_positive(tags.get(_FOCAL)),
-        _to_positive(tags.get(_PLANE_X)) or _to_positive(tags.get(_PLANE_Y)),
-    )
+    length = _to_positive(tags.get(_FOCAL))
+    density = _to_positive(tags.get(_PLANE_X)) or _to_positive(tags.get(_PLANE_Y))
     if unit and length and density:
         return FocalLength(length / unit * density, "EXIF")
     return FocalLength(DEFAULT_FOCAL * longer, "default")

@@ -178,9 +178,8 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     locations, changed = vkitti.locate_frames(table, "0001")
     frames, lost, assumed = vkitti.make_tracked_objects(table)
     writer = Vkitti1Writer(out)
-    count = writer.write_tables(
-        [_make_entry(location, frames[location.number], np.eye(4)) for location in locations]
-    )
+    entries = [_make_entry(location, frames[location.number], np.eye(4)) for location in locations]
+    count = writer.write_tables(entries)
     targets = {table.frames[p.number]: writer.image_path(p, "rgb").with_suffix("") for p in locations}
     occluded = sum(tracked.occlusion > 2 for objects in frames for tracked in objects)
     more = {"occlusion 3 (2 is the most)": occluded, "frame names": changed}

@@ -75,19 +75,8 @@ def format_bbox(frame: int, camera: int, tracked: TrackedObject) -> str:
     """
     left, top, right, bottom = tracked.box_ltrb
     shares = (repr(float(tracked.truncation)), repr(float(tracked.visible)))
-    fields = (
-        frame,
-        camera,
-        tracked.track,
-        left,
-        right,
-        top,
-        bottom,
-        tracked.pixels,
-        *shares,
-        bool(tracked.moving),
-    )
-    return " ".join(map(str, fields))
+    integers = (frame, camera, tracked.track, left, right, top, bottom, tracked.pixels)
+    return " ".join(map(str, (*integers, *shares, bool(tracked.moving))))
 
 
 def format_pose(frame: int, camera: int, tracked: TrackedObject) -> str:
@@ -264,10 +253,8 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     supported = (*vkitti.SUPPORTED_FIELDS, "pixels", "world", "world_yxz", "camera")
     more = {"frame names": changed, "camera's offset": shifted}
     without = {"camera": len(table.frames) - len(table.cameras)}
-    copied = copy_images(targets, images)
-    return WriteSummary.from_counts(
-        count + copied, lost | more | table.count_lost(supported, {}), assumed | without
-    )
+    count += copy_images(targets, images)
+    return WriteSummary.from_counts(count, lost | more | table.count_lost(supported, {}), assumed | without)
 
 
 def _find_folder(parent: Path, name: str) -> Path | None:

@@ -340,13 +340,7 @@ class YoloDataset(FrameIndex[Path]):
             focal = read_focal_length(image_path, self.focal_px)
             camera = pinhole_camera(height, width, focal.length_px)
             provenance["focal"] = str(focal)
-        return Frame(
-            identifier=identifier,
-            photograph=to_tensor(image),
-            camera=camera,
-            labels=self.labels(identifier),
-            provenance=provenance,
-        )
+        return Frame(identifier, to_tensor(image), camera, self.labels(identifier), provenance=provenance)
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:

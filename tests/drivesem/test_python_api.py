@@ -28,7 +28,7 @@ from drivesem.run import attack as attack_run
 from drivesem.run.attack import AttackWorker
 from drivesem.run.counterexample import OPTIONS as ATTACK_OPTIONS
 from drivesem.run.results import Failure, load_frame
-from drivesem.scenes.scene import image_of
+from drivesem.scenes.scene import to_image_tensor
 from scene_ir.errors import FormatError, RangeError, SceneError
 from scene_ir.files import read_image
 from scene_ir.types import Frame
@@ -333,8 +333,8 @@ def test_photographs_as_files_arrays_tensors_and_frames(small_kitti: Path, tmp_p
     photo = small_kitti / "training" / "image_2" / f"{name}.png"
     labels, calib = (small_kitti / "training" / part / f"{name}.txt" for part in ("label_2", "calib"))
     frame = ds.open_dataset("kitti", small_kitti)[name]
-    assert torch.equal(image_of(read_image(photo)), frame.photograph)
-    assert torch.equal(image_of(frame.photograph), frame.photograph)
+    assert torch.equal(to_image_tensor(read_image(photo)), frame.photograph)
+    assert torch.equal(to_image_tensor(frame.photograph), frame.photograph)
     scenes = [
         ds.derender(photo, labels, calib, fit=False),
         ds.derender(read_image(photo), frame.labels, frame.camera.matrix.numpy(), fit=False),
@@ -352,7 +352,7 @@ def test_bad_photographs(small_kitti: Path) -> None:
     folder = small_kitti / "training"
     photo, labels = folder / "image_2" / "000008.png", folder / "label_2" / "000008.txt"
     pixels = read_image(photo)
-    with pytest.raises(UsageError, match="calib: expected a calibration beside labels, found none"):
+    with pytest.raises(UsageError, match="calib: expected a calibration for labels, found none"):
         ds.derender(photo, labels)
     with pytest.raises(UsageError, match="photo: expected an array"):
         ds.derender(pixels.astype(np.float32))  # pyright: ignore[reportArgumentType]

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from drivesem.data.ground_truth import SKY_CM, Exposure, TrackedObject
-from scene_ir.types import Camera, Labels
+from scene_ir.types import Camera
+from tests.drivesem.data.shots import make_labels, shot
 from tests.drivesem.data.shots import make_object as build_object
-from tests.drivesem.data.shots import shot
 
 HEIGHT, WIDTH = 40, 80
 CLASS_NAMES = (
@@ -40,17 +40,13 @@ def _exposure(seed: int = 0, specification: Sequence[tuple] = OBJECTS, empty_box
         visible = pixels / ((bottom - top) * (right - left))
         x, z = generator.uniform(-5, 5), generator.uniform(8, 40)
         objects.append(
-            TrackedObject(
-                track=track,
-                kind=kind,
-                model=f"{kind}-1",
-                paint="Red",
-                moving=False,
+            build_object(
+                track,
+                kind,
                 box_ltrb=(left, top, right - 1, bottom - 1),
                 pixels=pixels,
                 truncation=0.25 if labelled else 0.0,
                 visible=visible,
-                occlusion=sum(visible <= step for step in (0.9, 0.5, 0.1)),
                 translation=(x, 1.65, z),
                 yaw=float(generator.uniform(-np.pi, np.pi)),
                 size_lhw=(4.25, 1.5, 1.75),
@@ -60,9 +56,6 @@ def _exposure(seed: int = 0, specification: Sequence[tuple] = OBJECTS, empty_box
             )
         )
     labelled_objects = [o for o in objects if o.labelled]
-
-    def table(rows: list, width: int) -> torch.Tensor:
-        return torch.tensor(rows, dtype=torch.float32).reshape(-1, width)
 
     def edges(tracked: TrackedObject) -> list[float]:
         left, top, right, bottom = tracked.box_ltrb
@@ -82,17 +75,10 @@ def _exposure(seed: int = 0, specification: Sequence[tuple] = OBJECTS, empty_box
         ),
         extrinsic=np.eye(4),
         objects=tuple(objects),
-        labels=Labels(
-            kind=tuple(o.kind for o in labelled_objects),
-            boxes_xyxy=table([edges(o) for o in labelled_objects], 4),
-            truncation=torch.tensor([o.truncation for o in labelled_objects]),
-            occlusion=torch.tensor([o.occlusion for o in labelled_objects], dtype=torch.int64),
-            translation=table([o.translation for o in labelled_objects], 3),
-            yaw=torch.tensor([o.yaw for o in labelled_objects]),
-            size_lhw=table([o.size_lhw for o in labelled_objects], 3),
-            ignore_xyxy=table(
-                [edges(o) for o in objects if not o.labelled] + [[70.0, 2.0, 76.0, 8.5]] * empty_box, 4
-            ),
+        labels=make_labels(
+            labelled_objects,
+            [edges(o) for o in labelled_objects],
+            [edges(o) for o in objects if not o.labelled] + [[70.0, 2.0, 76.0, 8.5]] * empty_box,
         ),
     )
 

@@ -1,8 +1,11 @@
-"""A small exposure made by hand: a road, two cars of which one hides part of the other, and a walker."""
+"""Builders: a small exposure with a road, two overlapping cars and a walker, and damages to files."""
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 import torch
 
@@ -10,6 +13,48 @@ from drivesem.data.ground_truth import SKY_CM, Exposure, TrackedObject, occlusio
 from scene_ir.types import Camera, Labels
 
 CLASS_NAMES = ("Undefined", "Sky", "Road", "Tree", "Car", "Van", "Pedestrian", "GuardRail")
+
+Damage: TypeAlias = "Callable[[Path], object]"
+"""Damages a file below a folder."""
+
+
+def remove(path: str) -> Damage:
+    return lambda root: (root / path).unlink()
+
+
+def overwrite(path: str, data: bytes) -> Damage:
+    return lambda root: (root / path).write_bytes(data)
+
+
+def truncate(path: str, count: int) -> Damage:
+    return lambda root: (root / path).write_bytes((root / path).read_bytes()[:count])
+
+
+def write_image(path: str, array: np.ndarray) -> Damage:
+    return lambda root: cv2.imwrite(str(root / path), array)
+
+
+def replace_text(path: str, old: str, new: str) -> Damage:
+    """Replace the first occurrence in a text file."""
+
+    def damage(root: Path) -> None:
+        text = (root / path).read_text()
+        assert old in text
+        (root / path).write_text(text.replace(old, new, 1))
+
+    return damage
+
+
+def set_field(path: str, column: str, value: str) -> Damage:
+    """Set a column of a table's first row."""
+
+    def damage(root: Path) -> None:
+        header, first, *rest = (root / path).read_text().splitlines()
+        fields = first.split()
+        fields[header.split().index(column)] = value
+        (root / path).write_text("\n".join([header, " ".join(fields), *rest, ""]))
+
+    return damage
 
 
 def make_object(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
@@ -36,6 +81,26 @@ def make_object(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObj
     return replace(changed, occlusion=occlusion_from_visible(changed.visible))
 
 
+def make_labels(
+    objects: Sequence[TrackedObject], boxes: Sequence[Sequence[float]], regions: Sequence[Sequence[float]]
+) -> Labels:
+    """Labels of objects with these boxes xyxy px, and regions to ignore."""
+
+    def table(rows: Iterable[Any], *shape: int) -> torch.Tensor:
+        return torch.tensor(list(rows), dtype=torch.float32).reshape(-1, *shape)
+
+    return Labels(
+        kind=tuple(o.kind for o in objects),
+        boxes_xyxy=table(boxes, 4),
+        truncation=table(o.truncation for o in objects),
+        occlusion=torch.tensor([o.occlusion for o in objects], dtype=torch.int64),
+        translation=table((o.translation for o in objects), 3),
+        yaw=table(o.yaw for o in objects),
+        size_lhw=table((o.size_lhw for o in objects), 3),
+        ignore_xyxy=table(regions, 4),
+    )
+
+
 def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: int = 0) -> Exposure:
     """The exposure, in the upper left 40x80 pixels of an image of this size."""
     rng = np.random.default_rng(seed)
@@ -58,7 +123,7 @@ def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: 
         classes[top : bottom + 1, left : right + 1] = CLASS_NAMES.index(item.kind)
     tracked_objects = (near, cut, far, walker)
     labelled = [t for t in tracked_objects if t.labelled]
-    small = torch.tensor([t.box_ltrb for t in tracked_objects if not t.labelled], dtype=torch.float32)
+    small = [t.box_ltrb for t in tracked_objects if not t.labelled]
     k = torch.tensor([[72.00087, 0, 39.5], [0, 72.5, 18.25], [0, 0, 1]])
     turn, shift = np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]]), np.array([1.25, -1.7, 300.123456])
     extrinsic = np.eye(4)
@@ -72,14 +137,5 @@ def shot(height: int = 40, width: int = 80, camera: Camera | None = None, seed: 
         camera=camera or Camera(k, height, width),
         extrinsic=extrinsic,
         objects=tracked_objects,
-        labels=Labels(
-            kind=tuple(t.kind for t in labelled),
-            boxes_xyxy=torch.tensor([t.box_ltrb for t in labelled], dtype=torch.float32),
-            truncation=torch.tensor([t.truncation for t in labelled], dtype=torch.float32),
-            occlusion=torch.tensor([t.occlusion for t in labelled]),
-            translation=torch.tensor([t.translation for t in labelled], dtype=torch.float32),
-            yaw=torch.tensor([t.yaw for t in labelled], dtype=torch.float32),
-            size_lhw=torch.tensor([t.size_lhw for t in labelled], dtype=torch.float32),
-            ignore_xyxy=small,
-        ),
+        labels=make_labels(labelled, [t.box_ltrb for t in labelled], small),
     )

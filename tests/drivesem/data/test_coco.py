@@ -51,7 +51,7 @@ def folder(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     entries = [
         writer.write(place(0), make_exposure(0)),
         writer.write(place(1), make_exposure(1)),
-        writer.write(place(2, "val"), make_exposure(2, tracked_objects=(), empty_box=False)),
+        writer.write(place(2, "val"), make_exposure(2, specification=(), empty_box=False)),
     ]
     assert writer.exists(place(0))
     writer.finish(json.loads(json.dumps(entries)))
@@ -119,7 +119,7 @@ def test_the_same_entries_give_the_same_bytes(
     folder: Path, tmp_path: Path, make_exposure: Callable[..., Exposure]
 ) -> None:
     writer = coco.CocoWriter(tmp_path / "again")
-    last = writer.write(place(2, "val"), make_exposure(2, tracked_objects=(), empty_box=False))
+    last = writer.write(place(2, "val"), make_exposure(2, specification=(), empty_box=False))
     entries = [coco.CocoWriter(tmp_path / "again").write(place(i), make_exposure(i)) for i in (0, 1)]
     writer.finish([*entries, last])
     for path in (p for p in folder.rglob("*") if p.is_file()):

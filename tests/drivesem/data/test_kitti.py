@@ -473,7 +473,7 @@ def written(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     entries = [
         writer.write(FrameLocation(0, "01", "clone", 0, "train"), make_exposure(0)),
         writer.write(
-            FrameLocation(1, "01", "fog", 0, "val"), make_exposure(1, tracked_objects=(), empty_box=False)
+            FrameLocation(1, "01", "fog", 0, "val"), make_exposure(1, specification=(), empty_box=False)
         ),
     ]
     assert writer.exists(FrameLocation(0, "01", "clone", 0, "train"))

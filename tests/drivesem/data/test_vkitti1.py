@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -22,6 +21,7 @@ from drivesem.data.registry import open_dataset
 from drivesem.data.vkitti1 import Vkitti1Dataset, Vkitti1Writer
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Camera
+from tests.drivesem.data.shots import Damage, remove, replace_text, set_field, write_image
 
 ROOT = Path(__file__).resolve().parents[3]
 FACTS = ROOT / ".." / "shared" / "FORMATS.md"
@@ -203,97 +203,55 @@ def test_rows_as_the_data_set_has_them(tmp_path: Path) -> None:
     assert Vkitti1Dataset(tmp_path, with_dont_care=True).labels(FIRST).kind == ("Car", "Van")
 
 
-def edit(path: str, old: str, new: str) -> Callable[[Path], Any]:
-    def spoil(root: Path) -> None:
-        text = (root / f"vkitti_1.3.1_{path}").read_text()
-        assert old in text
-        (root / f"vkitti_1.3.1_{path}").write_text(text.replace(old, new, 1))
-
-    return spoil
-
-
-def field(column: str, value: str) -> Callable[[Path], Any]:
-    """Set one field of the first row of motgt."""
-
-    def spoil(root: Path) -> None:
-        path = root / "vkitti_1.3.1_motgt/0001_clone.txt"
-        header, first, *rest = path.read_text().splitlines()
-        fields = first.split()
-        fields[header.split().index(column)] = value
-        path.write_text("\n".join([header, " ".join(fields), *rest, ""]))
-
-    return spoil
-
-
-def png(path: str, array: np.ndarray) -> Callable[[Path], Any]:
-    return lambda root: cv2.imwrite(str(root / f"vkitti_1.3.1_{path}"), array)
-
-
-ENCODING = "scenegt/0001_clone_scenegt_rgb_encoding.txt"
-BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no-motgt": (
-        lambda r: (r / "vkitti_1.3.1_motgt/0001_clone.txt").unlink(),
-        r"motgt/0001_clone\.txt: expected a readable file",
-    ),
-    "column": (
-        edit("motgt/0001_clone.txt", "orig_label", "original"),
-        r"clone\.txt:1: orig_label: expected a colu",
-    ),
-    "fields": (field("color", ""), r"0001_clone\.txt:2: expected 25 fields, found 24"),
-    "frame": (field("frame", "a"), r"0001_clone\.txt:2: frame: expected a whole number, found 'a'"),
-    "tid": (field("tid", "3"), r"0001_clone\.txt:3: tid: expected each once in a frame, found 3 twice"),
-    "label": (field("label", "Auto"), r"clone\.txt:2: label: expected one of Car.*DontCare, found 'Auto'"),
-    "orig": (field("orig_label", "DontCare"), r"clone\.txt:2: orig_label: expected one of Car.*found 'DontCare'"),
-    "truncated": (field("truncated", "3"), r"clone\.txt:2: truncated: expected one of 0, 1, 2, found '3'"),
-    "occluded": (field("occluded", "0.5"), r"clone\.txt:2: occluded: expected one of 0, 1, 2, found '0\.5'"),
-    "truncr": (field("truncr", "-0.1"), r"clone\.txt:2: truncr: expected a number in \[0, 1\], found -0\.1"),
-    "moving": (field("moving", "True"), r"clone\.txt:2: moving: expected one of 0, 1, found 'True'"),
-    "right": (field("r", "9"), r"clone\.txt:2: r: expected at least 10, found 9"),
-    "bottom": (field("b", "9"), r"clone\.txt:2: b: expected at least 14, found 9"),
-    "outside": (field("r", "1250"), r"00000\.png: expected an image that holds .*1250"),
-    "size": (field("w3d", "-1"), r"clone\.txt:2: w3d: expected more than 0, found -1"),
-    "behind": (field("z3d", "-14"), r"clone\.txt:2: z3d: expected a 3D box in front of the camera"),
-    "yaw": (field("ry", "90"), r"clone\.txt:2: ry: expected a number in"),
-    "no-encoding": (
-        lambda r: (r / f"vkitti_1.3.1_{ENCODING}").unlink(),
-        r"encoding\.txt: expected a readable file",
-    ),
-    "encoding-header": (
-        edit(ENCODING, "(:id)", ""),
-        r"encoding\.txt:1: Category\(:id\): expected a column of that",
-    ),
-    "encoding-id": (
-        edit(ENCODING, "Car:3", "Car:x"),
-        r"Car:x: expected a whole number after the colon, found 'x'",
-    ),
-    "encoding-value": (edit(ENCODING, "210 0 200", "210 0"), r"encoding\.txt:2: expected 4 fields, found 3"),
-    "no-colour": (
-        edit(ENCODING, "100 60 100", "1 2 3"),
+PREFIX = "vkitti_1.3.1_"
+MOTGT, IMAGE = f"{PREFIX}motgt/0001_clone.txt", "0001/clone/00000.png"
+ENCODING = f"{PREFIX}scenegt/0001_clone_scenegt_rgb_encoding.txt"
+COLUMN_FAULTS = (
+    ("frame", "a", "a whole number, found 'a'"),
+    ("label", "Auto", "one of Car.*DontCare, found 'Auto'"),
+    ("orig_label", "DontCare", "one of Car.*found 'DontCare'"),
+    ("truncated", "3", "one of 0, 1, 2, found '3'"),
+    ("occluded", "0.5", r"one of 0, 1, 2, found '0\.5'"),
+    ("truncr", "-0.1", r"a number in \[0, 1\], found -0\.1"),
+    ("moving", "True", "one of 0, 1, found 'True'"),
+    ("r", "9", "at least 10, found 9"),
+    ("b", "9", "at least 14, found 9"),
+    ("w3d", "-1", "more than 0, found -1"),
+    ("z3d", "-14", "a 3D box in front of the camera"),
+    ("ry", "90", "a number in"),
+)
+"""Column of motgt, damaged value, error."""
+FAULTS: tuple[tuple[Damage, str], ...] = (
+    *((set_field(MOTGT, c, v), rf"clone\.txt:2: {c}: expected {error}") for c, v, error in COLUMN_FAULTS),
+    (remove(MOTGT), r"motgt/0001_clone\.txt: expected a readable file"),
+    (replace_text(MOTGT, "orig_label", "original"), r"clone\.txt:1: orig_label: expected a column"),
+    (set_field(MOTGT, "color", ""), r"0001_clone\.txt:2: expected 25 fields, found 24"),
+    (set_field(MOTGT, "tid", "3"), r"0001_clone\.txt:3: tid: expected each once in a frame, found 3 twice"),
+    (set_field(MOTGT, "r", "1250"), r"00000\.png: expected an image that holds .*1250"),
+    (remove(ENCODING), r"encoding\.txt: expected a readable file"),
+    (replace_text(ENCODING, "(:id)", ""), r"encoding\.txt:1: Category\(:id\): expected a column of that"),
+    (replace_text(ENCODING, "Car:3", "Car:x"), "Car:x: expected a whole number after the colon, found 'x'"),
+    (replace_text(ENCODING, "210 0 200", "210 0"), r"encoding\.txt:2: expected 4 fields, found 3"),
+    (
+        replace_text(ENCODING, "100 60 100", "1 2 3"),
         r"clone/00000\.png: pixel \(\d+, \d+\): expected a colour of 0001_clone_.*, found 100 60 100",
     ),
-    "image-size": (
-        png("rgb/0001/clone/00000.png", np.zeros((370, 1226, 3), np.uint8)),
+    (
+        write_image(f"{PREFIX}rgb/{IMAGE}", np.zeros((370, 1226, 3), np.uint8)),
         r"rgb/0001/clone/00000\.png: expected 1242x375 px, found 1226x370 px",
     ),
-    "no-depth": (
-        lambda r: (r / "vkitti_1.3.1_depthgt/0001/clone/00000.png").unlink(),
-        r"depthgt/0001/clone/00000\.png: expected a readable file",
-    ),
-    "8-bit-depth": (
-        png("depthgt/0001/clone/00000.png", np.zeros(SIZE, np.uint8)),
+    (remove(f"{PREFIX}depthgt/{IMAGE}"), r"depthgt/0001/clone/00000\.png: expected a readable file"),
+    (
+        write_image(f"{PREFIX}depthgt/{IMAGE}", np.zeros(SIZE, np.uint8)),
         r"depthgt.*00000\.png: expected 16 bits and 1 channel",
     ),
-    "no-scene": (
-        lambda r: (r / "vkitti_1.3.1_scenegt/0001/clone/00000.png").unlink(),
-        r"scenegt/0001/clone/00000\.png: expected a readable file",
-    ),
-}
+    (remove(f"{PREFIX}scenegt/{IMAGE}"), r"scenegt/0001/clone/00000\.png: expected a readable file"),
+)
 
 
-@pytest.mark.parametrize("fault", BAD)
-def test_a_fault_is_named(fault: str, folder: Path) -> None:
-    spoil, message = BAD[fault]
-    spoil(folder)
+@pytest.mark.parametrize(("damage", "message"), FAULTS, ids=[message for _, message in FAULTS])
+def test_a_fault_is_named(damage: Damage, message: str, folder: Path) -> None:
+    damage(folder)
     with pytest.raises(FormatError, match=message) as caught:
         Vkitti1Dataset(folder).frame(FIRST)
     assert "\n" not in str(caught.value)

@@ -29,6 +29,15 @@ from drivesem.synth.frames import SynthSettings, generate_frame
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.types import Camera
+from tests.drivesem.data.shots import (
+    Damage,
+    overwrite,
+    remove,
+    replace_text,
+    set_field,
+    truncate,
+    write_image,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 FIRST = "Scene01/clone/Camera_0/00000"
@@ -416,175 +425,93 @@ def test_columns_are_found_by_name(folder: Path, make_shot: MakeShot) -> None:
     check_frame(Vkitti2Dataset(folder).frame(FIRST), make_shot())
 
 
-def edit(name: str, old: str, new: str) -> Callable[[Path], Any]:
-    """Replace the first occurrence in a table of the clip."""
-
-    def spoil(clip: Path) -> None:
-        text = (clip / f"{name}.txt").read_text()
-        assert old in text
-        (clip / f"{name}.txt").write_text(text.replace(old, new, 1))
-
-    return spoil
-
-
-def field(name: str, column: str, value: str) -> Callable[[Path], Any]:
-    """Set one field of the first row of a table."""
-
-    def spoil(clip: Path) -> None:
-        header, first, *rest = (clip / f"{name}.txt").read_text().splitlines()
-        fields = first.split()
-        fields[header.split().index(column)] = value
-        (clip / f"{name}.txt").write_text("\n".join([header, " ".join(fields), *rest, ""]))
-
-    return spoil
-
-
-def png(folder: str, name: str, array: np.ndarray) -> Callable[[Path], Any]:
-    return lambda clip: cv2.imwrite(str(clip / "frames" / folder / "Camera_0" / name), array)
-
-
-def cut(folder: str, name: str, count: int) -> Callable[[Path], Any]:
-    path = Path("frames") / folder / "Camera_0" / name
-    return lambda clip: (clip / path).write_bytes((clip / path).read_bytes()[:count])
-
-
-def remove(path: str) -> Callable[[Path], Any]:
-    return lambda clip: (clip / path).unlink()
-
-
-DEPTH, CLASSES, INSTANCES = (
-    ("depth", "depth_00000.png"),
-    ("classSegmentation", "classgt_00000.png"),
-    (
-        "instanceSegmentation",
-        "instancegt_00000.png",
-    ),
+FRAMES = "frames/{}/Camera_0/{}_00000.{}"
+PHOTOGRAPH, DEPTH = FRAMES.format("rgb", "rgb", "jpg"), FRAMES.format("depth", "depth", "png")
+CLASSES = FRAMES.format("classSegmentation", "classgt", "png")
+INSTANCES = FRAMES.format("instanceSegmentation", "instancegt", "png")
+COLUMN_FAULTS = (
+    ("bbox", "frame", "0.5", r"a whole number, found '0\.5'"),
+    ("bbox", "trackID", "-1", "at least 0, found -1"),
+    ("bbox", "left", "x", "a whole number, found 'x'"),
+    ("bbox", "right", "9", "at least 10, found 9"),
+    ("bbox", "bottom", "3", "at least 14, found 3"),
+    ("bbox", "number_pixels", "-2", "at least 0, found -2"),
+    ("bbox", "truncation_ratio", "1.5", r"a number in \[0, 1\], found 1\.5"),
+    ("bbox", "occupancy_ratio", "nan", "a finite number, found nan"),
+    ("bbox", "isMoving", "yes", "one of True, False.*'yes'"),
+    ("pose", "height", "0", "more than 0, found 0"),
+    ("pose", "rotation_camera_space_y", "180", "a num"),
+    ("pose", "camera_space_Z", "-9", "a 3D box in front of the camera, found -9 m, behind it"),
+    ("pose", "world_space_X", "inf", "a finite number"),
+    ("info", "label", "Bus", "one of Car, Van, .*'Bus'"),
+    ("intrinsic", "K[1,1]", "-1", "more than 0, found -1"),
+    ("colors", "r", "256", r"a number in \[0, 255\], found 256"),
 )
-BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
-    **{
-        f"no-{name}": (remove(f"{name}.txt"), rf"clone/{name}\.txt: expected a readable file, found no such")
+"""Table, column, damaged value, error."""
+FAULTS: tuple[tuple[Damage, str], ...] = (
+    *(
+        (set_field(f"{table}.txt", column, value), rf"{table}\.txt:2: {re.escape(column)}: expected {error}")
+        for table, column, value, error in COLUMN_FAULTS
+    ),
+    *(
+        (remove(f"{name}.txt"), rf"clone/{name}\.txt: expected a readable file, found no such")
         for name in ("bbox", "pose", "info", "intrinsic", "colors")
-    },
-    "no-column": (
-        edit("bbox", "number_pixels", "pixels"),
+    ),
+    (
+        replace_text("bbox.txt", "number_pixels", "pixels"),
         r"bbox\.txt:1: number_pixels: expected a column of that name, found frame cameraID",
     ),
-    "no-header": (
-        lambda c: (c / "pose.txt").write_text(""),
-        r"pose\.txt:1: expected a header 'frame .*found none",
-    ),
-    "few-fields": (field("bbox", "isMoving", ""), r"bbox\.txt:2: expected 11 fields, found 10"),
-    "many-fields": (field("bbox", "isMoving", "True x"), r"bbox\.txt:2: expected 11 fields, found 12"),
-    "one-field": (lambda c: edit("bbox", "\n2 0 7", "\n2\n0 0 7")(c), r"bbox\.txt:8: expected 11 fields, found 1"),
-    "frame": (field("bbox", "frame", "0.5"), r"bbox\.txt:2: frame: expected a whole number, found '0\.5'"),
-    "track": (field("bbox", "trackID", "-1"), r"bbox\.txt:2: trackID: expected at least 0, found -1"),
-    "track-twice": (
-        field("bbox", "trackID", "3"),
-        r"bbox\.txt:3: trackID: expected each once in a frame, found 3 twice",
-    ),
-    "left": (field("bbox", "left", "x"), r"bbox\.txt:2: left: expected a whole number, found 'x'"),
-    "right": (field("bbox", "right", "9"), r"bbox\.txt:2: right: expected at least 10, found 9"),
-    "bottom": (field("bbox", "bottom", "3"), r"bbox\.txt:2: bottom: expected at least 14, found 3"),
-    "outside": (
-        field("bbox", "right", "90"),
-        r"rgb_00000\.jpg: expected an image that holds .*90\.0.*found 80x40",
-    ),
-    "pixels": (field("bbox", "number_pixels", "-2"), r"bbox\.txt:2: number_pixels: expected at least 0, found -2"),
-    "truncation": (
-        field("bbox", "truncation_ratio", "1.5"),
-        r"bbox\.txt:2: truncation_ratio: expected a number in \[0, 1\], found 1\.5",
-    ),
-    "occupancy": (
-        field("bbox", "occupancy_ratio", "nan"),
-        r"bbox\.txt:2: occupancy_ratio: expected a finite number, found nan",
-    ),
-    "moving": (field("bbox", "isMoving", "yes"), r"bbox\.txt:2: isMoving: expected one of True, False.*'yes'"),
-    "no-pose": (
-        field("pose", "trackID", "99"),
+    (overwrite("pose.txt", b""), r"pose\.txt:1: expected a header 'frame .*found none"),
+    (set_field("bbox.txt", "isMoving", ""), r"bbox\.txt:2: expected 11 fields, found 10"),
+    (set_field("bbox.txt", "isMoving", "True x"), r"bbox\.txt:2: expected 11 fields, found 12"),
+    (replace_text("bbox.txt", "\n2 0 7", "\n2\n0 0 7"), r"bbox\.txt:8: expected 11 fields, found 1"),
+    (set_field("bbox.txt", "trackID", "3"), r"bbox\.txt:3: trackID: expected each once in a frame, found 3 twice"),
+    (set_field("bbox.txt", "right", "90"), r"rgb_00000\.jpg: expected an image that holds .*90\.0.*found 80x40"),
+    (
+        set_field("pose.txt", "trackID", "99"),
         r"pose\.txt: expected a row of frame 0 cameraID 0 trackID 0, found none",
     ),
-    "size": (field("pose", "height", "0"), r"pose\.txt:2: height: expected more than 0, found 0"),
-    "yaw": (
-        field("pose", "rotation_camera_space_y", "180"),
-        r"pose\.txt:2: rotation_camera_space_y: expected a num",
-    ),
-    "behind": (
-        field("pose", "camera_space_Z", "-9"),
-        r"pose\.txt:2: camera_space_Z: expected a 3D box in front of the camera, found -9 m, behind it",
-    ),
-    "world": (field("pose", "world_space_X", "inf"), r"pose\.txt:2: world_space_X: expected a finite number"),
-    "unknown-type": (field("info", "label", "Bus"), r"info\.txt:2: label: expected one of Car, Van, .*'Bus'"),
-    "no-type": (
-        edit("info", "0 Car car000", "1 Car car000"),
+    (
+        replace_text("info.txt", "0 Car car000", "1 Car car000"),
         r"info\.txt: expected a row of trackID 0, found none",
     ),
-    "two-types": (edit("info", "3 Car", "0 Car"), r"info\.txt:3: expected one row of trackID 0, found 2"),
-    "no-intrinsic": (
-        field("intrinsic", "frame", "7"),
+    (replace_text("info.txt", "3 Car", "0 Car"), r"info\.txt:3: expected one row of trackID 0, found 2"),
+    (
+        set_field("intrinsic.txt", "frame", "7"),
         r"intrinsic\.txt: expected a row of frame 0 cameraID 0, found none",
     ),
-    "focal": (field("intrinsic", "K[1,1]", "-1"), r"intrinsic\.txt:2: K\[1,1\]: expected more than 0, found -1"),
-    "centre": (field("intrinsic", "K[0,2]", "70"), r"rgb_00000\.jpg: expected 93 to 280 px wide"),
-    "colour-range": (
-        edit("colors", "210", "256"),
-        r"colors\.txt:2: r: expected a number in \[0, 255\], found 256",
-    ),
-    "colour-twice": (
-        edit("colors", "255 127 80", "0 0 0"),
-        r"colors\.txt:16: r g b: expected a unique colour",
-    ),
-    "name-twice": (edit("colors", "Van", "Car"), r"colors\.txt:15: Category: expected each once, found Car twice"),
-    "no-colour": (
-        edit("colors", "100 60 100", "1 2 3"),
+    (set_field("intrinsic.txt", "K[0,2]", "70"), r"rgb_00000\.jpg: expected 93 to 280 px wide"),
+    (replace_text("colors.txt", "255 127 80", "0 0 0"), r"colors\.txt:16: r g b: expected a unique colour"),
+    (replace_text("colors.txt", "Van", "Car"), r"colors\.txt:15: Category: expected each once, found Car twice"),
+    (
+        replace_text("colors.txt", "100 60 100", "1 2 3"),
         r"classgt_00000\.png: pixel \(\d+, \d+\): expected a colour of colors\.txt, found 100 60 100",
     ),
-    "no-colours": (
-        lambda c: (c / "colors.txt").write_text("Category r g b\n"),
-        r"colors\.txt: expected at least one colour, found none",
-    ),
-    "no-depth": (remove("frames/depth/Camera_0/depth_00000.png"), r"depth_00000\.png: expected a readable file"),
-    "8-bit-depth": (png(*DEPTH, np.zeros((40, 80), np.uint8)), r"expected 16 bits and 1 channel, found 8 bits"),
-    "colour-depth": (
-        png(*DEPTH, np.zeros((40, 80, 3), np.uint8)),
-        r"depth_00000\.png: expected 1 channel, found 3",
-    ),
-    "depth-size": (png(*DEPTH, np.zeros((30, 80), np.uint16)), r"depth_0.*: expected 80x40 px, found 80x30 px"),
-    "cut-depth": (cut(*DEPTH, 900), r"depth_00000\.png: expected a whole PNG, found 900 bytes"),
-    "empty-depth": (cut(*DEPTH, 0), r"depth_00000\.png: expected a PNG, found 0 bytes"),
-    "cut-instances": (
-        cut(*INSTANCES, 850),
-        r"instancegt_00000\.png: expected a whole PNG, found 850 bytes, cut in",
-    ),
-    "cut-between": (
-        cut(*INSTANCES, 33),
-        r"instancegt_00000\.png: expected a whole PNG, found 33 bytes, without an",
-    ),
-    "jpeg-instances": (
-        lambda c: (c / "frames/instanceSegmentation/Camera_0/instancegt_00000.png").write_bytes(b"\xff\xd8\xff"),
+    (overwrite("colors.txt", b"Category r g b\n"), r"colors\.txt: expected at least one colour, found none"),
+    (remove(DEPTH), r"depth_00000\.png: expected a readable file"),
+    (write_image(DEPTH, np.zeros((40, 80), np.uint8)), "expected 16 bits and 1 channel, found 8 bits"),
+    (write_image(DEPTH, np.zeros((40, 80, 3), np.uint8)), r"depth_00000\.png: expected 1 channel, found 3"),
+    (write_image(DEPTH, np.zeros((30, 80), np.uint16)), "depth_0.*: expected 80x40 px, found 80x30 px"),
+    (truncate(DEPTH, 900), r"depth_00000\.png: expected a whole PNG, found 900 bytes"),
+    (truncate(DEPTH, 0), r"depth_00000\.png: expected a PNG, found 0 bytes"),
+    (truncate(INSTANCES, 850), r"instancegt_00000\.png: expected a whole PNG, found 850 bytes, cut in"),
+    (truncate(INSTANCES, 33), r"instancegt_00000\.png: expected a whole PNG, found 33 bytes, without an"),
+    (
+        overwrite(INSTANCES, b"\xff\xd8\xff"),
         r"instancegt_00000\.png: expected a PNG, found 3 bytes of another format",
     ),
-    "colour-instances": (
-        png(*INSTANCES, np.zeros((40, 80, 3), np.uint8)),
-        r"instancegt.*: expected 1 channel, found 3",
-    ),
-    "instance-size": (
-        png(*INSTANCES, np.zeros((40, 81), np.uint8)),
-        r"instancegt.*expected 80x40 px, found 81x40",
-    ),
-    "class-size": (png(*CLASSES, np.zeros((40, 81, 3), np.uint8)), r"classgt.*expected 80x40 px, found 81x40 px"),
-    "grey-classes": (png(*CLASSES, np.zeros((40, 80), np.uint8)), r"classgt.*expected 8 bits and 3 channels"),
-    "photograph": (
-        lambda c: (c / "frames/rgb/Camera_0/rgb_00000.jpg").write_bytes(b"no"),
-        r"rgb_00000\.jpg: expected an image, found 2 bytes",
-    ),
-}
+    (write_image(INSTANCES, np.zeros((40, 80, 3), np.uint8)), "instancegt.*: expected 1 channel, found 3"),
+    (write_image(INSTANCES, np.zeros((40, 81), np.uint8)), "instancegt.*expected 80x40 px, found 81x40"),
+    (write_image(CLASSES, np.zeros((40, 81, 3), np.uint8)), "classgt.*expected 80x40 px, found 81x40 px"),
+    (write_image(CLASSES, np.zeros((40, 80), np.uint8)), "classgt.*expected 8 bits and 3 channels"),
+    (overwrite(PHOTOGRAPH, b"no"), r"rgb_00000\.jpg: expected an image, found 2 bytes"),
+)
 
 
-@pytest.mark.parametrize("fault", BAD)
-def test_a_fault_is_named_and_other_clips_are_read(fault: str, folder: Path) -> None:
-    spoil, message = BAD[fault]
+@pytest.mark.parametrize(("damage", "message"), FAULTS, ids=[message for _, message in FAULTS])
+def test_a_fault_is_named_and_other_clips_are_read(damage: Damage, message: str, folder: Path) -> None:
     Vkitti2Dataset(folder).frame(FIRST)
-    spoil(folder / "Scene01" / "clone")
+    damage(folder / "Scene01" / "clone")
     dataset = Vkitti2Dataset(folder)
     with pytest.raises(FormatError, match=message) as caught:
         dataset.frame(FIRST)
@@ -594,7 +521,7 @@ def test_a_fault_is_named_and_other_clips_are_read(fault: str, folder: Path) -> 
 
 
 def test_a_faulty_row_leaves_other_frames_alone(folder: Path) -> None:
-    field("bbox", "left", "x")(folder / "Scene01" / "clone")
+    set_field("bbox.txt", "left", "x")(folder / "Scene01" / "clone")
     Vkitti2Dataset(folder).frame("Scene01/clone/Camera_0/00002")
 
 

@@ -34,7 +34,7 @@ def folder(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     assert not writer.exists(place(0))
     entries = [
         writer.write(place(0), make_exposure(0)),
-        writer.write(place(1, "val"), make_exposure(1, tracked_objects=())),
+        writer.write(place(1, "val"), make_exposure(1, specification=())),
     ]
     assert writer.exists(place(0))
     assert not writer.exists(place(0, "val"))

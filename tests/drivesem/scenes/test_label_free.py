@@ -86,7 +86,7 @@ def cars(count: int) -> Detections:
 def test_what_is_behind_is_hidden_and_what_leaves_the_image_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """One car behind another, one beside, one half out of the image, one behind the camera."""
     places = torch.tensor([[0.0, 1.65, 10], [0.3, 1.65, 20], [9, 1.65, 20], [-8, 1.65, 9.5], [0, 1.65, -5]])
-    monkeypatch.setattr("drivesem.scenes.label_free.estimate", known(places))
+    monkeypatch.setattr("drivesem.scenes.label_free.estimate_poses", known(places))
     labels = label_from_detections(frame_of(), cars(5)).labels
     assert labels is not None
     assert torch.equal(labels.translation, places[:4])
@@ -141,7 +141,7 @@ def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.Monkey
         requested.append(boxes_xyxy)
         return known(torch.tensor([[4.0 * i, 1.65, 20] for i in range(len(boxes_xyxy))]))()
 
-    monkeypatch.setattr("drivesem.scenes.label_free.estimate", estimate)
+    monkeypatch.setattr("drivesem.scenes.label_free.estimate_poses", estimate)
     boxes = [
         [902.0, 232, 1232, 368],
         [10, 100, 210, 200],
@@ -159,7 +159,7 @@ def test_boxes_that_end_near_the_border_are_cut_by_it(monkeypatch: pytest.Monkey
 def test_vehicles_that_cannot_stand_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cars in one place the surer one stays; one above the ground goes; neighbours stay."""
     places = torch.tensor([[0.0, 1.65, 10], [0.4, 1.65, 11], [3.0, 1.65, 10], [6.0, -1.5, 15], [8.0, 2.2, 25]])
-    monkeypatch.setattr("drivesem.scenes.label_free.estimate", known(places))
+    monkeypatch.setattr("drivesem.scenes.label_free.estimate_poses", known(places))
     found = cars(5)
     found.scores[1] = 0.95
     labels = label_from_detections(frame_of(), found).labels
@@ -332,7 +332,7 @@ def test_derender_takes_a_photograph(
     [
         (["none.png"], "none.png: expected a readable file"),
         (["a.txt"], "a.txt: expected an image"),
-        (["none.png", "--dataset", "kitti", "--root", "."], "PHOTO: expected no --dataset beside it"),
+        (["none.png", "--dataset", "kitti", "--root", "."], "PHOTO: expected no --dataset, found"),
         (["--focal", "700"], "--focal: expected --dataset coco, yolo, photographs"),
         (["none.png", "--focal", "-1"], "--focal: expected positive px"),
     ],

@@ -194,7 +194,7 @@ def test_a_fault_of_ours_is_one_line_too(
     def broken(self: InteractiveScene, drawn: object) -> bytes:
         raise AssertionError("two\nlines")
 
-    monkeypatch.setattr(InteractiveScene, "picture", broken)
+    monkeypatch.setattr(InteractiveScene, "encode_picture", broken)
     answer = get(server, query("/picture", **STILL))
     assert answer.status == 500
     assert answer.line == "two lines"
@@ -218,7 +218,7 @@ def test_a_later_request_of_a_page_supersedes_those_that_wait(
         assert go_on.wait(30)
         return really(self, state, keep)
 
-    monkeypatch.setattr(InteractiveScene, "drawn", slow)
+    monkeypatch.setattr(InteractiveScene, "render_state", slow)
     statuses: dict[int, int] = {}
     with served(viewer) as server:
 
@@ -295,7 +295,7 @@ def test_few_frames_and_pages_are_cached(
         def __init__(self, folder: Path, *rest: Any) -> None:
             made.append(folder)
 
-    monkeypatch.setattr("drivesem.viewer.server.Stage", Made)
+    monkeypatch.setattr("drivesem.viewer.server.InteractiveScene", Made)
     frames = {name: ViewerFrame(Path(name)) for name in "abc"}
     viewer = Viewer("t", frames, stubborn, PRESETS["street"])
     for name in "abacab":

@@ -1,4 +1,4 @@
-"""Splits: 3D-SDN's of Virtual KITTI, and names in a file, on generated folders in that layout."""
+"""Subsets and joined folders: 3D-SDN's splits of Virtual KITTI, random shares, names in a file, several folders."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,10 +14,12 @@ from drivesem.config.commands import TrainConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions
 from drivesem.data.ground_truth import Exposure, FrameLocation
+from drivesem.data.kitti import KittiDataset
 from drivesem.data.registry import open_dataset
-from drivesem.data.subsets import PUBLISHED_SPLITS, select_split
+from drivesem.data.subsets import PUBLISHED_SPLITS, open_folders, select_split
 from drivesem.data.vkitti1 import Vkitti1Writer
 from drivesem.scenes.sources import open_source
+from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera
 
@@ -124,3 +127,37 @@ def test_a_split_needs_a_labelled_data_set(refused: Callable[..., str]) -> None:
     with pytest.raises(UsageError, match="--split, --held-out-split: expected none with --dataset synth"):
         TrainConfig(dataset="synth", held_out_split="3d-sdn").check()
     TrainConfig(dataset="vkitti1", root="x", held_out_split="3d-sdn").check()
+
+
+CALIBRATION = "P2: 700 0 60 0 0 700 20 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\n"
+
+
+def _kitti(root: Path, names: list[str], value: int) -> Path:
+    for name in names:
+        files.write_png(root / f"training/image_2/{name}.png", np.full((40, 120, 3), value, np.uint8))
+        files.write_text(root / f"training/calib/{name}.txt", CALIBRATION)
+        box = f"{value}.00 5.00 90.00 30.00"
+        files.write_text(root / f"training/label_2/{name}.txt", f"Car 0 0 -10 {box} 1.5 1.7 4.2 0 1.6 20 0.1\n")
+    return root
+
+
+def test_frames_of_both_folders_in_order(tmp_path: Path) -> None:
+    first = _kitti(tmp_path / "b", ["000000", "000001"], 10)
+    second = _kitti(tmp_path / "a", ["000000"], 20)
+    joined = open_folders("kitti", f"{first},{second}")
+    assert joined.identifiers == ("0/000000", "0/000001", "1/000000")
+    for name, value in zip(joined.identifiers, (10, 10, 20), strict=True):
+        labels = joined.labels(name)
+        assert labels is not None
+        assert float(labels.boxes_xyxy[0, 0]) == value
+        assert torch.equal(joined.frame(name).photograph, torch.full((3, 40, 120), value / 255))
+
+
+def test_one_folder_stays_itself(tmp_path: Path) -> None:
+    assert isinstance(open_folders("kitti", str(_kitti(tmp_path, ["000000"], 10))), KittiDataset)
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    first = _kitti(tmp_path / "a", ["000000"], 10)
+    with pytest.raises(FormatError, match="missing"):
+        open_folders("kitti", f"{first},{tmp_path / 'missing'}")
