@@ -139,7 +139,7 @@ def test_flatten_rejects_what_does_not_fit(street):
     space = ParameterSpace(street(), ("rotate",))
     with pytest.raises(ShapeError, match=r"perturbation\.rotate"):
         space.flatten(Perturbation())
-    with pytest.raises(ShapeError, match=r"perturbation\.mesh.*held"):
+    with pytest.raises(ShapeError, match=r"perturbation\.mesh.*fixed"):
         space.flatten(Perturbation(rotate=torch.zeros(4, 1), mesh=torch.zeros(4, 96)))
     with pytest.raises(ShapeError, match="theta"):
         space.unflatten(torch.zeros(5))
