@@ -132,7 +132,7 @@ def render_pictures(
     Args:
         views: The pictures.
         renderer: Renderer of this process.
-        config: Settings, of which other processes make theirs.
+        config: Settings, from which other processes build their renderers.
         out: Folder of the data set.
 
     Raises:

@@ -18,7 +18,7 @@ from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
 from drivesem.run.frame import RESULT
 from drivesem.run.records import load_record
-from drivesem.run.report.runs import PAGE
+from drivesem.run.run_report import PAGE
 from scene_ir import files
 
 CSV = "classified.csv"

@@ -21,7 +21,7 @@ from drivesem.report.tables import ReportTable, format_count, format_percent, pr
 from drivesem.report.terminal import Console
 from drivesem.run.driver import print_output_folder, publish_report
 from drivesem.run.folder import claim_folder, resolve_output_folder
-from drivesem.run.report.runs import PAGE
+from drivesem.run.run_report import PAGE
 
 _ANALYSES = {"explain": explain_failures, "holes": find_pose_regions, "gate": compare_networks}
 
@@ -33,17 +33,17 @@ def classify_command(config: ClassifyConfig) -> int:
         report = _ANALYSES[config.what](config)
         publish_report(report, config.json)
         return 0 if report.data.get("passed", True) else 1
-    actions = {"data": _data, "train": _train, "attack": _attack, "confirm": _confirm}
+    actions = {"data": _write_data_set, "train": _train, "attack": _attack, "confirm": _confirm}
     actions[config.what](config, Console(stderr=True) if config.json else Console())
     return 0
 
 
-def _data(config: ClassifyConfig, console: Console) -> None:
+def _write_data_set(config: ClassifyConfig, console: Console) -> None:
     out = resolve_output_folder(config.out, Path("runs") / "classify-pictures")
     claim_folder(out, config, ("train", "val", "test"))
     counts, failed = write_pictures(config, out)
     console.print(f"pictures: {', '.join(f'{count} {split}' for split, count in counts.items())}")
-    _print_end(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed}, failed)
+    _print_results(config, console, out, {"out": str(out), "pictures": counts, "frames_failed": failed}, failed)
 
 
 def _train(config: ClassifyConfig, console: Console) -> None:
@@ -57,12 +57,12 @@ def _train(config: ClassifyConfig, console: Console) -> None:
             f"accuracy on {split}: {format_percent(value)} % [{low}, {high}] of {data['pictures'][split]}",
             markup=False,
         )
-    _print_end(config, console, Path(data["weights"]), data, data["frames_failed"])
+    _print_results(config, console, Path(data["weights"]), data, data["frames_failed"])
 
 
 def _attack(config: ClassifyConfig, console: Console) -> None:
     metrics = attack_pictures(config)
-    console.print(_table(metrics).to_rich(("class",)))
+    console.print(_build_table(metrics).to_rich(("class",)))
     grades = metrics.grades
     console.print(
         f"{format_count(metrics.overall.pictures, 'picture')}, {format_count(metrics.queries, 'query', 'queries')}, "
@@ -70,12 +70,12 @@ def _attack(config: ClassifyConfig, console: Console) -> None:
         f"{grades['threshold']} misclassified by threshold, {grades['certain']} certain",
         soft_wrap=True,
     )
-    _print_end(config, console, Path(metrics.out) / PAGE, metrics.to_json(), metrics.frames_failed)
+    _print_results(config, console, Path(metrics.out) / PAGE, metrics.to_json(), metrics.frames_failed)
 
 
 def _confirm(config: ClassifyConfig, console: Console) -> None:
     metrics, facts = confirm_failures(config)
-    console.print(_table(metrics).to_rich(("class",)))
+    console.print(_build_table(metrics).to_rich(("class",)))
     lines = [
         f"{facts['renderer']} agrees on {facts['agree']} of {format_count(facts['failures'], 'failure')}; "
         f"{metrics.grades['certain']} are certain, {metrics.grades['confirmed']} confirmed"
@@ -88,12 +88,12 @@ def _confirm(config: ClassifyConfig, console: Console) -> None:
             "(CIE 1976, mean of an object)"
         )
     console.print("\n".join(lines), soft_wrap=True)
-    _print_end(
+    _print_results(
         config, console, Path(metrics.out) / PAGE, {**metrics.to_json(), "second": facts}, facts["frames_failed"]
     )
 
 
-def _print_end(
+def _print_results(
     config: ClassifyConfig, console: Console, out: Path, data: Mapping[str, Any], failed: Mapping[str, str]
 ) -> None:
     print_output_folder(out, console, failed)
@@ -101,7 +101,7 @@ def _print_end(
         print_json(data)
 
 
-def _table(metrics: ClassifyMetrics) -> ReportTable:
+def _build_table(metrics: ClassifyMetrics) -> ReportTable:
     def row(name: str, counts: ClassCounts) -> tuple[str, ...]:
         return name, str(counts.pictures), *format_accuracy(counts), str(counts.certain), str(counts.confirmed)
 

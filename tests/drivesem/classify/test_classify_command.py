@@ -181,17 +181,19 @@ def test_training_pictures_are_mirrored_and_halved(solids, tmp_path, classify, m
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--views back", "--views: expected names among forward, top, left, right"),
-        ("--params colour", "params: expected names among vertex, pose, lighting"),
-        ("--backgrounds {folder}/gone", "--backgrounds: expected a folder of photographs"),
-        ("--backgrounds {folder}/empty", "expected a folder with photographs"),
-        ("--backgrounds {folder}/torn", "sky.png"),
-        ("--weights x.pth", "--weights: expected classify train"),
-        ("--half 2", "--half: expected classify train --layers all, found 2"),
-        ("--precision bfloat16", "--precision: expected classify train --layers all, found bfloat16"),
-        ("--queries 7", "--queries: expected --method random"),
-        ("--step-pose 0", "--step-pose: expected a number above 0"),
-        ("--nuisances fog=1", "--nuisances"),
+        ("attack --views back", "--views: expected names among forward, top, left, right"),
+        ("attack --params colour", "params: expected names among vertex, pose, lighting"),
+        ("attack --backgrounds {folder}/gone", "--backgrounds: expected a folder of photographs"),
+        ("attack --backgrounds {folder}/empty", "expected a folder with photographs"),
+        ("attack --backgrounds {folder}/torn", "sky.png"),
+        ("attack --weights x.pth", "--weights: expected only with train, found attack"),
+        ("attack --half 2", "--half: expected only with train, found attack"),
+        ("attack --precision bfloat16", "--precision: expected only with train, found attack"),
+        ("attack --queries 7", "--queries: expected only with --method random, halton"),
+        ("attack --step-pose 0", "--step-pose: expected a number above 0"),
+        ("attack --nuisances fog=1", "--nuisances"),
+        ("train --half 2", "--half: expected --layers all, found --layers last"),
+        ("train --precision bfloat16", "--precision: expected --layers all, found --layers last"),
     ],
 )
 def test_bad_settings_are_one_line_and_exit_code_2(solids, tmp_path, classify, words, message):
@@ -199,7 +201,7 @@ def test_bad_settings_are_one_line_and_exit_code_2(solids, tmp_path, classify, w
     (tmp_path / "torn").mkdir()
     (tmp_path / "torn" / "sky.png").write_bytes(b"\x89PNG no picture")
     words = words.format(folder=tmp_path).split()
-    code, _, printed = classify("attack", "--out", tmp_path / "run", "--limit", "1", *words)
+    code, _, printed = classify(*words, "--out", tmp_path / "run", "--limit", "1")
     assert code == 2
     assert message in error_line(printed)
 

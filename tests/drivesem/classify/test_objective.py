@@ -1,11 +1,13 @@
-"""Losses by hand, and attacks on networks with known outcomes."""
+"""Losses by hand, and attacks on networks with fixed outcomes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 
+from drivesem.attack.methods.base import Score
 from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
 from drivesem.attack.methods.gradient_free import Sampling
 from drivesem.attack.methods.scw import SCW
@@ -20,7 +22,7 @@ WIDE = ParameterAmounts(0.5, 3.0, 0.9)
 SCORES = torch.tensor([2.0, 3.0, -1.0])
 
 
-def objective_of(network, aimed="logit", params="pose", kind="box", reach=WIDE):
+def make_objective(network, aimed="logit", params="pose", kind="box", reach=WIDE):
     scene = ObjectScene(kind, make_model(kind), "forward", GREY)
     space = ObjectSpace(scene.vertices, parse_parameters(params), ParameterAmounts(0.002, 0.15, 0.2), reach)
     return ClassifierObjective(scene, space, network, aimed)
@@ -44,7 +46,7 @@ def test_prediction_confidence_and_margin():
 
 
 def test_loss_and_gradient(colours):
-    objective = objective_of(colours)
+    objective = make_objective(colours)
     loss, gradient = objective.loss_and_grad(torch.tensor([0.1, 0.2, 0.0]))
     seen = objective.evaluate(torch.tensor([0.1, 0.2, 0.0]))
     assert loss == pytest.approx(-float(seen.logits[0]), abs=0.02)  # what is judged is rounded to 8 bits
@@ -52,8 +54,8 @@ def test_loss_and_gradient(colours):
     assert objective.passes == 1 + 3 + 1
 
 
-def test_a_picture_that_is_wrong_from_the_start_is_no_failure(colours):
-    objective = objective_of(colours, kind="ball")
+def test_a_picture_that_is_misclassified_unchanged_is_no_failure(colours):
+    objective = make_objective(colours, kind="ball")
     object.__setattr__(objective.scene.model, "label", 2)
     objective = ClassifierObjective(objective.scene, objective.space, colours, "logit")
     score = objective.score(torch.zeros(3))
@@ -61,15 +63,15 @@ def test_a_picture_that_is_wrong_from_the_start_is_no_failure(colours):
     assert (score.lost, score.phantoms, score.success, score.failures) == (0, 0, False, 0)
 
 
-def test_a_loss_that_is_no_number(colours):
-    objective = objective_of(colours)
+def test_a_loss_that_is_not_finite(colours):
+    objective = make_objective(colours)
     objective.network = lambda images: images.mean(dim=(2, 3)) * math.nan
     with pytest.raises(RangeError, match="a finite loss"):
         objective.loss_and_grad(torch.zeros(3))
 
 
-class Narrow(nn.Module):
-    """Says box as long as it is red enough: less than `limit` below what it is at first."""
+class NarrowClassifier(nn.Module):
+    """Predicts box while red is less than `limit` below its first value."""
 
     def __init__(self, network, limit):
         super().__init__()
@@ -90,10 +92,12 @@ METHODS = {
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_the_papers_methods_find_a_failure_and_stop_at_it(name, colours):
+def test_methods_stop_at_the_first_failure(name, colours):
     method, aimed = METHODS[name]
     params = "pose" if name == "halton" else "pose,vertex"
-    objective = objective_of(Narrow(colours, 0.02), aimed, params, reach=ParameterAmounts(0.05, 0.75, 0.9))
+    objective = make_objective(
+        NarrowClassifier(colours, 0.02), aimed, params, reach=ParameterAmounts(0.05, 0.75, 0.9)
+    )
     result = method(objective.problem(), objective.space.theta0, seed=0)
     assert result.success_moved
     assert not objective.evaluate(result.theta).correct
@@ -105,22 +109,20 @@ def test_the_papers_methods_find_a_failure_and_stop_at_it(name, colours):
 @pytest.mark.parametrize("name", ["si-fgsm", "sgd", "scw"])
 def test_the_true_score_falls(name, colours):
     method, aimed = METHODS[name]
-    objective = objective_of(Narrow(colours, 99.0), aimed, "pose,vertex")
+    objective = make_objective(NarrowClassifier(colours, 99.0), aimed, "pose,vertex")
     result = method(objective.problem(), objective.space.theta0, seed=0)
     assert not result.success_moved
     assert result.score.loss > objective.score(objective.space.theta0).loss
     assert result.queries == 5
 
 
-class Chosen:
-    """A problem in which wrong answers are known by theta: (theta, misclassified, softmax of the wrong class)."""
+class FixedOutcomes:
+    """A problem in which wrong answers are fixed by theta: (theta, misclassified, softmax of the wrong class)."""
 
     def __init__(self, outcomes):
         self.outcomes, self.samples = outcomes, []
 
     def score(self, theta):
-        from drivesem.attack.methods.base import Score
-
         if not bool(theta.any()):
             return Score(0.05, 0, 0, False, False)
         if not any(torch.equal(theta, t) for t in self.samples):
@@ -139,13 +141,14 @@ class Chosen:
         ([(False, 0.10), (False, 0.20), (False, 0.30), (False, 0.40), (False, 0.25)], 3),
     ],
 )
-def test_of_five_samples_the_misclassified_one_with_the_highest_wrong_softmax(kind, outcomes, winner, colours):
-    from dataclasses import replace
-
-    objective, known = objective_of(colours, "softmax", reach=ParameterAmounts(0.05, 0.75, 0.5)), Chosen(outcomes)
-    problem = replace(objective.problem(), score=known.score)
+def test_sampling_prefers_failures_then_the_highest_wrong_softmax(kind, outcomes, winner, colours):
+    objective, fixed = (
+        make_objective(colours, "softmax", reach=ParameterAmounts(0.05, 0.75, 0.5)),
+        FixedOutcomes(outcomes),
+    )
+    problem = replace(objective.problem(), score=fixed.score)
     result = Sampling(5, kind=kind)(problem, objective.space.theta0, seed=1)
-    assert len(known.samples) == 5
-    assert torch.equal(result.theta, known.samples[winner])
+    assert len(fixed.samples) == 5
+    assert torch.equal(result.theta, fixed.samples[winner])
     assert float(result.theta.abs().max()) <= 0.75
-    assert max(float(theta.abs().max()) for theta in known.samples) > 0.3
+    assert max(float(theta.abs().max()) for theta in fixed.samples) > 0.3

@@ -45,7 +45,7 @@ def test_views():
     assert abs(sides[0]) > 0.1
 
 
-def test_a_rotation_is_one_and_angles_add_to_the_view():
+def test_rotation_matrices_and_angles_add_to_the_view():
     turn = rotation_matrix(torch.tensor([0.3, -0.5, 0.2]))
     torch.testing.assert_close(turn @ turn.T, torch.eye(3))
     assert float(torch.linalg.det(turn)) == pytest.approx(1)
@@ -65,8 +65,8 @@ def test_a_picture_has_its_background_around_the_object():
 
 @pytest.mark.parametrize("drawn_px", [512, 96, 448])
 @pytest.mark.parametrize("along", [(0.0, 0.0), (0.9, -0.4), (30.0, 0.0)])
-def test_only_what_is_around_an_object_is_drawn_smaller(drawn_px, along, monkeypatch):
-    """As if all of the picture were; the object in the middle, over two borders, or out of it."""
+def test_only_the_surroundings_of_an_object_are_downscaled(drawn_px, along, monkeypatch):
+    """The result equals that of the whole picture, with the object in the middle, over two borders, or outside."""
     monkeypatch.setattr(scenes, "DRAWN_PX", drawn_px)
     behind = torch.rand(3, drawn_px, drawn_px, generator=torch.Generator().manual_seed(0))
     scene, view = ObjectScene("ball", make_model("ball"), "forward", behind), picture_camera(drawn_px)
@@ -93,44 +93,38 @@ def smooth_noise():
     return torch.nn.functional.avg_pool2d(noise, 9, 1, 4)[0].double()
 
 
+def gradient_agreement(value, dim, step):
+    """Cosine between the gradient at theta = 0 and central differences."""
+    leaf = torch.zeros(dim, requires_grad=True)
+    (gradient,) = torch.autograd.grad(value(leaf), leaf)
+    with torch.no_grad():
+        slopes = [(value(step * d) - value(-step * d)) / (2 * step) for d in torch.eye(dim)]
+    return float(torch.nn.functional.cosine_similarity(torch.stack(slopes).double(), gradient.double(), dim=0))
+
+
 @pytest.mark.parametrize("params", ["pose", pytest.param("vertex", marks=pytest.mark.slow), "lighting"])
-def test_gradients_through_the_picture_and_through_a_score(params, colours):
-    """512 px drawn, 224 seen, and what a network makes of it."""
+def test_gradients_of_the_picture_and_of_a_score(params, colours):
     scene = ObjectScene("box", make_model("box"), "left", generate_background("box"))
     space = ObjectSpace(scene.vertices, parse_parameters(params), ParameterAmounts(0.002, 0.15, 0.2))
     weight = smooth_noise()
     step = 1e-2 if params == "lighting" else 2e-3
-    through = {
-        "image": lambda theta: (scene.render(space.change(theta)).double() * weight).sum(),
-        "score": lambda theta: colours(scene.render(space.change(theta))[None])[0, 0].double(),
-    }
-    for name, value in through.items():
-        leaf = torch.zeros(space.dim, requires_grad=True)
-        (gradient,) = torch.autograd.grad(value(leaf), leaf)
-        with torch.no_grad():
-            slopes = [(value(step * d) - value(-step * d)) / (2 * step) for d in torch.eye(space.dim)]
-        cosine = torch.nn.functional.cosine_similarity(torch.stack(slopes).double(), gradient.double(), dim=0)
-        assert float(cosine) >= 0.99, name
+    for value in (
+        lambda theta: (scene.render(space.change(theta)).double() * weight).sum(),
+        lambda theta: colours(scene.render(space.change(theta))[None])[0, 0].double(),
+    ):
+        assert gradient_agreement(value, space.dim, step) >= 0.99
 
 
 @pytest.mark.parametrize("name", ["bus/0080", "airplane/0080"])
 def test_gradients_of_objects_with_parts_thinner_than_a_pixel(name):
-    """Through the picture; where faces came and went with the pixels' centres, it was 0.86 and 0.57."""
+    """Faces that appear and vanish at pixel centres would give 0.86 and 0.57."""
     scene = ObjectScene(name, open_objects(None).load(name), "top", generate_background(name))
     space = ObjectSpace(scene.vertices, parse_parameters("pose"), ParameterAmounts(0.002, 0.15, 0.2))
     weight = smooth_noise()
-
-    def value(theta):
-        return (scene.render(space.change(theta)).double() * weight).sum()
-
-    step, leaf = 1e-3, torch.zeros(3, requires_grad=True)
-    (gradient,) = torch.autograd.grad(value(leaf), leaf)
-    with torch.no_grad():
-        slopes = [(value(step * d) - value(-step * d)) / (2 * step) for d in torch.eye(3)]
-    assert float(torch.nn.functional.cosine_similarity(torch.stack(slopes), gradient.double(), dim=0)) >= 0.99
+    assert gradient_agreement(lambda t: (scene.render(space.change(t)).double() * weight).sum(), 3, 1e-3) >= 0.99
 
 
-def test_made_backgrounds_follow_from_their_names():
+def test_generated_backgrounds_depend_on_the_name():
     one = generate_background("a")
     assert one.shape == (3, DRAWN_PX, DRAWN_PX)
     assert bool((one >= 0).all() and (one <= 1).all())
@@ -147,7 +141,7 @@ def test_photographs_as_backgrounds(tmp_path):
     torch.testing.assert_close(background, expected)
 
 
-def test_backgrounds_that_cannot_be_used(tmp_path):
+def test_missing_and_damaged_backgrounds(tmp_path):
     with pytest.raises(FormatError, match="photographs"):
         open_backgrounds(str(tmp_path))
     (tmp_path / "torn.jpg").write_bytes(b"\xff\xd8 no picture")
@@ -155,5 +149,5 @@ def test_backgrounds_that_cannot_be_used(tmp_path):
         open_backgrounds(str(tmp_path))("anything")
 
 
-def test_classes_in_turn():
+def test_classes_are_interleaved():
     assert interleave_classes(["a/0", "a/1", "b/0", "b/1", "b/2"]) == ["a/0", "b/0", "a/1", "b/1", "b/2"]
