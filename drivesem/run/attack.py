@@ -53,8 +53,8 @@ from drivesem.run.finished import MANIFEST, METRICS
 from drivesem.run.folder import FRAMES, claim_folder, result_settings
 from drivesem.run.frame import RESULT, AttackedScene, grade_failures, write_frame
 from drivesem.run.manifest import build_manifest
-from drivesem.run.report.runs import write_run_report
 from drivesem.run.results import FrameResult, RunSummary, load_frame
+from drivesem.run.run_report import write_run_report
 from drivesem.run.summary import summarise_frames
 from drivesem.scenes.sources import NoVehicleError, SceneSource, compile_source_kernels, open_source
 from scene_ir import files

@@ -114,20 +114,17 @@ class FrameAnalyser(ABC, Generic[K]):
         self.run_folder, self.out = run_folder, out
 
     @abstractmethod
-    def analyse(self, name: str, source: str, folder: Path) -> K:
-        """Analyse one frame.
-
-        Args:
-            name: The frame.
-            source: Digest of its result.json, for the result.
-            folder: Where pictures go.
-        """
+    def analyse(self, name: str, folder: Path) -> K:
+        """Analyse a frame, and write pictures to `folder`. The result has the frame's `source_digest`."""
 
     def __call__(self, name: str) -> None:
         """Analyse one frame and write its folder, completely or not at all."""
-        source = files.sha256_digest(self.run_folder / FRAMES / name / RESULT)
         with files.atomic_folder(self.out / FRAMES / name) as folder:
-            files.write_text(folder / self.file, dump_record(self.analyse(name, source, folder), self.schema))
+            files.write_text(folder / self.file, dump_record(self.analyse(name, folder), self.schema))
+
+    def source_digest(self, name: str) -> str:
+        """Return the digest of a frame's result.json in the run."""
+        return files.sha256_digest(self.run_folder / FRAMES / name / RESULT)
 
     def load_result(self, name: str) -> K:
         """Load the stored result of a frame. Raises FormatError for a damaged file."""
@@ -135,8 +132,7 @@ class FrameAnalyser(ABC, Generic[K]):
 
     def is_done(self, name: str) -> bool:
         """Whether there is a stored result of the frame as it is now in the run."""
-        source = self.run_folder / FRAMES / name / RESULT
-        return self._result_path(name).is_file() and self.load_result(name).source == files.sha256_digest(source)
+        return self._result_path(name).is_file() and self.load_result(name).source == self.source_digest(name)
 
     def _result_path(self, name: str) -> Path:
         return self.out / FRAMES / name / self.file

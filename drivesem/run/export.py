@@ -14,8 +14,8 @@ from drivesem.config.errors import UsageError
 from drivesem.data.label_table import WriteSummary, xyxy_to_coco
 from drivesem.failures.grades import Grade
 from drivesem.report.tables import rows_to_csv
+from drivesem.run.conversion import ConversionSettings, convert_labels, provenance
 from drivesem.run.finished import AttackRun
-from drivesem.run.labels import ConversionSettings, convert_labels, provenance
 from drivesem.run.results import FrameResult
 from drivesem.run.summary import has_grade
 from scene_ir import files

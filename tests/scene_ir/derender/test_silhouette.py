@@ -47,7 +47,7 @@ def test_silhouettes_of_no_cars_and_of_a_car_next_to_the_image():
     assert not outline(car(x=60.0)).any()
 
 
-@pytest.mark.parametrize(("radius", "kept"), [(2.0, 45), (-2.0, 5)])
+@pytest.mark.parametrize(("radius", "remaining"), [(2.0, 45), (-2.0, 5)])
 def test_grow_and_shrink(radius, remaining):
     mask = np.zeros((30, 30), bool)
     mask[13:18, 13:18] = True
