@@ -32,14 +32,14 @@ _START = "import sys; from drivesem.cli import main; sys.exit(main())"
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class RunTime:
     """Seconds of one run: the processor's and the clock's."""
 
     processor: float
     clock: float
 
 
-def run(checkout: Path, words: Sequence[str], out: Path) -> Spent:
+def run(checkout: Path, words: Sequence[str], out: Path) -> RunTime:
     """One run of a checkout's `drivesem`. UsageError with its last line where it ends with another code than 0 or
     1, a check that failed.
     """
@@ -53,13 +53,13 @@ def run(checkout: Path, words: Sequence[str], out: Path) -> Spent:
         last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
         raise UsageError(f"drivesem of {checkout}", "a command that works", last)
     processor = after.children_user + after.children_system - before.children_user - before.children_system
-    return Spent(processor, clock)
+    return RunTime(processor, clock)
 
 
-def compare(before: Path, words: Sequence[str], rounds: int, keep: Path | None) -> dict[str, list[Spent]]:
+def compare(before: Path, words: Sequence[str], rounds: int, keep: Path | None) -> dict[str, list[RunTime]]:
     """`rounds` runs of each checkout, in turn."""
     checkouts = {"before": before.resolve(), "now": ROOT}
-    spent: dict[str, list[Spent]] = {name: [] for name in checkouts}
+    spent: dict[str, list[RunTime]] = {name: [] for name in checkouts}
     for number in range(rounds):
         for name in sorted(checkouts, reverse=bool(number % 2)):
             with tempfile.TemporaryDirectory(prefix="drivesem-beside-") as folder:

@@ -65,7 +65,7 @@ _FREE_DEG = 50.0
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelFile:
     """How to read one model."""
 
     kind: str
@@ -86,48 +86,48 @@ class Model:
     """What lies wholly above this is left out (aerials)."""
 
 
-_KATOR_01 = Model(
+_KATOR_01 = ModelFile(
     "sedan", ("Car",), ("Glass",), ("Tire_Rubber",), ("Turn_signals", "Headlights", "Taillights", "Reflector")
 )
-_KATOR_02 = Model(
+_KATOR_02 = ModelFile(
     "sedan",
     ("PAINT_lt_blue",),
     ("GLASS_car_window", "GLASS_car_defroster"),
     ("RUBBER_tread", "RUBBER"),
     ("GLASS", "GLASS_headlights", "GLASS_brake_light2", "GLASS_brakelight", "GLASS_turn_signals"),
 )
-MODELS: Mapping[str, Model] = {
-    "scopia/seat_leon": Model(
+MODELS: Mapping[str, ModelFile] = {
+    "scopia/seat_leon": ModelFile(
         "hatchback",
         ("chapa_roja",),
         ("cristales",),
         ("neumaticos",),
         ("faros_rojos", "faros_blan_back", "faros_blancos_faro1_leon.jpg"),
     ),
-    "scopia/suv": Model("suv", ("firstcolor",)),
-    "scopia/smart-car": Model(
+    "scopia/suv": ModelFile("suv", ("firstcolor",)),
+    "scopia/smart-car": ModelFile(
         "hatchback",
         ("first-color", "second-color"),
         ("glass", "black-glass"),
         ("wheels-rubber",),
         ("back-lights",),
     ),
-    "scopia/chevrolet": Model("sedan", ("firstcolor",), light=("glassfocus",)),
-    "scopia/peugeot-308": Model("sedan", ("color-exterior",), light=("front-lights", "rear-lights")),
-    "scopia/renault-scenic": Model(
+    "scopia/chevrolet": ModelFile("sedan", ("firstcolor",), light=("glassfocus",)),
+    "scopia/peugeot-308": ModelFile("sedan", ("color-exterior",), light=("front-lights", "rear-lights")),
+    "scopia/renault-scenic": ModelFile(
         "estate",
         ("color-beige-green",),
         ("glass", "dark-glass"),
         light=("front-lights", "back-lights"),
         roof_m=1.66,
     ),
-    "scopia/van": Model("van", ("firstcolor", "whiteglass"), light=("redlights",)),
-    "scopia/bus": Model("bus", ("firstcolor",)),
-    "scopia/cityBus": Model("bus", ("whiteBase", "accentColor"), ("glass", "darkglass")),
-    "scopia/truck": Model(
+    "scopia/van": ModelFile("van", ("firstcolor", "whiteglass"), light=("redlights",)),
+    "scopia/bus": ModelFile("bus", ("firstcolor",)),
+    "scopia/cityBus": ModelFile("bus", ("whiteBase", "accentColor"), ("glass", "darkglass")),
+    "scopia/truck": ModelFile(
         "truck", ("red-cabin", "white-container"), tyre=("black-plastic",), light=("orange-lights",)
     ),
-    "katorlegaz/VW-new-beetle": Model(
+    "katorlegaz/VW-new-beetle": ModelFile(
         "hatchback",
         ("PAINT_yellow",),
         ("GLASS_car_window", "GLASS_car_defroster"),
@@ -148,11 +148,13 @@ MODELS: Mapping[str, Model] = {
     "katorlegaz/concept-sedan-01v2": _KATOR_01,
     "katorlegaz/concept-sedan-02": _KATOR_02,
     "katorlegaz/concept-sedan-02-sport": _KATOR_02,
-    "blendswap-cc-by/fordFocus": Model(
+    "blendswap-cc-by/fordFocus": ModelFile(
         "hatchback", ("carPaint",), tyre=("black_rubber",), light=("glass_red", "white", "yellow_chrome")
     ),
-    "blendswap-cc-by/dafTruck": Model("truck", ("Cabin", "Payload"), ("Glass",), (), plain=("Payload", "Trailer")),
-    "blendswap-cc-0/peterbilt": Model(
+    "blendswap-cc-by/dafTruck": ModelFile(
+        "truck", ("Cabin", "Payload"), ("Glass",), (), plain=("Payload", "Trailer")
+    ),
+    "blendswap-cc-0/peterbilt": ModelFile(
         "truck", ("body", "bodyTrailer"), tyre=("tires", "tiresTrailer"), light=("reflector", "reflectorTrailer")
     ),
 }
@@ -160,7 +162,7 @@ MODELS: Mapping[str, Model] = {
 
 
 @dataclass(frozen=True)
-class Entry:
+class PackEntry:
     """A model in a catalogue."""
 
     name: str
@@ -176,7 +178,7 @@ class Entry:
         return self.file.rpartition("/")[0]
 
 
-def catalogue(archive: zipfile.ZipFile) -> list[Entry]:
+def catalogue(archive: zipfile.ZipFile) -> list[PackEntry]:
     """The models of a furniture library (.sh3f), in its order. Raises FormatError where it has no catalogue."""
     try:
         text = archive.read(_CATALOGUE).decode("latin-1")
@@ -196,13 +198,13 @@ def catalogue(archive: zipfile.ZipFile) -> list[Entry]:
             width, depth, height = (float(values[k]) / 100 for k in ("width", "depth", "height"))
             author = values.get("creator", common.get("provider", "unknown"))
             found.append(
-                Entry(values["name"], values["model"].lstrip("/"), (depth, height, width), author, licence)
+                PackEntry(values["name"], values["model"].lstrip("/"), (depth, height, width), author, licence)
             )
     return found
 
 
 def vehicle(
-    scene: trimesh.Scene, model: Model, entry: Entry, most_faces: int = _MOST_FACES
+    scene: trimesh.Scene, model: ModelFile, entry: PackEntry, most_faces: int = _MOST_FACES
 ) -> tuple[Mesh, tuple[float, float, float]]:
     """A model in the unit box, and its size (length, height, width) in m.
 
@@ -238,7 +240,7 @@ def vehicle(
     return _lamps(simplify(mesh, most_faces)), size
 
 
-def _part(model: Model, material: str) -> Part:
+def _part(model: ModelFile, material: str) -> Part:
     for part, names in (
         (Part.PAINT, model.paint),
         (Part.GLASS, model.glass),
@@ -251,7 +253,7 @@ def _part(model: Model, material: str) -> Part:
 
 
 def _cut(
-    shapes: list[tuple[np.ndarray, trimesh.Trimesh, bool]], entry: Entry
+    shapes: list[tuple[np.ndarray, trimesh.Trimesh, bool]], entry: PackEntry
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """All triangles (F, 3, 3) with their colours (F, 3), and how many each shape gave, as `_CUTS` says.
 
@@ -386,7 +388,7 @@ def _lamps(mesh: Mesh) -> Mesh:
 
 
 @dataclass
-class Pack:
+class AssetPack:
     """The folder that is written, and what is in it so far."""
 
     root: Path
@@ -407,7 +409,9 @@ class Pack:
         files.write_text(self.root / "vehicles" / "vehicles.yaml", text)
 
 
-def add_vehicles(library: zipfile.ZipFile, pack: Pack, models: Mapping[str, Model] = MODELS) -> Iterator[str]:
+def add_vehicles(
+    library: zipfile.ZipFile, pack: AssetPack, models: Mapping[str, ModelFile] = MODELS
+) -> Iterator[str]:
     """Convert a furniture library's vehicles into the pack; yields a line for each that was made."""
     for entry in catalogue(library):
         model = models.get(entry.folder)
@@ -521,7 +525,7 @@ def run(command: list[str], folder: Path, otherwise: str) -> None:
         )
 
 
-def licences(pack: Pack, skies: list[str]) -> str:
+def licences(pack: AssetPack, skies: list[str]) -> str:
     """The text of LICENCES.md: who made what, and under which licence."""
     lines = [
         "# Licences of this folder",
@@ -539,7 +543,7 @@ def licences(pack: Pack, skies: list[str]) -> str:
 
 def fetch(out: Path, deb: Path | None, tarball: Path | None) -> Iterator[str]:
     """Make or complete the pack at `out`; yields a line for each file."""
-    pack = Pack(out)
+    pack = AssetPack(out)
     wanted = [re.sub(r"[^a-z0-9]+", "-", key.rpartition("/")[2].lower()) + ".glb" for key in MODELS]
     with tempfile.TemporaryDirectory() as scratch:
         if not all(pack.has(name) for name in wanted):

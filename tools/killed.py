@@ -47,7 +47,7 @@ _MINUTES = 20
 
 
 @dataclass
-class Trial:
+class KillTrial:
     """What became of a command."""
 
     name: str
@@ -76,7 +76,7 @@ def run_unbroken(words: Sequence[str], folder: Path) -> None:
 
 
 def run_killed(
-    words: Sequence[str], folder: Path, delays: Sequence[float], trial: Trial, killed: Callable[[], object]
+    words: Sequence[str], folder: Path, delays: Sequence[float], trial: KillTrial, killed: Callable[[], object]
 ) -> int:
     """The same, killed after so many seconds, and given again, as often as there are delays. How many of them
     passed until it was done. killed: called at each. RuntimeError as `run_unbroken`.
@@ -102,7 +102,7 @@ def _check(code: int, folder: Path) -> None:
         raise RuntimeError(f"{folder}: exit code {code}: {(folder / 'said.txt').read_text()[-2000:]}")
 
 
-def hashes(folder: Path, trial: Trial) -> dict[str, str]:
+def hashes(folder: Path, trial: KillTrial) -> dict[str, str]:
     """Of what a run left in `folder`, less what kills left, which is removed."""
     left = files.find_leftovers(folder / RUN)
     trial.left = max(trial.left, len(left))
@@ -115,7 +115,7 @@ def hashes(folder: Path, trial: Trial) -> dict[str, str]:
 
 
 def try_out(
-    trial: Trial,
+    trial: KillTrial,
     words: Sequence[str],
     work: Path,
     kills: int,
@@ -157,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--work", type=Path, help="folder to work in, which stays; by default a temporary one")
     given = parser.parse_args(argv)
     console = Console(stderr=True)
-    trials: list[Trial] = []
+    trials: list[KillTrial] = []
     with tempfile.TemporaryDirectory() as temporary:
         work = (given.work or Path(temporary)).resolve()
         work.mkdir(parents=True, exist_ok=True)
@@ -166,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 small_frames(part, given.frames)
         for name, kills in (one.split("=") for one in given.kills.split(",")):
             command = COMMANDS[name].format(count=given.frames) + f" --out {RUN}"
-            trial = Trial(name, command)
+            trial = KillTrial(name, command)
             trials.append(trial)
             shutil.rmtree(work / name, ignore_errors=True)
             words = [sys.executable, "-m", *command_words(command, work / name, work / name)]

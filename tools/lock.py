@@ -26,18 +26,18 @@ _HEAD = (
 )
 
 
-def pinned(path: Path) -> dict[str, str]:
+def read_pins(path: Path) -> dict[str, str]:
     """Lines NAME==VERSION of a constraints file, by the names that registries have. FormatError for others."""
     found = {}
     for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         match = re.fullmatch(r"([A-Za-z0-9._-]+)==(\S+)", line.strip())
         if match is None:
             raise FormatError(f"{path}:{number}", "NAME==VERSION", repr(line))
-        found[plain(match[1])] = match[0]
+        found[normalise_name(match[1])] = match[0]
     return found
 
 
-def plain(name: str) -> str:
+def normalise_name(name: str) -> str:
     """A package's name as registries have it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
@@ -49,7 +49,7 @@ def hashes(reports: Sequence[Path]) -> dict[str, str]:
         try:
             for one in files.read_json(path)["install"]:
                 told = one["metadata"]
-                release = f"{plain(told['name'])}=={told['version']}"
+                release = f"{normalise_name(told['name'])}=={told['version']}"
                 found[release] = one["download_info"]["archive_info"]["hashes"]["sha256"]
         except (KeyError, TypeError) as error:
             raise FormatError(str(path), "a report of pip install --report", repr(error)) from error
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("reports", nargs="+", type=Path, help="of pip install --report")
     parser.add_argument("--check", action="store_true", help="compare, and write nothing")
     given = parser.parse_args(argv)
-    text = lock(pinned(CONSTRAINTS), hashes(given.reports))
+    text = lock(read_pins(CONSTRAINTS), hashes(given.reports))
     if not given.check:
         files.write_text(LOCK, text)
     elif files.read_text(LOCK) != text:

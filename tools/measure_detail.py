@@ -43,7 +43,7 @@ SEED = 0
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class VehicleView:
     """A vehicle of size_lhw m, `height_px` high in the image, turned by yaw rad, bent by offsets (64, 3)."""
 
     size_lhw: tuple[float, float, float]
@@ -58,7 +58,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class VehicleRender:
     """covered (h, w) bool; depth (h, w) m, inf outside; normals (h, w, 3) unit."""
 
     covered: NDArray[np.bool_]
@@ -67,7 +67,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Deviation:
+class DetailError:
     """Outline: mean, 99th percentile and largest distance, px."""
 
     outline_mean: float
@@ -79,7 +79,7 @@ class Deviation:
     """Mean angle, degrees."""
 
 
-def clip_coordinates(mesh: Mesh, view: View) -> tuple[Tensor, Tensor]:
+def clip_coordinates(mesh: Mesh, view: VehicleView) -> tuple[Tensor, Tensor]:
     """Clip coordinates (V, 3) of the finely drawn vehicle, and its welded normals (V, 3)."""
     unit = mesh.vertices.float()
     bent = unit + ffd.lattice_weights(unit) @ view.offsets
@@ -93,14 +93,14 @@ def clip_coordinates(mesh: Mesh, view: View) -> tuple[Tensor, Tensor]:
     return to_clip(points, torch.tensor([[focal, 0, 0, 0], [0, focal, 0, 0], [0, 0, 1.0, 0]])), normals
 
 
-def draw(mesh: Mesh, clip: Tensor, normals: Tensor, rect: Sequence[int]) -> Picture:
+def draw(mesh: Mesh, clip: Tensor, normals: Tensor, rect: Sequence[int]) -> VehicleRender:
     """The mesh inside a rectangle (x0, y0, x1, y1) px."""
     layout = verbs.PixelLayout.from_rects(torch.tensor([list(rect)]))
     fragments = verbs.rasterize(clip, mesh.faces, torch.tensor([[0, len(mesh.faces)]]), layout)
     values = verbs.interpolate(fragments, clip, mesh.faces, normals)
     shape = (rect[3] - rect[1], rect[2] - rect[0])
     unit = torch.nn.functional.normalize(values, dim=1).reshape(*shape, 3)
-    return Picture(
+    return VehicleRender(
         (fragments.face >= 0).reshape(shape).numpy(), fragments.depth.reshape(shape).numpy(), unit.numpy()
     )
 
@@ -116,7 +116,7 @@ def apart(from_rim: NDArray[np.bool_], to_rim: NDArray[np.bool_]) -> NDArray[np.
     return np.asarray(distance, dtype=np.float32)[from_rim]
 
 
-def compare(full: Mesh, coarse: Mesh, view: View) -> Deviation:
+def compare(full: Mesh, coarse: Mesh, view: VehicleView) -> DetailError:
     """How far the coarse mesh's picture is from the full one's."""
     clips = [clip_coordinates(m, view) for m in (full, coarse)]
     px = torch.cat([c[:, :2] / c[:, 2:] for c, _ in clips])
@@ -127,7 +127,7 @@ def compare(full: Mesh, coarse: Mesh, view: View) -> Deviation:
     distance = np.concatenate([apart(rims[0], rims[1]), apart(rims[1], rims[0])])
     both = a.covered & b.covered
     cosine = (a.normals[both] * b.normals[both]).sum(axis=1).clip(-1.0, 1.0)
-    return Deviation(
+    return DetailError(
         outline_mean=float((a.covered ^ b.covered).sum()) / float(rims[0].sum()) / view.fine,
         outline_p99=float(np.quantile(distance, 0.99)) / view.fine,
         outline_max=float(distance.max()) / view.fine,
@@ -144,13 +144,13 @@ def bend(generator: torch.Generator, amplitude: float) -> Tensor:
     return grid.reshape(LATTICE_POINTS, 3)
 
 
-def measure(kind: str, height_px: float, amplitude: float) -> tuple[Mesh, list[Deviation]]:
+def measure(kind: str, height_px: float, amplitude: float) -> tuple[Mesh, list[DetailError]]:
     """The level of detail of a kind at a height, and its deviation at each yaw."""
     full = template(kind, 0)
     coarse = level_of_detail(full, height_px)
     generator = torch.Generator().manual_seed(SEED)
     size = typical_size_lhw(kind, 0)
-    views = [View(size, height_px, yaw, bend(generator, amplitude)) for yaw in YAWS_RAD]
+    views = [VehicleView(size, height_px, yaw, bend(generator, amplitude)) for yaw in YAWS_RAD]
     return coarse, [compare(full, coarse, view) for view in views]
 
 

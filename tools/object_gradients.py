@@ -34,7 +34,7 @@ STEPS = {"vertex": 1e-4, "pose": 1e-3, "lighting": 1e-2}
 
 
 @dataclass(frozen=True, slots=True)
-class Values:
+class PictureScore:
     """picture: theta (D,) to (3, H, W); score: of a picture, (); noise (3, H, W)."""
 
     picture: Callable[[Tensor], Tensor]
@@ -56,7 +56,7 @@ class Values:
         return (gradient.double() * (behind.double() - before.double())).sum() / 2
 
 
-def slopes(values: Values, theta: Tensor, direction: Tensor) -> Tensor:
+def slopes(values: PictureScore, theta: Tensor, direction: Tensor) -> Tensor:
     """Derivatives (2,) along a direction (D,) at theta (D,), by the gradient."""
     leaf = theta.clone().requires_grad_(True)
     found = values(leaf)
@@ -65,12 +65,12 @@ def slopes(values: Values, theta: Tensor, direction: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def difference(values: Values, step: Tensor) -> Tensor:
+def difference(values: PictureScore, step: Tensor) -> Tensor:
     """The change (2,) of values from one step (D,) before to one behind."""
     return (values(step) - values(-step)) / 2
 
 
-def cosines(values: Values, directions: Tensor, step: float, points: int) -> Tensor:
+def cosines(values: PictureScore, directions: Tensor, step: float, points: int) -> Tensor:
     """(6,): through the picture, in the middle and along the way, and through the score; of the score what the
     network's slope leaves, and what the renderer's does; of directions (N, D).
     """
@@ -123,7 +123,7 @@ def main() -> None:
             def score(picture: Tensor, label: int = scene.model.label) -> Tensor:
                 return network(picture[None])[0, label]
 
-            values = Values(picture, score, noise)
+            values = PictureScore(picture, score, noise)
             directions = torch.randn(told.directions, space.dim, generator=torch.Generator().manual_seed(1))
             row = cosines(values, directions, told.step or STEPS[parameter], told.points)
             found[parameter].append(row)

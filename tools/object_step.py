@@ -23,14 +23,14 @@ from drivesem.classify.objective import ClassifierObjective, compute_attack_loss
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.scenes import ObjectScene, generate_background
 from drivesem.classify.space import ClassifyParameter, ObjectSpace, ParameterAmounts
-from drivesem.run.jobs import keep_freed_memory
+from drivesem.run.allocation import keep_freed_memory
 
 USUAL = ("bus/0080:top", "helmet/0080:right")
 STEPS = 5
 """Of the paper's attacks."""
 
 
-class Stepping:
+class ObjectStep:
     """The parts of a step on one object before a network."""
 
     def __init__(self, scene: ObjectScene, network: Classifier) -> None:
@@ -85,7 +85,7 @@ def main() -> None:
     for word in told.names:
         name, _, view = word.partition(":")
         scene = ObjectScene(name, objects.load(name), view or "forward", generate_background(name))
-        stepping, clock = Stepping(scene, network), PairedTimer()
+        stepping, clock = ObjectStep(scene, network), PairedTimer()
         parts = (stepping.whole, stepping.drawing, stepping.looking)
         for part in parts:
             part()  # what is loaded once

@@ -33,7 +33,7 @@ _EARLY = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Resident:
+class MemoryTrace:
     """seconds, frames, mb: at each look; growth_kb: a frame, of a line through all but the first frames, from_mb
     to to_mb at its ends; peak_mb: the most.
     """
@@ -48,7 +48,7 @@ class Resident:
     to_mb: float
 
 
-def watch(words: Sequence[str], run: Path) -> Resident:
+def watch(words: Sequence[str], run: Path) -> MemoryTrace:
     """Give a command and look at it until it ends. run: the folder that it writes. RuntimeError where it fails; an
     interrupt is no failure.
     """
@@ -60,17 +60,17 @@ def watch(words: Sequence[str], run: Path) -> Resident:
         time.sleep(_SECONDS)
     if process.returncode not in (0, *_STOPPED):
         raise RuntimeError(f"exit code {process.returncode}")
-    return told("drivesem " + " ".join(words), looks)
+    return summarise_samples("drivesem " + " ".join(words), looks)
 
 
-def told(command: str, looks: Sequence[tuple[float, int, float]]) -> Resident:
+def summarise_samples(command: str, looks: Sequence[tuple[float, int, float]]) -> MemoryTrace:
     """What was seen: seconds, frames, MB."""
     looks = [look for look in looks if look[2] > 0]  # a process that has just ended has none
     seconds, frames, mb = (list(column) for column in zip(*looks, strict=True))
     late = np.array(looks)[np.array(frames) >= _EARLY * max(frames)]
     slope, level = np.polyfit(late[:, 1], late[:, 2], 1)
     ends = [round(float(level + slope * late[place, 1]), 1) for place in (0, -1)]
-    return Resident(command, seconds, frames, mb, max(mb), round(float(slope) * 1024, 2), *ends)
+    return MemoryTrace(command, seconds, frames, mb, max(mb), round(float(slope) * 1024, 2), *ends)
 
 
 def _frames_in(run: Path) -> int:
@@ -86,7 +86,7 @@ def _resident_mb(pid: int) -> float:
     return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
 
 
-def draw(found: Resident, path: Path) -> None:
+def draw(found: MemoryTrace, path: Path) -> None:
     """The plot, as PNG."""
     from matplotlib.figure import Figure
 

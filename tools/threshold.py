@@ -25,7 +25,7 @@ from drivesem.training.validation import detect_in_store, score_detections
 DRAWS = 200
 
 
-def told(name: str, folder: Path) -> str:
+def measure_threshold(name: str, folder: Path) -> str:
     """One line."""
     detector, dataset = load_detector(name), open_dataset("kitti", folder)
     with tempfile.TemporaryDirectory() as cache:
@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("detectors", nargs="+")
     arguments = parser.parse_args()
     for name in arguments.detectors:
-        print(told(name, arguments.folder))
+        print(measure_threshold(name, arguments.folder))
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ VEHICLES = ("Car", "Van", "Truck")
 
 
 @dataclass(frozen=True)
-class Cases:
+class CutoutCases:
     """K vehicles."""
 
     rect: np.ndarray
@@ -88,15 +88,15 @@ class Cases:
     """Share of its silhouette in the image, (K,)."""
 
 
-def settings_of(index: int, split: str, pack: Assets) -> SynthSettings:
+def street_settings(index: int, split: str, pack: Assets) -> SynthSettings:
     """Every other street with the pack's vehicles and skies, all with more vehicles than KITTI has."""
     fleet = of_split(pack.vehicles, split) if index % 2 else ()
     layout = LayoutSettings(variants=VARIANTS[split], vehicles=(4, 12), fleet=fleet)
     return SynthSettings(layout, bent=True, skies=pack.skies if index % 2 else ())
 
 
-def cases_of(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]:
-    """What is kept of each usable vehicle of a frame: layers (h, w, 8), and the row of `Cases` without start."""
+def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]:
+    """What is kept of each usable vehicle of a frame: layers (h, w, 8), and the row of `CutoutCases` without start."""
     assert frame.background is not None
     samples = blocks(frame.owner)
     lit = frame.background.max(-1).astype(np.float32)
@@ -204,26 +204,26 @@ def make(folder: Path, split: str, seed: int, frames: int, assets: Path | None) 
         place = 0
         with (part / "layers.bin").open("wb") as out:
             for index in range(first, first + told["frames"]):
-                frame = render_frame(plan_frame(seed, index, split, settings_of(index, split, pack)), True)
+                frame = render_frame(plan_frame(seed, index, split, street_settings(index, split, pack)), True)
                 assert frame is not None
-                for kept, row in cases_of(frame):
+                for kept, row in cutout_cases(frame):
                     out.write(kept.tobytes())
                     rows.append(row | {"start": place})
                     place += kept.size
         files.write_npz(
-            part / "cases.npz", {f.name: np.array([row[f.name] for row in rows]) for f in fields(Cases)}
+            part / "cases.npz", {f.name: np.array([row[f.name] for row in rows]) for f in fields(CutoutCases)}
         )
         files.write_json(part / "made.json", told)
         print(f"{split}: {first + told['frames']} streets, {len(rows)} vehicles in the last {CHUNK}", flush=True)
     return made
 
 
-class Store:
+class CutoutStore:
     """Vehicles of folders that `make` wrote."""
 
     def __init__(self, parts: Sequence[Path]) -> None:
         loaded = [files.read_npz(part / "cases.npz") for part in parts]
-        self.cases = Cases(*(np.concatenate([one[f.name] for one in loaded]) for f in fields(Cases)))
+        self.cases = CutoutCases(*(np.concatenate([one[f.name] for one in loaded]) for f in fields(CutoutCases)))
         self.part = np.repeat(np.arange(len(parts)), [len(one["start"]) for one in loaded])
         self.bytes = [np.memmap(part / "layers.bin", np.uint8, "r") for part in parts]
 
@@ -277,7 +277,7 @@ TILES = 2
 
 
 @dataclass(frozen=True)
-class Sample:
+class CutoutSample:
     """One vehicle to learn from. crop (96, 160, 3) uint8; truth (96, 160, 3): visible, front, shadow, uint8; given
     (2, 96, 160): nearer vehicles, and what lies inside; photograph (h, w, 3), shares (h, w, 3) uint8: what lies
     inside in its own pixels, its first pixel at offset (x, y) of the crop's rect."""
@@ -294,7 +294,9 @@ class Sample:
     offset: tuple[int, int]
 
 
-def sample_of(store: Store, index: int, amount: float, rng: np.random.Generator | None) -> Sample | None:
+def make_sample(
+    store: CutoutStore, index: int, amount: float, rng: np.random.Generator | None
+) -> CutoutSample | None:
     """A vehicle with its template off by `amount`; rng: also in other looks. None where the template shows nowhere
     in what is kept."""
     camera = store.camera(index)
@@ -312,7 +314,7 @@ def sample_of(store: Store, index: int, amount: float, rng: np.random.Generator 
     photograph = np.ascontiguousarray(layers[..., :3])
     shares, nearer = np.ascontiguousarray(layers[..., 3:6]), np.ascontiguousarray(layers[..., 6])
     if rng is not None:
-        photograph, shares = looks(photograph, shares, rng)
+        photograph, shares = vary_appearance(photograph, shares, rng)
     box = np.array([[rect[0] - left, rect[1] - top, rect[2] - left, rect[3] - top]], np.float32) - 0.5
     inside = cutout.inside_mask(rect, (left, top, right, bottom))
     crop = crop_boxes(photograph, box, CROP_HW, 1.0)[0]
@@ -323,7 +325,7 @@ def sample_of(store: Store, index: int, amount: float, rng: np.random.Generator 
     given = np.stack([others, inside]).astype(np.float32)
     ground = torch.from_numpy(store.cases.ground[index]).float()
     offset = (left - rect[0], top - rect[1])
-    return Sample(placement, camera, ground, rect, crop, truth, given, photograph, shares, offset)
+    return CutoutSample(placement, camera, ground, rect, crop, truth, given, photograph, shares, offset)
 
 
 def jittered(rect: tuple[int, int, int, int], rng: np.random.Generator) -> tuple[int, int, int, int]:
@@ -351,14 +353,14 @@ def misjudged(nearer: NDArray[np.float32], rng: np.random.Generator) -> NDArray[
 _NOISE = np.random.default_rng(5).normal(0, 1, (512, 2048, 3)).astype(np.float32)
 
 
-def looks(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
+def vary_appearance(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
     """The photograph in other light, other colours, less sharp, noisier, compressed; the vehicle painted as its
     surroundings are, or behind a pole; and the shares that belong to it."""
     visible = shares[..., 0]
     if rng.random() < CAMOUFLAGE_SHARE:
-        photograph = camouflaged(photograph, visible, rng)
+        photograph = camouflage(photograph, visible, rng)
     if rng.random() < POLE_SHARE:
-        photograph, shares = behind_pole(photograph, shares, rng)
+        photograph, shares = add_pole(photograph, shares, rng)
     levels = np.arange(256, dtype=np.float32)[:, None] / 255
     level = float(photograph.mean()) / 255
     curve = levels ** np.exp(rng.uniform(-0.5, 0.5))
@@ -380,7 +382,7 @@ def looks(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> tuple[B
     return photograph, shares
 
 
-def camouflaged(photograph: Bytes, visible: Bytes, rng: np.random.Generator) -> Bytes:
+def camouflage(photograph: Bytes, visible: Bytes, rng: np.random.Generator) -> Bytes:
     """The vehicle's colours brought near to those around it, all or some of the way."""
     alpha = visible.astype(np.float32)[..., None] / 255
     around = cv2.dilate(visible, np.ones((9, 9))) > 0
@@ -395,7 +397,7 @@ def camouflaged(photograph: Bytes, visible: Bytes, rng: np.random.Generator) -> 
     return np.clip(repainted, 0, 255).astype(np.uint8)
 
 
-def behind_pole(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
+def add_pole(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
     """With an upright bar of one colour, lighter towards one side, in front."""
     h, w = photograph.shape[:2]
     wide = max(rng.uniform(0.02, 0.1) * w, 1.0)
@@ -413,7 +415,9 @@ def behind_pole(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> t
     return photograph, np.rint(kept).clip(0, 255).astype(np.uint8)
 
 
-def batch_of(store: Store, step: int, settings: Settings) -> tuple[list[Sample], np.random.Generator]:
+def build_batch(
+    store: CutoutStore, step: int, settings: CutoutSettings
+) -> tuple[list[CutoutSample], np.random.Generator]:
     """The vehicles of a step, and the generator for what is left to draw: both a function of the seed and the
     step alone."""
     rng = np.random.default_rng([settings.seed, step])
@@ -421,11 +425,11 @@ def batch_of(store: Store, step: int, settings: Settings) -> tuple[list[Sample],
     epoch, place = divmod(step, per_epoch)
     order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
     chosen = order[place * settings.batch : (place + 1) * settings.batch]
-    found = [sample_of(store, int(i), float(rng.choice(AMOUNTS, p=AMOUNT_SHARE)), rng) for i in chosen]
+    found = [make_sample(store, int(i), float(rng.choice(AMOUNTS, p=AMOUNT_SHARE)), rng) for i in chosen]
     return [sample for sample in found if sample is not None], rng
 
 
-def first_inputs(samples: Sequence[Sample]) -> tuple[Tensor, Tensor]:
+def first_inputs(samples: Sequence[CutoutSample]) -> tuple[Tensor, Tensor]:
     """Crops (N, 3, 96, 160) and guides (N, 7, 96, 160)."""
     crops = torch.from_numpy(np.stack([s.crop for s in samples])).permute(0, 3, 1, 2).float() / 255
     given = np.stack([s.given for s in samples])
@@ -433,14 +437,14 @@ def first_inputs(samples: Sequence[Sample]) -> tuple[Tensor, Tensor]:
     return crops, cutout.render_guides([s.placement for s in samples], cameras, [s.ground for s in samples], given)
 
 
-def weight_of(sample: Sample) -> NDArray[np.float32]:
+def pixel_weights(sample: CutoutSample) -> NDArray[np.float32]:
     """How much each pixel (96, 160) of a crop counts: those along the vehicle's border five times as much."""
     visible = np.ascontiguousarray(sample.truth[..., 0])
     edge = cv2.dilate(visible, np.ones((5, 5))) - cv2.erode(visible, np.ones((5, 5)))
     return (0.5 + 2 * edge.astype(np.float32) / 255) * sample.given[1]
 
 
-def mirrored(
+def mirror(
     crops: Tensor, said: Tensor, truth: Tensor, weight: Tensor, flip: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Some of the batch mirrored: what is left of a vehicle is right of it then."""
@@ -455,15 +459,15 @@ def mirrored(
     )
 
 
-def first_loss(logits: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+def initial_loss(logits: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
     """Cross entropy with the true shares (N, 3, 96, 160), by weight."""
     rest = (1 - truth.sum(1, keepdim=True)).clamp(min=0)
     wanted = torch.cat([truth, rest], 1)
     return -((wanted * logits.float().log_softmax(1)).sum(1, keepdim=True) * weight).sum() / weight.sum()
 
 
-def tiles_of(
-    sample: Sample, said: NDArray[np.float32], rng: np.random.Generator
+def split_tiles(
+    sample: CutoutSample, said: NDArray[np.float32], rng: np.random.Generator
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Second looks at a vehicle's borders: inputs (6, 48, 48), and true shares (2, 48, 48) of visible and front.
     said (3, 96, 160): the first look's shares."""
@@ -501,7 +505,7 @@ def second_loss(log_shares: Tensor, truth: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Settings:
+class CutoutSettings:
     """What decides on the result of a run."""
 
     cycles: tuple[tuple[int, float], ...] = ((1000, 3e-3), (900, 2e-3))
@@ -526,32 +530,34 @@ class Settings:
         return 0.0
 
 
-class Run(AveragedRun[CutoutNet]):
+class CutoutRun(AveragedRun[CutoutNet]):
     """The network in training."""
 
-    settings: Settings
+    settings: CutoutSettings
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: CutoutSettings) -> None:
         torch.manual_seed(settings.seed)
         super().__init__(CutoutNet().to(memory_format=torch.channels_last).train(), settings)
 
-    def step(self, store: Store) -> dict[str, float]:
+    def step(self, store: CutoutStore) -> dict[str, float]:
         """One step of the optimiser; the terms of the loss."""
         step, settings = self.step_number, self.settings
         with self.timed():
-            samples, rng = batch_of(store, step, settings)
+            samples, rng = build_batch(store, step, settings)
             crops, said = first_inputs(samples)
             truth = torch.from_numpy(np.stack([s.truth for s in samples])).permute(0, 3, 1, 2).float() / 255
             flip = torch.from_numpy(rng.random(len(samples)) < 0.5)
-            weight = torch.from_numpy(np.stack([weight_of(s) for s in samples])[:, None])
-            crops, said, truth, weight = mirrored(crops, said, truth, weight, flip)
+            weight = torch.from_numpy(np.stack([pixel_weights(s) for s in samples])[:, None])
+            crops, said, truth, weight = mirror(crops, said, truth, weight, flip)
             with torch.autocast("cpu", torch.bfloat16):
                 logits = self.network(crops, said)
-            terms = {"first": first_loss(logits, truth, weight)}
+            terms = {"first": initial_loss(logits, truth, weight)}
             seen = logits.detach().float().softmax(1)[:, :3]
             seen = torch.where(flip[:, None, None, None], seen.flip(3), seen).numpy()
             tiles = [
-                tile for sample, share in zip(samples, seen, strict=True) for tile in tiles_of(sample, share, rng)
+                tile
+                for sample, share in zip(samples, seen, strict=True)
+                for tile in split_tiles(sample, share, rng)
             ]
             both, wanted = (torch.from_numpy(np.stack(part)) for part in zip(*tiles, strict=True))
             both = both.contiguous(memory_format=torch.channels_last)
@@ -564,13 +570,13 @@ class Run(AveragedRun[CutoutNet]):
 
 
 @torch.no_grad()
-def judge(store: Store, network: CutoutNet, amount: float, most: int = 200) -> dict[str, float]:
+def judge(store: CutoutStore, network: CutoutNet, amount: float, most: int = 200) -> dict[str, float]:
     """Figures over the first `most` vehicles at least 40 px high of which 70% show, and over smaller or hidden
     ones: IoU of what is visible (median and tenth percentile); of things in front (median over those with some);
     mean difference of the shares along the true border, in px of border."""
     large, small, front, border = [], [], [], []
     for index in range(min(len(store), most)):
-        sample = sample_of(store, index, amount, None)
+        sample = make_sample(store, index, amount, None)
         if sample is None:
             continue
         shares = network(*first_inputs([sample])).softmax(1)[0, :3].numpy()
@@ -646,7 +652,7 @@ COLUMNS = (
 )
 
 
-def table_of(figures: dict[float, dict[str, float]]) -> str:
+def format_table(figures: dict[float, dict[str, float]]) -> str:
     """A Markdown table, a row an amount."""
     lines = ["| amount | " + " | ".join(c[1] for c in COLUMNS) + " |", "| --- |" + " --- |" * len(COLUMNS)]
     for amount, row in figures.items():
@@ -663,21 +669,21 @@ def main() -> None:
     parser.add_argument("--held-out", type=int, default=24, help="streets to judge by")
     parser.add_argument("--data-seed", type=int, default=41, help="of the streets; one more for those to judge by")
     parser.add_argument(
-        "--steps", type=int, nargs="+", default=[steps for steps, _ in Settings.cycles], help="of each cycle"
+        "--steps", type=int, nargs="+", default=[steps for steps, _ in CutoutSettings.cycles], help="of each cycle"
     )
-    parser.add_argument("--batch", type=int, default=Settings.batch)
-    parser.add_argument("--seed", type=int, default=Settings.seed)
+    parser.add_argument("--batch", type=int, default=CutoutSettings.batch)
+    parser.add_argument("--seed", type=int, default=CutoutSettings.seed)
     parser.add_argument("--remark", default="", help="a remark on this run for the model card")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    rates = [rate for _, rate in Settings.cycles]
+    rates = [rate for _, rate in CutoutSettings.cycles]
     cycles = tuple((steps, rates[min(i, len(rates) - 1)]) for i, steps in enumerate(arguments.steps))
-    settings = Settings(cycles, arguments.batch, seed=arguments.seed)
+    settings = CutoutSettings(cycles, arguments.batch, seed=arguments.seed)
     seeds = arguments.data_seed, arguments.data_seed + 1
-    store = Store(make(arguments.run / "train", "train", seeds[0], arguments.frames, arguments.assets))
-    held = Store(make(arguments.run / "heldout", "heldout", seeds[1], arguments.held_out, arguments.assets))
-    run = Run(settings)
+    store = CutoutStore(make(arguments.run / "train", "train", seeds[0], arguments.frames, arguments.assets))
+    held = CutoutStore(make(arguments.run / "heldout", "heldout", seeds[1], arguments.held_out, arguments.assets))
+    run = CutoutRun(settings)
     checkpoint = arguments.run / "checkpoint.safetensors"
     if checkpoint.is_file():
         run.load(checkpoint)
@@ -694,7 +700,7 @@ def main() -> None:
                 print(f"step {run.step_number}, {run.seconds:.0f} s: {terms}", flush=True)
     network = run.averaged()
     figures = {amount: judge(held, network, amount) for amount in AMOUNTS}
-    print(table_of(figures))
+    print(format_table(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
     run.ship(arguments.out, facts)
     card = CARD.format(
@@ -715,7 +721,7 @@ def main() -> None:
         seed=settings.seed,
         note=f"\n  {arguments.remark}" if arguments.remark else "",
         held=len(held),
-        table=table_of(figures),
+        table=format_table(figures),
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

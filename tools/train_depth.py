@@ -25,15 +25,15 @@ from train_segmenter import (
     CLASS_OF,
     HORIZON_ERROR,
     STORE_HW,
-    classes_of,
     options,
-    other_camera,
-    other_colours,
-    other_light,
     planned,
     shrunk,
+    surface_classes,
     taken,
     train,
+    vary_camera,
+    vary_colours,
+    vary_light,
     window,
 )
 
@@ -67,13 +67,13 @@ def street(seed: int, index: int, split: str) -> SynthFrame:
     return frame
 
 
-def nearness_of(depth_m: np.ndarray, height_m: float) -> np.ndarray:
+def depth_to_nearness(depth_m: np.ndarray, height_m: float) -> np.ndarray:
     """Nearness (h, w) float16 at the size of kept frames. depth_m (H, W): each pixel takes one of its."""
     nearness = (height_m / depth_m).astype(np.float32)
     return cv2.resize(nearness, STORE_HW[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float16)
 
 
-def pictures_of(frame: SynthFrame) -> dict[str, np.ndarray]:
+def training_pictures(frame: SynthFrame) -> dict[str, np.ndarray]:
     """What is kept of a frame with a background: twice, with its actors and without, image (2, h, w, 3) uint8,
     classes (2, h, w) uint8 and nearness (2, h, w) float16; elevation and the ground's nearness (h, w) float16;
     focal () px.
@@ -89,16 +89,16 @@ def pictures_of(frame: SynthFrame) -> dict[str, np.ndarray]:
     images = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (frame.image, frame.background))
     return {
         "images": np.stack(list(images)),
-        "classes": np.stack([shrunk(classes_of(frame)), shrunk(table[frame.ground_material])]),
-        "nearness": np.stack([nearness_of(d, height_m) for d in (frame.depth_m, frame.background_depth_m)]),
+        "classes": np.stack([shrunk(surface_classes(frame)), shrunk(table[frame.ground_material])]),
+        "nearness": np.stack([depth_to_nearness(d, height_m) for d in (frame.depth_m, frame.background_depth_m)]),
         "elevation": unet.compute_elevation(ground, camera, STORE_HW).astype(np.float16),
-        "ground": nearness_of(maps.compute_plane_depth(ground, camera), height_m),
+        "ground": depth_to_nearness(maps.compute_plane_depth(ground, camera), height_m),
         "focal": np.array(float(camera.intrinsics[0, 0]) * STORE_HW[0] / camera.height, np.float32),
     }
 
 
-class Store:
-    """Frames of a stream, made as far as they are not there yet: see `pictures_of`. A picture is half a frame: 2i
+class DepthStore:
+    """Frames of a stream, made as far as they are not there yet: see `training_pictures`. A picture is half a frame: 2i
     the one with actors, 2i + 1 the one without."""
 
     def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
@@ -109,7 +109,7 @@ class Store:
         if {k: found[k] for k in told} != told:
             raise ValueError(f"{stamp}: expected frames of {told}, found {found}")
         for index in range(found["frames"], frames):
-            files.write_npz(folder / f"{index:05d}.npz", pictures_of(street(seed, index, split)))
+            files.write_npz(folder / f"{index:05d}.npz", training_pictures(street(seed, index, split)))
             files.write_json(stamp, told | {"frames": index + 1})
         parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
         self.images, self.classes, self.nearness = (
@@ -124,7 +124,7 @@ class Store:
 
 
 @dataclass(frozen=True)
-class Example:
+class DepthExample:
     """A part of a picture. image (h, w, 3) in [0, 1]; elevation, ground, nearness (h, w): as a camera of the
     network's focal length would have them."""
 
@@ -137,7 +137,7 @@ class Example:
 _LEVEL = (StreetClass.ROAD, StreetClass.GROUND, StreetClass.GRASS)
 
 
-def example(store: Store, index: int, rng: np.random.Generator) -> Example:
+def example(store: DepthStore, index: int, rng: np.random.Generator) -> DepthExample:
     """A part of a picture, zoomed, mirrored or not, in other light and colours.
 
     Zoomed, all is as near as it seems. What the network is told of the horizon is off, as an estimated plane is;
@@ -150,17 +150,17 @@ def example(store: Store, index: int, rng: np.random.Generator) -> Example:
     looks = taken(store.elevation[index // 2].astype(np.float32), part) * zoom
     ground = taken(store.ground[index // 2].astype(np.float32), part) * zoom
     near = taken(store.nearness[index].astype(np.float32), part, cv2.INTER_NEAREST) * zoom
-    other_colours(image, classes, looks, rng)
-    other_light(image, classes, rng)
-    image = other_camera(image, rng)
+    vary_colours(image, classes, looks, rng)
+    vary_light(image, classes, rng)
+    image = vary_camera(image, rng)
     error = np.float32(rng.normal(0, HORIZON_ERROR))
     told = np.where(ground > 0, np.maximum(ground - error, 0), 0)
     near = np.maximum(np.where(np.isin(classes, _LEVEL), near + told - ground, near), told)
-    return Example(image, looks + error, told, near)
+    return DepthExample(image, looks + error, told, near)
 
 
 @dataclass(frozen=True)
-class Settings:
+class DepthSettings:
     """What decides on the result of a run."""
 
     steps: int = 2600
@@ -178,7 +178,7 @@ class Settings:
 Batch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def batch_of(store: Store, step: int, settings: Settings) -> Batch:
+def build_batch(store: DepthStore, step: int, settings: DepthSettings) -> Batch:
     """Images (N, 3, h, w), elevations, the ground's nearness and the truth (N, 1, h, w) of a step: a function of
     the seed and the step alone."""
     examples = []
@@ -192,7 +192,7 @@ def batch_of(store: Store, step: int, settings: Settings) -> Batch:
     return images, looks, ground, near
 
 
-def loss_of(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float) -> Tensor:
+def compute_loss(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float) -> Tensor:
     """Mean difference () of the logarithms of nearness, and of their slopes at three scales. numbers (N, 1, h/2,
     w/2): the network's; ground, near (N, 1, h, w)."""
     found = F.avg_pool2d(ground, 2) + depth.nearness_excess(numbers)
@@ -205,12 +205,12 @@ def loss_of(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float) -> T
     return loss
 
 
-class Run(AveragedRun[DepthNet]):
+class DepthRun(AveragedRun[DepthNet]):
     """The network in training."""
 
-    settings: Settings
+    settings: DepthSettings
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: DepthSettings) -> None:
         torch.manual_seed(settings.seed)
         network = DepthNet().train()
         known = segment.load_network().state_dict()
@@ -218,15 +218,15 @@ class Run(AveragedRun[DepthNet]):
         super().__init__(network, settings)
         self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def step(self, store: Store) -> float:
+    def step(self, store: DepthStore) -> float:
         """One step of the optimiser; the loss."""
         step, settings = self.step_number, self.settings
         with self.timed():
-            images, looks, ground, near = batch_of(store, step, settings)
+            images, looks, ground, near = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 50)
             with torch.autocast("cpu", torch.bfloat16):
                 numbers = self.network(images, looks)
-            loss = loss_of(numbers.float(), ground, near, settings.gradient)
+            loss = compute_loss(numbers.float(), ground, near, settings.gradient)
             self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())
 
@@ -305,7 +305,7 @@ With the same generator, on the same machine, another run gives the same bytes.
 """
 
 
-def table_of(figures: dict[str, tuple[float, float]]) -> str:
+def format_table(figures: dict[str, tuple[float, float]]) -> str:
     """A Markdown table, a row each thing that tells depth."""
     rows = [f"| {name} | {error:.3f} | {near:.3f} |" for name, (error, near) in figures.items()]
     return "\n".join(["| depth by | relative error | within 1.25 |", "| --- | --- | --- |", *rows])
@@ -316,18 +316,20 @@ TRAIN_SEED, HELD_SEED = 51, 52
 
 
 def main() -> None:
-    arguments = options(__doc__, Path("build/depth"), depth.WEIGHTS, 40, Settings)
+    arguments = options(__doc__, Path("build/depth"), depth.WEIGHTS, 40, DepthSettings)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
-    store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
+    settings = DepthSettings(
+        arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed
+    )
+    store = DepthStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
     print(f"{len(store)} pictures", flush=True)
-    run = Run(settings)
+    run = DepthRun(settings)
     if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
         return
     network = run.averaged()
     figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(table_of(figures))
+    print(format_table(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
     run.ship(arguments.out, facts)
     card = CARD.format(
@@ -346,7 +348,7 @@ def main() -> None:
         note=f"\n  {arguments.remark}" if arguments.remark else "",
         held_out=arguments.held_out,
         far=FAR_M,
-        table=table_of(figures),
+        table=format_table(figures),
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

@@ -45,7 +45,7 @@ sides are wrong by 0.12 on generated frames, by 0.09 on KITTI's, there 0.08 too 
 CLASS_OF = {Category.CAR: "Car", Category.TRUCK: "Truck"}
 
 
-def class_of(kind: str) -> str:
+def vehicle_class(kind: str) -> str:
     """What a detector calls a vehicle of a data set's type."""
     return CLASS_OF[VEHICLES[kind]]
 
@@ -59,7 +59,7 @@ def usable(labels: Labels) -> list[int]:
 
 
 @dataclass(frozen=True)
-class Truth:
+class TruePoses:
     """What is known of K boxes. box (K, 4) px; centre (K, 2) px and depth (K,) m of the 3D centre; alpha (K,) rad;
     size (K, 3) m; kind (K,) index into KINDS, -1 where not known; truck (K,) bool.
     """
@@ -74,18 +74,18 @@ class Truth:
     camera: Tensor
     """Focal lengths, principal point, width, height, (K, 6)."""
 
-    def rows(self, index: Tensor) -> Truth:
+    def rows(self, index: Tensor) -> TruePoses:
         """Those of an index."""
-        return Truth(*(getattr(self, f.name)[index] for f in fields(self)))
+        return TruePoses(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
-def truth_of(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Sequence[int]) -> Truth:
+def true_poses(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Sequence[int]) -> TruePoses:
     """What is known of the labels `rows`."""
     index = torch.tensor(rows, dtype=torch.int64)
     size, foot = labels.size_lhw[index], labels.translation[index]
     middle = foot - size[:, 1:2] * torch.tensor([0.0, 0.5, 0.0])
     clip = middle @ camera.matrix[:, :3].T + camera.matrix[:, 3]
-    return Truth(
+    return TruePoses(
         labels.boxes_xyxy[index],
         clip[:, :2] / clip[:, 2:],
         middle[:, 2],
@@ -118,23 +118,23 @@ class CropStore:
                     continue
                 models = [o["model"] for o in entry["objects"] if o["labelled"]]
                 kinds = [KINDS.index(models[i].rsplit("-", 1)[0]) for i in rows]
-                truths.append(truth_of(frame.labels, rows, frame.camera, kinds))
+                truths.append(true_poses(frame.labels, rows, frame.camera, kinds))
                 image = (frame.photograph.numpy().transpose(1, 2, 0) * 255).round().astype(np.uint8)
                 crops.append(pose.crop_boxes(image, truths[-1].box.numpy(), STORE_HW, STORE_CONTEXT))
             np.save(crops_path, np.concatenate(crops))
-            joined = {f.name: np.concatenate([getattr(t, f.name) for t in truths]) for f in fields(Truth)}
+            joined = {f.name: np.concatenate([getattr(t, f.name) for t in truths]) for f in fields(TruePoses)}
             files.write_npz(truth_path, joined)
             files.write_json(stamp, told)
         self.crops = np.load(crops_path, mmap_mode="r")
         arrays = files.read_npz(truth_path)
-        self.truth = Truth(*(torch.from_numpy(arrays[f.name]) for f in fields(Truth)))
+        self.truth = TruePoses(*(torch.from_numpy(arrays[f.name]) for f in fields(TruePoses)))
 
     def __len__(self) -> int:
         return len(self.crops)
 
 
 @dataclass(frozen=True)
-class Targets:
+class PoseTargets:
     """What the network should say of N boxes: see `Said`; kind (N,) int64."""
 
     alpha: Tensor
@@ -144,7 +144,7 @@ class Targets:
     kind: Tensor
 
 
-def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, Tensor, Targets]:
+def build_batch(store: CropStore, step: int, settings: PoseSettings) -> tuple[Tensor, Tensor, PoseTargets]:
     """Crops (N, 3, 64, 96), numbers (N, 9) and targets of a step: a function of the seed and the step alone."""
     rng = np.random.default_rng([settings.seed, step])
     per_epoch = max(len(store) // settings.batch, 1)
@@ -177,13 +177,13 @@ def batch_of(store: CropStore, step: int, settings: Settings) -> tuple[Tensor, T
     numbers = torch.where(flip[:, None], pose.mirror_features(numbers), numbers)
     alpha = torch.where(flip, math.pi - alpha, alpha)
     offset = torch.where(flip[:, None], offset * torch.tensor([-1.0, 1.0]), offset)
-    targets = Targets(
+    targets = PoseTargets(
         alpha, offset, torch.log(truth.size / pose.mean_sizes(kinds)), torch.log(truth.depth / mean), truth.kind
     )
-    return looks(crops, rng), numbers, targets
+    return vary_appearance(crops, rng), numbers, targets
 
 
-def looks(crops: Tensor, rng: np.random.Generator) -> Tensor:
+def vary_appearance(crops: Tensor, rng: np.random.Generator) -> Tensor:
     """The crops in other light, other colours, less sharp, noisier, partly hidden."""
     n = len(crops)
 
@@ -212,7 +212,7 @@ def looks(crops: Tensor, rng: np.random.Generator) -> Tensor:
     return crops.clamp(0, 1)
 
 
-def loss_terms(said: PosePrediction, wanted: Targets) -> dict[str, Tensor]:
+def loss_terms(said: PosePrediction, wanted: PoseTargets) -> dict[str, Tensor]:
     """Terms of the loss, means over boxes, and their weighted sum "total"."""
     centre = torch.arange(pose.BINS) * (2 * math.pi / pose.BINS)
     apart = wanted.alpha[:, None] - centre
@@ -238,7 +238,7 @@ def loss_terms(said: PosePrediction, wanted: Targets) -> dict[str, Tensor]:
 
 
 @dataclass(frozen=True)
-class Settings:
+class PoseSettings:
     """What decides on the result of a run."""
 
     steps: int = 4000
@@ -249,12 +249,12 @@ class Settings:
     seed: int = 0
 
 
-class Run(AveragedRun[PoseNet]):
+class PoseRun(AveragedRun[PoseNet]):
     """The network in training."""
 
-    settings: Settings
+    settings: PoseSettings
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: PoseSettings) -> None:
         torch.manual_seed(settings.seed)
         super().__init__(PoseNet().train(), settings)
 
@@ -262,7 +262,7 @@ class Run(AveragedRun[PoseNet]):
         """One step of the optimiser; the terms of the loss."""
         step, settings = self.step_number, self.settings
         with self.timed():
-            crops, numbers, targets = batch_of(store, step, settings)
+            crops, numbers, targets = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 100)
             terms = loss_terms(self.network(crops, numbers), targets)
             rate = settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
@@ -271,7 +271,7 @@ class Run(AveragedRun[PoseNet]):
 
 
 @dataclass(frozen=True)
-class Errors:
+class PoseErrors:
     """Of K vehicles: yaw (K,) rad, depth (K,) relative, size (K, 3) relative, right template (K,)."""
 
     yaw: np.ndarray
@@ -301,14 +301,14 @@ class Errors:
         figures |= {f"{n}_pc": 100 * float(np.median(s)) for n, s in zip("lhw", self.size.T, strict=True)}
         return figures | {"kind": float(self.kind.mean())}
 
-    def chosen(self, mask: np.ndarray) -> Errors:
+    def chosen(self, mask: np.ndarray) -> PoseErrors:
         """Those of a mask."""
-        return Errors(*(getattr(self, f.name)[mask] for f in fields(self)))
+        return PoseErrors(*(getattr(self, f.name)[mask] for f in fields(self)))
 
 
 def judge(
-    frames: Sequence[tuple[Frame, list[int]]], network: PoseNet, found: Sequence[Found] | None = None
-) -> Errors:
+    frames: Sequence[tuple[Frame, list[int]]], network: PoseNet, found: Sequence[PoseDetections] | None = None
+) -> PoseErrors:
     """Errors of the estimate on frames, whose vehicles' templates are given too (-1: not known). Boxes are the
     labels', or what was `found`, of which those count that meet a label (IoU of at least 0.5).
     """
@@ -317,7 +317,7 @@ def judge(
         labels = frame.labels
         assert labels is not None
         index = usable(labels)
-        classes = [class_of(labels.kind[i]) for i in index]
+        classes = [vehicle_class(labels.kind[i]) for i in index]
         boxes, answers = labels.boxes_xyxy[index], list(range(len(index)))
         if found is not None:
             overlap = iou_matrix(boxes, found[number].boxes_xyxy)
@@ -327,8 +327,10 @@ def judge(
                 int(best.indices[i]) if best is not None and float(best.values[i]) >= 0.5 else -1
                 for i in range(len(index))
             ]
-        looks = 1 if found is None else POSE_ROUNDS
-        poses = pose.estimate_poses(frame.photograph, boxes, classes, frame.camera, network=network, rounds=looks)
+        vary_appearance = 1 if found is None else POSE_ROUNDS
+        poses = pose.estimate_poses(
+            frame.photograph, boxes, classes, frame.camera, network=network, rounds=vary_appearance
+        )
         for row, answer in zip(index, answers, strict=True):
             if answer < 0:
                 continue
@@ -348,18 +350,18 @@ def judge(
                 )
             )
     table = np.array(rows, np.float64).reshape(-1, 8)
-    return Errors(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5], table[:, 6] > 0, table[:, 7])
+    return PoseErrors(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5], table[:, 6] > 0, table[:, 7])
 
 
 @dataclass(frozen=True)
-class Found:
+class PoseDetections:
     """A detector's vehicles in one frame: boxes_xyxy (N, 4) px, kinds."""
 
     boxes_xyxy: Tensor
     kinds: tuple[str, ...]
 
 
-def detected(frames: Sequence[tuple[Frame, list[int]]]) -> list[Found]:
+def detected(frames: Sequence[tuple[Frame, list[int]]]) -> list[PoseDetections]:
     """What the shipped detector finds, from its score of best F1 on."""
     detector = load_detector("squeezedet")
     out = []
@@ -371,11 +373,11 @@ def detected(frames: Sequence[tuple[Frame, list[int]]]) -> list[Found]:
             for i in range(len(seen))
             if float(seen.scores[i]) >= detector.t_star and CLASSES[int(seen.labels[i])] in ("Car", "Truck")
         ]
-        out.append(Found(seen.boxes_xyxy[rows], tuple(CLASSES[int(seen.labels[i])] for i in rows)))
+        out.append(PoseDetections(seen.boxes_xyxy[rows], tuple(CLASSES[int(seen.labels[i])] for i in rows)))
     return out
 
 
-def frames_of(root: Path, limit: int | None = None) -> list[tuple[Frame, list[int]]]:
+def labelled_frames(root: Path, limit: int | None = None) -> list[tuple[Frame, list[int]]]:
     """Labelled frames of a KITTI folder, and each label's template, -1 where no manifest tells it."""
     dataset = KittiDataset(root)
     manifest = root / "manifest.json"
@@ -436,7 +438,7 @@ COLUMNS = (
 )
 
 
-def table_of(figures: dict[str, dict[str, float]]) -> str:
+def format_table(figures: dict[str, dict[str, float]]) -> str:
     """A Markdown table, a row a set of vehicles."""
     lines = ["| boxes | " + " | ".join(c[1] for c in COLUMNS) + " |", "| --- |" + " --- |" * len(COLUMNS)]
     for name, row in figures.items():
@@ -447,13 +449,13 @@ def table_of(figures: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def all_figures(network: PoseNet, held: Path, real: Path | None) -> dict[str, dict[str, float]]:
+def all_metrics(network: PoseNet, held: Path, real: Path | None) -> dict[str, dict[str, float]]:
     """Figures of the model card by the name of their row."""
     figures = {}
     for name, root in (("generated", held), ("KITTI", real)):
         if root is None:
             continue
-        frames = frames_of(root)
+        frames = labelled_frames(root)
         found = detected(frames)
         for boxes, errors in (("labels", judge(frames, network)), ("detector", judge(frames, network, found))):
             for level, part in (("moderate", errors.chosen(errors.moderate)), ("all", errors)):
@@ -471,26 +473,26 @@ def main() -> None:
     parser.add_argument("--also", type=Path, help="labelled photographs whose figures go into the model card")
     parser.add_argument("--run", type=Path, default=Path("build/pose"), help="checkpoint, log, crops")
     parser.add_argument("--out", type=Path, default=pose.WEIGHTS)
-    parser.add_argument("--steps", type=int, default=Settings.steps)
-    parser.add_argument("--batch", type=int, default=Settings.batch)
-    parser.add_argument("--rate", type=float, default=Settings.rate)
-    parser.add_argument("--seed", type=int, default=Settings.seed)
+    parser.add_argument("--steps", type=int, default=PoseSettings.steps)
+    parser.add_argument("--batch", type=int, default=PoseSettings.batch)
+    parser.add_argument("--rate", type=float, default=PoseSettings.rate)
+    parser.add_argument("--seed", type=int, default=PoseSettings.seed)
     parser.add_argument(
         "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
     )
     parser.add_argument("--remark", default="", help="a remark on this run for the model card")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    settings = Settings(arguments.steps, arguments.batch, arguments.rate, seed=arguments.seed)
+    settings = PoseSettings(arguments.steps, arguments.batch, arguments.rate, seed=arguments.seed)
     store = CropStore(arguments.data, arguments.run / "train")
     print(f"{format_count(len(store), 'vehicle')} in {format_count(store.frames, 'frame')}", flush=True)
-    run = Run(settings)
+    run = PoseRun(settings)
     checkpoint = arguments.run / "checkpoint.safetensors"
     if checkpoint.is_file():
         run.load(checkpoint)
         print(f"going on from step {run.step_number}", flush=True)
     end = min(settings.steps, run.step_number + (arguments.pause_after or settings.steps))
-    held = frames_of(arguments.held_out)
+    held = labelled_frames(arguments.held_out)
     log_path = arguments.run / "log.csv"
     with log_path.open("a", newline="") as file:
         log = csv.writer(file)
@@ -508,8 +510,8 @@ def main() -> None:
     if run.step_number < settings.steps:
         return
     network = run.averaged()
-    figures = all_figures(network, arguments.held_out, arguments.also)
-    print(table_of(figures))
+    figures = all_metrics(network, arguments.held_out, arguments.also)
+    print(format_table(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
     run.ship(arguments.out, facts)
     card = CARD.format(
@@ -527,7 +529,7 @@ def main() -> None:
         train_seed=files.read_json(arguments.data / "manifest.json")["seed"],
         held_seed=files.read_json(arguments.held_out / "manifest.json")["seed"],
         real=len(KittiDataset(arguments.also)) if arguments.also else 0,
-        table=table_of(figures),
+        table=format_table(figures),
         version=files.read_json(arguments.data / "manifest.json")["generator"],
         note=f"\n  {arguments.remark}" if arguments.remark else "",
     )

@@ -72,7 +72,7 @@ ACTORS = {
 }
 
 
-def classes_of(frame: SynthFrame) -> np.ndarray:
+def surface_classes(frame: SynthFrame) -> np.ndarray:
     """The `Class` (H, W) uint8 of each pixel. The frame is one without a background of its own."""
     table = np.full(256, StreetClass.OTHER, np.uint8)
     for material, kind in CLASS_OF.items():
@@ -83,7 +83,7 @@ def classes_of(frame: SynthFrame) -> np.ndarray:
     return found
 
 
-def planned(seed: int, index: int, split: str) -> Plan:
+def plan_street(seed: int, index: int, split: str) -> Plan:
     """What frame `index` of a stream shows: any weather, any season, from turned cameras too."""
     rng = np.random.default_rng([STREAM, seed, index, split == "train"])
     layout = LayoutSettings(variants=VARIANTS[split], people=True)
@@ -95,7 +95,7 @@ def planned(seed: int, index: int, split: str) -> Plan:
 
 def street(seed: int, index: int, split: str) -> SynthFrame:
     """Frame `index` of a stream."""
-    frame = render_frame(planned(seed, index, split))
+    frame = render_frame(plan_street(seed, index, split))
     assert frame is not None
     return frame
 
@@ -110,7 +110,7 @@ def shrunk(classes: np.ndarray) -> np.ndarray:
     return np.argmax(shares, axis=0).astype(np.uint8)
 
 
-class Store:
+class SegmentStore:
     """Frames of a stream at the size `STORE_HW`, made as far as they are not there yet.
 
     images (N, h, w, 3) uint8, classes (N, h, w) uint8, elevation (N, h, w) float16: see `unet.elevation`.
@@ -130,7 +130,7 @@ class Store:
             height_of = unet.compute_elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
             files.write_npz(
                 folder / f"{index:05d}.npz",
-                {"image": image, "classes": shrunk(classes_of(frame)), "elevation": height_of},
+                {"image": image, "classes": shrunk(surface_classes(frame)), "elevation": height_of},
             )
             files.write_json(stamp, told | {"frames": index + 1})
         parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
@@ -171,32 +171,32 @@ def window(rng: np.random.Generator) -> np.ndarray:
     return matrix
 
 
-def taken(values: np.ndarray, part: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+def resample_crop(values: np.ndarray, part: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
     """A part of what is known of a kept frame. part (2, 3): see `window`; how: OpenCV's interpolation."""
     return cv2.warpAffine(values, part, CROP_HW[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
 
 
-def cropped(store: Store, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_crop(
+    store: SegmentStore, index: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A part of a frame, zoomed, mirrored or not: image (h, w, 3) in [0, 1], classes (h, w), elevation (h, w)."""
     part = window(rng)
-    image = taken(store.images[index], part).astype(np.float32) / 255
-    classes = taken(store.classes[index], part, cv2.INTER_NEAREST)
-    return image, classes, taken(store.elevation[index].astype(np.float32), part)
+    image = resample_crop(store.images[index], part).astype(np.float32) / 255
+    classes = resample_crop(store.classes[index], part, cv2.INTER_NEAREST)
+    return image, classes, resample_crop(store.elevation[index].astype(np.float32), part)
 
 
-def other_surfaces(
-    image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator
-) -> None:
+def vary_surfaces(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
     """Each kind of thing in colours and light of its own, other skies, unknown things in the way; in place.
 
     What the generator draws always alike must not be what the network goes by.
     """
-    other_colours(image, classes, elevation, rng)
-    unknown_things(image, classes, rng)
-    other_light(image, classes, rng)
+    vary_colours(image, classes, elevation, rng)
+    paste_unknown_objects(image, classes, rng)
+    vary_light(image, classes, rng)
 
 
-def other_colours(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
+def vary_colours(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
     """Each kind of thing in colours of its own, other skies; in place."""
     if rng.random() < 0.4:
         gains = np.exp(rng.normal(0, 0.25, (len(StreetClass), 1)) + rng.normal(0, 0.06, (len(StreetClass), 3)))
@@ -225,7 +225,7 @@ def other_colours(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray,
         image += (drawn - image) * opacity
 
 
-def unknown_things(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
+def paste_unknown_objects(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
     """What no generated street has, in the way; in place."""
     height, width = classes.shape
     for _ in range(int(rng.integers(0, 4)) if rng.random() < 0.35 else 0):
@@ -237,7 +237,7 @@ def unknown_things(image: np.ndarray, classes: np.ndarray, rng: np.random.Genera
         classes[y : y + h, x : x + w] = StreetClass.OTHER
 
 
-def other_light(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
+def vary_light(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
     """Grain on the ground, shade from what is not in the picture; in place."""
     sky = (classes == StreetClass.SKY)[..., None]
     ground = np.isin(classes, (StreetClass.ROAD, StreetClass.GROUND, StreetClass.GRASS, StreetClass.OTHER))[
@@ -252,7 +252,7 @@ def other_light(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator
         image *= 1 - shade * (1 - sky) * _draw(rng, 0.3, 0.85)
 
 
-def other_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def vary_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The picture (h, w, 3) in another exposure, other colours, less sharp, hazy, noisy, compressed."""
     if rng.random() < 0.15:
         air = _draw(rng, 0.5, 1.0)
@@ -281,7 +281,7 @@ def other_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Settings:
+class SegmentSettings:
     """What decides on the result of a run."""
 
     steps: int = 1800
@@ -298,7 +298,7 @@ HORIZON_ERROR = 0.012
 """Standard deviation of the elevation that the network is told: a plane estimated from a photograph is off."""
 
 
-def batch_of(store: Store, step: int, settings: Settings) -> tuple[Tensor, Tensor, Tensor]:
+def build_batch(store: SegmentStore, step: int, settings: SegmentSettings) -> tuple[Tensor, Tensor, Tensor]:
     """Images (N, 3, h, w), elevations (N, 1, h, w) and classes (N, h, w) of a step: a function of the seed and the
     step alone."""
     images, heights, classes = [], [], []
@@ -307,9 +307,9 @@ def batch_of(store: Store, step: int, settings: Settings) -> tuple[Tensor, Tenso
         epoch, inside = divmod(number, len(store))
         order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
         rng = np.random.default_rng([settings.seed, step, place])
-        image, found, height = cropped(store, int(order[inside]), rng)
-        other_surfaces(image, found, height, rng)
-        images.append(other_camera(image, rng))
+        image, found, height = random_crop(store, int(order[inside]), rng)
+        vary_surfaces(image, found, height, rng)
+        images.append(vary_camera(image, rng))
         classes.append(found)
         heights.append(height + np.float32(rng.normal(0, HORIZON_ERROR)))
     return (
@@ -323,32 +323,32 @@ WEIGHTS_OF_CLASSES = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0, 1.1, 2.0)
 """In the loss, in the order of `Class`: what is rare counts more."""
 
 
-def loss_of(logits: Tensor, classes: Tensor) -> Tensor:
+def compute_loss(logits: Tensor, classes: Tensor) -> Tensor:
     """Cross entropy () of logits (N, C, h/2, w/2) with the shares of the classes (N, h, w) in each 2x2 px."""
     shares = F.avg_pool2d(F.one_hot(classes, len(StreetClass)).permute(0, 3, 1, 2).float(), 2)
     weights = logits.new_tensor(WEIGHTS_OF_CLASSES)[:, None, None]
     return -(shares * logits.log_softmax(1) * weights).sum(1).mean()
 
 
-class Run(AveragedRun[SegmentNet]):
+class SegmentRun(AveragedRun[SegmentNet]):
     """The network in training."""
 
-    settings: Settings
+    settings: SegmentSettings
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SegmentSettings) -> None:
         torch.manual_seed(settings.seed)
         super().__init__(SegmentNet().train(), settings)
         self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def step(self, store: Store) -> float:
+    def step(self, store: SegmentStore) -> float:
         """One step of the optimiser; the loss."""
         step, settings = self.step_number, self.settings
         with self.timed():
-            images, heights, classes = batch_of(store, step, settings)
+            images, heights, classes = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 50)
             with torch.autocast("cpu", torch.bfloat16):
                 logits = self.network(images, heights)
-            loss = loss_of(logits.float(), classes)
+            loss = compute_loss(logits.float(), classes)
             self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())
 
@@ -418,7 +418,7 @@ With the same generator, on the same machine, another run gives the same bytes.
 """
 
 
-def table_of(figures: dict[str, tuple[float, float]]) -> str:
+def format_table(figures: dict[str, tuple[float, float]]) -> str:
     """A Markdown table, a row a map."""
     rows = [f"| {name} | {whole:.3f} | {tail:.3f} |" for name, (whole, tail) in figures.items()]
     return "\n".join(["| map | IoU | 10th percentile |", "| --- | --- | --- |", *rows])
@@ -469,18 +469,20 @@ def train(run: Any, store: Any, steps: int, folder: Path, pause_after: int | Non
 
 
 def main() -> None:
-    arguments = options(__doc__, Path("build/segment"), segment.WEIGHTS, 60, Settings)
+    arguments = options(__doc__, Path("build/segment"), segment.WEIGHTS, 60, SegmentSettings)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    settings = Settings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
-    store = Store(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
+    settings = SegmentSettings(
+        arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed
+    )
+    store = SegmentStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
     print(f"{len(store)} frames", flush=True)
-    run = Run(settings)
+    run = SegmentRun(settings)
     if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
         return
     network = run.averaged()
     figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(table_of(figures))
+    print(format_table(figures))
     facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
     run.ship(arguments.out, facts)
     card = CARD.format(
@@ -495,7 +497,7 @@ def main() -> None:
         minutes=run.seconds / 60,
         seed=settings.seed,
         held_out=arguments.held_out,
-        table=table_of(figures),
+        table=format_table(figures),
         note=f"\n  {arguments.remark}" if arguments.remark else "",
     )
     files.write_text(arguments.out.with_suffix(".md"), card)

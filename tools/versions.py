@@ -56,19 +56,19 @@ print(json.dumps({{"Python": platform.python_version(), **{{name: version(name) 
 
 
 @dataclass(frozen=True)
-class Ended:
+class StepResult:
     """A step: why it failed, in a line, or nothing; what it said."""
 
     failed: str = ""
     said: str = ""
 
 
-Run = Callable[[Sequence[str], Path], Ended]
+Run = Callable[[Sequence[str], Path], StepResult]
 """Runs words in a folder."""
 
 
 @dataclass(frozen=True)
-class Outcome:
+class VersionOutcome:
     """What came of one Python and one set of versions."""
 
     python: str
@@ -83,7 +83,7 @@ class Outcome:
     """The attack's."""
 
 
-def lowest(pyproject: Path, python: str) -> list[str]:
+def lowest_versions(pyproject: Path, python: str) -> list[str]:
     """Each dependency at its lower bound, `name==version`, for a Python such as 3.11. ValueError where there is
     none.
     """
@@ -99,7 +99,7 @@ def lowest(pyproject: Path, python: str) -> list[str]:
     return pins
 
 
-def hiding(work: Path, usr: Path = Path("/usr")) -> list[str]:
+def hiding_prefix(work: Path, usr: Path = Path("/usr")) -> list[str]:
     """Words before a command that hide `HIDDEN` from it. work: a folder for the layer of /usr that lacks it."""
     upper, spare = work / "upper", work / "spare"
     spare.mkdir(parents=True)
@@ -112,29 +112,33 @@ def hiding(work: Path, usr: Path = Path("/usr")) -> list[str]:
     return ["unshare", "-rm", "sh", "-c", f'mount -t overlay overlay -o {layers} {usr} && exec "$@"', "sh"]
 
 
-def run_words(words: Sequence[str], folder: Path) -> Ended:
+def run_words(words: Sequence[str], folder: Path) -> StepResult:
     """See `Run`."""
     own = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     try:
         ended = subprocess.run(words, cwd=folder, env=own, capture_output=True, text=True, timeout=60 * _MINUTES)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Ended(str(error))
+        return StepResult(str(error))
     lines = [line for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
     named = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]  # pytest's last line counts only
     failed = "; ".join(named) or (lines[-1] if lines else f"exit code {ended.returncode}")
-    return Ended(failed if ended.returncode else "", ended.stdout)
+    return StepResult(failed if ended.returncode else "", ended.stdout)
 
 
-def tried(python: str, versions: str, wheel: str, work: Path, args: argparse.Namespace, run: Run) -> Outcome:
+def try_versions(
+    python: str, versions: str, wheel: str, work: Path, args: argparse.Namespace, run: Run
+) -> VersionOutcome:
     """One Python and one set of versions. wheel: to install, or the tree."""
     environment, empty = work / "environment", work / "empty"
     empty.mkdir(parents=True)
-    before = hiding(work) if args.bare else []
+    before = hiding_prefix(work) if args.bare else []
     own = [*before, str(environment / "bin" / "python")]
     install = [*own, "-m", "pip", "install", "-q"]
     if versions == "lowest":
         told = run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], work).said.strip()
-        files.write_text(work / "lowest.txt", "\n".join(lowest(ROOT / "pyproject.toml", told or "3.11")) + "\n")
+        files.write_text(
+            work / "lowest.txt", "\n".join(lowest_versions(ROOT / "pyproject.toml", told or "3.11")) + "\n"
+        )
         install += ["-c", str(work / "lowest.txt")]
     if versions == "pinned":
         install += ["-c", str(ROOT / "constraints.txt")]
@@ -164,10 +168,10 @@ def tried(python: str, versions: str, wheel: str, work: Path, args: argparse.Nam
         failed = "doctor: EGL is hidden, and works"
     figures = {key: said["attack"][key] for key in ("frames", "grades") if key in said.get("attack", {})}
     named = f"{versions}, bare" if args.bare else versions
-    return Outcome(python, named, failed, said.get("versions", {}), parts, figures)
+    return VersionOutcome(python, named, failed, said.get("versions", {}), parts, figures)
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def table(outcomes: Sequence[VersionOutcome]) -> str:
     """The outcomes in Markdown."""
     heads = ("Python", "versions", *PACKAGES, "outcome")
     rows = [
@@ -197,7 +201,7 @@ def main(argv: Sequence[str] | None = None, run: Run = run_words) -> int:
     args = parser.parse_args(argv)
     if not set(args.versions.split(",")) <= set(SETS):
         parser.error(f"--versions: expected some of {', '.join(SETS)}, found {args.versions}")
-    outcomes: list[Outcome] = []
+    outcomes: list[VersionOutcome] = []
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         made = run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work), str(ROOT)], work)
@@ -208,7 +212,7 @@ def main(argv: Sequence[str] | None = None, run: Run = run_words) -> int:
         for python in args.python.split(","):
             for versions in args.versions.split(","):
                 place = work / f"{Path(python).name}-{versions}-{len(outcomes)}"
-                outcome = tried(python, versions, wheel, place, args, run)
+                outcome = try_versions(python, versions, wheel, place, args, run)
                 outcomes.append(outcome)
                 lacking = ", ".join(name for name, status in outcome.parts.items() if status != "works")
                 sys.stdout.write(f"{python}, {versions}: {outcome.failed or 'works'}\n")

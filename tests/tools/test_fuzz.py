@@ -15,8 +15,8 @@ from scene_ir.errors import FormatError
 from tools.fuzz import trial
 from tools.fuzz.__main__ import main
 from tools.fuzz.formats import FORMATS, Format, call_all
-from tools.fuzz.mutate import mutated
-from tools.fuzz.trial import Subject, fuzz
+from tools.fuzz.mutate import mutate
+from tools.fuzz.trial import FuzzSubject, fuzz
 
 
 def make(root: Path) -> None:
@@ -88,7 +88,7 @@ def test_each_fault_is_told(fault: str, said: str, tmp_path: Path, monkeypatch: 
 def test_an_input_is_the_same_each_time(tmp_path: Path) -> None:
     found = []
     for name in ("a", "b"):
-        subject = Subject(Format("words", make, taken), tmp_path / name)
+        subject = FuzzSubject(Format("words", make, taken), tmp_path / name)
         for number in range(20):
             with subject.damaged(3, number) as root:
                 found.append((root / "a.txt").read_bytes())
@@ -102,7 +102,7 @@ def test_bytes_of_no_kind_are_damaged_too(suffix: str) -> None:
     for seed in range(20):
         rng = random.Random(seed)
         data = rng.randbytes(rng.choice((0, 1, 30, 300)))
-        assert isinstance(mutated(f"a.{suffix}", data, rng), bytes)
+        assert isinstance(mutate(f"a.{suffix}", data, rng), bytes)
 
 
 def test_readers_do_not_hide_one_another() -> None:

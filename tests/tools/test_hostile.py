@@ -12,19 +12,19 @@ import pytest
 
 from tools.hostile import __main__ as command
 from tools.hostile.cases import FAMILIES, cases
-from tools.hostile.inputs import MARK, Ground, nothing, text
-from tools.hostile.trial import Case, Done, Signals, error_lines, judge, notes, run
+from tools.hostile.inputs import MARK, ValidInputs, nothing, text
+from tools.hostile.trial import CaseResult, HostileCase, Signals, error_lines, judge, notes, run
 
 LINE = "drivesem: a.json: score: expected a number, found 'high'"
-REFUSED = Case("a", "tracebacks", nothing, "drivesem report run", ("a.json: score",))
-VERIFIED = Case("b", "trust", nothing, "drivesem verify run", ("metrics.json: t_star",), code=1)
-STOPPED = Case("c", "signals", nothing, "x", ("interrupted",), 130, Signals("", (0.0,)), unlimited=True)
-DONE = Done(code=2, out="", err=f"{LINE}\n", seconds=2.0, mb=300.0)
+REFUSED = HostileCase("a", "tracebacks", nothing, "drivesem report run", ("a.json: score",))
+VERIFIED = HostileCase("b", "trust", nothing, "drivesem verify run", ("metrics.json: t_star",), code=1)
+STOPPED = HostileCase("c", "signals", nothing, "x", ("interrupted",), 130, Signals("", (0.0,)), unlimited=True)
+DONE = CaseResult(code=2, out="", err=f"{LINE}\n", seconds=2.0, mb=300.0)
 DIFFERENCE = "(run): totals: metrics.json: t_star: expected 0.6, found 0.545"
-AGAIN = Done(
+AGAIN = CaseResult(
     code=1, out=f"{DIFFERENCE}\nthe run is not what it says it is\n", err="written to a\n", seconds=2, mb=300
 )
-ENDED = Done(code=130, out="", err="drivesem: interrupted; the same\n", seconds=30, mb=300, ended_s=1.0)
+ENDED = CaseResult(code=130, out="", err="drivesem: interrupted; the same\n", seconds=30, mb=300, ended_s=1.0)
 
 
 def test_good_outcomes_pass() -> None:
@@ -89,9 +89,9 @@ raise SystemExit(130)
 """
 
 
-def run_script(content: str, folder: Path, **fields: Any) -> Done:
+def run_script(content: str, folder: Path, **fields: Any) -> CaseResult:
     case = replace(REFUSED, make=text("a.py", content), words="python a.py", **fields)
-    return run(case, folder / "case", Ground(folder))
+    return run(case, folder / "case", ValidInputs(folder))
 
 
 def test_a_command_is_measured(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tools import killed
-from tools.killed import Trial, main, try_out
-from tools.resident import told
+from tools.killed import KillTrial, main, try_out
+from tools.resident import summarise_samples
 
 _SOUND = """
 import os, pathlib, time
@@ -41,8 +41,8 @@ for number in range(12):
 """
 
 
-def tried(code: str, folder: Path, kills: int = 12) -> Trial:
-    trial = Trial("stub", "stub")
+def tried(code: str, folder: Path, kills: int = 12) -> KillTrial:
+    trial = KillTrial("stub", "stub")
     try_out(trial, [sys.executable, "-c", code], folder, kills, 0.8, seed=1)
     return trial
 
@@ -77,7 +77,7 @@ def test_commands_that_are_killed_end_alike(name: str, tmp_path: Path) -> None:
 
 def test_growth_is_that_of_a_line_through_later_frames() -> None:
     looks = [(0.5 * frame, frame, 500.0 + min(frame, 10) * 20 + 0.25 * frame) for frame in range(101)]
-    found = told("drivesem attack", [*looks, (51.0, 101, 0.0)])
+    found = summarise_samples("drivesem attack", [*looks, (51.0, 101, 0.0)])
     assert found.growth_kb == pytest.approx(256, rel=1e-3)
     assert (found.from_mb, found.to_mb) == (702.5, 725.0)
     assert found.peak_mb == 725.0

@@ -10,7 +10,7 @@ import pytest
 
 from scene_ir.errors import FormatError
 from tools import lock
-from tools.lock import CONSTRAINTS, LOCK, hashes, main, pinned
+from tools.lock import CONSTRAINTS, LOCK, hashes, main, read_pins
 
 
 def test_the_lock_has_each_tested_release_once_with_a_hash() -> None:
@@ -60,4 +60,4 @@ def test_what_is_no_report_and_no_constraint(tmp_path: Path) -> None:
         hashes([path])
     path.write_text("a>=1.0\n")
     with pytest.raises(FormatError, match=r"a\.json:1: expected NAME==VERSION, found 'a>=1.0'"):
-        pinned(path)
+        read_pins(path)

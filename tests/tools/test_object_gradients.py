@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tools.object_gradients import Values, cosines
+from tools.object_gradients import PictureScore, cosines
 
 DIRECTIONS = torch.eye(2)
 NOISE = torch.ones(3, 1, 1, dtype=torch.float64)
@@ -32,7 +32,7 @@ def bent(picture):
     [(smooth, linear, True, True), (smooth, bent, False, True), (jumping, linear, True, False)],
 )
 def test_what_falls_short_is_told_apart(picture, score, network, renderer):
-    found = cosines(Values(picture, score, NOISE), DIRECTIONS, 1e-3, 4)
+    found = cosines(PictureScore(picture, score, NOISE), DIRECTIONS, 1e-3, 4)
     assert (float(found[4]) > 0.999) == network
     assert (float(found[5]) > 0.999) == renderer
     assert (float(found[2]) > 0.999) == (network and renderer)

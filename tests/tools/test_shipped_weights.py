@@ -41,4 +41,4 @@ FILES = [path for part in ("detectors", "drivesem", "scene_ir") for path in (ROO
 
 @pytest.mark.parametrize("path", sorted(FILES), ids=lambda path: path.stem)
 def test_a_card_has_the_sha_of_every_file(path: Path) -> None:
-    files.check_card(path, files.read_bytes(path))
+    files.check_model_card(path, files.read_bytes(path))

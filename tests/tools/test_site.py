@@ -20,7 +20,12 @@ from tools.site import hooks  # noqa: E402
     [
         ("[a](docs/guide/attack.md)", "README.md", "index.md", "[a](guide/attack.md)"),
         ("![a](docs/example.jpg)", "README.md", "index.md", "![a](example.jpg)"),
-        ("[a](docs/guide/where.md#failure-regions)", "README.md", "index.md", "[a](guide/where.md#failure-regions)"),
+        (
+            "[a](docs/guide/where.md#failure-regions)",
+            "README.md",
+            "index.md",
+            "[a](guide/where.md#failure-regions)",
+        ),
         ("[c](detectors/weights/)", "README.md", "index.md", "[c](cards.md)"),
         ("[c](CITATION.cff)", "README.md", "index.md", "c (`CITATION.cff`)"),
         (
@@ -47,6 +52,7 @@ def test_commands_page_lists_options() -> None:
     page = "".join(hooks.iterate_commands())
     assert "### attack" in page
     assert "--combo" in page
+    assert "│" not in page
 
 
 def test_every_page_is_in_the_navigation() -> None:
@@ -60,7 +66,12 @@ def test_it_builds_without_a_warning(tmp_path: Path) -> None:
     words = ["build", "--strict", "-q", "-f", "tools/site/mkdocs.yml", "-d", str(tmp_path / "site")]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}  # a notice of the theme, not a warning
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", *words], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "mkdocs", *words],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
     start = (tmp_path / "site/index.html").read_text(encoding="utf-8")

@@ -12,12 +12,12 @@ import torch
 from tests.tools.loading import tool
 
 train = tool("train_cutout")
-SETTINGS = train.Settings(cycles=((2, 3e-3), (1, 1e-3)), batch=2)
+SETTINGS = train.CutoutSettings(cycles=((2, 3e-3), (1, 1e-3)), batch=2)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return train.Store(train.make(tmp_path_factory.mktemp("streets"), "train", 5, 2, None))
+    return train.CutoutStore(train.make(tmp_path_factory.mktemp("streets"), "train", 5, 2, None))
 
 
 def test_shares_of_a_pixel_add_up_to_at_most_one(store: Any) -> None:
@@ -34,7 +34,7 @@ def test_without_disturbance_the_template_lies_on_the_vehicle(store: Any) -> Non
     for index in range(len(store)):
         if store.cases.visible[index] < 0.9:
             continue
-        sample = train.sample_of(store, index, 0.0, None)
+        sample = train.make_sample(store, index, 0.0, None)
         assert sample is not None
         _, said = train.first_inputs([sample])
         cover, visible = said[0, 0].numpy() >= 0.5, sample.truth[..., 0] >= 128
@@ -46,7 +46,9 @@ def test_looks_keep_size_and_shares(store: Any) -> None:
     layers = store.layers(0)
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        photograph, shares = train.looks(np.ascontiguousarray(layers[..., :3]), layers[..., 3:6].copy(), rng)
+        photograph, shares = train.vary_appearance(
+            np.ascontiguousarray(layers[..., :3]), layers[..., 3:6].copy(), rng
+        )
         assert photograph.shape == (*layers.shape[:2], 3)
         assert photograph.dtype == shares.dtype == np.uint8
         assert (shares.astype(int).sum(-1) <= 255 + 3).all()
@@ -55,14 +57,14 @@ def test_looks_keep_size_and_shares(store: Any) -> None:
 
 def test_a_run_that_was_stopped_ends_at_the_same_weights(store: Any, tmp_path: Path) -> None:
     torch.set_num_threads(1)
-    whole = train.Run(SETTINGS)
+    whole = train.CutoutRun(SETTINGS)
     for _ in range(SETTINGS.steps):
         terms = whole.step(store)
     assert np.isfinite(list(terms.values())).all()
-    first = train.Run(SETTINGS)
+    first = train.CutoutRun(SETTINGS)
     first.step(store)
     first.save(tmp_path / "c.safetensors")
-    second = train.Run(SETTINGS)
+    second = train.CutoutRun(SETTINGS)
     second.load(tmp_path / "c.safetensors")
     while second.step_number < SETTINGS.steps:
         second.step(store)
@@ -71,9 +73,9 @@ def test_a_run_that_was_stopped_ends_at_the_same_weights(store: Any, tmp_path: P
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
-    train.Run(SETTINGS).save(tmp_path / "c.safetensors")
+    train.CutoutRun(SETTINGS).save(tmp_path / "c.safetensors")
     with pytest.raises(ValueError, match="expected settings"):
-        train.Run(train.Settings(cycles=((4, 3e-3),), batch=2)).load(tmp_path / "c.safetensors")
+        train.CutoutRun(train.CutoutSettings(cycles=((4, 3e-3),), batch=2)).load(tmp_path / "c.safetensors")
 
 
 def test_streets_are_made_once(store: Any, tmp_path: Path) -> None:
@@ -84,7 +86,7 @@ def test_streets_are_made_once(store: Any, tmp_path: Path) -> None:
 
 
 def test_each_cycle_begins_at_its_rate_and_ends_at_nothing() -> None:
-    settings = train.Settings(cycles=((100, 3e-3), (60, 1e-3)))
+    settings = train.CutoutSettings(cycles=((100, 3e-3), (60, 1e-3)))
     rates = [settings.rate(step) for step in range(160)]
     assert max(rates[50:100]) < 3e-3
     assert rates[99] < 1e-5

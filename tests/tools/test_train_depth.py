@@ -16,7 +16,7 @@ from scene_ir.derender.depth import DepthNet
 from tests.tools.loading import tool
 
 training: Any = tool("train_depth")
-SETTINGS = training.Settings(steps=4, batch=2, frames=2)
+SETTINGS = training.DepthSettings(steps=4, batch=2, frames=2)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def streets() -> list[Any]:
 def store(streets: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "street", lambda seed, index, split: streets[index])
-        return training.Store(tmp_path_factory.mktemp("depth"), 2, 7, "train")
+        return training.DepthStore(tmp_path_factory.mktemp("depth"), 2, 7, "train")
 
 
 def test_later_streets_are_taken_from_other_heights(streets: list[Any]) -> None:
@@ -44,14 +44,14 @@ def test_a_frame_is_kept_with_its_actors_and_without(store: Any, streets: list[A
     assert (store.nearness[0::2] >= store.nearness[1::2] - 1e-3).mean() > 0.99
     assert (store.nearness[0] > store.nearness[1]).any()
     with pytest.raises(ValueError, match="expected frames of"):
-        training.Store(tmp_path_of(store, streets, tmp_path), 1, 8, "train")
+        training.DepthStore(tmp_path_of(store, streets, tmp_path), 1, 8, "train")
 
 
 def tmp_path_of(store: Any, streets: list[Any], folder: Path) -> Path:
     """A folder with the first frame of another stream."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "street", lambda seed, index, split: streets[index])
-        training.Store(folder, 1, 7, "train")
+        training.DepthStore(folder, 1, 7, "train")
     return folder
 
 
@@ -67,7 +67,7 @@ def test_nothing_is_farther_than_the_ground(store: Any) -> None:
 
 
 def test_a_step_is_a_function_of_seed_and_number(store: Any) -> None:
-    first, again, other = (training.batch_of(store, step, SETTINGS) for step in (3, 3, 4))
+    first, again, other = (training.build_batch(store, step, SETTINGS) for step in (3, 3, 4))
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first[0], other[0])
     assert first[0].shape[:2] == (2, 3)
@@ -75,28 +75,28 @@ def test_a_step_is_a_function_of_seed_and_number(store: Any) -> None:
 
 
 def test_the_truth_costs_least(store: Any) -> None:
-    _, _, ground, near = training.batch_of(store, 0, SETTINGS)
+    _, _, ground, near = training.build_batch(store, 0, SETTINGS)
     over = F.avg_pool2d(near, 2) - F.avg_pool2d(ground, 2)
     right = torch.log(torch.expm1(over.clamp(min=1e-6))) + 4.0
-    assert torch.allclose(depth.excess(right), over, atol=1e-4)
-    least = training.loss_of(right, ground, near, 0.5)
+    assert torch.allclose(depth.nearness_excess(right), over, atol=1e-4)
+    least = training.compute_loss(right, ground, near, 0.5)
     assert least < 1e-2
-    assert least < training.loss_of(right + 0.5, ground, near, 0.5)
-    assert least < training.loss_of(right.roll(5, 3), ground, near, 0.5)
+    assert least < training.compute_loss(right + 0.5, ground, near, 0.5)
+    assert least < training.compute_loss(right.roll(5, 3), ground, near, 0.5)
 
 
 def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
     torch.set_num_threads(1)
-    whole = training.Run(SETTINGS)
+    whole = training.DepthRun(SETTINGS)
     losses = [whole.step(store) for _ in range(4)]
-    first = training.Run(SETTINGS)
+    first = training.DepthRun(SETTINGS)
     for _ in range(2):
         first.step(store)
     first.save(tmp_path / "checkpoint.safetensors")
-    second = training.Run(SETTINGS)
+    second = training.DepthRun(SETTINGS)
     second.load(tmp_path / "checkpoint.safetensors")
     assert [second.step(store) for _ in range(2)] == losses[2:]
-    other = training.Run(replace(SETTINGS, rate=1e-3))
+    other = training.DepthRun(replace(SETTINGS, rate=1e-3))
     with pytest.raises(ValueError, match="expected settings"):
         other.load(tmp_path / "checkpoint.safetensors")
 
@@ -106,4 +106,4 @@ def test_judged_beside_walls_by_rule(streets: list[Any]) -> None:
     figures = training.judge(network, streets[:1])
     assert set(figures) == {"walls by rule", "network", "both"}
     assert all(error >= 0 and 0 <= near <= 1 for error, near in figures.values())
-    assert training.table_of(figures).count("\n") == 1 + len(figures)
+    assert training.format_table(figures).count("\n") == 1 + len(figures)

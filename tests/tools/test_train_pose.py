@@ -12,11 +12,11 @@ import torch
 
 from drivesem.synth.write import Order, synthesise
 from scene_ir.derender import pose
-from scene_ir.derender.pose import BINS, KINDS, Said
+from scene_ir.derender.pose import BINS, KINDS, PosePrediction
 from tests.tools.loading import tool
 
 training = tool("train_pose")
-SETTINGS = training.Settings(steps=6, batch=4)
+SETTINGS = training.PoseSettings(steps=6, batch=4)
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +43,11 @@ def test_crops_are_kept(streets: Path, store: Any) -> None:
 
 def test_targets_are_what_the_estimate_undoes(store: Any) -> None:
     """Angle, offset and depth of jittered, mirrored boxes lead back to the truth."""
-    crops, numbers, targets = training.batch_of(store, 0, SETTINGS)
+    crops, numbers, targets = training.build_batch(store, 0, SETTINGS)
     assert crops.shape == (4, 3, *pose.CROP_HW)
     assert float(crops.min()) >= 0
     assert float(crops.max()) <= 1
-    assert numbers.shape == (4, pose.NUMBERS)
+    assert numbers.shape == (4, pose.BOX_FEATURES)
     # the box's height and the mean size tell a depth; the target is what is missing from it
     heights = torch.exp(numbers[:, 3] + pose.LEVEL_SIZE[1])
     kinds = ["Truck" if t else "Car" for t in numbers[:, 8] > 0]
@@ -68,11 +68,11 @@ def test_targets_are_what_the_estimate_undoes(store: Any) -> None:
     torch.testing.assert_close(middle[:, 1], ray[:, 1], atol=1e-4, rtol=0)
 
 
-def said_of(targets: Any, confidence: float) -> Said:
+def said_of(targets: Any, confidence: float) -> PosePrediction:
     n = len(targets.alpha)
     apart = targets.alpha[:, None] - torch.arange(BINS) * (2 * math.pi / BINS)
     kind = torch.nn.functional.one_hot(targets.kind, len(KINDS)) * 20.0
-    return Said(
+    return PosePrediction(
         confidence * apart.cos(),
         torch.stack([apart.cos(), apart.sin()], -1),
         targets.offset,
@@ -84,7 +84,7 @@ def said_of(targets: Any, confidence: float) -> Said:
 
 
 def test_the_truth_costs_least(store: Any) -> None:
-    _, _, targets = training.batch_of(store, 0, SETTINGS)
+    _, _, targets = training.build_batch(store, 0, SETTINGS)
     right = training.loss_terms(said_of(targets, 40.0), targets)
     for name in ("turn", "offset", "size", "depth_error", "kind"):
         assert float(right[name]) < 0.02, name
@@ -101,27 +101,27 @@ def test_the_truth_costs_least(store: Any) -> None:
 
 def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
     torch.set_num_threads(1)
-    whole = training.Run(SETTINGS)
+    whole = training.PoseRun(SETTINGS)
     terms = [whole.step(store)["total"] for _ in range(6)]
-    first = training.Run(SETTINGS)
+    first = training.PoseRun(SETTINGS)
     for _ in range(3):
         first.step(store)
     first.save(tmp_path / "checkpoint.safetensors")
-    second = training.Run(SETTINGS)
+    second = training.PoseRun(SETTINGS)
     second.load(tmp_path / "checkpoint.safetensors")
     assert [second.step(store)["total"] for _ in range(3)] == terms[3:]
     for name, value in whole.average.items():
         assert torch.equal(value, second.average[name]), name
-    other = training.Run(replace(SETTINGS, rate=1e-3))
+    other = training.PoseRun(replace(SETTINGS, rate=1e-3))
     with pytest.raises(ValueError, match="expected settings"):
         other.load(tmp_path / "checkpoint.safetensors")
 
 
 def test_judged_by_errors(streets: Path) -> None:
-    frames = training.frames_of(streets)
-    errors = training.judge(frames, training.Run(SETTINGS).averaged())
+    frames = training.labelled_frames(streets)
+    errors = training.judge(frames, training.PoseRun(SETTINGS).averaged())
     assert len(errors.yaw) == sum(len(training.usable(frame.labels)) for frame, _ in frames)
-    table = training.table_of({"all": errors.summary(), "none": errors.chosen(errors.depth < 0).summary()})
+    table = training.format_table({"all": errors.summary(), "none": errors.chosen(errors.depth < 0).summary()})
     assert table.count("\n") == 3
-    blind = [training.Found(torch.zeros(0, 4), ())] * len(frames)
-    assert len(training.judge(frames, training.Run(SETTINGS).averaged(), blind).yaw) == 0
+    blind = [training.PoseDetections(torch.zeros(0, 4), ())] * len(frames)
+    assert len(training.judge(frames, training.PoseRun(SETTINGS).averaged(), blind).yaw) == 0

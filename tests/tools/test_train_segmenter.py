@@ -12,11 +12,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from scene_ir.derender.segment import Class
+from scene_ir.derender.segmentation import StreetClass
 from tests.tools.loading import tool
 
 training: Any = tool("train_segmenter")
-SETTINGS = training.Settings(steps=4, batch=2, frames=2)
+SETTINGS = training.SegmentSettings(steps=4, batch=2, frames=2)
 
 
 @pytest.fixture(scope="module")
@@ -28,21 +28,25 @@ def streets() -> list[Any]:
 def store(streets: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "street", lambda seed, index, split: streets[index])
-        return training.Store(tmp_path_factory.mktemp("segment"), 2, 7, "train")
+        return training.SegmentStore(tmp_path_factory.mktemp("segment"), 2, 7, "train")
 
 
 def test_classes_are_the_generators(streets: list[Any]) -> None:
     frame = streets[0]
-    classes = training.classes_of(frame)
+    classes = training.surface_classes(frame)
     environment = frame.environment
-    clear = {"sky": [Class.SKY], "foliage_map": [Class.LEAVES, Class.GRASS], "road": [Class.ROAD]}
+    clear = {
+        "sky": [StreetClass.SKY],
+        "foliage_map": [StreetClass.LEAVES, StreetClass.GRASS],
+        "road": [StreetClass.ROAD],
+    }
     for name, kinds in clear.items():
         share = getattr(environment, name).numpy()
         found = np.isin(classes, kinds)
         assert found[share == 1].mean() > 0.999, name
         assert found[share == 0].mean() < 0.001, name
     vehicle = np.isin(frame.semantic, [12, 13, 14])
-    assert np.array_equal(classes == Class.VEHICLE, vehicle)
+    assert np.array_equal(classes == StreetClass.VEHICLE, vehicle)
 
 
 def test_a_store_is_made_once_and_of_one_stream(store: Any, tmp_path: Path, monkeypatch: Any) -> None:
@@ -51,28 +55,28 @@ def test_a_store_is_made_once_and_of_one_stream(store: Any, tmp_path: Path, monk
     frame = training.street(7, 0, "train")
     made = []
     monkeypatch.setattr(training, "street", lambda *key: (made.append(key), frame)[1])
-    first = training.Store(tmp_path, 1, 7, "train")
-    second = training.Store(tmp_path, 1, 7, "train")
+    first = training.SegmentStore(tmp_path, 1, 7, "train")
+    second = training.SegmentStore(tmp_path, 1, 7, "train")
     assert made == [(7, 0, "train")]
     assert np.array_equal(first.classes, second.classes)
     assert np.array_equal(first.images[0], store.images[0])
     with pytest.raises(ValueError, match="expected frames of"):
-        training.Store(tmp_path, 1, 8, "train")
+        training.SegmentStore(tmp_path, 1, 8, "train")
 
 
 def test_a_crop_keeps_picture_classes_and_elevation_together(store: Any) -> None:
     for seed in range(6):
-        image, classes, height = training.cropped(store, 0, np.random.default_rng(seed))
+        image, classes, height = training.random_crop(store, 0, np.random.default_rng(seed))
         assert image.shape == (*training.CROP_HW, 3)
-        assert set(np.unique(classes)) <= set(Class)
-        sky = classes == Class.SKY
+        assert set(np.unique(classes)) <= set(StreetClass)
+        sky = classes == StreetClass.SKY
         assert not sky[height < -0.03].any()
-        assert not (classes == Class.ROAD)[height > 0.03].any()
+        assert not (classes == StreetClass.ROAD)[height > 0.03].any()
         assert (np.diff(height, axis=0) < 0).all()
 
 
 def test_a_step_is_a_function_of_seed_and_number(store: Any) -> None:
-    first, again, other = (training.batch_of(store, step, SETTINGS) for step in (3, 3, 4))
+    first, again, other = (training.build_batch(store, step, SETTINGS) for step in (3, 3, 4))
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first[0], other[0])
     images, heights, classes = first
@@ -86,42 +90,42 @@ def test_pictures_stay_neither_black_nor_white(store: Any) -> None:
     levels = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        image, classes, height = training.cropped(store, seed % 2, rng)
-        training.other_surfaces(image, classes, height, rng)
-        levels.append(float(training.other_camera(image, rng).mean()))
+        image, classes, height = training.random_crop(store, seed % 2, rng)
+        training.vary_surfaces(image, classes, height, rng)
+        levels.append(float(training.vary_camera(image, rng).mean()))
     assert min(levels) > 0.03
     assert max(levels) < 0.97
     assert np.std(levels) > 0.05
 
 
 def test_the_truth_costs_least(store: Any) -> None:
-    _, _, classes = training.batch_of(store, 0, SETTINGS)
-    shares = F.avg_pool2d(F.one_hot(classes, len(Class)).permute(0, 3, 1, 2).float(), 2)
-    right = training.loss_of((shares + 1e-6).log(), classes)
-    assert right < training.loss_of((shares.roll(1, 1) + 1e-6).log(), classes)
-    assert right < training.loss_of(torch.zeros_like(shares), classes)
+    _, _, classes = training.build_batch(store, 0, SETTINGS)
+    shares = F.avg_pool2d(F.one_hot(classes, len(StreetClass)).permute(0, 3, 1, 2).float(), 2)
+    right = training.compute_loss((shares + 1e-6).log(), classes)
+    assert right < training.compute_loss((shares.roll(1, 1) + 1e-6).log(), classes)
+    assert right < training.compute_loss(torch.zeros_like(shares), classes)
 
 
 def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
     torch.set_num_threads(1)
-    whole = training.Run(SETTINGS)
+    whole = training.SegmentRun(SETTINGS)
     losses = [whole.step(store) for _ in range(4)]
-    first = training.Run(SETTINGS)
+    first = training.SegmentRun(SETTINGS)
     for _ in range(2):
         first.step(store)
     first.save(tmp_path / "checkpoint.safetensors")
-    second = training.Run(SETTINGS)
+    second = training.SegmentRun(SETTINGS)
     second.load(tmp_path / "checkpoint.safetensors")
     assert [second.step(store) for _ in range(2)] == losses[2:]
     for name, value in whole.average.items():
         assert torch.equal(value, second.average[name]), name
-    other = training.Run(replace(SETTINGS, rate=1e-3))
+    other = training.SegmentRun(replace(SETTINGS, rate=1e-3))
     with pytest.raises(ValueError, match="expected settings"):
         other.load(tmp_path / "checkpoint.safetensors")
 
 
 def test_judged_by_overlap(streets: list[Any]) -> None:
-    figures = training.judge(training.Run(SETTINGS).averaged(), streets)
+    figures = training.judge(training.SegmentRun(SETTINGS).averaged(), streets)
     assert set(figures) == set(training.JUDGED)
     assert all(0 <= whole <= 1 for whole, _ in figures.values())
-    assert training.table_of(figures).count("\n") == 1 + len(figures)
+    assert training.format_table(figures).count("\n") == 1 + len(figures)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.versions import PACKAGES, ROOT, Ended, hiding, lowest, main, run_words
+from tools.versions import PACKAGES, ROOT, StepResult, hiding_prefix, lowest_versions, main, run_words
 
 
 class Recorder:
@@ -21,20 +21,20 @@ class Recorder:
         self.pins = ""
         self.failing, self.egl = failing, egl
 
-    def __call__(self, words: Sequence[str], folder: Path) -> Ended:
+    def __call__(self, words: Sequence[str], folder: Path) -> StepResult:
         line = " ".join(words)
         self.steps.append(line)
         if "-c" in words and "lowest.txt" in line:
             self.pins = Path(words[words.index("-c") + 1]).read_text()
         if self.failing and self.failing in line:
-            return Ended("no such version")
+            return StepResult("no such version")
         if "sys.version_info" in line:
-            return Ended(said="3.13\n")
+            return StepResult(said="3.13\n")
         if "importlib.metadata" in line:
-            return Ended(said=json.dumps({"Python": "9.0.1", "torch": "9.1"}))
+            return StepResult(said=json.dumps({"Python": "9.0.1", "torch": "9.1"}))
         if "doctor" in line:
-            return Ended(said=json.dumps({"parts": [{"name": "EGL", "status": self.egl}]}))
-        return Ended(
+            return StepResult(said=json.dumps({"parts": [{"name": "EGL", "status": self.egl}]}))
+        return StepResult(
             said=json.dumps({"frames": 10, "grades": {"certain": 3}, "more": 0}) if "attack" in line else ""
         )
 
@@ -43,13 +43,13 @@ def test_lower_bounds_are_pinned(tmp_path: Path) -> None:
     path = tmp_path / "pyproject.toml"
     newer = """"numpy>=2.0; python_version < '3.13'", "numpy>=2.1; python_version >= '3.13'\""""
     path.write_text(f'[project]\ndependencies = ["torch>=2.6", "warp-lang >= 1.19, <2", {newer}]\n')
-    assert lowest(path, "3.11") == ["torch==2.6", "warp-lang==1.19", "numpy==2.0"]
-    assert lowest(path, "3.13")[2] == "numpy==2.1"
+    assert lowest_versions(path, "3.11") == ["torch==2.6", "warp-lang==1.19", "numpy==2.0"]
+    assert lowest_versions(path, "3.13")[2] == "numpy==2.1"
     path.write_text('[project]\ndependencies = ["torch"]\n')
     with pytest.raises(ValueError, match="dependency 'torch': expected a lower bound"):
-        lowest(path, "3.11")
+        lowest_versions(path, "3.11")
     for python in ("3.11", "3.12", "3.13"):
-        names = [pin.partition("==")[0] for pin in lowest(ROOT / "pyproject.toml", python)]
+        names = [pin.partition("==")[0] for pin in lowest_versions(ROOT / "pyproject.toml", python)]
         assert len(names) == len(set(names))
         assert set(PACKAGES) <= set(names)
 
@@ -90,7 +90,7 @@ def test_a_layer_marks_what_is_hidden_and_nothing_else(tmp_path: Path) -> None:
     for name in ("bin/x86_64-linux-gnu-gcc-12", "bin/env", "lib/a/libEGL.so.1", "lib/a/libc.so.6"):
         (usr / name).parent.mkdir(parents=True, exist_ok=True)
         (usr / name).touch()
-    words = hiding(work, usr)
+    words = hiding_prefix(work, usr)
     marked = sorted(
         str(path.relative_to(work / "upper")) for path in (work / "upper").rglob("*") if not path.is_dir()
     )
@@ -107,7 +107,7 @@ def namespaces() -> bool:
 @pytest.mark.skipif(not namespaces(), reason="--bare needs mount namespaces; the layer's marks are tested above")
 def test_what_is_hidden_is_not_there(tmp_path: Path) -> None:
     hidden = run_words(
-        [*hiding(tmp_path), "sh", "-c", "ls /usr/bin/env /usr/bin/*gcc* /usr/lib/*/libEGL*"], tmp_path
+        [*hiding_prefix(tmp_path), "sh", "-c", "ls /usr/bin/env /usr/bin/*gcc* /usr/lib/*/libEGL*"], tmp_path
     )
     assert hidden.said == "/usr/bin/env\n"
     assert "cannot access" in hidden.failed
@@ -130,7 +130,7 @@ def test_resolving_installs_nothing() -> None:
 
 
 def test_words_are_run(tmp_path: Path) -> None:
-    assert run_words(["python3", "-c", "print(7)"], tmp_path) == Ended("", "7\n")
+    assert run_words(["python3", "-c", "print(7)"], tmp_path) == StepResult("", "7\n")
     assert run_words(["python3", "-c", "raise ValueError('so')"], tmp_path).failed == "ValueError: so"
     tests = "print('FAILED a.py::b - so'); print('1 failed in 3 s'); raise SystemExit(1)"
     assert run_words(["python3", "-c", tests], tmp_path).failed == "FAILED a.py::b - so"

@@ -52,7 +52,7 @@ from tools.bench import (
     weather,
 )
 from tools.bench import detector as detectors
-from tools.bench.planted import across, across_names, summary, yardstick
+from tools.bench.planted import across, across_report, summary, yardstick
 from tools.bench.settings import BenchTool, DetectorBenchConfig, GradcheckConfig
 
 _PROGRAM = "python -m tools.bench"
@@ -275,48 +275,52 @@ def _planted(config: DetectorBenchConfig, console: Console) -> BenchResult:
 
 def _planted_across(config: DetectorBenchConfig, console: Console) -> BenchResult:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
-    first = across.Across.of(config)
+    first = across.SharedFaultBench.of(config)
     names, _, failed = select_frames(first.source, config)
     pooling = run_frame_jobs(
-        names, first.pool, partial(across.pool_of, config), config, ProgressSettings("states", show_remaining=True)
+        names,
+        first.pool,
+        partial(across.build_pool_worker, config),
+        config,
+        ProgressSettings("states", show_remaining=True),
     )
     pools = [pooling.results[name] for name in names if name in pooling.results]
     kinds = across.KINDS[1::8] if config.quick else across.KINDS
     kinds = [(kind, nth) for nth in range(config.each) for kind in kinds]
-    planted = [across.plant_across(pools, kind, config.seed, nth) for kind, nth in kinds]
+    planted = [across.plant_shared_fault(pools, kind, config.seed, nth) for kind, nth in kinds]
     faults = [one for one in planted if one is not None]
     console.print(f"{len(faults)} of {len(kinds)} faults could be planted")
     texts = tuple(one.fault.text for one in faults)
-    second, frames = across.Across.of(config, texts), list(enumerate(pool.frame for pool in pools))
+    second, frames = across.SharedFaultBench.of(config, texts), list(enumerate(pool.frame for pool in pools))
     frames = frames[: config.searched]
     build = partial(across.judge_of, config, texts)
     asked = run_frame_jobs(
         frames, second.judge, build, config, ProgressSettings("searches", show_remaining=True), lambda job: job[1]
     )
     judged = [asked.results[job] for job in frames if job in asked.results]
-    rows = across_names.rows_of(faults, pools, judged, tuple(first.workers) if frames else ())
-    told, summed = [row.to_json() for row in rows], across_names.summary_rows(rows)
-    summed += across_names.chance_rows(pools, config.seed, across_names.SHAMS)
+    rows = across_report.rule_rows(faults, pools, judged, tuple(first.workers) if frames else ())
+    told, summed = [row.to_json() for row in rows], across_report.summary_rows(rows)
+    summed += across_report.chance_rows(pools, config.seed, across_report.CHANCE_DETECTORS)
     return BenchResult(
         {
             "rows": told,
             "summary": summed,
             "unplanted": ["+".join(kind) for (kind, _), one in zip(kinds, planted, strict=True) if one is None],
             "failed": failed | pooling.failed | asked.failed,
-            "method": across_names.METHOD,
+            "method": across_report.METHOD,
         },
         [
-            BenchTable(across_names.TITLE, across_names.COLUMNS, told),
-            BenchTable(across_names.SUMMARY_TITLE, across_names.SUMMARY_COLUMNS, summed),
+            BenchTable(across_report.TITLE, across_report.COLUMNS, told),
+            BenchTable(across_report.SUMMARY_TITLE, across_report.SUMMARY_COLUMNS, summed),
         ],
     )
 
 
 def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> BenchResult:
     config = replace(config, limit=config.limit or _PLANTED_FRAMES)
-    judge = yardstick.Yardstick.of(config)
+    judge = yardstick.PlantedFaultBench.of(config)
     names, _, failed = select_frames(next(iter(judge.workers.values())).source, config)
-    methods = yardstick.methods_of(config)
+    methods = yardstick.chosen_methods(config)
     sought = min(config.faults or len(judge.kinds), len(judge.kinds))
     count = len(names) * (sought * len(methods) + len(judge.named))  # named ones once more without a fault
     console.print(
@@ -331,7 +335,7 @@ def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> BenchRe
         ProgressSettings("frames", show_remaining=True),
     )
     judged = [asked.results[name] for name in names if name in asked.results]
-    rows, kinds = summary.rows_of(judged, methods, config.seed), summary.kind_rows(judged, methods)
+    rows, kinds = summary.method_rows(judged, methods, config.seed), summary.kind_rows(judged, methods)
     return BenchResult(
         {
             "rows": rows,

@@ -60,7 +60,7 @@ _STREAM_SEED = 53
 
 
 @dataclass(frozen=True, slots=True)
-class Street:
+class DepthStreet:
     """What a guess goes by: the picture (H, W, 3) in [0, 1] without vehicles, the ground's plane (4,), and what is
     known besides."""
 
@@ -70,7 +70,7 @@ class Street:
     ties: depth.DepthConstraints
 
     @staticmethod
-    def of(scene: SceneIR) -> Street:
+    def of(scene: SceneIR) -> DepthStreet:
         """A scene's street."""
         picture = np.ascontiguousarray(scene.background.numpy().transpose(1, 2, 0))
         plane, camera, objects = scene.environment.ground, scene.camera, scene.objects
@@ -81,7 +81,7 @@ class Street:
             objects.translation, objects.yaw, objects.size_lhw, torch.zeros(0, 4),
         )  # fmt: skip
         stood = maps.draw_footprints(labels, list(range(count)), plane, camera)
-        return Street(
+        return DepthStreet(
             picture, plane, camera, depth.DepthConstraints(seen.sky, seen.ground, stood, np.zeros_like(stood))
         )
 
@@ -148,7 +148,9 @@ class DepthRow:
     within_up: float | None = None
 
 
-def row_of(source: str, name: str, kind: str, found: Array, truth: Array | None, street: Street) -> DepthRow:
+def depth_row(
+    source: str, name: str, kind: str, found: Array, truth: Array | None, street: DepthStreet
+) -> DepthRow:
     """A depth (H, W) m held against the truth (H, W) m, inf where it is not known."""
     bands = round(bands_px(found, street.picture), 1)
     known = None if truth is None else truth < FAR_M
@@ -165,12 +167,12 @@ def row_of(source: str, name: str, kind: str, found: Array, truth: Array | None,
 
 def judge(source: str, name: str, scene: SceneIR, truth: Array | None, sheets: Path | None) -> list[DepthRow]:
     """Rows of the network's depth, which the scene has, and of its rivals. sheets: folder for pictures of fog."""
-    street = Street.of(scene)
+    street = DepthStreet.of(scene)
     depths = {**street.guesses(), USED: scene.depth.numpy()}
     if sheets is not None:
         panels = [to_uint8(scene.photograph), *(in_fog(scene, depths[k]) for k in ("guessed walls", USED))]
         write_picture(sheets / f"{source}_{name.replace('/', '_')}.png", np.concatenate(panels))
-    rows = [row_of(source, name, kind, found, truth, street) for kind, found in depths.items()]
+    rows = [depth_row(source, name, kind, found, truth, street) for kind, found in depths.items()]
     if source == _GENERATED and truth is not None:
         rows.append(DepthRow(source, name, "exact", round(bands_px(truth, street.picture), 1)))
     return rows

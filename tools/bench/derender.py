@@ -42,7 +42,7 @@ from scene_ir.render import blend, surfaces
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import Crop, Frame, Labels, SceneIR
-from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
+from tools.bench.pictures import EXACT_DB, SheetStrip, psnr, sheet
 from tools.experiments.realism.perceptual import PERCEPTUAL, PerceptualDistance, Picture
 
 Mask = NDArray[np.bool_]
@@ -109,7 +109,7 @@ ABLATIONS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class VehicleMove:
     """One vehicle's edit."""
 
     track: int
@@ -122,19 +122,19 @@ class Move:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class EditedStreet:
     """One street before and after the edit."""
 
     plan: Plan
     before: SynthFrame
-    move: Move
+    move: VehicleMove
     """What happens."""
     moved: SynthFrame
     """The generator's own frame of it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class SilhouetteOverlap:
     """One vehicle's silhouettes: IoU of the template at the disturbed label, the fitted mesh, and the matte; 0
     where de-rendering made no object of it. template_iou is None where the scene comes from elsewhere.
     """
@@ -155,7 +155,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Edited:
+class EditAccuracy:
     """A scene's edited picture beside the truth."""
 
     psnr_db: float
@@ -176,13 +176,13 @@ class DerenderRow:
     weather: str
     road: str
     objects: int
-    shapes: tuple[Shape, ...]
+    shapes: tuple[SilhouetteOverlap, ...]
     moved: str
     shift_m: tuple[float, float]
     turn_deg: float
     never_seen: float
-    move: Edited
-    remove: Edited
+    move: EditAccuracy
+    remove: EditAccuracy
     identity_db: float
     """In the objects' boxes."""
     exact: bool
@@ -190,18 +190,18 @@ class DerenderRow:
     derender_s: float
     cpu_s: float
     peak_mb: float | None
-    withheld: tuple[Shape, ...] = ()
+    withheld: tuple[SilhouetteOverlap, ...] = ()
     """Shapes where no vehicle's own kind of template may be chosen."""
     ablations: dict[str, dict[str, float]] = field(default_factory=dict)
     """PSNR of move and removal with a part replaced by the truth."""
     shadow_iou: float | None = None
-    """See `shadows`; no sun but under a clear sky."""
+    """See `compare_shadows`; no sun but under a clear sky."""
     sun_deg: float | None = None
-    """See `shadows`; no sun but under a clear sky."""
+    """See `compare_shadows`; no sun but under a clear sky."""
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class DerenderTask:
     """One frame to measure."""
 
     seed: int
@@ -232,7 +232,7 @@ def measure(
     with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as name:
         folder = None if sheets is None else Path(name)
         settings = settings or DerenderSettings()
-        tasks = [Task(seed, index, ablate, folder, settings) for index in range(frames)]
+        tasks = [DerenderTask(seed, index, ablate, folder, settings) for index in range(frames)]
         found = []
         for row in _in_processes(tasks, min(workers, frames)):
             found.append(row)
@@ -241,7 +241,7 @@ def measure(
             _keep_sheets(found, folder, sheets)
 
 
-def _in_processes(tasks: Sequence[Task], workers: int) -> Iterator[DerenderRow]:
+def _in_processes(tasks: Sequence[DerenderTask], workers: int) -> Iterator[DerenderRow]:
     if workers == 1:
         yield from map(work, tasks)
         return
@@ -260,18 +260,18 @@ def _perception() -> PerceptualDistance:
     return PerceptualDistance()
 
 
-def work(task: Task) -> DerenderRow:
+def work(task: DerenderTask) -> DerenderRow:
     """Make a frame, de-render it, judge the scene."""
     case = make_case(task.seed, task.index)
     rng = np.random.default_rng([_STREAM, task.seed, task.index, 1])
-    labels = disturbed(case.before, rng)
-    frame = photograph_of(case.before, labels)
+    labels = disturb_labels(case.before, rng)
+    frame = synthetic_photograph(case.before, labels)
     reset = _reset_peak()
     start, cpu = time.perf_counter(), time.process_time()
     scene = derender(frame, task.settings)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     peak = _peak_mb() if reset else None
-    tracks = tracks_of(scene, case.before)
+    tracks = match_tracks(scene, case.before)
     row, strips = judge(case, scene, tracks, labels, task.index)
     row = replace(row, derender_s=round(seconds, 3), cpu_s=round(cpu, 3), peak_mb=peak)
     row = replace(row, withheld=_withheld(case, frame, task.settings))
@@ -282,14 +282,14 @@ def work(task: Task) -> DerenderRow:
     return row
 
 
-def _withheld(case: Case, frame: Frame, settings: DerenderSettings) -> tuple[Shape, ...]:
+def _withheld(case: EditedStreet, frame: Frame, settings: DerenderSettings) -> tuple[SilhouetteOverlap, ...]:
     """The shapes of the frame taken apart with templates of other kinds than the vehicles are of."""
     kinds = tuple(t.actor.kind for t in case.before.truths if t.labelled)
     scene = derender(frame, replace(settings, withheld=kinds))
-    return tuple(silhouettes(case, Compositor(scene), tracks_of(scene, case.before), None))
+    return tuple(compare_silhouettes(case, Compositor(scene), match_tracks(scene, case.before), None))
 
 
-def make_case(seed: int, index: int, split: str = "heldout") -> Case:
+def make_case(seed: int, index: int, split: str = "heldout") -> EditedStreet:
     """Street `index` of stream `seed`, with a vehicle that can be moved. split: "train" or "heldout", the
     generator's pools. Raises RangeError where none is found.
     """
@@ -300,14 +300,14 @@ def make_case(seed: int, index: int, split: str = "heldout") -> Case:
         if found is None:
             continue
         plan, before, move = found
-        moved = render_frame(apply_edit(plan, edit_of(move)))
+        moved = render_frame(apply_edit(plan, move_to_edit(move)))
         assert moved is not None
-        if (share_of(moved, move.track) >= 0.5).any():
-            return Case(plan, before, move, moved)
+        if (track_coverage(moved, move.track) >= 0.5).any():
+            return EditedStreet(plan, before, move, moved)
     raise RangeError(f"bench derender: street {index} of seed {seed}", f"one within {_ATTEMPTS} attempts", "none")
 
 
-def _photographed(plan: Plan, key: tuple[int, ...]) -> tuple[Plan, SynthFrame, Move] | None:
+def _photographed(plan: Plan, key: tuple[int, ...]) -> tuple[Plan, SynthFrame, VehicleMove] | None:
     """The plan without what the photograph hides altogether, and nobody can know of; its frame, and a move.
 
     key: seeds the choice of the move. None where nothing can be moved.
@@ -330,7 +330,7 @@ def _seen(truths: Sequence[Truth]) -> bool:
     return all(t.visible >= _LEAST_SEEN for t in truths)
 
 
-def edit_of(move: Move) -> FrameEdit:
+def move_to_edit(move: VehicleMove) -> FrameEdit:
     """The move as the generator takes it."""
     return FrameEdit({move.track: ObjectEdit(translate_m=move.shift_m, rotate=move.turn, size=move.size)})
 
@@ -355,7 +355,7 @@ def eligible(truth: Truth) -> bool:
     )
 
 
-def choose_move(plan: Plan, truths: Sequence[Truth], rng: np.random.Generator) -> list[Move]:
+def choose_move(plan: Plan, truths: Sequence[Truth], rng: np.random.Generator) -> list[VehicleMove]:
     """A move of one well visible vehicle that ends free of collision, and on no kerb; none where there is no
     such."""
     movable = [
@@ -364,19 +364,19 @@ def choose_move(plan: Plan, truths: Sequence[Truth], rng: np.random.Generator) -
     for i in rng.permutation(len(movable)):
         actor = movable[int(i)].actor
         options = [
-            Move(actor.track, (MOVE_M * along, MOVE_M * across), MOVE_RAD * turn)
+            VehicleMove(actor.track, (MOVE_M * along, MOVE_M * across), MOVE_RAD * turn)
             for along, across in ((1, 0), (-1, 0), (0, 1), (0, -1))
             for turn in (1, -1)
         ]
         for j in rng.permutation(len(options)):
-            if free(plan, actor, options[int(j)]):
+            if is_free(plan, actor, options[int(j)]):
                 return [options[int(j)]]
     return []
 
 
-def free(plan: Plan, actor: Actor, move: Move) -> bool:
+def is_free(plan: Plan, actor: Actor, move: VehicleMove) -> bool:
     """Whether a vehicle, moved so, meets no other and stands on nothing raised more than before."""
-    edited = apply_edit(plan, edit_of(move)).actors
+    edited = apply_edit(plan, move_to_edit(move)).actors
     place = next(a for a in edited if a.track == actor.track)
     old, new = (footprint(a.position_xz, a.yaw, a.size_lhw) for a in (actor, place))
     others = [footprint(a.position_xz, a.yaw, a.size_lhw) for a in edited if a.track != actor.track]
@@ -397,7 +397,7 @@ def _raised(road: Road, corners: np.ndarray) -> int:
     return sum(int(((d >= strip.d0) & (d <= strip.d1)).sum()) for strip in kerbs)
 
 
-def disturbed(frame: SynthFrame, rng: np.random.Generator) -> Labels:
+def disturb_labels(frame: SynthFrame, rng: np.random.Generator) -> Labels:
     """The frame's labels with their 3D boxes off by a little; one that would lie behind the camera stays."""
     labels, ground = frame.labels, frame.environment.ground.double()
     count = len(labels.kind)
@@ -422,19 +422,19 @@ def disturbed(frame: SynthFrame, rng: np.random.Generator) -> Labels:
     )
 
 
-def photograph_of(frame: SynthFrame, labels: Labels, masks: Tensor | None = None) -> Frame:
+def synthetic_photograph(frame: SynthFrame, labels: Labels, masks: Tensor | None = None) -> Frame:
     """What de-rendering is given of a generated frame."""
     picture = torch.from_numpy(frame.image.transpose(2, 0, 1).astype(np.float32) / np.float32(255))
     return Frame("generated", picture, frame.camera, labels, masks)
 
 
-def tracks_of(scene: SceneIR, frame: SynthFrame) -> list[int]:
+def match_tracks(scene: SceneIR, frame: SynthFrame) -> list[int]:
     """The track of each object of a scene that was de-rendered from the frame."""
     labelled = [t.actor.track for t in frame.truths if t.labelled]
     return [labelled[int(scene.provenance[f"objects[{i}].label"])] for i in range(len(scene.objects))]
 
 
-def share_of(frame: SynthFrame, track: int) -> NDArray[np.float32]:
+def track_coverage(frame: SynthFrame, track: int) -> NDArray[np.float32]:
     """How much (H, W) of each pixel truly shows a vehicle, in [0, 1]."""
     owner = next((t.index + 1 for t in frame.truths if t.actor.track == track), None)
     parts = blocks(frame.owner)
@@ -444,8 +444,8 @@ def share_of(frame: SynthFrame, track: int) -> NDArray[np.float32]:
 
 
 def judge(
-    case: Case, scene: SceneIR, tracks: Sequence[int], labels: Labels | None = None, index: int = 0
-) -> tuple[DerenderRow, list[Strip]]:
+    case: EditedStreet, scene: SceneIR, tracks: Sequence[int], labels: Labels | None = None, index: int = 0
+) -> tuple[DerenderRow, list[SheetStrip]]:
     """Hold a scene against the truth. tracks: of its objects; labels: that it was made from, if any.
 
     -> what was found (no time, no memory), and strips to look at.
@@ -453,7 +453,7 @@ def judge(
     before, move = case.before, case.move
     compositor = Compositor(scene)
     identity_db, exact = _identity(compositor)
-    ours = _picture(compositor.render(moved_scene(case, scene, tracks)).image)
+    ours = _picture(compositor.render(apply_move(case, scene, tracks)).image)
     region = changed_region(before, case.moved, [move.track])
     edited = _edited(ours, before.image, case.moved.image, region, _zones(case, region))
     gone = sorted({*tracks, *_removable(before)})
@@ -461,14 +461,14 @@ def judge(
     cleared = _picture(scene.background)
     hole = changed_region(before, empty, gone)
     removed = _edited(cleared, before.image, empty.image, hole)
-    shade, sun = shadows(scene, before, empty, gone)
+    shade, sun = compare_shadows(scene, before, empty, gone)
     truth = next(t for t in before.truths if t.actor.track == move.track)
     row = DerenderRow(
         index=index,
         weather=str(before.manifest["weather"]),
         road=str(before.manifest["road"]),
         objects=len(scene.objects),
-        shapes=tuple(silhouettes(case, compositor, tracks, labels)),
+        shapes=tuple(compare_silhouettes(case, compositor, tracks, labels)),
         moved=truth.actor.kind,
         shift_m=move.shift_m,
         turn_deg=round(math.degrees(move.turn), 1),
@@ -485,18 +485,20 @@ def judge(
     )
     told = f"{truth.actor.kind} moved {move.shift_m[0]:+.1f} {move.shift_m[1]:+.1f} m, {row.turn_deg:+.0f} deg"
     strips = [
-        Strip(before.image, ours, case.moved.image, region, f"{index}, {told}: {edited.psnr_db:.1f} dB"),
-        Strip(before.image, cleared, empty.image, hole, f"all removed: {removed.psnr_db:.1f} dB"),
+        SheetStrip(before.image, ours, case.moved.image, region, f"{index}, {told}: {edited.psnr_db:.1f} dB"),
+        SheetStrip(before.image, cleared, empty.image, hole, f"all removed: {removed.psnr_db:.1f} dB"),
     ]
     return row, strips
 
 
-def shadows(scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequence[int]) -> tuple[float, float]:
+def compare_shadows(
+    scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequence[int]
+) -> tuple[float, float]:
     """Of the shadows that a scene's vehicles cast: IoU of where they darken the ground beside the vehicles, with
     the truth; and degrees between the sun's azimuths. gone: tracks of the vehicles that `empty` lacks."""
     seen = np.zeros(before.image.shape[:2], bool)
     for track in gone:
-        seen |= share_of(before, track) > 0
+        seen |= track_coverage(before, track) > 0
     beside = ~silhouette.grow_mask(seen, _GROW_PX)
     bright = [frame.image.max(axis=2).astype(np.float32) + 1 for frame in (before, empty)]
     true = (bright[0] < _SHADED * bright[1]) & beside
@@ -514,12 +516,12 @@ def shadows(scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequenc
     return np.count_nonzero(true & ours) / either if either else 1.0, apart
 
 
-def moved_scene(case: Case, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
+def apply_move(case: EditedStreet, scene: SceneIR, tracks: Sequence[int]) -> SceneIR:
     """The scene with its vehicle moved by the same vector and angle as the true one, and grown alike."""
     if case.move.track not in tracks:
         return scene
     i = list(tracks).index(case.move.track)
-    old, new = (truth_of(frame, case.move.track) for frame in (case.before, case.moved))
+    old, new = (true_shape(frame, case.move.track) for frame in (case.before, case.moved))
     translation, yaw = scene.objects.translation.clone(), scene.objects.yaw.clone()
     translation[i] += torch.from_numpy(new.translation - old.translation).to(translation)
     yaw[i] += case.move.turn
@@ -535,7 +537,7 @@ def _removable(frame: SynthFrame) -> list[int]:
     return [t.actor.track for t in vehicles if eligible(t) or t.visible < _HARDLY_SEEN]
 
 
-def without(case: Case, tracks: Sequence[int]) -> SynthFrame:
+def without(case: EditedStreet, tracks: Sequence[int]) -> SynthFrame:
     """The generator's frame of the street without these vehicles."""
     edit = FrameEdit({track: ObjectEdit(remove=True) for track in tracks})
     frame = render_frame(apply_edit(case.plan, edit))
@@ -543,7 +545,7 @@ def without(case: Case, tracks: Sequence[int]) -> SynthFrame:
     return frame
 
 
-def truth_of(frame: SynthFrame, track: int) -> Truth:
+def true_shape(frame: SynthFrame, track: int) -> Truth:
     """The truth of a vehicle that the frame has."""
     return next(t for t in frame.truths if t.actor.track == track)
 
@@ -553,14 +555,14 @@ def changed_region(before: SynthFrame, after: SynthFrame, tracks: Sequence[int])
     the pictures differ."""
     seen = np.zeros(before.image.shape[:2], bool)
     for track in tracks:
-        seen |= (share_of(before, track) > 0) | (share_of(after, track) > 0)
+        seen |= (track_coverage(before, track) > 0) | (track_coverage(after, track) > 0)
     apart = np.abs(before.image.astype(np.int16) - after.image).max(axis=2) > _CHANGED_LEVELS
     return silhouette.grow_mask(seen, _GROW_PX) | apart
 
 
-def _zones(case: Case, region: Mask) -> dict[str, Mask]:
+def _zones(case: EditedStreet, region: Mask) -> dict[str, Mask]:
     """The parts of a move's region: each pixel lies in one."""
-    new, old = (share_of(frame, case.move.track) >= 0.5 for frame in (case.moved, case.before))
+    new, old = (track_coverage(frame, case.move.track) >= 0.5 for frame in (case.moved, case.before))
     inside = silhouette.grow_mask(new, -_OUTLINE_PX)
     outline = silhouette.grow_mask(new, _OUTLINE_PX) & ~inside
     uncovered = silhouette.grow_mask(old, _GROW_PX) & ~outline & ~inside
@@ -571,12 +573,12 @@ def _zones(case: Case, region: Mask) -> dict[str, Mask]:
 
 def _edited(
     ours: Picture, photograph: Picture, truth: Picture, region: Mask, zones: dict[str, Mask] | None = None
-) -> Edited:
+) -> EditAccuracy:
     perception = _perception()
     square = ((ours.astype(np.float64) - truth) ** 2).sum(axis=2)
     total = max(float(square[region].sum()), 1.0)
     zones = {} if zones is None else {name: zone for name, zone in zones.items() if zone.any()}
-    return Edited(
+    return EditAccuracy(
         psnr_db=round(psnr(ours, truth, region), 3),
         unchanged_db=round(psnr(photograph, truth, region), 3),
         perceptual=round(perception.distance(ours, truth, region), 4),
@@ -617,9 +619,9 @@ def _identity(compositor: Compositor) -> tuple[float, bool]:
     return round(identity_db, 3), bool((apart[~touched] == 0).all())
 
 
-def silhouettes(
-    case: Case, compositor: Compositor, tracks: Sequence[int], labels: Labels | None
-) -> Iterator[Shape]:
+def compare_silhouettes(
+    case: EditedStreet, compositor: Compositor, tracks: Sequence[int], labels: Labels | None
+) -> Iterator[SilhouetteOverlap]:
     """Each eligible vehicle's silhouettes against the true ones."""
     frame, scene = case.before, compositor.scene
     meshes = _meshes_seen(compositor)
@@ -627,7 +629,7 @@ def silhouettes(
     rows = [t.actor.track for t in frame.truths if t.labelled]
     for truth in filter(eligible, frame.truths):
         track = truth.actor.track
-        seen = share_of(frame, track) >= 0.5
+        seen = track_coverage(frame, track) >= 0.5
         whole = np.zeros_like(seen)
         h, w = truth.opacity.values.shape[1:]
         x0, y0 = truth.opacity.x0, truth.opacity.y0
@@ -648,7 +650,7 @@ def silhouettes(
             start = round(
                 silhouette.mask_iou(silhouette.render_silhouettes([placed], frame.camera)[0], seen, hidden), 4
             )
-        yield Shape(
+        yield SilhouetteOverlap(
             track=track,
             kind=truth.actor.kind,
             height_px=round(float(truth.box_xyxy[3] - truth.box_xyxy[1]), 1),
@@ -697,11 +699,11 @@ def _far_to_near(scene: SceneIR) -> list[int]:
     return blend.paint_order(objects.size_lhw, objects.yaw, objects.translation, centre)
 
 
-def never_seen(case: Case) -> Mask:
+def never_seen(case: EditedStreet) -> Mask:
     """Pixels (H, W) of the moved vehicle whose surface the photograph did not show: turned away, hidden or out of
     the image."""
     before, after = case.before, case.moved
-    old, new = truth_of(before, case.move.track), truth_of(after, case.move.track)
+    old, new = true_shape(before, case.move.track), true_shape(after, case.move.track)
     value = case.move.track + 1
     rows, columns = np.nonzero(after.instance == value)
     unseen = np.zeros(after.instance.shape, bool)
@@ -729,7 +731,7 @@ def never_seen(case: Case) -> Mask:
 
 
 def _ablations(
-    case: Case, scene: SceneIR, tracks: list[int], frame: Frame, settings: DerenderSettings
+    case: EditedStreet, scene: SceneIR, tracks: list[int], frame: Frame, settings: DerenderSettings
 ) -> dict[str, dict[str, float]]:
     """Move and removal once more, each with a part of the answer given; nothing where a vehicle was not found."""
     before = case.before
@@ -738,7 +740,7 @@ def _ablations(
     assert frame.labels is not None
     found: dict[str, dict[str, float]] = {}
     rows = [t for t in before.truths if t.labelled]
-    masks = np.stack([share_of(before, t.actor.track) >= 0.5 for t in rows]).astype(np.float32)
+    masks = np.stack([track_coverage(before, t.actor.track) >= 0.5 for t in rows]).astype(np.float32)
     given = {
         "true labels": replace(frame, labels=before.labels),
         "true masks": replace(frame, masks=torch.from_numpy(masks)),
@@ -746,7 +748,7 @@ def _ablations(
     empty = without(case, tracks)
     for name, better in given.items():
         other = derender(better, settings)
-        found[name] = _figures(case, other, tracks_of(other, before), empty)
+        found[name] = _accuracy_columns(case, other, match_tracks(other, before), empty)
     perfect = perfect_scene(before, empty, tracks)
     parts: dict[str, tuple[str, ...]] = {
         "true pose": ("pose",),
@@ -758,7 +760,7 @@ def _ablations(
         "all true": ("pose", "shape", "mattes", "background"),
     }
     for name, true in parts.items():
-        found[name] = _figures(case, _mixed(scene, perfect, true), tracks, empty)
+        found[name] = _accuracy_columns(case, _mixed(scene, perfect, true), tracks, empty)
     return found
 
 
@@ -766,7 +768,7 @@ def perfect_scene(before: SynthFrame, empty: SynthFrame, tracks: Sequence[int]) 
     """The generator's own scene of these vehicles, in this order. empty: the street without them."""
     frame = replace(
         before,
-        truths=tuple(truth_of(before, track) for track in tracks),
+        truths=tuple(true_shape(before, track) for track in tracks),
         background=empty.image,
         background_depth_m=empty.depth_m,
         ground_material=empty.ground_material,
@@ -814,10 +816,12 @@ def _reach_px(alpha: Crop, outline: Mask) -> float:
     return float(np.clip(far + 1.5, settings.min_reach_px, most))
 
 
-def _figures(case: Case, scene: SceneIR, tracks: Sequence[int], empty: SynthFrame) -> dict[str, float]:
+def _accuracy_columns(
+    case: EditedStreet, scene: SceneIR, tracks: Sequence[int], empty: SynthFrame
+) -> dict[str, float]:
     compositor = Compositor(scene)
-    shapes = list(silhouettes(case, compositor, tracks, None))
-    ours = _picture(compositor.render(moved_scene(case, scene, tracks)).image)
+    shapes = list(compare_silhouettes(case, compositor, tracks, None))
+    ours = _picture(compositor.render(apply_move(case, scene, tracks)).image)
     region = changed_region(case.before, case.moved, [case.move.track])
     hole = changed_region(case.before, empty, tracks)
     return {

@@ -25,7 +25,7 @@ from drivesem.synth.frames import SPLITS, SynthSettings
 from scene_ir.derender.derender import derender
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Frame, SceneIR, convert_scene
-from tools.bench.weather import rendered, tensor_of
+from tools.bench.weather import rendered, to_tensor
 
 TITLE = "A GPU beside the processor"
 COLUMNS: Columns = {
@@ -86,7 +86,7 @@ def measure(frames: int, detector: str, device: str) -> Iterator[list[DeviceRow]
             _SEED, number, SPLITS[number % len(SPLITS)], SynthSettings(bent=True, sunny=True)
         )
         made = rendered(plan, generated.build_street(plan))
-        scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
+        scene = derender(Frame(f"{number:03d}", to_tensor(made.image), made.camera, made.labels))
         yield [_row(state, scene, number, there, here, device) for state in STATES]
 
 

@@ -19,8 +19,8 @@ from scene_ir.derender.derender import derender
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Frame
-from tools.bench.pictures import Strip, psnr, sheet
-from tools.bench.weather import rendered, tensor_of
+from tools.bench.pictures import SheetStrip, psnr, sheet
+from tools.bench.weather import rendered, to_tensor
 
 TITLE = "Foliage, ours beside the generator's"
 COLUMNS: Columns = {
@@ -63,13 +63,13 @@ def measure(frames: int, sheets: Path | None) -> Iterator[list[FoliageRow]]:
     for number in range(frames):
         pool = SPLITS[number % len(SPLITS)]
         plan = generated.plan_frame(_SEED, number // len(SPLITS), pool, SynthSettings(bent=True, sunny=True))
-        yield rows_of(pool, number, plan, sheets)
+        yield foliage_rows(pool, number, plan, sheets)
 
 
-def rows_of(pool: str, number: int, plan: Plan, sheets: Path | None = None) -> list[FoliageRow]:
+def foliage_rows(pool: str, number: int, plan: Plan, sheets: Path | None = None) -> list[FoliageRow]:
     """The figures of one frame. sheets: folder for its pictures."""
     made = rendered(plan, generated.build_street(plan))
-    scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
+    scene = derender(Frame(f"{number:03d}", to_tensor(made.image), made.camera, made.labels))
     compositor = Compositor(scene)
     leaves = (scene.environment.foliage_map >= 0.5).numpy()
     stands = (compositor.crown_maps[:2].sum(0) >= 0.5).numpy()
@@ -86,7 +86,7 @@ def rows_of(pool: str, number: int, plan: Plan, sheets: Path | None = None) -> l
             for picture in (ours, made.image)
         ]
         rows.append(FoliageRow(pool, f"{number:03d}", name, *figures))
-        strips.append(Strip(made.image, ours, truth, np.ones(leaves.shape, bool), name))
+        strips.append(SheetStrip(made.image, ours, truth, np.ones(leaves.shape, bool), name))
     if sheets is not None:
         write_picture(sheets / f"{number:03d}_{pool}.png", sheet(strips, 3200))
     return rows

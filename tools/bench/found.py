@@ -13,13 +13,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.base import Predictor
+from detectors.boxes import iou_matrix
 from detectors.registry import load_predictor
+from detectors.types import Detections
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller, SceneLabels
 from drivesem.attack.scene_edits import apply_changes
@@ -27,6 +30,7 @@ from drivesem.bench.tables import Columns
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.options import SceneOptions
 from drivesem.evaluation.resampling import wilson
+from drivesem.report.drawing import PAPER_COLOUR, TEXT_PX, measure_text, write_text
 from drivesem.run.workers import run_jobs
 from drivesem.scenes.sources import SceneSource, open_source
 from scene_ir import files
@@ -35,9 +39,8 @@ from scene_ir.io import load_scene
 from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor, render
 from scene_ir.types import Category, SceneIR
-from tools.bench.found_sheet import failure_sheet
 from tools.bench.settings import BenchTool
-from tools.bench.sights import CAR, UNSEEN, VEHICLES, Eye, Sight
+from tools.bench.sights import CAR, UNSEEN, VEHICLES, CarView, DetectorSight, DetectorView, Picture
 
 TITLE = "Cars that a detector finds, removed and moved"
 COLUMNS: Columns = {
@@ -76,21 +79,21 @@ class CarRow:
     truncation: float
     judged: bool
     """High and visible enough."""
-    before: Sight
+    before: DetectorSight
     """In the photograph."""
-    removed: Sight
+    removed: DetectorSight
     """At the old box in the emptied picture, as a car and as any vehicle."""
-    removed_any: Sight
+    removed_any: DetectorSight
     """At the old box in the emptied picture, as a car and as any vehicle."""
-    removed_faint: Sight
+    removed_faint: DetectorSight
     """As a car at a tenth of a score."""
-    ghost: Sight
+    ghost: DetectorSight
     """The surest car that lies at least half in the old box and was not in the photograph."""
     move: tuple[float, float] | None
     """(m along the heading, rad)."""
-    alone: Sight | None
+    alone: DetectorSight | None
     """At the moved box, None where no move was possible."""
-    together: Sight | None
+    together: DetectorSight | None
     """At the moved box, None where no move was possible."""
 
 
@@ -108,22 +111,22 @@ def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str
 
 def count(config: BenchTool) -> int:
     """How many frames `measure` goes through."""
-    return len(names_of(config))
+    return len(frame_names(config))
 
 
 def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[CarRow]]:
     return _FoundJudge(config, sheets).frame
 
 
-def source_of(config: BenchTool) -> SceneSource:
+def open_scene_source(config: BenchTool) -> SceneSource:
     """The scenes that are asked for: of a data set, or a folder of them."""
     asked = SceneOptions(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
     return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
 
 
-def names_of(config: BenchTool) -> list[str]:
+def frame_names(config: BenchTool) -> list[str]:
     """Their identifiers, as many as are wanted."""
-    return list(source_of(config).identifiers())[: config.limit]
+    return list(open_scene_source(config).identifiers())[: config.limit]
 
 
 class SceneFolder:
@@ -150,7 +153,7 @@ class _FoundJudge:
 
     def __init__(self, config: BenchTool, sheets: Path | None) -> None:
         self._config = config
-        self._source = source_of(config)
+        self._source = open_scene_source(config)
         self._sheets = sheets
         self._predictor = load_predictor(config.detector, config.device, config.tiles)
 
@@ -175,8 +178,8 @@ def judge(
     rows = (scene.objects.category == int(Category.CAR)).nonzero()[:, 0].tolist()
     if not rows:
         return []
-    eye = Eye(predictor)
-    moves = Moves(scene, rows, rng)
+    eye = DetectorView(predictor)
+    moves = CarMoves(scene, rows, rng)
     photograph = eye.look(scene.photograph, scene.objects.box2d)
     emptied = eye.look(_emptied(scene), scene.objects.box2d)
     together = moves.together()
@@ -236,7 +239,7 @@ def _emptied(scene: SceneIR) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class MovedCar:
     """A scene with a car moved, or several; its picture (3, H, W), and the boxes (N, 4) px of all its objects."""
 
     along_m: float
@@ -246,7 +249,7 @@ class Moved:
     boxes_xyxy: Tensor
 
 
-class Moves:
+class CarMoves:
     """A move of each car of a scene that can be moved, and the scene with as many of them as fit together.
 
     alone: by row, what could be moved; in_crowd: rows moved in `together`.
@@ -261,7 +264,7 @@ class Moves:
         self.alone = {row: move for row in rows if (move := self._possible(row, signs[row])) is not None}
         self.in_crowd: list[int] = []
 
-    def _possible(self, row: int, order: NDArray[np.int64]) -> Moved | None:
+    def _possible(self, row: int, order: NDArray[np.int64]) -> MovedCar | None:
         for k in order.tolist():
             along, turn = (1 - 2 * (k & 1)) * MOVE_M, (1 - (k & 2)) * TURN_RAD
             changed = self._changed({row: (along, turn)})
@@ -269,7 +272,7 @@ class Moves:
                 continue
             image, labels = self._drawn(changed)
             if self._as_visible(labels, row):
-                return Moved(along, turn, changed, image, labels.boxes_xyxy)
+                return MovedCar(along, turn, changed, image, labels.boxes_xyxy)
         return None
 
     def _changed(self, places: Mapping[int, tuple[float, float]]) -> SceneIR | None:
@@ -293,7 +296,7 @@ class Moves:
             cut or bool(labels.became_ignored[row]) or int(labels.occlusion[row]) > int(objects.occlusion[row])
         )
 
-    def together(self) -> Moved:
+    def together(self) -> MovedCar:
         """As many moves at once as do not collide; without a way of their own."""
         places: dict[int, tuple[float, float]] = {}
         changed = self._scene
@@ -303,7 +306,7 @@ class Moves:
                 places[row], changed = (move.along_m, move.turn), more
         image, labels = self._drawn(changed)
         self.in_crowd = [row for row in places if self._as_visible(labels, row)]
-        return Moved(0.0, 0.0, changed, image, labels.boxes_xyxy)
+        return MovedCar(0.0, 0.0, changed, image, labels.boxes_xyxy)
 
 
 def summary(cars: Sequence[CarRow]) -> list[dict[str, Any]]:
@@ -359,3 +362,55 @@ def rank_sheets(cars: Sequence[CarRow], folder: Path) -> None:
 
 def _plain(name: str) -> str:
     return name.replace("/", "_")
+
+
+_TRUE, _GIVEN, _OTHER = (0, 158, 115), (240, 228, 66), (213, 94, 0)
+"""Colours of Okabe and Ito: the object's box, cars, and vehicles of other classes that were found."""
+_NEAR_IOU = 0.1
+"""With the object's box before or after, of detections that are drawn."""
+_CONTEXT, _PANEL_PX, _GAP_PX = 0.5, 420, 6
+"""Of a sheet: context around the boxes in their longer sides, height of a panel, gap."""
+
+
+def failure_sheet(before: CarView, after: CarView, row: int, caption: str) -> Picture:
+    """Photograph and edited picture around an object, side by side, without boxes above and with them below."""
+    boxes = torch.stack([before.boxes_xyxy[row], after.boxes_xyxy[row]])
+    x0, y0 = boxes[:, :2].amin(dim=0).tolist()
+    x1, y1 = boxes[:, 2:].amax(dim=0).tolist()
+    margin = _CONTEXT * max(x1 - x0, y1 - y0)
+    height, width = before.picture.shape[:2]
+    left, top = max(math.floor(x0 - margin), 0), max(math.floor(y0 - margin), 0)
+    right, bottom = min(math.ceil(x1 + margin) + 1, width), min(math.ceil(y1 + margin) + 1, height)
+    scale = _PANEL_PX / max(bottom - top, 1)
+    panels = []
+    for view in (before, after):
+        cut = np.ascontiguousarray(view.picture[top:bottom, left:right])
+        plain = cv2.resize(cut, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        drawn = plain.copy()
+        _draw(drawn, view.boxes_xyxy[row], _TRUE, "", (left, top, scale))
+        for names, colour in (((CAR,), _GIVEN), (VEHICLES[1:], _OTHER)):
+            found = view.named(names)
+            near = iou_matrix(found.boxes_xyxy, boxes).amax(dim=1) > _NEAR_IOU
+            found = Detections(found.boxes_xyxy[near], found.labels[near], found.scores[near])
+            for box, score, label in zip(found.boxes_xyxy, found.scores, found.labels, strict=True):
+                told = f"{view.classes[int(label)]} {float(score):.2f}"
+                _draw(drawn, box, colour, told, (left, top, scale))
+        panels.append(np.concatenate([plain, drawn]))
+    gap = np.full((panels[0].shape[0], _GAP_PX, 3), PAPER_COLOUR, np.uint8)
+    picture = np.concatenate([panels[0], gap, panels[1]], axis=1)
+    head = np.full((measure_text(caption, TEXT_PX)[1] + _GAP_PX, picture.shape[1], 3), PAPER_COLOUR, np.uint8)
+    write_text(head, (2, 2), caption)
+    return np.concatenate([head, picture])
+
+
+def _draw(
+    canvas: NDArray[Any], box: Tensor, colour: tuple[int, int, int], text: str, place: tuple[int, int, float]
+) -> None:
+    """A box px of the picture on a panel that begins at (left, top) and is enlarged by scale."""
+    left, top, scale = place
+    x0, y0, x1, y1 = ((box.cpu() + 0.5 - torch.tensor([left, top] * 2)) * scale).round().int().tolist()
+    cv2.rectangle(canvas, (x0, y0), (x1, y1), colour, 2)
+    if text:
+        wide, high = measure_text(text, TEXT_PX)
+        x, y = min(max(x0, 0), max(canvas.shape[1] - wide, 0)), min(max(y0 - high, 0), canvas.shape[0] - high)
+        write_text(canvas, (x, y), text, colour)

@@ -52,9 +52,9 @@ from scene_ir.raster.verbs import Backend
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR, convert_scene
-from tools.bench.reach.agreement import rows_of as rows_of_reach
-from tools.bench.reach.frames import ReachWorker, measure_of
-from tools.bench.reach.report import answer_of as reach_answer
+from tools.bench.reach.agreement import reach_rows
+from tools.bench.reach.report import ReachWorker, build_reach_worker
+from tools.bench.reach.report import build_reach_report as reach_answer
 from tools.bench.settings import GradcheckConfig
 
 Array = NDArray[np.float64]
@@ -105,7 +105,7 @@ _ROUNDING = 1e-15
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class GradientAgreement:
     """How well a gradient agrees with differences of one step."""
 
     step: float
@@ -139,7 +139,7 @@ class GradcheckRow:
     step: float | None
     """Those of the step that agrees best, None where the parameter has no effect on the functional by either
     account."""
-    steps: tuple[Agreement, ...]
+    steps: tuple[GradientAgreement, ...]
     """All three."""
 
     def passes(self, least_cosine: float, largest_error: float) -> bool:
@@ -155,7 +155,7 @@ class GradcheckRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Differences:
+class FiniteDifferences:
     """Along some directions of one parameter."""
 
     where: slice
@@ -262,7 +262,7 @@ class SceneCheck:
         theta, assignment, picture = self._at(at)
         return {b: path.gradients(theta, assignment, picture) for b, path in self._paths.items()}
 
-    def differences(self, at: Point, parameter: Parameter) -> Differences:
+    def differences(self, at: Point, parameter: Parameter) -> FiniteDifferences:
         """Central differences of the float64 reference at a point, along random directions of one parameter."""
         theta, assignment, _ = self._at(at)
         where = self.space.blocks.get(parameter)
@@ -282,7 +282,7 @@ class SceneCheck:
                 largest.append(_ROUNDING * ahead.abs() / length)
             slopes.append(torch.stack(columns, dim=1).numpy())
             noise.append(torch.stack(largest, dim=1).numpy())
-        return Differences(where, chosen.numpy(), np.stack(slopes), np.stack(noise))
+        return FiniteDifferences(where, chosen.numpy(), np.stack(slopes), np.stack(noise))
 
     def _at(self, at: Point) -> tuple[Tensor, AnchorAssignment, Tensor]:
         """Of a point: theta (D,) float64, which anchors answer for which objects, the picture (3, H, W)."""
@@ -335,13 +335,13 @@ def _generator(seed: int, purpose: int) -> torch.Generator:
     return torch.Generator().manual_seed(1000 * seed + purpose)
 
 
-def rows_of(
-    scene: str, at: Point, gradients: Gradients, differences: dict[Parameter, Differences]
+def gradcheck_rows(
+    scene: str, at: Point, gradients: Gradients, differences: dict[Parameter, FiniteDifferences]
 ) -> tuple[GradcheckRow, ...]:
     """All comparisons of one scene at one point."""
     rows = []
     for backend, gradient in gradients.items():
-        known = {p: _Compared.of(gradient, found) for p, found in differences.items()}
+        known = {p: _GradientErrors.of(gradient, found) for p, found in differences.items()}
         for parameter, compared in known.items():
             for functional, outputs in ((PICTURE, slice(0, -1)), (LOSS, slice(-1, None))):
                 where = (parameter.value, at, functional, backend, scene)
@@ -349,7 +349,7 @@ def rows_of(
         together = [known[p].of_outputs(slice(-1, None)) for p in COMBOS[COMBO] if p in known]
         if len(together) == len(COMBOS[COMBO]):
             where = (f"combo {COMBO} {LOSS}", at, LOSS, backend, scene)
-            rows.append(_row(where, GEOMETRY_STEPS, _Compared.joined(together)))
+            rows.append(_row(where, GEOMETRY_STEPS, _GradientErrors.joined(together)))
     return tuple(rows)
 
 
@@ -364,7 +364,7 @@ def worst(rows: Iterable[GradcheckRow]) -> tuple[GradcheckRow, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Compared:
+class _GradientErrors:
     """Slopes (S, outputs, directions) by gradient and by differences, and the noise of the latter."""
 
     analytic: Array
@@ -372,7 +372,7 @@ class _Compared:
     noise: Array
 
     @classmethod
-    def of(cls, gradient: Array, found: Differences) -> _Compared:
+    def of(cls, gradient: Array, found: FiniteDifferences) -> _GradientErrors:
         """Slopes along K of D directions, as long together as the whole gradient on average."""
         count, size = found.directions.shape
         scale = math.sqrt(size / count)
@@ -380,7 +380,7 @@ class _Compared:
         return cls(scale * np.broadcast_to(along, found.slopes.shape), scale * found.slopes, scale * found.noise)
 
     @classmethod
-    def joined(cls, parts: Sequence[_Compared]) -> _Compared:
+    def joined(cls, parts: Sequence[_GradientErrors]) -> _GradientErrors:
         """Parameters one after the other, as theta holds them."""
         return cls(
             np.concatenate([p.analytic for p in parts], axis=-1),
@@ -388,12 +388,14 @@ class _Compared:
             np.concatenate([p.noise for p in parts], axis=-1),
         )
 
-    def of_outputs(self, which: slice) -> _Compared:
+    def of_outputs(self, which: slice) -> _GradientErrors:
         """Some outputs only."""
-        return _Compared(self.analytic[:, which], self.numeric[:, which], self.noise[:, which])
+        return _GradientErrors(self.analytic[:, which], self.numeric[:, which], self.noise[:, which])
 
 
-def _row(where: tuple[str, Point, str, Backend, str], steps: Sequence[float], compared: _Compared) -> GradcheckRow:
+def _row(
+    where: tuple[str, Point, str, Backend, str], steps: Sequence[float], compared: _GradientErrors
+) -> GradcheckRow:
     agreements = []
     silent = True
     for step, analytic, numeric, noise in zip(
@@ -405,7 +407,7 @@ def _row(where: tuple[str, Point, str, Backend, str], steps: Sequence[float], co
         product = lengths[0] * lengths[1]
         cosine = float((analytic * numeric).sum()) / product if product > 0 else 0.0
         error = float(np.linalg.norm(analytic - numeric)) / max(lengths[1], floor)
-        agreements.append(Agreement(step, cosine, error))
+        agreements.append(GradientAgreement(step, cosine, error))
     if silent:
         return GradcheckRow(*where, cosine=None, relative_error=None, step=None, steps=())
     best = min(agreements, key=lambda a: a.relative_error)
@@ -469,8 +471,8 @@ def _reach(config: GradcheckConfig) -> int:
     worker = ReachWorker.of(config)
     names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or _DEFAULT_SCENES))
     bar = ProgressSettings("comparing gradients and slopes", show_remaining=True)
-    asked = run_frame_jobs(names, worker.measure, partial(measure_of, config), config, bar)
-    rows = rows_of_reach([asked.results[name] for name in names if name in asked.results], config.seed)
+    asked = run_frame_jobs(names, worker.measure, partial(build_reach_worker, config), config, bar)
+    rows = reach_rows([asked.results[name] for name in names if name in asked.results], config.seed)
     if not rows:
         raise UsageError("gradcheck --reach", "at least one vehicle that the detector finds", "none")
     facts = {
@@ -517,7 +519,7 @@ class GradcheckWorker:
         }
         self._current: tuple[str, SceneCheck] | None = None
 
-    def do(self, task: _Task) -> Gradients | Differences:
+    def do(self, task: _Task) -> Gradients | FiniteDifferences:
         """One task; the scene is kept for the next one."""
         if self._current is None or self._current[0] != task.identifier:
             self._current = None
@@ -527,7 +529,7 @@ class GradcheckWorker:
         check = self._current[1]
         return check.gradients(task.at) if task.parameter is None else check.differences(task.at, task.parameter)
 
-    def __call__(self, tasks: Sequence[_Task]) -> list[Gradients | Differences]:
+    def __call__(self, tasks: Sequence[_Task]) -> list[Gradients | FiniteDifferences]:
         """Several tasks."""
         return [self.do(task) for task in tasks]
 
@@ -557,7 +559,7 @@ def _check_all(
 
     def rows(name: str, at: Point) -> tuple[GradcheckRow, ...]:
         differences = {p: results[_Task(name, at, p)] for p in PAPER_PARAMETERS}
-        return rows_of(name, at, results[_Task(name, at, None)], differences)
+        return gradcheck_rows(name, at, results[_Task(name, at, None)], differences)
 
     scenes = {
         name: tuple(row for at in POINTS for row in rows(name, at)) for name in names if name not in answers.failed

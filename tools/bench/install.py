@@ -13,7 +13,7 @@ from pathlib import Path
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import Spread
 from drivesem.config.errors import UsageError
-from tools.versions import ROOT, Ended, Run, run_words
+from tools.versions import ROOT, Run, StepResult, run_words
 
 STEPS_TITLE, SIZES_TITLE, STARTS_TITLE = "From a clone to the first report", "What lies on the disk", "Starts"
 STEPS: Columns = {"step": ("step", "step"), "seconds": ("s", "s"), "mb": ("MB on the disk", "MB")}
@@ -169,7 +169,7 @@ def _start(command: tuple[str, Sequence[str]], repetitions: int, folder: Path, r
 def _timed(words: Sequence[str], folder: Path, run: Run) -> tuple[float, str]:
     """Seconds, and what was said."""
     start = time.perf_counter()
-    ended: Ended = run(words, folder)
+    ended: StepResult = run(words, folder)
     if ended.failed:
         raise UsageError("bench install", "steps that work", f"{' '.join(words)[:200]}: {ended.failed}")
     return time.perf_counter() - start, ended.said

@@ -45,7 +45,7 @@ _GOALS = {"heading, degrees": "median 5", "depth, relative": "median 0.06"}
 
 
 @dataclass(frozen=True, slots=True)
-class Error:
+class VehicleError:
     """Between an estimate and a label: yaw_deg in [0, 180], relative depth, m on the ground."""
 
     yaw_deg: float
@@ -61,8 +61,8 @@ class VehicleRow:
     frame: str
     label: int
     height_px: float
-    before: Error
-    after: Error | None
+    before: VehicleError
+    after: VehicleError | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +106,11 @@ class _LabelFreeJudge:
         self._config = config
 
     def frame(self, name: str) -> FrameRows:
-        frame = frame_of(self._config, name)
+        frame = load_frame_without_labels(self._config, name)
         return FrameRows(0, ()) if frame.labels is None else judge(frame, frame.labels)
 
 
-def frame_of(config: BenchTool, name: str) -> Frame:
+def load_frame_without_labels(config: BenchTool, name: str) -> Frame:
     """A frame of the data set, or a generated one by its number. Raises SceneError for one that cannot be read."""
     if config.dataset != DEMO:
         from drivesem.data.registry import open_dataset
@@ -142,9 +142,11 @@ def judge(frame: Frame, labels: Labels) -> FrameRows:
         if best < 0 or overlap[k, best] < _MEETS or int(overlap[:, best].argmax()) != k:
             continue
         row = mine[best]
-        before = error(labels, label, guess.translation[row], float(guess.yaw[row]), frame.camera)
+        before = vehicle_error(labels, label, guess.translation[row], float(guess.yaw[row]), frame.camera)
         end = fitted.get(row)
-        after = None if end is None else error(labels, label, end.translation, float(end.yaw), frame.camera)
+        after = (
+            None if end is None else vehicle_error(labels, label, end.translation, float(end.yaw), frame.camera)
+        )
         height = float(labels.boxes_xyxy[label, 3] - labels.boxes_xyxy[label, 1])
         rows.append(VehicleRow(frame.identifier, label, round(height, 1), before, after))
     near = labels.boxes_xyxy[nearest(labels)].float()
@@ -170,13 +172,13 @@ def nearest(labels: Labels) -> list[int]:
     return [i for i, kind in enumerate(labels.kind) if kind in VEHICLE_CATEGORIES and bool(clear[i])]
 
 
-def error(labels: Labels, row: int, translation: Tensor, yaw: float, camera: Camera) -> Error:
+def vehicle_error(labels: Labels, row: int, translation: Tensor, yaw: float, camera: Camera) -> VehicleError:
     """Of an estimate beside a label."""
     true = labels.translation[row].double()
     apart = translation.double() - true
     offset = float(camera.matrix[2, 3])
     turn = math.remainder(yaw - float(labels.yaw[row]), 2 * math.pi)
-    return Error(
+    return VehicleError(
         round(abs(math.degrees(turn)), 3),
         round(abs(float(apart[2])) / (float(true[2]) + offset), 4),
         round(float(torch.hypot(apart[0], apart[2])), 3),

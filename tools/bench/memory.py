@@ -14,7 +14,7 @@ import torch
 from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.tables import Columns
 from scene_ir.io import save_scene
-from tools.bench.probe import ProbeOrder, Resident, probe
+from tools.bench.probe import ProbeOrder, ResidentMemory, probe
 
 TITLE = "Memory"
 COLUMNS: Columns = {
@@ -87,7 +87,7 @@ def measure(case_list: Sequence[MemoryCase], seed: int, detector: str) -> Iterat
     """One row a case. Raises FormatError where a process ends without a result."""
     with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as name:
         folder = Path(name)
-        alone: dict[int, Resident] = {}
+        alone: dict[int, ResidentMemory] = {}
         for case in case_list:
             scene = folder / f"{case.cars}x{case.triangles}"
             if not scene.exists():
@@ -98,7 +98,7 @@ def measure(case_list: Sequence[MemoryCase], seed: int, detector: str) -> Iterat
             yield _row(case, probe("attack", order, _ASKER), alone[case.batch])
 
 
-def _row(case: MemoryCase, attack: Resident, alone: Resident) -> MemoryRow:
+def _row(case: MemoryCase, attack: ResidentMemory, alone: ResidentMemory) -> MemoryRow:
     def after(step: int) -> float | None:
         return round(attack.rss_kb[step - 1] / _KB, 1) if len(attack.rss_kb) >= step else None
 

@@ -28,21 +28,21 @@ from scene_ir.derender.derender import VEHICLE_CATEGORIES, derender
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 from tools.bench.derender import (
-    Case,
-    Move,
+    EditedStreet,
+    VehicleMove,
+    apply_move,
     changed_region,
-    disturbed,
-    edit_of,
-    free,
+    disturb_labels,
+    is_free,
     make_case,
-    moved_scene,
-    photograph_of,
-    tracks_of,
-    truth_of,
+    match_tracks,
+    move_to_edit,
+    synthetic_photograph,
+    true_shape,
 )
-from tools.bench.pictures import Strip, psnr, sheet
+from tools.bench.pictures import SheetStrip, psnr, sheet
 from tools.bench.settings import BenchTool
-from tools.bench.sights import CAR, IOU, Eye, View
+from tools.bench.sights import CAR, IOU, CarView, DetectorView
 
 TITLE = "Moved cars by how far they went"
 COLUMNS: Columns = {
@@ -74,7 +74,7 @@ _TURNS_DEG = (5, 10, 20, 30)
 _SIZES = (0.05, 0.1, 0.2)
 _SHARES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
 """Of a car's distance from the camera, by which it is brought nearer: bounds of what is counted together."""
-_VISIBLE, _CUT, _HEIGHT_KEPT = 0.5, 0.5, 0.6
+_VISIBLE, _CUT, _MIN_HEIGHT_RATIO = 0.5, 0.5, 0.6
 """What must be left of a vehicle, as in attacks, where it comes to stand."""
 _BUDGETS = (PAPER, STREET)
 _TRIES = 8
@@ -124,30 +124,30 @@ class _MovesJudge:
 
     def __init__(self, config: BenchTool, sheets: Path | None) -> None:
         self._seed, self._sheets = config.seed, sheets
-        self._eye = Eye(load_predictor(config.detector, config.device, config.tiles))
+        self._eye = DetectorView(load_predictor(config.detector, config.device, config.tiles))
 
     def __call__(self, name: str) -> list[MovedRow]:
         split: Split = "train" if name.startswith("train") else "heldout"
         index = int(name.partition("/")[2])
         rng = np.random.default_rng([self._seed, index, len(split)])
         case = make_case(self._seed, index, split)
-        scene = derender(photograph_of(case.before, disturbed(case.before, rng)))
-        rows, strips = judge(case, scene, tracks_of(scene, case.before), self._eye, rng)
+        scene = derender(synthetic_photograph(case.before, disturb_labels(case.before, rng)))
+        rows, strips = judge(case, scene, match_tracks(scene, case.before), self._eye, rng)
         if self._sheets is not None and strips:
             files.write_png(self._sheets / f"{split}-{index}.png", sheet(strips[:_SHEET_CHANGES]))
         return [replace(row, split=split, index=index) for row in rows]
 
 
 def judge(
-    case: Case, scene: SceneIR, tracks: Sequence[int], eye: Eye, rng: np.random.Generator
-) -> tuple[list[MovedRow], list[Strip]]:
+    case: EditedStreet, scene: SceneIR, tracks: Sequence[int], eye: DetectorView, rng: np.random.Generator
+) -> tuple[list[MovedRow], list[SheetStrip]]:
     """One row a change that the case's vehicle can take; strips, the worst first. tracks: of the scene's objects;
     rng: signs, and places in budgets. Nothing where the vehicle is none of the objects.
     """
     before = case.before
-    old = truth_of(before, case.move.track)
+    old = true_shape(before, case.move.track)
     rows: list[MovedRow] = []
-    strips: list[tuple[float, Strip]] = []
+    strips: list[tuple[float, SheetStrip]] = []
     if case.move.track not in tracks:
         return [], []
     compositor = Compositor(scene)
@@ -155,8 +155,8 @@ def judge(
         changed = next(filter(None, (changed_case(case, move) for move in moves)), None)
         if changed is None:
             continue
-        image = compositor.render(moved_scene(changed, scene, tracks)).image
-        new = truth_of(changed.moved, case.move.track)
+        image = compositor.render(apply_move(changed, scene, tracks)).image
+        new = true_shape(changed.moved, case.move.track)
         box = _inside(new, before.image.shape[:2])
         boxes = torch.tensor(np.stack([new.box_xyxy, *_others(changed.moved, case.move.track)])).float()
         true = torch.from_numpy(changed.moved.image.transpose(2, 0, 1).astype(np.float32) / 255)
@@ -179,24 +179,27 @@ def judge(
         )
         rows.append(row)
         told = f"{new.actor.kind} {change}: {row.psnr_db:.1f} dB, score {row.found} and {row.ours}"
-        strips.append((row.psnr_db, Strip(before.image, ours.picture, changed.moved.image, region, told)))
+        strips.append((row.psnr_db, SheetStrip(before.image, ours.picture, changed.moved.image, region, told)))
     return rows, [strip for _, strip in sorted(strips, key=lambda pair: pair[0])]
 
 
-def changes(old: Truth, rng: np.random.Generator) -> Iterator[tuple[str, list[Move]]]:
+def changes(old: Truth, rng: np.random.Generator) -> Iterator[tuple[str, list[VehicleMove]]]:
     """What is tried on a vehicle, by name: the moves, either of which will do."""
     track = old.actor.track
     # The heading is (cos yaw, -sin yaw) in (x, z): whether it leads away from the camera.
     away = 1.0 if float(np.cos(old.yaw) * old.translation[0] - np.sin(old.yaw) * old.translation[2]) > 0 else -1.0
     for metres in _ALONG_M:
-        yield f"{metres:g} m nearer", [Move(track, (-away * metres, 0.0), 0.0)]
-        yield f"{metres:g} m farther", [Move(track, (away * metres, 0.0), 0.0)]
-    either: list[tuple[str, Callable[[float], Move]]] = []
-    either += [(f"{m:g} m across", lambda sign, m=m: Move(track, (0.0, sign * m), 0.0)) for m in _ACROSS_M]
+        yield f"{metres:g} m nearer", [VehicleMove(track, (-away * metres, 0.0), 0.0)]
+        yield f"{metres:g} m farther", [VehicleMove(track, (away * metres, 0.0), 0.0)]
+    either: list[tuple[str, Callable[[float], VehicleMove]]] = []
+    either += [(f"{m:g} m across", lambda sign, m=m: VehicleMove(track, (0.0, sign * m), 0.0)) for m in _ACROSS_M]
     either += [
-        (f"{d} degrees", lambda sign, d=d: Move(track, (0.0, 0.0), sign * math.radians(d))) for d in _TURNS_DEG
+        (f"{d} degrees", lambda sign, d=d: VehicleMove(track, (0.0, 0.0), sign * math.radians(d)))
+        for d in _TURNS_DEG
     ]
-    either += [(f"{s:.0%} in size", lambda sign, s=s: Move(track, (0.0, 0.0), 0.0, sign * s)) for s in _SIZES]
+    either += [
+        (f"{s:.0%} in size", lambda sign, s=s: VehicleMove(track, (0.0, 0.0), 0.0, sign * s)) for s in _SIZES
+    ]
     for name, of in either:
         sign = float(rng.choice((-1.0, 1.0)))
         yield name, [of(sign), of(-sign)]
@@ -207,21 +210,21 @@ def changes(old: Truth, rng: np.random.Generator) -> Iterator[tuple[str, list[Mo
         along = min(budget.translate * length_m, budget.translate_m, budget.distance_share * distance_m)
         most = np.array([along, min(along, budget.across_m), budget.rotate, budget.size])
         drawn = rng.uniform(-most, most, (_TRIES, len(most))).tolist()
-        yield f"anywhere in {name}", [Move(track, (x, z), turn, size) for x, z, turn, size in drawn]
+        yield f"anywhere in {name}", [VehicleMove(track, (x, z), turn, size) for x, z, turn, size in drawn]
 
 
-def changed_case(case: Case, move: Move) -> Case | None:
+def changed_case(case: EditedStreet, move: VehicleMove) -> EditedStreet | None:
     """The case with another move; None where the vehicle would hit something, or too little of it be left."""
-    old = truth_of(case.before, move.track)
-    if not free(case.plan, old.actor, move):
+    old = true_shape(case.before, move.track)
+    if not is_free(case.plan, old.actor, move):
         return None
-    moved = render_frame(apply_edit(case.plan, edit_of(move)))
+    moved = render_frame(apply_edit(case.plan, move_to_edit(move)))
     if moved is None or all(t.actor.track != move.track for t in moved.truths):
         return None
-    new = truth_of(moved, move.track)
+    new = true_shape(moved, move.track)
     high = [float(t.box_xyxy[3] - t.box_xyxy[1]) for t in (old, new)]
     kept = new.labelled and new.visible >= _VISIBLE and new.truncation <= _CUT
-    return replace(case, move=move, moved=moved) if kept and high[1] >= _HEIGHT_KEPT * high[0] else None
+    return replace(case, move=move, moved=moved) if kept and high[1] >= _MIN_HEIGHT_RATIO * high[0] else None
 
 
 def _others(frame: SynthFrame, track: int) -> list[np.ndarray]:
@@ -236,11 +239,11 @@ def _inside(truth: Truth, frame_hw: tuple[int, ...]) -> np.ndarray:
     return mask
 
 
-def _score(view: View) -> float | None:
+def _score(view: CarView) -> float | None:
     return view.assigned[0].score if view.assigned[0].found else None
 
 
-def _invented(ours: View, theirs: View) -> int:
+def _invented(ours: CarView, theirs: CarView) -> int:
     """Cars that the detector finds in our picture, and that meet no vehicle and none that it finds in theirs."""
     found = ours.named((CAR,)).boxes_xyxy
     known = torch.cat([ours.boxes_xyxy, theirs.named((CAR,)).boxes_xyxy])

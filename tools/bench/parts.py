@@ -20,7 +20,7 @@ from scene_ir.derender import segmentation as segment
 from scene_ir.derender import template_choice as stand
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.types import Frame
-from tools.bench.label_free import frame_of, names
+from tools.bench.label_free import load_frame_without_labels, names
 from tools.bench.settings import BenchTool
 
 TITLE = "Where the time of taking a photograph apart goes"
@@ -50,19 +50,19 @@ REST, WHOLE = "the rest", "all"
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class DerenderedStreet:
     """Seconds of one frame by part, with a fit and with --fast."""
 
     fit: dict[str, float]
     fast: dict[str, float]
 
 
-def measure(config: BenchTool) -> Iterator[Taken]:
+def measure(config: BenchTool) -> Iterator[DerenderedStreet]:
     """Frame by frame. Raises SceneError for one that cannot be used."""
     chosen = names(config)
     for place, name in enumerate((chosen[0], *chosen)):
-        frame = frame_of(config, name)
-        taken = Taken(spent(frame, DerenderSettings()), spent(frame, DerenderSettings.fast()))
+        frame = load_frame_without_labels(config, name)
+        taken = DerenderedStreet(spent(frame, DerenderSettings()), spent(frame, DerenderSettings.fast()))
         if place:  # the first time loads kernels and networks
             yield taken
 
@@ -96,7 +96,7 @@ def _timed(owner: Any, name: str, part: str, seconds: dict[str, float]) -> Itera
         yield
 
 
-def summary(rows: Sequence[Taken]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[DerenderedStreet]) -> list[dict[str, Any]]:
     """A row a part, and one for all."""
     found = []
     for part in (*PARTS, REST, WHOLE):

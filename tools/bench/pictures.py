@@ -31,7 +31,7 @@ def psnr(first: Picture, second: Picture, region: Mask) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Strip:
+class SheetStrip:
     """One row of a sheet: the photograph, our picture and the true one (H, W, 3) uint8, the region (H, W) looked
     at, and what to write above it."""
 
@@ -42,7 +42,7 @@ class Strip:
     caption: str
 
 
-def sheet(strips: Sequence[Strip], width: int = 1920) -> Picture:
+def sheet(strips: Sequence[SheetStrip], width: int = 1920) -> Picture:
     """Photograph, ours, truth and their difference x4 around each strip's region, side by side, strips below each
     other -> (h, width, 3)."""
     rows = []

@@ -41,7 +41,7 @@ class ProbeOrder:
 
 
 @dataclass(frozen=True, slots=True)
-class Resident:
+class ResidentMemory:
     """Resident KB: the peak, with the imports and with the detector loaded, and after each step."""
 
     peak_kb: int
@@ -50,7 +50,7 @@ class Resident:
     rss_kb: list[int]
 
 
-def probe(what: Literal["detector", "attack"], order: ProbeOrder, asker: str) -> Resident:
+def probe(what: Literal["detector", "attack"], order: ProbeOrder, asker: str) -> ResidentMemory:
     """What a fresh process found out. Raises FormatError, which names `asker`, where it ends without a result."""
     from scene_ir import files
     from scene_ir.errors import FormatError
@@ -62,7 +62,7 @@ def probe(what: Literal["detector", "attack"], order: ProbeOrder, asker: str) ->
         if done.returncode != 0 or not answer.is_file():
             last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
             raise FormatError(f"{asker}: process {what}", "a result", f"exit code {done.returncode}: {last}")
-        return Resident(**files.read_json(answer))
+        return ResidentMemory(**files.read_json(answer))
 
 
 def image_gradient(detector: Detector, images: Tensor) -> Tensor:
@@ -79,7 +79,7 @@ def image_gradient(detector: Detector, images: Tensor) -> Tensor:
     return torch.autograd.grad(detector.loss(detector(leaf), targets)["objectness"], leaf)[0]
 
 
-def _detector_alone(order: ProbeOrder) -> Resident:
+def _detector_alone(order: ProbeOrder) -> ResidentMemory:
     """The detector's forward and backward on `batch` images, and nothing else of the project."""
     import torch
 
@@ -98,7 +98,7 @@ def _detector_alone(order: ProbeOrder) -> Resident:
     return _watched(lambda: image_gradient(detector, images), steps, libraries)
 
 
-def _attack(order: ProbeOrder) -> Resident:
+def _attack(order: ProbeOrder) -> ResidentMemory:
     """Steps of an attack of combo 2: gradient, sign step, projection."""
     import torch
 
@@ -132,12 +132,12 @@ def _attack(order: ProbeOrder) -> Resident:
     return _watched(step, order.steps, libraries)
 
 
-def _watched(step: Callable[[], object], steps: int, libraries_kb: int) -> Resident:
+def _watched(step: Callable[[], object], steps: int, libraries_kb: int) -> ResidentMemory:
     loaded, rss = _resident_kb(), []
     for _ in range(steps):
         step()
         rss.append(_resident_kb())
-    return Resident(_peak_kb(), libraries_kb, loaded, rss)
+    return ResidentMemory(_peak_kb(), libraries_kb, loaded, rss)
 
 
 def _resident_kb() -> int:
@@ -159,7 +159,7 @@ def _peak_kb() -> int:
 
 def main(words: list[str]) -> None:
     """Run what the words ask for and leave the result in the file."""
-    from drivesem.run.jobs import keep_freed_memory
+    from drivesem.run.allocation import keep_freed_memory
     from scene_ir.files import write_json
 
     keep_freed_memory()

@@ -28,9 +28,9 @@ from drivesem.run.workers import run_jobs
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import Category, SceneIR
-from tools.bench.found import LEAST_HEIGHT_PX, MOST_OCCLUSION, Moves, names_of, source_of
+from tools.bench.found import LEAST_HEIGHT_PX, MOST_OCCLUSION, CarMoves, frame_names, open_scene_source
 from tools.bench.settings import BenchTool
-from tools.bench.sights import Eye, View
+from tools.bench.sights import CarView, DetectorView
 
 TITLE = "The second renderer of photographs"
 COLUMNS: Columns = {
@@ -53,7 +53,7 @@ METHOD = (
 
 
 @dataclass(frozen=True, slots=True)
-class FrameRow:
+class RedrawRow:
     """One frame."""
 
     frame: str
@@ -77,17 +77,17 @@ class FrameRow:
     picture_s: float
 
 
-def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str, FrameRow]]:
+def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[tuple[str, RedrawRow]]:
     """Frame by frame, in the order in which they are done. config: as of `found.measure`; sheets: a folder that
     gets a picture of each frame. Raises NoSecondRendererError where pyrender cannot draw.
     """
     judge = _RedrawJudge(config, sheets)
-    names = names_of(config)
+    names = frame_names(config)
     for name, outcome in run_jobs(judge.frame, partial(_in_process, config, sheets), names, config):
         yield name, outcome()
 
 
-def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], FrameRow]:
+def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], RedrawRow]:
     return _RedrawJudge(config, sheets).frame
 
 
@@ -96,11 +96,11 @@ class _RedrawJudge:
 
     def __init__(self, config: BenchTool, sheets: Path | None) -> None:
         self._config, self._sheets = config, sheets
-        self._source = source_of(config)
+        self._source = open_scene_source(config)
         self._predictor = load_predictor(config.detector, config.device, config.tiles)
 
-    def frame(self, name: str) -> FrameRow:
-        number = names_of(self._config).index(name)
+    def frame(self, name: str) -> RedrawRow:
+        number = frame_names(self._config).index(name)
         rng = np.random.default_rng([self._config.seed, number])
         return judge(name, self._source.scene(name), self._predictor, rng, self._sheets)
 
@@ -108,7 +108,7 @@ class _RedrawJudge:
 @torch.no_grad()
 def judge(
     name: str, scene: SceneIR, predictor: Predictor, rng: np.random.Generator, sheets: Path | None = None
-) -> FrameRow:
+) -> RedrawRow:
     """One scene by both renderers. rng: signs of the moves. sheets: a folder for the pictures side by side."""
     objects = scene.objects
     cars = (objects.category == int(Category.CAR)).nonzero()[:, 0].tolist()
@@ -119,9 +119,9 @@ def judge(
     made = time.process_time()
     drawn = second.render(scene)
     ended = time.process_time()
-    compositor, eye = Compositor(scene), Eye(predictor)
+    compositor, eye = Compositor(scene), DetectorView(predictor)
     ours = compositor.render(scene)
-    moves = Moves(scene, cars, rng)
+    moves = CarMoves(scene, cars, rng)
     together = moves.together()
     ours_moved = compositor.render(together.scene)
     moved = second.render(together.scene)
@@ -132,7 +132,7 @@ def judge(
         pictures = [view.picture for view in (first[0], first[2], *then)]
         files.write_png(sheets / f"{name.replace('/', '-')}.png", _sheet(name, pictures))
     on = ours.object_id > 0
-    return FrameRow(
+    return RedrawRow(
         frame=name,
         cars=len(judged),
         apart=_apart(drawn.image, scene.photograph, on),
@@ -150,7 +150,7 @@ def judge(
     )
 
 
-def summary(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[RedrawRow]) -> list[dict[str, Any]]:
     """A line a frame with vehicles, and one of all: sums of cars, means of the rest."""
     shown = [row for row in rows if row.apart is not None]
     lines: list[dict[str, Any]] = [{key: getattr(row, key) for key in COLUMNS} for row in shown]
@@ -164,7 +164,7 @@ def summary(rows: Sequence[FrameRow]) -> list[dict[str, Any]]:
     return [*lines, total]
 
 
-def _found(view: View, rows: Sequence[int]) -> int:
+def _found(view: CarView, rows: Sequence[int]) -> int:
     return sum(view.assigned[row].found for row in rows)
 
 

@@ -56,7 +56,7 @@ class RenderTask:
 
 
 @dataclass(frozen=True, slots=True)
-class Renderer:
+class RivalRenderer:
     """forward: draws once; backward: takes what forward gave back to the vertices, None where it cannot. hits: how
     many of the frame's pixels show a car.
     """
@@ -67,7 +67,7 @@ class Renderer:
     hits: Callable[[Any], int]
 
 
-def own_verbs(task: RenderTask, backend: verbs.Backend = "warp") -> Renderer:
+def own_verbs(task: RenderTask, backend: verbs.Backend = "warp") -> RivalRenderer:
     """The project's four verbs at the job that the others have."""
     placed, camera = task.placed, task.camera
     leaf = placed.clip.detach().clone().requires_grad_(True)
@@ -87,10 +87,10 @@ def own_verbs(task: RenderTask, backend: verbs.Backend = "warp") -> Renderer:
         return torch.autograd.grad(drawn[0], leaf, parts)
 
     shows = "vertex colours, antialiased outlines, car by car"
-    return Renderer(shows, forward, backward, lambda drawn: int((drawn[1] >= 0).sum()))
+    return RivalRenderer(shows, forward, backward, lambda drawn: int((drawn[1] >= 0).sum()))
 
 
-def pyrender(task: RenderTask) -> Renderer:
+def pyrender(task: RenderTask) -> RivalRenderer:
     """OpenGL through pyrender."""
     os.environ.setdefault("PYOPENGL_PLATFORM", _PLATFORM)
     library = _load(lambda: importlib.import_module("pyrender"))
@@ -110,10 +110,10 @@ def pyrender(task: RenderTask) -> Renderer:
         scene.add(view)
         return screen.render(scene, flags=library.RenderFlags.FLAT | library.RenderFlags.SKIP_CULL_FACES)
 
-    return Renderer("vertex colours", forward, None, lambda drawn: int((drawn[1] > 0).sum()))
+    return RivalRenderer("vertex colours", forward, None, lambda drawn: int((drawn[1] > 0).sum()))
 
 
-def open3d(task: RenderTask) -> Renderer:
+def open3d(task: RenderTask) -> RivalRenderer:
     """Ray casting by Open3D (Embree)."""
     library = _load(lambda: importlib.import_module("open3d"))
     points, faces = task.relative, task.faces
@@ -126,10 +126,10 @@ def open3d(task: RenderTask) -> Renderer:
         rays = scene.create_rays_pinhole(k, eye, task.camera.width, task.camera.height)
         return scene.cast_rays(rays)["t_hit"].numpy()
 
-    return Renderer("depth", forward, None, lambda depth: int(np.isfinite(depth).sum()))
+    return RivalRenderer("depth", forward, None, lambda depth: int(np.isfinite(depth).sum()))
 
 
-def pytorch3d(task: RenderTask) -> Renderer:
+def pytorch3d(task: RenderTask) -> RivalRenderer:
     """PyTorch3D's rasteriser, one face a pixel, without blur."""
     structures = _load(lambda: importlib.import_module("pytorch3d.structures"))
     cameras = _load(lambda: importlib.import_module("pytorch3d.renderer.cameras"))
@@ -153,7 +153,7 @@ def pytorch3d(task: RenderTask) -> Renderer:
         image = ops.interpolate_face_attributes(found.pix_to_face, found.bary_coords, corners)
         return image[0, :, :, 0], found.pix_to_face
 
-    return Renderer(
+    return RivalRenderer(
         "vertex colours, hard outlines",
         forward,
         lambda drawn: torch.autograd.grad(drawn[0], leaf, task.weight),
@@ -161,7 +161,7 @@ def pytorch3d(task: RenderTask) -> Renderer:
     )
 
 
-def nvdiffrast(task: RenderTask) -> Renderer:
+def nvdiffrast(task: RenderTask) -> RivalRenderer:
     """nvdiffrast's rasterise, interpolate and antialias; needs CUDA."""
     library = _load(lambda: importlib.import_module("nvdiffrast.torch"))
     if task.placed.points.device.type != "cuda":
@@ -181,7 +181,7 @@ def nvdiffrast(task: RenderTask) -> Renderer:
         image, _ = library.interpolate(task.colours[None], found, faces)
         return library.antialias(image, found, clip, faces)[0], found[..., 3]
 
-    return Renderer(
+    return RivalRenderer(
         "vertex colours, antialiased outlines",
         forward,
         lambda drawn: torch.autograd.grad(drawn[0], leaf, task.weight),
@@ -189,7 +189,7 @@ def nvdiffrast(task: RenderTask) -> Renderer:
     )
 
 
-def mitsuba(task: RenderTask) -> Renderer:
+def mitsuba(task: RenderTask) -> RivalRenderer:
     """Mitsuba 3's projective integrator: direct light of a constant sky, gradients through silhouettes."""
     library = _load(lambda: importlib.import_module("mitsuba"))
     jit = _load(lambda: importlib.import_module("drjit"))
@@ -248,10 +248,10 @@ def mitsuba(task: RenderTask) -> Renderer:
 
     shows = f"grey meshes under a white sky, {_MITSUBA_SAMPLES} rays a pixel"
     # The sky is 1, and a mesh reflects half of what it receives.
-    return Renderer(shows, forward, backward, lambda image: int((np.array(image)[..., 0] < 0.75).sum()))
+    return RivalRenderer(shows, forward, backward, lambda image: int((np.array(image)[..., 0] < 0.75).sum()))
 
 
-RENDERERS: dict[str, Callable[[RenderTask], Renderer]] = {
+RENDERERS: dict[str, Callable[[RenderTask], RivalRenderer]] = {
     "pyrender": pyrender,
     "open3d": open3d,
     "pytorch3d": pytorch3d,

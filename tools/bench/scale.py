@@ -53,7 +53,7 @@ METHOD = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ScaleRow:
     """One engine; see `METHOD`."""
 
     engine: Engine
@@ -70,7 +70,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class _Round:
+class _ScaleRound:
     """start_s: until the first frame began; frame_ms: of a process for each frame; own_ms: of each frame; told:
     what came of each, by number.
     """
@@ -81,7 +81,7 @@ class _Round:
     told: dict[int, str]
 
 
-def measure(config: DetectorBenchConfig) -> Iterator[Row]:
+def measure(config: DetectorBenchConfig) -> Iterator[ScaleRow]:
     """A row for each engine. Raises UsageError where there is no Ray."""
     frames, count = (QUICK_FRAMES, _QUICK_ROUNDS) if config.quick else (FRAMES, _ROUNDS)
     processes = config.processes
@@ -89,7 +89,7 @@ def measure(config: DetectorBenchConfig) -> Iterator[Row]:
     engines: tuple[Engine, Engine] = ("local", "ray")
     work, settings = _worker(config.detector), {engine: _settings(config, engine) for engine in engines}
     first = {engine: _round(work, settings[engine], range(2 * processes)) for engine in engines}
-    rounds: dict[Engine, list[_Round]] = {engine: [] for engine in engines}
+    rounds: dict[Engine, list[_ScaleRound]] = {engine: [] for engine in engines}
     for number in range(count):
         for engine in engines if number % 2 == 0 else engines[::-1]:
             numbers = range(number * a_round, (number + 1) * a_round)
@@ -101,7 +101,7 @@ def measure(config: DetectorBenchConfig) -> Iterator[Row]:
         frame = Spread.from_values([one.frame_ms for one in times])
         own = Spread.from_values([ms for one in times for ms in one.own_ms])
         mean = sum(sum(one.own_ms) for one in times) / sum(len(one.own_ms) for one in times)
-        yield Row(
+        yield ScaleRow(
             engine=engine,
             processes=processes,
             frames=count * a_round,
@@ -121,7 +121,7 @@ def _settings(config: DetectorBenchConfig, engine: Engine) -> DetectorBenchConfi
     return replace(config, engine=engine, address=address, workers=config.processes)
 
 
-def _round(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range) -> _Round:
+def _round(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range) -> _ScaleRound:
     begun = time.perf_counter()
     ends, own_ms, told = [], [], {}
     build = partial(_worker, config.detector)
@@ -131,7 +131,7 @@ def _round(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig
         own_ms.append(1e3 * seconds)
     start = ends[0] - own_ms[0] / 1e3
     wall = 1e3 * (ends[-1] - start)
-    return _Round(start - begun, wall * config.processes / len(ends), own_ms, told)
+    return _ScaleRound(start - begun, wall * config.processes / len(ends), own_ms, told)
 
 
 def _worker(name: str) -> Callable[[int], tuple[float, str]]:

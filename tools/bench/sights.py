@@ -27,7 +27,7 @@ VEHICLES = (CAR, "Truck", "truck", "bus", "train")
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class DetectorSight:
     """How a detector saw one box: the IoU and the score of the detection that was given to it; zeros of none."""
 
     iou: float = 0.0
@@ -39,11 +39,11 @@ class Sight:
         return self.iou >= IOU
 
 
-UNSEEN = Sight()
+UNSEEN = DetectorSight()
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CarView:
     """A picture (H, W, 3), the boxes (N, 4) px of the scene's N objects in it, and what a detector found, classes
     its labels' names.
     """
@@ -52,17 +52,17 @@ class View:
     boxes_xyxy: Tensor
     detections: Detections
     classes: tuple[str, ...]
-    assigned: list[Sight]
+    assigned: list[DetectorSight]
     """What was given to each object, as a car."""
 
-    def sight(self, row: int, names: Sequence[str], score: float = SCORE) -> Sight:
+    def sight(self, row: int, names: Sequence[str], score: float = SCORE) -> DetectorSight:
         """The best overlap with an object's box of all that is called so, whatever else it may belong to."""
         found = self.named(names, score)
         if not len(found):
             return UNSEEN
         overlap = iou_matrix(self.boxes_xyxy[row : row + 1], found.boxes_xyxy)[0]
         best = int(overlap.argmax())
-        return Sight(round(float(overlap[best]), 4), round(float(found.scores[best]), 4))
+        return DetectorSight(round(float(overlap[best]), 4), round(float(found.scores[best]), 4))
 
     def named(self, names: Sequence[str], score: float = SCORE) -> Detections:
         """The detections that are called so and score more."""
@@ -72,7 +72,7 @@ class View:
             *(t[wanted] for t in (self.detections.boxes_xyxy, self.detections.labels, self.detections.scores))
         )
 
-    def ghost(self, row: int, before: View) -> Sight:
+    def ghost(self, row: int, before: CarView) -> DetectorSight:
         """The surest car at least half of which lies in an object's box, and that `before` did not have there."""
         found, known = self.named((CAR,)), before.named((CAR,))
         box = self.boxes_xyxy[row : row + 1]
@@ -83,32 +83,32 @@ class View:
             return UNSEEN
         best = int(torch.where(new, found.scores, -1.0).argmax())
         overlap = float(iou_matrix(found.boxes_xyxy[best : best + 1], box))
-        return Sight(round(overlap, 4), round(float(found.scores[best]), 4))
+        return DetectorSight(round(overlap, 4), round(float(found.scores[best]), 4))
 
 
-class Eye:
+class DetectorView:
     """A detector that looks at pictures as they are written to files."""
 
     def __init__(self, predictor: Predictor) -> None:
         self._predictor = predictor
 
-    def look(self, image: Tensor, boxes_xyxy: Tensor) -> View:
+    def look(self, image: Tensor, boxes_xyxy: Tensor) -> CarView:
         """image (3, H, W) in [0, 1]; boxes (N, 4) px of the objects in it."""
         picture = to_uint8(image)
         given = torch.from_numpy(picture.transpose(2, 0, 1).copy()).float() / 255
         found = predict(self._predictor, given[None])[0]
-        view = View(picture, boxes_xyxy, found, self._predictor.classes, [])
+        view = CarView(picture, boxes_xyxy, found, self._predictor.classes, [])
         return replace(view, assigned=assign(boxes_xyxy, view.named((CAR,))))
 
 
-def assign(boxes_xyxy: Tensor, detections: Detections) -> list[Sight]:
+def assign(boxes_xyxy: Tensor, detections: Detections) -> list[DetectorSight]:
     """One detection for each box (N, 4) at most, and one box for each detection: the best overlaps first."""
     overlap = iou_matrix(boxes_xyxy, detections.boxes_xyxy.to(boxes_xyxy)).numpy().copy()
     found = [UNSEEN] * len(boxes_xyxy)
     while overlap.size and overlap.max() > 0:
         box, detection = np.unravel_index(int(overlap.argmax()), overlap.shape)
         score = float(detections.scores[int(detection)])
-        found[int(box)] = Sight(round(float(overlap[box, detection]), 4), round(score, 4))
+        found[int(box)] = DetectorSight(round(float(overlap[box, detection]), 4), round(score, 4))
         overlap[box] = 0
         overlap[:, detection] = 0
     return found

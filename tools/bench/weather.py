@@ -35,7 +35,7 @@ from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.model import LUMA, SUN_RISE_RAD, SUN_STRENGTH, SUN_TURN_RAD
 from scene_ir.types import Frame, SceneIR
-from tools.bench.pictures import Strip, psnr, sheet
+from tools.bench.pictures import SheetStrip, psnr, sheet
 from tools.bench.settings import BenchTool
 
 Picture = NDArray[np.uint8]
@@ -116,16 +116,16 @@ def measure(config: BenchTool, frames: int, sheets: Path | None) -> Iterator[lis
     for number in range(frames):
         pool = SPLITS[number % len(SPLITS)]
         plan = generated.plan_frame(_SEED, number // len(SPLITS), pool, SynthSettings(bent=True, sunny=True))
-        yield rows_of(pool, number, plan, detector, sheets)
+        yield weather_rows(pool, number, plan, detector, sheets)
 
 
-def rows_of(
+def weather_rows(
     pool: str, number: int, plan: Plan, detector: Predictor, sheets: Path | None = None
 ) -> list[WeatherRow]:
     """The figures of one frame. sheets: folder for its pictures."""
     street = generated.build_street(plan)
     made = rendered(plan, street)
-    scene = derender(Frame(f"{number:03d}", tensor_of(made.image), made.camera, made.labels))
+    scene = derender(Frame(f"{number:03d}", to_tensor(made.image), made.camera, made.labels))
     shown = [truth for truth in made.truths if _shown(truth)]
     if not shown:
         return []
@@ -136,7 +136,7 @@ def rows_of(
         truth = rendered(apply_edit(plan, edit), street).image
         rows.append(_row((pool, f"{number:03d}", name), made.image, ours, truth, shown, detector))
         region = np.ones(ours.shape[:2], bool)
-        strips.append(Strip(made.image, ours, truth, region, f"{name}: {rows[-1].psnr_db:.1f} dB"))
+        strips.append(SheetStrip(made.image, ours, truth, region, f"{name}: {rows[-1].psnr_db:.1f} dB"))
     if sheets is not None:
         write_picture(sheets / f"{number:03d}_{pool}.png", sheet(strips, 3200))
     return rows
@@ -192,7 +192,7 @@ def _row(
 def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
     boxes = torch.tensor(np.stack([car.box_xyxy for car in shown]), dtype=torch.float32)
     labels = torch.tensor([int(VEHICLES[car.actor.label]) for car in shown])
-    found = candidates_from_detections(predict(detector, tensor_of(picture)[None])[0], len(detector.classes))
+    found = candidates_from_detections(predict(detector, to_tensor(picture)[None])[0], len(detector.classes))
     return object_margins(found, boxes, labels, boxes, resolve_t_star(detector))
 
 
@@ -221,5 +221,5 @@ def rendered(plan: Plan, street: generated.Street) -> SynthFrame:
     return frame
 
 
-def tensor_of(image: Picture) -> Tensor:
+def to_tensor(image: Picture) -> Tensor:
     return torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32) / np.float32(255))

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from scene_ir import files
 from tools.fuzz.formats import FORMATS
-from tools.fuzz.trial import Outcome, Subject, fuzz
+from tools.fuzz.trial import FuzzOutcome, FuzzSubject, fuzz
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if given.show is not None:
         with (
             tempfile.TemporaryDirectory() as folder,
-            Subject(forms[0], Path(folder)).damaged(given.seed, given.show) as root,
+            FuzzSubject(forms[0], Path(folder)).damaged(given.seed, given.show) as root,
         ):
             forms[0].read(root)
         return 0
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return int(any(one.wrong for one in outcomes))
 
 
-def _print(outcomes: Sequence[Outcome], seed: int) -> None:
+def _print(outcomes: Sequence[FuzzOutcome], seed: int) -> None:
     table = Table(title=f"seed {seed}")
     for column in ("format", "inputs", "read", "refused", "wrong", "most s", "most MB"):
         table.add_column(column, justify="left" if column == "format" else "right")

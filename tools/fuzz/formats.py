@@ -42,8 +42,8 @@ from drivesem.data.photographs import read_photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.finished import load_run
-from drivesem.run.report.runs import build_reports
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame, load_frame
+from drivesem.run.run_report import build_reports
 from drivesem.run.summary import summarise_frames
 from drivesem.scenes.segmenter import OnnxSegmenter
 from scene_ir import files

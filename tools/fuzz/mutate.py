@@ -112,7 +112,7 @@ _SIZES = (
 Damage = Callable[[bytes, random.Random], bytes]
 
 
-def mutated(name: str, data: bytes, rng: random.Random) -> bytes:
+def mutate(name: str, data: bytes, rng: random.Random) -> bytes:
     """Other bytes for the file `name`, whose suffix tells its form."""
     own = _BY_SUFFIX.get(PurePath(name).suffix.lower())
     for _ in range(rng.choice((1, 1, 1, 2, 4))):

@@ -24,7 +24,7 @@ from types import FrameType, TracebackType
 from typing import NoReturn
 
 from tools.fuzz.formats import OWN_ERRORS, Format
-from tools.fuzz.mutate import mutated
+from tools.fuzz.mutate import mutate
 
 MEMORY_MB = 1024
 """By how much an input may make the process grow."""
@@ -37,7 +37,7 @@ _STATE = struct.Struct("<5q2d")
 
 
 @dataclass
-class Outcome:
+class FuzzOutcome:
     """What became of a format's inputs."""
 
     name: str
@@ -54,7 +54,7 @@ class TooSlowError(BaseException):
     """The time of an input is up; no reader's own `except` may take it for the file's fault."""
 
 
-class Subject:
+class FuzzSubject:
     """A format's valid files, and their damaged likes one after the other."""
 
     def __init__(self, form: Format, folder: Path) -> None:
@@ -70,7 +70,7 @@ class Subject:
         rng = random.Random(f"{self.form.name} {seed} {number}")
         chosen = rng.sample(sorted(self.valid), k=min(rng.choice((1, 1, 1, 2)), len(self.valid)))
         for path in chosen:
-            path.write_bytes(mutated(path.name, self.valid[path], rng))
+            path.write_bytes(mutate(path.name, self.valid[path], rng))
         try:
             yield self.root
         finally:
@@ -81,7 +81,7 @@ class Subject:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def fault_of(form: Format, root: Path) -> tuple[str, bool]:
+def find_fault(form: Format, root: Path) -> tuple[str, bool]:
     """Read a folder: what is wrong with how its readers took it, "" for nothing; and whether they took it."""
     try:
         with _time_limit(), warnings.catch_warnings(action="error"):
@@ -125,9 +125,9 @@ def _time_limit() -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def fuzz(form: Format, seed: int, count: int, keep: Path | None = None, tell: bool = False) -> Outcome:
+def fuzz(form: Format, seed: int, count: int, keep: Path | None = None, tell: bool = False) -> FuzzOutcome:
     """Give `count` damaged inputs to a format's readers. keep: where those that showed a fault are kept."""
-    outcome = Outcome(form.name)
+    outcome = FuzzOutcome(form.name)
     start = 0
     while start < count:
         start = _in_child(form, seed, start, count, outcome, keep, tell)
@@ -135,7 +135,7 @@ def fuzz(form: Format, seed: int, count: int, keep: Path | None = None, tell: bo
 
 
 def _in_child(
-    form: Format, seed: int, start: int, count: int, outcome: Outcome, keep: Path | None, tell: bool
+    form: Format, seed: int, start: int, count: int, outcome: FuzzOutcome, keep: Path | None, tell: bool
 ) -> int:
     """Fork a child that goes on from `start`: where the next has to begin."""
     shared = mmap.mmap(-1, _STATE.size)
@@ -169,7 +169,7 @@ def _in_child(
     return state[0] + 1
 
 
-def _add(outcome: Outcome, fault: str, number: int, tell: bool) -> None:
+def _add(outcome: FuzzOutcome, fault: str, number: int, tell: bool) -> None:
     if tell and fault not in outcome.wrong:
         print(f"{outcome.name}: {number}: {fault}", flush=True)
     outcome.wrong.setdefault(fault, []).append(number)
@@ -208,7 +208,7 @@ def _work(form: Format, seed: int, numbers: range, shared: mmap.mmap, writing: i
     tried = accepted = refused = wrong = 0
     most_seconds = most_mb = 0.0
     with tempfile.TemporaryDirectory(prefix="fuzz") as folder:
-        subject = Subject(form, Path(folder))
+        subject = FuzzSubject(form, Path(folder))
         form.read(subject.root)  # what is loaded once counts for none
         limit = _data_bytes() + (MEMORY_MB << 20)
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
@@ -216,7 +216,7 @@ def _work(form: Format, seed: int, numbers: range, shared: mmap.mmap, writing: i
             shared[:] = _STATE.pack(number, tried, accepted, refused, wrong, most_seconds, most_mb)
             with subject.damaged(seed, number) as root:
                 before, start = _peak_mb(), time.process_time()
-                fault, taken = fault_of(form, root)
+                fault, taken = find_fault(form, root)
                 most_seconds = max(most_seconds, time.process_time() - start)
                 most_mb = max(most_mb, _peak_mb() - before)
                 if fault:

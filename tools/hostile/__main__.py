@@ -25,8 +25,8 @@ from rich.table import Table
 
 from drivesem.report.terminal import Console, progress_bar
 from tools.hostile.cases import FAMILIES, cases
-from tools.hostile.inputs import Ground
-from tools.hostile.trial import Case, Done, error_lines, judge, notes, run
+from tools.hostile.inputs import ValidInputs
+from tools.hostile.trial import CaseResult, HostileCase, error_lines, judge, notes, run
 
 _MAX_OUTPUT_LINES = 12
 """Lines of output shown of a failed case."""
@@ -46,8 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as temporary:
         work = (arguments.work or Path(temporary)).resolve()
         work.mkdir(parents=True, exist_ok=True)
-        ground = Ground(work)
-        outcomes: list[tuple[Case, Done, list[str]]] = []
+        ground = ValidInputs(work)
+        outcomes: list[tuple[HostileCase, CaseResult, list[str]]] = []
         with progress_bar(Console(stderr=True), keep=False) as progress:
             task = progress.add_task("commands", total=len(chosen))
             for number, case in enumerate(chosen):
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return int(count > 0)
 
 
-def table(outcomes: Sequence[tuple[Case, Done, list[str]]]) -> Table:
+def table(outcomes: Sequence[tuple[HostileCase, CaseResult, list[str]]]) -> Table:
     """Counts by family, with the slowest and largest case among those with limits."""
     columns = ("family", "cases", "clean", "most s", "of", "most MB", "of ")
     summary = Table()
@@ -88,7 +88,7 @@ def table(outcomes: Sequence[tuple[Case, Done, list[str]]]) -> Table:
     return summary
 
 
-def failure(case: Case, done: Done, wrong: Sequence[str]) -> str:
+def failure(case: HostileCase, done: CaseResult, wrong: Sequence[str]) -> str:
     """Describe a failed case.
 
     Args:
@@ -101,7 +101,7 @@ def failure(case: Case, done: Done, wrong: Sequence[str]) -> str:
     return "\n".join([*lines, *(f"  | {line}" for line in output[-_MAX_OUTPUT_LINES:])])
 
 
-def row(case: Case, done: Done, wrong: Sequence[str]) -> dict[str, Any]:
+def row(case: HostileCase, done: CaseResult, wrong: Sequence[str]) -> dict[str, Any]:
     """A case as JSON.
 
     Args:

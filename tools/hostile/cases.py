@@ -25,7 +25,7 @@ from tools.hostile.inputs import (
     text,
     weights,
 )
-from tools.hostile.trial import Case, Signals
+from tools.hostile.trial import HostileCase, Signals
 
 FAMILIES: Mapping[str, str] = {
     "trust": "runs that were edited by hand, or that name code",
@@ -43,12 +43,12 @@ CHECK_MINE = "drivesem check --detector module:mine.py:Mine --size 96x64"
 ATTACK = "drivesem attack --dataset kitti --root kitti --no-fit --params translate --workers 1 --out out"
 
 
-def cases() -> list[Case]:
+def cases() -> list[HostileCase]:
     """All cases by family."""
     return [*_trust(), *_escapes(), *_allocation(), *_tracebacks(), *_signals(), *_own()]
 
 
-def _trust() -> Iterator[Case]:
+def _trust() -> Iterator[HostileCase]:
     changed: dict[str, tuple[Make, str]] = {
         "AP set to 0.05": (
             edited("run/metrics.json", "attacked", "moved", "ap50", value=0.05),
@@ -93,7 +93,7 @@ def _trust() -> Iterator[Case]:
         "a file more": (text(f"run/{FRAME}/scene/more.txt", "more"), "scene/more.txt"),
     }
     for name, (make, field) in changed.items():
-        yield Case(f"verify: {name}", "trust", both(run, make), "drivesem verify run", (field,), code=1)
+        yield HostileCase(f"verify: {name}", "trust", both(run, make), "drivesem verify run", (field,), code=1)
 
     evil = text("evil.py", inputs.EVIL)
     refused = ("run/config.yaml: {}", "--trust")
@@ -107,7 +107,9 @@ def _trust() -> Iterator[Case]:
     ):
         make = both(run, evil, setting("detector", "module:evil.py:D"))
         named = tuple(line.format("detector") for line in refused)
-        yield Case(f"code in a run: {command.partition(' ')[0]}", "trust", make, f"drivesem {command}", named)
+        yield HostileCase(
+            f"code in a run: {command.partition(' ')[0]}", "trust", make, f"drivesem {command}", named
+        )
     for name, value in {
         "second_detector": "module:evil.py:D",
         "reference_detector": "module:evil.py:D",
@@ -115,24 +117,24 @@ def _trust() -> Iterator[Case]:
     }.items():
         make = both(run, evil, setting(name, value))
         named = tuple(line.format(name) for line in refused)
-        yield Case(
+        yield HostileCase(
             f"code in a run: {value.partition(':')[0]} as {name}", "trust", make, "drivesem verify run", named
         )
     tag = setting("steps", f"!!python/object/apply:os.mkdir [{inputs.MARK}]")
-    yield Case("code in YAML", "trust", both(run, tag), "drivesem report run", ("run/config.yaml",))
+    yield HostileCase("code in YAML", "trust", both(run, tag), "drivesem report run", ("run/config.yaml",))
     make = both(scene, inputs.pickled_arrays)
-    yield Case("pickle in a scene", "trust", make, "drivesem render scene", ("arrays.npz", "pickle"))
+    yield HostileCase("pickle in a scene", "trust", make, "drivesem render scene", ("arrays.npz", "pickle"))
     make = both(run, inputs.pickled_weights("weights/alexnet-owt-7be5be79.pth"))
     words = "tools.experiments realism run --metrics lpips-alex --weights weights"
-    yield Case("pickle in weights", "trust", make, words, ("alexnet-owt-7be5be79.pth",))
+    yield HostileCase("pickle in weights", "trust", make, words, ("alexnet-owt-7be5be79.pth",))
 
 
-def _escapes() -> Iterator[Case]:
+def _escapes() -> Iterator[HostileCase]:
     device = "a regular file"
     make = both(kitti(), linked("kitti/training/image_2/n00000.png", "/dev/zero"))
-    yield Case("photograph: link to /dev/zero", "escapes", make, DERENDER, ("n00000.png", device))
+    yield HostileCase("photograph: link to /dev/zero", "escapes", make, DERENDER, ("n00000.png", device))
     make = linked("photo.png", "/dev/zero")
-    yield Case(
+    yield HostileCase(
         "photograph typed: link to /dev/zero",
         "escapes",
         make,
@@ -141,15 +143,15 @@ def _escapes() -> Iterator[Case]:
     )
     for file in ("manifest.json", "metrics.json", "config.yaml", f"{FRAME}/result.json"):
         make = both(run, linked(f"run/{file}", "/dev/zero"))
-        yield Case(
+        yield HostileCase(
             f"{file}: link to /dev/zero", "escapes", make, "drivesem report run", (file.rpartition("/")[2],)
         )
     for name in ("/dev/zero", "../..", "/etc"):
         make = both(run, edited("run/manifest.json", "frames", value={name: {}}))
-        yield Case(f"manifest.json: frame {name}", "escapes", make, "drivesem report run", ("frames", name))
+        yield HostileCase(f"manifest.json: frame {name}", "escapes", make, "drivesem report run", ("frames", name))
     secret = text("secret.json", "{}")
     make = both(run, secret, linked(RESULT, "../../../secret.json"))
-    yield Case(
+    yield HostileCase(
         "link out of a run",
         "escapes",
         make,
@@ -159,40 +161,40 @@ def _escapes() -> Iterator[Case]:
     for name in ("../../secret.png", "/dev/zero"):
         make = coco("images", "file_name", name)
         words = "drivesem derender --dataset coco --root coco --out out"
-        yield Case(f"COCO: file_name {name}", "escapes", make, words, ("images[0].file_name", name))
+        yield HostileCase(f"COCO: file_name {name}", "escapes", make, words, ("images[0].file_name", name))
     for name in ("../secret", "/dev"):
         make = both(inputs.layout("yolo"), text("yolo/data.yaml", f"train: {name}\nnames: [Car]\n"))
         words = "drivesem derender --dataset yolo --root yolo --out out"
-        yield Case(f"YOLO: train {name}", "escapes", make, words, ("data.yaml: train", name))
+        yield HostileCase(f"YOLO: train {name}", "escapes", make, words, ("data.yaml: train", name))
 
 
-def _allocation() -> Iterator[Case]:
+def _allocation() -> Iterator[HostileCase]:
     for name, words in {"derender": DERENDER, "attack": ATTACK}.items():
-        yield Case(
+        yield HostileCase(
             f"3,000 cars in a frame: {name}", "allocation", kitti(cars=3000), words, ("n00000", "found 3000")
         )
-    yield Case(
+    yield HostileCase(
         "1,000,000 labels of a frame", "allocation", kitti(cars=10**6), DERENDER, ("n00000.txt", "1,000,000")
     )
     make = both(kitti(), inputs.equal_detections)
     words = "drivesem eval --gt kitti --pred found --protocol kitti"
-    yield Case("80,000 equal detections", "allocation", make, words, ("2,000 detections", "80,000"))
+    yield HostileCase("80,000 equal detections", "allocation", make, words, ("2,000 detections", "80,000"))
     for name, maker in {
         "NPZ header of 10^12 floats": inputs.oversized_arrays,
         "zip bomb of 4 GB": inputs.bomb(),
         "zip bomb that declares 1,000 bytes": inputs.bomb(declared=1000),
     }.items():
-        yield Case(name, "allocation", both(scene, maker), "drivesem render scene", ("scene/arrays.npz",))
+        yield HostileCase(name, "allocation", both(scene, maker), "drivesem render scene", ("scene/arrays.npz",))
     lines = [f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]" for a, b in zip("abcdefghijk", "bcdefghijkl", strict=True)]
     content = "\n".join(["a: &a [x, x, x, x]", *lines, ""])
-    yield Case(
+    yield HostileCase(
         "YAML alias bomb: a run",
         "allocation",
         both(run, text("run/config.yaml", content)),
         "drivesem report run",
         ("config.yaml", "alias"),
     )
-    yield Case(
+    yield HostileCase(
         "YAML alias bomb: a preset",
         "allocation",
         text("bomb.yaml", content),
@@ -200,14 +202,16 @@ def _allocation() -> Iterator[Case]:
         ("bomb.yaml", "alias"),
     )
     words = "drivesem check --detector darknet:net.cfg"
-    yield Case("20,000 Darknet layers", "allocation", inputs.layers, words, ("net.cfg", "20001"))
-    yield Case("100,000 anchors: Darknet", "allocation", inputs.anchors, words, ("net.cfg", "anchors"))
+    yield HostileCase("20,000 Darknet layers", "allocation", inputs.layers, words, ("net.cfg", "20001"))
+    yield HostileCase("100,000 anchors: Darknet", "allocation", inputs.anchors, words, ("net.cfg", "anchors"))
     words = "drivesem check --detector weights.safetensors"
     many = weights(anchors=str([[10, 10]] * 100_000))
-    yield Case("100,000 anchors: weights", "allocation", many, words, ("anchors", "100000"))
-    yield Case("2 GB in a header of 1 KB", "allocation", inputs.oversized_weights, words, ("weights.safetensors",))
+    yield HostileCase("100,000 anchors: weights", "allocation", many, words, ("anchors", "100000"))
+    yield HostileCase(
+        "2 GB in a header of 1 KB", "allocation", inputs.oversized_weights, words, ("weights.safetensors",)
+    )
     make = both(kitti(), inputs.ply("meshes/car.ply", 10**9))
-    yield Case("a mesh of 10^9 faces", "allocation", make, f"{DERENDER} --meshes meshes", ("car.ply",))
+    yield HostileCase("a mesh of 10^9 faces", "allocation", make, f"{DERENDER} --meshes meshes", ("car.ply",))
 
 
 READERS: Mapping[str, tuple[Make, str, str]] = {
@@ -249,32 +253,34 @@ READERS: Mapping[str, tuple[Make, str, str]] = {
 """Every kind of JSON and YAML file that a command reads: maker, file, command."""
 
 
-def _tracebacks() -> Iterator[Case]:
+def _tracebacks() -> Iterator[HostileCase]:
     for name, (make, file, words) in READERS.items():
         named = (file.rpartition("/")[2],)
         digits = f'{{"a": {DIGITS}}}'
-        yield Case(f"deep nesting: {name}", "tracebacks", both(make, text(file, DEEP)), words, named)
-        yield Case(f"5,000 digits: {name}", "tracebacks", both(make, text(file, digits)), words, named)
+        yield HostileCase(f"deep nesting: {name}", "tracebacks", both(make, text(file, DEEP)), words, named)
+        yield HostileCase(f"5,000 digits: {name}", "tracebacks", both(make, text(file, digits)), words, named)
     words = "drivesem check --detector weights.safetensors"
     for name, value in {"deep nesting": DEEP, "5,000 digits": f"[[{DIGITS}, 1]]"}.items():
-        yield Case(
+        yield HostileCase(
             f"{name}: anchors of weights", "tracebacks", weights(anchors=value), words, ("weights.safetensors",)
         )
-    yield Case("5,000 digits: KITTI's label", "tracebacks", kitti(lines={2: DIGITS}), DERENDER, ("n00000.txt",))
+    yield HostileCase(
+        "5,000 digits: KITTI's label", "tracebacks", kitti(lines={2: DIGITS}), DERENDER, ("n00000.txt",)
+    )
     for focal in ("1e30", "1e-30", "nan"):
-        yield Case(f"f = {focal}", "tracebacks", kitti(focal=focal), DERENDER, ("n00000.txt", "P2"))
-    yield Case("f = 1e30: attack", "tracebacks", kitti(focal="1e30"), ATTACK, ("n00000.txt", "P2"))
+        yield HostileCase(f"f = {focal}", "tracebacks", kitti(focal=focal), DERENDER, ("n00000.txt", "P2"))
+    yield HostileCase("f = 1e30: attack", "tracebacks", kitti(focal="1e30"), ATTACK, ("n00000.txt", "P2"))
     photo = "drivesem derender photo.png --out out"
     huge = png("photo.png", 100_000, 100_000)
-    yield Case("PNG header of 100000x100000", "tracebacks", huge, photo, ("photo.png", "px"))
+    yield HostileCase("PNG header of 100000x100000", "tracebacks", huge, photo, ("photo.png", "px"))
     make = both(kitti(), png("kitti/training/image_2/n00000.png", 100_000, 100_000))
-    yield Case("PNG header of 100000x100000: KITTI", "tracebacks", make, DERENDER, ("n00000.png", "px"))
-    yield Case("photograph of 1x1", "tracebacks", inputs.one_pixel("photo.png"), photo, ("1x1 px",))
+    yield HostileCase("PNG header of 100000x100000: KITTI", "tracebacks", make, DERENDER, ("n00000.png", "px"))
+    yield HostileCase("photograph of 1x1", "tracebacks", inputs.one_pixel("photo.png"), photo, ("1x1 px",))
     make = both(kitti(), inputs.one_pixel("kitti/training/image_2/n00000.png"))
-    yield Case("photograph of 1x1: KITTI", "tracebacks", make, DERENDER, ("1x1 px",))
+    yield HostileCase("photograph of 1x1: KITTI", "tracebacks", make, DERENDER, ("1x1 px",))
     for value in (10**9, -(10**9), 1e300):
         make = both(scene, edited("scene/scene.json", "sources", 0, "foreground", "x0", value=value))
-        yield Case(
+        yield HostileCase(
             f"crop x0 = {value:g}", "tracebacks", make, "drivesem render scene", ("scene.json", "foreground")
         )
     for table, key, value, named in (
@@ -287,11 +293,11 @@ def _tracebacks() -> Iterator[Case]:
         ("categories", "name", "\udfff", "half of one"),
     ):
         name = f"COCO: {table}.{key} = {value!a}"
-        yield Case(
+        yield HostileCase(
             name, "tracebacks", coco(table, key, value), "drivesem convert coco --to kitti --out out", (named,)
         )
     words = "drivesem check --detector darknet:net.cfg"
-    yield Case(".names that is not UTF-8", "tracebacks", inputs.names, words, ("net.names",))
+    yield HostileCase(".names that is not UTF-8", "tracebacks", inputs.names, words, ("net.names",))
     for name, command in {
         "report": "drivesem report run",
         "worth": "tools.experiments worth run --distance none",
@@ -310,12 +316,12 @@ def _tracebacks() -> Iterator[Case]:
             ("t_star a text", edited("run/metrics.json", "t_star", value="half"), "metrics.json: t_star"),
             ("detector: 5", setting("detector", "5"), "config.yaml: detector"),
         ):
-            yield Case(f"{what}: {name}", "tracebacks", both(run, make), command, (named,))
+            yield HostileCase(f"{what}: {name}", "tracebacks", both(run, make), command, (named,))
     make = both(run, setting("detector", "5"))
-    yield Case("detector: 5: verify", "tracebacks", make, "drivesem verify run", ("config.yaml: detector",))
+    yield HostileCase("detector: 5: verify", "tracebacks", make, "drivesem verify run", ("config.yaml: detector",))
     for command in ("check --detector weights.safetensors", "attack --detector weights.safetensors --out out"):
         name = f"t_star NaN in weights: {command.partition(' ')[0]}"
-        yield Case(
+        yield HostileCase(
             name, "tracebacks", weights(t_star="nan"), f"drivesem {command}", ("weights.safetensors", "t_star")
         )
     for command in ("convert kitti --to coco --out out", DERENDER.removeprefix("drivesem ")):
@@ -325,10 +331,10 @@ def _tracebacks() -> Iterator[Case]:
             ("truncation 1.5", {1: "1.5"}, "truncat"),
         ):
             name = f"{what}: {command.partition(' ')[0]}"
-            yield Case(name, "tracebacks", kitti(lines=lines), f"drivesem {command}", ("n00000", named))
+            yield HostileCase(name, "tracebacks", kitti(lines=lines), f"drivesem {command}", ("n00000", named))
 
 
-def _signals() -> Iterator[Case]:
+def _signals() -> Iterator[HostileCase]:
     attack = "drivesem attack --combo 2 --no-fit --steps 2 --no-grade --workers 2 --out out"
     created, first = "out/config.yaml", "out/frames/demo-*"
     moments = [
@@ -349,7 +355,7 @@ def _signals() -> Iterator[Case]:
             ("Ctrl-C twice", (after, after + 0.2), signal.SIGINT, 130),
             ("SIGTERM", (after,), signal.SIGTERM, 143),
         ):
-            yield Case(
+            yield HostileCase(
                 f"{name}, {when}",
                 "signals",
                 inputs.nothing,
@@ -360,10 +366,10 @@ def _signals() -> Iterator[Case]:
                 unlimited=True,
             )
     make = both(kitti(), text("script.py", inputs.SCRIPT))
-    yield Case("two workers, no main guard", "signals", make, "python script.py", code=0, unlimited=True)
+    yield HostileCase("two workers, no main guard", "signals", make, "python script.py", code=0, unlimited=True)
 
 
-def _own() -> Iterator[Case]:
+def _own() -> Iterator[HostileCase]:
     for name, method in {
         "__init__": "def __init__(self):",
         "forward": "def forward(self, images):",
@@ -371,13 +377,13 @@ def _own() -> Iterator[Case]:
         "loss": "def loss(self, raw, targets):",
     }.items():
         make = detector(method, 'raise KeyError("wheels")')
-        yield Case(
+        yield HostileCase(
             f"raises in {name}: check", "own detectors", make, CHECK_MINE, ("KeyError", f"mine.py:7, in {name}")
         )
     make = detector(module_code="import nowhere")
-    yield Case("raises when imported: check", "own detectors", make, CHECK_MINE, ("nowhere",))
+    yield HostileCase("raises when imported: check", "own detectors", make, CHECK_MINE, ("nowhere",))
     make = detector(module_code="def broken(:")
-    yield Case("no Python: check", "own detectors", make, CHECK_MINE, ("SyntaxError", "(mine.py:2)"))
+    yield HostileCase("no Python: check", "own detectors", make, CHECK_MINE, ("SyntaxError", "(mine.py:2)"))
     mine, evaluation = "--detector module:mine.py:Mine", "drivesem eval --dataset kitti --root kitti --workers 1"
     words = f"{ATTACK} {mine}"
     for name, method, command in (
@@ -390,10 +396,10 @@ def _own() -> Iterator[Case]:
         make = both(kitti(), detector(method, 'raise KeyError("wheels")'))
         named = ("--detector", "KeyError", f"mine.py:7, in {name.partition(':')[0]}")
         unlimited = "drive" in name  # de-rendering comes before the first detection
-        yield Case(f"raises in {name}", "own detectors", make, command, named, unlimited=unlimited)
+        yield HostileCase(f"raises in {name}", "own detectors", make, command, named, unlimited=unlimited)
     make = both(kitti(), detector("def decode(self, raw):", 'raise KeyError("wheels")'))
     two = words.replace("--workers 1", "--workers 2")
     named = ("--detector", "mine.py:7, in decode")
-    yield Case("raises in decode: attack, two workers", "own detectors", make, two, named, unlimited=True)
+    yield HostileCase("raises in decode: attack, two workers", "own detectors", make, two, named, unlimited=True)
     make = both(kitti(), text("mine.py", inputs.BLIND))
-    yield Case("finds no car: attack", "own detectors", make, words, ("--detector", "finds something"))
+    yield HostileCase("finds no car: attack", "own detectors", make, words, ("--detector", "finds something"))

@@ -29,11 +29,11 @@ FRAME = "frames/n00000"
 """Folder of the frame of the run."""
 GIGABYTE = 1 << 30
 
-Make = Callable[["Ground", Path], object]
+Make = Callable[["ValidInputs", Path], object]
 """Writes the input of a command into a folder."""
 
 
-class Ground:
+class ValidInputs:
     """Valid data from which inputs are made, created on first use in a temporary folder."""
 
     def __init__(self, folder: Path) -> None:
@@ -59,7 +59,7 @@ class Ground:
         return out
 
 
-def nothing(ground: Ground, place: Path) -> None:
+def nothing(ground: ValidInputs, place: Path) -> None:
     """No files."""
 
 
@@ -71,7 +71,7 @@ def text(name: str, content: str) -> Make:
 def both(*makers: Make) -> Make:
     """Call several makers in order."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         for maker in makers:
             maker(ground, place)
 
@@ -81,12 +81,12 @@ def both(*makers: Make) -> Make:
 # ---- runs and scenes ----
 
 
-def run(ground: Ground, place: Path) -> None:
+def run(ground: ValidInputs, place: Path) -> None:
     """The run in folder `run`."""
     shutil.copytree(ground.run, place / "run")
 
 
-def scene(ground: Ground, place: Path) -> None:
+def scene(ground: ValidInputs, place: Path) -> None:
     """The scene of its frame in folder `scene`."""
     shutil.copytree(ground.run / FRAME / "scene", place / "scene")
 
@@ -94,7 +94,7 @@ def scene(ground: Ground, place: Path) -> None:
 def edited(path: str, *keys: Any, value: Any) -> Make:
     """Change the value of a JSON file at the path of keys."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         data = json.loads((place / path).read_text())
         inner = data
         for key in keys[:-1]:
@@ -110,7 +110,7 @@ def edited(path: str, *keys: Any, value: Any) -> Make:
 def setting(name: str, value: str) -> Make:
     """Change a setting of the run's config.yaml, as text."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         path = place / "run" / "config.yaml"
         lines = path.read_text().splitlines()
         (at,) = (number for number, line in enumerate(lines) if line.startswith(f"{name}: "))
@@ -123,14 +123,14 @@ def setting(name: str, value: str) -> Make:
 def linked(path: str, target: str) -> Make:
     """Replace a file by a link."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         (place / path).unlink(missing_ok=True)
         (place / path).symlink_to(target)
 
     return make
 
 
-def brightened(ground: Ground, place: Path) -> None:
+def brightened(ground: ValidInputs, place: Path) -> None:
     """Change one corner of the counterexample."""
     path = place / "run" / FRAME / "counterexample.png"
     image = files.read_image(path)
@@ -138,13 +138,13 @@ def brightened(ground: Ground, place: Path) -> None:
     files.write_png(path, image)
 
 
-def overlay(ground: Ground, place: Path) -> None:
+def overlay(ground: ValidInputs, place: Path) -> None:
     """Replace the picture with boxes by the photograph."""
     frame = place / "run" / FRAME
     shutil.copy(frame / "benign.png", frame / "overlay.png")
 
 
-def labels(ground: Ground, place: Path) -> None:
+def labels(ground: ValidInputs, place: Path) -> None:
     """Shift the moved label by 3 px."""
     path = place / "run" / FRAME / "labels_moved.txt"
     words = path.read_text().split()
@@ -171,7 +171,7 @@ class _Touching:
         return open, (MARK, "w")
 
 
-def pickled_arrays(ground: Ground, place: Path) -> None:
+def pickled_arrays(ground: ValidInputs, place: Path) -> None:
     """Put a pickled object into the arrays of a scene."""
     with (place / "scene" / "arrays.npz").open("wb") as file:
         np.savez(file, depth=np.array([_Touching()], dtype=object))
@@ -180,7 +180,7 @@ def pickled_arrays(ground: Ground, place: Path) -> None:
 def pickled_weights(name: str) -> Make:
     """A state_dict with a pickled object."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         torch.save({"layer.weight": torch.ones(2), "more": _Touching()}, place / name)
 
@@ -212,7 +212,7 @@ def one_pixel(name: str) -> Make:
     return lambda ground, place: files.write_png(place / name, np.zeros((1, 1, 3), np.uint8))
 
 
-def oversized_arrays(ground: Ground, place: Path) -> None:
+def oversized_arrays(ground: ValidInputs, place: Path) -> None:
     """An array that declares 10^12 numbers and has none."""
     head = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + "\n"
     member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
@@ -223,7 +223,7 @@ def oversized_arrays(ground: Ground, place: Path) -> None:
 def bomb(declared: int | None = None) -> Make:
     """An archive of 4 MB that expands to 4 GB of zeros; its directory may declare another size, bytes."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         path = place / "scene" / "arrays.npz"
         zeros = bytes(1 << 24)
         with (
@@ -261,7 +261,7 @@ def kitti(cars: int = 1, lines: Mapping[int, str] | None = None, focal: str | No
         focal: Focal length of its camera, px.
     """
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         shutil.copytree(ground.kitti, place / "kitti")
         part = place / "kitti" / "training"
         label, calib = part / "label_2" / "n00000.txt", part / "calib" / "n00000.txt"
@@ -275,7 +275,7 @@ def kitti(cars: int = 1, lines: Mapping[int, str] | None = None, focal: str | No
     return make
 
 
-def equal_detections(ground: Ground, place: Path) -> None:
+def equal_detections(ground: ValidInputs, place: Path) -> None:
     """80,000 equal detections in each frame, in folder `found`."""
     for path in (ground.kitti / "training" / "label_2").iterdir():
         files.write_text(place / "found" / path.name, f"{path.read_text().strip()} 0.5\n" * 80_000)
@@ -284,7 +284,7 @@ def equal_detections(ground: Ground, place: Path) -> None:
 def coco(table: str, key: str, value: Any) -> Make:
     """A COCO data set in folder `coco` with one changed value."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         dataset("coco", place / "coco")
         edited(COCO, table, 0, key, value=value)(ground, place)
 
@@ -305,26 +305,26 @@ def layout(name: str) -> Make:
 def weights(**changed: str) -> Make:
     """The weights of SqueezeDet with other metadata, in `weights.safetensors`."""
 
-    def make(ground: Ground, place: Path) -> None:
+    def make(ground: ValidInputs, place: Path) -> None:
         metadata, tensors = read_weights(SHIPPED["squeezedet"])
         write_weights(place / "weights.safetensors", metadata | changed, tensors)
 
     return make
 
 
-def oversized_weights(ground: Ground, place: Path) -> None:
+def oversized_weights(ground: ValidInputs, place: Path) -> None:
     """A header of 1 KB that declares 2 GB."""
     tensors = {"weight": {"dtype": "F32", "shape": [1 << 29], "data_offsets": [0, 1 << 31]}}
     header = json.dumps(tensors).encode().ljust(1024)
     files.write_bytes(place / "weights.safetensors", struct.pack("<Q", len(header)) + header)
 
 
-def layers(ground: Ground, place: Path) -> None:
+def layers(ground: ValidInputs, place: Path) -> None:
     """A Darknet network of 20,000 layers, in `net.cfg`."""
     files.write_text(place / "net.cfg", "[net]\nchannels=3\n" + "[shortcut]\nfrom=-1\n" * 20_000)
 
 
-def anchors(ground: Ground, place: Path) -> None:
+def anchors(ground: ValidInputs, place: Path) -> None:
     """A Darknet network of 100,000 anchors, in `net.cfg`."""
     _darknet(place)
     path = place / "net.cfg"
@@ -332,7 +332,7 @@ def anchors(ground: Ground, place: Path) -> None:
     path.write_text("\n".join("anchors=" + "10,13," * 100_000 if "anchors" in line else line for line in lines))
 
 
-def names(ground: Ground, place: Path) -> None:
+def names(ground: ValidInputs, place: Path) -> None:
     """A Darknet network with class names that are not UTF-8."""
     _darknet(place)
     (place / "net.names").write_bytes(b"\xff\xfe\n")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from drivesem.report.tables import format_count
 from tools.beside import ROOT
-from tools.hostile.inputs import MARK, Ground
+from tools.hostile.inputs import MARK, ValidInputs
 from tools.same import environment
 
 SECONDS = 5.0
@@ -68,14 +68,14 @@ class Signals:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class HostileCase:
     """A command with hostile input."""
 
     name: str
     """Unique name."""
     family: str
     """One of FAMILIES."""
-    make: Callable[[Ground, Path], object]
+    make: Callable[[ValidInputs, Path], object]
     """Writes the input into an empty folder."""
     words: str
     """Command line, run in that folder."""
@@ -90,7 +90,7 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class CaseResult:
     """Outcome of a case."""
 
     code: int | None
@@ -111,23 +111,23 @@ class Done:
     """Processes that outlived the command."""
 
 
-def error_lines(done: Done) -> list[str]:
+def error_lines(done: CaseResult) -> list[str]:
     """Lines of standard error that begin with the program's name, without notices about code that is run."""
     return [line for line in done.err.splitlines() if line.startswith(_PREFIXES) and _CODE_NOTICE not in line]
 
 
-def notes(done: Done) -> list[str]:
+def notes(done: CaseResult) -> list[str]:
     """Other lines of standard error, without progress bars."""
     lines = (line.strip() for line in done.err.splitlines())
     return [line for line in lines if line and _PROGRESS not in line and not line.startswith(_PREFIXES)]
 
 
-def difference_lines(done: Done) -> list[str]:
+def difference_lines(done: CaseResult) -> list[str]:
     """Lines in which `verify` reports a difference."""
     return [line for line in done.out.splitlines() if ": expected " in line and ", found " in line]
 
 
-def judge(case: Case, done: Done) -> list[str]:
+def judge(case: HostileCase, done: CaseResult) -> list[str]:
     """One line for each defect."""
     if done.code is None:
         return [f"no end after {_STUCK_SECONDS} s"]
@@ -149,7 +149,7 @@ def judge(case: Case, done: Done) -> list[str]:
     return wrong
 
 
-def _wrong_lines(case: Case, done: Done) -> list[str]:
+def _wrong_lines(case: HostileCase, done: CaseResult) -> list[str]:
     lines = error_lines(done)
     if case.code == 1:
         wrong = [f"an error besides the differences: {line}" for line in lines]
@@ -168,14 +168,14 @@ def _wrong_lines(case: Case, done: Done) -> list[str]:
     return wrong
 
 
-def process_words(case: Case) -> list[str]:
+def process_words(case: HostileCase) -> list[str]:
     """Arguments of the process: `drivesem` and `tools` of this checkout, with this Python."""
     first, *rest = shlex.split(case.words)
     module = "drivesem.cli" if first == "drivesem" else first
     return [sys.executable, *(() if first == "python" else ("-m", module)), *rest]
 
 
-def run(case: Case, folder: Path, ground: Ground) -> Done:
+def run(case: HostileCase, folder: Path, ground: ValidInputs) -> CaseResult:
     """Make the input of a case and run its command.
 
     Args:
@@ -211,7 +211,7 @@ def run(case: Case, folder: Path, ground: Ground) -> Done:
                 _signal(os.kill, pid, signal.SIGKILL)
             launcher.wait()
     outputs = [(folder / name).read_text(errors="replace") for name in ("out.txt", "err.txt")]
-    return Done(
+    return CaseResult(
         code=used.get("code"),
         out=outputs[0],
         err=outputs[1],

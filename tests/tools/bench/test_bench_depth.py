@@ -14,7 +14,7 @@ from scene_ir.derender import depth as derendered
 from scene_ir.types import SceneIR
 from tools.bench import depth as bench
 from tools.bench.__main__ import main
-from tools.bench.depth import DepthRow, Street
+from tools.bench.depth import DepthRow, DepthStreet
 
 HEIGHT, WIDTH = 100, 400
 
@@ -25,8 +25,8 @@ def scene() -> SceneIR:
 
 
 @pytest.fixture(scope="module")
-def street(scene: SceneIR) -> Street:
-    return Street.of(scene)
+def street(scene: SceneIR) -> DepthStreet:
+    return DepthStreet.of(scene)
 
 
 def step(at: int = 200) -> np.ndarray:
@@ -71,21 +71,21 @@ def test_the_lasers_points_lie_where_the_camera_sees_them(scene: SceneIR) -> Non
     assert np.isfinite(depth).sum() == 1
 
 
-def test_errors_are_relative_and_told_apart(street: Street) -> None:
+def test_errors_are_relative_and_told_apart(street: DepthStreet) -> None:
     shape = street.ties.sky.shape
     truth = np.full(shape, np.inf, np.float32)
     truth[50, :100] = 20
     found = np.full(shape, 30.0, np.float32)
     found[50, :50] = 22
-    row = bench.row_of("here", "000", "a guess", found, truth, street)
+    row = bench.depth_row("here", "000", "a guess", found, truth, street)
     assert row.abs_rel == pytest.approx((0.1 + 0.5) / 2, abs=1e-3)
     assert row.within == pytest.approx(0.5)
     assert row.within_up == pytest.approx(0.5)
-    assert bench.row_of("here", "000", "a guess", found, None, street).abs_rel is None
+    assert bench.depth_row("here", "000", "a guess", found, None, street).abs_rel is None
 
 
-def test_both_together_beat_walls_on_an_embedded_street(scene: SceneIR, street: Street) -> None:
-    used = derendered.surroundings(street.picture, street.plane, street.camera, street.ties)
+def test_both_together_beat_walls_on_an_embedded_street(scene: SceneIR, street: DepthStreet) -> None:
+    used = derendered.estimate_depth(street.picture, street.plane, street.camera, street.ties)
     rows = {
         row.depth: row
         for row in bench.judge(

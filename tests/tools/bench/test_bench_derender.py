@@ -19,26 +19,26 @@ from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 from tools.bench import derender as bench
 from tools.bench.__main__ import main
-from tools.bench.derender import Case, DerenderRow, Edited, Shape
+from tools.bench.derender import DerenderRow, EditAccuracy, EditedStreet, SilhouetteOverlap
 
 
 @pytest.fixture(scope="module")
-def case() -> Case:
+def case() -> EditedStreet:
     return bench.make_case(0, 0)
 
 
 @pytest.fixture(scope="module")
-def tracks(case: Case) -> list[int]:
-    return [t.actor.track for t in case.before.truths if t.labelled and t.actor.label in bench.VEHICLES]
+def tracks(case: EditedStreet) -> list[int]:
+    return [t.actor.track for t in case.before.truths if t.labelled and t.actor.label in bench.VEHICLE_CATEGORIES]
 
 
 @pytest.fixture(scope="module")
-def empty(case: Case, tracks: list[int]) -> SynthFrame:
+def empty(case: EditedStreet, tracks: list[int]) -> SynthFrame:
     return bench.without(case, tracks)
 
 
 @pytest.fixture(scope="module")
-def perfect(case: Case, tracks: list[int], empty: SynthFrame) -> SceneIR:
+def perfect(case: EditedStreet, tracks: list[int], empty: SynthFrame) -> SceneIR:
     return bench.perfect_scene(case.before, empty, tracks)
 
 
@@ -51,7 +51,7 @@ def _displaced(scene: SceneIR, metres: float) -> SceneIR:
     )
 
 
-def test_a_case_has_a_vehicle_that_moves(case: Case) -> None:
+def test_a_case_has_a_vehicle_that_moves(case: EditedStreet) -> None:
     move = case.move
     assert sorted(abs(v) for v in move.shift_m) == [0, 0.5]
     assert abs(move.turn) == pytest.approx(math.radians(10))
@@ -62,7 +62,9 @@ def test_a_case_has_a_vehicle_that_moves(case: Case) -> None:
     assert all(t.visible >= 0.05 for t in case.before.truths)
 
 
-def test_the_perfect_scene_gets_nearly_perfect_marks(case: Case, tracks: list[int], perfect: SceneIR) -> None:
+def test_the_perfect_scene_gets_nearly_perfect_marks(
+    case: EditedStreet, tracks: list[int], perfect: SceneIR
+) -> None:
     row, strips = bench.judge(case, perfect, tracks)
     assert len(row.shapes) == sum(map(bench.eligible, case.before.truths)) > 0
     for shape in row.shapes:
@@ -82,29 +84,31 @@ def test_the_perfect_scene_gets_nearly_perfect_marks(case: Case, tracks: list[in
     json.dumps(bench.summary([row]), allow_nan=False)
 
 
-def test_the_moved_scene_moves_as_the_truth_does(case: Case, tracks: list[int], perfect: SceneIR) -> None:
-    moved = bench.moved_scene(case, perfect, tracks)
+def test_the_moved_scene_moves_as_the_truth_does(case: EditedStreet, tracks: list[int], perfect: SceneIR) -> None:
+    moved = bench.apply_move(case, perfect, tracks)
     i = tracks.index(case.move.track)
     truth = next(t for t in case.moved.truths if t.actor.track == case.move.track)
     assert moved.objects.translation[i].numpy() == pytest.approx(truth.translation, abs=1e-5)
     assert math.remainder(float(moved.objects.yaw[i]) - truth.yaw, 2 * math.pi) == pytest.approx(0, abs=1e-5)
     others = [j for j in range(len(tracks)) if j != i]
     assert torch.equal(moved.objects.translation[others], perfect.objects.translation[others])
-    assert bench.moved_scene(case, perfect, [-1] * len(tracks)) is perfect
+    assert bench.apply_move(case, perfect, [-1] * len(tracks)) is perfect
 
 
-def test_misplaced_and_missing_vehicles_lose_marks(case: Case, tracks: list[int], perfect: SceneIR) -> None:
-    off = list(bench.silhouettes(case, Compositor(_displaced(perfect, 0.4)), tracks, None))
+def test_misplaced_and_missing_vehicles_lose_marks(
+    case: EditedStreet, tracks: list[int], perfect: SceneIR
+) -> None:
+    off = list(bench.compare_silhouettes(case, Compositor(_displaced(perfect, 0.4)), tracks, None))
     assert all(shape.mesh_iou < 0.9 for shape in off)
     assert [shape.place_m for shape in off] == pytest.approx([0.4] * len(off), abs=1e-3)
-    gone = list(bench.silhouettes(case, Compositor(perfect), [-1] * len(tracks), None))
+    gone = list(bench.compare_silhouettes(case, Compositor(perfect), [-1] * len(tracks), None))
     assert gone
     assert all(shape.mesh_iou == shape.matte_iou == 0 for shape in gone)
 
 
-def test_labels_are_off_by_what_they_should_be(case: Case) -> None:
+def test_labels_are_off_by_what_they_should_be(case: EditedStreet) -> None:
     true = case.before.labels
-    off = bench.disturbed(case.before, np.random.default_rng(1))
+    off = bench.disturb_labels(case.before, np.random.default_rng(1))
     shift = (off.translation - true.translation).double()
     ground = case.before.environment.ground.double()
     assert shift[:, [0, 2]].norm(dim=1).tolist() == pytest.approx([0.2] * len(shift), abs=1e-5)
@@ -113,23 +117,23 @@ def test_labels_are_off_by_what_they_should_be(case: Case) -> None:
     ratio = off.size_lhw / true.size_lhw
     assert (ratio - 1).abs().reshape(-1).tolist() == pytest.approx([0.05] * 3 * len(shift), abs=1e-5)
     assert torch.equal(off.boxes_xyxy, true.boxes_xyxy)
-    again, other = (bench.disturbed(case.before, np.random.default_rng(s)) for s in (1, 2))
+    again, other = (bench.disturb_labels(case.before, np.random.default_rng(s)) for s in (1, 2))
     assert torch.equal(again.translation, off.translation)
     assert not torch.equal(other.translation, off.translation)
 
 
-def test_a_label_behind_the_camera_stays(case: Case) -> None:
+def test_a_label_behind_the_camera_stays(case: EditedStreet) -> None:
     before = case.before
     near = before.labels.translation.clone()
     near[0] = torch.tensor([0.0, 1.6, -6.0])
     frame = replace(before, labels=replace(before.labels, translation=near))
-    off = bench.disturbed(frame, np.random.default_rng(0))
+    off = bench.disturb_labels(frame, np.random.default_rng(0))
     assert torch.equal(off.translation[0], near[0])
     assert not torch.equal(off.translation[1:], near[1:])
 
 
-def test_de_rendering_is_given_neither_mask_nor_depth(case: Case) -> None:
-    frame = bench.photograph_of(case.before, case.before.labels)
+def test_de_rendering_is_given_neither_mask_nor_depth(case: EditedStreet) -> None:
+    frame = bench.synthetic_photograph(case.before, case.before.labels)
     assert frame.masks is None
     assert frame.depth is None
     assert frame.classes is None
@@ -139,20 +143,20 @@ def test_de_rendering_is_given_neither_mask_nor_depth(case: Case) -> None:
     )
 
 
-def test_what_is_in_the_way_forbids_a_move(case: Case) -> None:
+def test_what_is_in_the_way_forbids_a_move(case: EditedStreet) -> None:
     plan = case.plan
     actor = next(a for a in plan.actors if a.track == case.move.track)
-    assert bench.free(plan, actor, case.move)
+    assert bench.is_free(plan, actor, case.move)
     x, z = actor.position_xz
     cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)
     along, across = case.move.shift_m
     ahead = 2 * along * (actor.size_lhw[0] + 0.6), 2 * across * (actor.size_lhw[2] + 0.6)
     place = (x + ahead[0] * cos + ahead[1] * sin, z - ahead[0] * sin + ahead[1] * cos)
     blocked = replace(plan, actors=(*plan.actors, replace(actor, position_xz=place, track=99)))
-    assert not bench.free(blocked, actor, case.move)
+    assert not bench.is_free(blocked, actor, case.move)
 
 
-def test_a_kerb_is_raised(case: Case) -> None:
+def test_a_kerb_is_raised(case: EditedStreet) -> None:
     road = replace(case.plan.setting.road, curvature=0.01, strips=(Kerb(3.0, 5.0, Material.PAVEMENT, 0.12),))
     x, z = road.point(np.array([2.5, 3.5, 4.5, 5.5]), np.array([20.0, 30.0, 10.0, 25.0]))
     corners = np.stack([x, z], axis=1)
@@ -166,22 +170,22 @@ def _share(mask: np.ndarray, region: np.ndarray) -> float:
     return np.count_nonzero(mask & region) / np.count_nonzero(region)
 
 
-def test_what_the_photograph_never_saw(case: Case) -> None:
+def test_what_the_photograph_never_saw(case: EditedStreet) -> None:
     still = replace(case, moved=case.before, move=replace(case.move, shift_m=(0.0, 0.0), turn=0.0))
-    seen = bench.share_of(case.before, case.move.track) > 0
+    seen = bench.track_coverage(case.before, case.move.track) > 0
     assert _share(bench.never_seen(still), seen) < 0.01
-    assert 0 < _share(bench.never_seen(case), bench.share_of(case.moved, case.move.track) > 0) < 0.6
+    assert 0 < _share(bench.never_seen(case), bench.track_coverage(case.moved, case.move.track) > 0) < 0.6
     old = next(t for t in case.before.truths if t.actor.track == case.move.track)
     turned = tuple(replace(t, yaw=t.yaw + math.pi) if t is old else t for t in case.before.truths)
     about = replace(still, moved=replace(case.before, truths=turned))
     assert _share(bench.never_seen(about), seen) > 0.8
 
 
-def test_the_region_is_what_changes(case: Case) -> None:
+def test_the_region_is_what_changes(case: EditedStreet) -> None:
     none = bench.changed_region(case.before, case.before, [])
     assert not none.any()
     same = bench.changed_region(case.before, case.before, [case.move.track])
-    seen = bench.share_of(case.before, case.move.track) > 0
+    seen = bench.track_coverage(case.before, case.move.track) > 0
     assert same[seen].all()
     assert np.count_nonzero(seen) < np.count_nonzero(same) < 3 * np.count_nonzero(seen)
     whole = bench.changed_region(case.before, case.moved, [case.move.track])
@@ -191,8 +195,8 @@ def test_the_region_is_what_changes(case: Case) -> None:
 
 
 def _row(index: int, move_db: float, **changes: Any) -> DerenderRow:
-    edited = Edited(move_db, 15.0, 0.1 * index, 0.9, 1000, {"seen": move_db}, {"seen": 1.0})
-    shape = Shape(1, "sedan", 60.0, 1.0, 0.8, 0.9 + 0.01 * index, 0.9)
+    edited = EditAccuracy(move_db, 15.0, 0.1 * index, 0.9, 1000, {"seen": move_db}, {"seen": 1.0})
+    shape = SilhouetteOverlap(1, "sedan", 60.0, 1.0, 0.8, 0.9 + 0.01 * index, 0.9)
     row = DerenderRow(
         index, "sun", "city", 3, (shape,), "sedan", (0.5, 0.0), 10.0, 0.1, edited, edited, 99.0, True,
         1.0 + index, 1.0, None,

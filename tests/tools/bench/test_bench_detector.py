@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
-from drivesem.bench.timing import Clock, Taken
-from drivesem.cli import main
+from drivesem.bench.timing import CallTime, PairedTimer
 from drivesem.commands import bench
 from tools.bench import detector, memory, probe
+from tools.bench.__main__ import main
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def test_both_gives_the_gradient_to_the_image() -> None:
 
 
 def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Ticks(Clock):
+    class Ticks(PairedTimer):
         """Forward 2, both 5, decode 1, at worst 3 ms; ten times as slow in the second of three rounds. Four at
         once take as long of the processor as three.
         """
@@ -41,11 +41,11 @@ def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch
             super().__init__()
             self.calls = 0
 
-        def taken(self, call: object) -> Taken:
+        def taken(self, call: object) -> CallTime:
             turn, kind = divmod(self.calls, 6)
             self.calls += 1
             slow = 10 if turn == 1 else 1 + turn
-            return Taken((2.0, 5.0, 1.0, 3.0, 8.0, 20.0)[kind] * slow, (2.0, 5.0, 1.0, 3.0, 6.0, 15.0)[kind])
+            return CallTime((2.0, 5.0, 1.0, 3.0, 8.0, 20.0)[kind] * slow, (2.0, 5.0, 1.0, 3.0, 6.0, 15.0)[kind])
 
     monkeypatch.setattr(detector, "_peak_mb", lambda name, height, width: 12.5)
     image = torch.rand(1, 3, 32, 48)
@@ -82,7 +82,7 @@ def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyP
 
 
 def test_a_detector_without_a_gradient_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "detector", "--detector", "onnx:graph.onnx"]) == 2
+    assert main(["detector", "--detector", "onnx:graph.onnx"]) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
     assert "--detector: expected a detector with gradients" in captured.err

@@ -23,7 +23,7 @@ def test_both_layouts_hold_the_same_boxes(tmp_path: Path) -> None:
     results = read_table(tmp_path / "found.json", "coco", scored=True, truth=coco)
     for first, second, count in ((labels, coco, 5), (detected, results, 20)):
         assert len(first.boxes) == len(second.boxes) == count * _FRAMES
-        assert first.boxes == pytest.approx(second.in_edges(first.edges).boxes, abs=1e-6)
+        assert first.boxes == pytest.approx(second.with_box_format(first.box_format).boxes, abs=1e-6)
 
 
 def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

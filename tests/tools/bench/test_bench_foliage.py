@@ -17,7 +17,7 @@ def rows() -> list[foliage.FoliageRow]:
     with pytest.MonkeyPatch.context() as patch:
         chosen = {"none": FrameEdit()} | {name: foliage.CODES[name] for name in ("hue 1", "density -1")}
         patch.setattr(foliage, "CODES", chosen)
-        return foliage.rows_of("train", 0, plan)
+        return foliage.foliage_rows("train", 0, plan)
 
 
 @pytest.mark.slow

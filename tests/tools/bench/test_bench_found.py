@@ -21,7 +21,7 @@ from scene_ir.io import save_scene
 from scene_ir.types import SceneIR
 from tools.bench import found
 from tools.bench.__main__ import main
-from tools.bench.sights import SCORE, Sight, View, assign
+from tools.bench.sights import SCORE, CarView, DetectorSight, assign
 
 CLASSES = ("person", "Car", "truck")
 PERSON, CAR, TRUCK = range(3)
@@ -61,7 +61,7 @@ def cars(boxes: Tensor, scores: Sequence[float]) -> Rows:
 
 def moved_boxes(scene: SceneIR) -> tuple[dict[int, Tensor], Tensor, list[int]]:
     """Boxes (N, 4) with each car moved alone, then with all that fit; rows of those."""
-    moves = found.Moves(scene, range(len(scene.objects)), np.random.default_rng(0))
+    moves = found.CarMoves(scene, range(len(scene.objects)), np.random.default_rng(0))
     boxes = moves.together().boxes_xyxy
     return {row: move.boxes_xyxy for row, move in moves.alone.items()}, boxes, moves.in_crowd
 
@@ -70,7 +70,7 @@ def test_each_detection_is_one_cars_only() -> None:
     boxes = torch.tensor([[0.0, 0, 10, 10], [2.0, 0, 12, 10], [50.0, 0, 60, 10]])
     one = assign(boxes, detections([((1.5, 0, 11.5, 10), CAR, 0.6)]))
     assert [sight.found for sight in one] == [False, True, False]
-    assert one[1] == Sight(iou=round(9.5 / 10.5, 4), score=0.6)
+    assert one[1] == DetectorSight(iou=round(9.5 / 10.5, 4), score=0.6)
     two = assign(boxes, detections([((1.5, 0, 11.5, 10), CAR, 0.6), ((0, 0, 11, 10), CAR, 0.5)]))
     assert [sight.score for sight in two] == [0.5, 0.6, 0.0]
     assert assign(boxes[:0], detections([])) == []
@@ -78,7 +78,7 @@ def test_each_detection_is_one_cars_only() -> None:
 
 def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> None:
     scene = street()
-    moves = found.Moves(scene, range(4), np.random.default_rng(3))
+    moves = found.CarMoves(scene, range(4), np.random.default_rng(3))
     assert set(moves.alone) == {0, 1, 2, 3}
     for row, move in moves.alone.items():
         apart = (move.scene.objects.translation - scene.objects.translation).norm(dim=1)
@@ -94,7 +94,7 @@ def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> No
 def test_a_car_between_others_stays(street: Callable[..., SceneIR]) -> None:
     # bumper to bumper: no way along the heading
     scene = street(positions_xz=((0.0, 9.0), (0.0, 13.3), (0.0, 17.6)))
-    assert 1 not in found.Moves(scene, range(3), np.random.default_rng(0)).alone
+    assert 1 not in found.CarMoves(scene, range(3), np.random.default_rng(0)).alone
 
 
 def test_what_is_counted(street: Callable[..., SceneIR]) -> None:
@@ -149,7 +149,7 @@ def test_small_and_hidden_cars_are_beside(street: Callable[..., SceneIR]) -> Non
     scene = replace(scene, objects=replace(scene.objects, box2d=boxes))
     rows = found.judge("street", scene, Told([[]] * 7), np.random.default_rng(0))
     assert [row.judged for row in rows] == [True, False, True, False]
-    assert [row.before for row in rows] == [Sight()] * 4
+    assert [row.before for row in rows] == [DetectorSight()] * 4
     lines = [line for line in found.summary(rows) if line["measure"] == "in the photograph"]
     assert [(line["which"], line["cars"]) for line in lines] == [("judged", 2), ("all", 4)]
 
@@ -157,13 +157,13 @@ def test_small_and_hidden_cars_are_beside(street: Callable[..., SceneIR]) -> Non
 def test_a_ghost_is_new_and_inside() -> None:
     box = torch.tensor([[100.0, 100, 200, 150]])
 
-    def view(rows: Rows) -> View:
-        return View(np.zeros((9, 9, 3), np.uint8), box, detections(rows), CLASSES, [])
+    def view(rows: Rows) -> CarView:
+        return CarView(np.zeros((9, 9, 3), np.uint8), box, detections(rows), CLASSES, [])
 
     part, beyond = (110.0, 110, 150, 140), (180.0, 110, 240, 140)
-    assert view([(part, CAR, 0.4), (beyond, CAR, 0.9)]).ghost(0, view([])) == Sight(iou=0.24, score=0.4)
-    assert view([(part, CAR, 0.4)]).ghost(0, view([(part, CAR, 0.35)])) == Sight()
-    assert view([(part, TRUCK, 0.4), (part, CAR, 0.2)]).ghost(0, view([])) == Sight()
+    assert view([(part, CAR, 0.4), (beyond, CAR, 0.9)]).ghost(0, view([])) == DetectorSight(iou=0.24, score=0.4)
+    assert view([(part, CAR, 0.4)]).ghost(0, view([(part, CAR, 0.35)])) == DetectorSight()
+    assert view([(part, TRUCK, 0.4), (part, CAR, 0.2)]).ghost(0, view([])) == DetectorSight()
 
 
 def test_a_detector_without_cars_is_refused(street: Callable[..., SceneIR]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from drivesem.config.errors import UsageError
 from tools.bench import install
 from tools.bench.__main__ import main
-from tools.versions import Ended
+from tools.versions import StepResult
 
 PACKAGES = [["drivesem", "9.1", 5], *([f"p{i}", str(i), i * 1_000_000] for i in range(12))]
 
@@ -23,17 +23,17 @@ class Recorder:
         self.steps: list[tuple[str, Path]] = []
         self.failing = failing
 
-    def __call__(self, words: Sequence[str], folder: Path) -> Ended:
+    def __call__(self, words: Sequence[str], folder: Path) -> StepResult:
         line = " ".join(words)
         self.steps.append((line, folder))
         if self.failing and self.failing in line:
-            return Ended("no such thing")
+            return StepResult("no such thing")
         if "git clone" in line:
             Path(words[-1]).mkdir()
             (Path(words[-1]) / "a.py").write_bytes(bytes(2_000_000))
         if "distributions" in line:
-            return Ended(said=json.dumps(PACKAGES))
-        return Ended()
+            return StepResult(said=json.dumps(PACKAGES))
+        return StepResult()
 
 
 def test_the_readmes_words_one_after_another() -> None:

@@ -12,7 +12,7 @@ import torch
 from scene_ir.types import Camera, Labels
 from tools.bench import label_free as bench
 from tools.bench.__main__ import main
-from tools.bench.label_free import Error, FrameRows, VehicleRow
+from tools.bench.label_free import FrameRows, VehicleError, VehicleRow
 from tools.bench.settings import BenchTool
 
 CAMERA = Camera(torch.tensor([[720.0, 0, 620.0], [0, 720.0, 180.0], [0, 0, 1.0]]), 375, 1242)
@@ -48,20 +48,20 @@ def test_what_is_very_near() -> None:
 
 
 def test_errors_are_of_heading_depth_and_place() -> None:
-    found = bench.error(labels(), 0, torch.tensor([1.3, 1.2, 20.4]), 0.5 - math.radians(3), CAMERA)
+    found = bench.vehicle_error(labels(), 0, torch.tensor([1.3, 1.2, 20.4]), 0.5 - math.radians(3), CAMERA)
     assert found.yaw_deg == pytest.approx(3, abs=0.01)
     assert found.depth == pytest.approx(0.02, abs=1e-4)
     assert found.place_m == pytest.approx(0.5, abs=1e-3)
-    behind = bench.error(labels(), 0, torch.tensor([1.0, 1.6, 20.0]), 0.5 + math.pi + 2 * math.pi, CAMERA)
+    behind = bench.vehicle_error(labels(), 0, torch.tensor([1.0, 1.6, 20.0]), 0.5 + math.pi + 2 * math.pi, CAMERA)
     assert behind.yaw_deg == pytest.approx(180, abs=0.01)
 
 
 def test_summary_keeps_both_stages_apart() -> None:
-    before = [Error(4.0 + i, 0.05, 1.0) for i in range(5)]
+    before = [VehicleError(4.0 + i, 0.05, 1.0) for i in range(5)]
     rows = tuple(
         VehicleRow("000", i, 60.0, e, None if i == 4 else replace(e, yaw_deg=1.0)) for i, e in enumerate(before)
     )
-    turned = VehicleRow("001", 0, 60.0, Error(178.0, 0.1, 2.0), Error(178.0, 0.1, 2.0))
+    turned = VehicleRow("001", 0, 60.0, VehicleError(178.0, 0.1, 2.0), VehicleError(178.0, 0.1, 2.0))
     lines = {
         s["measure"]: s for s in bench.summary([FrameRows(6, rows, (0.2,)), FrameRows(2, (turned,), (0.1, 1.0))])
     }

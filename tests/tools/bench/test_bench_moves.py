@@ -18,9 +18,9 @@ from drivesem.synth.frames import render_frame
 from scene_ir.types import SceneIR
 from tools.bench import derender, moves
 from tools.bench.__main__ import main
-from tools.bench.derender import Case, Move
+from tools.bench.derender import EditedStreet, VehicleMove
 from tools.bench.moves import MovedRow
-from tools.bench.sights import Eye
+from tools.bench.sights import DetectorView
 
 
 class Dazzled:
@@ -42,56 +42,58 @@ class Dazzled:
 
 
 @pytest.fixture(scope="module")
-def case() -> Case:
+def case() -> EditedStreet:
     return derender.make_case(0, 0, "train")
 
 
 @pytest.fixture(scope="module")
-def perfect(case: Case) -> SceneIR:
+def perfect(case: EditedStreet) -> SceneIR:
     tracks = _tracks(case)
     return derender.perfect_scene(case.before, derender.without(case, tracks), tracks)
 
 
-def _tracks(case: Case) -> list[int]:
-    return [t.actor.track for t in case.before.truths if t.labelled and t.actor.label in derender.VEHICLES]
+def _tracks(case: EditedStreet) -> list[int]:
+    return [
+        t.actor.track for t in case.before.truths if t.labelled and t.actor.label in derender.VEHICLE_CATEGORIES
+    ]
 
 
-def test_a_vehicle_that_grows_grows_in_truth_and_in_the_scene(case: Case, perfect: SceneIR) -> None:
-    move = Move(case.move.track, (0.0, 0.0), 0.0, 0.1)
-    moved = render_frame(apply_edit(case.plan, derender.edit_of(move)))
+def test_a_vehicle_that_grows_grows_in_truth_and_in_the_scene(case: EditedStreet, perfect: SceneIR) -> None:
+    move = VehicleMove(case.move.track, (0.0, 0.0), 0.0, 0.1)
+    moved = render_frame(apply_edit(case.plan, derender.move_to_edit(move)))
     assert moved is not None
-    old, new = (derender.truth_of(frame, move.track).box_xyxy for frame in (case.before, moved))
+    old, new = (derender.true_shape(frame, move.track).box_xyxy for frame in (case.before, moved))
     assert ((new[2:] - new[:2]) / (old[2:] - old[:2])).tolist() == pytest.approx([1.1, 1.1], abs=0.05)
-    ours = derender.moved_scene(replace(case, move=move, moved=moved), perfect, _tracks(case))
+    ours = derender.apply_move(replace(case, move=move, moved=moved), perfect, _tracks(case))
     row = _tracks(case).index(move.track)
     grown = ours.objects.size_lhw[row] / perfect.objects.size_lhw[row]
     assert grown.tolist() == pytest.approx([1.1, 1.1, 1.1])
 
 
-def test_nearer_is_towards_the_camera(case: Case) -> None:
-    old = derender.truth_of(case.before, case.move.track)
+def test_nearer_is_towards_the_camera(case: EditedStreet) -> None:
+    old = derender.true_shape(case.before, case.move.track)
     tried = dict(moves.changes(old, np.random.default_rng(0)))
     for metres in (0.5, 8.0):
         places = []
         for way in ("nearer", "farther"):
             (move,) = tried[f"{metres:g} m {way}"]
-            actor = apply_edit(case.plan, derender.edit_of(move)).actors[old.index]
+            actor = apply_edit(case.plan, derender.move_to_edit(move)).actors[old.index]
             places.append(actor.position_xz[1])
         assert places[0] < case.plan.actors[old.index].position_xz[1] < places[1]
     for name, most in (("paper", 0.25 * old.actor.size_lhw[0]), ("street", 1.0)):
         assert max(abs(move.shift_m[1]) for move in tried[f"anywhere in {name}"]) <= most
 
 
-def test_a_perfect_scene_holds_and_the_detector_is_heard(case: Case, perfect: SceneIR) -> None:
-    box = torch.from_numpy(derender.truth_of(case.before, case.move.track).box_xyxy).float()
+def test_a_perfect_scene_holds_and_the_detector_is_heard(case: EditedStreet, perfect: SceneIR) -> None:
+    box = torch.from_numpy(derender.true_shape(case.before, case.move.track).box_xyxy).float()
     rng = np.random.default_rng(0)
-    rows, strips = moves.judge(case, perfect, _tracks(case), Eye(Dazzled(box)), rng)
+    rows, strips = moves.judge(case, perfect, _tracks(case), DetectorView(Dazzled(box)), rng)
     assert len(rows) == len(strips) > 10
     by_name = {row.change: row for row in rows}
     assert by_name["0.5 m farther"].psnr_db > by_name["0.5 m farther"].unchanged_db + 3
     assert by_name["0.5 m farther"].found == pytest.approx(0.9)
     assert by_name["0.5 m farther"].ours is None
-    assert moves.judge(case, perfect, [-1] * len(_tracks(case)), Eye(Dazzled(box)), rng) == ([], [])
+    assert moves.judge(case, perfect, [-1] * len(_tracks(case)), DetectorView(Dazzled(box)), rng) == ([], [])
 
 
 def test_a_line_counts_what_both_see() -> None:
@@ -110,15 +112,15 @@ def test_a_line_counts_what_both_see() -> None:
     assert (share["change"], share["count"]) == ("0 to 0.1 of its distance nearer", 1)
 
 
-def test_what_leaves_the_picture_is_left_out(case: Case) -> None:
-    assert moves.changed_case(case, Move(case.move.track, (-60.0, 0.0), 0.0)) is None
-    assert moves.changed_case(case, Move(case.move.track, (60.0, 0.0), 0.0)) is None
+def test_what_leaves_the_picture_is_left_out(case: EditedStreet) -> None:
+    assert moves.changed_case(case, VehicleMove(case.move.track, (-60.0, 0.0), 0.0)) is None
+    assert moves.changed_case(case, VehicleMove(case.move.track, (60.0, 0.0), 0.0)) is None
     other = next(t for t in case.before.truths if t.actor.track != case.move.track)
-    own = derender.truth_of(case.before, case.move.track)
+    own = derender.true_shape(case.before, case.move.track)
     apart = np.array(other.actor.position_xz) - np.array(own.actor.position_xz)
     cos, sin = math.cos(own.actor.yaw), math.sin(own.actor.yaw)
     onto = (float(apart @ [cos, -sin]), float(apart @ [sin, cos]))
-    assert moves.changed_case(case, Move(case.move.track, onto, 0.0)) is None
+    assert moves.changed_case(case, VehicleMove(case.move.track, onto, 0.0)) is None
 
 
 @pytest.mark.slow

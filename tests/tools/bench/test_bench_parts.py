@@ -8,7 +8,7 @@ import pytest
 
 from tools.bench import parts
 from tools.bench.__main__ import main
-from tools.bench.parts import PARTS, REST, WHOLE, Taken
+from tools.bench.parts import PARTS, REST, WHOLE, DerenderedStreet
 
 
 def test_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -28,7 +28,7 @@ def test_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_means_and_medians() -> None:
     rows = [
-        Taken(*(dict.fromkeys((*PARTS, REST, WHOLE), seconds * way) for way in (1.0, 0.5)))
+        DerenderedStreet(*(dict.fromkeys((*PARTS, REST, WHOLE), seconds * way) for way in (1.0, 0.5)))
         for seconds in (1.0, 2.0, 6.0)
     ]
     line = parts.summary(rows)[-1]

@@ -40,10 +40,10 @@ class Twice:
         return [Detections(boxes, torch.zeros(len(boxes), dtype=torch.int64), torch.full((len(boxes),), 0.9))]
 
 
-def row(name: str, **changes: object) -> redraw.FrameRow:
+def row(name: str, **changes: object) -> redraw.RedrawRow:
     facts = {"cars": 2, "apart": 3.0, "psnr_db": 30.0, "apart_beside": 0.5, "psnr_moved_db": 25.0}
     facts |= {"photograph": 2, "ours": 2, "second": 1, "moved": 1, "ours_moved": 1, "second_moved": 0}
-    return redraw.FrameRow(frame=name, **facts | {"made_s": 1.0, "picture_s": 0.25} | changes)
+    return redraw.RedrawRow(frame=name, **facts | {"made_s": 1.0, "picture_s": 0.25} | changes)
 
 
 def test_counts_are_summed_and_the_rest_is_averaged() -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from drivesem.bench.render import SceneSize
-from drivesem.bench.scenes import Placed, bench_scene
+from drivesem.bench.scenes import PackedMeshes, build_bench_scene
 from scene_ir.raster import verbs
 from scene_ir.types import convert_scene
 from tools.bench import renderers, rivals
@@ -23,8 +23,8 @@ def test_the_own_verbs_stand_beside(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _task(cars: int) -> RenderTask:
-    scene = convert_scene(bench_scene(cars, 600).scene, torch.float32)
-    placed = Placed.of(scene)
+    scene = convert_scene(build_bench_scene(cars, 600).scene, torch.float32)
+    placed = PackedMeshes.from_scene(scene)
     weight = torch.ones(scene.camera.height, scene.camera.width, 3)
     return RenderTask(placed, scene.camera, torch.rand(placed.points.shape), weight)
 

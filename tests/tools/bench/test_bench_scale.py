@@ -7,19 +7,21 @@ from collections.abc import Callable
 
 import pytest
 
-from drivesem.cli import main
-from tools.bench.settings import DetectorBenchConfig
 from tools.bench import scale
+from tools.bench.__main__ import main
+from tools.bench.settings import DetectorBenchConfig
 
 
 def test_rounds_are_in_turn_and_their_figures_are_medians(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, range]] = []
 
-    def one(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range) -> scale._Round:
+    def one(
+        work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range
+    ) -> scale._ScaleRound:
         asked.append((config.engine, numbers))
         n, slow = len(asked), config.engine == "ray"
         told = {number: "another" if slow and number == 4 else f"{number}" for number in numbers}
-        return scale._Round(9.0 if n < 3 else 2.0, 120.0 + n if slow else 110.0, [100.0] * len(numbers), told)
+        return scale._ScaleRound(9.0 if n < 3 else 2.0, 120.0 + n if slow else 110.0, [100.0] * len(numbers), told)
 
     monkeypatch.setattr(scale, "_round", one)
     monkeypatch.setattr(scale, "_worker", lambda name: None)
@@ -42,7 +44,7 @@ def test_frames_are_the_same_by_either(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    assert main(["bench", "scale", "--quick", "--limit", "4", "--workers", "1", "--json"]) == 0
+    assert main(["scale", "--quick", "--limit", "4", "--workers", "1", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["engine"], row["frames"], row["same"]) for row in rows] == [("local", 4, 4), ("ray", 4, 4)]
     assert all(row["own_ms"] > 0 and row["start_s"] > 0 for row in rows)

@@ -18,7 +18,7 @@ def rows() -> list[weather.WeatherRow]:
     plan = plan_frame(61, 2, "train", SynthSettings(bent=True, sunny=True))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(weather, "CODES", {name: weather.CODES[name] for name in ("none", "fog 1", "overcast 1")})
-        return weather.rows_of("train", 2, plan, load_predictor("squeezedet"))
+        return weather.weather_rows("train", 2, plan, load_predictor("squeezedet"))
 
 
 @pytest.mark.slow

@@ -12,8 +12,9 @@ import torch
 from drivesem.bench.scenes import build_bench_scene
 from tools.bench import climb, memory
 from tools.bench.__main__ import main
-from tools.bench.planted import across, across_names, yardstick
-from tools.bench.planted.pool import FramePool, SeenCar
+from tools.bench.planted import across, yardstick
+from tools.bench.planted import across_report as across_names
+from tools.bench.planted.pool import CarObservation, FramePool
 
 
 @pytest.fixture(autouse=True)
@@ -44,14 +45,16 @@ def test_a_leak_shows_as_a_slope() -> None:
 
 def test_planted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """What is done is kept, and the figures are of it."""
-    row = yardstick.Attempt("demo-000", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 1, 1, 1, 50, 4.0)
+    row = yardstick.FaultSearch(
+        "demo-000", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 1, 1, 1, 50, 4.0
+    )
     asked = []
 
-    def judged(self: yardstick.Yardstick, name: str) -> yardstick.JudgedFrame:
+    def judged(self: yardstick.PlantedFaultBench, name: str) -> yardstick.FrameSearches:
         asked.append(name)
-        return yardstick.JudgedFrame(name, (replace(row, frame=name),), ("contrast rare",))
+        return yardstick.FrameSearches(name, (replace(row, frame=name),), ("contrast rare",))
 
-    monkeypatch.setattr(yardstick.Yardstick, "_judge", judged)
+    monkeypatch.setattr(yardstick.PlantedFaultBench, "_judge", judged)
     words = ["planted", "--methods", "halton", "--limit", "2", "--workers", "1", "--json"]
     for _ in range(2):
         assert main([*words, "--out", str(tmp_path)]) == 0
@@ -79,26 +82,26 @@ def test_planted_across(
         made.append(name)
         rng = np.random.default_rng(len(made))
 
-        def car(index: int) -> SeenCar:
+        def car(index: int) -> CarObservation:
             height, shade = 20.0 + 8 * index + rng.uniform(-3, 3), rng.random()
-            return SeenCar(index, (height, shade), 2.0, ((0.9, height, 1.5, 0.5, shade, 0.2),))
+            return CarObservation(index, (height, shade), 2.0, ((0.9, height, 1.5, 0.5, shade, 0.2),))
 
         rows = [tuple(car(index) for index in range(8)) for _ in range(4 + states)]
         return FramePool(name, 0.545, names, tuple(rows[:4]), tuple(rows[4:]))
 
     def attempt(
-        self: across.Across, name: str, scene: Any, fault: str, method: str, *_: Any
-    ) -> across.AcrossAttempt:
+        self: across.SharedFaultBench, name: str, scene: Any, fault: str, method: str, *_: Any
+    ) -> across.SharedFaultSearch:
         searched.append((name, fault))
-        return across.AcrossAttempt(name, fault, method, 0, 0, 24, ())
+        return across.SharedFaultSearch(name, fault, method, 0, 0, 24, ())
 
     monkeypatch.setattr(FramePool, "make", pool)
-    monkeypatch.setattr(across.Across, "_attempt", attempt)
+    monkeypatch.setattr(across.SharedFaultBench, "_attempt", attempt)
     monkeypatch.setattr(across, "KINDS", (("height_px",), ("aspect",), ("lightness",)))
     monkeypatch.setattr(across, "FRAMES", 2)
     monkeypatch.setattr(across, "CARS", 3)
     scene = build_bench_scene(1, 600).scene
-    monkeypatch.setattr(across.Across, "_scene", lambda *_: scene)
+    monkeypatch.setattr(across.SharedFaultBench, "_scene", lambda *_: scene)
     monkeypatch.setattr(across_names, "SHAMS", 2)
     words = [
         "planted",

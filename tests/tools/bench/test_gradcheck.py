@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from drivesem.attack.space import PAPER_PARAMETERS, Parameter
-from drivesem.cli import main
 from drivesem.config.parsing import parse
 from scene_ir.types import Camera, Mesh, SceneIR
 from tools.bench import gradcheck
 from tools.bench import gradcheck as gradcheck_command
-from tools.bench.gradcheck import LOSS, PICTURE, Differences, GradcheckRow, rows_of, worst
+from tools.bench.__main__ import BENCHMARKS, main
+from tools.bench.gradcheck import LOSS, PICTURE, FiniteDifferences, GradcheckRow, gradcheck_rows, worst
 from tools.bench.settings import GradcheckConfig
 
 COUNT, OUTPUTS = 12, gradcheck.FUNCTIONALS + 1
@@ -27,12 +27,12 @@ def _generator() -> torch.Generator:
     return torch.Generator().manual_seed(7)
 
 
-def _differences(gradient: np.ndarray, where: slice, directions: int = 4) -> Differences:
+def _differences(gradient: np.ndarray, where: slice, directions: int = 4) -> FiniteDifferences:
     """What exact differences of a function with this gradient (F + 1, D) would be."""
     size = where.stop - where.start
     chosen = gradcheck.orthonormal(size, min(directions, size), _generator()).numpy()
     slopes = np.stack([gradient[:, where] @ chosen.T] * 3)
-    return Differences(where, chosen, slopes, np.full_like(slopes, 1e-12))
+    return FiniteDifferences(where, chosen, slopes, np.full_like(slopes, 1e-12))
 
 
 def _gradient() -> np.ndarray:
@@ -42,7 +42,7 @@ def _gradient() -> np.ndarray:
 def _rows(analytic: np.ndarray, truth: np.ndarray) -> dict[tuple[str, str], GradcheckRow]:
     blocks = (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.MESH)
     found = {p: _differences(truth, slice(4 * i, 4 * i + 4)) for i, p in enumerate(blocks)}
-    rows = rows_of("a scene", "theta0", {"warp": analytic}, found)
+    rows = gradcheck_rows("a scene", "theta0", {"warp": analytic}, found)
     return {(row.name, row.functional): row for row in rows}
 
 
@@ -80,7 +80,7 @@ def test_the_best_of_three_steps_is_reported_and_all_are_listed() -> None:
     found = _differences(_gradient(), slice(0, 4))
     found.slopes[0] *= 2.0
     found.slopes[2] *= 1.1
-    row = rows_of("a scene", "theta0", {"warp": _gradient()}, {Parameter.ROTATE: found})[0]
+    row = gradcheck_rows("a scene", "theta0", {"warp": _gradient()}, {Parameter.ROTATE: found})[0]
     assert row.step == gradcheck.STEPS[Parameter.ROTATE][1]
     assert [a.relative_error for a in row.steps] == pytest.approx([0.5, 0, 1 - 1 / 1.1])
 
@@ -91,8 +91,8 @@ def test_errors_keep_their_length_on_few_directions(size: int) -> None:
     truth, error = torch.randn(2, 400, size, generator=generator, dtype=torch.float64)
     directions = gradcheck.orthonormal(size, 2, generator).numpy()
     slopes = truth.numpy() @ directions.T
-    found = Differences(slice(0, size), directions, np.stack([slopes] * 3), np.zeros((3, 400, 2)))
-    row = rows_of("a scene", "theta0", {"warp": (truth + 0.1 * error).numpy()}, {Parameter.COLOR: found})[0]
+    found = FiniteDifferences(slice(0, size), directions, np.stack([slopes] * 3), np.zeros((3, 400, 2)))
+    row = gradcheck_rows("a scene", "theta0", {"warp": (truth + 0.1 * error).numpy()}, {Parameter.COLOR: found})[0]
     assert row.relative_error == pytest.approx(0.1, rel=0.1)
     assert directions @ directions.T == pytest.approx(np.eye(2))
 
@@ -126,9 +126,9 @@ def test_functionals_are_smooth() -> None:
 
 
 def test_options() -> None:
-    assert parse(["gradcheck"]) == GradcheckConfig()
+    assert parse(["gradcheck"], BENCHMARKS) == GradcheckConfig()
     words = ["gradcheck", "--limit", "2", "--min-cosine", "0.999", "--max-error", "0.01", "--directions", "5"]
-    assert parse(words) == GradcheckConfig(limit=2, min_cosine=0.999, max_error=0.01, directions=5)
+    assert parse(words, BENCHMARKS) == GradcheckConfig(limit=2, min_cosine=0.999, max_error=0.01, directions=5)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scene_ir.errors import ShapeError
-from tools.bench.pictures import EXACT_DB, Strip, psnr, sheet
+from tools.bench.pictures import EXACT_DB, SheetStrip, psnr, sheet
 
 
 def _noise(seed: int = 0, height: int = 60, width: int = 90) -> np.ndarray:
@@ -39,7 +39,8 @@ def test_a_sheet_shows_four_panels_a_strip() -> None:
     region = np.zeros((60, 90), bool)
     region[20:40, 20:60] = True
     drawn = sheet(
-        [Strip(photograph, ours, truth, region, "one"), Strip(photograph, ours, truth, region, "two")], 400
+        [SheetStrip(photograph, ours, truth, region, "one"), SheetStrip(photograph, ours, truth, region, "two")],
+        400,
     )
     assert drawn.dtype == np.uint8
     assert drawn.shape[1:] == (400, 3)
@@ -52,5 +53,5 @@ def test_a_sheet_shows_four_panels_a_strip() -> None:
 def test_a_region_at_the_border_stays_inside() -> None:
     region = np.zeros((60, 90), bool)
     region[0, 0] = region[59, 89] = True
-    drawn = sheet([Strip(_noise(), _noise(1), _noise(2), region, "all")], 360)
+    drawn = sheet([SheetStrip(_noise(), _noise(1), _noise(2), region, "all")], 360)
     assert drawn.shape == (18 + 60, 360, 3)

@@ -26,10 +26,14 @@ from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
-from tools.bench.planted.naming import looked_around
-from tools.bench.planted.pool import FramePool, hidden, sharpness
-from tools.bench.planted.remembering import Remembering
-from tools.bench.planted.yardstick import attack_settings, certain_of, methods_of, seen_without
+from tools.bench.planted.pool import CachingDetector, FramePool, hidden, sharpness
+from tools.bench.planted.yardstick import (
+    attack_settings,
+    certain_losses,
+    chosen_methods,
+    detected_without_fault,
+    sample_neighbourhood,
+)
 from tools.bench.settings import DetectorBenchConfig
 
 KINDS = tuple(
@@ -57,7 +61,7 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Planted:
+class SharedFault:
     """A fault of a detector."""
 
     fault: PlantedFault
@@ -73,7 +77,7 @@ class Planted:
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
+class NeighbourhoodSamples:
     """Samples around a failure of one object."""
 
     index: int
@@ -81,7 +85,7 @@ class Looked:
 
 
 @dataclass(frozen=True, slots=True)
-class AcrossAttempt:
+class SharedFaultSearch:
     """A search in one frame."""
 
     frame: str
@@ -94,21 +98,23 @@ class AcrossAttempt:
     """Of these, those that the detector without the fault sees in the same picture."""
     passes: int
     """Of the search."""
-    looked: tuple[Looked, ...]
+    looked: tuple[NeighbourhoodSamples, ...]
     """Around each of the certain ones."""
 
 
 @dataclass(frozen=True, slots=True)
-class AcrossFrame:
+class SharedFaultFrame:
     """What was found in one frame."""
 
     frame: str
     asked: str
-    """See `Across`."""
-    attempts: tuple[AcrossAttempt, ...]
+    """See `SharedFaultBench`."""
+    attempts: tuple[SharedFaultSearch, ...]
 
 
-def plant_across(pools: Sequence[FramePool], names: Sequence[str], seed: int, nth: int = 0) -> Planted | None:
+def plant_shared_fault(
+    pools: Sequence[FramePool], names: Sequence[str], seed: int, nth: int = 0
+) -> SharedFault | None:
     """The n-th fault of such features; None where none could be drawn. Equal arguments, equal faults."""
     rows = [FEATURES.index(name) for name in names]
     values, still, cars, frames = _reached(pools, rows)
@@ -169,7 +175,7 @@ def _inside(values: np.ndarray, bands: np.ndarray) -> np.ndarray:
     return np.all((values >= bands[:, 0]) & (values <= bands[:, 1]), axis=1)
 
 
-def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> Planted | None:
+def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> SharedFault | None:
     """The fault and how often it hides what; None where that is too much or too little."""
     pictures = hit = count = lost = found = still = 0
     cars: set[tuple[str, int]] = set()
@@ -191,11 +197,11 @@ def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> Planted | None
         return None
     if len(cars) < CARS or len({frame for frame, _ in cars}) < FRAMES:
         return None
-    return Planted(fault, hit / pictures, lost / count, still / found, sharpness(pools, fault))
+    return SharedFault(fault, hit / pictures, lost / count, still / found, sharpness(pools, fault))
 
 
 @dataclass(frozen=True)
-class Across:
+class SharedFaultBench:
     """What one process needs."""
 
     config: DetectorBenchConfig
@@ -207,9 +213,9 @@ class Across:
     """In words."""
 
     @classmethod
-    def of(cls, config: DetectorBenchConfig, faults: tuple[str, ...] = ()) -> Across:
+    def of(cls, config: DetectorBenchConfig, faults: tuple[str, ...] = ()) -> SharedFaultBench:
         """Raises UsageError or SceneError for settings that cannot be."""
-        methods = methods_of(config)
+        methods = chosen_methods(config)
         parse_params(config.params)
         parse_budget(config.budget)
         try:
@@ -245,7 +251,7 @@ class Across:
             return load_record(path, FramePool, SCHEMA)
         scene = self._scene(name)
         space = ParameterSpace(scene, parse_params(self.config.params), parse_budget(self.config.budget))
-        objective = Objective(Compositor(scene), space, Remembering(self.detector))
+        objective = Objective(Compositor(scene), space, CachingDetector(self.detector))
         pool = FramePool.make(objective, name, self.config.seed, self.states)
         if path is not None:
             with files.atomic_folder(path.parent) as part:
@@ -253,23 +259,23 @@ class Across:
                 files.write_text(part / "asked", asked)
         return pool
 
-    def judge(self, numbered: tuple[int, str]) -> AcrossFrame:
+    def judge(self, numbered: tuple[int, str]) -> SharedFaultFrame:
         """Searches of a frame, by its number and name, for the faults whose turn it is."""
         number, name = numbered
         chosen = self.turn(number)
         asked = self._asked(("params", "budget", "detector", "methods", "passes")) + repr(chosen)
         path = None if self.kept is None else self.kept / "frames" / f"{name}.json"
         if path is not None and self.config.resume and path.is_file():
-            known = load_record(path, AcrossFrame, SCHEMA)
+            known = load_record(path, SharedFaultFrame, SCHEMA)
             if known.asked == asked:
                 return known
-        scene, shared_detector = self._scene(name), Remembering(self.detector)
+        scene, shared_detector = self._scene(name), CachingDetector(self.detector)
         attempts = tuple(
             self._attempt(name, scene, fault, method, shared_detector)
             for fault in chosen
             for method in self.workers
         )
-        judged = AcrossFrame(name, asked, attempts)
+        judged = SharedFaultFrame(name, asked, attempts)
         if path is not None:
             files.write_text(path, dump_record(judged, SCHEMA))
         return judged
@@ -280,19 +286,22 @@ class Across:
         count = min(self.config.faults or len(every), len(every))
         return [every[(number * count + k) % len(every)] for k in range(count)]
 
-    def _attempt(self, name: str, scene: SceneIR, fault: str, method: str, inner: Remembering) -> AcrossAttempt:
+    def _attempt(
+        self, name: str, scene: SceneIR, fault: str, method: str, inner: CachingDetector
+    ) -> SharedFaultSearch:
         worker = self.workers[method]
         detector = PlantedDetector(inner, PlantedFault.parse(fault)).requires_grad_(False) if fault else inner
         attacked = replace(worker, detector=detector, grader=build_grader(worker.config, detector)).attack_scene(
             name, scene
         )
-        certain = certain_of(attacked)
-        seen = seen_without(self.detector, attacked) if certain else ()
+        certain = certain_losses(attacked)
+        seen = detected_without_fault(self.detector, attacked) if certain else ()
         looked = tuple(
-            Looked(index, looked_around(attacked, index, SAMPLES, self.config.seed)) for index in certain
+            NeighbourhoodSamples(index, sample_neighbourhood(attacked, index, SAMPLES, self.config.seed))
+            for index in certain
         )
         found = sum(index in seen for index in certain)
-        return AcrossAttempt(name, fault, method, len(certain), found, attacked.passes, looked)
+        return SharedFaultSearch(name, fault, method, len(certain), found, attacked.passes, looked)
 
     def _scene(self, name: str) -> SceneIR:
         scene = self.source.scene(name)
@@ -305,11 +314,13 @@ class Across:
         return repr(sorted((key, str(value)) for key, value in settings.items() if key != "limit"))
 
 
-def pool_of(config: DetectorBenchConfig) -> Callable[[str], FramePool]:
+def build_pool_worker(config: DetectorBenchConfig) -> Callable[[str], FramePool]:
     """`Across.pool` of another process."""
-    return Across.of(config).pool
+    return SharedFaultBench.of(config).pool
 
 
-def judge_of(config: DetectorBenchConfig, faults: tuple[str, ...]) -> Callable[[tuple[int, str]], AcrossFrame]:
+def judge_of(
+    config: DetectorBenchConfig, faults: tuple[str, ...]
+) -> Callable[[tuple[int, str]], SharedFaultFrame]:
     """`Across.judge` of another process."""
-    return Across.of(config, faults).judge
+    return SharedFaultBench.of(config, faults).judge

@@ -21,7 +21,7 @@ HITS: dict[Rarity, tuple[float, float]] = {"easy": (0.1, 0.4), "rare": (0.0, 0.0
 """Shares of Halton's draws that hit a fault: of easy ones from a tenth on, of rare ones at most one in fifty."""
 _TRIALS = 4000
 """Bands that are drawn for a fault."""
-_LOOKED_AT = 200
+_MAX_CHECKED = 200
 """Of these, so many of the most promising are looked at closely."""
 _DIGITS = 4
 
@@ -51,7 +51,7 @@ KINDS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Planting:
+class FaultPlacement:
     """A fault of a kind in a frame."""
 
     kind: FaultKind
@@ -62,7 +62,7 @@ class Planting:
     """In which one is so far inside that what a camera does between two pictures would not take it out."""
 
 
-def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> Planting | None:
+def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> FaultPlacement | None:
     """A fault for this frame; None where theta brings no car into such bands. Equal arguments, equal faults."""
     if not bool(survey.sure.any()):
         return None
@@ -90,7 +90,7 @@ def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> Planting | None:
         surely = int(np.any(_within(reached, bands, -mostly)[:, aims], axis=1).sum())
         if surely:
             promising.append((-surely, trial, bands))
-    for _, _, bands in sorted(promising, key=lambda one: one[:2])[:_LOOKED_AT]:
+    for _, _, bands in sorted(promising, key=lambda one: one[:2])[:_MAX_CHECKED]:
         named = zip(kind.features, bands.tolist(), strict=True)
         fault = PlantedFault(tuple(Band(name, low, high) for name, (low, high) in named))
         hit = survey.rarity(fault)
@@ -98,7 +98,7 @@ def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> Planting | None:
         reachable = any(bool(s.lost(fault)[aims].any()) for s in (*survey.halton, *survey.corners))
         if clear and reachable and least <= hit <= most:
             sure = float(np.any(_within(reached[:drawn], bands, -mostly)[:, aims], axis=1).mean())
-            return Planting(kind, fault, hit, sure)
+            return FaultPlacement(kind, fault, hit, sure)
     return None
 
 

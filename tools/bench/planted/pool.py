@@ -6,13 +6,17 @@ are made once, and serve for where faults are planted, for how often chance hits
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from detectors import boxes
-from detectors.base import lower_probability
+from detectors.base import Detector, DetectorWrapper, lower_probability
 from detectors.planted import BLIND_TO, FEATURES, Band, PlantedFault, compute_features, group_cars
 from detectors.types import CLASSES
 from drivesem.attack.objective import Objective
@@ -20,13 +24,13 @@ from drivesem.evaluation.failures import MATCH_IOU
 from drivesem.failures.neighbourhood import ObjectSample, SceneSampler
 from drivesem.failures.nuisances import Nuisances
 
-LOOKS = 4
+CAMERA_DRAWS = 4
 """Draws of the camera before any change."""
 SCHEMA = 1
 
 
 @dataclass(frozen=True, slots=True)
-class SeenCar:
+class CarObservation:
     """One car in one picture."""
 
     index: int
@@ -52,7 +56,7 @@ class SeenCar:
         return hidden([self], fault, t_star)[0]
 
 
-def hidden(cars: Sequence[SeenCar], fault: PlantedFault, t_star: float) -> list[bool]:
+def hidden(cars: Sequence[CarObservation], fault: PlantedFault, t_star: float) -> list[bool]:
     """Which cars a fault hides, see `SeenCar.hidden`."""
     counts = [len(car.told) if car.margin > 0 else 0 for car in cars]
     rows = [row for car, count in zip(cars, counts, strict=True) if count for row in car.told]
@@ -72,9 +76,9 @@ class FramePool:
     t_star: float
     """Of the detector."""
     names: tuple[str, ...]
-    looks: tuple[tuple[SeenCar, ...], ...]
-    """Its cars as photographed, in `LOOKS` draws of the camera."""
-    states: tuple[tuple[SeenCar, ...], ...]
+    looks: tuple[tuple[CarObservation, ...], ...]
+    """Its cars as photographed, in `CAMERA_DRAWS` draws of the camera."""
+    states: tuple[tuple[CarObservation, ...], ...]
     """At Halton's draws over all of the bounds."""
 
     @classmethod
@@ -86,14 +90,14 @@ class FramePool:
         cars = objective.benign.paper.category == CLASSES.index(BLIND_TO)
         still = objective.space.theta0
         # Numbers of looks lie beyond those of states: no draw of the camera is seen twice.
-        looked = [everywhere.sample_at(still, states + number) for number in range(LOOKS)]
+        looked = [everywhere.sample_at(still, states + number) for number in range(CAMERA_DRAWS)]
         drawn = [everywhere.sample(number) for number in range(states)]
         seen = []
         for samples in (*looked, *drawn):
             of_cars = {index: sample for index, sample in samples.items() if bool(cars[index])}
             seen.append(_seen(objective, of_cars, everywhere.margins(of_cars)))
         names = next((tuple(sample.features) for samples in (*looked, *drawn) for sample in samples.values()), ())
-        return cls(name, objective.t_star, names, tuple(seen[:LOOKS]), tuple(seen[LOOKS:]))
+        return cls(name, objective.t_star, names, tuple(seen[:CAMERA_DRAWS]), tuple(seen[CAMERA_DRAWS:]))
 
     def hidden_as_photographed(self, fault: PlantedFault) -> set[int]:
         """Cars that the fault hides in any look before a change."""
@@ -144,7 +148,7 @@ def sharpness(pools: Sequence[FramePool], fault: PlantedFault) -> float:
 @torch.no_grad()
 def _seen(
     objective: Objective, samples: dict[int, ObjectSample], margins: dict[int, float]
-) -> tuple[SeenCar, ...]:
+) -> tuple[CarObservation, ...]:
     if not samples:
         return ()
     exposure = next(iter(samples.values())).image
@@ -163,5 +167,32 @@ def _seen(
             best = float(scores[cars.rows][meets & (cars.car == car)].max())
             groups.append(tuple(round(value, 6) for value in (best, *values[car].tolist())))
         described = tuple(round(value, 6) for value in sample.features.values())
-        found.append(SeenCar(index, described, round(margins[index], 6), tuple(groups)))
+        found.append(CarObservation(index, described, round(margins[index], 6), tuple(groups)))
     return tuple(found)
+
+
+_MOST = 96
+"""Pictures whose predictions are kept, half a megabyte each: those that searches of one frame share."""
+
+
+class CachingDetector(DetectorWrapper):
+    """`inner`, which is asked once for each picture without a gradient. asked: how often it was."""
+
+    def __init__(self, inner: Detector) -> None:
+        super().__init__(inner)
+        self.asked = 0
+        self._known: OrderedDict[bytes, Any] = OrderedDict()
+
+    def forward(self, images: Tensor) -> Any:
+        """Inner's, of images (B, 3, H, W)."""
+        if images.requires_grad or len(images) != 1:
+            self.asked += len(images)
+            return self.inner(images)
+        key = hashlib.blake2b(images.detach().cpu().contiguous().numpy().tobytes(), digest_size=16).digest()
+        if key not in self._known:
+            self.asked += 1
+            self._known[key] = self.inner(images)
+            if len(self._known) > _MOST:
+                self._known.popitem(last=False)
+        self._known.move_to_end(key)
+        return self._known[key]

@@ -10,7 +10,7 @@ import numpy as np
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import DRAWS, bootstrap_intervals, ratio_metric
 from drivesem.failures.rules import format_rule
-from tools.bench.planted.yardstick import NO_FAULT, JudgedFrame
+from tools.bench.planted.yardstick import NO_FAULT, FrameSearches
 
 METHOD = (
     "Each fault is planted into the detector for one frame: as photographed no car is inside of it, and theta "
@@ -43,7 +43,7 @@ COLUMNS: Columns = {
 KINDS_TITLE = "planted faults, by kind"
 
 
-def rows_of(judged: Sequence[JudgedFrame], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
+def method_rows(judged: Sequence[FrameSearches], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
     """A row for each rarity and method that was asked; None where nothing was planted."""
     attempts = [attempt for frame in judged for attempt in frame.attempts]
     asked = {(attempt.rarity, attempt.method) for attempt in attempts}
@@ -52,7 +52,7 @@ def rows_of(judged: Sequence[JudgedFrame], methods: Sequence[str], seed: int) ->
     return [_row(judged, method, rarity, seed) for method, rarity in pairs]
 
 
-def kind_rows(judged: Sequence[JudgedFrame], methods: Sequence[str]) -> list[dict[str, Any]]:
+def kind_rows(judged: Sequence[FrameSearches], methods: Sequence[str]) -> list[dict[str, Any]]:
     """A row for each kind: in how many frames it could be planted, how often chance hits it, and how many of the
     planted ones each method found.
     """
@@ -88,7 +88,7 @@ def kind_columns(methods: Sequence[str]) -> Columns:
     }
 
 
-def _row(judged: Sequence[JudgedFrame], method: str, rarity: str, seed: int) -> dict[str, Any]:
+def _row(judged: Sequence[FrameSearches], method: str, rarity: str, seed: int) -> dict[str, Any]:
     by_frame = [[a for a in frame.attempts if (a.method, a.rarity) == (method, rarity)] for frame in judged]
     own = [attempt for frame in by_frame for attempt in frame]
 

@@ -25,7 +25,7 @@ HALTON = 128
 """Draws of a scrambled Halton sequence over all of the bounds: they say how rare a fault is."""
 CORNERS = 48
 """Corners of the bounds, each parameter at one of them or held: they say what can be reached beside."""
-LOOKS = 8
+CAMERA_DRAWS = 8
 """Draws of the camera before any change: they say how far features differ from one picture to the next."""
 MOSTLY = 0.75
 """Of looks: as many draws must fail after a change for a failure to be certain."""
@@ -34,7 +34,7 @@ _BY_FACTOR = ("height_px", "aspect")
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class FeatureObservation:
     """What a detector without a fault says of the cars in one picture, as faults take it."""
 
     values: Tensor
@@ -51,7 +51,7 @@ class Sighting:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, objective: Objective, image: Tensor, labels_xyxy: Tensor, ignore: Tensor) -> Sighting:
+    def of(cls, objective: Objective, image: Tensor, labels_xyxy: Tensor, ignore: Tensor) -> FeatureObservation:
         """In an image (3, H, W) with labels (N, 4) px and ignore (N,) bool of the scene's objects."""
         detector = objective.differentiable
         label = detector.classes.index(BLIND_TO)
@@ -89,7 +89,7 @@ class Sighting:
         return self.meets.any(1) & ~(self.meets & still).any(1)
 
 
-class SeenFrame:
+class ObservedFrame:
     """A scene's cars at theta, by labels and pictures. judged (N,) bool: its cars that count."""
 
     def __init__(self, objective: Objective) -> None:
@@ -108,18 +108,18 @@ class SeenFrame:
         labels = objective.labeller.moved(scene)
         return compute_features(image[None], labels.boxes_xyxy.to(image)[None], names)[:, 0]
 
-    def sighting(self, theta: Tensor) -> Sighting:
+    def sighting(self, theta: Tensor) -> FeatureObservation:
         """What the detector sees at a feasible theta (D,)."""
         scene = self.objective.space.apply(self.objective.space.scene, theta)
         return self._sighting(scene)
 
-    def looks(self, name: str, seed: int) -> Iterator[Sighting]:
-        """What it sees in `LOOKS` draws of the scene before any change."""
+    def looks(self, name: str, seed: int) -> Iterator[FeatureObservation]:
+        """What it sees in `CAMERA_DRAWS` draws of the scene before any change."""
         scene = self.objective.space.scene
-        for number in range(LOOKS):
+        for number in range(CAMERA_DRAWS):
             yield self._sighting(scene, f"planted:{name}:{seed}", number)
 
-    def _sighting(self, scene: SceneIR, stream: str | None = None, number: int = 0) -> Sighting:
+    def _sighting(self, scene: SceneIR, stream: str | None = None, number: int = 0) -> FeatureObservation:
         renderer = CompositorRenderer(self.objective.compositor, self.objective.labeller)
         if stream is None:
             drawn = renderer.render(scene)
@@ -129,17 +129,19 @@ class SeenFrame:
             drawn = renderer.render(draw.perturb_scene(scene))
             image, at = draw.degrade_image(drawn.image), draw.transform_boxes(drawn.targets.boxes_xyxy)
         count = len(self.judged)
-        return Sighting.of(self.objective, image, at[:count], drawn.targets.ignore[:count] | ~self.judged)
+        return FeatureObservation.of(
+            self.objective, image, at[:count], drawn.targets.ignore[:count] | ~self.judged
+        )
 
 
 @dataclass(frozen=True)
 class FrameSurvey:
     """Sightings of a frame: in draws of the camera before any change, at Halton's draws, and at corners."""
 
-    frame: SeenFrame
-    looks: tuple[Sighting, ...]
-    halton: tuple[Sighting, ...]
-    corners: tuple[Sighting, ...]
+    frame: ObservedFrame
+    looks: tuple[FeatureObservation, ...]
+    halton: tuple[FeatureObservation, ...]
+    corners: tuple[FeatureObservation, ...]
     benign: Tensor
     """Features as photographed, by the detector's boxes, (F, N)."""
     farthest: Tensor
@@ -159,7 +161,7 @@ class FrameSurvey:
         """Of one frame; the same arguments give the same survey. name: the frame's. Raises RangeError where the
         detector has no gradient, DetectorError where it does not tell its candidates.
         """
-        frame = SeenFrame(objective)
+        frame = ObservedFrame(objective)
         looks = tuple(frame.looks(name, seed))
         photographed = frame.sighting(objective.space.theta0)
         labelled, benign = photographed.labelled, photographed.main

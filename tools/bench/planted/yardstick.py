@@ -11,8 +11,10 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 
 from detectors.base import Detector, DetectorError, predict
-from detectors.planted import PlantedDetector
+from detectors.planted import Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
+from drivesem.analysis.holes.rules import FeatureSamples
+from drivesem.analysis.holes.run import draw_samples_around
 from drivesem.attack.budgets import parse_budget
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
@@ -21,14 +23,15 @@ from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions, shared_options
 from drivesem.evaluation import failures
 from drivesem.failures.grades import Grade
-from drivesem.failures.rules import format_rule
+from drivesem.failures.neighbourhood import Neighbourhood
+from drivesem.failures.nuisances import Nuisances
+from drivesem.failures.rules import fit_rule, format_rule, overlap
 from drivesem.run.attack import AttackWorker, build_grader
 from drivesem.run.frame import AttackedScene
 from drivesem.scenes.sources import NoVehicleError
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
-from tools.bench.planted.naming import agrees, told_of
-from tools.bench.planted.plant import KINDS, FaultKind, Planting, plant
+from tools.bench.planted.plant import KINDS, FaultKind, FaultPlacement, plant
 from tools.bench.planted.survey import FrameSurvey
 from tools.bench.settings import DetectorBenchConfig
 
@@ -42,7 +45,7 @@ QUICK_KINDS = (KINDS[2], KINDS[-2])
 
 
 @dataclass(frozen=True, slots=True)
-class Attempt:
+class FaultSearch:
     """One method on one fault of one frame."""
 
     frame: str
@@ -50,9 +53,9 @@ class Attempt:
     rarity: str
     fault: str
     hit: float
-    """As of `Planting`."""
+    """As of `FaultPlacement`."""
     sure: float
-    """As of `Planting`."""
+    """As of `FaultPlacement`."""
     method: str
     certain: int
     """Cars lost for certain."""
@@ -75,11 +78,11 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class JudgedFrame:
+class FrameSearches:
     """A frame."""
 
     frame: str
-    attempts: tuple[Attempt, ...]
+    attempts: tuple[FaultSearch, ...]
     """On all faults that could be planted."""
     unplanted: tuple[str, ...]
     """Kinds of the others."""
@@ -88,18 +91,18 @@ class JudgedFrame:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, data: Mapping[str, Any]) -> JudgedFrame:
-        return cls(data["frame"], tuple(Attempt(**row) for row in data["attempts"]), tuple(data["unplanted"]))
+    def of_json(cls, data: Mapping[str, Any]) -> FrameSearches:
+        return cls(data["frame"], tuple(FaultSearch(**row) for row in data["attempts"]), tuple(data["unplanted"]))
 
 
-def methods_of(config: DetectorBenchConfig) -> tuple[str, ...]:
+def chosen_methods(config: DetectorBenchConfig) -> tuple[str, ...]:
     """The methods that a command names. Raises UsageError for one that is not known."""
     return _names_among(METHODS, "--methods", config.methods)
 
 
-def naming_of(config: DetectorBenchConfig) -> tuple[str, ...]:
+def rule_methods(config: DetectorBenchConfig) -> tuple[str, ...]:
     """Those of its methods whose failures are to be told by rules. Raises UsageError for another one."""
-    return () if config.naming is None else _names_among(methods_of(config), "--naming", config.naming)
+    return () if config.naming is None else _names_among(chosen_methods(config), "--naming", config.naming)
 
 
 def _names_among(known: Sequence[str], setting: str, text: str) -> tuple[str, ...]:
@@ -128,7 +131,7 @@ def attack_settings(config: DetectorBenchConfig, method: str) -> AttackConfig:
 
 
 @dataclass(frozen=True)
-class Yardstick:
+class PlantedFaultBench:
     """What one process needs."""
 
     config: DetectorBenchConfig
@@ -142,9 +145,9 @@ class Yardstick:
     """Folder of what is done, by frame."""
 
     @classmethod
-    def of(cls, config: DetectorBenchConfig) -> Yardstick:
+    def of(cls, config: DetectorBenchConfig) -> PlantedFaultBench:
         """Raises UsageError or SceneError for settings that cannot be."""
-        methods = methods_of(config)
+        methods = chosen_methods(config)
         parse_params(config.params)
         try:
             detector = load_detector(config.detector, config.device)
@@ -153,9 +156,9 @@ class Yardstick:
         first = AttackWorker.from_config(attack_settings(config, methods[0]), detector)
         workers = {method: first.with_config(attack_settings(config, method)) for method in methods}
         kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
-        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, naming_of(config), kept)
+        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, rule_methods(config), kept)
 
-    def judge(self, name: str) -> JudgedFrame:
+    def judge(self, name: str) -> FrameSearches:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
         asked = {field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)}
         keys = ("methods", "passes", "params", "budget", "detector", "quick", "faults", "naming")
@@ -165,20 +168,20 @@ class Yardstick:
         if path is not None and self.config.resume and path.is_file():
             known = files.read_json(path)
             if known["asked"] == asked:
-                return JudgedFrame.of_json(known["judged"])
+                return FrameSearches.of_json(known["judged"])
         judged = self._judge(name)
         if path is not None:
             files.write_json(path, {"asked": asked, "judged": judged.to_json()})
         return judged
 
-    def _judge(self, name: str) -> JudgedFrame:
+    def _judge(self, name: str) -> FrameSearches:
         scene = next(iter(self.workers.values())).source.scene(name)
         if not len(scene.objects):
             raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
         space = ParameterSpace(scene, parse_params(self.config.params), parse_budget(self.config.budget))
         objective = Objective(Compositor(scene), space, self.detector)
         survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)
-        attempts: list[Attempt] = []
+        attempts: list[FaultSearch] = []
         unplanted: list[str] = []
         planted = 0
         for kind in self._kinds_of(name):
@@ -197,7 +200,7 @@ class Yardstick:
         attempts += [
             self._control(name, method, self.workers[method].attack_scene(name, scene)) for method in self.named
         ]
-        return JudgedFrame(name, tuple(attempts), tuple(unplanted))
+        return FrameSearches(name, tuple(attempts), tuple(unplanted))
 
     def _kinds_of(self, name: str) -> list[FaultKind]:
         """All, or with --faults easy and rare ones in turn, in an order of the frame's own."""
@@ -210,13 +213,13 @@ class Yardstick:
         return [kind for pair in pairs for kind in pair if kind is not None]
 
     def _attempt(
-        self, name: str, method: str, planting: Planting, survey: FrameSurvey, attacked: AttackedScene
-    ) -> Attempt:
-        certain = certain_of(attacked)
-        seen = seen_without(self.detector, attacked) if certain else ()
+        self, name: str, method: str, planting: FaultPlacement, survey: FrameSurvey, attacked: AttackedScene
+    ) -> FaultSearch:
+        certain = certain_losses(attacked)
+        seen = detected_without_fault(self.detector, attacked) if certain else ()
         found = [index for index in certain if index in seen]
         inside = survey.inside(planting.fault, attacked.search.theta) if found else None
-        attempt = Attempt(
+        attempt = FaultSearch(
             frame=name,
             kind=planting.kind.text,
             rarity=planting.kind.rarity,
@@ -232,17 +235,17 @@ class Yardstick:
         )
         if not found or method not in self.named:
             return attempt
-        where, passes = told_of(attacked, found[0], HolesConfig.samples, self.config.seed)
-        whole, in_part = agrees(where, planting.fault, survey.bands_by_label(planting.fault))
+        where, passes = fit_fault_rule(attacked, found[0], HolesConfig.samples, self.config.seed)
+        whole, in_part = rule_names_fault(where, planting.fault, survey.bands_by_label(planting.fault))
         return replace(attempt, rule=format_rule(where), named=whole, in_part=in_part, naming=passes)
 
-    def _control(self, name: str, method: str, attacked: AttackedScene) -> Attempt:
+    def _control(self, name: str, method: str, attacked: AttackedScene) -> FaultSearch:
         """The same without a fault: what is named then is not planted."""
-        certain = certain_of(attacked)
+        certain = certain_losses(attacked)
         where, passes = (
-            told_of(attacked, certain[0], HolesConfig.samples, self.config.seed) if certain else (None, 0)
+            fit_fault_rule(attacked, certain[0], HolesConfig.samples, self.config.seed) if certain else (None, 0)
         )
-        return Attempt(
+        return FaultSearch(
             frame=name,
             kind=NO_FAULT,
             rarity=NO_FAULT,
@@ -260,17 +263,17 @@ class Yardstick:
         )
 
 
-def judge_of(config: DetectorBenchConfig) -> Callable[[str], JudgedFrame]:
+def judge_of(config: DetectorBenchConfig) -> Callable[[str], FrameSearches]:
     """`Yardstick.judge` of another process."""
-    return Yardstick.of(config).judge
+    return PlantedFaultBench.of(config).judge
 
 
-def certain_of(attacked: AttackedScene) -> list[int]:
+def certain_losses(attacked: AttackedScene) -> list[int]:
     """Objects that are lost for certain."""
     return [f.index for f in attacked.failures if f.index is not None and f.grade in SURE]
 
 
-def seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:
+def detected_without_fault(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]:
     """Objects that a detector finds in an attacked scene's picture."""
     objective, rendered = attacked.objective, attacked.rendered
     detections = objective.classes.map_detections(predict(detector, rendered.render.image[None])[0])
@@ -278,3 +281,32 @@ def seen_without(detector: Detector, attacked: AttackedScene) -> tuple[int, ...]
         objective.classes.map_targets(rendered.moved.targets), detections, objective.t_star
     )
     return tuple(judgement.detected.nonzero()[:, 0].tolist())
+
+
+ENOUGH = 0.5
+"""Overlap of bands, their intersection by their hull, from which a band is the right one."""
+
+Where = Mapping[str, tuple[float, float]]
+
+
+def fit_fault_rule(attacked: AttackedScene, index: int, samples: int, seed: int) -> tuple[Where, int]:
+    """A rule from so many samples around the failure of one object, and the passes that they took."""
+    around = sample_neighbourhood(attacked, index, samples, seed)
+    return fit_rule(around.columns(), around.failing).intervals if around.margins else {}, len(around.margins)
+
+
+def sample_neighbourhood(attacked: AttackedScene, index: int, samples: int, seed: int) -> FeatureSamples:
+    """So many samples around the failure of one object, half of them close to it. Each costs a pass."""
+    objective, nuisances = attacked.objective, Nuisances()
+    name = f"{attacked.identifier}:{index}:{seed}"
+    near = Neighbourhood(objective, objective.feasible_set(), attacked.search.theta, index, nuisances, name)
+    return draw_samples_around(near, samples)
+
+
+def rule_names_fault(where: Where, fault: PlantedFault, bands: Sequence[Band]) -> tuple[bool, bool]:
+    """Whether a rule names a fault: wholly, in part. bands: where it hides cars, by features of their labels;
+    without any nothing is right.
+    """
+    true = {band.feature: (band.low, band.high) for band in bands}
+    right = [name for name in where if name in true and overlap({name: where[name]}, {name: true[name]}) >= ENOUGH]
+    return bool(right) and set(right) == set(where) == set(fault.feature_names), bool(right)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.bench.reach.slopes import STEPS, Slopes
+from tools.bench.reach.slopes import STEPS, ProbeSlopes
 
 Array = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ _RESAMPLES = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class SlopeAgreement:
     """How well one list of slopes tells another."""
 
     cosine: float
@@ -45,16 +45,16 @@ class ReachRow:
     """How many there are."""
     slopes: int
     """How many there are."""
-    point: Told
+    point: SlopeAgreement
     """What gradients tell of the slopes over that width."""
-    smoothed: Told
+    smoothed: SlopeAgreement
     """What gradients tell of the slopes over that width."""
-    repeated: Told
+    repeated: SlopeAgreement
     """What the slopes of half the draws tell of those of the other half, which no gradient can be better than by
     much."""
 
 
-def rows_of(frames: Sequence[Sequence[Slopes]], seed: int) -> tuple[ReachRow, ...]:
+def reach_rows(frames: Sequence[Sequence[ProbeSlopes]], seed: int) -> tuple[ReachRow, ...]:
     """Of all objects and then of each band of distances that has some; rows in the order of their appearance."""
     names = tuple(dict.fromkeys(one.row for found in frames for one in found))
     bands = [(ALL, 0.0, np.inf), *((_words(low, high), low, high) for low, high in BANDS)]
@@ -73,7 +73,7 @@ def rows_of(frames: Sequence[Sequence[Slopes]], seed: int) -> tuple[ReachRow, ..
     return tuple(rows)
 
 
-def told(slopes: Array, by: Array, owner: NDArray[np.int64], seed: int) -> Told:
+def compare_slopes(slopes: Array, by: Array, owner: NDArray[np.int64], seed: int) -> SlopeAgreement:
     """What `by` (S,) says of slopes (S,). owner (S,): the object of each."""
     count = int(owner.max()) + 1
     sums = np.stack([np.bincount(owner, part, count) for part in (slopes * by, slopes**2, by**2)])
@@ -84,11 +84,11 @@ def told(slopes: Array, by: Array, owner: NDArray[np.int64], seed: int) -> Told:
         low, high = (float(q) for q in np.quantile(_cosine(sums @ weights.T), (0.025, 0.975)))
     same = float((np.sign(slopes) == np.sign(by)).mean())
     product, _, said = sums.sum(axis=1).tolist()
-    return Told(float(_cosine(sums.sum(axis=1))), low, high, same, product / max(said, 1e-30))
+    return SlopeAgreement(float(_cosine(sums.sum(axis=1))), low, high, same, product / max(said, 1e-30))
 
 
 def _row(
-    name: str, band: str, place: int, steps: int, picked: Sequence[tuple[int, Slopes]], seed: int
+    name: str, band: str, place: int, steps: int, picked: Sequence[tuple[int, ProbeSlopes]], seed: int
 ) -> ReachRow | None:
     owners: dict[tuple[int, int], int] = {}
     columns: list[tuple[float, ...]] = []
@@ -112,9 +112,9 @@ def _row(
         steps=steps,
         objects=len(owners),
         slopes=len(wide),
-        point=told(wide, point, index, seed),
-        smoothed=told(wide, smoothed, index, seed),
-        repeated=told(even, odd, index, seed),
+        point=compare_slopes(wide, point, index, seed),
+        smoothed=compare_slopes(wide, smoothed, index, seed),
+        repeated=compare_slopes(even, odd, index, seed),
     )
 
 

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from detectors.base import Detector, DetectorError
+from detectors.registry import load_detector
+from drivesem.attack.objective import Objective
+from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
+from drivesem.config.errors import UsageError
+from drivesem.config.options import SceneOptions
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
+from drivesem.failures.nuisances import Nuisances
 from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE
 from drivesem.report.tables import AnalysisReport, ReportTable
+from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
 from scene_ir import files
-from tools.bench.reach.agreement import ALL, ReachRow, Told
-from tools.bench.reach.slopes import STEPS
+from scene_ir.render.compositor import Compositor
+from tools.bench.reach.agreement import ALL, ReachRow, SlopeAgreement
+from tools.bench.reach.slopes import STEPS, ProbeSlopes, measure, probes
+from tools.bench.settings import GradcheckConfig
 
 NAME = "reach"
 _KINDS = ("point", "smoothed", "repeated")
@@ -39,7 +52,7 @@ _NOTES = (
 )
 
 
-def answer_of(
+def build_reach_report(
     out: Path, rows: Sequence[ReachRow], facts: Mapping[str, Any], failed: Mapping[str, str]
 ) -> AnalysisReport:
     """What is said of all frames. facts: what stands before the rows in the JSON."""
@@ -75,7 +88,7 @@ def write_reach(path: Path, rows: Sequence[ReachRow]) -> None:
         for panel, name in zip(panels, names, strict=False):
             own = [row for row in rows if row.row == name]
             for kind, colour, style in series:
-                values: list[Told] = [getattr(row, kind) for row in own]
+                values: list[SlopeAgreement] = [getattr(row, kind) for row in own]
                 places, cosines = [row.steps for row in own], [one.cosine for one in values]
                 panel.plot(places, cosines, style, color=colour, label=kind)
             panel.axhline(0, color="#888888", linewidth=0.8)
@@ -100,7 +113,7 @@ def _line(row: ReachRow) -> tuple[str, ...]:
     return (row.row, str(row.objects), str(row.steps), *said, f"{row.repeated.cosine:.2f}")
 
 
-def _cells(one: Told) -> tuple[str, str, str]:
+def _cells(one: SlopeAgreement) -> tuple[str, str, str]:
     bounds = "" if one.low is None or one.high is None else f" [{one.low:.2f}, {one.high:.2f}]"
     return (f"{one.cosine:.2f}{bounds}", f"{100 * one.signs:.0f}", f"{one.kept:.2f}")
 
@@ -126,3 +139,64 @@ def _flat(row: ReachRow) -> dict[str, Any]:
     for kind in _KINDS:
         line |= {f"{kind}_{key}": value for key, value in asdict(getattr(row, kind)).items()}
     return line
+
+
+@dataclass(frozen=True)
+class ReachWorker:
+    """What one process needs."""
+
+    config: GradcheckConfig
+    source: SceneSource
+    detector: Detector
+    kept: Path | None
+    """Folder of what is done, by frame; None keeps nothing."""
+
+    @classmethod
+    def of(cls, config: GradcheckConfig) -> ReachWorker:
+        """Raises UsageError or SceneError for settings that cannot be."""
+        source = open_source(config)
+        try:
+            detector = load_detector(config.detector, config.device)
+        except DetectorError as error:
+            raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
+        if type(detector).candidates is Detector.candidates:
+            raise UsageError("--detector", "one that tells its candidates", detector.name)
+        return cls(config, source, detector, None if config.out is None else Path(config.out) / "frames")
+
+    def measure(self, name: str) -> tuple[ProbeSlopes, ...]:
+        """Of a frame; what another call has done with the same settings is read."""
+        asked: dict[str, Any] = {
+            field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)
+        }
+        asked |= {"detector": self.config.detector, "draws": self.config.draws}
+        asked.pop("limit")
+        path = None if self.kept is None else self.kept / f"{name}.json"
+        if path is not None and self.config.resume and path.is_file():
+            known = files.read_json(path)
+            if known["asked"] == asked:
+                return tuple(_of_json(row) for row in known["slopes"])
+        found = self._measure(name)
+        if path is not None:
+            files.write_json(path, {"asked": asked, "slopes": [asdict(one) for one in found]})
+        return found
+
+    def _measure(self, name: str) -> tuple[ProbeSlopes, ...]:
+        scene = self.source.scene(name)
+        if not len(scene.objects):
+            raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
+        space = ParameterSpace(scene, PAPER_PARAMETERS)
+        objective = Objective(Compositor(scene), space, self.detector)
+        views = NuisanceMarginOracle.for_objective(objective, Nuisances(), f"reach:{name}:{self.config.seed}")
+        generator = torch.Generator().manual_seed(self.config.seed)
+        tried = probes(space, generator)
+        return measure(views, objective.feasible_set(), tried, self.config.draws, generator)
+
+
+def build_reach_worker(config: GradcheckConfig) -> Callable[[str], tuple[ProbeSlopes, ...]]:
+    """`ReachWorker.measure` of another process."""
+    return ReachWorker.of(config).measure
+
+
+def _of_json(row: dict[str, Any]) -> ProbeSlopes:
+    drawn: dict[str, Any] = {key: tuple(map(tuple, row[key])) for key in ("point", "smoothed", "wide")}
+    return ProbeSlopes(**(row | drawn))

@@ -30,7 +30,7 @@ _LEAST_MOVE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
+class SlopeProbe:
     """Directions of theta that are tried at once."""
 
     row: str
@@ -42,7 +42,7 @@ class Probe:
 
 
 @dataclass(frozen=True, slots=True)
-class Slopes:
+class ProbeSlopes:
     """What is known of one object and one direction, in logits of the margin a step: for each of STEPS, a value
     for each draw; None where an object does not count on one of the sides, or cannot go there.
     """
@@ -60,14 +60,18 @@ class Slopes:
     """By differences."""
 
 
-def probes(space: ParameterSpace, generator: torch.Generator) -> tuple[Probe, ...]:
+def probes(space: ParameterSpace, generator: torch.Generator) -> tuple[SlopeProbe, ...]:
     """All directions of a space: its coordinates one by one; of meshes some random ones and the low bends."""
     return tuple(probe for parameter in space.params for probe in _of(space, parameter, generator))
 
 
 def measure(
-    views: MarginOracle, feasible: FeasibleSet, tried: tuple[Probe, ...], draws: int, generator: torch.Generator
-) -> tuple[Slopes, ...]:
+    views: MarginOracle,
+    feasible: FeasibleSet,
+    tried: tuple[SlopeProbe, ...],
+    draws: int,
+    generator: torch.Generator,
+) -> tuple[ProbeSlopes, ...]:
     """Of all objects that are found as photographed, around theta0. Costs for each draw 6 passes a probe, and two
     gradients an object. Raises RangeError for a gradient that is not finite.
     """
@@ -82,7 +86,7 @@ def measure(
         places = (space.theta0, feasible.project(space.theta0 + apart).theta)
         gradients.append(torch.stack([_gradients(views, space, place, draw) for place in places]))
     where = space.scene.objects.translation[:, [0, 2]].norm(dim=1).tolist()
-    found: list[Slopes] = []
+    found: list[ProbeSlopes] = []
     for probe in tried:
         seen = torch.stack([_slopes(views, feasible, probe, steps, gradients, generator) for steps in STEPS])
         for i in views.counted_objects.nonzero()[:, 0].tolist():
@@ -90,11 +94,11 @@ def measure(
                 tuple(tuple(None if math.isnan(one) else one for one in drawn) for drawn in kind.tolist())
                 for kind in seen[..., i].permute(2, 0, 1)
             )
-            found.append(Slopes(i, where[i], probe.row, probe.name, point, smoothed, wide))
+            found.append(ProbeSlopes(i, where[i], probe.row, probe.name, point, smoothed, wide))
     return tuple(found)
 
 
-def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator) -> Iterator[Probe]:
+def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator) -> Iterator[SlopeProbe]:
     spec, where = SPECS[parameter], space.blocks[parameter]
     size, step = spec.size, getattr(space.steps, parameter.value)
     row = parameter.value
@@ -110,12 +114,12 @@ def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator)
         yield _probe(space, name if parameter is Parameter.TRANSLATE else row, name, where, step * direction)
 
 
-def _probe(space: ParameterSpace, row: str, name: str, where: slice, direction: Tensor) -> Probe:
+def _probe(space: ParameterSpace, row: str, name: str, where: slice, direction: Tensor) -> SlopeProbe:
     """One direction (size,) of a block, for each object that the block holds."""
     count = (where.stop - where.start) // len(direction)
     ways = space.theta0.new_zeros(count, space.dim)
     ways[:, where] = torch.block_diag(*[direction[None].to(ways)] * count)
-    return Probe(row, name, ways)
+    return SlopeProbe(row, name, ways)
 
 
 def _gradients(views: MarginOracle, space: ParameterSpace, theta: Tensor, draw: int) -> Tensor:
@@ -135,7 +139,7 @@ def _gradients(views: MarginOracle, space: ParameterSpace, theta: Tensor, draw: 
 def _slopes(
     views: MarginOracle,
     feasible: FeasibleSet,
-    probe: Probe,
+    probe: SlopeProbe,
     steps: int,
     gradients: list[Tensor],
     generator: torch.Generator,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from detectors.planted import FEATURES, Band, PlantedFault
 from tools.bench.planted import plant as planting
 from tools.bench.planted.plant import HITS, KINDS, FaultKind, plant
-from tools.bench.planted.survey import FrameSurvey, SeenFrame, Sighting
+from tools.bench.planted.survey import FeatureObservation, FrameSurvey, ObservedFrame
 
 SLACK = 0.02
 """How far features differ between draws of the camera."""
@@ -25,11 +25,13 @@ def _few_trials() -> Iterator[None]:
         yield
 
 
-def seen(values: torch.Tensor) -> Sighting:
+def seen(values: torch.Tensor) -> FeatureObservation:
     """Each car by one prediction; values (F, N)."""
     count = values.shape[1]
     scores = torch.full((count,), 0.9)
-    return Sighting(values, torch.arange(count), scores, torch.eye(count, dtype=torch.bool), values - 0.1, 0.5)
+    return FeatureObservation(
+        values, torch.arange(count), scores, torch.eye(count, dtype=torch.bool), values - 0.1, 0.5
+    )
 
 
 def survey(seed: int = 0, cars: int = 3, sure: bool = True, reach: float = 0.3) -> FrameSurvey:
@@ -40,7 +42,7 @@ def survey(seed: int = 0, cars: int = 3, sure: bool = True, reach: float = 0.3) 
     halton = benign + reach * (2 * torch.rand(128, *shape, generator=generator) - 1)
     corners = benign + 1.5 * reach * torch.where(torch.rand(48, *shape, generator=generator) < 0.5, -1.0, 1.0)
     looks = benign + SLACK * (2 * torch.rand(8, *shape, generator=generator) - 1)
-    frame = SeenFrame.__new__(SeenFrame)
+    frame = ObservedFrame.__new__(ObservedFrame)
     frame.judged = torch.ones(cars, dtype=torch.bool)
     return FrameSurvey(
         frame=frame,
@@ -61,7 +63,7 @@ def test_a_sighting_tells_what_a_fault_hides() -> None:
     values = torch.zeros(len(FEATURES), 2)
     values[FEATURES.index("aspect")] = torch.tensor([1.5, 3.0])
     meets = torch.tensor([[True, True], [False, False]])
-    sighting = Sighting(values, torch.tensor([0, 1]), torch.tensor([0.9, 0.8]), meets, values, 0.5)
+    sighting = FeatureObservation(values, torch.tensor([0, 1]), torch.tensor([0.9, 0.8]), meets, values, 0.5)
     assert sighting.single.tolist() == [False, False]
     assert sighting.main[FEATURES.index("aspect"), 0] == 1.5
     assert sighting.main[:, 1].isnan().all()

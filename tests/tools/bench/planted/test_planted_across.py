@@ -8,29 +8,29 @@ import numpy as np
 import pytest
 
 from detectors.planted import PlantedFault
-from drivesem.analysis.holes.results import Samples
+from drivesem.analysis.holes.rules import FeatureSamples
 from tools.bench.planted.across import (
     AS_PHOTOGRAPHED,
     CARS,
     FRAMES,
     HIT,
     KINDS,
-    AcrossAttempt,
-    AcrossFrame,
-    Looked,
-    plant_across,
+    NeighbourhoodSamples,
+    SharedFaultFrame,
+    SharedFaultSearch,
+    plant_shared_fault,
 )
-from tools.bench.planted.across_names import (
+from tools.bench.planted.across_report import (
     ALL,
     CONTRAST,
-    NameRow,
+    FaultRuleRow,
     chance_rows,
     drawn_evidence,
-    rows_of,
+    rule_rows,
     searched_evidence,
     summary_rows,
 )
-from tools.bench.planted.pool import LOOKS, FramePool, SeenCar
+from tools.bench.planted.pool import CAMERA_DRAWS, CarObservation, FramePool
 
 NAMES = ("height_px", "aspect", "across", "lightness", "contrast", "moved_m")
 T_STAR = 0.5
@@ -45,14 +45,14 @@ def world(frames: int, states: int, seed: int = 0) -> list[FramePool]:
     for number in range(frames):
         cars = rng.uniform([25, 1.0, 0.1, 0.2, 0.1], [90, 2.8, 0.9, 0.6, 0.3], (5, 5))
 
-        def seen(index: int, cars: np.ndarray = cars, free: bool = True) -> SeenCar:
+        def seen(index: int, cars: np.ndarray = cars, free: bool = True) -> CarObservation:
             own = cars[index].copy()
             if free:
                 own *= rng.uniform(0.9, 1.1, 5)
                 own[3:] = rng.uniform([0.05, 0.05], [0.9, 0.4])
             told = own * rng.normal(1, 0.02, 5)
             moved = float(rng.random()) if free else 0.0
-            return SeenCar(index, (*own.tolist(), moved), 2.0, ((0.9, *told.tolist()),))
+            return CarObservation(index, (*own.tolist(), moved), 2.0, ((0.9, *told.tolist()),))
 
         looks = tuple(tuple(seen(i, free=False) for i in range(5)) for _ in range(4))
         drawn = tuple(tuple(seen(i) for i in range(5)) for _ in range(states))
@@ -69,11 +69,11 @@ def pools() -> list[FramePool]:
 def test_faults_hide_few_cars_as_photographed_and_some_others(
     pools: list[FramePool], kind: tuple[str, ...]
 ) -> None:
-    one = plant_across(pools, kind, 0)
+    one = plant_shared_fault(pools, kind, 0)
     assert one is not None
     assert one.fault.feature_names == kind
-    assert one == plant_across(pools, kind, 0)
-    assert one != plant_across(pools, kind, 1)
+    assert one == plant_shared_fault(pools, kind, 0)
+    assert one != plant_shared_fault(pools, kind, 1)
     assert one.still <= AS_PHOTOGRAPHED
     assert HIT[0] <= one.cars <= HIT[1]
     assert one.hit >= one.cars
@@ -90,24 +90,24 @@ def test_faults_hide_few_cars_as_photographed_and_some_others(
 
 
 def test_what_no_car_reaches_is_not_planted() -> None:
-    assert plant_across(world(2, 4), ("height_px",), 0) is None, "too few frames"
-    assert plant_across([], ("height_px",), 0) is None
+    assert plant_shared_fault(world(2, 4), ("height_px",), 0) is None, "too few frames"
+    assert plant_shared_fault([], ("height_px",), 0) is None
 
 
 def test_a_frame_without_cars_changes_nothing(pools: list[FramePool]) -> None:
-    empty = FramePool("empty", T_STAR, (), ((),) * LOOKS, ((),) * 12)
-    with_it, without = (plant_across(all_of, KINDS[0], 0) for all_of in ([*pools, empty], pools))
+    empty = FramePool("empty", T_STAR, (), ((),) * CAMERA_DRAWS, ((),) * 12)
+    with_it, without = (plant_shared_fault(all_of, KINDS[0], 0) for all_of in ([*pools, empty], pools))
     assert with_it is not None
     assert without is not None
     assert (with_it.fault, with_it.sharp) == (without.fault, without.sharp)
-    assert rows_of([with_it], [*pools, empty], [], ())[0].named == rows_of([without], pools, [], ())[0].named
+    assert rule_rows([with_it], [*pools, empty], [], ())[0].named == rule_rows([without], pools, [], ())[0].named
 
 
 def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
     """At least two of three, the third in part: a rule may take a second feature along."""
     kinds = (KINDS[0], KINDS[3], KINDS[8])
-    planted = [one for kind in kinds if (one := plant_across(pools, kind, 0)) is not None]
-    rows = [row for row in rows_of(planted, pools, [], ()) if row.by == ALL]
+    planted = [one for kind in kinds if (one := plant_shared_fault(pools, kind, 0)) is not None]
+    rows = [row for row in rule_rows(planted, pools, [], ()) if row.by == ALL]
     *faults, none = rows
     assert sum(row.named for row in faults) >= 2
     for row, kind in zip(faults, kinds, strict=True):
@@ -119,10 +119,10 @@ def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
 
 def test_searches_bring_their_samples_and_their_passes(pools: list[FramePool]) -> None:
     fault = PlantedFault.parse("height_px=30:40")
-    around = Samples(NAMES, ((35.0, 1.5, 0.5, 0.3, 0.2, 0.1),) * 3, (-1.0, -1.0, 2.0))
-    attempt = AcrossAttempt("003", fault.text, "climb", 1, 1, 24, (Looked(2, around),))
+    around = FeatureSamples(NAMES, ((35.0, 1.5, 0.5, 0.3, 0.2, 0.1),) * 3, (-1.0, -1.0, 2.0))
+    attempt = SharedFaultSearch("003", fault.text, "climb", 1, 1, 24, (NeighbourhoodSamples(2, around),))
     others = [replace(attempt, fault=""), replace(attempt, method="halton")]
-    frames = [AcrossFrame("003", "", (attempt, *others))]
+    frames = [SharedFaultFrame("003", "", (attempt, *others))]
     found = searched_evidence(fault, "climb", pools, frames)
     plain = drawn_evidence(fault, pools, CONTRAST)
     assert len(found.fails) == len(plain.fails) + 3
@@ -148,7 +148,7 @@ def test_chance_has_no_name(pools: list[FramePool]) -> None:
 
 def test_rows_are_summed_by_what_named_them() -> None:
     fault = PlantedFault.parse("height_px=30:40")
-    one = NameRow(fault.text, "climb", 0.2, 0.1, 0.0, 0.5, 9, 4, 300, ("a", "b"), True, True, 1)
+    one = FaultRuleRow(fault.text, "climb", 0.2, 0.1, 0.0, 0.5, 9, 4, 300, ("a", "b"), True, True, 1)
     blunt = replace(one, named=False, rules=(), further=0, passes=100, sharp=0.1)
     planted, sharp, none = summary_rows([one, blunt, replace(one, fault="", sharp=None, further=2)])
     assert (sharp["by"], sharp["faults"], sharp["named"]) == ("climb, sharp faults", 1, 1)

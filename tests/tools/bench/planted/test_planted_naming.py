@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from detectors.planted import Band, PlantedFault
-from tools.bench.planted.naming import agrees
+from tools.bench.planted.yardstick import rule_names_fault
 
 PAIR = PlantedFault.parse("aspect=1:2,lightness=0.2:0.4")
 BANDS = (Band("aspect", 1.1, 1.9), Band("lightness", 0.2, 0.4))
@@ -24,8 +24,8 @@ BANDS = (Band("aspect", 1.1, 1.9), Band("lightness", 0.2, 0.4))
     ],
 )
 def test_a_rule_names_a_fault(where: dict[str, tuple[float, float]], whole: bool, in_part: bool) -> None:
-    assert agrees(where, PAIR, BANDS) == (whole, in_part)
+    assert rule_names_fault(where, PAIR, BANDS) == (whole, in_part)
 
 
 def test_a_fault_that_hides_nothing_is_not_named() -> None:
-    assert agrees({"aspect": (1.0, 2.0)}, PlantedFault.parse("aspect=1:2"), ()) == (False, False)
+    assert rule_names_fault({"aspect": (1.0, 2.0)}, PlantedFault.parse("aspect=1:2"), ()) == (False, False)

@@ -17,28 +17,27 @@ from drivesem.failures.nuisances import Nuisances
 from drivesem.run.records import dump_record, load_record
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
-from tools.bench.planted.pool import SCHEMA, FramePool, SeenCar, bands_by_label
-from tools.bench.planted.remembering import Remembering
+from tools.bench.planted.pool import SCHEMA, CachingDetector, CarObservation, FramePool, bands_by_label
 
 NAMES = ("height_px", "lightness")
 DARK = PlantedFault.parse("lightness=0.1:0.3")
 
 
-def car(lightness: float, score: float = 0.9, index: int = 0, *others: tuple[float, ...]) -> SeenCar:
+def car(lightness: float, score: float = 0.9, index: int = 0, *others: tuple[float, ...]) -> CarObservation:
     """Seen once, at a shade; its label is ten per cent lighter."""
     told = ((score, 40.0, 1.5, 0.5, lightness, 0.2), *others)
-    return SeenCar(index, (41.0, 1.1 * lightness), 1.0, told)
+    return CarObservation(index, (41.0, 1.1 * lightness), 1.0, told)
 
 
 def test_a_car_in_the_band_is_lost() -> None:
     assert car(0.2).lost(DARK, 0.5)
     assert car(0.2).hidden(DARK, 0.5)
     assert not car(0.6).lost(DARK, 0.5)
-    lost = SeenCar(0, (41.0, 0.6), -1.0, car(0.6).told)
+    lost = CarObservation(0, (41.0, 0.6), -1.0, car(0.6).told)
     assert lost.lost(DARK, 0.5)
     assert not lost.hidden(DARK, 0.5), "it was not found before"
     assert car(0.2).best == (40.0, 1.5, 0.5, 0.2, 0.2)
-    assert SeenCar(0, (41.0, 0.6), -1.0, ()).best is None
+    assert CarObservation(0, (41.0, 0.6), -1.0, ()).best is None
 
 
 def test_one_prediction_outside_of_the_band_is_enough() -> None:
@@ -60,7 +59,7 @@ def test_bands_by_label_are_where_cars_are_hidden() -> None:
 @pytest.fixture(scope="module")
 def objective() -> Objective:
     scene = demo_scene(0, 0)
-    detector = Remembering(load_detector("squeezedet"))
+    detector = CachingDetector(load_detector("squeezedet"))
     return Objective(Compositor(scene), ParameterSpace(scene, ("color", "translate")), detector)
 
 
@@ -95,7 +94,7 @@ def test_what_a_fault_hides_is_what_its_detector_does_not_find(objective: Object
 
 def test_a_detector_that_remembers_says_the_same() -> None:
     plain = load_detector("squeezedet")
-    remembering = Remembering(plain)
+    remembering = CachingDetector(plain)
     images = torch.rand(2, 3, 128, 256, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         first, again = (predict(remembering, images[:1])[0] for _ in range(2))

@@ -14,7 +14,7 @@ from drivesem.evaluation import failures
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 from tools.bench.planted import survey as surveying
-from tools.bench.planted.survey import FrameSurvey, SeenFrame, corners, halton
+from tools.bench.planted.survey import FrameSurvey, ObservedFrame, corners, halton
 
 
 @pytest.fixture(scope="module")
@@ -30,16 +30,16 @@ def feasible(objective: Objective) -> FeasibleSet:
 
 
 def test_features_are_those_of_labels_and_picture(objective: Objective) -> None:
-    values = SeenFrame(objective).labelled(objective.space.theta0)
+    values = ObservedFrame(objective).labelled(objective.space.theta0)
     label = objective.benign.paper.boxes_xyxy
     assert values.shape == (len(FEATURES), len(label))
     torch.testing.assert_close(values[0], label[:, 3] - label[:, 1])
-    (lightness,) = SeenFrame(objective).labelled(objective.space.theta0, ("lightness",))
+    (lightness,) = ObservedFrame(objective).labelled(objective.space.theta0, ("lightness",))
     torch.testing.assert_close(lightness, values[FEATURES.index("lightness")])
 
 
 def test_turning_a_car_changes_its_aspect_and_painting_it_its_lightness(objective: Objective) -> None:
-    space, of = objective.space, SeenFrame(objective)
+    space, of = objective.space, ObservedFrame(objective)
     names = [space.name(i) for i in range(space.dim)]
     before, theta = of.labelled(space.theta0), space.theta0.clone()
     theta[names.index("objects[0].paint.lightness")] = 0.8
@@ -86,7 +86,7 @@ def test_a_survey_knows_what_is_inside(
 
 
 def test_what_a_survey_calls_hidden_a_planted_detector_does_not_find(objective: Objective) -> None:
-    frame, space = SeenFrame(objective), objective.space
+    frame, space = ObservedFrame(objective), objective.space
     sighting = frame.sighting(space.theta0)
     aspects = sighting.main[1]
     middle = float(aspects[torch.isfinite(aspects)].median())
@@ -94,8 +94,8 @@ def test_what_a_survey_calls_hidden_a_planted_detector_does_not_find(objective: 
     hidden = sighting.lost(fault)
     assert hidden.any()
     planted = Objective(objective.compositor, space, PlantedDetector(objective.differentiable, fault))
-    targets = planted.judged.targets(planted.benign.paper.targets)
-    found = failures.judge(targets, planted.benign.detections, planted.t_star).found[: len(hidden)]
+    targets = planted.classes.map_targets(planted.benign.paper.targets)
+    found = failures.match_detections(targets, planted.benign.detections, planted.t_star).detected[: len(hidden)]
     assert not found[hidden].any()
     kept = torch.isfinite(aspects) & ~hidden
     assert found[kept].all()

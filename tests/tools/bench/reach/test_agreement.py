@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.bench.reach.agreement import ALL, ReachRow, rows_of, told
-from tools.bench.reach.report import answer_of
-from tools.bench.reach.slopes import STEPS, Slopes
+from tools.bench.reach.agreement import ALL, ReachRow, compare_slopes, reach_rows
+from tools.bench.reach.report import build_reach_report
+from tools.bench.reach.slopes import STEPS, ProbeSlopes
 
-ONE = Slopes(
+ONE = ProbeSlopes(
     0,
     10.0,
     "rotate",
@@ -28,25 +28,25 @@ FAR = replace(
 
 
 def rows() -> dict[tuple[str, int], ReachRow]:
-    return {(row.distance, row.steps): row for row in rows_of([[ONE, FAR]], 0)}
+    return {(row.distance, row.steps): row for row in reach_rows([[ONE, FAR]], 0)}
 
 
 def test_what_one_list_tells_of_another() -> None:
     slopes, by, owner = np.array([1.0, 2.0, -1.0, 0.5]), np.array([2.0, 4.0, 1.0, 1.0]), np.array([0, 0, 1, 2])
-    one = told(slopes, by, owner, 0)
+    one = compare_slopes(slopes, by, owner, 0)
     assert one.cosine == pytest.approx(9.5 / np.sqrt(6.25 * 22))
     assert one.signs == 0.75
     assert one.kept == pytest.approx(9.5 / 22)
     assert one.low is not None
     assert one.high is not None
     assert one.low <= one.cosine <= one.high
-    assert told(slopes, by, np.array([0, 0, 1, 1]), 0).low is None, "two objects have no interval"
+    assert compare_slopes(slopes, by, np.array([0, 0, 1, 1]), 0).low is None, "two objects have no interval"
 
 
 def test_noise_in_slopes_lowers_the_cosine_and_not_what_is_kept() -> None:
     generator = np.random.default_rng(0)
     by = generator.standard_normal(4000)
-    noisy = told(0.5 * by + 2 * generator.standard_normal(4000), by, np.arange(4000), 0)
+    noisy = compare_slopes(0.5 * by + 2 * generator.standard_normal(4000), by, np.arange(4000), 0)
     assert noisy.cosine < 0.3
     assert noisy.kept == pytest.approx(0.5, abs=0.1)
 
@@ -74,7 +74,7 @@ def test_halves_of_the_draws_say_how_much_is_noise() -> None:
 
 
 def test_an_answer_has_tables_and_a_picture(tmp_path: Path) -> None:
-    answer = answer_of(tmp_path, list(rows().values()), {"settings": {}}, {})
+    answer = build_reach_report(tmp_path, list(rows().values()), {"settings": {}}, {})
     answer.write()
     assert len(json.loads((tmp_path / "reach.json").read_text())["rows"]) == len(rows())
     assert (tmp_path / "reach.png").stat().st_size > 5000

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from drivesem.cli import main
 from drivesem.config.parsing import parse
-from tools.bench.reach.frames import ReachWorker
-from tools.bench.reach.slopes import Slopes
+from tools.bench.__main__ import BENCHMARKS, main
+from tools.bench.reach.report import ReachWorker
+from tools.bench.reach.slopes import ProbeSlopes
 from tools.bench.settings import GradcheckConfig
 
 WORDS = ("gradcheck", "--reach", "--draws", "2", "--limit", "2", "--workers", "1")
-SLOPES = Slopes(
+SLOPES = ProbeSlopes(
     0, 10.0, "rotate", "yaw", ((1.0, 3.0),) * 3, ((0.0, 1.0),) * 3, ((2.0, 2.0), (1.0, None), (1.0, 1.0))
 )
 
@@ -26,7 +25,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the frames that are measured, which takes no time."""
     names: list[str] = []
 
-    def measure(_: ReachWorker, name: str) -> tuple[Slopes, ...]:
+    def measure(_: ReachWorker, name: str) -> tuple[ProbeSlopes, ...]:
         names.append(name)
         return (SLOPES, replace(SLOPES, object=1, distance_m=50.0))
 
@@ -35,7 +34,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_options() -> None:
-    assert parse(list(WORDS)) == GradcheckConfig(reach=True, draws=2, limit=2, workers=1)
+    assert parse(list(WORDS), BENCHMARKS) == GradcheckConfig(reach=True, draws=2, limit=2, workers=1)
 
 
 @pytest.mark.parametrize(
@@ -51,8 +50,9 @@ def test_options() -> None:
         ),
     ],
 )
-def test_what_does_not_go_together(words: list[str], message: str, refused: Callable[..., str]) -> None:
-    assert refused("gradcheck", *words).startswith(f"drivesem: {message}")
+def test_what_does_not_go_together(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gradcheck", *words]) == 2
+    assert capsys.readouterr().err.startswith(f"python -m tools.bench: {message}")
 
 
 def test_all_is_written_and_finished_frames_are_kept(

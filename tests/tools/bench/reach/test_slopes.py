@@ -14,7 +14,7 @@ from drivesem.attack.space import Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.types import SceneIR
-from tools.bench.reach.slopes import LATTICE_DIRECTIONS, STEPS, Probe, Slopes, measure, probes
+from tools.bench.reach.slopes import LATTICE_DIRECTIONS, STEPS, ProbeSlopes, SlopeProbe, measure, probes
 
 PARAMS = ("color", "weather", "translate", "rotate", "mesh")
 
@@ -24,7 +24,7 @@ class Margins:
     """Margins of objects as a function of theta (D,); `draw` shifts them, and changes no slope."""
 
     of: Callable[[Tensor], Tensor]
-    judged: Tensor
+    counted_objects: Tensor
     differentiable: bool = True
     passes: int = 0
 
@@ -42,13 +42,13 @@ def space(street: Callable[..., SceneIR]) -> ParameterSpace:
     return ParameterSpace(street(((-4.0, 12.0), (4.0, 30.0))), PARAMS)
 
 
-def tried(space: ParameterSpace) -> tuple[Probe, ...]:
+def tried(space: ParameterSpace) -> tuple[SlopeProbe, ...]:
     return probes(space, torch.Generator().manual_seed(0))
 
 
 def measured(
     space: ParameterSpace, of: Callable[[Tensor], Tensor], judged: tuple[bool, ...] = (True, True)
-) -> dict[tuple[int, str], Slopes]:
+) -> dict[tuple[int, str], ProbeSlopes]:
     views = Margins(of, torch.tensor(judged))
     found = measure(views, FeasibleSet(space), tried(space), 3, torch.Generator().manual_seed(1))
     return {(one.object, one.name): one for one in found}

@@ -12,15 +12,15 @@ from detectors.planted import PlantedFault
 from drivesem.bench.tables import Columns
 from drivesem.evaluation.resampling import wilson
 from drivesem.failures.rules import Flags, Floats, Intervals, fit_rule_list, format_rule
-from tools.bench.planted.across import AcrossFrame, Planted
-from tools.bench.planted.naming import agrees
+from tools.bench.planted.across import SharedFault, SharedFaultFrame
 from tools.bench.planted.pool import FramePool, bands_by_label, hidden
+from tools.bench.planted.yardstick import rule_names_fault
 
 CONTRAST = 4
 """Halton's states of each frame beside samples around failures: they say where cars are not lost."""
-AS_MANY, ALL = "halton's states, as many passes", "halton's states, all"
+SAME_PASSES, ALL = "halton's states, as many passes", "halton's states, all"
 CHANCE = "chance"
-SHAMS = 40
+CHANCE_DETECTORS = 40
 """Detectors of each kind whose failures follow nothing."""
 SHARP = 0.3
 """Share of the cars in its bands by labels that a fault hides, from which it counts as sharp."""
@@ -67,7 +67,7 @@ SUMMARY_COLUMNS: Columns = {
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PooledSamples:
     """Samples of many cars. columns: features (n,) by name; fails (n,); objects (n,): which car each is of;
     passes: what they took.
     """
@@ -85,7 +85,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True)
-class NameRow:
+class FaultRuleRow:
     """What is said of one detector. failures, objects: lost samples, and of how many cars; passes: of the
     detector; rules: in words; named, in_part: whether the first is the fault, or has one of its features; further:
     those
@@ -111,9 +111,12 @@ class NameRow:
         return asdict(self) | {"rule": self.rules[0] if self.rules else "none"}
 
 
-def rows_of(
-    planted: Sequence[Planted], pools: Sequence[FramePool], judged: Sequence[AcrossFrame], methods: Sequence[str]
-) -> list[NameRow]:
+def rule_rows(
+    planted: Sequence[SharedFault],
+    pools: Sequence[FramePool],
+    judged: Sequence[SharedFaultFrame],
+    methods: Sequence[str],
+) -> list[FaultRuleRow]:
     """Of each fault and of none, by each method, and by Halton's states alone: as many passes, and all of them."""
     rows = []
     for one in (*planted, None):
@@ -124,14 +127,14 @@ def rows_of(
             most = max(most, searched.passes)
             rows.append(_row(one, method, searched, pools))
         states = max(len(pool.states) for pool in pools)
-        counts = {ALL: states} if not methods else {AS_MANY: min(-(-most // len(pools)), states), ALL: states}
+        counts = {ALL: states} if not methods else {SAME_PASSES: min(-(-most // len(pools)), states), ALL: states}
         rows += [_row(one, by, drawn_evidence(fault, pools, count), pools) for by, count in counts.items()]
     return rows
 
 
 def searched_evidence(
-    fault: PlantedFault | None, method: str, pools: Sequence[FramePool], judged: Sequence[AcrossFrame]
-) -> Evidence:
+    fault: PlantedFault | None, method: str, pools: Sequence[FramePool], judged: Sequence[SharedFaultFrame]
+) -> PooledSamples:
     """Samples around what a method lost for certain, and `CONTRAST` states of every frame."""
     text = "" if fault is None else fault.text
     own = [a for frame in judged for a in frame.attempts if (a.fault, a.method) == (text, method)]
@@ -147,10 +150,10 @@ def searched_evidence(
     fails = np.concatenate([contrast.fails, *(part.failing for _, part in parts)])
     objects = np.concatenate([contrast.objects, *(np.full(len(part.margins), car) for car, part in parts)])
     spent = sum(a.passes for a in own) + sum(len(part.margins) for _, part in parts)
-    return Evidence(columns, fails, objects, contrast.passes + spent)
+    return PooledSamples(columns, fails, objects, contrast.passes + spent)
 
 
-def drawn_evidence(fault: PlantedFault | None, pools: Sequence[FramePool], states: int) -> Evidence:
+def drawn_evidence(fault: PlantedFault | None, pools: Sequence[FramePool], states: int) -> PooledSamples:
     """So many of Halton's states of each frame, with all cars in them that the fault leaves as photographed."""
     names = next((pool.names for pool in pools if pool.names), ())
     rows: list[tuple[float, ...]] = []
@@ -166,7 +169,7 @@ def drawn_evidence(fault: PlantedFault | None, pools: Sequence[FramePool], state
     table = np.array(rows, np.float64).reshape(len(rows), len(names))
     columns = {name: table[:, i] for i, name in enumerate(names)}
     passes = sum(len(pool.states[:states]) for pool in pools)
-    return Evidence(columns, np.array(fails, np.bool_), np.array(objects, np.int64), passes)
+    return PooledSamples(columns, np.array(fails, np.bool_), np.array(objects, np.int64), passes)
 
 
 def chance_rows(pools: Sequence[FramePool], seed: int, shams: int) -> list[dict[str, Any]]:
@@ -182,13 +185,13 @@ def chance_rows(pools: Sequence[FramePool], seed: int, shams: int) -> list[dict[
                 known = np.unique(plain.objects)
                 chosen = rng.choice(known, max(round(2 * _SHARE * len(known)), 1), replace=False)
                 fails = np.isin(plain.objects, chosen) & (rng.random(len(plain.fails)) < 0.5)
-            told += bool(Evidence(plain.columns, fails, plain.objects, plain.passes).rules())
+            told += bool(PooledSamples(plain.columns, fails, plain.objects, plain.passes).rules())
         low, high = wilson(told, shams)
         rows.append({"by": f"{CHANCE}, {kind}", "faults": shams, "told": told, "low": low, "high": high})
     return rows
 
 
-def summary_rows(rows: Sequence[NameRow]) -> list[dict[str, Any]]:
+def summary_rows(rows: Sequence[FaultRuleRow]) -> list[dict[str, Any]]:
     """Of faults, of the sharp ones, and of none, by what named them."""
     found = []
     for by in dict.fromkeys(row.by for row in rows):
@@ -218,12 +221,12 @@ def summary_rows(rows: Sequence[NameRow]) -> list[dict[str, Any]]:
     return found
 
 
-def _row(one: Planted | None, by: str, evidence: Evidence, pools: Sequence[FramePool]) -> NameRow:
+def _row(one: SharedFault | None, by: str, evidence: PooledSamples, pools: Sequence[FramePool]) -> FaultRuleRow:
     rules = evidence.rules()
     whole = in_part = False
     if one is not None and rules:
-        whole, in_part = agrees(rules[0], one.fault, bands_by_label(pools, one.fault))
-    return NameRow(
+        whole, in_part = rule_names_fault(rules[0], one.fault, bands_by_label(pools, one.fault))
+    return FaultRuleRow(
         fault="" if one is None else one.fault.text,
         by=by,
         hit=None if one is None else one.hit,
