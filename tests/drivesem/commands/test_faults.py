@@ -25,7 +25,7 @@ from drivesem.run.results import FrameResult
 from drivesem.scenes.sources import DatasetSource
 from scene_ir import files
 from scene_ir.types import SceneIR
-from tools.same import copy_part, objects_of
+from tools.same import copy_crop, sort_labels
 
 NAMES = ("000000", "000001", "000002")
 WIDTH, HEIGHT = 192, 112
@@ -35,12 +35,12 @@ WIDTH, HEIGHT = 192, 112
 def tiny_kitti(small_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three frames of one car."""
     folder, source = tmp_path_factory.mktemp("tiny"), small_kitti / "training"
-    car = objects_of(source / "label_2" / "000008.txt")[0]
+    car = sort_labels(source / "label_2" / "000008.txt")[0]
     x0, y0, x1, y1 = map(float, car[4:8])
     left, top = round((x0 + x1 - WIDTH) / 2), round((y0 + y1 - HEIGHT) / 2)
     for shift, name in enumerate(NAMES):
         window = (left + shift, top, left + shift + WIDTH, top + HEIGHT)
-        copy_part(source, folder / "training", "000008", 1.0, window, slice(1))
+        copy_crop(source, folder / "training", "000008", 1.0, window, slice(1))
         for path in (folder / "training").glob("*/000008.*"):
             path.rename(path.with_stem(name))
     return folder
