@@ -110,7 +110,7 @@ class Program:
             gc.enable()
         gc.freeze()
 
-        from drivesem.run.jobs import keep_freed_memory
+        from drivesem.run.allocation import keep_freed_memory
 
         keep_freed_memory()
         return run

@@ -41,10 +41,11 @@ def count_code_lines(source: str) -> int:
     """Lines of a Python source that hold code."""
     docstrings: set[int] = set()
     for node in ast.walk(ast.parse(source)):
-        for statement in getattr(node, "body", None) if isinstance(getattr(node, "body", None), list) else ():
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-                if isinstance(statement.value.value, str):
-                    docstrings.update(range(statement.lineno, (statement.end_lineno or statement.lineno) + 1))
+        match node:
+            case ast.Expr(value=ast.Constant(value=str()), lineno=first, end_lineno=int(last)):
+                docstrings.update(range(first, last + 1))
+            case _:
+                pass
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in SKIPPED:

@@ -1,4 +1,4 @@
-"""Who may import whom, read from the sources; and what stays unloaded until it is used."""
+"""Which module may import which, read from the sources; and what stays unloaded until it is used."""
 
 import ast
 import functools
@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("scene_ir", "detectors", "drivesem")
 COMMAND_TABLE = ROOT / "drivesem" / "cli.py"
 """Loads a command's module by the command's name."""
-DOOR = ROOT / "drivesem" / "__init__.py"
-"""Loads what a name stands for when it is asked for: its modules are the dotted texts in it."""
+IMPORT_BY_NAME = (ROOT / "drivesem" / "__init__.py", ROOT / "scene_ir" / "render" / "fast.py")
+"""Import modules from a table, when they are used: the dotted strings in these files."""
 TOP_LEVEL_NAMES = {
     *PACKAGES,
     *("configs", "docs", "tests", "tools"),
@@ -42,32 +42,30 @@ LOADED_WHERE_USED = (
 
 @dataclass(frozen=True)
 class Rule:
-    """What the modules under `package` may import besides the standard library and themselves.
-
-    project: prefixes of this project's modules. libraries: top-level names, None for any. never: prefixes that are
-    out even where `project` covers them. adapters: prefixes of modules whose job is one more library.
-    """
+    """What the modules under `package` may import besides the standard library and themselves."""
 
     package: str
     project: tuple[str, ...]
+    """Prefixes of this project's modules."""
     libraries: tuple[str, ...] | None
+    """Top-level names; None for any."""
     never: tuple[str, ...] = ()
+    """Prefixes that are forbidden even where `project` covers them."""
     adapters: tuple[str, ...] = ()
+    """Prefixes of modules that adapt further libraries."""
 
 
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
-_JOINED = tuple(f"drivesem.attack.{name}" for name in ("theta", "regions", "space", "feasible", "methods"))
-_BELOW_TRUTH = ("attack", "scenes", "data", "evaluation", "settings", "store", "synth")
-_BELOW_RUN = ("attack", "truth", "scenes", "data", "evaluation", "report", "settings", "store")
-_NOT_TO_SHOW = ("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster")
-MADE_OF = {"study": ("confirm", "transfer"), "survey": ("realism",), "worth": ("realism", "transfer")}
-"""Questions that are made of others."""
+_SEARCH = tuple(f"drivesem.attack.{name}" for name in ("theta", "roi", "space", "feasible", "methods"))
+_BELOW_FAILURES = ("attack", "scenes", "data", "evaluation", "config", "store", "synth")
+_BELOW_RUN = ("attack", "failures", "scenes", "data", "evaluation", "report", "config", "store")
+_NOT_IN_REPORTS = ("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster")
 RULES = (
     Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "PIL", "trimesh", "warp", "yaml")),
     Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
-    *(Rule(package, (*_LOGIC, *_JOINED), (*_LOGIC_LIBRARIES, "cma")) for package in _JOINED),
-    # the second, independent judge of what the first one, drivesem.attack.feasible, let through
+    *(Rule(package, (*_LOGIC, *_SEARCH), (*_LOGIC_LIBRARIES, "cma")) for package in _SEARCH),
+    # checks, independently, what drivesem.attack.feasible lets through
     Rule(
         "drivesem.attack.feasibility_check",
         _LOGIC,
@@ -80,8 +78,8 @@ RULES = (
         ("torch", "numpy", "pycocotools", "ultrafast_pycocotools"),
         never=("scene_ir", "drivesem.attack"),
     ),
-    Rule("drivesem.truth", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_TRUTH)), None),
-    # the second renderer of photographs shares nothing with the first one but the scene that both read
+    Rule("drivesem.failures", ("scene_ir", "detectors", *(f"drivesem.{part}" for part in _BELOW_FAILURES)), None),
+    # the second renderer of photographs shares nothing with the first one but the scene
     *(
         Rule(
             f"drivesem.failures.second_renderer.{name}",
@@ -94,23 +92,23 @@ RULES = (
         )
         for name in ("base", "photograph", "baking", "geometry", "opengl", "shading")
     ),
-    Rule("drivesem.run", ("scene_ir", "detectors", *(f"drivesem.{room}" for room in _BELOW_RUN)), None),
+    Rule("drivesem.run", ("scene_ir", "detectors", *(f"drivesem.{part}" for part in _BELOW_RUN)), None),
     Rule(
-        "drivesem.questions",
-        ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run", "synth", "training"))),
+        "drivesem.analysis",
+        ("scene_ir", "detectors", *(f"drivesem.{part}" for part in (*_BELOW_RUN, "run", "synth", "training"))),
         None,
     ),
     Rule(
         "drivesem.video",
-        ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run", "synth"))),
+        ("scene_ir", "detectors", *(f"drivesem.{part}" for part in (*_BELOW_RUN, "run", "synth"))),
         None,
     ),
     Rule(
         "drivesem.viewer",
-        ("scene_ir", "detectors", *(f"drivesem.{room}" for room in (*_BELOW_RUN, "run"))),
+        ("scene_ir", "detectors", *(f"drivesem.{part}" for part in (*_BELOW_RUN, "run"))),
         None,
     ),
-    Rule("drivesem.report", ("scene_ir.errors", "scene_ir.files"), None, never=_NOT_TO_SHOW),
+    Rule("drivesem.report", ("scene_ir.errors", "scene_ir.files"), None, never=_NOT_IN_REPORTS),
     Rule(
         "drivesem.run.report",
         (
@@ -121,14 +119,14 @@ RULES = (
             "scene_ir.files",
         ),
         None,
-        never=_NOT_TO_SHOW,
+        never=_NOT_IN_REPORTS,
     ),
 )
 
 
 @dataclass(frozen=True)
 class Import:
-    """One import statement: where it stands, and the module or member it names."""
+    """The import of one module or member."""
 
     file: Path
     line: int
@@ -144,15 +142,15 @@ class Import:
         return f"{self.file.relative_to(ROOT)}:{self.line} imports {self.name}"
 
 
-def modules() -> list[Path]:
+def list_modules() -> list[Path]:
     """Every source file of the three packages."""
     return [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 
-def imports(path: Path, source: str | None = None) -> Iterator[Import]:
-    """Every import of a file, those inside functions too; not those for the type checker's eyes only."""
+def iterate_imports(path: Path, source: str | None = None) -> Iterator[Import]:
+    """Yield every import of a file, those inside functions too; not those for the type checker alone."""
     tree = ast.parse(path.read_text(encoding="utf-8") if source is None else source, filename=str(path))
-    unseen = {
+    type_checking = {
         inner
         for node in ast.walk(tree)
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
@@ -160,7 +158,7 @@ def imports(path: Path, source: str | None = None) -> Iterator[Import]:
     }
     top = set(tree.body)
     for node in ast.walk(tree):
-        if node in unseen:
+        if node in type_checking:
             continue
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -174,35 +172,37 @@ def imports(path: Path, source: str | None = None) -> Iterator[Import]:
             if path == COMMAND_TABLE and not isinstance(name, ast.Constant):
                 yield Import(path, node.lineno, "drivesem.commands", False)
                 continue
-            if path == DOOR and not isinstance(name, ast.Constant):
+            if path in IMPORT_BY_NAME and not isinstance(name, ast.Constant):
                 continue
-            assert isinstance(name, ast.Constant), f"{path}:{node.lineno}: an import that cannot be read"
+            assert isinstance(name, ast.Constant), (
+                f"{path}:{node.lineno}: the module of an import is not a constant"
+            )
             yield Import(path, node.lineno, str(name.value), False)
-        elif path == DOOR and isinstance(node, ast.Constant) and under(str(node.value), PACKAGES):
+        elif path in IMPORT_BY_NAME and isinstance(node, ast.Constant) and is_under(str(node.value), PACKAGES):
             yield Import(path, node.lineno, str(node.value), False)
 
 
 @functools.cache
-def every_import() -> tuple[Import, ...]:
+def list_imports() -> tuple[Import, ...]:
     """Every import of the three packages."""
-    return tuple(found for path in modules() for found in imports(path))
+    return tuple(imported for path in list_modules() for imported in iterate_imports(path))
 
 
-def under(name: str, prefixes: tuple[str, ...]) -> bool:
+def is_under(name: str, prefixes: tuple[str, ...]) -> bool:
     """Whether a dotted name is one of `prefixes` or below one."""
     return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
 
 
-def breaks(rule: Rule, found: Import) -> bool:
+def is_forbidden(rule: Rule, imported: Import) -> bool:
     """Whether an import of a module under `rule.package` is against it."""
-    if under(found.name, rule.never):
+    if is_under(imported.name, rule.never):
         return True
-    top = found.name.partition(".")[0]
-    if top in sys.stdlib_module_names or under(found.name, (rule.package,)):
+    top = imported.name.partition(".")[0]
+    if top in sys.stdlib_module_names or is_under(imported.name, (rule.package,)):
         return False
     if top in PACKAGES:
-        return not under(found.name, rule.project)
-    if under(found.importer, rule.adapters):
+        return not is_under(imported.name, rule.project)
+    if is_under(imported.importer, rule.adapters):
         return False
     return rule.libraries is not None and top not in rule.libraries
 
@@ -210,7 +210,9 @@ def breaks(rule: Rule, found: Import) -> bool:
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.package)
 def test_packages_import_only_what_they_may(rule: Rule) -> None:
     broken = [
-        str(found) for found in every_import() if under(found.importer, (rule.package,)) and breaks(rule, found)
+        str(imported)
+        for imported in list_imports()
+        if is_under(imported.importer, (rule.package,)) and is_forbidden(rule, imported)
     ]
     assert not broken, "\n".join(broken)
 
@@ -240,8 +242,8 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
     ],
 )
 def test_the_rules_catch_what_they_forbid(file: str, source: str) -> None:
-    found = list(imports(ROOT / file, source))
-    assert any(breaks(rule, f) for rule in RULES for f in found if under(f.importer, (rule.package,)))
+    imported = list(iterate_imports(ROOT / file, source))
+    assert any(is_forbidden(rule, f) for rule in RULES for f in imported if is_under(f.importer, (rule.package,)))
 
 
 @pytest.mark.parametrize(
@@ -258,42 +260,51 @@ def test_the_rules_catch_what_they_forbid(file: str, source: str) -> None:
     ],
 )
 def test_the_rules_let_through_what_they_allow(file: str, source: str) -> None:
-    found = list(imports(ROOT / file, source))
-    assert found
-    assert not [f for rule in RULES for f in found if under(f.importer, (rule.package,)) and breaks(rule, f)]
+    imported = list(iterate_imports(ROOT / file, source))
+    assert imported
+    assert not [
+        f for rule in RULES for f in imported if is_under(f.importer, (rule.package,)) and is_forbidden(rule, f)
+    ]
 
 
 def test_only_the_command_table_imports_commands_and_only_commands_import_benchmarks() -> None:
     front = ("drivesem.cli", "drivesem.commands", "drivesem.bench")
     broken = [
-        str(found)
-        for found in every_import()
-        if under(found.name, ("drivesem.commands", "drivesem.bench")) and not under(found.importer, front)
+        str(imported)
+        for imported in list_imports()
+        if is_under(imported.name, ("drivesem.commands", "drivesem.bench"))
+        and not is_under(imported.importer, front)
     ]
     assert not broken, "\n".join(broken)
 
 
-def test_questions_do_not_import_each_other() -> None:
-    rooms = ("drivesem.questions",)
-    broken = []
-    for found in every_import():
-        if under(found.importer, rooms) and under(found.name, rooms):
-            asking, asked = (name.split(".")[2] for name in (found.importer, found.name))
-            if asking != asked and asked not in MADE_OF.get(asking, ()):
-                broken.append(str(found))
+def test_analyses_do_not_import_each_other() -> None:
+    analyses = ("drivesem.analysis",)
+    broken = [
+        str(imported)
+        for imported in list_imports()
+        if is_under(imported.importer, analyses)
+        and is_under(imported.name, analyses)
+        and imported.importer.split(".")[2:3] != imported.name.split(".")[2:3]
+    ]
+    assert not broken, "\n".join(broken)
+
+
+def test_the_product_does_not_import_tools() -> None:
+    broken = [str(imported) for imported in list_imports() if is_under(imported.name, ("tools", "tests"))]
     assert not broken, "\n".join(broken)
 
 
 def test_no_import_circle() -> None:
     """Imports inside functions count too: what needs them to be there is a circle as well."""
-    names = {Import(path, 0, "", at_top=True).importer for path in modules()}
+    names = {Import(path, 0, "", at_top=True).importer for path in list_modules()}
     needs: dict[str, set[str]] = {name: set() for name in names}
-    for found in every_import():
-        name = found.name
+    for imported in list_imports():
+        name = imported.name
         while name and name not in names:
             name = name.rpartition(".")[0]
-        if name and name != found.importer:
-            needs[found.importer].add(name)
+        if name and name != imported.importer:
+            needs[imported.importer].add(name)
     try:
         TopologicalSorter(needs).prepare()
     except CycleError as circle:
@@ -301,13 +312,15 @@ def test_no_import_circle() -> None:
 
 
 def test_libraries_that_may_be_missing_are_imported_where_used() -> None:
-    early = [str(f) for f in every_import() if f.at_top and under(f.name, LOADED_WHERE_USED)]
+    early = [str(f) for f in list_imports() if f.at_top and is_under(f.name, LOADED_WHERE_USED)]
     early = [line for line in early if not line.startswith("detectors/adapters")]
     assert not early, "\n".join(early)
 
 
 def test_files_are_named_for_what_they_hold() -> None:
-    assert not [str(path) for path in modules() if path.stem in ("utils", "util", "helpers", "misc", "common")]
+    assert not [
+        str(path) for path in list_modules() if path.stem in ("utils", "util", "helpers", "misc", "common")
+    ]
 
 
 def test_top_level_names() -> None:

@@ -1,7 +1,6 @@
-"""Every block of code in README.md and docs/: Python runs, the real parser reads commands, data is well-formed.
+"""Every block of code in README.md and docs/: Python runs, the real parsers read commands, data is well-formed.
 
-A Python block that needs what is not there has a comment before it, `<!-- not run: needs ... -->`,
-and must compile.
+A Python block that cannot run here follows a comment, `<!-- not run: needs ... -->`, and must compile.
 """
 
 from __future__ import annotations
@@ -17,19 +16,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import tyro
 import yaml
 
 from drivesem.cli import main
-from drivesem.config.parsing import parse
-from tools.bench.settings import BenchTool
+from drivesem.config.commands import COMMANDS
+from drivesem.config.parsing import Commands, parse
+from tools.bench.__main__ import BENCHMARKS
+from tools.experiments.__main__ import EXPERIMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 LANGUAGES = ("python", "sh", "yaml", "json", "")
-CHEAP = ("render", "edit", "report", "plausibility", "convert", "verify")
-"""Commands that take seconds where a run, scenes and a data set are there."""
+PROGRAMS: dict[str, Commands] = {"drivesem": COMMANDS, "tools.bench": BENCHMARKS, "tools.experiments": EXPERIMENTS}
+"""Settings of each program's commands."""
+CHEAP = ("render", "edit", "report", "convert", "verify")
+"""Commands that take seconds, given a run, scenes and a data set."""
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_INLINE = re.compile(r"`(?:python -m )?(drivesem|tools\.bench|tools\.experiments) ([a-z][\w-]*)([^`]*)`")
 _PATH = re.compile(r"(?<=`)(?:drivesem|scene_ir|detectors|tools|configs)/[\w./-]+(?=`)")
 _NAME = re.compile(r"`((?:drivesem|scene_ir|detectors)(?:\.\w+)+)(?:\([^`]*\))?`")
 _LINK = re.compile(r"\]\(([^)#]*)(?:#[^)]*)?\)")
@@ -38,31 +41,33 @@ _NOT_RUN = re.compile(r"<!-- not run: \S.* -->\s*$")
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A fenced block. line: of its first line in the page."""
+    """A fenced block of a page."""
 
     page: Path
     line: int
+    """Line of the page with its first line."""
     language: str
     text: str
     runs: bool
+    """Whether its Python is run, and not only compiled."""
 
     def __str__(self) -> str:
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
 
-def blocks_of(page: Path) -> Iterator[Block]:
-    """The blocks of a page, in order."""
+def iterate_blocks(page: Path) -> Iterator[Block]:
+    """Yield the blocks of a page, in order."""
     content = page.read_text(encoding="utf-8")
     for match in _FENCE.finditer(content):
         before = content[: match.start()]
         yield Block(page, before.count("\n") + 2, match[1], match[2], _NOT_RUN.search(before) is None)
 
 
-BLOCKS = tuple(block for page in PAGES for block in blocks_of(page))
+BLOCKS = tuple(block for page in PAGES for block in iterate_blocks(page))
 
 
-def commands_of(block: Block) -> Iterator[tuple[str, list[str]]]:
-    """The commands of a shell block: where each stands, and its words."""
+def iterate_commands(block: Block) -> Iterator[tuple[str, list[str]]]:
+    """Yield the commands of a shell block: the place of each, and its words."""
     joined = block.text.replace("\\\n", " ")
     for line in joined.splitlines():
         words = shlex.split(line, comments=True)
@@ -72,12 +77,12 @@ def commands_of(block: Block) -> Iterator[tuple[str, list[str]]]:
             words = words[end + 1 :]
 
 
-SHELL = tuple(command for block in BLOCKS if block.language == "sh" for command in commands_of(block))
+SHELL = tuple(command for block in BLOCKS if block.language == "sh" for command in iterate_commands(block))
 
 
 @pytest.fixture
 def workplace(small_kitti: Path, small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder where the names that the pages use stand for something."""
+    """A folder with the data and runs that the pages name."""
     for name in ("PATH_TO_KITTI", "data/kitti"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).symlink_to(small_kitti)
@@ -92,11 +97,11 @@ def test_every_block_has_a_language() -> None:
     assert not [str(block) for block in BLOCKS if block.language not in LANGUAGES]
     assert {block.language for block in BLOCKS} >= {"python", "sh", "yaml"}
     bare = [str(block) for block in BLOCKS if not block.language and "drivesem " in block.text.split(": ")[0]]
-    assert not bare, "commands stand in sh blocks"
+    assert not bare, "commands belong into sh blocks"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_what_a_page_names_is_there(page: Path) -> None:
+def test_paths_links_and_names_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     paths = {match[0].rstrip("/") for match in _PATH.finditer(text)}
     targets = {match[1] for match in _LINK.finditer(text) if match[1] and "://" not in match[1]}
@@ -108,17 +113,29 @@ def test_what_a_page_names_is_there(page: Path) -> None:
 
 
 @pytest.mark.parametrize(("where", "words"), SHELL, ids=[where for where, _ in SHELL])
-def test_commands_are_read_by_the_parser(where: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_parse(where: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     program = Path(words[0]).name
     if program == "drivesem":
         parse(words[1:])
-    elif words[1:3] == ["-m", "tools.bench"]:
-        tyro.cli(BenchTool, args=words[3:])
+    elif words[1] == "-m" and words[2] in PROGRAMS:
+        parse(words[3:], PROGRAMS[words[2]])
+    elif words[1] == "-m" and words[2].startswith("tools."):
+        assert (ROOT / words[2].replace(".", "/")).with_suffix(".py").is_file()
     elif program.startswith("python") and words[1] != "-m":
         assert (ROOT / words[1]).is_file()
     else:
-        assert program in ("python", "python3", "pip", "ray"), where
+        assert program in ("python", "python3", "pip", "ray", "source"), where
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_in_sentences_exist(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for program, name, words in set(_INLINE.findall(page.read_text(encoding="utf-8"))):
+        with pytest.raises(SystemExit):
+            parse([name, "--help-all"], PROGRAMS[program])
+        assert set(re.findall(r"--[a-z][\w-]*", words)) <= set(
+            re.findall(r"--[a-z][\w-]*", capsys.readouterr().out)
+        )
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language in ("yaml", "json")], ids=str)
@@ -133,12 +150,12 @@ def test_python_that_does_not_run_compiles(block: Block) -> None:
 
 @pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if any(b.language == "python" and b.runs for b in blocks_of(page))],
+    [page for page in PAGES if any(b.language == "python" and b.runs for b in iterate_blocks(page))],
     ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_python_runs(page: Path, workplace: Path) -> None:
     names: dict[str, object] = {"__name__": "__main__"}
-    for block in blocks_of(page):
+    for block in iterate_blocks(page):
         if block.language == "python" and block.runs:
             padded = "\n" * (block.line - 1) + block.text  # so that a traceback names the page's line
             exec(compile(padded, str(page), "exec"), names)

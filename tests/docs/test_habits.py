@@ -67,6 +67,6 @@ def test_every_extra_is_documented() -> None:
 def test_exit_codes_are_documented() -> None:
     text = (ROOT / "docs" / "guide" / "start.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| ", text, re.MULTILINE)
-    source = (ROOT / "drivesem" / "cli.py").read_text(encoding="utf-8")
+    source = (ROOT / "drivesem" / "program.py").read_text(encoding="utf-8")
     constants = re.findall(r"^_EXIT_\w+ = (\d+)$", source, re.MULTILINE)
     assert rows == sorted({"0", "1", *constants}, key=int)

@@ -1,7 +1,8 @@
 """Tables and intervals in the documentation follow from the stored results in docs/data.
 
-A page marks what it takes from docs/data/NAME with `<!-- study NAME: begin -->` and `<!-- study NAME: end -->`. Each table
-there, and each number with an interval, is in the page that `python -m tools.experiments ... --from docs/data/NAME` writes.
+A page marks what it takes from docs/data/NAME with `<!-- study NAME: begin -->` and `<!-- study NAME: end -->`. Each
+table there, and each number with an interval, is in the page that `python -m tools.experiments ... --from
+docs/data/NAME` writes.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ Links between files of the repository become links between pages. A link to a fi
 
 from __future__ import annotations
 
+import contextlib
+import io
 import posixpath
 import re
 from collections.abc import Iterator
@@ -16,8 +18,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from drivesem.cli import TOPICS
 from drivesem.config.commands import COMMANDS
-from drivesem.config.help import TOPICS, command_help
+from drivesem.config.help import print_help
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES_OUTSIDE_DOCS = {
@@ -101,8 +104,15 @@ def iterate_commands() -> Iterator[str]:
     for topic, names in TOPICS.items():
         yield f"\n## {topic}\n"
         for name in names:
-            if name in COMMANDS:
-                yield f"\n### {name}\n\n```text\n{command_help(name)}```\n"
+            yield f"\n### {name}\n\n```text\n{format_options(name)}\n```\n"
+
+
+def format_options(command: str) -> str:
+    """Every option of a command, as its help prints them to a file: without a box."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        print_help(f"drivesem {command}", COMMANDS[command], every_option=True)
+    return printed.getvalue().strip()
 
 
 def iterate_api() -> Iterator[str]:
