@@ -156,7 +156,7 @@ class _ProtocolEvaluator:
             count_by_frame_and_class = np.bincount(found.frame * len(self.sets.classes) + found.label)
             largest_count = int(count_by_frame_and_class.max(initial=0))
             expected = (
-                f"at largest_count {_MAX_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
+                f"at most {_MAX_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
             )
             refuse(largest_count > _MAX_DETECTIONS, "--pred", expected, f"{largest_count:,}")
             curves = kitti.evaluate(self.sets.truths, found, self.sets.classes, small)

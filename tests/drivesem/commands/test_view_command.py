@@ -103,7 +103,7 @@ def test_refuses_a_port_that_is_taken(two_scenes: Path, refused: Refused) -> Non
         other.listen()
         port = other.getsockname()[1]
         output = refused("view", str(two_scenes), "--port", str(port), "--no-browser")
-    assert output == f"drivesem: --port: expected a free port of 127.0.0.1, found {port}, which cannot be had"
+    assert output == f"drivesem: --port: expected a free port of 127.0.0.1, found {port}, which is in use"
 
 
 def test_the_next_port_that_is_free(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
