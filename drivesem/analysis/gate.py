@@ -187,7 +187,7 @@ class GateAnalyser(FrameAnalyser[FrameGateResult]):
         self.attack, self.params = load_attack_config(run.folder, "RUN"), parse_params(run.params)
         self.detectors = load_detector_pair(config)
 
-    def analyse(self, name: str, source: str, folder: Path) -> FrameGateResult:
+    def analyse(self, name: str, folder: Path) -> FrameGateResult:
         """See `FrameAnalyser`."""
         start = time.perf_counter()
         before, after = self.detectors
@@ -196,7 +196,7 @@ class GateAnalyser(FrameAnalyser[FrameGateResult]):
             _draw_paired_samples(failure, neighbourhood, after, self.config.samples)
             for failure, neighbourhood in frame.neighbourhoods(str(self.config.seed))
         )
-        return FrameGateResult(name, source, pairs, round(time.perf_counter() - start, 3))
+        return FrameGateResult(name, self.source_digest(name), pairs, round(time.perf_counter() - start, 3))
 
 
 def _draw_paired_samples(

@@ -80,7 +80,7 @@ class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
         self.detector = load_run_detector(attack, config.device)
         self.device, self.t_star = config.device, float(files.read_json(run.folder / METRICS)["t_star"])
 
-    def analyse(self, name: str, source: str, folder: Path) -> ConfirmedFrame:
+    def analyse(self, name: str, folder: Path) -> ConfirmedFrame:
         """See `FrameAnalyser`. Raises SceneError if no second renderer reproduces the frame's photograph."""
         start = time.perf_counter()
         changed = load_scene(self.run_folder / FRAMES / name / "scene")
@@ -95,7 +95,7 @@ class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
         compositor, second = compare_failures(result, targets, detections, classes, self.t_star)
         confirmed = ConfirmedFrame(
             identifier=name,
-            source=source,
+            source=self.source_digest(name),
             renderer=renderer.name,
             compositor=compositor,
             second=second,

@@ -188,7 +188,7 @@ class ExplainAnalyser(FrameAnalyser[Explanation]):
         keep_lost = config.least == "lost"
         self.budget = ExplainBudget(config.points, config.permutations, config.seed, keep_lost)
 
-    def analyse(self, name: str, source: str, folder: Path) -> Explanation:
+    def analyse(self, name: str, folder: Path) -> Explanation:
         """See `FrameAnalyser`. A scene that fails by the exchange of its vehicles alone has no contributions.
 
         Raises FormatError if the detector does not fail on this machine, RangeError for a gradient that is not
@@ -223,7 +223,7 @@ class ExplainAnalyser(FrameAnalyser[Explanation]):
         gradients = _pixel_gradients(objective, theta)
         explanation = Explanation(
             identifier=name,
-            source=source,
+            source=self.source_digest(name),
             objects=frame.result.objects,
             benign=evaluator.outcome(theta, ~everything),
             found=found,

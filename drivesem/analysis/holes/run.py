@@ -155,7 +155,7 @@ class HolesAnalyser(_NeighbourhoodAnalyser[FrameHoles]):
 
     file, kind, schema = "holes.json", FrameHoles, 3
 
-    def analyse(self, name: str, source: str, folder: Path) -> FrameHoles:
+    def analyse(self, name: str, folder: Path) -> FrameHoles:
         """See `FrameAnalyser`."""
         start = time.perf_counter()
         config, frame = self.config, self.load_frame(name)
@@ -166,7 +166,7 @@ class HolesAnalyser(_NeighbourhoodAnalyser[FrameHoles]):
         passes = sum(len(one.all_samples().margins) + one.lost.extra_samples for one in around)
         contrast, contrast_passes = _sample_all_objects(frame, config.contrast, config.seed)
         seconds = round(time.perf_counter() - start, 3)
-        return FrameHoles(name, source, around, contrast, passes + contrast_passes, seconds)
+        return FrameHoles(name, self.source_digest(name), around, contrast, passes + contrast_passes, seconds)
 
 
 class RuleRegionAnalyser(_NeighbourhoodAnalyser[FrameRuleSamples]):
@@ -178,7 +178,7 @@ class RuleRegionAnalyser(_NeighbourhoodAnalyser[FrameRuleSamples]):
         super().__init__(config, run, out)
         self.rules, self.extra, self.file = rules, extra, extra.file
 
-    def analyse(self, name: str, source: str, folder: Path) -> FrameRuleSamples:
+    def analyse(self, name: str, folder: Path) -> FrameRuleSamples:
         """See `FrameAnalyser`."""
         start = time.perf_counter()
         config, extra, rules = self.config, self.extra, self.rules[name]
@@ -193,7 +193,7 @@ class RuleRegionAnalyser(_NeighbourhoodAnalyser[FrameRuleSamples]):
         }
         return FrameRuleSamples(
             identifier=name,
-            source=source,
+            source=self.source_digest(name),
             indices=tuple(inside),
             inside=tuple(inside.values()),
             passes=sum(len(samples.margins) for samples in inside.values()),

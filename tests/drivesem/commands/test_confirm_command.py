@@ -114,8 +114,10 @@ def test_another_picture_is_refused(
     files.write_png(benign, image)
     out = run / "again"
     assert main(["confirm", "--run", str(run), "--workers", "1", "--out", str(out)]) == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert "photograph of demo-000: expected the image that the generator renders, found one 64 levels off" in told
+    output = " ".join(capsys.readouterr().err.split())
+    assert (
+        "photograph of demo-000: expected the image that the generator renders, found one 64 levels off" in output
+    )
     words = ("--run", str(run), "--workers", "1", "--out", str(out), "--keep-going")
     assert main(["confirm", *words]) == 2
     assert "a run with frames that can be used" in " ".join(capsys.readouterr().err.split())

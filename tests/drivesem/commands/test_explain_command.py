@@ -289,8 +289,8 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(
         assert found.least.failures
     capsys.readouterr()
     assert main(["explain", "--run", str(run), "--workers", "1", "--frame", "demo-001", "--points", "4"]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert said.endswith("found frames that fail by the exchange of vehicles alone: demo-001")
+    error_line = " ".join(capsys.readouterr().err.split())
+    assert error_line.endswith("found frames that fail by the exchange of vehicles alone: demo-001")
 
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

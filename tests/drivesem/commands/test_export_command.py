@@ -107,16 +107,16 @@ def test_kitti_by_a_parser_of_its_own(run: Path, tmp_path: Path) -> None:
 def test_coco_by_pycocotools(run: Path, tmp_path: Path) -> None:
     out = export(run, "coco", tmp_path / "C", "--grade", "all")
     with contextlib.redirect_stdout(io.StringIO()):
-        told = COCO(str(out / "annotations" / "instances_all.json"))
-        found = told.loadRes(str(out / "detections.json"))
-    images = {row["drivesem"]["frame"]: row for row in told.loadImgs(told.getImgIds())}
+        coco = COCO(str(out / "annotations" / "instances_all.json"))
+        found = coco.loadRes(str(out / "detections.json"))
+    images = {row["drivesem"]["frame"]: row for row in coco.loadImgs(coco.getImgIds())}
     assert set(images) == {"demo-000", "demo-001"}
     for name, row in images.items():
         result = result_of(run, name)
         assert (out / "images" / row["file_name"]).is_file()
         assert row["drivesem"]["theta"] == {c.name: c.value for c in result.theta}
         assert row["drivesem"]["grade"] == (GRADE if name == "demo-000" else None)
-        objects = [r for r in told.loadAnns(told.getAnnIds(row["id"])) if not r["iscrowd"]]
+        objects = [r for r in coco.loadAnns(coco.getAnnIds(row["id"])) if not r["iscrowd"]]
         for i, (entry, record) in enumerate(zip(objects, result.targets_moved, strict=False)):
             x, y, w, h = entry["bbox"]
             assert [x - 0.5, y - 0.5, x - 0.5 + w, y - 0.5 + h] == pytest.approx(record.xyxy, abs=1e-3)
@@ -125,7 +125,7 @@ def test_coco_by_pycocotools(run: Path, tmp_path: Path) -> None:
         assert scores == pytest.approx(sorted(d.score for d in result.detections_attacked if d.score is not None))
 
 
-def test_fiftyone_as_its_documentation_says(run: Path, tmp_path: Path) -> None:
+def test_fiftyone_follows_its_documented_format(run: Path, tmp_path: Path) -> None:
     out = export(run, "fiftyone", tmp_path / "F", "--grade", "all")
     content = json.loads((out / "labels.json").read_text())
     uuids = {path.stem for path in (out / "data").iterdir()}
@@ -154,8 +154,8 @@ def test_yolo_and_virtual_kitti_by_their_readers(layout: str, kind: Any, run: Pa
     records = [r for r in result_of(run, "demo-000").targets_moved if r.index is not None]
     boxes = torch.tensor([r.xyxy for r in records])
     assert float((frame.labels.boxes_xyxy - boxes).abs().max()) < (0.01 if layout == "yolo" else 1.01)
-    shown = picture(run / "frames/demo-000/counterexample.png")[..., ::-1]
-    assert np.array_equal((frame.photograph * 255).round().byte().permute(1, 2, 0).numpy(), shown)
+    exported_picture = picture(run / "frames/demo-000/counterexample.png")[..., ::-1]
+    assert np.array_equal((frame.photograph * 255).round().byte().permute(1, 2, 0).numpy(), exported_picture)
 
 
 PEOPLE = (
@@ -214,15 +214,15 @@ def test_an_attack_on_a_frame_with_people(run: Path, tmp_path: Path) -> None:
 def test_coco_has_people_as_objects_and_regions_as_crowds(crowded: Path, tmp_path: Path) -> None:
     out = export(crowded, "coco", tmp_path / "C")
     with contextlib.redirect_stdout(io.StringIO()):
-        told = COCO(str(out / "annotations" / "instances_all.json"))
-    names = {row["id"]: row["name"] for row in told.loadCats(told.getCatIds())}
-    rows = told.loadAnns(told.getAnnIds(iscrowd=0))
+        coco = COCO(str(out / "annotations" / "instances_all.json"))
+    names = {row["id"]: row["name"] for row in coco.loadCats(coco.getCatIds())}
+    rows = coco.loadAnns(coco.getAnnIds(iscrowd=0))
     for kind, *numbers in people_of(list(PEOPLE)):
         (row,) = (row for row in rows if names[row["category_id"]] == kind)
         left, top, right, bottom = numbers[3:7]
         assert row["bbox"] == pytest.approx([left + 0.5, top + 0.5, right - left, bottom - top])
         assert ("pose" in row) == (kind == "Pedestrian")
-    crowds = told.loadAnns(told.getAnnIds(iscrowd=1))
+    crowds = coco.loadAnns(coco.getAnnIds(iscrowd=1))
     assert sorted(row["category_id"] for row in crowds) == sorted(names)  # of every class
     assert {tuple(row["bbox"]) for row in crowds} == {(300.5, 160.5, 30.0, 15.0)}
 
@@ -287,15 +287,15 @@ def test_label_files_without_their_regions_are_refused(
     assert "labels_moved.txt: expected at its end 3 DontCare, as the scene has" in refused("export", *words)
 
 
-def test_provenance_says_where_a_picture_is_from(run: Path, tmp_path: Path) -> None:
-    told = files.read_json(export(run, "kitti", tmp_path / "K") / "provenance.json")
-    assert (told["run"], told["detector"], told["params"], told["labels"]) == (
+def test_provenance_of_exported_pictures(run: Path, tmp_path: Path) -> None:
+    content = files.read_json(export(run, "kitti", tmp_path / "K") / "provenance.json")
+    assert (content["run"], content["detector"], content["params"], content["labels"]) == (
         "a",
         "squeezedet",
         ["translate"],
         "moved",
     )
-    (frame,) = told["frames"]
+    (frame,) = content["frames"]
     assert (frame["frame"], frame["grade"], frame["feasible"]) == ("demo-000", GRADE, True)
     assert [row["kind"] for row in frame["failed"]] == ["missed"]
 

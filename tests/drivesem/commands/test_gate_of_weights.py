@@ -22,20 +22,20 @@ def test_itself_passes_and_noise_in_the_weights_does_not(
     assert main(["attack", *words, "--no-confirm", "--second-detector", "off", "--out", str(run)]) == 0
     save_detector(with_noise(load_detector("squeezedet"), 0.5), noisy)
 
-    def overall(told: dict[str, Any]) -> dict[str, Any]:
-        return next(row for row in told["rows"] if row["hole"] == "all")
+    def overall(data: dict[str, Any]) -> dict[str, Any]:
+        return next(row for row in data["rows"] if row["hole"] == "all")
 
     def gate(after: str, out: str) -> tuple[int, dict[str, Any]]:
         capsys.readouterr()
         words = ["gate", str(run), "--after", after, "--samples", "16", "--workers", "1", "--json"]
         return main([*words, "--out", str(tmp_path / out)]), json.loads(capsys.readouterr().out)
 
-    code, told = gate("squeezedet", "itself")
-    assert (code, told["passed"]) == (0, True)
-    assert told["rows"]
-    assert {(row["difference"], *row["interval"]) for row in told["rows"]} == {(0, 0, 0)}
-    assert 0 < overall(told)["before"] < 1
+    code, data = gate("squeezedet", "itself")
+    assert (code, data["passed"]) == (0, True)
+    assert data["rows"]
+    assert {(row["difference"], *row["interval"]) for row in data["rows"]} == {(0, 0, 0)}
+    assert 0 < overall(data)["before"] < 1
 
-    code, told = gate(str(noisy), "noisy")
-    assert (code, told["passed"]) == (1, False)
-    assert overall(told)["difference"] > 0.05
+    code, data = gate(str(noisy), "noisy")
+    assert (code, data["passed"]) == (1, False)
+    assert overall(data)["difference"] > 0.05

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from detectors.planted import compute_features
 from detectors.types import Detections
-from drivesem.analysis import gate as gate_asking
+from drivesem.analysis import gate as gate_analysis
 from drivesem.analysis.holes.rules import FrameHoles, FrameRuleSamples
 from drivesem.attack.labels import Labeller
 from drivesem.cli import main
@@ -135,7 +135,7 @@ def holes(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any
 
 
 @pytest.fixture(scope="module")
-def looked(attacked: Path, tmp_path_factory: pytest.TempPathFactory, scene: SceneIR, blind: Blind) -> Path:
+def mapped(attacked: Path, tmp_path_factory: pytest.TempPathFactory, scene: SceneIR, blind: Blind) -> Path:
     """What is written of that run."""
     out = tmp_path_factory.mktemp("looked") / "holes"
     with pytest.MonkeyPatch.context() as patch:
@@ -144,11 +144,11 @@ def looked(attacked: Path, tmp_path_factory: pytest.TempPathFactory, scene: Scen
     return out
 
 
-def test_the_feature_and_the_band_are_named(attacked: Path, looked: Path, blind: Blind) -> None:
+def test_the_feature_and_the_band_are_named(attacked: Path, mapped: Path, blind: Blind) -> None:
     (frame,) = load_run(attacked).frames
     certain = [f for f in frame.result.failures if f.grade != "threshold"]
     assert certain
-    found = json.loads((looked / "holes.json").read_text())
+    found = json.loads((mapped / "holes.json").read_text())
     assert found["failures"] == len(certain)
     first = found["holes"][0]
     assert first["parameters"] == ["lightness"]
@@ -160,37 +160,37 @@ def test_the_feature_and_the_band_are_named(attacked: Path, looked: Path, blind:
     size = first["size"]
     assert size["interval"][0] < size["probability"] < size["interval"][1] < 0.7
     assert first["frames"] == ["demo-000"]
-    rows = list(csv.DictReader((looked / "holes.csv").read_text().splitlines()))
+    rows = list(csv.DictReader((mapped / "holes.csv").read_text().splitlines()))
     assert rows[0]["where"].startswith("lightness")
-    assert cv2.imread(str(looked / "holes.png")).std() > 10
-    assert "lightness" in (looked / "holes.md").read_text()
+    assert cv2.imread(str(mapped / "holes.png")).std() > 10
+    assert "lightness" in (mapped / "holes.md").read_text()
 
 
-def test_a_second_call_goes_on_and_says_the_same(
-    attacked: Path, looked: Path, capsys: pytest.CaptureFixture[str]
+def test_a_second_call_resumes_with_equal_results(
+    attacked: Path, mapped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, kept = (
-        (looked / "holes.json").read_text(),
-        looked / "runs" / "0" / "frames" / "demo-000" / "holes.json",
+    before, cached = (
+        (mapped / "holes.json").read_text(),
+        mapped / "runs" / "0" / "frames" / "demo-000" / "holes.json",
     )
-    written = kept.stat().st_mtime_ns
-    holes([str(attacked), *HOLES, "--out", str(looked)], capsys)
-    assert (looked / "holes.json").read_text() == before
-    assert kept.stat().st_mtime_ns == written
+    written = cached.stat().st_mtime_ns
+    holes([str(attacked), *HOLES, "--out", str(mapped)], capsys)
+    assert (mapped / "holes.json").read_text() == before
+    assert cached.stat().st_mtime_ns == written
 
 
 @pytest.mark.slow
 def test_a_rule_is_checked_by_draws_of_its_own(
-    attacked: Path, looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    attacked: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """After the holes, which are kept: of seeds that neither the rule nor its probability knew."""
     out, name = tmp_path / "holes", Path("0") / "frames" / "demo-000"
-    shutil.copytree(looked, out)
-    kept = out / "runs" / name / "holes.json"
-    written = kept.stat().st_mtime_ns
+    shutil.copytree(mapped, out)
+    cached = out / "runs" / name / "holes.json"
+    written = cached.stat().st_mtime_ns
     words = [str(attacked), *HOLES, "--out", str(out)]
     found = holes([*words, "--recheck", "16"], capsys)
-    assert kept.stat().st_mtime_ns == written
+    assert cached.stat().st_mtime_ns == written
     assert (found["rechecked"], found["hold"]) == (len(found["holes"]), len(found["holes"]))
     (checked,) = (out / "rechecks" / "16" / "0").glob("*/frames/demo-000/recheck.json")
     (fresh,) = (out / "fresh" / "0").glob("*/frames/demo-000/fresh.json")
@@ -204,7 +204,7 @@ def test_a_rule_is_checked_by_draws_of_its_own(
         load_record(checked, FrameRuleSamples, 3).inside,
     )
     for around, first, inside in zip(
-        load_record(kept, FrameHoles, 3).around, inside_first, inside_again, strict=True
+        load_record(cached, FrameHoles, 3).around, inside_first, inside_again, strict=True
     ):
         known = {*around.samples.values, *around.near.values, *first.values}
         assert len(inside.values) == 16
@@ -220,10 +220,10 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     assert holes(words, capsys)["holes"][0]["recheck"] is None
 
 
-def test_other_cars_are_sampled_too(looked: Path) -> None:
+def test_other_cars_are_sampled_too(mapped: Path) -> None:
     """By default four states of the frame, in which both cars change."""
-    kept = load_record(looked / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3)
-    (contrast,) = kept.contrast
+    cached = load_record(mapped / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3)
+    (contrast,) = cached.contrast
     assert (contrast.label, len(contrast.objects)) == ("Car", 8)
     assert set(contrast.by_object()) == {0, 1}
     assert all(len(samples.margins) == 4 for samples in contrast.by_object().values())
@@ -241,32 +241,32 @@ def test_without_contrast_there_are_none(
 
 
 def test_an_answer_of_an_older_version_is_refused_in_one_line(
-    attacked: Path, looked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    attacked: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "holes"
-    shutil.copytree(looked, out)
-    kept = out / "runs" / "0" / "frames" / "demo-000" / "holes.json"
-    old = json.loads(kept.read_text())
-    kept.write_text(json.dumps(old | {"schema": 2}))
+    shutil.copytree(mapped, out)
+    cached = out / "runs" / "0" / "frames" / "demo-000" / "holes.json"
+    old = json.loads(cached.read_text())
+    cached.write_text(json.dumps(old | {"schema": 2}))
     capsys.readouterr()
     assert main(["holes", str(attacked), *HOLES, "--out", str(out)]) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith("drivesem: ")
-    assert "holes.json" in said
+    error_line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error_line.startswith("drivesem: ")
+    assert "holes.json" in error_line
 
 
 @pytest.mark.slow
 def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    kept = []
+    cached = []
     for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):
         words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--seed", seed]
         holes([*words, "--out", str(tmp_path / name)], capsys)
-        kept.append(
+        cached.append(
             load_record(
                 tmp_path / name / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3
             ).around
         )
-    one, again, other = kept
+    one, again, other = cached
     assert one == again != other
 
 
@@ -298,7 +298,7 @@ def gate(
         "other": Other(blind.boxes, blind.band),
         "seeing things": Imagining(blind.boxes, blind.band),
     }
-    monkeypatch.setattr(gate_asking, "load_predictor", lambda name, *_: known[name])
+    monkeypatch.setattr(gate_analysis, "load_predictor", lambda name, *_: known[name])
 
     def call(after: str) -> tuple[int, dict[str, Any]]:
         capsys.readouterr()
@@ -310,25 +310,25 @@ def gate(
 
 
 def test_a_detector_passes_its_own_gate(gate: Callable[[str], tuple[int, dict[str, Any]]]) -> None:
-    code, told = gate("any")
-    assert (code, told["passed"]) == (0, True)
-    assert {row["difference"] for row in told["rows"]} == {0}
-    assert told["rows"][0]["before"] > 0
+    code, data = gate("any")
+    assert (code, data["passed"]) == (0, True)
+    assert {row["difference"] for row in data["rows"]} == {0}
+    assert data["rows"][0]["before"] > 0
 
 
 def test_a_worse_one_does_not_and_a_better_one_does(
     gate: Callable[[str], tuple[int, dict[str, Any]]], tmp_path: Path
 ) -> None:
-    code, told = gate("worse")
-    assert (code, told["passed"]) == (1, False)
-    row = told["rows"][0]
+    code, data = gate("worse")
+    assert (code, data["passed"]) == (1, False)
+    row = data["rows"][0]
     assert (row["level"], row["grew"]) == ("hole", True)
     assert row["interval"][0] > 0.05
     suite = ET.parse(tmp_path / "worse" / "gate.xml").getroot()
-    assert int(suite.attrib["failures"]) == sum(row["grew"] for row in told["rows"]) > 0
-    code, told = gate("better")
-    assert (code, told["passed"]) == (0, True)
-    phantoms, whole = told["rows"][-1], told["rows"][-2]
+    assert int(suite.attrib["failures"]) == sum(row["grew"] for row in data["rows"]) > 0
+    code, data = gate("better")
+    assert (code, data["passed"]) == (0, True)
+    phantoms, whole = data["rows"][-1], data["rows"][-2]
     assert (whole["level"], phantoms["level"]) == ("all", "phantoms")
     assert whole["difference"] < -0.05
     assert (phantoms["before"], phantoms["after"]) == (0, 0)
@@ -338,10 +338,10 @@ def test_one_that_sees_what_is_not_there_does_not_pass(
     gate: Callable[[str], tuple[int, dict[str, Any]]], tmp_path: Path
 ) -> None:
     """It loses no more objects."""
-    code, told = gate("seeing things")
-    assert (code, told["passed"]) == (1, False)
-    assert [row["hole"] for row in told["rows"] if row["grew"]] == ["phantoms"]
-    phantoms = told["rows"][-1]
+    code, data = gate("seeing things")
+    assert (code, data["passed"]) == (1, False)
+    assert [row["hole"] for row in data["rows"] if row["grew"]] == ["phantoms"]
+    phantoms = data["rows"][-1]
     assert (phantoms["before"], phantoms["after"]) == (0, 1)
     assert "phantoms" in (tmp_path / "seeing things" / "gate.md").read_text()
 
@@ -357,9 +357,9 @@ def test_frames_that_cannot_be_compared_do_not_pass(
     shutil.copytree(attacked, run, ignore=shutil.ignore_patterns("scene"))
     words = ["gate", str(run), "--before", "any", "--after", "any", "--workers", "1", "--out", str(out)]
     assert main([*words, "--keep-going", "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert (told["passed"], told["rows"]) == (False, [])
-    (reason,) = told["frames_failed"].values()
+    data = json.loads(capsys.readouterr().out)
+    assert (data["passed"], data["rows"]) == (False, [])
+    (reason,) = data["frames_failed"].values()
     assert "scene" in reason
     suite = ET.parse(out / "gate.xml").getroot()
     assert (suite.attrib["tests"], suite.attrib["errors"], suite.attrib["failures"]) == ("1", "1", "0")
@@ -372,7 +372,7 @@ def test_frames_that_cannot_be_compared_do_not_pass(
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def error_line(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """The one line of a gate that is refused."""
 
     def call(*words: object) -> str:
@@ -385,17 +385,17 @@ def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 @pytest.mark.usefixtures("gate")
-def test_other_classes_are_no_comparison(attacked: Path, said: Callable[..., str]) -> None:
-    other = said(attacked, "--after", "other")
+def test_other_classes_are_no_comparison(attacked: Path, error_line: Callable[..., str]) -> None:
+    other = error_line(attacked, "--after", "other")
     assert other == "--after: expected the classes of --before, found Bus, which --before does not know"
-    fewer = said(attacked, "--before", "other", "--after", "any")
+    fewer = error_line(attacked, "--before", "other", "--after", "any")
     assert fewer == "--after: expected the classes of --before, found no Bus"
 
 
-def test_the_gate_needs_the_new_detector(attacked: Path, said: Callable[..., str]) -> None:
+def test_the_gate_needs_the_new_detector(attacked: Path, error_line: Callable[..., str]) -> None:
     """The old detector compared with itself would always pass."""
     wanted = "the detector that replaces --before"
-    assert said(attacked) == f"--after: expected {wanted}, found nothing"
+    assert error_line(attacked) == f"--after: expected {wanted}, found nothing"
     assert not (attacked / "gate").exists()
 
 
@@ -408,13 +408,13 @@ def test_before_defaults_to_the_detector_of_the_runs(
     _, named = gate("worse")
     words = ["--after", "worse", "--samples", "20", "--workers", "1"]
     assert main(["gate", str(attacked), *words, "--json", "--out", str(tmp_path / "own")]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert (told["before"], told["rows"]) == ("any", named["rows"])
+    data = json.loads(capsys.readouterr().out)
+    assert (data["before"], data["rows"]) == ("any", named["rows"])
     assert "before: any" in (tmp_path / "own" / "config.yaml").read_text()
 
 
 def test_runs_without_a_usable_detector_need_before(
-    attacked: Path, tmp_path: Path, said: Callable[..., str]
+    attacked: Path, tmp_path: Path, error_line: Callable[..., str]
 ) -> None:
     run = shutil.copytree(attacked, tmp_path / "run")
     config, as_it_was = run / "config.yaml", (run / "config.yaml").read_text()
@@ -424,17 +424,17 @@ def test_runs_without_a_usable_detector_need_before(
 
     of("better")
     several = "the current detector, as these runs have several"
-    assert said(attacked, run, "--after", "worse") == f"--before: expected {several}, found any, better"
+    assert error_line(attacked, run, "--after", "worse") == f"--before: expected {several}, found any, better"
     of("module:evil.py:D")
     trusted = f"{config}: detector: expected a detector that is data alone, or --trust"
-    assert said(run, "--after", "worse").startswith(trusted)
+    assert error_line(run, "--after", "worse").startswith(trusted)
     # weights that were written over: the new detector may be in the old one's file
     weights = tmp_path / "weights.safetensors"
     weights.write_bytes(b"new")
     of(str(weights))
     (run / "files.json").write_text(json.dumps({str(weights): "0" * 64}))
     made_with = f"expected the files that this run was made with, found another {weights}"
-    assert made_with in said(run, "--after", "worse")
+    assert made_with in error_line(run, "--after", "worse")
 
 
 @pytest.mark.parametrize(

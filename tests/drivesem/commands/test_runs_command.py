@@ -40,7 +40,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def run_json(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     capsys.readouterr()
     assert main(["runs", *words, "--json"]) == 0
     return json.loads(capsys.readouterr().out)
@@ -54,13 +54,13 @@ def test_parts_are_every_nth_frame_and_merge_into_the_whole(
     assert names == {"part1": {"demo-000", "demo-002"}, "part2": {"demo-001"}}
     out = tmp_path / "merged"
     both = [str(parts / "part1"), str(parts / "part2")]
-    merged = told(["merge", *both, str(parts / "whole"), "--out", str(out)], capsys)
+    merged = run_json(["merge", *both, str(parts / "whole"), "--out", str(out)], capsys)
     whole = json.loads((parts / "whole" / "metrics.json").read_text())
     assert without_times(merged) == without_times(whole)
     hashes = [json.loads((folder / "manifest.json").read_text()) for folder in (out, parts / "whole")]
     assert hashes[0] == hashes[1]
     assert main(["verify", "--run", str(out)]) == 0
-    assert told(["merge", *both, "--out", str(out)], capsys)["frames"] == 3, "it goes on"
+    assert run_json(["merge", *both, "--out", str(out)], capsys)["frames"] == 3, "it goes on"
 
 
 def test_frames_that_differ_and_other_settings_are_refused(
@@ -89,7 +89,7 @@ def test_a_part_that_takes_the_others_keeps_its_frames(
     shutil.copytree(parts / "part1", own)
     config = own / "config.yaml"
     config.write_text(config.read_text().replace("resume: true", "resume: false"))
-    merged = told(["merge", str(own), str(parts / "part2"), "--out", str(own)], capsys)
+    merged = run_json(["merge", str(own), str(parts / "part2"), "--out", str(own)], capsys)
     assert without_times(merged) == without_times(json.loads((parts / "whole" / "metrics.json").read_text()))
     assert "resume: true" in config.read_text()
 
@@ -101,14 +101,14 @@ def test_frames_that_are_there_are_compared_with_the_parts(
     shutil.copytree(parts / "part2", part)
     merge = ["runs", "merge", str(part), "--out", str(out)]
     assert main(merge) == 0
-    figures = (out / "metrics.json").read_text()
+    metrics = (out / "metrics.json").read_text()
     result = part / "frames" / "demo-001" / "result.json"
     files.write_json(result, json.loads(result.read_text()) | {"objects": 99})
     assert main(merge) == 2
     assert f"--out: expected a new folder, or one of the same frames, found another demo-001 in {out}" in (
         capsys.readouterr().err
     )
-    assert (out / "metrics.json").read_text() == figures
+    assert (out / "metrics.json").read_text() == metrics
 
 
 @pytest.mark.slow
@@ -127,23 +127,23 @@ def test_parts_with_nothing_to_attack_merge_into_the_whole(
     whole = json.loads((tmp_path / "whole" / "metrics.json").read_text())
     assert whole["frames_without_vehicles"] == 2
     for runs in (names, [*names, str(tmp_path / "whole")]):
-        merged = told(["merge", *runs, "--out", str(tmp_path / "merged")], capsys)
+        merged = run_json(["merge", *runs, "--out", str(tmp_path / "merged")], capsys)
         assert without_times(merged) == without_times(whole)
     assert main(["runs", "merge", names[3], "--out", str(tmp_path / "nothing")]) == 2
     assert f"FOLDER: expected runs with frames, found none in {names[3]}" in capsys.readouterr().err
 
 
 def test_list_and_show(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = {Path(row["run"]).name: row for row in told(["list", str(parts)], capsys)["runs"]}
+    rows = {Path(row["run"]).name: row for row in run_json(["list", str(parts)], capsys)["runs"]}
     assert {name: row["frames"] for name, row in rows.items()} == {"part1": 2, "part2": 1, "whole": 3}
     assert rows["whole"]["params"] == "color"
     assert rows["whole"]["finished"]
-    (shown,) = told(["show", str(parts / "whole")], capsys)["runs"]
-    assert shown["settings"] == {"params": "color", "method": "fgsm", "second_detector": "off"}
+    (row,) = run_json(["show", str(parts / "whole")], capsys)["runs"]
+    assert row["settings"] == {"params": "color", "method": "fgsm", "second_detector": "off"}
     assert main(["runs", "list", str(parts)]) == 0
-    said = capsys.readouterr().out
-    assert "whole: 3 frames, " in said
-    assert "color by fgsm on squeezedet" in said
+    output = capsys.readouterr().out
+    assert "whole: 3 frames, " in output
+    assert "color by fgsm on squeezedet" in output
     assert main(["runs", "show", str(parts / "whole")]) == 0
     assert "  method: fgsm\n" in capsys.readouterr().out
 
@@ -164,7 +164,7 @@ def test_runs_of_other_commands_are_passed_over(
     shutil.copytree(parts / "part2", tmp_path / "run")
     (tmp_path / "clip" / "frames").mkdir(parents=True)
     (tmp_path / "clip" / "config.yaml").write_text("detector: squeezedet\nclip: null\nbend: 3\n")
-    assert [row["run"] for row in told(["list", str(tmp_path)], capsys)["runs"]] == [str(tmp_path / "run")]
+    assert [row["run"] for row in run_json(["list", str(tmp_path)], capsys)["runs"]] == [str(tmp_path / "run")]
     assert main(["runs", "list", str(tmp_path / "clip")]) == 2
     assert "expected a run of drivesem attack, found" in capsys.readouterr().err
 
@@ -179,9 +179,9 @@ def test_prune_removes_what_a_killed_command_left(
     (half / ".benign.png.89abcdef.tmp").write_bytes(b"half")
     before = {p for p in run.rglob("*") if half not in (p, *p.parents) and p.name != ".lock"}
     assert files.find_leftovers(run) == [half]
-    assert told(["prune", str(run), "--dry"], capsys) == {"removed": [str(half)]}
+    assert run_json(["prune", str(run), "--dry"], capsys) == {"removed": [str(half)]}
     assert half.is_dir()
-    assert told(["prune", str(run)], capsys) == {"removed": [str(half)]}
+    assert run_json(["prune", str(run)], capsys) == {"removed": [str(half)]}
     assert {p for p in run.rglob("*") if p.name != ".lock"} == before
 
 
@@ -205,13 +205,13 @@ def test_prune_passes_over_what_a_question_is_writing(
         half.mkdir(parents=True)
         (half.parent.parent / ".lock").touch()
     command = [sys.executable, "-c", _HOLDER, str(run / "explain")]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as asking:
-        assert asking.stdout is not None
-        assert asking.stdout.readline() == "held\n"
-        assert told(["prune", str(run)], capsys) == {"removed": [str(halves[1])]}
-        asking.communicate()
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        assert run_json(["prune", str(run)], capsys) == {"removed": [str(halves[1])]}
+        holder.communicate()
     assert halves[0].is_dir()
-    assert told(["prune", str(run)], capsys) == {"removed": [str(halves[0])]}
+    assert run_json(["prune", str(run)], capsys) == {"removed": [str(halves[0])]}
 
 
 @pytest.mark.parametrize(

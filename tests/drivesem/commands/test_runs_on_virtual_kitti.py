@@ -40,8 +40,12 @@ def run(small_run: Path, tmp_path: Path) -> Path:
     for name in NAMES:
         shutil.copytree(attacked, out / "frames" / name)
         result = out / "frames" / name / "result.json"
-        told = json.loads(result.read_text()) | {"identifier": name, "success_moved": True, "success_paper": True}
-        result.write_text(json.dumps(told))
+        record = json.loads(result.read_text()) | {
+            "identifier": name,
+            "success_moved": True,
+            "success_paper": True,
+        }
+        result.write_text(json.dumps(record))
     return out
 
 

@@ -16,7 +16,7 @@ import torch
 from detectors.types import Detections
 from drivesem.analysis.transfer import run as transfer_run
 from drivesem.cli import main
-from drivesem.run import detection_cache as looking
+from drivesem.run import detection_cache
 from drivesem.run.results import load_frame
 
 
@@ -60,20 +60,20 @@ def transfer(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]
     return call
 
 
-def test_the_source_itself_finds_what_the_run_says(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+def test_the_source_detector_reproduces_the_run(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
     (row,) = transfer("--run", run, "--detectors", "squeezedet")["rows"]
-    figures = json.loads((run / "metrics.json").read_text())
+    metrics = json.loads((run / "metrics.json").read_text())
     for key in ("ap50", "ap70", "recall_at_t_star"):
-        assert row[f"benign_{key}"] == pytest.approx(figures["benign"][key], abs=1e-9)
-        assert row[f"moved_{key}"] == pytest.approx(figures["attacked"]["moved"][key], abs=1e-9)
-        assert row[f"paper_{key}"] == pytest.approx(figures["attacked"]["paper"][key], abs=1e-9)
+        assert row[f"benign_{key}"] == pytest.approx(metrics["benign"][key], abs=1e-9)
+        assert row[f"moved_{key}"] == pytest.approx(metrics["attacked"]["moved"][key], abs=1e-9)
+        assert row[f"paper_{key}"] == pytest.approx(metrics["attacked"]["paper"][key], abs=1e-9)
     assert row["drop_moved"] == pytest.approx(row["benign_ap50"] - row["moved_ap50"], abs=1e-9)
     assert row["drop_moved_low"] <= row["drop_moved"] + 1e-9
     assert row["frames"] == 2
     assert row["frame_rate"] == 1.0
-    assert row["frame_rate_of"] == figures["successes_moved"] > 0
+    assert row["frame_rate_of"] == metrics["successes_moved"] > 0
     assert row["transfer_rate"] in (1.0, None)
-    assert (row["transfer_rate"] is None) == (figures["lost_objects"] == 0)
+    assert (row["transfer_rate"] is None) == (metrics["lost_objects"] == 0)
 
 
 def test_files(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
@@ -87,20 +87,20 @@ def test_files(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
     assert min(picture.shape[:2]) > 200
 
 
-def test_a_second_call_looks_at_nothing_twice(
+def test_a_second_call_detects_nothing_again(
     run: Path, transfer: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = transfer("--run", run, "--detectors", "squeezedet")
-    kept = sorted((run / "transfer" / "detections").rglob("*.json"))
-    assert len(kept) == 4
-    kept[1].unlink()
-    looks: list[int] = []
-    predict = looking.predict
-    monkeypatch.setattr(looking, "predict", lambda *words: looks.append(1) or predict(*words))
+    cached = sorted((run / "transfer" / "detections").rglob("*.json"))
+    assert len(cached) == 4
+    cached[1].unlink()
+    calls: list[int] = []
+    predict = detection_cache.predict
+    monkeypatch.setattr(detection_cache, "predict", lambda *words: calls.append(1) or predict(*words))
     assert transfer("--run", run, "--detectors", "squeezedet") == first
-    assert len(looks) == 1
+    assert len(calls) == 1
     assert transfer("--run", run, "--detectors", "squeezedet", "--no-resume") == first
-    assert len(looks) == 5
+    assert len(calls) == 5
 
 
 def test_what_another_detector_loses(
@@ -119,7 +119,7 @@ def test_what_another_detector_loses(
         moved = {t.index: t for t in result.targets_moved}
         known += sum(not moved[t.index].ignore for t in cars)
         lost += sum(f.kind == "lost" and f.label == "Car" for f in result.failures)
-    monkeypatch.setattr(looking, "load_predictor", lambda *_: Blind(seen))
+    monkeypatch.setattr(detection_cache, "load_predictor", lambda *_: Blind(seen))
     (row,) = transfer("--run", run, "--detectors", "onnx:some/blind.onnx")["rows"]
     assert row["target"] == "onnx:blind.onnx"
     assert row["t_star"] == 0.3
@@ -152,7 +152,7 @@ def test_a_matrix_of_two_runs(run: Path, tmp_path: Path, transfer: Callable[...,
         ("onnx:n.onnx,n.yaml,onnx:m.onnx,b.safetensors", ["onnx:n.onnx,n.yaml", "onnx:m.onnx", "b.safetensors"]),
     ],
 )
-def test_detectors_are_told_apart(text: str, names: list[str]) -> None:
+def test_detectors_have_distinct_names(text: str, names: list[str]) -> None:
     assert transfer_run.parse_detector_names(text) == names
 
 
@@ -180,30 +180,32 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (line,) = capsys.readouterr().err.splitlines()
         return line.removeprefix("drivesem: ")
 
-    asked = ("--detectors", "squeezedet")
-    assert refused(*asked) == "--run: expected a folder of drivesem attack, found nothing"
-    assert refused("--run", tmp_path / "none", *asked).startswith("--run: expected a folder of drivesem attack")
+    detectors = ("--detectors", "squeezedet")
+    assert refused(*detectors) == "--run: expected a folder of drivesem attack, found nothing"
+    assert refused("--run", tmp_path / "none", *detectors).startswith(
+        "--run: expected a folder of drivesem attack"
+    )
     assert refused("--run", run) == "--detectors: expected detectors with commas, found nothing"
     unknown = refused("--run", run, "--detectors", "squeezdet")
     assert unknown.startswith("--detectors: expected detectors (squeezedet, yolov3-slim, a path.safetensors, or")
     assert unknown.endswith("ensemble: or planted:), found 'squeezdet'")
     assert (unknown.count("expected"), unknown.count("found")) == (1, 1)
     assert "each detector once, found squeezedet" in refused("--run", run, "--detectors", "squeezedet,squeezedet")
-    assert "each run once" in refused("--run", f"{run},{run}", *asked)
-    assert "--bootstrap" in refused("--run", run, *asked, "--bootstrap", "-1")
+    assert "each run once" in refused("--run", f"{run},{run}", *detectors)
+    assert "--bootstrap" in refused("--run", run, *detectors, "--bootstrap", "-1")
     assert not (run / "transfer").exists()
     broken = run / "frames" / "demo-001" / "counterexample.png"
     broken.write_bytes(broken.read_bytes()[:999])
     # its progress bar may stand before the line
-    assert main(["transfer", "--run", str(run), *asked, "--workers", "1"]) == 2
+    assert main(["transfer", "--run", str(run), *detectors, "--workers", "1"]) == 2
     assert str(broken) in " ".join(capsys.readouterr().err.split())
     (run / "metrics.json").unlink()
-    assert "a finished run" in refused("--run", run, *asked)
+    assert "a finished run" in refused("--run", run, *detectors)
     (run / "config.yaml").write_text("photo: street.png\n")
-    assert "a run of another command" in refused("--run", run, *asked)
+    assert "a run of another command" in refused("--run", run, *detectors)
 
 
-def test_bad_frames_are_left_out_where_asked(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+def test_bad_frames_are_left_out_with_keep_going(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
     broken = run / "frames" / "demo-001" / "counterexample.png"
     broken.write_bytes(b"no picture")
     data = transfer("--run", run, "--detectors", "squeezedet", "--keep-going")
@@ -216,6 +218,6 @@ def test_a_detector_without_cars_is_refused(
 ) -> None:
     blind = Blind({})
     monkeypatch.setattr(blind, "classes", ("bus",), raising=False)
-    monkeypatch.setattr(looking, "load_predictor", lambda *_: blind)
+    monkeypatch.setattr(detection_cache, "load_predictor", lambda *_: blind)
     assert main(["transfer", "--run", str(run), "--detectors", "onnx:blind.onnx"]) == 2
     assert "expected one that knows Car, found bus" in capsys.readouterr().err

@@ -86,7 +86,7 @@ def change(path: Path, edit: Callable[[Any], None]) -> None:
     path.write_text(json.dumps(data))
 
 
-def told(data: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def differing_fields(data: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Differences by field; all of them are in the first frame or the run's."""
     assert {one["frame"] for one in data["differences"]} <= {"demo-000", "(run)"}
     return {one["field"]: one for one in data["differences"]}
@@ -159,8 +159,8 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
     )
     out = tmp_path / "street"
     assert main(["attack", *WORDS, *words, "--out", str(out)]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["feasible_fraction"] == 1.0
+    data = json.loads(capsys.readouterr().out)
+    assert data["feasible_fraction"] == 1.0
     assert yaml.safe_load((out / "config.yaml").read_text())["budget"] == "street"
     theta = [c for c in load_frame(out / FRAME / "result.json").theta if c.name.endswith("along")]
     assert max(abs(c.value) for c in theta) > 0.25
@@ -179,7 +179,7 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
     # The same scenes do not pass for a run in a budget as narrow as the paper's, nor for one that holds sizes.
     change_text = (out / "config.yaml").read_text().replace("budget: street", "budget: street,translate=0.25")
     (out / "config.yaml").write_text(change_text)
-    found = told(verify(out))
+    found = differing_fields(verify(out))
     assert "own lengths" in found["violations"]["found"]
     (out / "config.yaml").write_text(change_text.replace("budget: street,translate=0.25", "budget: paper"))
     assert main(["verify", "--run", str(out)]) == 2
@@ -207,13 +207,13 @@ def test_changed_pixels(run: Path, verify: Callable[..., dict[str, Any]]) -> Non
         files.write_png(run / FRAME / name, image)
     data = verify(run)
     assert checks(data) >= {"files", "pictures", "detections"}
-    assert set(told(data)) >= {*pictures, *pictures.values()}
+    assert set(differing_fields(data)) >= {*pictures, *pictures.values()}
     share = f"up to 128 levels off, in {100 * 1600 / (image.shape[0] * image.shape[1]):.3g} % of the pixels"
     found = {d["field"]: d["found"] for d in data["differences"] if d["check"] == "pictures"}
     assert found == dict.fromkeys(pictures, share)
 
 
-def test_what_is_wrong_in_many_ways_hides_nothing_else(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_many_differences_hide_no_other(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A picture with other detections makes differences by the dozen."""
     result = run / FRAME / "result.json"
     change(result, lambda data: data["detections_benign"].extend(data["detections_benign"] * 40))
@@ -221,12 +221,12 @@ def test_what_is_wrong_in_many_ways_hides_nothing_else(run: Path, capsys: pytest
     (run / "config.yaml").write_text(settings.replace("steps: 10", "steps: 99"))
     capsys.readouterr()
     assert main(["verify", "--run", str(run), "--workers", "1"]) == 1
-    said = capsys.readouterr().out
-    lines = [line for line in said.splitlines() if ": expected " in line]
+    output = capsys.readouterr().out
+    lines = [line for line in output.splitlines() if ": expected " in line]
     assert lines[0].startswith("(run): ")
     assert "(run): settings: config.yaml: steps: expected 99, found 10" in lines
     assert len([line for line in lines if ": detections: " in line]) == 5
-    assert re.search(r"^and \d+ more$", said, re.MULTILINE)
+    assert re.search(r"^and \d+ more$", output, re.MULTILINE)
 
 
 def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
@@ -236,7 +236,7 @@ def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[st
         words[4] = f"{float(words[4]) - 3:.2f}"
         (run / FRAME / name).write_text("\n".join([lines[0], " ".join(words), *lines[2:]]) + "\n")
     data = verify(run)
-    assert set(told(data)) == {
+    assert set(differing_fields(data)) == {
         *("labels_paper.txt", "labels_paper.txt: objects[1].boxes_xyxy"),
         *("labels_moved.txt", "labels_moved.txt: objects[1].boxes_xyxy"),
     }
@@ -251,7 +251,7 @@ def test_an_object_struck_from_the_labels_and_another_sum(
     change(run / "metrics.json", lambda data: data.update(successes_paper=7))
     data = verify(run)
     found = {path.name, f"{path.name}: type", "metrics.json", "metrics.json: successes_paper"}
-    assert set(told(data)) == found
+    assert set(differing_fields(data)) == found
     assert data["differences"][-1]["expected"] == "7"
 
 
@@ -261,7 +261,7 @@ def test_a_success_that_is_none(run: Path, verify: Callable[..., dict[str, Any]]
 
     change(run / FRAME / "result.json", flip)
     data = verify(run)
-    found = told(data)
+    found = differing_fields(data)
     assert set(found) == {
         "success_moved",
         "success_moved by labels_moved.txt",
@@ -280,7 +280,7 @@ def test_failures_detections_and_targets_that_are_others(run: Path, verify: Call
         data["targets_moved"][1]["ignore"] ^= True
 
     change(run / FRAME / "result.json", spoil)
-    found = told(verify(run))
+    found = differing_fields(verify(run))
     assert {"lost", "phantoms", "lost by labels_moved.txt", "phantoms by labels_moved.txt"} <= set(found)
     assert (found["lost"]["expected"], found["lost"]["found"]) == ("objects[1]", "none")
     assert found["targets_moved[1]"]["check"] == "labels"
@@ -298,7 +298,7 @@ def test_another_grade_kind_or_count(run: Path, verify: Callable[..., dict[str, 
         change(path, lambda data: data["failures"][0].update(fields))
         data = verify(run)
         path.write_text(whole)
-        return told(data)
+        return differing_fields(data)
 
     found = spoil(grade="certain")
     files_changed = {"result.json", "result.json: failures"}
@@ -363,7 +363,7 @@ def test_each_figure_of_the_run(
     run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
 ) -> None:
     change(run / "metrics.json", edit)
-    assert field in told(verify(run))
+    assert field in differing_fields(verify(run))
 
 
 @pytest.mark.parametrize(
@@ -390,14 +390,14 @@ def test_each_figure_of_a_frame(
     run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
 ) -> None:
     change(run / FRAME / "result.json", edit)
-    assert {field, "result.json"} <= set(told(verify(run)))
+    assert {field, "result.json"} <= set(differing_fields(verify(run)))
 
 
 def test_runs_from_before_values_had_hashes_of_their_own(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
     change(run / "manifest.json", lambda data: data.pop("fields"))
     verify(run, code=0)
     change(run / FRAME / "result.json", nested("loss_trace", value=[9.0]))
-    assert set(told(verify(run))) == {"result.json"}
+    assert set(differing_fields(verify(run))) == {"result.json"}
 
 
 def test_settings_overlays_and_files_that_were_added_or_taken_away(
@@ -409,7 +409,7 @@ def test_settings_overlays_and_files_that_were_added_or_taken_away(
     (run / FRAME / "difference.png").unlink()
     (run / FRAME / "scene" / "more.txt").write_text("more")
     change(run / FRAME / "result.json", nested("seconds", value=1e6))  # no two runs take as long
-    found = told(verify(run))
+    found = differing_fields(verify(run))
     assert set(found) == {"config.yaml: steps", "overlay.png", "difference.png", "scene/more.txt"}
     assert (found["config.yaml: steps"]["expected"], found["config.yaml: steps"]["found"]) == ("99", "10")
     assert found["difference.png"]["found"] == found["scene/more.txt"]["expected"] == "no file"
@@ -430,7 +430,7 @@ def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(
 ) -> None:
     change(run / FRAME / "scene" / "scene.json", lambda data: shift(data, 0.15))
     data = verify(run)
-    found = told(data)
+    found = differing_fields(data)
     assert "scene: objects[0].translation" in found
     for name in ("budget", "violations"):
         assert found[name]["found"].startswith("objects[0]: moved by")
@@ -439,7 +439,7 @@ def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(
 
 def test_a_scene_that_cannot_be(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
     change(run / FRAME / "scene" / "scene.json", lambda data: shift(data, 3.0))
-    found = told(verify(run))
+    found = differing_fields(verify(run))
     assert found["violations"]["expected"] == "none"
     assert "own lengths" in found["violations"]["found"]
 
@@ -454,7 +454,7 @@ def test_theta_beyond_the_budget_and_another_in_its_own_file(
     name = "objects[0].translate.along"
     change(run / FRAME / "result.json", beyond)
     change(run / FRAME / "theta.json", lambda data: data[name].update(value=0.0))
-    found = told(verify(run))
+    found = differing_fields(verify(run))
     assert set(found) == {
         *("weather.fog, budget", "weather.fog, bounds", "theta.json: weather.fog", "scene: weather"),
         *("theta.json", f"theta.json: {name}", "result.json"),

@@ -16,7 +16,7 @@ ROWS = (
 SHEET = ReportTable("Far", COLUMNS, ROWS)
 
 
-def shown(sheet: ReportTable, width: int, words: tuple[str, ...] = COLUMNS[:2]) -> str:
+def printed(sheet: ReportTable, width: int, words: tuple[str, ...] = COLUMNS[:2]) -> str:
     """What a terminal shows of it."""
     console = Console(file=io.StringIO(), width=width)
     console.print(*sheet.fit_to_console(console, words), sep="\n")
@@ -36,13 +36,13 @@ def test_a_column_that_the_first_row_lacks_is_in_the_csv() -> None:
 
 
 def test_a_table_that_fits_is_one() -> None:
-    text = shown(SHEET, 110)
+    text = printed(SHEET, 110)
     assert text.count("Far") == 1
     assert "further" not in text
 
 
 def test_a_table_that_does_not_fit_goes_on_below_with_its_first_columns() -> None:
-    text = shown(SHEET, 80)
+    text = printed(SHEET, 80)
     for row in ROWS:
         assert all(cell in text for cell in row)
     assert max(map(len, text.splitlines())) <= 80
@@ -57,7 +57,7 @@ def test_where_not_even_one_column_has_room_it_stays_one() -> None:
         ReportTable("Far words", ("a", "b"), (("x" * 50, "y" * 50),)),
         ReportTable("Far", ("a", "b"), ()),
     ):
-        text = shown(sheet, 40, (*COLUMNS[:2], "a", "b"))
+        text = printed(sheet, 40, (*COLUMNS[:2], "a", "b"))
         assert "further" not in text
         assert max(map(len, text.splitlines())) <= 40
 
@@ -80,7 +80,7 @@ def test_no_word_and_no_number_is_broken(
         *(f"{head}{i}" for i, (head, _) in enumerate(numbers)),
     )
     sheet = ReportTable("t", columns, ((*[sentence] * len(names), *(number for _, number in numbers)),))
-    text = shown(sheet, width, columns[: len(names)])
+    text = printed(sheet, width, columns[: len(names)])
     assert max(map(len, text.splitlines())) <= width
     assert all(number in text for _, number in numbers)
     assert all(word in text for word in " ".join([*columns, sentence]).split())

@@ -41,7 +41,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     found.shutdown()
 
 
-def look(job: int, folder: str) -> tuple[int, str]:
+def square_and_node(job: int, folder: str) -> tuple[int, str]:
     """A job's square and the node that found it. FormatError for 3; job 5 ends its process once, job 7 always."""
     with Path(folder, str(job)).open("a") as tries:
         tries.write("x")
@@ -53,13 +53,13 @@ def look(job: int, folder: str) -> tuple[int, str]:
     return job * job, ray.get_runtime_context().get_node_id()
 
 
-def looking(folder: str) -> Callable[[int], tuple[int, str]]:
-    return partial(look, folder=folder)
+def make_worker(folder: str) -> Callable[[int], tuple[int, str]]:
+    return partial(square_and_node, folder=folder)
 
 
 def found_by(jobs: list[int], folder: Path, address: str) -> Iterator[tuple[int, Any]]:
     config = WorkerOptions(engine="ray", address=address)
-    for job, outcome in run_jobs(look, partial(looking, str(folder)), jobs, config):
+    for job, outcome in run_jobs(square_and_node, partial(make_worker, str(folder)), jobs, config):
         try:
             yield job, outcome()
         except SceneError as error:
@@ -128,7 +128,7 @@ def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch
     ray.shutdown()
     config = WorkerOptions(engine="ray", workers=1)
     try:
-        found = dict(run_jobs(look, partial(looking, str(tmp_path)), [1, 2], config))
+        found = dict(run_jobs(square_and_node, partial(make_worker, str(tmp_path)), [1, 2], config))
         assert {job: outcome()[0] for job, outcome in found.items()} == {1: 1, 2: 4}
     finally:
         ray.shutdown()
@@ -153,25 +153,25 @@ def alike(
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    def run(words: list[str], out: str, *figures: str) -> None:
-        told, others = [], (*figures, "config.yaml", ".lock")
+    def run(words: list[str], out: str, *varying: str) -> None:
+        contents_by_run, others = [], (*varying, "config.yaml", ".lock")
         alone = [sys.executable, "-m", "drivesem.cli", *words, "--workers", "1", "--out", str(tmp_path / out)]
         subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
         shared = ["--engine", "ray", "--address", cluster.address, "--out", str(tmp_path / f"{out}-ray"), "--json"]
         assert main([*words, *shared]) == 0
         for folder in (out, f"{out}-ray"):
-            told.append({n: x for n, x in contents(tmp_path / folder).items() if not n.startswith(others)})
-        assert told[0] == told[1]
-        assert told[0]
+            contents_by_run.append(
+                {n: x for n, x in contents(tmp_path / folder).items() if not n.startswith(others)}
+            )
+        assert contents_by_run[0] == contents_by_run[1]
+        assert contents_by_run[0]
 
     return run
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_frames_that_a_cluster_makes_and_looks_at_are_those_made_here(
-    tmp_path: Path, cluster: Any, alike: Alike
-) -> None:
+def test_frames_from_a_cluster_equal_local_ones(tmp_path: Path, cluster: Any, alike: Alike) -> None:
     alike(["synth", "--frames", "2", "--seed", "5"], "kitti")
     read = ["--dataset", "kitti", "--root", str(tmp_path / "kitti")]
     alike(["derender", "--no-fit", *read], "scenes")
@@ -188,7 +188,7 @@ def test_frames_that_a_cluster_makes_and_looks_at_are_those_made_here(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_studies_and_questions_by_a_cluster_are_those_asked_here(tmp_path: Path, alike: Alike) -> None:
+def test_analyses_on_a_cluster_equal_local_ones(tmp_path: Path, alike: Alike) -> None:
     study = [
         "study",
         "labels",

@@ -34,11 +34,11 @@ def test_a_run_goes_on_with_the_files_that_it_was_made_with(spelled: str, tmp_pa
         claimed(config, out)
         check_referenced_files(out, config)
     path.write_bytes(b"two")
-    for ask in (lambda: claimed(config, out), lambda: check_referenced_files(out, config)):
+    for check in (lambda: claimed(config, out), lambda: check_referenced_files(out, config)):
         with pytest.raises(
             UsageError, match=rf"{out / REFERENCED_FILES}: expected the files .*another.*weights\.bin"
         ):
-            ask()
+            check()
     claimed(AttackConfig(detector=spelled.format(path), resume=False), out)
     check_referenced_files(out, config)
 

@@ -104,7 +104,7 @@ def test_what_was_begun_and_killed_at_once_is_a_new_folder(
     assert (out / "metrics.json").is_file()
 
 
-def test_one_process_may_ask_again_and_lets_go_at_the_end(tmp_path: Path) -> None:
+def test_a_process_may_lock_again_and_unlocks_at_its_end(tmp_path: Path) -> None:
     with release_folder_locks():
         acquire_folder_lock(tmp_path)
         with release_folder_locks():

@@ -29,7 +29,7 @@ def test_frames_of_a_finished_run_are_those_of_its_manifest(run: Path) -> None:
     assert list_frames(run) == ["000000", "000001"]
 
 
-def test_a_damaged_manifest_is_told(run: Path) -> None:
+def test_a_damaged_manifest_is_refused(run: Path) -> None:
     for frames in (["000000"], {"../other": {}}, None):
         files.write_json(run / "manifest.json", {"frames": frames})
         with pytest.raises(FormatError, match="frames"):

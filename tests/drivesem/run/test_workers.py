@@ -19,10 +19,10 @@ import torch
 
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
-from drivesem.run.jobs import release_freed_memory
+from drivesem.run.allocation import release_freed_memory
 from drivesem.run.workers import run_jobs
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
-from tools.hostile.trial import soon
+from tools.hostile.trial import wait_until
 
 
 def square(job: int, offset: int = 0) -> tuple[int, int]:
@@ -69,12 +69,12 @@ def test_processes_begin_once_for_all_jobs() -> None:
     assert len(processes) <= 2, "a start takes seconds; on a busy machine one is done before the other has begun"
 
 
-_KEPT: list[bytes] = []
+_HELD: list[bytes] = []
 
 
 def grow(job: int) -> int:
     """Keeps 400 MB, and takes so long that it is noticed. The process's number."""
-    _KEPT.append(bytes(bytearray(b"x") * 400_000_000))
+    _HELD.append(bytes(bytearray(b"x") * 400_000_000))
     time.sleep(1.1)
     return os.getpid()
 
@@ -141,11 +141,11 @@ def test_a_defect_ends_the_work_unless_it_is_to_keep_going(workers: int) -> None
                 results[job] = str(error)
         return results
 
-    said = found(keep_going=True)
-    assert (said[3], said[4]) == (4, 3)
+    output = found(keep_going=True)
+    assert (output[3], output[4]) == (4, 3)
     assert re.fullmatch(
         r"drivesem: expected no defect of its own, found ZeroDivisionError at test_workers.py:\d+: .*",
-        str(said[0]),
+        str(output[0]),
     )
     with pytest.raises(ZeroDivisionError):
         found(keep_going=False)
@@ -173,7 +173,7 @@ def dying(folder: str) -> Callable[[int], int]:
     return partial(die, folder=folder)
 
 
-def test_a_job_whose_process_is_killed_is_tried_alone_and_then_listed(tmp_path: Path) -> None:
+def test_a_job_that_kills_its_process_is_retried_and_then_listed(tmp_path: Path) -> None:
     found: dict[int, int | str] = {}
     for job, outcome in run_jobs(die, partial(dying, str(tmp_path)), [1, 2, 3, 4, 5], WorkerOptions(workers=2)):
         try:
@@ -237,11 +237,11 @@ _NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="nee
 def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, tmp_path: Path) -> None:
     with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
-        assert soon(lambda: len(children(parent.pid)) > 0, 60)
+        assert wait_until(lambda: len(children(parent.pid)) > 0, 60)
         time.sleep(after_s)
         os.killpg(parent.pid, signal.SIGINT)
-        said = parent.stderr.read()
-    assert said.count("Traceback") == 1, said  # of the script itself, which catches nothing
+        output = parent.stderr.read()
+    assert output.count("Traceback") == 1, output  # of the script itself, which catches nothing
 
 
 @_NO_PROC
@@ -250,7 +250,7 @@ def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_pa
     """Soon, and without a word of their own; also where the script guards nothing by its name."""
     with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
-        assert soon(lambda: len(list(tmp_path.glob("[12]-*"))) == 2, 60)
+        assert wait_until(lambda: len(list(tmp_path.glob("[12]-*"))) == 2, 60)
         workers = [int(path.name.partition("-")[2]) for path in tmp_path.glob("[12]-*")]
         start = time.monotonic()
         if number == signal.SIGINT:  # as a terminal sends it: to all of them
@@ -258,10 +258,10 @@ def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_pa
         else:
             parent.send_signal(number)
         parent.wait()
-        assert soon(lambda: not any(_lives(pid) for pid in workers), 10)
-        took, said = time.monotonic() - start, parent.stderr.read()
+        assert wait_until(lambda: not any(_lives(pid) for pid in workers), 10)
+        took, output = time.monotonic() - start, parent.stderr.read()
     assert took < 5
-    assert said.count("Traceback") == (number == signal.SIGINT), "of the script itself, which catches nothing"
+    assert output.count("Traceback") == (number == signal.SIGINT), "of the script itself, which catches nothing"
 
 
 def _lives(pid: int) -> bool:

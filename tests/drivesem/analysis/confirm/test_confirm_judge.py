@@ -19,7 +19,7 @@ CAR = CLASSES.index("Car")
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
-def beside(step: float) -> tuple[float, float, float, float]:
+def shifted_box(step: float) -> tuple[float, float, float, float]:
     x0, y0, x1, y1 = BOX
     return x0 + step, y0, x1 + step, y1
 
@@ -47,29 +47,29 @@ def detections(*boxes: tuple[float, ...]) -> Detections:
 
 
 def test_rows_are_objects_then_regions_of_both_pictures() -> None:
-    before = drawn(BOX, beside(300), beside(500), ignored=(0,), region=beside(700))
-    after = drawn(BOX, beside(310), beside(500), ignored=(2,), region=beside(800))
+    before = drawn(BOX, shifted_box(300), shifted_box(500), ignored=(0,), region=shifted_box(700))
+    after = drawn(BOX, shifted_box(310), shifted_box(500), ignored=(2,), region=shifted_box(800))
     rows = pair_targets(before, after, 3)
     for targets in (rows.benign, rows.changed):
         assert targets.ignore.tolist() == [True, False, True, True, True]
-        assert targets.boxes_xyxy[3:].tolist() == [list(beside(700)), list(beside(800))]
-    assert rows.benign.boxes_xyxy[1].tolist() == list(beside(300))
-    assert rows.changed.boxes_xyxy[1].tolist() == list(beside(310))
+        assert targets.boxes_xyxy[3:].tolist() == [list(shifted_box(700)), list(shifted_box(800))]
+    assert rows.benign.boxes_xyxy[1].tolist() == list(shifted_box(300))
+    assert rows.changed.boxes_xyxy[1].tolist() == list(shifted_box(310))
 
 
 def found(failures: list[Failure], after: Detections, *moved: tuple[float, ...]) -> Any:
     """Findings of two cars, both found before; `moved`: their boxes after the change."""
-    before = drawn(BOX, beside(300))
+    before = drawn(BOX, shifted_box(300))
     rows = pair_targets(before, drawn(*moved) if moved else before, 2)
     result: Any = SimpleNamespace(failures=failures)
-    seen = [detections(BOX, beside(300)), after]
+    seen = [detections(BOX, shifted_box(300)), after]
     return compare_failures(result, rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR)
 
 
 def test_the_same_vehicle_is_lost_in_both() -> None:
-    ours, theirs = found([Failure("lost", "Car", beside(300), index=1)], detections(BOX))
+    ours, theirs = found([Failure("lost", "Car", shifted_box(300), index=1)], detections(BOX))
     assert [(f.kind, f.index, f.survives) for f in ours] == [("lost", 1, True)]
-    assert [(f.kind, f.index, f.survives, f.xyxy) for f in theirs] == [("lost", 1, True, beside(300))]
+    assert [(f.kind, f.index, f.survives, f.xyxy) for f in theirs] == [("lost", 1, True, shifted_box(300))]
 
 
 def test_another_vehicle_is_another_failure() -> None:
@@ -89,28 +89,30 @@ def test_what_is_ignored_is_not_lost() -> None:
 
 def test_phantoms_of_a_class_and_place_are_the_same() -> None:
     phantoms = [
-        Failure("phantom", "Car", beside(505), score=0.8),
-        Failure("phantom", "Car", beside(700), score=0.8),
-        Failure("phantom", "Truck", beside(500), score=0.8),
+        Failure("phantom", "Car", shifted_box(505), score=0.8),
+        Failure("phantom", "Car", shifted_box(700), score=0.8),
+        Failure("phantom", "Truck", shifted_box(500), score=0.8),
     ]
-    ours, theirs = found(phantoms, detections(BOX, beside(300), beside(500)))
+    ours, theirs = found(phantoms, detections(BOX, shifted_box(300), shifted_box(500)))
     assert [f.survives for f in ours] == [True, False, False]
     assert [(f.kind, f.label, f.survives) for f in theirs] == [("phantom", "Car", True)]
 
 
 def test_found_where_it_went_is_no_failure() -> None:
-    ours, theirs = found([], detections(BOX, beside(330)), BOX, beside(330))
+    ours, theirs = found([], detections(BOX, shifted_box(330)), BOX, shifted_box(330))
     assert ours == theirs == ()
 
 
 def test_where_vehicles_stand() -> None:
-    rows = pair_targets(drawn(BOX, beside(300), BOX), drawn(BOX, beside(312), NOTHING, ignored=(1, 2)), 3)
+    rows = pair_targets(
+        drawn(BOX, shifted_box(300), BOX), drawn(BOX, shifted_box(312), NOTHING, ignored=(1, 2)), 3
+    )
     record = [
         BoxRecord(BOX, "Car", index=0),
-        BoxRecord(beside(300), "Car", index=1),
+        BoxRecord(shifted_box(300), "Car", index=1),
         BoxRecord(BOX, "Car", index=2),
     ]
-    moved = [BoxRecord(beside(20), "Car", index=0), BoxRecord(beside(312), "Car", index=1), record[2]]
+    moved = [BoxRecord(shifted_box(20), "Car", index=0), BoxRecord(shifted_box(312), "Car", index=1), record[2]]
     result: Any = SimpleNamespace(targets_benign=record, targets_moved=moved)
     one, two, three = compare_objects(result, rows, 3)
     assert (one.index, one.judged, one.iou_benign, one.iou) == (0, True, 1.0, 0.5)

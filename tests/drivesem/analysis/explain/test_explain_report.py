@@ -80,9 +80,9 @@ def explanation(name: str, rotate: float = 0.5) -> Explanation:
 
 
 def test_back_from_json(tmp_path: Path) -> None:
-    path, told = tmp_path / "explain.json", explanation("a")
-    path.write_text(dump_record(told, SCHEMA))
-    assert load_record(path, Explanation, SCHEMA) == told
+    path, record = tmp_path / "explain.json", explanation("a")
+    path.write_text(dump_record(record, SCHEMA))
+    assert load_record(path, Explanation, SCHEMA) == record
     for broken in ("[]", "{}", '{"schema": 1}', path.read_text().replace('"sign_changes"', '"signs"')):
         (tmp_path / "broken.json").write_text(broken)
         with pytest.raises(FormatError, match=r"broken\.json: (schema|identifier|least)"):
@@ -163,7 +163,7 @@ def test_waterfalls_grow_with_the_number_of_cars(tmp_path: Path) -> None:
     cars = tuple(contribution("object", f"objects[{i}]", (-1) ** i * 0.3, 0.1, 0.05) for i in range(12))
     many = replace(many, contributions=many.of_kind("parameter") + cars)
     heights = []
-    for told in (few, many):
-        plot_waterfalls(tmp_path / "shapley.png", told)
+    for record in (few, many):
+        plot_waterfalls(tmp_path / "shapley.png", record)
         heights.append(cv2.imread(str(tmp_path / "shapley.png")).shape[0])
     assert heights[1] > heights[0] + 10 * 40

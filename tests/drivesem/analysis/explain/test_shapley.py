@@ -26,10 +26,10 @@ class Table:
     """A game by a table of values (2^P, K); counts how often it is asked."""
 
     def __init__(self, values):
-        self.values, self.asked = values, 0
+        self.values, self.evaluations = values, 0
 
     def __call__(self, members):
-        self.asked += 1
+        self.evaluations += 1
         return self.values[int(members @ (1 << np.arange(len(members))))]
 
 
@@ -71,7 +71,7 @@ def test_a_player_without_effect_gets_nothing_and_equals_get_the_same(seed):
 def test_every_coalition_is_valued_once():
     table = random_table(4, 1)
     exact_shapley_values(table, 4)
-    assert table.asked == 16
+    assert table.evaluations == 16
 
 
 def test_drawn_orders_come_near_within_their_errors():
@@ -107,9 +107,9 @@ def test_an_order_and_its_reverse_cancel_for_pairs():
 def test_few_players_are_exact_and_many_are_drawn():
     few, many = random_table(MOST_EXACT, 0), random_table(MOST_EXACT + 1, 0)
     assert shapley_values(few, MOST_EXACT, 4, np.random.default_rng(0)).errors is None
-    assert few.asked == 2**MOST_EXACT
+    assert few.evaluations == 2**MOST_EXACT
     assert shapley_values(many, MOST_EXACT + 1, 4, np.random.default_rng(0)).errors is not None
-    assert many.asked == 4 * (MOST_EXACT + 2)
+    assert many.evaluations == 4 * (MOST_EXACT + 2)
     again = shapley_values(many, MOST_EXACT + 1, 4, np.random.default_rng(0)).contributions
     np.testing.assert_array_equal(
         again, shapley_values(many, MOST_EXACT + 1, 4, np.random.default_rng(0)).contributions

@@ -18,7 +18,7 @@ class Counter:
     """Loss 1 + t0 + 10 t1 t2, failing from 1.5 on; t3 is held to 0.1 unless t0 moves too."""
 
     def __init__(self):
-        self.asked = 0
+        self.evaluations = 0
 
     def problem(self):
         return Problem(
@@ -38,7 +38,7 @@ class Counter:
         return ProjectedTheta(held, ())
 
     def score(self, theta):
-        self.asked += 1
+        self.evaluations += 1
         loss = 1 + float(theta[0] + 10 * theta[1] * theta[2])
         fails = loss > 1.5
         return Score(loss, int(fails), 0, fails, fails)
@@ -68,7 +68,7 @@ def test_what_each_adds():
     assert (a.gradient, b.gradient) == (pytest.approx(0.1), pytest.approx(0.1))
     assert (a.gradient_share, b.gradient_share) == (pytest.approx(0.75), pytest.approx(0.25))
     assert (a.alone.held_back, b.alone.held_back) == (False, True)
-    assert counter.asked == judge.renders == 4
+    assert counter.evaluations == judge.renders == 4
 
 
 def test_drawn_orders_carry_errors_and_no_gradient_is_no_share():

@@ -44,8 +44,8 @@ def rows(found, tolerance: float = 0.05):
 
 def test_shares_and_order() -> None:
     found = {"a": [pair(10, 10), pair(4, 14, index=1)], "b": [pair(10, 5, error="placed")]}
-    told = rows(found)
-    assert [(row.level, row.hole) for row in told] == [
+    compared = rows(found)
+    assert [(row.level, row.hole) for row in compared] == [
         (HOLE, "a: objects[1]"),
         (HOLE, "a: objects[0]"),
         (HOLE, "b: objects[0]"),
@@ -54,7 +54,7 @@ def test_shares_and_order() -> None:
         (ALL, ALL),
         (PHANTOMS, PHANTOMS),
     ]
-    most, whole = told[0], told[-2]
+    most, whole = compared[0], compared[-2]
     assert (most.before, most.after, most.difference) == pytest.approx((0.2, 0.7, 0.5))
     assert (whole.before, whole.after, whole.samples, whole.holes) == pytest.approx((24 / 60, 29 / 60, 60, 3))
 
@@ -74,11 +74,11 @@ def test_what_grew_is_beyond_the_tolerance_and_beyond_chance() -> None:
 
 def test_phantoms_are_a_row_of_their_own() -> None:
     """Of all samples, whether the object is lost there or not; they alone may fail a gate."""
-    told = rows({"a": [pair(10, 9, phantoms=(2, 12))], "b": [pair(3, 3, phantoms=(0, 9))]})
-    assert [row.hole for row in told if row.grew] == [PHANTOMS]
-    row = told[-1]
+    compared = rows({"a": [pair(10, 9, phantoms=(2, 12))], "b": [pair(3, 3, phantoms=(0, 9))]})
+    assert [row.hole for row in compared if row.grew] == [PHANTOMS]
+    row = compared[-1]
     assert (row.before, row.after, row.samples, row.holes) == pytest.approx((2 / 40, 21 / 40, 40, 2))
-    case = ET.fromstring(format_junit(told, {})).find(f"testcase[@name='{PHANTOMS}']/failure")
+    case = ET.fromstring(format_junit(compared, {})).find(f"testcase[@name='{PHANTOMS}']/failure")
     assert case is not None
     assert case.attrib["message"] == "phantoms in 5.0 % before, 52.5 % after"
 
@@ -100,15 +100,15 @@ def test_p_is_of_samples_in_which_one_fails_alone() -> None:
     hole, kind, whole, phantoms = rows({"a": [pair(4, 14)]})
     assert (hole.p, kind.p, whole.p, phantoms.p) == pytest.approx((2**-9, 2**-9, 2**-9, 1))
     # Two holes and phantoms: three tests, and all of both holes a fourth.
-    told = {row.hole: row.p for row in rows({"a": [pair(4, 14)], "b": [pair(9, 9)]})}
-    assert told["a: objects[0]"] == told["missed"] == told[ALL] == pytest.approx(4 * 2**-10)
-    assert told["b: objects[0]"] == 1
+    compared = {row.hole: row.p for row in rows({"a": [pair(4, 14)], "b": [pair(9, 9)]})}
+    assert compared["a: objects[0]"] == compared["missed"] == compared[ALL] == pytest.approx(4 * 2**-10)
+    assert compared["b: objects[0]"] == 1
 
 
-def test_one_sample_tells_nothing() -> None:
-    told = rows({"a": [pair(0, 1, of=1)]})
-    assert (told[0].difference, told[0].low) == (1, 1)
-    assert not any(row.grew for row in told)
+def test_one_sample_is_no_evidence() -> None:
+    compared = rows({"a": [pair(0, 1, of=1)]})
+    assert (compared[0].difference, compared[0].low) == (1, 1)
+    assert not any(row.grew for row in compared)
 
 
 def seen(
@@ -126,10 +126,10 @@ def seen(
 
 
 def share_not_passed(holes: int, samples: int, new_alone: float, old_alone: float, of: int) -> float:
-    told = (
+    compared = (
         compute_gate_rows(seen(holes, samples, new_alone, old_alone, seed), 0.05, 40, seed) for seed in range(of)
     )
-    return sum(any(row.grew for row in one) for one in told) / of
+    return sum(any(row.grew for row in one) for one in compared) / of
 
 
 @pytest.mark.parametrize("samples", [8, 32])
@@ -160,7 +160,7 @@ NONE = "nothing to compare"
 
 
 @pytest.mark.parametrize(
-    ("found", "failed", "passed", "says_none"),
+    ("found", "failed", "passed", "without_rows"),
     [
         pytest.param({}, {}, True, True, id="no certain failure"),
         pytest.param({}, {"a": "no scene"}, False, False, id="all frames failed"),
@@ -170,14 +170,14 @@ NONE = "nothing to compare"
         pytest.param({"b": [pair(4, 14)]}, {}, False, False, id="a row grew"),
     ],
 )
-def test_the_verdict(found, failed, passed, says_none, tmp_path: Path) -> None:
+def test_the_verdict(found, failed, passed, without_rows, tmp_path: Path) -> None:
     """A gate is passed where all that should be compared was compared, and no row grew."""
     answer = build_gate_report(
         tmp_path, rows(found), sum(map(len, found.values())), {"before": "x", "after": "y"}, failed
     )
     assert answer.data["passed"] == passed
     assert answer.data["frames_failed"] == failed
-    assert any(NONE in note for note in answer.notes) == says_none
+    assert any(NONE in note for note in answer.notes) == without_rows
     assert any("could not be compared" in note for note in answer.notes) == bool(failed)
     suite = ET.fromstring((tmp_path / "gate.xml").read_text())
     assert int(suite.attrib["tests"]) == len(list(suite))
@@ -186,16 +186,19 @@ def test_the_verdict(found, failed, passed, says_none, tmp_path: Path) -> None:
     assert {name: one.attrib["message"] for name, one in errors.items() if one is not None} == failed
 
 
-def test_without_failures_there_is_nothing_to_say() -> None:
+def test_without_failures_there_are_no_rows() -> None:
     assert rows({}) == []
     assert rows({"a": [PairedSamples(0, "Car", "missed", (), (), (), ())]}) == []
     assert ET.fromstring(format_junit([], {})).attrib["tests"] == "0"
 
 
 def test_junit() -> None:
-    told = rows({"a<b>": [pair(4, 14)], "c": [pair(5, 5)]})
-    suite = ET.fromstring(format_junit(told, {}))
-    assert (suite.attrib["tests"], suite.attrib["failures"]) == (str(len(told)), str(sum(r.grew for r in told)))
+    compared = rows({"a<b>": [pair(4, 14)], "c": [pair(5, 5)]})
+    suite = ET.fromstring(format_junit(compared, {}))
+    assert (suite.attrib["tests"], suite.attrib["failures"]) == (
+        str(len(compared)),
+        str(sum(r.grew for r in compared)),
+    )
     cases = {case.attrib["name"]: case for case in suite}
     failure = cases["a<b>: objects[0]"].find("failure")
     assert failure is not None

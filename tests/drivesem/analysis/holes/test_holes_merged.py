@@ -147,7 +147,7 @@ def test_a_probability_of_another_place_does_not(fields: list[tuple[FailureWithR
     assert held / len(fields) < 0.05
 
 
-def test_a_recheck_is_of_what_the_whole_hole_says() -> None:
+def test_a_recheck_covers_the_whole_region() -> None:
     """Of a hole of two failures, draws of both count where they lie inside of the rule that is recheck."""
     again = {("a", 0): samples([21.0, 30.0, 39.0], [True] * 3), ("b", 0): samples([25.0, 41.9], [False] * 2)}
     (hole,) = merge({"a": [around(20, 40)], "b": [around(22, 42)]}, again)
@@ -171,7 +171,7 @@ def test_kitti_knows_some_features() -> None:
     assert kitti_shares({"yaw_deg": (-180.0, 180.0)})["yaw_deg"] == pytest.approx(1.0, abs=0.02)
 
 
-def test_sizes_by_samples_and_by_simulation_are_told_together() -> None:
+def test_sizes_by_samples_and_by_simulation() -> None:
     one = around(22, 42)
     rare = replace(
         one, failure=replace(one.failure, lost=FailureProbability(0.01, 0.002, 0.05, "subset simulation", 90))

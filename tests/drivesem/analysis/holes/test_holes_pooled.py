@@ -34,7 +34,7 @@ def samples(
     return FeatureSamples(NAMES, tuple(map(tuple, rows.tolist())), tuple(-1.0 if one else 1.0 for one in lost))
 
 
-def frame(rng: np.random.Generator, failing: list[float], beside: list[float], label: str = "Car") -> FrameHoles:
+def frame(rng: np.random.Generator, failing: list[float], others: list[float], label: str = "Car") -> FrameHoles:
     """Failures of cars of some heights, and others that were shown beside."""
     around = tuple(
         FailureSamples(
@@ -48,7 +48,7 @@ def frame(rng: np.random.Generator, failing: list[float], beside: list[float], l
         )
         for i, h in enumerate(failing)
     )
-    seen = [samples(rng, height, 4, FAULT) for height in beside]
+    seen = [samples(rng, height, 4, FAULT) for height in others]
     objects = tuple(len(failing) + i for i, one in enumerate(seen) for _ in one.margins)
     values = tuple(row for one in seen for row in one.values)
     margins = tuple(margin for one in seen for margin in one.margins)
@@ -69,10 +69,10 @@ def found() -> dict[str, FrameHoles]:
 def test_many_cars_pin_both_bands_down(found: dict[str, FrameHoles]) -> None:
     alone = [fit_failure_rule(one) for holes in found.values() for one in holes.around]
     assert not any("height_px" in where for where in alone), "a car alone leaves its height open"
-    told = fit_rules(found)
-    assert set(told) == {(name, 0) for name in found}
-    (where,) = {tuple(sorted(one.where.items())) for one in told.values()}
-    assert all(one.pooled for one in told.values())
+    rules = fit_rules(found)
+    assert set(rules) == {(name, 0) for name in found}
+    (where,) = {tuple(sorted(one.where.items())) for one in rules.values()}
+    assert all(one.pooled for one in rules.values())
     for name, (low, high) in where:
         wide = FAULT[name][1] - FAULT[name][0]
         assert (low, high) == pytest.approx(FAULT[name], abs=0.3 * wide)
@@ -82,16 +82,16 @@ def test_many_cars_pin_both_bands_down(found: dict[str, FrameHoles]) -> None:
 def test_without_contrast_heights_stay_open(found: dict[str, FrameHoles]) -> None:
     """All failing cars stand inside of the band: no sample says where it ends."""
     bare = {name: FrameHoles("x", "", holes.around, (), 0, 0.0) for name, holes in found.items()}
-    told = fit_rules(bare)
-    assert not any("height_px" in one.where for one in told.values())
+    rules = fit_rules(bare)
+    assert not any("height_px" in one.where for one in rules.values())
 
 
 def test_another_class_keeps_its_own(found: dict[str, FrameHoles]) -> None:
     van = frame(np.random.default_rng(9), [50.0], [], "Van")
-    told = fit_rules(found | {"van": van})
-    assert not told["van", 0].pooled
-    assert told["van", 0].where == fit_failure_rule(van.around[0])
-    assert all(one.pooled for key, one in told.items() if key[0] != "van")
+    rules = fit_rules(found | {"van": van})
+    assert not rules["van", 0].pooled
+    assert rules["van", 0].where == fit_failure_rule(van.around[0])
+    assert all(one.pooled for key, one in rules.items() if key[0] != "van")
 
 
 def test_a_failure_that_no_rule_explains_keeps_its_own(found: dict[str, FrameHoles]) -> None:
@@ -100,21 +100,21 @@ def test_a_failure_that_no_rule_explains_keeps_its_own(found: dict[str, FrameHol
     other = FailureSamples(
         5, "Car", "missed", "certain", far, NOTHING, FailureProbability(0.2, 0.1, 0.3, "samples", 0)
     )
-    told = fit_rules(found | {"other": FrameHoles("x", "", (other,), (), 0, 0.0)})
-    assert not told["other", 5].pooled
-    assert set(told["other", 5].where) == {"lightness"}
-    assert told["other", 5].where["lightness"][0] == pytest.approx(0.7, abs=0.1)
+    rules = fit_rules(found | {"other": FrameHoles("x", "", (other,), (), 0, 0.0)})
+    assert not rules["other", 5].pooled
+    assert set(rules["other", 5].where) == {"lightness"}
+    assert rules["other", 5].where["lightness"][0] == pytest.approx(0.7, abs=0.1)
 
 
 def test_one_failure_is_not_pooled() -> None:
     rng = np.random.default_rng(1)
-    told = fit_rules({"a": frame(rng, [50.0], [20.0, 90.0])})
-    assert not told["a", 0].pooled
+    rules = fit_rules({"a": frame(rng, [50.0], [20.0, 90.0])})
+    assert not rules["a", 0].pooled
 
 
 def test_a_failure_without_samples_has_no_rule() -> None:
     one = FailureSamples(
         0, "Car", "missed", "certain", NOTHING, NOTHING, FailureProbability(0.0, 0.0, 1.0, "samples", 0)
     )
-    told = fit_rules({"a": FrameHoles("x", "", (one,), (), 0, 0.0)})
-    assert (told["a", 0].where, told["a", 0].pooled) == ({}, False)
+    rules = fit_rules({"a": FrameHoles("x", "", (one,), (), 0, 0.0)})
+    assert (rules["a", 0].where, rules["a", 0].pooled) == ({}, False)

@@ -16,8 +16,8 @@ from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import build_cards
-from drivesem.run.report.runs import load_reported_runs, query_curves, write_run_report
 from drivesem.run.results import SCHEMA
+from drivesem.run.run_report import load_reported_runs, query_curves, write_run_report
 from scene_ir import files
 
 
@@ -28,18 +28,18 @@ def report(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, An
 
 
 def test_one_run(some_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = report([str(some_run)], capsys)
+    data = report([str(some_run)], capsys)
     page = some_run / "report.html"
-    assert told["out"] == str(page)
-    assert told["bytes"] == page.stat().st_size
-    (run,) = told["runs"]
+    assert data["out"] == str(page)
+    assert data["bytes"] == page.stat().st_size
+    (run,) = data["runs"]
     metrics = json.loads((some_run / "metrics.json").read_text())
     assert {key: run[key] for key in metrics if key not in ("out", "seconds")} == {
         key: value for key, value in metrics.items() if key not in ("out", "seconds")
     }
     assert run["paper"] is None  # which has another protocol
-    assert [one["frame"] for one in told["frames"]] == ["000001", "000002", "000003", "0001/rain/00004"]
-    assert told["frames"][3]["failures"] == {"some run": ["lost", "phantom"]}
+    assert [one["frame"] for one in data["frames"]] == ["000001", "000002", "000003", "0001/rain/00004"]
+    assert data["frames"][3]["failures"] == {"some run": ["lost", "phantom"]}
 
 
 def test_the_same_run_gives_the_same_page(some_run: Path) -> None:
@@ -51,8 +51,8 @@ def test_the_same_run_gives_the_same_page(some_run: Path) -> None:
 
 
 def test_an_attack_writes_the_same_page(some_run: Path) -> None:
-    (shown,), _ = load_reported_runs([str(some_run)])
-    write_run_report(some_run, AttackConfig(), shown.summary, shown.frames)
+    (loaded,), _ = load_reported_runs([str(some_run)])
+    write_run_report(some_run, AttackConfig(), loaded.summary, loaded.frames)
     written = (some_run / "report.html").read_bytes()
     assert main(["report", str(some_run)]) == 0
     assert (some_run / "report.html").read_bytes() == written
@@ -60,12 +60,12 @@ def test_an_attack_writes_the_same_page(some_run: Path) -> None:
 
 def test_an_attack_without_any_frame(some_run: Path) -> None:
     """Where none could be used, the page says which and why."""
-    (shown,), _ = load_reported_runs([str(some_run)])
+    (loaded,), _ = load_reported_runs([str(some_run)])
     failed = {"000009": "labels: expected a number, found x"}
     nothing = ClassScores(None, None, None, None, None, 0)
-    scores = CocoScores(nothing, nothing, dict.fromkeys(shown.summary.benign.per_class, nothing))
+    scores = CocoScores(nothing, nothing, dict.fromkeys(loaded.summary.benign.per_class, nothing))
     summary = replace(
-        shown.summary,
+        loaded.summary,
         frames=0,
         frames_failed=failed,
         benign=scores,
@@ -95,11 +95,11 @@ def test_runs_side_by_side(
     a = make_run(tmp_path / "a", frames, AttackConfig(**PROTOCOL))  # pyright: ignore[reportArgumentType]
     b = make_run(tmp_path / "b", [frame("2"), frame("1", phantom=True)], AttackConfig(method="placebo", like="x"))
     out = tmp_path / "both.html"
-    told = report([str(a), str(b), "--out", str(out)], capsys)
-    assert told["frames_left_out"] == 1
-    assert [one["frame"] for one in told["frames"]] == ["1", "2"]
-    assert told["frames"][0]["failures"] == {"a": ["lost"], "b": ["phantom"]}
-    one, other = told["runs"]
+    data = report([str(a), str(b), "--out", str(out)], capsys)
+    assert data["frames_left_out"] == 1
+    assert [one["frame"] for one in data["frames"]] == ["1", "2"]
+    assert data["frames"][0]["failures"] == {"a": ["lost"], "b": ["phantom"]}
+    one, other = data["runs"]
     assert (one["frames"], one["lost_objects"], one["phantoms"], one["successes_moved"]) == (2, 2, 0, 2)
     assert (other["frames"], other["lost_objects"], other["phantoms"]) == (2, 0, 1)
     assert one["attacked"]["moved"]["recall_at_t_star"] == pytest.approx(0.5)
@@ -121,7 +121,7 @@ def test_runs_side_by_side(
     assert "1 frames that only some runs have are left out" in found.text
 
 
-def test_figures_of_all_frames_are_those_of_the_run(
+def test_metrics_of_all_frames_equal_the_runs(
     tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Counted again on the frames that are shared, they are as `drivesem attack` counts them."""
@@ -129,8 +129,8 @@ def test_figures_of_all_frames_are_those_of_the_run(
     a = make_run(tmp_path / "a", [frame(name, lost=name == "1", phantom=True) for name in names])
     b = make_run(tmp_path / "b", [frame(name) for name in (*names, "3")])
     alone = report([str(a)], capsys)["runs"][0]
-    beside = report([str(a), str(b), "--out", str(tmp_path / "page.html")], capsys)["runs"][0]
-    assert alone == beside
+    compared = report([str(a), str(b), "--out", str(tmp_path / "page.html")], capsys)["runs"][0]
+    assert alone == compared
 
 
 def test_a_study_stands_for_its_arms(
@@ -150,8 +150,8 @@ def test_a_study_stands_for_its_arms(
         for q in (1, 2)
     ]
     files.write_json(study / "study.json", {"curves": points})
-    told = report([str(study)], capsys)
-    assert [run["name"] for run in told["runs"]] == ["apgd", "random"]
+    data = report([str(study)], capsys)
+    assert [run["name"] for run in data["runs"]] == ["apgd", "random"]
     found = parse(study / "report.html")
     assert "Frames broken by number of queries" in found.text
     (chart,) = query_curves(study)
@@ -173,8 +173,8 @@ def test_large_pictures_are_made_smaller(
 ) -> None:
     monkeypatch.setattr("drivesem.run.report.frames.LARGEST_PX", 100)
     run = make_run(tmp_path / "run", [frame("1", lost=True)])
-    shown, _ = load_reported_runs([str(run)])
-    (card,) = build_cards(shown, 1)
+    loaded, _ = load_reported_runs([str(run)])
+    (card,) = build_cards(loaded, 1)
     assert (card.width, card.height) == (320, 96)  # boxes stay in the picture's own px
     assert len(card.layers[0].source) < 2000
 
@@ -204,7 +204,7 @@ def test_unfinished(refused: Callable[..., str], some_run: Path) -> None:
     assert "expected a finished run" in refused("report", str(some_run))
 
 
-def test_damaged_figures(refused: Callable[..., str], some_run: Path) -> None:
+def test_damaged_metrics(refused: Callable[..., str], some_run: Path) -> None:
     files.write_json(some_run / "metrics.json", {"schema": SCHEMA, "params": ["mesh"], "detector": "x"})
     assert "metrics.json: expected the metrics of a run" in refused("report", str(some_run))
 

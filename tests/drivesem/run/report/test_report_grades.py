@@ -14,8 +14,8 @@ from drivesem.cli import main
 from drivesem.failures.grades import Certificate, SecondOpinion
 from drivesem.run.report import page as grading
 from drivesem.run.report.frames import build_cards
-from drivesem.run.report.runs import load_reported_runs
 from drivesem.run.results import Failure, FrameResult
+from drivesem.run.run_report import load_reported_runs
 
 CERTAIN = Certificate(16, 16, 15, 16, 1.42, -0.61)
 CHANCE = Certificate(9, 16, 12, 16)
@@ -25,7 +25,7 @@ SECOND, PEER = SecondOpinion("generator", 4, 4, 4), SecondOpinion("yolov3-slim",
 def graded(frame: FrameResult, *grades: str, error: str = "missed") -> FrameResult:
     """The frame's failures with these grades; "none" is the threshold's of none of a kind."""
 
-    def told(failure: Failure, grade: str) -> Failure:
+    def with_grade(failure: Failure, grade: str) -> Failure:
         if grade == "none":
             return replace(failure, grade="threshold")
         kind = "background" if failure.kind == "phantom" else error
@@ -34,7 +34,7 @@ def graded(frame: FrameResult, *grades: str, error: str = "missed") -> FrameResu
             fields |= {"second": SECOND, "peer": replace(PEER, after=4) if grade == "shared" else PEER}
         return replace(failure, **fields)  # pyright: ignore[reportArgumentType]
 
-    return replace(frame, failures=tuple(told(f, g) for f, g in zip(frame.failures, grades, strict=True)))
+    return replace(frame, failures=tuple(with_grade(f, g) for f, g in zip(frame.failures, grades, strict=True)))
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_the_page_begins_with_the_highest_grade(run: Path, parse: Callable[[Path
     assert "threshold" not in shots  # there are enough that are surer
 
 
-def test_draws_and_who_else_says_so(run: Path, parse: Callable[[Path], Any]) -> None:
+def test_draws_and_second_opinions(run: Path, parse: Callable[[Path], Any]) -> None:
     _, text = page_of(run, parse)
     assert "found in 16/16 draws before → 1/16 after" in text
     assert "there in 0/16 draws before → 15/16 after" in text
@@ -86,22 +86,22 @@ def test_draws_and_who_else_says_so(run: Path, parse: Callable[[Path], Any]) -> 
 
 
 def test_the_table_of_kinds_adds_up(run: Path) -> None:
-    (shown,), _ = load_reported_runs([str(run)])
-    rows = {row.name: row for row in grading.tabulate_kinds(shown.frames)}
+    (loaded,), _ = load_reported_runs([str(run)])
+    rows = {row.name: row for row in grading.tabulate_kinds(loaded.frames)}
     # shared, confirmed, certain, threshold
     assert rows["missed"].counts == (0, 0, 1, 1)
     assert rows["badly placed"].counts == (0, 0, 1, 0)
     assert rows["on nothing"].counts == (0, 1, 1, 1)
     assert rows["none of a kind"].counts == (0, 0, 0, 1)
-    assert sum(row.total for row in rows.values()) == shown.summary.grades["threshold"] == 7
-    (first, *_) = build_cards([shown], 1)
+    assert sum(row.total for row in rows.values()) == loaded.summary.grades["threshold"] == 7
+    (first, *_) = build_cards([loaded], 1)
     assert [mark.unsure for mark in first.layers[1].sets[0][1] if mark.kind in ("lost", "phantom")] == [
         True,
         False,
     ]
 
 
-def test_without_a_certain_failure_the_page_says_so(
+def test_a_page_without_certain_failures(
     tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], parse: Callable[[Path], Any]
 ) -> None:
     one = graded(frame("a", lost=True, phantom=True), "threshold", "none")
@@ -144,25 +144,25 @@ def test_runs_side_by_side_have_grades(
     assert "run: 1 certain of 1 lost" in text
 
 
-def test_runs_that_break_as_much_are_told_alike(
+def test_runs_with_equal_failures_share_the_headline(
     tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], parse: Callable[[Path], Any]
 ) -> None:
     runs = [make_run(tmp_path / n, [graded(frame("a", lost=True), "certain"), frame("b")]) for n in ("one", "two")]
     out = tmp_path / "page.html"
 
-    def told(*folders: Path) -> str:
+    def page_text(*folders: Path) -> str:
         assert main(["report", *map(str, folders), "--out", str(out)]) == 0
         return " ".join(parse(out).text.split())
 
-    assert "2 runs on 2 frames: both have as many certain failures, 1 each" in told(*runs)
+    assert "2 runs on 2 frames: both have as many certain failures, 1 each" in page_text(*runs)
     none = make_run(tmp_path / "none", [frame("a"), frame("b")])
-    assert "3 runs on 2 frames: one and two have most certain failures, 1 each" in told(*runs, none)
+    assert "3 runs on 2 frames: one and two have most certain failures, 1 each" in page_text(*runs, none)
     ungraded = [make_run(tmp_path / n, [frame("a", lost=True), frame("b")]) for n in ("three", "four")]
-    assert "2 runs on 2 frames: both have as many broken frames by threshold, 1 each" in told(*ungraded)
+    assert "2 runs on 2 frames: both have as many broken frames by threshold, 1 each" in page_text(*ungraded)
 
 
 @pytest.mark.parametrize(
-    ("error", "count", "told"),
+    ("error", "count", "expected"),
     [
         ("missed", Certificate(16, 16, 15, 16), "found in 16/16 draws before → 1/16 after"),
         ("missed", Certificate(0, 0, 4, 9), "found in 5/9 draws after"),
@@ -172,8 +172,8 @@ def test_runs_that_break_as_much_are_told_alike(
         (None, None, ""),
     ],
 )
-def test_draws_in_words(error: str | None, count: Certificate | None, told: str) -> None:
-    assert grading.format_draws(Failure("lost", "Car", (0, 0, 1, 1), error=error, count=count)) == told
+def test_draws_in_words(error: str | None, count: Certificate | None, expected: str) -> None:
+    assert grading.format_draws(Failure("lost", "Car", (0, 0, 1, 1), error=error, count=count)) == expected
 
 
 def test_frames_can_be_filtered_by_grade(chromium: Any, run: Path) -> None:

@@ -21,16 +21,16 @@ def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
         page = chromium.new_page(viewport={"width": width, "height": 900}, **of)
         page.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
         page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
-        asked: list[str] = []
+        page.on("request", lambda request: requests.append(request.url))
+        requests: list[str] = []
         page.goto(path.as_uri())
         page.wait_for_load_state("networkidle")
-        pages.append((page, asked, path))
+        pages.append((page, requests, path))
         return page
 
     yield at
-    for page, asked, path in pages:
-        assert [url for url in asked if not url.startswith("data:")] == [path.as_uri()]
+    for page, requests, path in pages:
+        assert [url for url in requests if not url.startswith("data:")] == [path.as_uri()]
         page.close()
     assert not complaints
 
@@ -46,7 +46,7 @@ def cut_of(page: Any, place: int = 0) -> float:
     return float(style.removesuffix("%"))
 
 
-def shown(page: Any, selector: str) -> list[str]:
+def visible_texts(page: Any, selector: str) -> list[str]:
     return page.locator(f"{selector}:not(.hidden)").evaluate_all("all => all.map(e => e.dataset.name)")
 
 
@@ -78,26 +78,26 @@ def test_slider_by_keyboard_and_mouse(opened: Callable[..., Any], page: Path) ->
 def test_filters(opened: Callable[..., Any], page: Path) -> None:
     tab = opened(page)
     every = ["0001/rain/00004", "000003", "000002", "000001"]
-    assert shown(tab, "article") == every
+    assert visible_texts(tab, "article") == every
     tab.get_by_label("lost objects").check()
-    assert shown(tab, "article") == ["0001/rain/00004", "000002"]
-    assert shown(tab, "#frames tbody tr") == ["0001/rain/00004", "000002"]
+    assert visible_texts(tab, "article") == ["0001/rain/00004", "000002"]
+    assert visible_texts(tab, "#frames tbody tr") == ["0001/rain/00004", "000002"]
     assert tab.locator("#count").inner_text() == "2 of 4 frames"
     tab.get_by_role("button", name="All frames").click()
-    assert shown(tab, "article") == every
+    assert visible_texts(tab, "article") == every
     tab.get_by_label("parameter").select_option("weather")
-    assert shown(tab, "article") == ["000003"]
+    assert visible_texts(tab, "article") == ["000003"]
     tab.get_by_role("button", name="All frames").click()
     tab.locator("select[name=weather]").select_option("rain")
-    assert shown(tab, "article") == ["0001/rain/00004"]
+    assert visible_texts(tab, "article") == ["0001/rain/00004"]
     tab.get_by_role("button", name="All frames").click()
     tab.get_by_label("size of change").fill("30")
-    assert shown(tab, "article") == ["000003", "000001"]
+    assert visible_texts(tab, "article") == ["000003", "000001"]
     tab.get_by_role("button", name="All frames").click()
     tab.get_by_label("name", exact=True).fill("00000")
-    assert shown(tab, "article") == every[1:]
+    assert visible_texts(tab, "article") == every[1:]
     tab.get_by_label("order").select_option("name")
-    assert shown(tab, "article") == every[:0:-1]
+    assert visible_texts(tab, "article") == every[:0:-1]
 
 
 def test_boxes_can_be_switched(opened: Callable[..., Any], page: Path) -> None:
@@ -122,7 +122,7 @@ def test_tables_are_sorted_by_keyboard(opened: Callable[..., Any], page: Path) -
     values = tab.locator("#frames tbody tr").evaluate_all("all => all.map(e => e.dataset.phantoms)")
     assert values == sorted(values)
     tab.locator("#frames th", has_text="frame").first.locator("button").click()
-    assert shown(tab, "#frames tbody tr") == ["000001", "0001/rain/00004", "000002", "000003"]
+    assert visible_texts(tab, "#frames tbody tr") == ["000001", "0001/rain/00004", "000002", "000003"]
 
 
 def test_runs_change_sides(

@@ -21,8 +21,8 @@ from drivesem.config.commands import AttackConfig
 from drivesem.report.plots import PLOT_COLOURS
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import build_cards
-from drivesem.run.report.runs import load_reported_runs
 from drivesem.run.results import load_frame
+from drivesem.run.run_report import load_reported_runs
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -123,7 +123,7 @@ def test_boxes_are_those_of_the_results(page: Path, parse: Callable[[Path], Any]
     assert "nothing → 0.70" in found.text
 
 
-def test_the_papers_figures_stand_beside_its_protocol_only(
+def test_paper_results_only_with_the_papers_protocol(
     tmp_path: Path,
     page: Path,
     frame: Callable[..., Any],
@@ -144,7 +144,7 @@ def test_the_papers_figures_stand_beside_its_protocol_only(
     assert "paper's mAP after" in parse(tmp_path / "both.html").text
 
 
-def test_figures_are_told(page: Path, parse: Callable[[Path], Any]) -> None:
+def test_the_page_shows_the_metrics(page: Path, parse: Callable[[Path], Any]) -> None:
     found = parse(page)
     metrics = json.loads((page.parent / "metrics.json").read_text())
     text = " ".join(found.text.split())
@@ -163,10 +163,10 @@ def test_a_cap_on_pictures_keeps_all_frames_in_the_table(some_run: Path, parse: 
 
 
 def test_a_missing_picture_is_named(some_run: Path) -> None:
-    shown, _ = load_reported_runs([str(some_run)])
+    embedded, _ = load_reported_runs([str(some_run)])
     (some_run / "frames" / "000002" / "benign.png").unlink()
     with pytest.raises(FormatError, match=r"000002/benign.png: expected a picture of the run, found none"):
-        build_cards(shown, 4)
+        build_cards(embedded, 4)
 
 
 def test_a_hundred_frames_stay_small(
@@ -187,10 +187,10 @@ def test_a_hundred_frames_stay_small(
     article = text[text.index("<article") : text.index("</article>")]
     assert 100 * len(article.encode()) < MOST_BYTES_OF_100_FRAMES
     source = re.findall(r'src="data:image/webp;base64,([^"]+)"', article)[0]
-    shown, full = Image.open(io.BytesIO(base64.b64decode(source))), Image.fromarray(image)
-    assert shown.size == full.size
+    embedded, full = Image.open(io.BytesIO(base64.b64decode(source))), Image.fromarray(image)
+    assert embedded.size == full.size
     # in grey: colour has half the resolution, as in any JPEG
-    grey = [np.asarray(picture.convert("L"), np.float64) for picture in (shown, full)]
+    grey = [np.asarray(picture.convert("L"), np.float64) for picture in (embedded, full)]
     assert 10 * np.log10(255**2 / np.mean((grey[0] - grey[1]) ** 2)) > 30
 
 
@@ -205,7 +205,7 @@ def _contrast(a: str, b: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
-def test_colours_can_be_told_apart() -> None:
+def test_colours_are_distinguishable() -> None:
     """WCAG 2.1 AA: 4.5 for text, 3 for lines, where they are not yellow or light blue with a dash as well."""
     style = resources.files("drivesem.report").joinpath("style.css").read_text(encoding="utf-8")
     light, dark = (
