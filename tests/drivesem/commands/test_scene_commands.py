@@ -376,7 +376,7 @@ def test_removed_vehicles_stay_removed_and_are_reported(
     assert f"S: {left} vehicles, 1 removed (" in capsys.readouterr().out
     words = ["edit", str(changed), "--photographed", "-o", str(still)]
     found, output = succeed(words, capsys)
-    note = "not the photograph: vehicles that were removed, exchanged, added, loaded or taken away stay so"
+    note = "not the photograph: vehicles that were removed, exchanged, added or loaded remain so"
     assert output == f"drivesem: {note}\n"
     assert (found["notes"], found["objects"]) == ([note], left)
     assert main(words) == 0
@@ -430,7 +430,7 @@ def test_infeasible_positions_are_reported_and_rendered(
         (["--set", "weather=snow"], "snow"),
         (["--set", "objects[0].mesh=50%"], "shares need a scene with changed shapes, and --photographed"),
         (["--remove", "99"], "objects[99]: expected a row from 0 to"),
-        (["--remove", "red"], "--remove: expected rows from 0, or all, found 'red'"),
+        (["--remove", "red"], "--remove: expected numbers from 0, or all, found 'red'"),
         (["--edits", "nowhere.yaml"], "nowhere.yaml: expected a readable file"),
         (["--remove", "0", "-o", "a.jpg"], "--out: expected a .png file, found a.jpg"),
         (["--remove", "0", "--save", "."], "--save"),
