@@ -37,7 +37,7 @@ CAMERA_HEIGHT_M = 1.65
 """Of the cameras above the ground (KITTI's sensor set-up page)."""
 
 
-def folder_of(root: Path) -> Path:
+def training_folder(root: Path) -> Path:
     """The folder under `root` that holds label_2 and calib. FormatError where there is none."""
     for folder in (root, root / "training"):
         if (folder / "label_2").is_dir() and (folder / "calib").is_dir():
@@ -122,7 +122,7 @@ def _cameras(folder: Path, paths: Sequence[Path], frames: Sequence[Labels]) -> l
 def fit_source(source: Path) -> dict[str, Any]:
     """The figures of a tar archive or a folder. FormatError naming what is wrong with it."""
     if source.is_dir():
-        return fit(folder_of(source))
+        return fit(training_folder(source))
     if not source.is_file():
         raise FormatError(str(source), "an archive or a folder", "nothing")
     with tempfile.TemporaryDirectory() as folder:
@@ -131,7 +131,7 @@ def fit_source(source: Path) -> dict[str, Any]:
                 archive.extractall(folder, filter="data")
         except (tarfile.TarError, lzma.LZMAError, EOFError, OSError) as error:
             raise FormatError(str(source), "a whole tar archive", type(error).__name__) from None
-        return fit(folder_of(Path(folder)))
+        return fit(training_folder(Path(folder)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

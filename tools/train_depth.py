@@ -26,10 +26,10 @@ from train_segmenter import (
     HORIZON_ERROR,
     STORE_HW,
     options,
-    planned,
+    plan_street,
+    resample_crop,
     shrunk,
     surface_classes,
-    taken,
     train,
     vary_camera,
     vary_colours,
@@ -56,7 +56,7 @@ LEAST_NEARNESS = 0.01
 
 def street(seed: int, index: int, split: str) -> SynthFrame:
     """Frame `index` of a stream, with a background: as the segmenter sees it, from other heights too."""
-    plan = planned(seed, index, split)
+    plan = plan_street(seed, index, split)
     if index >= HIGHER_FROM:
         rng = np.random.default_rng([STREAM, seed, index, split == "train"])
         view = plan.setting.view
@@ -144,12 +144,12 @@ def example(store: DepthStore, index: int, rng: np.random.Generator) -> DepthExa
     the ground is off with it.
     """
     part = window(rng)
-    image = taken(store.images[index], part).astype(np.float32) / 255
-    classes = taken(store.classes[index], part, cv2.INTER_NEAREST)
+    image = resample_crop(store.images[index], part).astype(np.float32) / 255
+    classes = resample_crop(store.classes[index], part, cv2.INTER_NEAREST)
     zoom = np.float32(store.focal[index // 2] * part[1, 1] / unet.INPUT_FOCAL_PX)
-    looks = taken(store.elevation[index // 2].astype(np.float32), part) * zoom
-    ground = taken(store.ground[index // 2].astype(np.float32), part) * zoom
-    near = taken(store.nearness[index].astype(np.float32), part, cv2.INTER_NEAREST) * zoom
+    looks = resample_crop(store.elevation[index // 2].astype(np.float32), part) * zoom
+    ground = resample_crop(store.ground[index // 2].astype(np.float32), part) * zoom
+    near = resample_crop(store.nearness[index].astype(np.float32), part, cv2.INTER_NEAREST) * zoom
     vary_colours(image, classes, looks, rng)
     vary_light(image, classes, rng)
     image = vary_camera(image, rng)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scene_ir import files
 from scene_ir.errors import FormatError
 from tools.fuzz.formats import FORMATS
-from tools.fuzz.trial import Subject, fault_of
+from tools.fuzz.trial import FuzzSubject, find_fault
 
 SEED, COUNT = 0, 20
 
@@ -23,13 +23,13 @@ SEED, COUNT = 0, 20
 @pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files(name: str, tmp_path: Path) -> None:
     form = FORMATS[name]
-    subject = Subject(form, tmp_path)
-    assert fault_of(form, subject.root) == ("", True)
+    subject = FuzzSubject(form, tmp_path)
+    assert find_fault(form, subject.root) == ("", True)
     for number in range(max(round(COUNT * form.share), 5)):
         with subject.damaged(SEED, number) as root:
-            fault, _ = fault_of(form, root)
+            fault, _ = find_fault(form, root)
         assert not fault, f"python -m tools.fuzz --formats '{name}' --seed {SEED} --show {number}: {fault}"
-    assert fault_of(form, subject.root) == ("", True)  # whole again
+    assert find_fault(form, subject.root) == ("", True)  # whole again
 
 
 JSON = st.recursive(
