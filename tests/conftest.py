@@ -38,7 +38,7 @@ QUICK = [
     "drivesem/synth/test_synth_variations.py",
     "drivesem/attack/test_budgets.py",
     "drivesem/attack/test_space.py",
-    "drivesem/attack/test_judging.py",
+    "drivesem/attack/test_targets.py",
     "drivesem/scenes/test_segmenter.py",
     "drivesem/run/test_results.py",
     "drivesem/training/test_samples.py",

@@ -106,7 +106,7 @@ class _Operations(TorchDispatchMode):
 
 
 class _Calls(TorchFunctionMode):
-    """What is asked for by name: devices of new tensors, moves, and where a tensor lies."""
+    """Devices requested by name: devices of new tensors, moves, and where a tensor lies."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -123,14 +123,14 @@ class _Calls(TorchFunctionMode):
             return _moved(args[0], GPU)
         if name == "to":
             return self._to(func, args, kwargs)
-        asked = place(args[0]) if name == "new_tensor" and "device" not in kwargs else kwargs.get("device")
-        if asked is None and name in _MADE:
-            asked = CPU
-        if asked is None or name == "_parse_to":
+        requested = place(args[0]) if name == "new_tensor" and "device" not in kwargs else kwargs.get("device")
+        if requested is None and name in _MADE:
+            requested = CPU
+        if requested is None or name == "_parse_to":
             return func(*args, **kwargs)
         kwargs["device"] = CPU
         outcome = func(*args, **kwargs)
-        where = _device(asked)
+        where = _device(requested)
         if name == "as_tensor" and isinstance(args[0], Tensor):
             return _moved(outcome, where)
         if isinstance(outcome, Tensor):
@@ -139,33 +139,33 @@ class _Calls(TorchFunctionMode):
 
     def _to(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Tensor:
         tensor, where, rest = args[0], place(args[0]), []
-        asked = kwargs.pop("device", None)
+        requested = kwargs.pop("device", None)
         other = kwargs.pop("other", None)
         for value in args[1:]:
             if isinstance(value, Tensor):
                 other = value
             elif isinstance(value, str | torch.device):
-                asked = value
+                requested = value
             elif not isinstance(value, bool):  # whether to wait for it, or to copy
                 rest.append(value)
         if other is not None:
             where, rest = place(other), [other.dtype, *rest]
-        if asked is not None:
-            where = _device(asked)
+        if requested is not None:
+            where = _device(requested)
         rest = [value for value in rest if value is not None]
         changed = func(tensor, *rest, **kwargs) if rest or kwargs else tensor
         return _moved(changed, where)
 
 
-def _device(asked: Any) -> torch.device:
-    return GPU if torch.device(asked).type == "cuda" else CPU
+def _device(requested: Any) -> torch.device:
+    return GPU if torch.device(requested).type == "cuda" else CPU
 
 
 class _Kernels:
     """Warp's arrays and launches: of tensors that are said to lie on the GPU, run by the processor."""
 
     def __init__(self) -> None:
-        self._array, self._run = launch.wp.from_torch, launch._run
+        self._array, self._run = launch.wp.from_torch, launch._launch_range
 
     def array(self, tensor: Tensor, *args: Any, **kwargs: Any) -> Any:
         where = place(tensor)

@@ -3,22 +3,22 @@
 from collections.abc import Sequence
 
 from detectors.types import CLASSES
-from drivesem.attack.judging import HEADLINE
-from drivesem.config.commands import Attack
+from drivesem.attack.targets import HEADLINE
+from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import coco
-from drivesem.run.frame import as_detections, as_targets
+from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult, RunSummary
-from drivesem.run.tally import graded
+from drivesem.run.summary import count_grades
 
 T_STAR = 0.5
 
 
-def summary_of(config: Attack, results: Sequence[FrameResult]) -> RunSummary:
+def summary_of(config: AttackConfig, results: Sequence[FrameResult]) -> RunSummary:
     """As `drivesem attack` counts."""
 
-    def scores(labels: str, seen: str) -> coco.Scores:
-        targets = [as_targets(getattr(r, f"targets_{labels}"), CLASSES) for r in results]
-        found = [as_detections(getattr(r, f"detections_{seen}"), CLASSES) for r in results]
+    def scores(labels: str, seen: str) -> coco.CocoScores:
+        targets = [targets_from_records(getattr(r, f"targets_{labels}"), CLASSES) for r in results]
+        found = [detections_from_records(getattr(r, f"detections_{seen}"), CLASSES) for r in results]
         return coco.evaluate(targets, found, CLASSES, T_STAR, HEADLINE)
 
     def count(kind: str) -> dict[str, int]:
@@ -47,6 +47,6 @@ def summary_of(config: Attack, results: Sequence[FrameResult]) -> RunSummary:
         successes_moved=sum(r.success_moved for r in results),
         feasible_fraction=1.0,
         queries=sum(r.queries for r in results),
-        **graded(results),
+        **count_grades(results),
         seconds=0.0,
     )

@@ -89,8 +89,8 @@ def test_an_attack_finds_what_it_finds_on_the_processor(name: str, tmp_path: Pat
     first, second = ([c["value"] for c in one["theta"]] for one in (here, there))
     np.testing.assert_allclose(second, first, atol=1e-4)
     np.testing.assert_allclose(there["loss_trace"], here["loss_trace"], rtol=1e-3)
-    for told in ("queries", "success_moved", "success_paper", "violations"):
-        assert here[told] == there[told]
+    for name in ("queries", "success_moved", "success_paper", "violations"):
+        assert here[name] == there[name]
     scores = [[found["score"] for found in one["detections_attacked"]] for one in (here, there)]
     np.testing.assert_allclose(scores[1], scores[0], atol=1e-3)
 
@@ -110,10 +110,10 @@ def test_a_classifier_is_attacked_as_on_the_processor(tmp_path: Path) -> None:
 def test_a_classifier_learns_what_it_learns_on_the_processor(layers: str, tmp_path: Path) -> None:
     words = ["classify", "train", "--layers", layers, "--limit", "12", "--views", "forward", "--batch", "6"]
     here, there = on_both([*words, "--epochs", "2", "--json"], tmp_path)
-    told = [json.loads((out / "training.json").read_text()) for out in (here, there)]
-    for one, other in zip(told[0]["epochs"], told[1]["epochs"], strict=True):
+    trainings = [json.loads((out / "training.json").read_text()) for out in (here, there)]
+    for one, other in zip(trainings[0]["epochs"], trainings[1]["epochs"], strict=True):
         assert other == pytest.approx(one, abs=2e-3)
-    assert told[0]["accuracy"] == pytest.approx(told[1]["accuracy"], abs=0.1)
+    assert trainings[0]["accuracy"] == pytest.approx(trainings[1]["accuracy"], abs=0.1)
 
 
 def test_a_gpu_convolves_in_float32() -> None:
@@ -123,7 +123,7 @@ def test_a_gpu_convolves_in_float32() -> None:
     assert not torch.backends.cudnn.allow_tf32
 
 
-def test_a_scene_is_shown(tmp_path: Path) -> None:
+def test_a_scene_is_rendered(tmp_path: Path) -> None:
     run(["attack", "--combo", "1", "--steps", "1", "--no-grade", "--limit", "1"], tmp_path / "run", "cpu")
     (scene,) = (tmp_path / "run").glob("frames/*/scene")
     with pretended():

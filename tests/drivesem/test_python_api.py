@@ -1,4 +1,4 @@
-"""The Python door: what comes back, that it is the command line's, and what bad arguments are told."""
+"""The Python API: its results equal the command line's, and bad arguments raise errors in one line."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def test_importing_is_quick_and_every_name_is_there() -> None:
         "print(time.perf_counter() - start, sorted(heavy), dir(ds) == ds.__all__)"
     )
     command = [sys.executable, "-c", code]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    seconds, rest = said.split(maxsplit=1)
+    captured = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    seconds, rest = captured.split(maxsplit=1)
     assert rest.strip() == "[] True"
     assert float(seconds) < 0.2
     assert all(callable(getattr(ds, name)) for name in ds.__all__)
@@ -127,7 +127,7 @@ def test_examples_in_docstrings() -> None:
         assert "```pycon\n>>> import" in (module.__doc__ or "")  # else the site shows quotations
 
 
-def test_a_scene_shows_and_tells_itself(scene: ds.Scene, tmp_path: Path) -> None:
+def test_a_scene_has_a_picture_and_a_description(scene: ds.Scene, tmp_path: Path) -> None:
     picture = scene.render()
     assert (picture.dtype, picture.shape) == (np.uint8, scene.photograph.shape)
     assert scene.tensor().shape == (3, *picture.shape[:2])
@@ -192,7 +192,9 @@ def test_an_attack_is_the_commands(counterexample: ds.Counterexample, small_run:
             assert (tmp_path / "frame" / name).read_bytes() == (written / name).read_bytes(), name
 
 
-def test_a_counterexample_shows_and_tells_itself(counterexample: ds.Counterexample, scene: ds.Scene) -> None:
+def test_a_counterexample_has_a_picture_and_a_description(
+    counterexample: ds.Counterexample, scene: ds.Scene
+) -> None:
     assert counterexample.feasible
     assert counterexample.tensor.shape == (3, *counterexample.picture.shape[:2])
     assert np.array_equal(counterexample.photograph, scene.photograph)
@@ -207,7 +209,7 @@ def test_a_counterexample_shows_and_tells_itself(counterexample: ds.Counterexamp
     assert further.render().shape == counterexample.picture.shape
 
 
-def test_failures_tell_kind_grade_and_draws(counterexample: ds.Counterexample, small_run: Path) -> None:
+def test_failures_have_kind_grade_and_draws(counterexample: ds.Counterexample, small_run: Path) -> None:
     box, count = (1.0, 2.0, 30.0, 40.0), Certificate(16, 16, 13, 16, 1.5, -0.5)
     failures = (
         Failure("lost", "Car", box, 0, None, "placed", "confirmed", count, SecondOpinion("generator", 4, 3, 4)),
@@ -222,9 +224,9 @@ def test_failures_tell_kind_grade_and_draws(counterexample: ds.Counterexample, s
     assert (lost["second"], lost["second_agrees"], lost["peer"]) == ("generator", True, None)
     assert (phantom["kind"], phantom["grade"], phantom["score"]) == (None, "threshold", 0.7)
     assert json.loads(json.dumps(found.failure_rows())) == [lost, phantom]
-    told = tags_of(found._repr_html_()).text
-    assert "2 threshold, 1 certain, 1 confirmed; feasible" in told
-    assert "confirmed: Car badly placed, objects[0] at 1, 2, 30, 40 px; found in 16/16 draws before" in told
+    description = tags_of(found._repr_html_()).text
+    assert "2 threshold, 1 certain, 1 confirmed; feasible" in description
+    assert "confirmed: Car badly placed, objects[0] at 1, 2, 30, 40 px; found in 16/16 draws before" in description
     run = ds.load_run(small_run)
     (frame,) = run.frames
     run = replace(run, frames=(replace(frame, result=result),))
@@ -370,7 +372,7 @@ def test_bad_photographs(small_kitti: Path) -> None:
         ds.derender(pixels, focal=-1.0)
 
 
-def test_the_collector_looks_again_once_a_command_is_loaded() -> None:
+def test_the_collector_runs_again_once_a_command_is_loaded() -> None:
     code = (
         "import gc\n"
         "from drivesem.cli import main\n"

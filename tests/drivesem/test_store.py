@@ -86,8 +86,8 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     store.set_output_store(None)
 
 
-def write(folder: Path, told: dict[str, str]) -> None:
-    for name, text in told.items():
+def write(folder: Path, texts: dict[str, str]) -> None:
+    for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
 
@@ -239,8 +239,8 @@ def test_damaged_files_are_not_there_and_names_stay_in_the_folder(tmp_path: Path
     other.upload(now=True)
     machine()
     assert texts(local_copy(one.url)) == {"a": "made anew", "b": "2"}
-    for told in ({"../a": [1, 0, "0"]}, {"/etc/a": None}, {"a": [1]}, [1], {"a": 5}):
-        data = json.dumps(told).encode()
+    for content in ({"../a": [1, 0, "0"]}, {"/etc/a": None}, {"a": [1]}, [1], {"a": 5}):
+        data = json.dumps(content).encode()
         name = f"000099-{store.hashlib.sha256(data).hexdigest()[:16]}.json"
         path = tmp_path / "run" / ".store" / name
         path.write_bytes(data)
@@ -250,7 +250,7 @@ def test_damaged_files_are_not_there_and_names_stay_in_the_folder(tmp_path: Path
         path.unlink()
 
 
-def test_a_folder_of_others_is_compared_by_what_the_store_says_of_it(tmp_path: Path, machine: Any) -> None:
+def test_a_folder_of_others_is_compared_by_the_metadata_of_the_store(tmp_path: Path, machine: Any) -> None:
     files = fsspec.filesystem("memory")
     for name, text in {"a": b"1", "deep/b": b"2", "c": b"3"}.items():
         files.pipe_file(f"/data/{name}", text)
@@ -347,7 +347,7 @@ def test_generated_frames_are_written_and_read_elsewhere(tmp_path: Path, machine
     assert main([*taken, url]) == 0
     machine()
     assert (local_copy(out) / "000000" / "scene.json").is_file()
-    looked = ["eval", "--detector", "squeezedet", "--limit", "1", "--out", str(tmp_path / "figures"), "--root"]
-    assert main([*looked, url]) == 0
+    words = ["eval", "--detector", "squeezedet", "--limit", "1", "--out", str(tmp_path / "figures"), "--root"]
+    assert main([*words, url]) == 0
     with pytest.raises(UsageError, match="--gt"):
         local_copy("memory://nothing", "--gt")

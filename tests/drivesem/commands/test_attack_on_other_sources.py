@@ -198,7 +198,9 @@ def test_a_folder_of_another_layout_is_recognised(plain_coco: Path, capsys: pyte
     assert "it looks like coco (--dataset coco)" in capsys.readouterr().err
 
 
-def test_nothing_to_attack_is_said(plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_to_attack_is_reported(
+    plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = shutil.copytree(plain_coco, tmp_path / "coco")
     (path,) = (root / "annotations").iterdir()
     files.write_json(path, files.read_json(path) | {"annotations": []})

@@ -73,7 +73,7 @@ def test_the_ratio_is_of_what_was_measured_in_one_round() -> None:
         def __init__(self) -> None:
             self.calls = 0
 
-        def taken(self, call: Any) -> CallTime:
+        def time_call(self, call: Any) -> CallTime:
             slow = 10 if self.calls in (2, 3) else 1
             self.calls += 1
             ms = 3.0 if call is stepping else 2.0

@@ -49,7 +49,7 @@ def test_a_run_holds_what_was_done_and_agrees_with_its_files(runs: Runs, kind: s
     assert main(["verify", "--run", str(folder)]) == 0
 
 
-def test_an_edit_leaves_the_change_and_says_so(
+def test_an_edit_keeps_the_change_and_reports_it(
     runs: Runs, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = runs["leave"][0] / "frames" / "demo-000" / "scene"

@@ -21,9 +21,9 @@ class Broken(SqueezeDet):
 
 def test_a_detector_that_keeps_its_contract(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--detector", "squeezedet", "--size", "96x64", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    verdicts = {finding["name"]: finding["verdict"] for finding in said["findings"]}
-    assert said["gradients"]
+    captured = json.loads(capsys.readouterr().out)
+    verdicts = {finding["name"]: finding["verdict"] for finding in captured["findings"]}
+    assert captured["gradients"]
     assert verdicts["planted prediction"] == verdicts["gradient to the image"] == verdicts["frozen"] == "ok"
 
 
@@ -31,9 +31,9 @@ def test_a_broken_one_ends_in_1(tmp_path: Path, capsys: pytest.CaptureFixture[st
     path = tmp_path / "broken.py"
     path.write_text(BROKEN)
     assert main(["check", "--detector", f"module:{path}:Broken", "--size", "96x64"]) == 1
-    said = " ".join(capsys.readouterr().out.split())
-    assert "loss terms failed loss: expected total and objectness, found total" in said
-    assert "broken" in said
+    captured = " ".join(capsys.readouterr().out.split())
+    assert "loss terms failed loss: expected total and objectness, found total" in captured
+    assert "broken" in captured
 
 
 RAISING = """
@@ -46,14 +46,16 @@ class Raising(SqueezeDet):
 
 
 @pytest.mark.parametrize("method", ["forward(self, images)", "decode(self, raw)", "loss(self, raw, targets)"])
-def test_one_whose_code_raises_ends_in_2(method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_detector_that_raises_exits_with_2(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "mine.py"
     path.write_text(RAISING.format(method=method))
     assert main(["check", "--detector", f"module:{path}:Raising", "--size", "96x64"]) == 2
-    said = capsys.readouterr()
-    assert "raised" in said.out
+    captured = capsys.readouterr()
+    assert "raised" in captured.out
     expected = "drivesem: --detector: expected methods that raise nothing, found KeyError: 'wheels'"
-    assert said.err.splitlines()[-1] == f"{expected} (mine.py:6, in {method.partition('(')[0]})"
+    assert captured.err.splitlines()[-1] == f"{expected} (mine.py:6, in {method.partition('(')[0]})"
 
 
 @pytest.mark.parametrize(

@@ -32,10 +32,10 @@ def test_it_writes_a_data_set_a_sheet_and_distributions(
     words = ["synth", "--layout", "coco", "--frames", "2", "--seed", "3", "--workers", "1", "--out", str(out)]
     assert main([*words, "--sheet", "--compare", "--json"]) == 0
     captured = capsys.readouterr()
-    told = json.loads(captured.out)
+    captured = json.loads(captured.out)
     assert captured.out.count("\n") == 1
-    assert told["frames"] == 2
-    assert told["out"] == str(out)
+    assert captured["frames"] == 2
+    assert captured["out"] == str(out)
     assert len(open_dataset("coco", out).identifiers) == 2
     assert files.read_image(out / "sheet.jpg").shape[1] > 1000
     assert (out / "distributions.png").read_bytes().startswith(b"\x89PNG")
@@ -50,14 +50,14 @@ def test_it_writes_a_data_set_a_sheet_and_distributions(
     [
         (["--frames", "0"], "--frames: expected at least 1, found 0"),
         (["--sequence", "0"], "--sequence: expected at least 1, found 0"),
-        (["--validation", "1.5"], "--validation: expected a share in [0, 1), found 1.5"),
+        (["--validation", "1.5"], "--validation: expected a fraction in [0, 1), found 1.5"),
         (["--cameras", "2"], "--cameras: expected 1, or --layout vkitti2, found 2"),
         (["--layout", "vkitti2", "--people", "True"], "--people: expected False with --layout vkitti2"),
         (["--variations", "night"], "variations: expected all, or names among mixed, clone"),
         (["--edits", "nothing.yaml"], "nothing.yaml: expected a readable file"),
         (["--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
         (["--assets", "nowhere"], "--assets: expected a folder, found nowhere"),
-        (["--layout", "voc"], "--layout: expected one of kitti, vkitti2, vkitti1, coco, yolo, found voc"),
+        (["--layout", "voc"], "invalid choice 'voc' for argument '--layout'. Expected one of ('kitti', 'vkitti2'"),
     ],
 )
 def test_bad_input_is_one_line(

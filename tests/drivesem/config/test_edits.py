@@ -94,7 +94,7 @@ def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:
         edit_of("sun.azimuth=2")
 
 
-def test_later_settings_of_the_same_thing_win() -> None:
+def test_later_settings_of_the_same_parameter_win() -> None:
     assert edit_of("objects[1].rotate=1deg", "objects[1].rotate=2deg").objects[1].rotate == math.radians(2)
     both = edit_of("objects[1].rotate=1deg", "objects[1].translate=1m,0m").objects[1]
     assert both == ObjectEdit(translate_m=(1.0, 0.0), rotate=math.radians(1))
@@ -103,7 +103,7 @@ def test_later_settings_of_the_same_thing_win() -> None:
     assert edit_of("weather=fog", "weather.rain=0.4").weather[:2] == (fog, 0.4)
 
 
-def test_a_file_and_the_command_line_say_it_alike(tmp_path: Path) -> None:
+def test_a_file_and_the_command_line_give_the_same_edit(tmp_path: Path) -> None:
     path = tmp_path / "edit.yaml"
     path.write_text(
         "weather: fog\nobjects:\n  2: {translate: [0.5m, 0m], rotate: 10deg}\n  all: {color: [0.1, 0, 0, 0, 0]}\n"

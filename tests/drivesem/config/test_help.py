@@ -90,9 +90,9 @@ def test_all_options_have_help(name: str, capsys: pytest.CaptureFixture[str]) ->
 
 def test_attack_shows_twenty_options_first(capsys: pytest.CaptureFixture[str]) -> None:
     text = printed(["attack", "-h"], capsys)
-    shown = options_in(text) - {"--help", "--help-all"}
-    assert len(shown) == 20
-    assert {"--detector", "--dataset", "--combo", "--budget", "--second-detector", "--config"} <= shown
+    listed = options_in(text) - {"--help", "--help-all"}
+    assert len(listed) == 20
+    assert {"--detector", "--dataset", "--combo", "--budget", "--second-detector", "--config"} <= listed
     assert "--step-form" not in text
     everything = printed(["attack", "--help-all"], capsys)
     assert "--project {feasible,bounds}" in everything

@@ -101,8 +101,8 @@ def test_shipped_presets_parse(preset: Path) -> None:
     for name in names:
         by_file = parse([name, "--config", str(preset), *_NEEDED.get(name, ())])
         assert isinstance(by_file, COMMANDS[name])
-        for told in (preset.stem, f"configs/{preset.stem}.yaml"):
-            assert parse([name, "--config", told, *_NEEDED.get(name, ())]) == by_file
+        for preset_name in (preset.stem, f"configs/{preset.stem}.yaml"):
+            assert parse([name, "--config", preset_name, *_NEEDED.get(name, ())]) == by_file
 
 
 def test_papers_preset_is_for_attacks_and_experiments() -> None:
@@ -245,7 +245,9 @@ DECLARED = [
 def test_values_that_a_type_excludes_are_refused(name: str, field: str, constraint: Constraint) -> None:
     config, flag = default_of(name), option_name(field)
     kind = next(f for f in dataclasses.fields(config) if f.name == field)
-    number = float if "float" in str(kind.type) or "Fraction" in str(kind.type) or "Score" in str(kind.type) else int
+    number = (
+        float if "float" in str(kind.type) or "Fraction" in str(kind.type) or "Score" in str(kind.type) else int
+    )
     for value in outside(constraint, number):
         with pytest.raises(UsageError, match=rf"^{flag}: expected .*, found ") as caught:
             dataclasses.replace(config, **{field: value}).check()
@@ -276,10 +278,10 @@ def test_a_value_outside_its_range_is_one_line(
     name: str, field: str, value: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([name, *_NEEDED.get(name, ()), f"{option_name(field)}={value}"]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith(f"drivesem: {option_name(field)}: expected ")
-    assert said.err.count("\n") == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"drivesem: {option_name(field)}: expected ")
+    assert captured.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -314,7 +316,7 @@ def test_keys_of_older_runs_are_known(name: str) -> None:
     assert set(_KEYS[name].split()) <= {field.name for field in dataclasses.fields(COMMANDS[name])}
 
 
-def test_a_run_opens_whatever_the_order_of_its_keys(tmp_path: Path) -> None:
+def test_a_run_opens_with_its_keys_in_any_order(tmp_path: Path) -> None:
     config = dataclasses.asdict(AttackConfig(steps=3, t_star=0.4))
     (tmp_path / "config.yaml").write_text(
         yaml.safe_dump({key: config[key] for key in reversed(_KEYS["attack"].split())})
@@ -369,8 +371,8 @@ def test_incremental_and_whole_exclude_each_other(command: tuple[str, ...]) -> N
 
 @pytest.mark.parametrize("command", [("attack",), ("bench",), ("explain", "--run", "run")])
 def test_memory_of_layers(command: tuple[str, ...]) -> None:
-    kept = [parse([*command, *words]) for words in ((), ("--keep-mb", "50"))]
-    assert [config.keep_mb for config in kept if isinstance(config, InferenceOptions)] == [800, 50]
+    configs = [parse([*command, *words]) for words in ((), ("--keep-mb", "50"))]
+    assert [config.keep_mb for config in configs if isinstance(config, InferenceOptions)] == [800, 50]
     with pytest.raises(UsageError, match="--keep-mb: expected at least 1, found 0"):
         parse([*command, "--keep-mb", "0"])
 
