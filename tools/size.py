@@ -29,10 +29,10 @@ def read_files(revision: str | None) -> Iterator[tuple[str, str]]:
         if not name.endswith((".py", ".md")):
             continue
         if revision:
-            shown = subprocess.run(
+            content = subprocess.run(
                 ["git", "show", f"{revision}:{name}"], cwd=ROOT, capture_output=True, check=True
             )
-            yield name, shown.stdout.decode()
+            yield name, content.stdout.decode()
         elif (ROOT / name).is_file():
             yield name, (ROOT / name).read_text(encoding="utf-8")
 

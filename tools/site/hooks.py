@@ -29,7 +29,7 @@ PAGES_OUTSIDE_DOCS = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
 }
-"""Pages whose text is a file outside docs/."""
+"""Pages with the text of a file outside docs/."""
 CARDS = ("detectors/weights", "scene_ir/derender/weights")
 API = {
     "drivesem": ("drivesem.scenes.scene", "drivesem.run.counterexample", "drivesem.run.finished"),

@@ -3,7 +3,7 @@
     python -m tools.site.notebooks            # writes docs/notebooks anew
     python -m tools.site.notebooks --check    # only runs them; exit code 1 where one fails
 
-Each runs in an empty folder. Pictures are kept as JPEG: a photograph as PNG weighs ten times as much.
+Each runs in an empty folder. Pictures are stored as JPEG: a photograph as PNG weighs ten times as much.
 """
 
 from __future__ import annotations
