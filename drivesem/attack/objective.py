@@ -108,7 +108,7 @@ class Objective:
         self.passes = 1
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
-        self._previews: dict[bytes, Score] = {}
+        self.previews: dict[bytes, Score] = {}
 
     @classmethod
     def from_config(
@@ -178,16 +178,16 @@ class Objective:
         key = _key(theta)
         if key not in self._scores:
             rendered = self.evaluate(theta)
-            self._scores[key] = self._score(rendered.loss, rendered.moved, rendered.detections)
+            self._scores[key] = self.score_image(rendered.loss, rendered.moved, rendered.detections)
         return self._scores[key]
 
     def preview(self, theta: Tensor) -> Score | None:
         """The score seen by the gradient pass at theta (D,), None without one: of an image that is not rounded to
         8 bits, in the precision of gradients.
         """
-        return self._previews.get(_key(theta))
+        return self.previews.get(_key(theta))
 
-    def _score(self, loss: float, moved: SceneLabels, detections: Detections) -> Score:
+    def score_image(self, loss: float, moved: SceneLabels, detections: Detections) -> Score:
         failed = self._failures(moved, detections)
         # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
         hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
@@ -243,10 +243,10 @@ class Objective:
         """Raw predictions for a render of the scene, with a gradient wherever vehicles are drawn. Raises
         RangeError for a detector without one.
         """
-        predictions = self._predict_regions(render)
+        predictions = self.predict_regions(render)
         return self.differentiable(render.image[None]) if predictions is None else predictions
 
-    def _predict_regions(self, render: Render) -> AnchorPredictions | None:
+    def predict_regions(self, render: Render) -> AnchorPredictions | None:
         """Predictions from the regions that differ from the benign picture; None where pictures are evaluated whole."""
         if render.vehicle_regions is None or (reference := self._reference_layers()) is None:
             return None
@@ -297,7 +297,7 @@ class Objective:
             render: its render.
         """
         labels = self.labeller.labels(self.label_mode, scene, render)
-        return self._loss(self.differentiable, raw, labels.targets)
+        return self.compute_loss(self.differentiable, raw, labels.targets)
 
     @torch.no_grad()
     def evaluate_render(self, scene: SceneIR, render: Render) -> RenderEvaluation:
@@ -308,14 +308,14 @@ class Objective:
         labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):
             raw = self.predict(render)
-            loss = float(self._loss(self.detector, raw, labels))
+            loss = float(self.compute_loss(self.detector, raw, labels))
             detections = self.classes.map_detections(self.detector.decode(raw)[0])
         else:
             detections = self.detect(render.image)
             loss = self._loss_without_gradient(detections, labels)
         return RenderEvaluation(scene, render, detections, paper, moved, loss)
 
-    def _loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> Tensor:
+    def compute_loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> Tensor:
         targets = self.classes.to_detector_targets(self.classes.map_targets(self.aim.targets(labels)))
         if self.term in losses.GOALS:
             columns = [detector.classes.index(name) for name in self.aim.classes_of(self.classes.names)]
@@ -384,7 +384,7 @@ def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -
     predictions: dict[int, AnchorPredictions] = {}
     whole_images: dict[torch.Size, list[int]] = {}
     for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
-        region_predictions = objective._predict_regions(render)
+        region_predictions = objective.predict_regions(render)
         if region_predictions is None:
             whole_images.setdefault(render.image.shape, []).append(i)
         else:
@@ -399,10 +399,10 @@ def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -
         detector, raw = objective.differentiable, predictions[i]
         moved = objective.labeller.moved(scenes[i], renders[i])
         labels = moved if objective.label_mode == "moved" else objective.labeller.paper()
-        loss = objective._loss(detector, raw, labels.targets)
+        loss = objective.compute_loss(detector, raw, labels.targets)
         with torch.no_grad():
             detections = objective.classes.map_detections(detector.decode(raw)[0])
-        objective._previews[_key(theta)] = objective._score(float(loss.detach()), moved, detections)
+        objective.previews[_key(theta)] = objective.score_image(float(loss.detach()), moved, detections)
         batch_losses.append(loss)
     return batch_losses
 

@@ -24,7 +24,7 @@ from drivesem.bench.step import AttackSteps, time_pair
 from drivesem.bench.tables import Columns
 from drivesem.bench.timing import PairedTimer, Spread
 from drivesem.config.options import DEFAULT_KEEP_MB
-from drivesem.data.kitti import read_calib, read_labels
+from drivesem.data.kitti import read_calibration, read_labels
 from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings
 from scene_ir.errors import FormatError
 from scene_ir.geometry import clip_boxes, project_boxes
@@ -184,7 +184,7 @@ def read_labelled_frames(path: Path, count: int) -> list[LabelledFrame]:
             labels, calib = Path(folder) / f"{name}.txt", Path(folder) / f"{name}.calib.txt"
             labels.write_bytes(texts["label_2", name])
             calib.write_bytes(texts["calib", name])
-            projection = read_calib(calib).projection
+            projection = read_calibration(calib).projection
             camera = Camera(projection[:, :3].clone(), HEIGHT, WIDTH, projection)
             frame_labels = read_labels(labels)
             return LabelledFrame(name, frame_labels, camera, _vehicle_rows(frame_labels, camera))

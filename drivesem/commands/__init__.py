@@ -1,1 +1,1 @@
-"""A module a command: parse what its settings say, call what does the work, print what came of it."""
+"""The commands: each takes its settings, calls what does the work, prints the result and returns the exit code."""

@@ -13,12 +13,12 @@ from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.attack import attack_dataset
 from drivesem.run.report.page import KINDS, NO_KIND
-from drivesem.run.report.runs import build_reports
 from drivesem.run.results import RunSummary
+from drivesem.run.run_report import build_reports
 
 
 def attack_command(config: AttackConfig) -> int:
-    """Run or continue an attack; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem attack`: run or resume an attack."""
     summary = attack_dataset(config)
     if config.json:
         print_json(summary.to_json())
@@ -41,8 +41,8 @@ def _print(summary: RunSummary, console: Console) -> None:
         "attacked, benign labels (paper)": summary.attacked_paper,
     }
     for name, scores in rows.items():
-        figures = scores.headline.columns
-        table.add_row(name, *("-" if figure is None else f"{100 * figure:.1f}" for figure in figures))
+        metrics = scores.headline.columns
+        table.add_row(name, *("-" if metric is None else f"{100 * metric:.1f}" for metric in metrics))
     console.print(table)
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
     console.print(
@@ -51,18 +51,18 @@ def _print(summary: RunSummary, console: Console) -> None:
         f"threshold, {format_count(summary.successes_moved, 'frame')} broken; "
         f"feasible {feasible}; {format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s"
     )
-    console.print(told_grades(summary), soft_wrap=True)
+    console.print(summarise_grades(summary), soft_wrap=True)
     for note, frames in summary.grade_notes.items():
         console.print(f"{format_count(frames, 'frame')}: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:
-        console.print(f"{format_count(summary.frames_without_vehicles, 'frame')} without vehicles passed over")
+        console.print(f"{format_count(summary.frames_without_vehicles, 'frame')} without vehicles skipped")
     for name, reason in summary.frames_failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)
 
 
-def told_grades(summary: RunSummary) -> str:
-    """How many failures hold, and of which kinds all are."""
+def summarise_grades(summary: RunSummary) -> str:
+    """Numbers of failures by grade and kind, in one line."""
     grades = summary.grades
     failures, certain = grades[Grade.THRESHOLD], grades[Grade.CERTAIN]
     if not failures:
@@ -73,20 +73,19 @@ def told_grades(summary: RunSummary) -> str:
         f"; {format_count(summary.frames_ungraded, 'frame')} of unknown grade" if summary.frames_ungraded else ""
     )
     kinds |= {NO_KIND: without} if without and not unknown else {}
-    told = f" ({', '.join(f'{count} {name}' for name, count in kinds.items())})" if kinds else ""
+    by_kind = f" ({', '.join(f'{count} {name}' for name, count in kinds.items())})" if kinds else ""
     if not certain:
-        return f"no certain failure: {failures} by threshold, which chance may explain{told}{unknown}"
-    held = f"{certain} certain, {grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared"
-    return f"failures: {held}, of {failures} by threshold{told}{unknown}"
+        return f"no certain failure: {failures} by threshold, which chance may explain{by_kind}{unknown}"
+    by_grade = f"{certain} certain, {grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared"
+    return f"failures: {by_grade}, of {failures} by threshold{by_kind}{unknown}"
 
 
 def report_command(config: ReportConfig) -> int:
-    """Write the page; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem report`: write the HTML report of one or more runs."""
     data = build_reports(config)
     if config.json:
         print_json(data)
         return 0
-    runs, frames = len(data["runs"]), len(data["frames"])
-    said = f"{format_count(runs, 'run')}, {format_count(frames, 'frame')}, {data['bytes'] / 1e6:.1f} MB: {data['out']}"
-    Console().print(said, soft_wrap=True)
+    runs, frames = format_count(len(data["runs"]), "run"), format_count(len(data["frames"]), "frame")
+    Console().print(f"{runs}, {frames}, {data['bytes'] / 1e6:.1f} MB: {data['out']}", soft_wrap=True)
     return 0

@@ -11,9 +11,9 @@ from typing import Any
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.bench import boxes, night, render, step
-from drivesem.bench.scenes import MOST_CARS
-from drivesem.bench.session import Measured, conduct, watched
-from drivesem.bench.tables import Section
+from drivesem.bench.scenes import MAX_CARS
+from drivesem.bench.session import BenchResult, run_benchmark, show_progress
+from drivesem.bench.tables import BenchTable
 from drivesem.config.commands import BenchConfig
 from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
@@ -25,88 +25,92 @@ from drivesem.scenes.sources import open_source
 from scene_ir.errors import FormatError
 
 _SECONDS = {"step": (36.0, 240.0), "render": (22.0, 240.0), "verbs": (6.0, 30.0)}
-"""Seconds for measuring, with --quick and without; imports and scenes take some more."""
+"""Seconds of measuring, with --quick and without; imports and scenes take some more."""
 
 
 def bench_command(config: BenchConfig) -> int:
-    """Measure, print, write; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem bench`: measure, print, write."""
     cars, _ = _sizes(config)
-    if max(cars) > MOST_CARS:
-        raise UsageError("--cars", f"at most {MOST_CARS}", max(cars))
-    measure: dict[str, Callable[[BenchConfig, Console], Measured]] = {
+    if max(cars) > MAX_CARS:
+        raise UsageError("--cars", f"at most {MAX_CARS}", max(cars))
+    measure: dict[str, Callable[[BenchConfig, Console], BenchResult]] = {
         "step": _step,
         "render": _render,
         "night": _night,
     }
-    return conduct(config, "drivesem bench", measure[config.what])
+    return run_benchmark(config, "drivesem bench", measure[config.what])
 
 
-def _step(config: BenchConfig, console: Console) -> Measured:
+def _step(config: BenchConfig, console: Console) -> BenchResult:
     try:
         detector = load_detector(config.detector, config.device)
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if config.boxes is not None:
         return _boxes(config, Path(config.boxes), detector, console)
-    sizes, beside = step.cases(*_sizes(config))
+    sizes, extra = step.cases(*_sizes(config))
     seconds = _seconds("step", config)
     measured = step.measure(
-        sizes + beside, detector, seconds, config.seed, config.device, config.whole, config.keep_mb
+        sizes + extra, detector, seconds, config.seed, config.device, config.whole, config.keep_mb
     )
-    rows = _dicts(watched(measured, len(sizes) + len(beside), console))
-    rows, beside_rows = rows[: len(sizes)], rows[len(sizes) :]
-    return Measured(
-        {"rows": rows, "beside": beside_rows, "method": step.METHOD},
-        [Section(step.TITLE, step.COLUMNS, rows), Section(step.BESIDE_TITLE, step.COLUMNS, beside_rows)],
+    rows = _dicts(show_progress(measured, len(sizes) + len(extra), console))
+    rows, extra_rows = rows[: len(sizes)], rows[len(sizes) :]
+    return BenchResult(
+        {"rows": rows, "extra": extra_rows, "method": step.METHOD},
+        [BenchTable(step.TITLE, step.COLUMNS, rows), BenchTable(step.EXTRA_TITLE, step.COLUMNS, extra_rows)],
     )
 
 
-def _boxes(config: BenchConfig, path: Path, detector: Detector, console: Console) -> Measured:
+def _boxes(config: BenchConfig, path: Path, detector: Detector, console: Console) -> BenchResult:
     try:
-        frames = boxes.frames_of(path, -(-config.frames // 4) if config.quick else config.frames)
+        frames = boxes.read_labelled_frames(path, -(-config.frames // 4) if config.quick else config.frames)
     except FormatError as error:
         raise UsageError("--boxes", error.expected, f"{error.field}: {error.actual}") from error
     measured = boxes.measure(frames, detector, config.seed, config.device, config.whole, config.keep_mb)
-    costs = list(watched(measured, len(frames), console))
-    row = asdict(boxes.BoxesRow.of(costs))
-    return Measured(
+    costs = list(show_progress(measured, len(frames), console))
+    row = asdict(boxes.BoxesRow.from_frames(costs))
+    return BenchResult(
         {"what": "step boxes", "boxes": row, "frames": _dicts(costs), "method": boxes.METHOD},
-        [Section(boxes.TITLE, boxes.COLUMNS, [row])],
+        [BenchTable(boxes.TITLE, boxes.COLUMNS, [row])],
     )
 
 
-def _render(config: BenchConfig, console: Console) -> Measured:
-    sizes, usual = render.sizes(*_sizes(config)), render.usual(*_sizes(config))
-    verbs = _dicts(render.measure_verbs(usual, _seconds("verbs", config), config.seed, config.device))
+def _render(config: BenchConfig, console: Console) -> BenchResult:
+    sizes, default_size = render.sizes(*_sizes(config)), render.default_size(*_sizes(config))
+    verbs = _dicts(render.measure_verbs(default_size, _seconds("verbs", config), config.seed, config.device))
     measured = render.measure(sizes, _seconds("render", config), config.seed, config.device)
-    rows = _dicts(watched(measured, len(sizes) * len(render.BACKENDS), console))
-    return Measured(
+    rows = _dicts(show_progress(measured, len(sizes) * len(render.BACKENDS), console))
+    return BenchResult(
         {"rows": rows, "verbs": verbs, "method": render.METHOD},
-        [Section(render.TITLE, render.COLUMNS, rows), Section(render.VERBS_TITLE, render.VERB_COLUMNS, verbs)],
-    )
-
-
-def _night(config: BenchConfig, console: Console) -> Measured:
-    settings = night.settings_of(config)
-    time_frame = night.timer_of(settings)
-    names, without, failed = select_frames(open_source(settings), settings)
-    count = config.count or len(names)
-    chosen = night.spread(names, config.limit or night.FRAMES)
-    console.print(
-        f"told by {len(chosen)} of {format_count(len(names), 'frame')} with vehicles; {without} without passed over"
-    )
-    build = partial(night.timer_of, settings)
-    asked = run_frame_jobs(chosen, time_frame, build, config, ProgressSettings("frames", show_remaining=True))
-    spent = [one for one in asked.results.values() if one is not None]
-    night.check_some(spent)
-    processes = min(config.processes, len(chosen))
-    parts, nights = night.part_rows(spent), night.night_rows(spent, count, processes, config.seed)
-    told = {"parts": parts, "nights": nights, "measured": _dicts(spent), "failed": failed | asked.failed}
-    return Measured(
-        told | {"method": night.METHOD},
         [
-            Section(night.PARTS_TITLE, night.PARTS_COLUMNS, parts),
-            Section(night.NIGHTS_TITLE, night.NIGHTS_COLUMNS, nights),
+            BenchTable(render.TITLE, render.COLUMNS, rows),
+            BenchTable(render.VERBS_TITLE, render.VERB_COLUMNS, verbs),
+        ],
+    )
+
+
+def _night(config: BenchConfig, console: Console) -> BenchResult:
+    settings = night.build_attack_config(config)
+    time_frame = night.build_frame_timer(settings)
+    names, skipped, failed = select_frames(open_source(settings), settings)
+    count = config.count or len(names)
+    chosen = night.pick_evenly(names, config.limit or night.FRAMES)
+    console.print(
+        f"measuring {len(chosen)} of {format_count(len(names), 'frame')} with vehicles; "
+        f"{skipped} without vehicles skipped"
+    )
+    build = partial(night.build_frame_timer, settings)
+    timed = run_frame_jobs(chosen, time_frame, build, config, ProgressSettings("frames", show_remaining=True))
+    times = [time for time in timed.results.values() if time is not None]
+    night.require_frames(times)
+    processes = min(config.processes, len(chosen))
+    parts, nights = night.part_rows(times), night.night_rows(times, count, processes, config.seed)
+    fields = {"parts": parts, "nights": nights, "measured": _dicts(times), "failed": failed | timed.failed}
+    return BenchResult(
+        fields | {"method": night.METHOD},
+        [
+            BenchTable(night.PARTS_TITLE, night.PARTS_COLUMNS, parts),
+            BenchTable(night.NIGHTS_TITLE, night.NIGHTS_COLUMNS, nights),
         ],
     )
 

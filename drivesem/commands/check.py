@@ -1,4 +1,4 @@
-"""`drivesem check`: whether a detector keeps the contract of `detectors.base`."""
+"""`drivesem check`: test a detector against the contract of `detectors.base`."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ from drivesem.config.errors import UsageError
 from drivesem.report.tables import print_json
 from drivesem.report.terminal import Console
 
-LEAST_SIDE = 64
-"""Of a picture, px: its blocks must be larger than a network's stride."""
+MIN_SIDE_PX = 64
+"""Smallest side of a test picture: its blocks must be larger than a network's stride."""
 _STYLES = {"ok": "green", "failed": "bold red", "raised": "bold red", "not tried": "dim"}
 
 
 def check_command(config: CheckConfig) -> int:
-    """Try every promise, say what came of it; exit code 0, or 1 where one is broken. UsageError for bad input, a
-    detector whose code raises among it.
-    """
+    """`drivesem check`: exit code 1 if a promise is broken. Raises UsageError if the detector's own code raises."""
     width, height = _size(config.size)
     check_device(config.device)
     try:
@@ -48,11 +46,11 @@ def check_command(config: CheckConfig) -> int:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Width and height px."""
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
-    if found is None or min(int(found[1]), int(found[2])) < LEAST_SIDE:
-        raise UsageError("--size", f"WIDTHxHEIGHT, each at least {LEAST_SIDE} px", repr(text))
-    return int(found[1]), int(found[2])
+    """Width and height, px."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if match is None or min(int(match[1]), int(match[2])) < MIN_SIDE_PX:
+        raise UsageError("--size", f"WIDTHxHEIGHT, each at least {MIN_SIDE_PX} px", repr(text))
+    return int(match[1]), int(match[2])
 
 
 def _print(report: ContractReport, config: CheckConfig, console: Console) -> None:
@@ -65,4 +63,4 @@ def _print(report: ContractReport, config: CheckConfig, console: Console) -> Non
         table.add_row(finding.name, Text(finding.verdict, style), finding.detail)
     console.print(table)
     tried = sum(finding.verdict != "not tried" for finding in report.findings)
-    console.print(f"{tried - len(report.failed)} of {tried} kept, {len(report.failed)} broken", soft_wrap=True)
+    console.print(f"{tried - len(report.failed)} of {tried} hold, {len(report.failed)} broken", soft_wrap=True)

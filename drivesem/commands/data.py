@@ -1,4 +1,4 @@
-"""`drivesem convert`: labels from one layout into another, and one line that says what is lost."""
+"""`drivesem convert` and `drivesem export`: labels and counterexamples in the formats of other tools."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from pathlib import Path
 from drivesem.config.commands import ConvertConfig, ExportConfig
 from drivesem.config.constraints import parse_class_map
 from drivesem.config.errors import UsageError
-from drivesem.data.label_table import Written
+from drivesem.data.label_table import WriteSummary
 from drivesem.report.tables import format_count, print_json
+from drivesem.run.conversion import ConversionSettings, convert_labels
 from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
 from drivesem.run.finished import load_runs
-from drivesem.run.labels import ConversionSettings, convert_labels, detect_labels_layout
+from drivesem.run.labels import detect_labels_layout
 
 
 def convert_command(config: ConvertConfig) -> int:
-    """Convert; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem convert`: convert labels and report what is lost."""
     out = Path(config.out)
     if out.suffix.lower() == ".json":
         if config.to_format != "coco":
@@ -42,9 +43,9 @@ def convert_command(config: ConvertConfig) -> int:
     written = convert_labels(source, out, conversion)
     if config.json:
         print_json({"out": config.out, **asdict(written)})
-    sys.stderr.write(f"{sentence(written)}\n")
+    sys.stderr.write(f"{summarise_losses(written)}\n")
     if layout == "run" and config.to_format == "coco" and not config.copy_images and not config.scores:
-        sys.stderr.write(f"file names of images are below {source / 'frames'} (--copy-images copies them)\n")
+        sys.stderr.write(f"images are in {source / 'frames'} (--copy-images copies them)\n")
     return 0
 
 
@@ -57,19 +58,19 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return int(match[1]), int(match[2])
 
 
-def sentence(written: Written) -> str:
-    """What is lost and what was assumed, on one line."""
+def summarise_losses(written: WriteSummary) -> str:
+    """What was lost and what was assumed, in one line."""
 
-    def listed(counts: Mapping[str, int]) -> str:
+    def join(counts: Mapping[str, int]) -> str:
         return ", ".join(f"{name} of {count}" for name, count in sorted(counts.items()))
 
-    parts = [f"lost: {listed(written.lost)}" if written.lost else "nothing lost"]
-    parts += [f"assumed: {listed(written.assumed)}"] if written.assumed else []
+    parts = [f"lost: {join(written.lost)}" if written.lost else "nothing lost"]
+    parts += [f"assumed: {join(written.assumed)}"] if written.assumed else []
     return f"{format_count(written.files, 'file')}; {'; '.join(parts)}"
 
 
 def export_command(config: ExportConfig) -> int:
-    """Export; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem export`: export the counterexamples of a run."""
     out = Path(config.out or "")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("--out", "a new or empty folder", out)
@@ -85,7 +86,7 @@ def export_command(config: ExportConfig) -> int:
     result = export_dataset(attack_run, out, config.to_format, config.grade, parse_class_map("--map", config.map))
     if config.json:
         print_json({"out": str(out), **asdict(result)})
-    sys.stderr.write(f"{sentence(result)}\n")
+    sys.stderr.write(f"{summarise_losses(result)}\n")
     return 0
 
 

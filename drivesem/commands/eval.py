@@ -1,4 +1,4 @@
-"""`drivesem eval`: figures of detections against labels, or of a detector on a data set."""
+"""`drivesem eval`: metrics of detections, or of a detector on a data set."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from drivesem.report.tables import print_json
 from drivesem.report.terminal import Console
 
 _FILE_WIDTH = 120
-"""Characters a line of the tables where they go to a file and not to a terminal."""
+"""Characters per line of tables that go to a file."""
 
 
 def eval_command(config: EvalConfig) -> int:
-    """Evaluate and report; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
+    """`drivesem eval`: evaluate and print."""
     console = Console(stderr=True)
     if config.detector is not None:
         from drivesem.analysis.evaluate.detector import evaluate_detector, print_detector_metrics
         from drivesem.config.devices import check_device
 
         check_device(config.device)
-        figures = evaluate_detector(config)
+        metrics = evaluate_detector(config)
         if config.json:
-            print_json(figures.data)
-        print_detector_metrics(figures, console)
+            print_json(metrics.data)
+        print_detector_metrics(metrics, console)
         return 0
     result = evaluate_files(config)
     if config.json:

@@ -13,7 +13,7 @@ from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_sett
 from drivesem.config.errors import UsageError
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
-from drivesem.scenes.scene import Scene, free_folder
+from drivesem.scenes.scene import Scene, check_scene_folder
 from scene_ir import files
 from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene, save_scene
@@ -70,7 +70,7 @@ def _changes(config: EditConfig) -> dict[Any, Any]:
 
 def _save_path(path: Path, scene: Path) -> Path:
     """The folder of the changed scene. Raises UsageError if it would overwrite anything but a scene."""
-    if free_folder(path, "--save").resolve() in scene.resolve().parents:
+    if check_scene_folder(path, "--save").resolve() in scene.resolve().parents:
         raise UsageError("--save", "a folder that does not hold the scene", path)
     return path
 

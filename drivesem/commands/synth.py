@@ -16,12 +16,12 @@ from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, synthesise
 
 _DRIVE_FRAMES = 10
-"""Frames of one drive in the layouts of Virtual KITTI, unless --sequence says otherwise."""
+"""Frames of one drive in the layouts of Virtual KITTI, without --sequence."""
 _SHEET_FRAMES = 8
 
 
-def order_of(config: SynthConfig) -> Order:
-    """What the configuration asks for. Raises UsageError or SceneError for what cannot be."""
+def build_order(config: SynthConfig) -> Order:
+    """The data set that the settings describe. Raises UsageError or SceneError for bad input."""
     out = resolve_output_folder(config.out, Path(f"data/synth-{config.layout}-{config.split}-seed{config.seed}"))
     virtual = config.layout.startswith("vkitti")
     for name in ("meshes", "assets"):
@@ -47,51 +47,51 @@ def order_of(config: SynthConfig) -> Order:
 
 
 def synth_command(config: SynthConfig) -> int:
-    """Write the frames that are not there yet; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem synth`: generate the frames that do not exist yet."""
     start = time.perf_counter()
-    order = order_of(config)
+    order = build_order(config)
     total = len(order.places())
     acquire_folder_lock(order.out)
     done = synthesise(order, make_parallel_map(config))
     with progress_bar(Console(stderr=True), show_remaining=True) as progress:
         for _ in progress.track(done, total=total, description="making frames"):
             pass
-    found: dict[str, object] = {"out": str(order.out), "frames": total}
+    result: dict[str, object] = {"out": str(order.out), "frames": total}
     if config.sheet:
-        found["sheet"] = str(_sheet(order))
+        result["sheet"] = str(_sheet(order))
     if config.compare:
-        found["distances"] = _compare(order)
-    found["seconds"] = round(time.perf_counter() - start, 3)
+        result["distances"] = _compare(order)
+    result["seconds"] = round(time.perf_counter() - start, 3)
     if config.json:
-        print_json(found)
+        print_json(result)
     else:
         Console().print(
-            f"{format_count(total, 'frame')} in {order.out} ({found['seconds']:.0f} s)", soft_wrap=True
+            f"{format_count(total, 'frame')} in {order.out} ({result['seconds']:.0f} s)", soft_wrap=True
         )
     return 0
 
 
 def _sheet(order: Order) -> Path:
-    """A contact sheet of what was written, read back by the layout's reader."""
+    """Write a contact sheet of the frames, as the layout's reader reads them."""
     from drivesem.data.registry import open_dataset
     from drivesem.report.drawing import write_picture
-    from drivesem.synth.sheet import sheet_of
+    from drivesem.synth.sheet import draw_sheet
 
     dataset = open_dataset(order.layout, order.out)
     names = dataset.identifiers
     step = max(len(names) // _SHEET_FRAMES, 1)
     path = order.out / "sheet.jpg"
-    write_picture(path, sheet_of(dataset, names[::step][:_SHEET_FRAMES]))
+    write_picture(path, draw_sheet(dataset, names[::step][:_SHEET_FRAMES]))
     return path
 
 
 def _compare(order: Order) -> dict[str, object]:
-    """Distributions beside KITTI's own: a plot and a table in the folder."""
+    """Write a plot and a table of the distributions, compared with KITTI's."""
     from drivesem.data.registry import open_dataset
     from drivesem.synth.compare import compare
     from scene_ir import files
 
-    found = compare(open_dataset(order.layout, order.out))
-    found.plot(order.out / "distributions.png")
-    files.write_text(order.out / "distributions.md", found.table())
-    return found.summary()["distances"]
+    comparison = compare(open_dataset(order.layout, order.out))
+    comparison.plot(order.out / "distributions.png")
+    files.write_text(order.out / "distributions.md", comparison.table())
+    return comparison.summary()["distances"]

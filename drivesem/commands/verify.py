@@ -17,7 +17,7 @@ _MAX_PRINTED, _MAX_PER_CHECK = 30, 5
 
 
 def verify_command(config: VerifyConfig) -> int:
-    """Verify and report. Returns 1 if anything differs or a frame cannot be read, otherwise 0."""
+    """`drivesem verify`: verify and report. Returns 1 if anything differs or a frame cannot be read, otherwise 0."""
     check_device(config.device)
     data, out = run_verify(config)
     console = Console(stderr=True)

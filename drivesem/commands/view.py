@@ -18,7 +18,7 @@ _MAX_TRIES = 20
 
 
 def view_command(config: ViewConfig) -> int:
-    """Serve until Ctrl-C; exit code 0. Raises UsageError or SceneError for bad input."""
+    """`drivesem view`: serve until Ctrl-C."""
     frames = open_viewer_frames(config)
     server = _create_server(frames, config.port)
     try:

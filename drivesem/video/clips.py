@@ -69,9 +69,9 @@ class _DemoFrames:
     """Frames of the embedded clip."""
 
     def __init__(self, source: ClipSource) -> None:
-        from drivesem.synth.drives import drive_of
+        from drivesem.synth.drives import make_drive
 
-        self._drive = drive_of(source.seed, source.limit or DEMO_FRAMES)
+        self._drive = make_drive(source.seed, source.limit or DEMO_FRAMES)
         self.name = DEMO
         self.names = tuple(f"drive-{number:03d}" for number in range(self._drive.frames))
 

@@ -77,7 +77,7 @@ class Confirmation:
     """Parts of the change that the second renderer lacks, by frame that is left out."""
     shares: tuple[SurvivalRate, ...]
     """Survival rates."""
-    scores: dict[str, coco.Scores]
+    scores: dict[str, coco.CocoScores]
     """Scores by picture, each by its own labels."""
     overlap: tuple[float, float, int] | None
     """Mean and least IoU of vehicles' boxes in both pictures, and their number; None without any."""

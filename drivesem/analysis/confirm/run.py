@@ -87,7 +87,7 @@ class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
         renderer = self.second.renderer_for(name, changed)
         renders = [renderer.render(scene) for scene in (changed.as_photographed(), changed)]
         count = len(changed.objects)
-        targets = pair_targets(*renders, count)
+        targets = pair_targets(renders[0], renders[1], count)
         classes = EvaluatedClasses.from_detector(self.detector)
         pictures = [to_uint8(render.image) for render in renders]
         detections = [detect_objects(self.detector, image_to_tensor(p, self.device)) for p in pictures]

@@ -26,14 +26,14 @@ from drivesem.synth.frames import (
     Street,
     SynthFrame,
     Truth,
+    build_street,
     render_frame,
-    street_of,
     table,
     yaw_in_camera,
 )
 from drivesem.synth.layout import Actor
 from drivesem.synth.view import SUPERSAMPLING, View
-from drivesem.synth.write import Order, jobs_of, plan_of
+from drivesem.synth.write import Order, list_jobs, plan_job
 from scene_ir import ffd, files
 from scene_ir.errors import FormatError
 from scene_ir.types import LATTICE, SceneIR
@@ -106,7 +106,7 @@ class FolderPlans:
                 )
         try:
             self._frames: list[dict[str, Any]] = list(manifest["frames"])
-            self._jobs = jobs_of(_order(self._path.parent, manifest))
+            self._jobs = list_jobs(_order(self._path.parent, manifest))
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(str(self._path), "a manifest as drivesem synth writes it", error) from error
 
@@ -121,7 +121,7 @@ class FolderPlans:
             raise FormatError(f"{self._path}: frame {number}", "objects with tracks", error) from error
         rows = [scene.provenance.get(f"objects[{i}].label", "") for i in range(len(scene.objects))]
         tracks = (labelled[int(r)] if r.isdecimal() and int(r) < len(labelled) else None for r in rows)
-        plan = plan_of(self._jobs[number])
+        plan = plan_job(self._jobs[number])
         known = {actor.track for actor in plan.actors}
         return PlanMatch(plan, tuple(track if track in known else None for track in tracks))
 
@@ -310,7 +310,7 @@ class GeneratorRenderer:
         self._identifier = identifier
         self._still = scene.as_photographed()
         self._planned = plans.find_plan(identifier, scene)
-        surround = street_of(self._planned.plan)
+        surround = build_street(self._planned.plan)
         frame = _render_plan(self._planned.plan, surround)
         _check_photograph(identifier, scene.photograph, frame.image)
         self._before = self._last = _RenderedEdit(self.transfer(self._still).edit, frame, surround)
@@ -344,7 +344,7 @@ class GeneratorRenderer:
             if edit == rendered.edit:
                 return rendered.frame
         plan = apply_edit(self._planned.plan, edit, f"frame {self._identifier}")
-        surround = self._last.surround if edit.foliage == self._last.edit.foliage else street_of(plan)
+        surround = self._last.surround if edit.foliage == self._last.edit.foliage else build_street(plan)
         frame = _render_plan(plan, surround)
         self._last = _RenderedEdit(edit, frame, surround)
         return frame

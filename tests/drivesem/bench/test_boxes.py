@@ -12,7 +12,7 @@ import torch
 from detectors.base import Detector
 from detectors.registry import load_detector
 from drivesem.bench import boxes
-from drivesem.data.kitti import format_calib
+from drivesem.data.kitti import format_calibration
 from scene_ir.errors import FormatError
 from scene_ir.render.compositor import Compositor
 
@@ -26,7 +26,7 @@ CYCLIST = "Cyclist 0.00 0 -1.58 540.0 170.0 560.0 230.0 1.70 0.60 1.80 -0.50 1.6
 def archive(path: Path, frames: dict[str, list[str]]) -> Path:
     with tarfile.open(path, "w:xz") as out:
         for name, lines in frames.items():
-            for folder, text in (("label_2", "\n".join(lines) + "\n"), ("calib", format_calib(PROJECTION))):
+            for folder, text in (("label_2", "\n".join(lines) + "\n"), ("calib", format_calibration(PROJECTION))):
                 info = tarfile.TarInfo(f"training/{folder}/{name}.txt")
                 info.size = len(text.encode())
                 out.addfile(info, io.BytesIO(text.encode()))
