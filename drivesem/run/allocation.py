@@ -1,4 +1,4 @@
-"""The C library's free memory: kept for reuse, or returned to the system. Imports nothing heavy."""
+"""Control the C library's free memory: reuse it, or return it to the system. Imports nothing heavy."""
 
 from __future__ import annotations
 

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from tools.names import find_all
+from tools.names import CODE, find_all, find_repeated_classes, iterate_files
+
+PRODUCT = ("scene_ir", "detectors", "drivesem", "docs", "README.md", "CONTRIBUTING.md")
 
 
 def test_names_and_prose_use_the_terms_of_the_glossary() -> None:
-    findings = [str(finding) for finding in find_all()]
+    findings = [str(finding) for finding in find_all(PRODUCT)]
+    assert not findings, "\n".join(findings)
+
+
+def test_class_names_are_unique() -> None:
+    paths = [path for path in iterate_files(CODE, (".py",)) if "tests" not in path.parts]
+    findings = [str(finding) for finding in find_repeated_classes(paths)]
     assert not findings, "\n".join(findings)

@@ -215,7 +215,7 @@ def _install(config: BenchTool, console: Console) -> BenchResult:
     _on_cpu(config)
     rows = list(show_progress(install.measure(config.quick), 20, console))
     parts = (
-        (install.STEPS_TITLE, install.STEPS, install.StepRow),
+        (install.STEPS_TITLE, install.STEPS, install.InstallStepRow),
         (install.SIZES_TITLE, install.SIZES, install.SizeRow),
         (install.STARTS_TITLE, install.STARTS, install.StartRow),
     )

@@ -540,10 +540,9 @@ def _check_all(
     """The rows of each scene, and why others have none."""
     parts = (None, *PAPER_PARAMETERS)
     per_scene = [tuple(_Task(name, at, part) for at in POINTS for part in parts) for name in names]
-    if len(names) >= worker.config.processes:
-        jobs = per_scene
-    else:  # too few scenes to keep every process busy: each makes the scene ready for itself
-        jobs = [(task,) for tasks in per_scene for task in tasks]
+    # with too few scenes to occupy every process, each process prepares the scene for itself
+    single = [(task,) for tasks in per_scene for task in tasks]
+    jobs = per_scene if len(names) >= worker.config.processes else single
     answers = run_frame_jobs(
         jobs,
         worker,
@@ -600,7 +599,8 @@ def _print(rows: Sequence[GradcheckRow], config: GradcheckConfig, console: Conso
     console.print(table)
     outside = sum(not row.passes(config.min_cosine, config.max_error) for row in rows)
     silent = sum(row.cosine is None for row in rows)
-    counts = f"{len(rows) - outside - silent} of {format_count(len(rows), 'row')} inside the tolerance, {outside} outside"
+    inside = len(rows) - outside - silent
+    counts = f"{inside} of {format_count(len(rows), 'row')} inside the tolerance, {outside} outside"
     counts += f", {silent} without effect" if silent else ""
     tolerance = f"cosine at least {config.min_cosine:g}, error at most {config.max_error:g}"
     console.print(f"{counts} ({tolerance})", soft_wrap=True)

@@ -48,7 +48,7 @@ print(json.dumps([[one.name, one.version, size(one)] for one in distributions()]
 
 
 @dataclass(frozen=True, slots=True)
-class StepRow:
+class InstallStepRow:
     """A step."""
 
     step: str
@@ -80,7 +80,7 @@ class StartRow:
     """Of the others."""
 
 
-Row = StepRow | SizeRow | StartRow
+Row = InstallStepRow | SizeRow | StartRow
 
 
 def measure(quick: bool, run: Run = run_words) -> Iterator[Row]:
@@ -98,7 +98,7 @@ def measure(quick: bool, run: Run = run_words) -> Iterator[Row]:
             yield _start(words, starts, folder, run)
 
 
-def _steps(work: Path, run: Run) -> Iterator[StepRow]:
+def _steps(work: Path, run: Run) -> Iterator[InstallStepRow]:
     """A clone, an environment, an installation, an attack, and their sum."""
     clone, environment = work / "clone", work / "environment"
     own = str(environment / "bin" / "python")
@@ -118,13 +118,15 @@ def _steps(work: Path, run: Run) -> Iterator[StepRow]:
             clone / "runs",
         ),
     ]
-    rows: list[StepRow] = []
+    rows: list[InstallStepRow] = []
     for name, words, folder, place in steps:
         before = _mb(place)
         taken, _ = _timed(words, folder, run)
-        rows.append(StepRow(name, round(taken, 1), round(_mb(place) - before, 1)))
+        rows.append(InstallStepRow(name, round(taken, 1), round(_mb(place) - before, 1)))
         yield rows[-1]
-    yield StepRow("in all", round(sum(row.seconds for row in rows), 1), round(sum(row.mb for row in rows), 1))
+    yield InstallStepRow(
+        "in all", round(sum(row.seconds for row in rows), 1), round(sum(row.mb for row in rows), 1)
+    )
 
 
 def _kernels(work: Path) -> list[str]:

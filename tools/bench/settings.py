@@ -86,10 +86,9 @@ class DetectorBenchConfig(BenchOptions):
     """Measure memory, detectors, attacks on planted faults, and a cluster."""
 
     what: CommandName = ""
-    """memory: peak memory above the detector's own; detector: forward, backward and decoding of each detector;
-    climb: a search by climb, and the parts of its passes; planted: how many faults that were planted into the
-    detector each attack finds (docs/research/planted.md), minutes a frame; scale: frames shared by Ray beside frames shared
-    by processes of this machine."""
+    """Benchmark. memory: peak memory above the detector's own; detector: its forward and backward pass;
+    climb: a search by climb and the parts of its passes; planted: planted faults that each attack finds; scale: frames
+    shared by Ray compared with local processes."""
     methods: str = "climb,corners,si-fgsm,halton,cma-es"
     """Planted: attacks to judge, with commas (drivesem attack --method)."""
     passes: Annotated[int, at_least(MIN_PASSES)] = 90

@@ -155,9 +155,7 @@ class _ProtocolEvaluator:
             small = self.config.small_detections
             count_by_frame_and_class = np.bincount(found.frame * len(self.sets.classes) + found.label)
             largest_count = int(count_by_frame_and_class.max(initial=0))
-            expected = (
-                f"at most {_MAX_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
-            )
+            expected = f"at most {_MAX_DETECTIONS:,} detections of a class in a frame for --protocol kitti"
             refuse(largest_count > _MAX_DETECTIONS, "--pred", expected, f"{largest_count:,}")
             curves = kitti.evaluate(self.sets.truths, found, self.sets.classes, small)
             curves = [curve for curve in curves if curve.name in self.names]

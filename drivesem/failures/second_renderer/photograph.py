@@ -277,9 +277,7 @@ def _paint_texture(vehicle: _Vehicle, code: Array) -> NDArray[np.uint8]:
     if not code.any():
         return vehicle.texture
     atlas = vehicle.atlas
-    return _to_levels(
-        shading.apply_paint(atlas.colour, code, atlas.paint_share, atlas.height, atlas.paint_colour)
-    )
+    return _to_levels(shading.apply_paint(atlas.colour, code, atlas.paint_share, atlas.height, atlas.paint_colour))
 
 
 def _to_levels(colour: Array) -> NDArray[np.uint8]:

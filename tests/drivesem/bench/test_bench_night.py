@@ -1,4 +1,4 @@
-"""How long an attack on many frames takes, estimated from hand-made frames; and two real frames in the command's tests."""
+"""The estimated time of an attack on many frames, from hand-made frames; the command on two real ones."""
 
 from __future__ import annotations
 

@@ -135,7 +135,9 @@ def test_it_serves_until_ctrl_c(small_run: Path) -> None:
     try:
         content = json.loads(child.stdout.readline())
         assert (content["frames"], content["detector"]) == (1, "squeezedet")
-        with urllib.request.urlopen(f"{content['url']}picture?frame=demo-000&weather.fog=0.5", timeout=60) as answer:
+        with urllib.request.urlopen(
+            f"{content['url']}picture?frame=demo-000&weather.fog=0.5", timeout=60
+        ) as answer:
             assert answer.read(2) == b"\xff\xd8", "a JPEG"
     finally:
         child.send_signal(signal.SIGINT)

@@ -472,9 +472,7 @@ def written(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> Path:
     assert not writer.exists(FrameLocation(0, "01", "clone", 0, "train"))
     entries = [
         writer.write(FrameLocation(0, "01", "clone", 0, "train"), make_exposure(0)),
-        writer.write(
-            FrameLocation(1, "01", "fog", 0, "val"), make_exposure(1, specification=(), empty_box=False)
-        ),
+        writer.write(FrameLocation(1, "01", "fog", 0, "val"), make_exposure(1, specification=(), empty_box=False)),
     ]
     assert writer.exists(FrameLocation(0, "01", "clone", 0, "train"))
     writer.finish(entries)

@@ -77,7 +77,7 @@ def test_no_word_and_no_number_is_broken(
 ) -> None:
     columns = (
         *(f"{name}{i}" for i, name in enumerate(names)),
-        *(f"{head}{i}" for i, (head, _) in enumerate(numbers)),
+        *(f"{head}{i}" for i, (head, _) in enumerate(numbers, len(names))),
     )
     sheet = ReportTable("t", columns, ((*[sentence] * len(names), *(number for _, number in numbers)),))
     text = printed(sheet, width, columns[: len(names)])

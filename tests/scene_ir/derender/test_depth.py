@@ -118,9 +118,9 @@ def test_where_something_stands_there_is_ground(street):
     ground, view = street.environment.ground, street.camera
     plane = maps.compute_plane_depth(ground, view)
     ties = ties_of(street)
-    stood = np.zeros_like(ties.footprint)
-    stood[230:, 300:600] = 1
-    tied = depth.estimate_depth(picture(street), ground, view, replace(ties, stood=stood))
+    footprint = np.zeros_like(ties.footprint)
+    footprint[230:, 300:600] = 1
+    tied = depth.estimate_depth(picture(street), ground, view, replace(ties, footprint=footprint))
     inside = tied[260:350, 340:560] / plane[260:350, 340:560]
     assert inside.min() > 0.999
 

@@ -158,7 +158,7 @@ def test_maps_of_one_within_a_mask_of_another(seen):
     other = Segmentation(*(1 - getattr(seen, f.name) for f in fields(Segmentation)))
     mask = np.zeros(seen.sky.shape, bool)
     mask[:40] = True
-    mixed = seen.within(mask, other)
+    mixed = seen.merge_inside(mask, other)
     assert np.array_equal(mixed.sky[:40], other.sky[:40])
     assert np.array_equal(mixed.sky[40:], seen.sky[40:])
 

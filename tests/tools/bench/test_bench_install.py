@@ -39,7 +39,7 @@ class Recorder:
 def test_the_readmes_words_one_after_another() -> None:
     run = Recorder()
     rows = list(install.measure(quick=False, run=run))
-    steps = [row for row in rows if isinstance(row, install.StepRow)]
+    steps = [row for row in rows if isinstance(row, install.InstallStepRow)]
     assert [row.step.split()[0] for row in steps] == ["git", "python3", "pip", "drivesem", "in"]
     assert [row.mb for row in steps] == [2, 0, 0, 0, 2]
     assert steps[-1].seconds == pytest.approx(sum(row.seconds for row in steps[:-1]), abs=0.05)

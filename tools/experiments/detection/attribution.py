@@ -47,7 +47,7 @@ OURS = "ours"
 _SETTINGS = {
     TARGETED_LABELS: "objective_labels",
     "loss": "objective",
-    "iterate kept": "keep",
+    "final iterate": "keep",
     "projection": "project",
     "parametrisation": "parametrisation",
 }

@@ -91,7 +91,7 @@ def test_points_sum_to_the_difference_on_both_paths_and_in_the_mean(found: Attri
 
 def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
     shares = {share.name: share for share in found.shares}
-    for name in ("loss", "iterate kept", "parametrisation"):
+    for name in ("loss", "final iterate", "parametrisation"):
         assert (shares[name].points.value, shares[name].points.low, shares[name].p) == (0, 0, 1)
     # by labels that move a car that drove away is found; by labels that stay it is lost, and a false one beside
     assert shares["projection"].path_points[1] == 0 < shares["projection"].path_points[0]
