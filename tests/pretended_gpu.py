@@ -203,7 +203,7 @@ def pretended() -> Iterator[None]:
             return engine(*args, **kwargs)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch, "_run", kernels.run)
+        patch.setattr(launch, "_launch_range", kernels.run)
         patch.setattr(launch.wp, "from_torch", kernels.array)
         patch.setattr(launch.wp, "device_from_torch", lambda device: device)
         patch.setattr(

@@ -102,7 +102,7 @@ def deb(content: bytes) -> bytes:
 def pack(tool: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pack")
     with zipfile.ZipFile(io.BytesIO(library())) as archive:
-        assert len(list(tool.add_vehicles(archive, tool.Pack(root)))) == 1
+        assert len(list(tool.add_vehicles(archive, tool.AssetPack(root)))) == 1
     return root
 
 
@@ -138,14 +138,14 @@ def test_a_car_becomes_a_vehicle_of_the_pack(pack: Path) -> None:
 def test_what_is_there_is_not_made_again(tool: ModuleType, pack: Path) -> None:
     before = (pack / "vehicles" / "seat-leon.glb").stat().st_mtime_ns
     with zipfile.ZipFile(io.BytesIO(library())) as archive:
-        assert list(tool.add_vehicles(archive, tool.Pack(pack))) == []
+        assert list(tool.add_vehicles(archive, tool.AssetPack(pack))) == []
         assert (pack / "vehicles" / "seat-leon.glb").stat().st_mtime_ns == before
         # A file that was written before its line in the list counts as missing.
         (pack / "vehicles" / "vehicles.yaml").write_text("{}")
-        assert len(list(tool.add_vehicles(archive, tool.Pack(pack)))) == 1
+        assert len(list(tool.add_vehicles(archive, tool.AssetPack(pack)))) == 1
     listed = yaml.safe_load((pack / "vehicles" / "vehicles.yaml").read_text())
     assert listed["seat-leon.glb"]["author"] == "Somebody"
-    assert "Somebody" in tool.licences(tool.Pack(pack), ["park.npz"])
+    assert "Somebody" in tool.licences(tool.AssetPack(pack), ["park.npz"])
 
 
 def test_textures_are_cut_into_faces_only_where_they_vary(tool: ModuleType) -> None:

@@ -34,16 +34,16 @@ METHOD = (
     "with both settings in turn, after one that is not counted. A part's time is that of the functions that do it."
 )
 PARTS: dict[str, Sequence[tuple[Any, str]]] = {
-    "template and heading": [(stand, "likely")],
-    "what is whose pixel": [(taking._VehicleSegmenter, "at"), (taking._VehicleSegmenter, "cut")],
-    "fit": [(silhouette, "fit")],
-    "things in front": [(front, "labelled"), (front, "opacities")],
-    "maps": [(segment, "segment")],
-    "light and shadows": [(shadow, "light"), (taking, "_shaded")],
-    "fill behind": [(behind.BackgroundFill, "filled")],
-    "depth": [(depth, "surroundings")],
+    "template and heading": [(stand, "choose_pose")],
+    "what is whose pixel": [(taking._VehicleSegmenter, "first_mask"), (taking._VehicleSegmenter, "cut_out")],
+    "fit": [(silhouette, "fit_silhouettes")],
+    "things in front": [(front, "find_labelled_occluders"), (front, "compute_opacities")],
+    "maps": [(segment, "segment_photograph")],
+    "light and shadows": [(shadow, "estimate_ground_light"), (taking, "_find_shadows")],
+    "fill behind": [(behind.BackgroundFill, "fill_hole")],
+    "depth": [(depth, "estimate_depth")],
     "sources": [(taking, "solve_sources")],
-    "paint": [(paint, "with_regions")],
+    "paint": [(paint, "add_paint_regions")],
 }
 """Functions by what they do; none of them calls another one."""
 REST, WHOLE = "the rest", "all"

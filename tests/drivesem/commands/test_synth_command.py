@@ -32,10 +32,10 @@ def test_it_writes_a_data_set_a_sheet_and_distributions(
     words = ["synth", "--layout", "coco", "--frames", "2", "--seed", "3", "--workers", "1", "--out", str(out)]
     assert main([*words, "--sheet", "--compare", "--json"]) == 0
     captured = capsys.readouterr()
-    captured = json.loads(captured.out)
     assert captured.out.count("\n") == 1
-    assert captured["frames"] == 2
-    assert captured["out"] == str(out)
+    summary = json.loads(captured.out)
+    assert summary["frames"] == 2
+    assert summary["out"] == str(out)
     assert len(open_dataset("coco", out).identifiers) == 2
     assert files.read_image(out / "sheet.jpg").shape[1] > 1000
     assert (out / "distributions.png").read_bytes().startswith(b"\x89PNG")

@@ -199,12 +199,12 @@ _STOPPED = """
 import signal
 from functools import partial
 
-from drivesem.run.workers import outcomes
-from drivesem.config.options import Sharing
+from drivesem.run.workers import run_jobs
+from drivesem.config.options import WorkerOptions
 from tests.drivesem.run.test_workers import lingering
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
-list(outcomes(None, partial(lingering, {folder!r}), [1, 2], Sharing(workers=2)))
+list(run_jobs(None, partial(lingering, {folder!r}), [1, 2], WorkerOptions(workers=2)))
 """
 
 

@@ -1,4 +1,4 @@
-"""`drivesem bench detector`: figures that fit each other, and a gradient that is one."""
+"""`python -m tools.bench detector`: consistent metrics, and a gradient that is one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from detectors.registry import load_detector
 from drivesem.bench.timing import CallTime, PairedTimer
-from drivesem.commands import bench
+from tools.bench import __main__ as bench
 from tools.bench import detector, memory, probe
 from tools.bench.__main__ import main
 
@@ -41,7 +41,7 @@ def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch
             super().__init__()
             self.calls = 0
 
-        def taken(self, call: object) -> CallTime:
+        def time_call(self, call: object) -> CallTime:
             turn, kind = divmod(self.calls, 6)
             self.calls += 1
             slow = 10 if turn == 1 else 1 + turn
@@ -60,10 +60,10 @@ def test_rounds_are_in_turn_and_the_fastest_stands_beside_the_median(monkeypatch
 
 
 def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(bench._SECONDS, "detector", (0.0, 0.0))
+    monkeypatch.setattr(bench, "_DETECTOR_SECONDS", (0.0, 0.0))
     monkeypatch.setattr(bench, "SHIPPED", {"squeezedet": Path()})
     monkeypatch.setattr(detector, "SIZES_HW", ((64, 96),))
-    words = ["bench", "detector", "--quick", "--threads", "1", "--json"]
+    words = ["detector", "--quick", "--threads", "1", "--json"]
     assert main([*words, "--markdown", str(tmp_path / "all.md")]) == 0
     captured = capsys.readouterr()
     result = json.loads(captured.out)
@@ -78,7 +78,7 @@ def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyP
     text = (tmp_path / "all.md").read_text()
     assert f"### {detector.TITLE}" in text
     assert "| forward and backward, ms |" in text
-    assert "`drivesem bench detector --quick --threads 1`" in text
+    assert "`python -m tools.bench detector --quick --threads 1`" in text
 
 
 def test_a_detector_without_a_gradient_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

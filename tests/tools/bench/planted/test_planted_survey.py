@@ -62,7 +62,7 @@ def test_draws_and_corners_are_feasible_and_repeat(feasible: FeasibleSet) -> Non
 def test_a_survey_knows_what_is_inside(
     objective: Objective, feasible: FeasibleSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, count in (("HALTON", 4), ("CORNERS", 2), ("LOOKS", 3)):
+    for name, count in (("HALTON", 4), ("CORNERS", 2), ("CAMERA_DRAWS", 3)):
         monkeypatch.setattr(surveying, name, count)
     made = FrameSurvey.make(objective, feasible, "frame", 0)
     assert made.sure.any()
