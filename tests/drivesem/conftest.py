@@ -81,16 +81,25 @@ def street() -> Callable[..., SceneIR]:
 
 
 @pytest.fixture
+def command_line() -> Callable[[list[str]], int]:
+    """The program that `refused` calls; folders of other programs override it."""
+    return main
+
+
+@pytest.fixture
 def refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    command_line: Callable[[list[str]], int],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[..., str]:
-    """The one line that a command says of bad input; it leaves no file behind."""
+    """The one line with which a command refuses bad input; it leaves no file behind."""
 
     def call(*words: str) -> str:
         folder = tmp_path / "empty"
         folder.mkdir()
         monkeypatch.chdir(folder)
-        assert main(list(words)) == 2
+        assert command_line(list(words)) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert not list(folder.iterdir())
         return line
