@@ -302,9 +302,9 @@ def read_gzip(path: Path, max_bytes: int = _MAX_BYTES) -> bytes:
 
 
 def decode_utf8(data: bytes, path: Path | str) -> str:
-    """UTF-8 text. Raises FormatError naming the file if it is none."""
+    """UTF-8 text without a byte-order mark. Raises FormatError naming the file if it is none."""
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FormatError(
             str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x} at {error.start}"

@@ -489,6 +489,8 @@ class Frame:
     """(P, 3) m in camera axes."""
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Data set and files, by keyword."""
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    """Attributes that the data set states, such as weather and timeofday."""
 
     def __post_init__(self) -> None:
         h, w = self.camera.height, self.camera.width

@@ -26,12 +26,12 @@ from torch import Tensor
 from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES
-from drivesem.data.classes import VEHICLES
 from drivesem.data.kitti import KittiDataset
 from drivesem.report.tables import format_count
 from drivesem.scenes.label_free import POSE_ROUNDS
 from scene_ir import files
 from scene_ir.derender import pose
+from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.derender.pose import KINDS, PoseNet, PosePrediction
 from scene_ir.types import Camera, Category, Frame, Labels
 
@@ -47,7 +47,7 @@ CLASS_OF = {Category.CAR: "Car", Category.TRUCK: "Truck"}
 
 def vehicle_class(kind: str) -> str:
     """What a detector calls a vehicle of a data set's type."""
-    return CLASS_OF[VEHICLES[kind]]
+    return CLASS_OF[VEHICLE_CATEGORIES[kind]]
 
 
 def usable(labels: Labels) -> list[int]:
@@ -55,7 +55,7 @@ def usable(labels: Labels) -> list[int]:
     height = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
     good = (height >= LEAST_HEIGHT_PX) & (labels.occlusion <= MOST_OCCLUSION) & torch.isfinite(labels.yaw)
     good &= labels.truncation < 0.7
-    return [i for i in range(len(labels.kind)) if labels.kind[i] in VEHICLES and bool(good[i])]
+    return [i for i in range(len(labels.kind)) if labels.kind[i] in VEHICLE_CATEGORIES and bool(good[i])]
 
 
 @dataclass(frozen=True)

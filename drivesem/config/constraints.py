@@ -151,6 +151,17 @@ def parse_class_map(option: str, text: str | None) -> dict[str, str | None]:
     return pairs
 
 
+def parse_attributes(option: str, text: str | None) -> dict[str, tuple[str, ...]]:
+    """The allowed values by attribute of "weather=rainy|foggy,timeofday=night". UsageError naming the option."""
+    pairs: dict[str, tuple[str, ...]] = {}
+    for part in text.split(",") if text else ():
+        name, sign, values = (word.strip() for word in part.partition("="))
+        if not (name and sign and values) or name in pairs:
+            raise UsageError(option, "NAME=VALUE with commas, each name once", repr(part))
+        pairs[name] = tuple(value.strip() for value in values.split("|"))
+    return pairs
+
+
 def parse_integers(option: str, text: str, minimum: int = 1) -> list[int]:
     """The whole numbers of "1,4,8", each once, in order.
 

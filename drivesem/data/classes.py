@@ -1,98 +1,125 @@
-"""Mapping from the object types of data sets to the detectors' classes, and which types are ignored."""
+"""What the class names of data sets mean: one table of synonyms, the detectors' classes, and ignored types."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
 
-import torch
+from scene_ir.errors import RangeError
 
-from detectors.types import CLASSES, Targets
-from scene_ir.errors import FormatError, RangeError
-from scene_ir.types import Category, Labels
+if TYPE_CHECKING:  # torch takes a second to load; readers of label files do not need it
+    from scene_ir.types import Labels
 
-
-@dataclass(frozen=True, slots=True)
-class ClassMap:
-    """How the object types of a data set map to the detectors' classes."""
-
-    classes: Mapping[str, str]
-    """Maps a type to one of `detectors.types.CLASSES`."""
-    ignored: Mapping[str, str | None] = field(default_factory=dict)
-    """Maps a type to the class for which it is ignored, neither a miss nor a hit; None: for every class."""
-
-    def __post_init__(self) -> None:
-        for kind, name in (*self.classes.items(), *self.ignored.items()):
-            if name is not None and name not in CLASSES:
-                raise RangeError(f"class map: {kind}", f"one of {', '.join(CLASSES)}", name)
-        both = sorted(set(self.classes) & set(self.ignored))
-        if both:
-            raise RangeError(f"class map: {both[0]}", "a class or to be ignored", "both")
-
-    def category(self, kind: str) -> Category | None:
-        """Return the class of a type; None if it is ignored. Raises FormatError for a type in neither table."""
-        if kind in self.classes:
-            return Category(CLASSES.index(self.classes[kind]))
-        if kind in self.ignored:
-            return None
-        raise FormatError("type", f"one of {', '.join((*self.classes, *self.ignored))}", kind)
-
-    def drop_unknown(self, labels: Labels) -> Labels:
-        """Return the labels without objects of types in neither table, which are background."""
-        rows = [i for i, kind in enumerate(labels.kind) if kind in self.classes or kind in self.ignored]
-        if len(rows) == len(labels.kind):
-            return labels
-        return labels.select(rows)
-
-    def targets(self, labels: Labels) -> Targets:
-        """Return the targets for training and evaluation: objects in file order, then DontCare regions.
-
-        Targets that are ignored for every class have the label 0. Objects with boxes without area are ignored, since
-        no detection can match them.
-        """
-        categories = [self.category(kind) for kind in labels.kind]
-        named = [self.ignored.get(kind) for kind in labels.kind]
-        index = [
-            int(c) if c is not None else CLASSES.index(n) if n is not None else 0
-            for c, n in zip(categories, named, strict=True)
-        ]
-        regions = labels.ignore_xyxy.shape[0]
-        flat = (labels.boxes_xyxy[:, 2:] <= labels.boxes_xyxy[:, :2]).any(dim=1).tolist()
-        ignored = [c is None or thin for c, thin in zip(categories, flat, strict=True)]
-        return Targets(
-            boxes_xyxy=torch.cat([labels.boxes_xyxy, labels.ignore_xyxy]),
-            labels=torch.tensor([*index, *[0] * regions], dtype=torch.int64),
-            ignore=torch.tensor([*ignored, *[True] * regions], dtype=torch.bool),
-        )
-
-
-KITTI = ClassMap(
-    classes={"Car": "Car", "Van": "Car", "Truck": "Truck", "Pedestrian": "Pedestrian", "Cyclist": "Cyclist"},
-    ignored={"Person_sitting": "Pedestrian", "Tram": None, "Misc": None},
-)
-"""KITTI's types. Vans count as cars; sitting people, trams and miscellaneous objects are ignored."""
-
-COCO_ROAD_USERS = ClassMap(
-    classes={"car": "Car", "truck": "Truck", "person": "Pedestrian"},
-    ignored={"bus": None, "train": None, "bicycle": "Cyclist", "motorcycle": "Cyclist"},
-)
-"""Road users among the classes of COCO 2017. Buses and trains are ignored, and so are bicycles: a KITTI cyclist
-includes the rider."""
-ROAD_USERS = ClassMap(
-    classes={**KITTI.classes, **COCO_ROAD_USERS.classes}, ignored={**KITTI.ignored, **COCO_ROAD_USERS.ignored}
-)
-"""KITTI's types and COCO's classes, which differ at least in letter case."""
-
-VEHICLES: Mapping[str, Category] = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
+CLASS_OF_TYPE: Mapping[str, str] = {
+    "Car": "Car",
+    "Van": "Car",
+    "Truck": "Truck",
+    "Pedestrian": "Pedestrian",
+    "Cyclist": "Cyclist",
+}
+"""The detectors' class of each object type, by KITTI's names."""
+IGNORED_TYPES: Mapping[str, str | None] = {
+    "Person_sitting": "Pedestrian",
+    "Bicycle": "Cyclist",
+    "Motorcycle": "Cyclist",
+    **dict.fromkeys(("Bus", "Tram", "Trailer", "Misc"), None),
+}
+"""Object types that are neither a miss nor a hit, and the class for which they are ignored; None: for every class.
+A bicycle is ignored for cyclists, since a KITTI cyclist includes the rider."""
+VEHICLES = ("Car", "Van", "Truck")
 """Types that are de-rendered into movable objects."""
 
+_SYNONYMS: Mapping[str, tuple[str, ...]] = {
+    "Car": (
+        *("car", "vehicle", "vehicle car", "taxi", "limousine", "automobile", "sedan", "suv"),
+        "vehicle emergency police",
+    ),
+    "Van": ("van", "minivan", "vehicle emergency ambulance", "ambulance"),
+    "Truck": ("truck", "vehicle truck", "lorry", "pickup", "pickup truck"),
+    "Pedestrian": (
+        *("pedestrian", "person", "people", "man", "woman", "boy", "girl", "child", "human pedestrian adult"),
+        *("human pedestrian child", "human pedestrian construction worker", "human pedestrian police officer"),
+    ),
+    "Cyclist": ("cyclist", "rider", "bicyclist"),
+    "Person_sitting": ("person sitting", "sitting person", "human pedestrian wheelchair", "wheelchair"),
+    "Bicycle": ("bicycle", "bike", "vehicle bicycle"),
+    "Motorcycle": ("motorcycle", "motorbike", "motor", "vehicle motorcycle", "tricycle", "awning tricycle"),
+    "Bus": ("bus", "vehicle bus rigid", "vehicle bus bendy"),
+    "Tram": ("tram", "train"),
+    "Trailer": ("trailer", "vehicle trailer", "caravan"),
+    "Misc": (
+        *("misc", "other vehicle", "other person", "others", "land vehicle", "construction vehicle"),
+        *("vehicle construction", "human pedestrian stroller", "human pedestrian personal mobility"),
+    ),
+}
+"""Names of the object types in KITTI, COCO, Pascal VOC, BDD100K, nuScenes, Waymo, Cityscapes, VisDrone and Open
+Images, in lower case with blanks between words."""
+_TYPE_OF_NAME = {name: kind for kind, names in _SYNONYMS.items() for name in names}
+_SEPARATORS = re.compile(r"[\s_.-]+")
+ClassRole = Literal["used", "mapped", "ignored", "background"]
+"""What becomes of a data set's class: its objects are used under their name or under another one, are neither a miss
+nor a hit, or are background."""
 
-def to_kitti_kinds(labels: Labels) -> Labels:
-    """Rename COCO's classes to KITTI's types; ignored classes keep their names."""
-    names = COCO_ROAD_USERS.classes
-    return replace(labels, kind=tuple(names.get(kind, kind) for kind in labels.kind))
+
+@lru_cache(maxsize=4096)
+def object_type(name: str) -> str | None:
+    """Return the object type that a data set's class name means; None for background, such as a traffic light.
+
+    The type is a key of CLASS_OF_TYPE or IGNORED_TYPES. Letter case, "_", "-", "." and a prefix "TYPE_" do not matter.
+    """
+    return _TYPE_OF_NAME.get(_SEPARATORS.sub(" ", name.strip().lower()).removeprefix("type "))
+
+
+def class_role(name: str, mapping: Mapping[str, str | None]) -> tuple[ClassRole, str]:
+    """Return what becomes of a data set's class, and the class whose objects it holds ("" for none).
+
+    Args:
+        name: Name in the data set.
+        mapping: New names, from `--map`; None makes a class background.
+    """
+    target = mapping.get(name, name)
+    kind = None if target is None else object_type(target)
+    if kind is None:
+        return "background", ""
+    if kind in IGNORED_TYPES:
+        return "ignored", IGNORED_TYPES[kind] or ""
+    found = CLASS_OF_TYPE[kind]
+    return ("used" if name.strip().lower() == found.lower() else "mapped"), found
+
+
+def check_class_map(mapping: Mapping[str, str | None]) -> None:
+    """Raise RangeError for a new class name (`--map OLD=NEW`) that means no object type."""
+    for name, target in mapping.items():
+        if target is not None and object_type(target) is None:
+            expected = f"one of {', '.join((*CLASS_OF_TYPE, *IGNORED_TYPES))}, or - for background"
+            raise RangeError(f"--map {name}", expected, repr(target))
+
+
+def rename_to_types(labels: Labels, mapping: Mapping[str, str | None]) -> Labels:
+    """Rename objects to their types; objects of other classes keep their names.
+
+    Args:
+        labels: Labels with the data set's class names.
+        mapping: New names, from `--map`; None makes a class background.
+
+    Returns:
+        The renamed labels, in the same order.
+    """
+    targets = [mapping.get(kind, kind) for kind in labels.kind]
+    kinds = ["background" if target is None else object_type(target) or target for target in targets]
+    return replace(labels, kind=tuple(kinds))
+
+
+def select_road_users(labels: Labels) -> Labels:
+    """Rename objects to their types, and drop those without a type, which are background."""
+    labels = rename_to_types(labels, {})
+    rows = [row for row, kind in enumerate(labels.kind) if object_type(kind) is not None]
+    return labels if len(rows) == len(labels.kind) else labels.select(rows)
 
 
 def count_vehicles(labels: Labels | None) -> int:
     """Count the movable objects of a frame."""
-    return 0 if labels is None else sum(kind in VEHICLES for kind in to_kitti_kinds(labels).kind)
+    return 0 if labels is None else sum(object_type(kind) in VEHICLES for kind in labels.kind)

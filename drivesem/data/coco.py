@@ -321,7 +321,7 @@ class CocoDataset(FrameIndex[_CocoImage]):
     """The frames of a COCO data set.
 
     A frame's identifier is its file name without suffix, folders joined by "_". `kind` is the category's name as
-    written; `COCO_ROAD_USERS` maps COCO's own. Unknown truncation and 3D boxes are NaN, unknown occlusion is 3, as
+    written. Unknown truncation and 3D boxes are NaN, unknown occlusion is 3, as
     in KITTI; crowds are regions to ignore. Images are turned upright by EXIF, unless the file states the stored size.
 
     Args:

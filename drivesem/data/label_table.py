@@ -5,7 +5,7 @@ Values are those of the files, in float64.
 **Boxes without area.** A box may end where it begins (left == right): a thin object that fills one column of
 pixels, or a detection that was clipped at the image's edge. All layouts read such boxes, and nothing can match them:
 such a label is a miss, such a detection a false positive, as in pycocotools and KITTI's development kit; training
-ignores them (`ClassMap.targets`). A box that ends before it begins is an error.
+ignores them. A box that ends before it begins is an error.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.data.account import DataAccount
 from scene_ir.errors import FormatError
 
 if TYPE_CHECKING:  # torch takes a second to load; most readers of label files do not need it
@@ -100,6 +101,10 @@ class LabelTable:
     """Image files by frame index, where not named after the frame."""
     frame_attributes: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     """Further attributes of frames as JSON, by frame index."""
+    splits: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    """Frame indices by split, of data sets that have splits."""
+    account: DataAccount | None = None
+    """What became of the files and rows of the data set; None for tables that no reader made."""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -185,6 +190,7 @@ class LabelTable:
             cameras={int(new[i]): camera for i, camera in self.cameras.items() if new[i] >= 0},
             image_files={int(new[i]): name for i, name in self.image_files.items() if new[i] >= 0},
             frame_attributes={int(new[i]): values for i, values in self.frame_attributes.items() if new[i] >= 0},
+            splits={name: [int(new[i]) for i in rows if new[i] >= 0] for name, rows in self.splits.items()},
         )
 
     def to_labels(self) -> Labels:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import torch
 
+from drivesem.data.account import IMAGE_SUFFIXES
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, make_printable
 from scene_ir.io import to_tensor
@@ -18,7 +20,6 @@ from scene_ir.types import Camera, Frame, Labels
 
 T = TypeVar("T")
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 PNG_COMPRESSION = 1
 """zlib level for images: several times as fast as the best compression."""
 BOX_MARGIN_PX = 2.0
@@ -56,6 +57,15 @@ class FrameIndex(Generic[T]):
         """Identifiers of the frames, sorted."""
         return tuple(self._entries)
 
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """Identifiers by split, where the data set has splits."""
+        return {}
+
+    def attributes(self, identifier: str) -> Mapping[str, str]:
+        """Attributes that the data set states of a frame, such as weather and timeofday."""
+        self._entry(identifier)
+        return {}
+
     def __len__(self) -> int:
         return len(self._entries)
 
@@ -65,15 +75,22 @@ class FrameIndex(Generic[T]):
         return self._entries[identifier]
 
 
-def list_images(folder: Path) -> list[Path]:
-    """List the images in a folder, sorted. Raises FormatError if there is no such folder."""
+def list_images(folder: Path, recursive: bool = False) -> list[Path]:
+    """List the images in a folder, sorted; with `recursive` also those in its subfolders.
+
+    Hidden files and folders are left out. Raises FormatError if there is no such folder.
+    """
     try:
         exists = folder.is_dir()
     except OSError as error:  # such as a name that is too long
         raise FormatError(make_printable(str(folder)), "a folder of images", f"{error.strerror}") from None
     if not exists:
         raise FormatError(str(folder), "a folder of images", "no such folder")
-    return [p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES and p.name[0] != "."]
+    images: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if recursive and name[0] != "."]
+        images += [Path(place, n) for n in names if n[0] != "." and n.lower().endswith(IMAGE_SUFFIXES)]
+    return sorted(images)
 
 
 def read_image_size(path: Path) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
+from drivesem.data.account import DataAccount
 from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.label_table import LabelTable, WriteSummary
 from drivesem.data.layouts import LAYOUTS, detect_layout
@@ -22,6 +23,18 @@ class Dataset(Protocol):
     @property
     def identifiers(self) -> tuple[str, ...]:
         """Identifiers of the frames, sorted."""
+        ...
+
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """Identifiers by split, where the data set has splits."""
+        ...
+
+    def account(self) -> DataAccount:
+        """Account for all files and label rows; reads all labels."""
+        ...
+
+    def attributes(self, identifier: str) -> Mapping[str, str]:
+        """Attributes that the data set states of a frame, such as weather and timeofday."""
         ...
 
     def labels(self, identifier: str) -> Labels | None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from drivesem.config.constraints import is_url
 from drivesem.data import kitti_tracking
+from drivesem.data.account import DataAccount, sum_accounts
+from drivesem.data.classes import check_class_map, rename_to_types
 from drivesem.data.kitti import KittiDataset
 from drivesem.data.layouts import detect_layout
 from drivesem.data.registry import DATASETS, Dataset, open_dataset
@@ -33,45 +36,138 @@ _CLIP_FOLDERS = (
 )
 
 
-class DatasetSubset:
-    """Some frames of a data set, in its order."""
+@dataclass(frozen=True, slots=True)
+class FrameFilter:
+    """Which frames of a data set are used, and under which class names."""
 
-    def __init__(self, dataset: Dataset, identifiers: Sequence[str]) -> None:
-        self._dataset, self._identifiers = dataset, tuple(identifiers)
+    split: str | None = None
+    """Split; see `select_split`."""
+    where: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Allowed values by attribute; a frame must have one of them for each attribute."""
+    mapping: Mapping[str, str | None] = field(default_factory=dict)
+    """New class names; None makes a class background."""
+
+    def describe(self) -> str:
+        """Return the selection as text, empty if all frames are used."""
+        parts = [f"split {self.split}"] if self.split is not None else []
+        parts += [f"{name} {' or '.join(values)}" for name, values in self.where.items()]
+        return ", ".join(parts)
+
+
+class DatasetSelection:
+    """Some frames of a data set, in its order, with the object types of its classes as names."""
+
+    def __init__(self, dataset: Dataset, identifiers: Sequence[str], choice: FrameFilter) -> None:
+        self._dataset, self._identifiers, self._choice = dataset, tuple(identifiers), choice
 
     @property
     def identifiers(self) -> tuple[str, ...]:
         """Identifiers of the selected frames."""
         return self._identifiers
 
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """Identifiers by split, where the data set has splits."""
+        return self._dataset.splits()
+
+    def account(self) -> DataAccount:
+        """Account for the whole data set, and name the selection."""
+        selected = self._choice.describe()
+        text = f"used: {len(self._identifiers):,} images ({selected})" if selected else ""
+        return replace(self._dataset.account(), selection=text, mapping=self._choice.mapping)
+
+    def attributes(self, identifier: str) -> Mapping[str, str]:
+        """Attributes that the data set states of a frame."""
+        return self._dataset.attributes(identifier)
+
     def labels(self, identifier: str) -> Labels | None:
         """Read the labels of one frame; None where the data set has none."""
-        return self._dataset.labels(identifier)
+        labels = self._dataset.labels(identifier)
+        return None if labels is None else rename_to_types(labels, self._choice.mapping)
 
     def frame(self, identifier: str) -> Frame:
         """Read one frame. Raises FormatError naming a damaged file."""
-        return self._dataset.frame(identifier)
+        frame = self._dataset.frame(identifier)
+        labels = None if frame.labels is None else rename_to_types(frame.labels, self._choice.mapping)
+        return replace(frame, labels=labels, attributes=self._dataset.attributes(identifier))
 
 
-def select_split(dataset: Dataset, split: str) -> Dataset:
-    """Select the frames of a split.
+def open_selection(
+    name: str,
+    roots: str | Path,
+    choice: FrameFilter | None = None,
+    with_points: bool = False,
+    focal_px: float | None = None,
+) -> DatasetSelection:
+    """Open the frames of a data set that a filter selects.
 
-    `split` is one of PUBLISHED_SPLITS (Virtual KITTI only), `random:0.75` (a fixed random share),
-    `random:0.75:rest` (all others), or a text file with one name a line, with or without a suffix such as .png.
-    Raises FormatError for a data set without that split, a name without a frame, and an empty selection.
+    Args:
+        name: Layout, a key of DATASETS.
+        roots: Folder or URL; or several, separated by commas, as one data set.
+        choice: Frames and class names; by default all frames.
+        with_points: Read laser points, which only KITTI has.
+        focal_px: Focal length of photographs without a camera.
+
+    Returns:
+        The selected frames.
+
+    Raises:
+        FormatError: As `open_dataset`; a split or an attribute that the data set does not have; no frame.
+        RangeError: As `open_dataset`; a class name that means no object type.
     """
-    identifiers, share = dataset.identifiers, _RANDOM_SPLIT.fullmatch(split)
-    if split in PUBLISHED_SPLITS:
+    choice = choice or FrameFilter()
+    check_class_map(choice.mapping)
+    folders = [part for part in str(roots).split(",") if part] if not is_url(str(roots)) else [str(roots)]
+    opened = [open_dataset(name, folder, with_points, focal_px) for folder in folders]
+    dataset = opened[0] if len(opened) == 1 else JoinedDataset(opened)
+    selected = dataset.identifiers if choice.split is None else select_split(dataset, choice.split)
+    if choice.where:
+        selected = _select_by_attributes(dataset, selected, choice.where)
+    return DatasetSelection(dataset, selected, choice)
+
+
+def _select_by_attributes(
+    dataset: Dataset, identifiers: Sequence[str], where: Mapping[str, tuple[str, ...]]
+) -> list[str]:
+    values = {identifier: dataset.attributes(identifier) for identifier in identifiers}
+    known = {name: sorted({str(v[name]) for v in values.values() if name in v}) for name in where}
+    for name, wanted in where.items():
+        if not known[name]:
+            there = sorted({key for v in values.values() for key in v})
+            raise FormatError(f"--where {name}", f"one of {', '.join(there)}" if there else "no filter", repr(name))
+        for value in wanted:
+            if value not in known[name]:
+                raise FormatError(f"--where {name}", f"one of {', '.join(known[name])}", repr(value))
+    selected = [i for i in identifiers if all(values[i].get(name) in wanted for name, wanted in where.items())]
+    if not selected:
+        raise FormatError("--where", "at least one frame", f"none of {len(identifiers)}")
+    return selected
+
+
+def select_split(dataset: Dataset, split: str) -> list[str]:
+    """Return the identifiers of a split, in the data set's order.
+
+    `split` is one of the data set's own (such as train, val), one of PUBLISHED_SPLITS (Virtual KITTI only),
+    `random:0.75` (a fixed random share), `random:0.75:rest` (all others), or a text file with one name a line, with or
+    without a suffix such as .png. Raises FormatError for a data set without that split, a name without a frame, and
+    an empty selection.
+    """
+    identifiers, share, own = dataset.identifiers, _RANDOM_SPLIT.fullmatch(split), dataset.splits()
+    if split in own:
+        selected = set(own[split])
+    elif split in PUBLISHED_SPLITS:
         selected = {name for name in identifiers if _is_test_frame(name) == (split == PUBLISHED_SPLITS[0])}
     elif share is not None:
         order = np.random.default_rng(_SPLIT_SEED).permutation(len(identifiers))
         count = round(float(share[1]) * len(identifiers))
         selected = {identifiers[i] for i in (order[count:] if share[2] else order[:count])}
+    elif not Path(split).is_file() and split.isidentifier():
+        expected = f"one of {', '.join(own)}, " if own else ""
+        raise FormatError("--split", f"{expected}random:FRACTION, or a file of names", repr(split))
     else:
         selected = _read_names(Path(split), identifiers)
     if not selected:
         raise FormatError(f"--split {split}", "at least one frame of the data set", f"none of {len(identifiers)}")
-    return DatasetSubset(dataset, [name for name in identifiers if name in selected])
+    return [name for name in identifiers if name in selected]
 
 
 def _is_test_frame(name: str) -> bool:
@@ -108,6 +204,23 @@ class JoinedDataset:
         """Identifiers of the frames, in the order of the data sets, each sorted."""
         return tuple(f"{i}/{name}" for i, dataset in enumerate(self._datasets) for name in dataset.identifiers)
 
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """Identifiers by split, where the data sets have splits."""
+        joined: dict[str, tuple[str, ...]] = {}
+        for i, dataset in enumerate(self._datasets):
+            for split, names in dataset.splits().items():
+                joined[split] = (*joined.get(split, ()), *(f"{i}/{name}" for name in names))
+        return joined
+
+    def account(self) -> DataAccount:
+        """Account for all data sets together."""
+        return sum_accounts([dataset.account() for dataset in self._datasets])
+
+    def attributes(self, identifier: str) -> Mapping[str, str]:
+        """Attributes that a frame's data set states of it."""
+        dataset, name = self._locate(identifier)
+        return dataset.attributes(name)
+
     def labels(self, identifier: str) -> Labels | None:
         """Read the labels of one frame; None where its data set has none."""
         dataset, name = self._locate(identifier)
@@ -121,14 +234,6 @@ class JoinedDataset:
     def _locate(self, identifier: str) -> tuple[Dataset, str]:
         number, _, name = identifier.partition("/")
         return self._datasets[int(number)], name
-
-
-def open_folders(name: str, roots: str) -> Dataset:
-    """Open the data set `name` in one folder, or in several separated by commas. Raises as `open_dataset`."""
-    folders = [Path(part) for part in roots.split(",") if part]
-    if len(folders) < 2:
-        return open_dataset(name, roots)
-    return JoinedDataset([open_dataset(name, folder) for folder in folders])
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections
 from drivesem.attack.targets import resolve_t_star
-from drivesem.data.classes import VEHICLES, to_kitti_kinds
+from drivesem.data.classes import VEHICLES, rename_to_types
 from drivesem.data.ground_truth import occlusion_from_visible
 from drivesem.data.label_table import UNKNOWN_OCCLUSION
 from scene_ir.derender.derender import DerenderSettings
@@ -180,7 +180,7 @@ def estimate_label_poses(frame: Frame) -> Frame:
     ground, or in the place of a larger one, gets no pose: it stays in the photograph and is ignored.
     """
     assert frame.labels is not None
-    labels = to_kitti_kinds(frame.labels)
+    labels = rename_to_types(frame.labels, {})
     boxes = labels.boxes_xyxy.float()
     flat = (boxes[:, 2:] <= boxes[:, :2]).any(1).tolist()
     names = ["" if thin else name for name, thin in zip(labels.kind, flat, strict=True)]

@@ -17,7 +17,7 @@ from detectors.squeezedet import ANCHOR_SIZES_WH
 from detectors.training import Sample
 from detectors.types import CLASSES, Targets
 from drivesem.attack.labels import Difficulty
-from drivesem.data.classes import ROAD_USERS
+from drivesem.data.classes import CLASS_OF_TYPE, IGNORED_TYPES, select_road_users
 from drivesem.data.registry import Dataset
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -168,8 +168,8 @@ def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[s
         difficulty: Limits of the objects.
         classes: Names of the classes.
     """
-    labels = ROAD_USERS.drop_unknown(labels)
-    targets = ROAD_USERS.targets(labels)
+    labels = select_road_users(labels)
+    targets = _make_targets(labels)
     ignore = targets.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
     own = _places(classes)[targets.labels]
@@ -186,8 +186,8 @@ def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence
         difficulty: Limits of the objects.
         classes: Names of the classes.
     """
-    labels = ROAD_USERS.drop_unknown(labels)
-    named = ROAD_USERS.targets(labels)
+    labels = select_road_users(labels)
+    named = _make_targets(labels)
     ignore = named.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
     own = _places(classes)[named.labels]
@@ -197,6 +197,24 @@ def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence
     label = torch.cat([own[~every], torch.arange(len(classes)).repeat_interleave(int(every.sum()))])
     left_out = torch.ones(int(every.sum()) * len(classes), dtype=torch.bool)
     return Targets(named.boxes_xyxy[rows], label, torch.cat([ignore[~every], left_out]))
+
+
+def _make_targets(labels: Labels) -> Targets:
+    """Return the targets of road users (see `select_road_users`) in file order, then of DontCare regions.
+
+    Targets that are ignored for every class have the label 0. Objects with boxes without area are ignored, since no
+    detection can match them.
+    """
+    names = [CLASS_OF_TYPE.get(kind) or IGNORED_TYPES[kind] for kind in labels.kind]
+    index = [0 if name is None else CLASSES.index(name) for name in names]
+    regions = labels.ignore_xyxy.shape[0]
+    flat = (labels.boxes_xyxy[:, 2:] <= labels.boxes_xyxy[:, :2]).any(dim=1).tolist()
+    ignored = [kind in IGNORED_TYPES or thin for kind, thin in zip(labels.kind, flat, strict=True)]
+    return Targets(
+        boxes_xyxy=torch.cat([labels.boxes_xyxy, labels.ignore_xyxy]),
+        labels=torch.tensor([*index, *[0] * regions], dtype=torch.int64),
+        ignore=torch.tensor([*ignored, *[True] * regions], dtype=torch.bool),
+    )
 
 
 def _too_hard(labels: Labels, difficulty: Difficulty) -> torch.Tensor:

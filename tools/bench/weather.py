@@ -24,13 +24,12 @@ from drivesem.attack.losses import candidates_from_detections
 from drivesem.attack.targets import resolve_t_star
 from drivesem.bench.tables import Columns
 from drivesem.config.edits import FrameEdit
-from drivesem.data.classes import VEHICLES
 from drivesem.failures.margins import object_margins
 from drivesem.report.drawing import write_picture
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthFrame, SynthSettings, Truth
-from scene_ir.derender.derender import derender
+from scene_ir.derender.derender import VEHICLE_CATEGORIES, derender
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.model import LUMA, SUN_RISE_RAD, SUN_STRENGTH, SUN_TURN_RAD
@@ -191,7 +190,7 @@ def _row(
 
 def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
     boxes = torch.tensor(np.stack([car.box_xyxy for car in shown]), dtype=torch.float32)
-    labels = torch.tensor([int(VEHICLES[car.actor.label]) for car in shown])
+    labels = torch.tensor([int(VEHICLE_CATEGORIES[car.actor.label]) for car in shown])
     found = candidates_from_detections(predict(detector, to_tensor(picture)[None])[0], len(detector.classes))
     return object_margins(found, boxes, labels, boxes, resolve_t_star(detector))
 
@@ -207,7 +206,9 @@ def _region(car: Truth, size: tuple[int, int]) -> Mask:
 
 def _shown(truth: Truth) -> bool:
     tall = truth.box_xyxy[3] - truth.box_xyxy[1] >= _LEAST_PX
-    return truth.labelled and truth.actor.label in VEHICLES and bool(tall) and truth.visible >= _LEAST_SEEN
+    return (
+        truth.labelled and truth.actor.label in VEHICLE_CATEGORIES and bool(tall) and truth.visible >= _LEAST_SEEN
+    )
 
 
 def _under(scene: SceneIR, edit: FrameEdit) -> SceneIR:

@@ -16,7 +16,6 @@ from detectors.types import CLASSES, Targets
 from drivesem.attack.labels import Difficulty
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.errors import UsageError
-from drivesem.data.classes import VEHICLES
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.synth.demo import demo_plan
 from drivesem.synth.edits import apply_edit
@@ -35,6 +34,7 @@ from drivesem.synth.layout import Actor
 from drivesem.synth.view import SUPERSAMPLING, View
 from drivesem.synth.write import Order, list_jobs, plan_job
 from scene_ir import ffd, files
+from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.errors import FormatError
 from scene_ir.types import LATTICE, SceneIR
 
@@ -235,8 +235,8 @@ def label_before_and_after(
         difficulty: Limits of what is evaluated; by default the usual ones.
     """
     difficulty = difficulty or Difficulty()
-    first = {t.actor.track: t for t in before.truths if t.labelled and t.actor.label in VEHICLES}
-    then = {t.actor.track: t for t in after.truths if t.actor.label in VEHICLES}
+    first = {t.actor.track: t for t in before.truths if t.labelled and t.actor.label in VEHICLE_CATEGORIES}
+    then = {t.actor.track: t for t in after.truths if t.actor.label in VEHICLE_CATEGORIES}
     regions = torch.cat(
         [
             *(_ignored_regions(frame) for frame in (before, after)),
@@ -247,7 +247,7 @@ def label_before_and_after(
     count = len(CLASSES)
     labels = torch.cat(
         [
-            torch.tensor([int(VEHICLES[t.actor.label]) for t in first.values()], dtype=torch.int64),
+            torch.tensor([int(VEHICLE_CATEGORIES[t.actor.label]) for t in first.values()], dtype=torch.int64),
             torch.arange(count).repeat(len(regions)),
         ]
     )
@@ -267,7 +267,7 @@ def _boxes(truths: Sequence[Truth]) -> Tensor:
 
 
 def _ignored_regions(frame: SynthFrame) -> Tensor:
-    people = [t for t in frame.truths if t.labelled and t.actor.label not in VEHICLES]
+    people = [t for t in frame.truths if t.labelled and t.actor.label not in VEHICLE_CATEGORIES]
     return torch.cat([frame.labels.ignore_xyxy, _boxes(people)])
 
 
