@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 from drivesem.config.commands import DerenderConfig
+from drivesem.data.account import write_account
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.derender import derender_frames
@@ -14,10 +16,19 @@ from drivesem.scenes.sources import PhotographSource, SceneSource
 def derender_command(config: DerenderConfig) -> int:
     """`drivesem derender`: make the scenes that do not exist yet."""
     console = Console(stderr=True)
-    result = derender_frames(config, lambda source: _print_source(source, config, console))
+    accounts: list[dict[str, Any]] = []
+
+    def print_source(source: SceneSource) -> None:
+        accounts.append(write_account(source.account()))
+        _print_source(source, config, console)
+
+    result = derender_frames(config, print_source)
     if config.json:
         frames = {name: asdict(summary) for name, summary in result.frames.items()}
-        print_json({"out": str(result.out), "frames": frames, "failed": result.failed, "seconds": result.seconds})
+        print_json(
+            {"out": str(result.out), "frames": frames, "failed": result.failed, "seconds": result.seconds}
+            | {"data": accounts[0]}
+        )
         return 0
     lines = Console()
     for name, summary in result.frames.items():

@@ -23,7 +23,6 @@ from drivesem.config.constraints import (
     Required,
     at_least,
     is_url,
-    parse_class_map,
     parse_integers,
     parse_part,
 )
@@ -35,6 +34,7 @@ from drivesem.config.options import (
     MIN_DRAWS,
     SCENES,
     BootstrapOption,
+    ClassMap,
     CommandConfig,
     Count,
     DetectionOptions,
@@ -42,6 +42,7 @@ from drivesem.config.options import (
     Flag,
     FolderOrUrl,
     FrameCommandConfig,
+    FrameFilterOptions,
     GradingOptions,
     InferenceOptions,
     NotNegative,
@@ -87,7 +88,6 @@ FractionOrEnds = Annotated[float, NumberRange(0, 1, expected="a fraction from 0 
 NewFolder = Annotated[str | None, Required("a new or empty folder"), tyro.conf.arg(aliases=["-o"])]
 PictureFile = Annotated[str | None, tyro.conf.arg(aliases=["-o"])]
 SceneFolder = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
-ClassMap = Annotated[str, ParsedBy(parse_class_map)]
 LabelFormat = Literal["kitti", "coco", "yolo", "vkitti1", "vkitti2", "fiftyone"]
 Stage = Literal["attacked", "attacked-paper", "rerendered", "benign"]
 
@@ -622,7 +622,7 @@ class ExportConfig(CommandConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig(TrainingOptions, FrameCommandConfig):
+class TrainConfig(FrameFilterOptions, TrainingOptions, FrameCommandConfig):
     """Train a detector."""
 
     basic: ClassVar[tuple[str, ...]] = (
@@ -633,15 +633,13 @@ class TrainConfig(TrainingOptions, FrameCommandConfig):
     detector: str = "squeezedet"
     """Architecture: squeezedet, or another one of the training guide."""
     dataset: Annotated[str, OneOf((*DATASETS, SYNTH))] = "kitti"
-    """Data set: kitti, vkitti1, vkitti2, coco, yolo; or synth: frames that the generator makes first."""
+    """Data set: kitti, vkitti1, vkitti2, coco, yolo, voc, bdd100k; or synth: frames that the generator makes first."""
     root: str | None = None
     """Folder of the data set; several with commas are joined."""
     held_out: str | None = None
     """Folder of frames that select the best weights and set t*, in the same layout."""
-    split: str | None = None
-    """Frames of --root: 3d-sdn-train, 3d-sdn, random:FRACTION, random:FRACTION:rest, or a file of names."""
     held_out_split: str | None = None
-    """Frames of --held-out, or of --root without it, in the same form."""
+    """Frames of --held-out, or of --root without it, in the form of --split."""
     validation: str | None = None
     """Folder of frames that select weights and t* instead of --held-out, which then only measures."""
     also: str | None = None
@@ -702,6 +700,8 @@ class TrainConfig(TrainingOptions, FrameCommandConfig):
         refuse(synth and given, folders, "none with --dataset synth, which makes its own frames", "one")
         split = self.split or self.held_out_split
         refuse(synth and split is not None, "--split, --held-out-split", "none with --dataset synth", split)
+        chosen = self.where or self.map
+        refuse(synth and chosen is not None, "--where, --map", "none with --dataset synth", chosen)
         unheld = self.validation is not None and self.held_out is None
         refuse(unheld, "--held-out", "frames to measure on, with --validation", "none")
         fitted = not isinstance(self.anchors, int) or (self.anchors > 0 and not synth)

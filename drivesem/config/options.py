@@ -28,6 +28,8 @@ from drivesem.config.constraints import (
     Required,
     at_least,
     is_url,
+    parse_attributes,
+    parse_class_map,
     parse_interval,
     parse_size_hw,
 )
@@ -43,15 +45,16 @@ FolderOrUrl = Annotated[str | None, AllowsUrl()]
 CommandName = Annotated[str, tyro.conf.Fixed]
 """The name of the command that was called: the parser sets it in classes that serve several commands."""
 Score = Annotated[float, NumberRange(0, 1, "(]", "a score in (0, 1]")]
+ClassMap = Annotated[str, ParsedBy(parse_class_map)]
 LabelMode = Literal["moved", "paper"]
 
 DEMO = "demo"
-DATASETS = ("kitti", "vkitti1", "vkitti2", "coco", "yolo")
+DATASETS = ("kitti", "vkitti1", "vkitti2", "coco", "yolo", "voc", "bdd100k")
 """The readers of `drivesem.data.registry`."""
 PHOTOGRAPHS, SCENES = "photographs", "scenes"
 SOURCES = (DEMO, *DATASETS, PHOTOGRAPHS, SCENES)
 """Values of --dataset: generated scenes, the readers, photographs without labels, and scene folders."""
-WITHOUT_CAMERA = ("coco", "yolo", PHOTOGRAPHS)
+WITHOUT_CAMERA = ("coco", "yolo", "voc", "bdd100k", PHOTOGRAPHS)
 """Data sets with photographs that may lack a camera."""
 
 DEFAULT_FINDER = "squeezedet"
@@ -215,7 +218,7 @@ class DataSourceOptions(SeedOption, LimitOption):
     """Where frames come from."""
 
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """Data set: demo (generated; needs no data), kitti, vkitti1, vkitti2, coco, yolo, photographs, scenes."""
+    """Data set: demo (generated), kitti, vkitti1, vkitti2, coco, yolo, voc, bdd100k, photographs, scenes."""
     root: FolderOrUrl = None
     """Folder or URL of the data set; a photograph or scene; or a folder of them."""
 
@@ -227,11 +230,21 @@ class DataSourceOptions(SeedOption, LimitOption):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(DataSourceOptions):
-    """Where frames come from, and how photographs become scenes."""
+class FrameFilterOptions(Options):
+    """Which frames of a data set are used, and what its class names mean."""
 
     split: str | None = None
-    """Frames of --root: 3d-sdn, 3d-sdn-train, random:FRACTION, random:FRACTION:rest, or a file of names."""
+    """Frames of --root: its own split (train, val), 3d-sdn, random:FRACTION, random:FRACTION:rest, or a file of names."""
+    where: Annotated[str, ParsedBy(parse_attributes)] | None = None
+    """Frames with these attributes: weather=rainy|foggy,timeofday=night."""
+    map: ClassMap | None = None
+    """What class names of the data set mean, such as lorry=Truck,cart=Misc; bus=- makes a class background."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(FrameFilterOptions, DataSourceOptions):
+    """Where frames come from, and how photographs become scenes."""
+
     fit: bool = True
     """Fit template, pose and shape to the silhouettes in photographs."""
     cache: str | None = None
@@ -249,7 +262,9 @@ class SceneOptions(DataSourceOptions):
         cached = self.cache is not None and self.dataset in (DEMO, SCENES)
         refuse(cached, "--cache", "a --dataset of photographs", data)
         labelled = self.dataset in DATASETS
-        refuse(self.split is not None and not labelled, "--split", f"--dataset {', '.join(DATASETS)}", data)
+        for name in ("split", "where", "map"):
+            unused = getattr(self, name) is not None and not labelled
+            refuse(unused, f"--{name}", f"--dataset {', '.join(DATASETS)}", data)
         self._check_photographs(data)
 
     def _check_photographs(self, data: str) -> None:

@@ -7,12 +7,14 @@ of labels are counted by class as written.
 from __future__ import annotations
 
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from drivesem.config.errors import refuse
 from drivesem.data.classes import class_role
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -61,14 +63,15 @@ class DataAccount:
             roles[role][f"{name} as {target}" if role == "mapped" else name] = count
         return roles
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the account as JSON."""
+    def to_json(self, roles: bool = True) -> dict[str, Any]:
+        """Return the account as JSON; without `roles` rows are given by class alone, as in `summarise`."""
+        rows = self.by_role() if roles else {"classes": dict(self.classes)}
         return {
             "layout": self.layout,
             "frames": self.frames,
             "files": self.files,
             "skipped": dict(self.skipped),
-            "rows": {**self.by_role(), "regions": self.regions},
+            "rows": {**rows, "regions": self.regions},
             "unlabelled": self.unlabelled,
             "without_image": self.without_image,
             "splits": dict(self.splits),
@@ -101,6 +104,25 @@ class DataAccount:
         parts += [f"skipped files: {_list_largest(self.skipped)}"] if self.skipped else []
         parts += [self.selection] if self.selection else []
         return "; ".join([text, *parts])
+
+
+def write_account(account: DataAccount | None, roles: bool = True) -> dict[str, Any]:
+    """Write an account as one line to stderr, and return it as JSON.
+
+    Args:
+        account: The account; None writes nothing and returns an empty object.
+        roles: Name what becomes of each class; see `DataAccount.summarise`.
+
+    Raises:
+        UsageError: `--map` names a class that the data set does not have.
+    """
+    if account is None:
+        return {}
+    for name in account.mapping:
+        known = ", ".join(sorted(account.classes)[:_MAX_REASONS]) or "none"
+        refuse(name not in account.classes, f"--map {name}", f"a class of the data set ({known})", "no such class")
+    sys.stderr.write(f"{account.summarise(roles)}\n")
+    return account.to_json(roles)
 
 
 def _count(number: int, noun: str, plural: str) -> str:

@@ -93,6 +93,23 @@ def list_images(folder: Path, recursive: bool = False) -> list[Path]:
     return sorted(images)
 
 
+def name_by_path(images: Sequence[Path], root: Path) -> dict[str, Path]:
+    """Return images by identifier, in order: their stems if these differ, else their paths below `root`.
+
+    Raises FormatError for two images of one folder that differ in their suffix only.
+    """
+    named = {image.stem: image for image in images}
+    if len(named) == len(images):
+        return named
+    named = {}
+    for image in images:
+        name = image.relative_to(root).with_suffix("").as_posix()
+        if name in named:
+            raise FormatError(str(image), "a unique name", f"the name of {named[name]}")
+        named[name] = image
+    return named
+
+
 def read_image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image, from its header. FormatError."""
     with files.open_image(path) as image:

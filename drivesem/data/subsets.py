@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivesem.config.constraints import is_url
+from drivesem.config.constraints import is_url, parse_attributes, parse_class_map
+from drivesem.config.options import FrameFilterOptions
 from drivesem.data import kitti_tracking
 from drivesem.data.account import DataAccount, sum_accounts
 from drivesem.data.classes import check_class_map, rename_to_types
@@ -46,6 +47,12 @@ class FrameFilter:
     """Allowed values by attribute; a frame must have one of them for each attribute."""
     mapping: Mapping[str, str | None] = field(default_factory=dict)
     """New class names; None makes a class background."""
+
+    @classmethod
+    def from_options(cls, options: FrameFilterOptions) -> FrameFilter:
+        """Return the filter that options configure."""
+        where = parse_attributes("--where", options.where)
+        return cls(options.split, where, parse_class_map("--map", options.map))
 
     def describe(self) -> str:
         """Return the selection as text, empty if all frames are used."""
@@ -133,7 +140,9 @@ def _select_by_attributes(
     for name, wanted in where.items():
         if not known[name]:
             there = sorted({key for v in values.values() for key in v})
-            raise FormatError(f"--where {name}", f"one of {', '.join(there)}" if there else "no filter", repr(name))
+            raise FormatError(
+                f"--where {name}", f"one of {', '.join(there)}" if there else "no filter", repr(name)
+            )
         for value in wanted:
             if value not in known[name]:
                 raise FormatError(f"--where {name}", f"one of {', '.join(known[name])}", repr(value))

@@ -90,11 +90,12 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
     config = usable_config
     out = Path(config.out) if config.out else Path("runs") / _run_name(config, worker.params)
     claim_folder(out, config, WRITTEN)
+    account = write_account(worker.source.account())
     names, without_vehicles, failed = select_frames(worker.source, config)
     _check_any_frame(config, names, without_vehicles, failed)
     names = _select_part(names, config.part)
     jobs = run_frame_jobs(*_prepare_jobs(worker, names, out))
-    return _finish_run(worker, names, out, jobs, start, without_vehicles, failed, require_detections=True)
+    return _finish_run(worker, names, out, jobs, start, without_vehicles, failed, True, account)
 
 
 def attack_frames(worker: AttackWorker, names: Sequence[str], out: Path) -> RunSummary:
@@ -140,6 +141,7 @@ def _finish_run(
     without_vehicles: int = 0,
     failed: Mapping[str, str] | None = None,
     require_detections: bool = False,
+    account: Mapping[str, Any] | None = None,
 ) -> RunSummary:
     """Summarise the frames of a run and write its files.
 
@@ -152,6 +154,7 @@ def _finish_run(
         without_vehicles: number of frames that were passed over.
         failed: frames that could not be read, with the reason.
         require_detections: raise UsageError where the detector finds nothing in any photograph.
+        account: files and label rows of the data set, as JSON.
     """
     config, failed = worker.config, {**(failed or {}), **jobs.failed}
     empty = {name for name, attacked in jobs.results.items() if not attacked}
@@ -166,6 +169,7 @@ def _finish_run(
         frames_without_vehicles=without_vehicles + len(empty),
         frames_failed=dict(sorted(failed.items())),
         seconds=round(time.perf_counter() - start, 3),
+        data=account or {},
     )
     return write_run_summary(out, config, summary, results, empty)
 

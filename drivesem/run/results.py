@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -215,6 +216,8 @@ class RunSummary:
     """Frames by reason why a grade could not be reached."""
     seconds: float
     """Run time."""
+    data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Files and label rows of the data set, and what became of them; empty for generated scenes."""
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object with totals, followed by counts by class."""

@@ -14,7 +14,7 @@ True
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -28,8 +28,9 @@ from torch import Tensor
 from drivesem.attack.scene_edits import apply_edit
 from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.errors import UsageError
-from drivesem.data import kitti, registry
+from drivesem.data import kitti
 from drivesem.data.photographs import check_image_size, default_camera, read_photograph, read_pixels
+from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.scenes.sources import derender_settings, place_vehicles
 from scene_ir import io
 from scene_ir.io import to_tensor, to_uint8
@@ -179,23 +180,35 @@ class Frames:
         return self.dataset.frame(name)
 
 
-def open_dataset(name: str, root: str | Path, *, velodyne: bool = False) -> Frames:
+def open_dataset(
+    name: str,
+    root: str | Path,
+    *,
+    velodyne: bool = False,
+    split: str | None = None,
+    where: Mapping[str, Sequence[str]] | None = None,
+    classes: Mapping[str, str | None] | None = None,
+) -> Frames:
     """Open a data set.
 
         for frame in ds.open_dataset("kitti", "PATH_TO_KITTI"):
             scene = ds.derender(frame)
 
     Args:
-        name: Layout: kitti, vkitti1, vkitti2, coco or yolo.
+        name: Layout: kitti, vkitti1, vkitti2, coco, yolo, voc or bdd100k.
         root: Folder or URL.
         velodyne: Read laser points, which only KITTI has.
+        split: Split of the data set, as `--split`.
+        where: Allowed values by attribute, as `--where`: {"timeofday": ["night"]}.
+        classes: What class names mean, as `--map`: {"lorry": "Truck"}; None makes a class background.
 
     Raises:
         RangeError: Unknown name.
         FormatError: The folder is not of this layout.
         UsageError: The URL cannot be read.
     """
-    return Frames(registry.open_dataset(name, root, with_points=velodyne))
+    choice = FrameFilter(split, {key: tuple(values) for key, values in (where or {}).items()}, classes or {})
+    return Frames(open_selection(name, root, choice, velodyne))
 
 
 def derender(

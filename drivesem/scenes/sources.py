@@ -17,6 +17,7 @@ from scene_ir.types import Frame, SceneIR
 
 if TYPE_CHECKING:
     from detectors.base import Predictor
+    from drivesem.data.account import DataAccount
     from drivesem.data.photographs import FocalLength
     from drivesem.scenes.scene_cache import SceneCache
     from scene_ir.derender.derender import DerenderSettings
@@ -30,6 +31,10 @@ _MAX_FACES = 5000
 
 class SceneSource(Protocol):
     """Interface of all sources: scenes by identifier. Cheap to construct: every worker makes its own."""
+
+    def account(self) -> DataAccount | None:
+        """Account for the files and label rows of a data set; None where there is nothing to skip or map."""
+        ...
 
     def identifiers(self) -> Iterator[str]:
         """Iterate over all frames in a fixed order."""
@@ -55,6 +60,9 @@ class DemoSource:
         self._seed = seed
         self._names = [f"demo-{index:03d}" for index in range(count)]
 
+    def account(self) -> None:
+        return None
+
     def identifiers(self) -> Iterator[str]:
         return iter(self._names)
 
@@ -71,14 +79,16 @@ class DatasetSource:
     """De-rendered frames of a labelled data set. Without 3D boxes, the shipped network estimates the poses."""
 
     def __init__(self, config: SceneOptions) -> None:
-        from drivesem.data.registry import open_dataset
-        from drivesem.data.subsets import select_split
+        from drivesem.data.subsets import FrameFilter, open_selection
 
         points = isinstance(config, DerenderConfig) and config.velodyne
-        dataset = open_dataset(config.dataset, config.root or "", with_points=points, focal_px=config.focal)
-        self._dataset = dataset if config.split is None else select_split(dataset, config.split)
+        choice = FrameFilter.from_options(config)
+        self._dataset = open_selection(config.dataset, config.root or "", choice, points, config.focal)
         self._settings = _make_settings(config)
         self._cache = _open_cache(config)
+
+    def account(self) -> DataAccount:
+        return self._dataset.account()
 
     def identifiers(self) -> Iterator[str]:
         return iter(self._dataset.identifiers)
@@ -100,20 +110,28 @@ class PhotographSource:
     """
 
     def __init__(self, path: Path, config: SceneOptions) -> None:
-        from drivesem.data.photographs import list_images
+        from drivesem.data.account import IMAGE_SUFFIXES
+        from drivesem.data.photographs import list_images, name_by_path
         from drivesem.scenes.label_free import detection_fit_settings
 
-        files = list_images(path) if path.is_dir() else [path]
+        self._root = path
+        files = list_images(path, recursive=True) if path.is_dir() else [path]
         if not files:
-            raise FormatError(str(path), "photographs (.png, .jpg)", "none")
-        self._paths = {file.stem: file for file in files}
-        if len(self._paths) < len(files):
-            raise FormatError(str(path), "photographs with unique names", "two that differ in their suffix")
+            raise FormatError(str(path), f"photographs ({', '.join(IMAGE_SUFFIXES)})", "none")
+        self._paths = name_by_path(files, path)
         self._focal_px = config.focal
         self.focal_length(files[0].stem)  # fails early if this is no image
         self._finder = _load_finder(config)
         self._settings = detection_fit_settings(_make_settings(config))
         self._cache = _open_cache(config)
+
+    def account(self) -> DataAccount | None:
+        from drivesem.data.account import DataAccount, account_for_files
+
+        if not self._root.is_dir():
+            return None
+        read, skipped = account_for_files(self._root, self._paths.values())
+        return DataAccount(PHOTOGRAPHS, len(self._paths), read, skipped, {})
 
     def focal_length(self, identifier: str) -> FocalLength:
         """Return the focal length of a photograph and its source."""
@@ -148,6 +166,9 @@ class SceneFolderSource:
 
     def __init__(self, root: Path) -> None:
         self._folders = find_scene_folders(root)
+
+    def account(self) -> None:
+        return None
 
     def identifiers(self) -> Iterator[str]:
         return iter(self._folders)

@@ -21,7 +21,8 @@ from drivesem.attack.targets import EvaluatedClasses
 from drivesem.config.commands import AttackConfig, RetrainConfig
 from drivesem.config.constraints import parse_interval, parse_size_hw
 from drivesem.config.errors import UsageError
-from drivesem.data.registry import open_dataset
+from drivesem.data.account import write_account
+from drivesem.data.subsets import open_selection
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
 from drivesem.report.tables import ReportTable, format_percent, rows_to_csv
 from drivesem.report.terminal import Console, training_progress_bar
@@ -139,7 +140,8 @@ def _mixture(
     if config.dataset is None:
         benign = AttackedSamples(training, "benign", "paper", classes)
     else:
-        dataset = open_dataset(config.dataset, Path(config.root or ""))
+        dataset = open_selection(config.dataset, config.root or "")
+        write_account(dataset.account())
         names = list(dataset.identifiers[: config.limit])
         if config.dataset == attack.dataset:  # never train on held-out frames, in any folder
             names = [name for name in names if name not in held_out]

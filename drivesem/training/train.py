@@ -26,8 +26,9 @@ from drivesem.config.constraints import parse_integers, parse_interval, parse_si
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.config.options import format_command_line
-from drivesem.data.registry import Dataset, open_dataset
-from drivesem.data.subsets import open_folders, select_split
+from drivesem.data.account import write_account
+from drivesem.data.registry import Dataset
+from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.report.terminal import Console, training_progress_bar
 from drivesem.run.folder import SHARING, claim_folder
 from drivesem.run.workers import make_parallel_map
@@ -106,6 +107,7 @@ def run_training(config: TrainConfig) -> TrainingResult | None:
     with _processes(config) as (rank, device):
         console = Console(stderr=True, quiet=rank > 0)
         settings = _settings(config)
+        config = _resolve_splits(config)
         detector = build_detector(config.detector)
         start = _begin(config, detector)  # before the folder is created: bad settings leave nothing behind
         out = Path(config.out or f"runs/train-{config.detector}-seed{config.seed}")
@@ -215,6 +217,19 @@ def _data(
     return frames, judged
 
 
+def _resolve_splits(config: TrainConfig) -> TrainConfig:
+    """Train on the split "train" of a data set that has one, and evaluate on "val", unless options say otherwise."""
+    if config.dataset == SYNTH or config.split is not None:
+        return config
+    splits = open_selection(config.dataset, config.root or "").splits()
+    if "train" not in splits:
+        return config
+    held_out = None
+    if config.held_out is None and config.held_out_split is None:
+        held_out = next((name for name in ("val", "valid", "validation") if name in splits), None)
+    return replace(config, split="train", held_out_split=held_out or config.held_out_split)
+
+
 def _warn_of_shared(config: TrainConfig, console: Console) -> None:
     """Warn where evaluation frames are also trained on, or select t*."""
 
@@ -264,9 +279,10 @@ def _store(
     whole: bool = False,
     split: str | None = None,
 ) -> FrameStore:
-    dataset = open_folders(name, str(root))
-    if split is not None:
-        dataset = select_split(dataset, split)
+    chosen = FrameFilter.from_options(config)
+    dataset = open_selection(name, root, replace(chosen, split=split))
+    if not console.quiet:
+        write_account(dataset.account())
     names = dataset.identifiers if whole else dataset.identifiers[: config.limit]
     if not names:
         raise UsageError(str(root), "at least one frame", "none")
@@ -407,9 +423,11 @@ def fit_dataset_anchors(config: TrainConfig, count: int) -> dict[str, Any]:
         UsageError: For more anchors than different boxes, or no boxes.
         FormatError: For a frame without labels.
     """
-    datasets = [open_dataset(config.dataset, Path(root)) for root in (config.root or "").split(",")]
-    frames = [(dataset, name) for dataset in datasets for name in dataset.identifiers][: config.limit]
-    sizes_wh = np.concatenate([np.zeros((0, 2)), *(_box_sizes(dataset, name) for dataset, name in frames)])
+    config = _resolve_splits(config)
+    dataset = open_selection(config.dataset, config.root or "", FrameFilter.from_options(config))
+    account = write_account(dataset.account())
+    frames = dataset.identifiers[: config.limit]
+    sizes_wh = np.concatenate([np.zeros((0, 2)), *(_box_sizes(dataset, name) for name in frames)])
     if not len(sizes_wh):
         raise UsageError("--root", f"boxes of at least {_MIN_HEIGHT_PX:g} px", f"none in {len(frames)} frames")
     different = len(np.unique(sizes_wh, axis=0))
@@ -418,6 +436,7 @@ def fit_dataset_anchors(config: TrainConfig, count: int) -> dict[str, Any]:
     anchors = fit_anchors(sizes_wh, count, config.seed)
     return {
         "dataset": config.dataset,
+        "data": account,
         "frames": len(frames),
         "boxes": len(sizes_wh),
         "min_height": _MIN_HEIGHT_PX,

@@ -16,7 +16,7 @@ from drivesem.config.options import SceneOptions
 from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.kitti import KittiDataset
 from drivesem.data.registry import open_dataset
-from drivesem.data.subsets import PUBLISHED_SPLITS, open_folders, select_split
+from drivesem.data.subsets import PUBLISHED_SPLITS, open_selection, select_split
 from drivesem.data.vkitti1 import Vkitti1Writer
 from drivesem.scenes.sources import open_source
 from scene_ir import files
@@ -49,7 +49,7 @@ def virtual(layout: str) -> list[str]:
 @pytest.mark.parametrize("layout", ["vkitti1", "vkitti2"])
 def test_3d_sdns_split_has_its_published_sizes_and_ends(layout: str) -> None:
     dataset = Named(virtual(layout))
-    tested, trained = (select_split(dataset, split).identifiers for split in PUBLISHED_SPLITS)
+    tested, trained = (select_split(dataset, split) for split in PUBLISHED_SPLITS)
     assert (len(tested), len(trained)) == (2 * 444, 2 * 1682)  # of 4,440 and 16,820 in ten variations
     assert set(tested) | set(trained) == set(dataset.identifiers)
     assert not set(tested) & set(trained)
@@ -78,14 +78,10 @@ def test_generated_worlds_are_divided_and_read(tmp_path: Path, make_shot: Callab
 
 def test_a_share_at_random_and_all_others_are_the_whole_in_its_order() -> None:
     dataset = Named(virtual("vkitti1"))
-    some, others = (select_split(dataset, f"random:0.75{rest}").identifiers for rest in ("", ":rest"))
+    some, others = (select_split(dataset, f"random:0.75{rest}") for rest in ("", ":rest"))
     assert len(some) == round(0.75 * len(dataset.identifiers))
     assert sorted((*some, *others)) == sorted(dataset.identifiers)
-    assert (
-        some
-        == tuple(sorted(some, key=dataset.identifiers.index))
-        == select_split(dataset, "random:.75").identifiers
-    )
+    assert some == tuple(sorted(some, key=dataset.identifiers.index)) == select_split(dataset, "random:.75")
     worlds = [{name[:10] for name in part} for part in (some, others)]
     assert worlds[0] == worlds[1]  # the same drives
     with pytest.raises(FormatError):
@@ -144,7 +140,7 @@ def _kitti(root: Path, names: list[str], value: int) -> Path:
 def test_frames_of_both_folders_in_order(tmp_path: Path) -> None:
     first = _kitti(tmp_path / "b", ["000000", "000001"], 10)
     second = _kitti(tmp_path / "a", ["000000"], 20)
-    joined = open_folders("kitti", f"{first},{second}")
+    joined = open_selection("kitti", f"{first},{second}")
     assert joined.identifiers == ("0/000000", "0/000001", "1/000000")
     for name, value in zip(joined.identifiers, (10, 10, 20), strict=True):
         labels = joined.labels(name)
@@ -154,10 +150,10 @@ def test_frames_of_both_folders_in_order(tmp_path: Path) -> None:
 
 
 def test_one_folder_stays_itself(tmp_path: Path) -> None:
-    assert isinstance(open_folders("kitti", str(_kitti(tmp_path, ["000000"], 10))), KittiDataset)
+    assert isinstance(open_selection("kitti", str(_kitti(tmp_path, ["000000"], 10))), KittiDataset)
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     first = _kitti(tmp_path / "a", ["000000"], 10)
     with pytest.raises(FormatError, match="missing"):
-        open_folders("kitti", f"{first},{tmp_path / 'missing'}")
+        open_selection("kitti", f"{first},{tmp_path / 'missing'}")

@@ -18,7 +18,7 @@ from drivesem.config.constraints import parse_size_hw
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO
 from drivesem.data.registry import Dataset, open_dataset
-from drivesem.data.subsets import open_folders
+from drivesem.data.subsets import open_selection
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.terminal import Console
 from drivesem.run.attack import AttackWorker
@@ -284,7 +284,7 @@ def divide_frames(study: StudyConfig) -> FrameDivision:
         raise UsageError("--held-out", "at least one frame", "none")
     benign = None
     if study.benign_root is not None:
-        further = open_folders(study.dataset, study.benign_root)
+        further = open_selection(study.dataset, study.benign_root)
         benign = further, further.identifiers
     elif not study.quick:
         benign = dataset, dataset.identifiers if training is None else training
