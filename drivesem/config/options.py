@@ -234,7 +234,7 @@ class FrameFilterOptions(Options):
     """Which frames of a data set are used, and what its class names mean."""
 
     split: str | None = None
-    """Frames of --root: its own split (train, val), 3d-sdn, random:FRACTION, random:FRACTION:rest, or a file of names."""
+    """Frames of --root: its own split (train, val), 3d-sdn, random:FRACTION, random:FRACTION:rest, or a file."""
     where: Annotated[str, ParsedBy(parse_attributes)] | None = None
     """Frames with these attributes: weather=rainy|foggy,timeofday=night."""
     map: ClassMap | None = None

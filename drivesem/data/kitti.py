@@ -14,21 +14,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
 from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
 from drivesem.data.kitti_labels import (
     TYPES,
     UNKNOWN_POSE,
-    UNKNOWN_POSITION,
     UNKNOWN_SIZE,
     KittiLabelLines,
     finite_number,
+    list_text_files,
 )
 from drivesem.data.label_table import (
     REGION,
@@ -48,6 +49,9 @@ from drivesem.data.photographs import (
     is_in_front,
     list_images,
     match_images_below,
+    pinhole_camera,
+    read_focal_length,
+    read_upright,
 )
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError
@@ -78,8 +82,8 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
 
     A 3D box that is marked as unknown (sizes -1, position -1000) is NaN in translation, yaw and size_lhw; in results
     truncation and occlusion may be unknown too. Raises FormatError naming file, line and field: a wrong number of
-    fields, a value that is not finite or out of range, an unknown type, a box that ends before it begins, a 3D box
-    wholly behind the camera.
+    fields, a value that is not finite or out of range, a box that ends before it begins, a 3D box wholly behind the
+    camera.
     """
     return _parse_labels(str(path), files.read_text(path), scored)
 
@@ -100,15 +104,14 @@ def check_scene(lines: KittiLabelLines, scored: bool = False) -> None:
             if not good:
                 raise FormatError(lines.locate(row, field), expected, found)
 
-        require(kind in TYPES, "type", f"one of {', '.join(TYPES)}", repr(kind))
         if kind == "DontCare":
             continue
-        truncated, occluded, _, _, _, _, _, h, w, l, x, y, z, yaw = values[:14]  # noqa: E741
+        truncated, occluded, _, _, _, _, _, h, w, l, _, _, z, yaw = values[:14]  # noqa: E741
         unknown = (-1.0,) if scored else ()
         good = 0 <= truncated <= 1 or truncated in unknown
         require(good, "truncated", "[0, 1]", f"{truncated:g}")
         require(occluded in (0, 1, 2, 3, *unknown), "occluded", "0, 1, 2 or 3", f"{occluded:g}")
-        if {h, w, l} == {UNKNOWN_SIZE} and {x, y, z} == {UNKNOWN_POSITION}:
+        if {h, w, l} <= {UNKNOWN_SIZE, 0.0} and len({h, w, l}) == 1:
             continue
         for name, size in zip(("height", "width", "length"), (h, w, l), strict=True):
             require(size > 0, name, "positive metres", f"{size:g}")
@@ -333,8 +336,12 @@ def read_points(path: Path, calibration: KittiCalibration) -> Tensor:
     return (points @ transform[:, :3].T + transform[:, 3]) @ calibration.rectification.T
 
 
-class KittiDataset(FrameIndex[Path | None]):
-    """The frames of a KITTI object folder: every image and every label file.
+class KittiDataset(FrameIndex[Path]):
+    """The frames of a KITTI object folder: every image, in subfolders too, with a label file, if there are labels.
+
+    An identifier is the path of an image below image_2, without suffix. Values of a 3D box, truncations and
+    occlusions that a scene cannot use are unknown; so are the 3D boxes of frames without a calibration, whose camera is
+    a pinhole. `account` counts all of them. Images are turned upright by EXIF.
 
     Args:
         root: Folder that contains `split`, or that folder itself.
@@ -342,50 +349,115 @@ class KittiDataset(FrameIndex[Path | None]):
         with_points: Read laser points of frames that have them.
 
     Raises:
-        FormatError: No or an empty image_2, or no velodyne for points. A frame's own faults are raised by `labels`
-            and `frame` only.
+        FormatError: No or an empty image_2, no image with labels, or no velodyne for points. A frame's own faults are
+            raised by `labels` and `frame` only.
     """
 
     def __init__(self, root: Path, split: str = "training", with_points: bool = False) -> None:
         root = Path(root)
+        self._root = root
         self.folder = root if (root / "image_2").is_dir() and not (root / split).is_dir() else root / split
         if not root.is_dir():
             raise FormatError(str(root), "a KITTI folder", "no such folder")
-        images = {path.stem: path for path in list_images(self.folder / "image_2")}
+        folder = self.folder / "image_2"
+        images = {p.relative_to(folder).with_suffix("").as_posix(): p for p in list_images(folder, recursive=True)}
         if with_points and not (self.folder / "velodyne").is_dir():
             raise FormatError(str(self.folder / "velodyne"), "a folder of a laser's points", "no such folder")
         self.with_points = with_points
         if not images:
-            raise FormatError(str(self.folder / "image_2"), "at least one .png or .jpg", "none")
+            raise FormatError(str(folder), f"at least one image ({', '.join(IMAGE_SUFFIXES)})", "none")
         self._has_labels = (self.folder / "label_2").is_dir()
-        labelled = (path.stem for path in (self.folder / "label_2").glob("[!.]*.txt")) if self._has_labels else ()
-        super().__init__(self.folder, {name: images.get(name) for name in sorted({*images, *labelled})})
+        self._unpaired: dict[str, str] = {}
+        if self._has_labels:
+            labelled = {name.removesuffix(".txt") for name in list_text_files(self.folder / "label_2")}
+            self._unpaired = {f"{images[name]}": "image without a label file" for name in images.keys() - labelled}
+            paths = (self._label_path(name) for name in labelled - images.keys())
+            self._unpaired |= {f"{path}": _WITHOUT_IMAGE for path in paths}
+            images = {name: path for name, path in images.items() if name in labelled}
+            if not images:
+                raise FormatError(str(self.folder / "label_2"), "label files named after the images", "none")
+        super().__init__(self.folder, dict(sorted(images.items())))
+
+    def _label_path(self, identifier: str) -> Path:
+        return self.folder / "label_2" / f"{identifier}.txt"
+
+    def _calibration_path(self, identifier: str) -> Path:
+        return self.folder / "calib" / f"{identifier}.txt"
+
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Identifiers by split, of the lists `ImageSets/{train,val,test}.txt`."""
+        lists = {name: self._root / "ImageSets" / f"{name}.txt" for name in _SPLITS}
+        names = {name: set(files.read_text(path).split()) for name, path in lists.items() if path.is_file()}
+        splits = {name: tuple(i for i in self.identifiers if i in chosen) for name, chosen in names.items()}
+        return {name: identifiers for name, identifiers in splits.items() if identifiers}
+
+    def account(self) -> DataAccount:
+        """Account for all files and label rows; reads all labels."""
+        names, splits = self.identifiers, self.splits()
+        read = [f"{self._entry(name)}" for name in names]
+        read += [f"{self._calibration_path(name)}" for name in names]
+        read += [f"{self._root / 'ImageSets' / name}.txt" for name in splits]
+        for folder, suffix in (("depth_2", "png"), ("instance_2", "png"), ("velodyne", "bin")):
+            if folder != "velodyne" or self.with_points:
+                read += [f"{self.folder / folder / name}.{suffix}" for name in names]
+        classes, regions, repairs = {}, 0, {}
+        if self._has_labels:
+            paths = [f"{self._label_path(name)}" for name in names]
+            read += paths
+            lines = KittiLabelLines(paths, [files.read_text(path) for path in paths], scored=False)
+            repairs, (classes, regions) = lines.drop_unusable(), lines.count_rows()
+        uncalibrated = sum(not self._calibration_path(name).exists() for name in names)
+        if uncalibrated:
+            repairs["frames without calibration (3D boxes not used)"] = uncalibrated
+        count, skipped = account_for_files(self._root, read, self._unpaired)
+        return DataAccount(
+            "kitti",
+            len(names),
+            count,
+            skipped,
+            classes,
+            regions,
+            without_image=sum(reason == _WITHOUT_IMAGE for reason in self._unpaired.values()),
+            splits={name: len(chosen) for name, chosen in splits.items()},
+            repairs=repairs,
+        )
 
     def labels(self, identifier: str) -> Labels | None:
         """Read the labels of one frame; None if the folder has no label_2 (test split)."""
         self._entry(identifier)
-        return read_labels(self.folder / "label_2" / f"{identifier}.txt") if self._has_labels else None
+        if not self._has_labels:
+            return None
+        path = self._label_path(identifier)
+        lines = KittiLabelLines([str(path)], [files.read_text(path)], scored=False)
+        lines.drop_unusable()
+        labels = lines.to_table([identifier], scored=False).to_labels()
+        return labels if self._calibration_path(identifier).exists() else _drop_poses(labels)
 
     def frame(self, identifier: str) -> Frame:
         """Read one frame: photograph, camera with P2, labels, points.
 
         Reads depth (inf where unknown) from depth_2, and classes and masks from instance_2, if they exist. Raises
-        FormatError naming the file and the fault: a missing or damaged image, label file or calibration; an image
-        of a size that does not fit its labels or its calibration.
+        FormatError naming the file and the fault: a damaged image, label file or calibration; an image of a size that
+        does not fit its labels or its calibration.
         """
         image_path = self._entry(identifier)
-        if image_path is None:
-            raise FormatError(str(self.folder / "image_2" / f"{identifier}.png"), "an image", "no such file")
-        calib_path = self.folder / "calib" / f"{identifier}.txt"
         labels = self.labels(identifier)
-        calibration = read_calibration(calib_path)
-        image = files.read_image(image_path)
-        height, width = image.shape[:2]
-        camera = Camera(calibration.projection[:, :3].clone(), height, width, calibration.projection)
+        provenance = {"dataset": "kitti", "image": image_path.name, "folder": self.folder.name}
+        image = read_upright(image_path)
+        size_hw = height, width = image.shape[:2]
+        points = None
+        calib_path = self._calibration_path(identifier)
+        if calib_path.exists():
+            calibration = read_calibration(calib_path)
+            camera = Camera(calibration.projection[:, :3].clone(), height, width, calibration.projection)
+            points_path = self.folder / "velodyne" / f"{identifier}.bin"
+            if self.with_points and points_path.exists():
+                points = read_points(points_path, calibration)
+        else:
+            focal = read_focal_length(image_path)
+            camera = pinhole_camera(height, width, focal.length_px)
+            provenance["focal"] = str(focal)
         check_image_size(image_path, camera, labels)
-        points_path = self.folder / "velodyne" / f"{identifier}.bin"
-        points = read_points(points_path, calibration) if self.with_points and points_path.exists() else None
-        size_hw = (height, width)
         classes, masks = _read_instances(self.folder / "instance_2" / f"{identifier}.png", size_hw, labels)
         return Frame(
             identifier=identifier,
@@ -397,8 +469,18 @@ class KittiDataset(FrameIndex[Path | None]):
             classes=classes,
             class_names=() if classes is None else SEMANTIC_NAMES,
             points=points,
-            provenance={"dataset": "kitti", "image": image_path.name, "folder": self.folder.name},
+            provenance=provenance,
         )
+
+
+_SPLITS = ("train", "val", "test")
+_WITHOUT_IMAGE = "label file without an image"
+
+
+def _drop_poses(labels: Labels) -> Labels:
+    """Return labels with unknown 3D boxes."""
+    names = ("translation", "yaw", "size_lhw")
+    return replace(labels, **{name: torch.full_like(getattr(labels, name), math.nan) for name in names})
 
 
 def _read_depth(path: Path, size_hw: tuple[int, int]) -> Tensor | None:

@@ -10,13 +10,16 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.label_table import REGION, LabelTable
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -34,6 +37,10 @@ _NUMBERS_BEFORE_POSE = FIELDS.index("height") - 1
 """Number of values of a line before its 3D box."""
 
 _MAX_FLAG = 2**31
+MAX_YAW = 2 * math.pi + 0.01
+"""Largest yaw, rad; more than a turn means another unit."""
+NEAR_M = 0.1
+"""Near plane of projected boxes; nothing nearer is visible."""
 
 
 def finite_number(where: str, text: str) -> float:
@@ -103,6 +110,40 @@ class KittiLabelLines:
             named = zip(FIELDS[1:], parts[1:], strict=False)
             rows.append([finite_number(self.locate(row, name), part) for name, part in named][: fields - 1])
         return np.array(rows, np.float64).reshape(-1, fields - 1)
+
+    def drop_unusable(self) -> dict[str, int]:
+        """Make values unknown that a scene cannot use, and count them by field.
+
+        A 3D box needs positive sizes, a yaw of at most a turn and a part in front of the camera; sizes of 0 and marks
+        of unknown values do not count. Truncation is in [0, 1], occlusion 0 to 3.
+        """
+        values = self.values
+        objects = np.array([kind.lower() != "dontcare" for kind in self.kinds], np.bool_)
+        width, length, z, yaw = values[:, 8], values[:, 9], values[:, 12], values[:, 13]
+        sizes = values[:, 7:10]
+        unknown = (sizes <= 0).all(axis=1) | (values[:, 10:13] == UNKNOWN_POSITION).all(axis=1)
+        reach = 0.5 * (length * np.abs(np.sin(yaw)) + width * np.abs(np.cos(yaw)))
+        fits = (sizes > 0).all(axis=1) & (np.abs(yaw) <= MAX_YAW) & (z + reach > NEAR_M)
+        bad_pose, bad_truncation = (
+            objects & ~unknown & ~fits,
+            objects & ((values[:, 0] > 1) | ((values[:, 0] < 0) & (values[:, 0] != -1))),
+        )
+        bad_occlusion = objects & ~np.isin(values[:, 1], (-1, 0, 1, 2, 3))
+        values[bad_pose | (objects & unknown), 7:14] = [float(text) for text in UNKNOWN_POSE]
+        values[bad_truncation, 0] = -1
+        values[bad_occlusion, 1] = -1
+        counts = {
+            "3D boxes that cannot be used": bad_pose,
+            "truncations outside [0, 1]": bad_truncation,
+            "occlusions other than 0 to 3": bad_occlusion,
+        }
+        return {name: int(rows.sum()) for name, rows in counts.items() if rows.any()}
+
+    def count_rows(self) -> tuple[dict[str, int], int]:
+        """Count the objects by type, as written, and the DontCare regions."""
+        counts = Counter(self.kinds)
+        regions = sum(counts.pop(name) for name in list(counts) if name.lower() == "dontcare")
+        return dict(counts), regions
 
     def check_sizes(self) -> None:
         """Raise FormatError for a negative size other than the mark of unknown ones."""
@@ -193,8 +234,16 @@ def find_label_folder(path: Path) -> Path | None:
 
 
 def list_text_files(folder: Path) -> list[str]:
-    """List the names of a folder's text files, sorted; paths of tens of thousands would take seconds."""
-    return [name for name in sorted(os.listdir(folder)) if name.endswith(".txt") and name[0] != "."]
+    """List a folder's text files, in subfolders too, by their paths below it, sorted.
+
+    Path objects of tens of thousands would take seconds.
+    """
+    names: list[str] = []
+    for place, folders, found in os.walk(folder):
+        folders[:] = [name for name in folders if name[0] != "."]
+        start = "" if place == str(folder) else f"{os.path.relpath(place, folder)}{os.sep}"
+        names += [f"{start}{name}" for name in found if name.endswith(".txt") and name[0] != "."]
+    return sorted(names)
 
 
 def read_table(path: Path, scored: bool) -> LabelTable:
@@ -206,7 +255,11 @@ def read_table(path: Path, scored: bool) -> LabelTable:
     table = read_label_files(paths, scored)
     if scored and not len(table):
         raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
-    return table
+    count, skipped = account_for_files(folder, paths.values())
+    counts = np.bincount(table.kind[table.kind >= 0], minlength=len(table.kinds)).tolist()
+    regions = int((table.kind < 0).sum())
+    classes = dict(zip(table.kinds, counts, strict=True))
+    return replace(table, account=DataAccount("kitti", len(paths), count, skipped, classes, regions))
 
 
 def read_label_files(paths: Mapping[str, str], scored: bool = False) -> LabelTable:

@@ -12,8 +12,9 @@ from functools import cached_property
 from pathlib import Path
 
 from drivesem.data import kitti
+from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.kitti_labels import KittiLabelLines, finite_number
-from drivesem.data.photographs import FrameIndex, check_image_size, list_images
+from drivesem.data.photographs import FrameIndex, check_image_size, list_images, read_upright
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import to_tensor
@@ -75,6 +76,15 @@ class KittiTrackingDataset(FrameIndex[Path]):
             raise FormatError(str(folder / IMAGES / sequence), "at least one .png or .jpg", "none")
         super().__init__(folder / IMAGES / sequence, {image.stem: image for image in images})
 
+    def account(self) -> DataAccount:
+        """Account for the sequence's files and label rows."""
+        images = [f"{self._entry(name)}" for name in self.identifiers]
+        lines = KittiLabelLines([""], ["\n".join(rows.text for rows in self._by_frame.values())], scored=False)
+        classes, regions = lines.count_rows()
+        count, skipped = account_for_files(self._entry(self.identifiers[0]).parent, images)
+        count += sum(path.is_file() for path in (self._labels, self._calib))
+        return DataAccount("kitti-tracking", len(images), count, skipped, classes, regions)
+
     def labels(self, identifier: str) -> Labels:
         """Read the labels of one frame. Raises FormatError naming file, line and field."""
         rows = self._frame_lines(identifier)
@@ -90,7 +100,7 @@ class KittiTrackingDataset(FrameIndex[Path]):
         """Read one frame: photograph, camera, labels. Raises FormatError naming the file and the fault."""
         path = self._entry(identifier)
         labels, projection = self.labels(identifier), kitti.read_calibration(self._calib).projection
-        image = files.read_image(path)
+        image = read_upright(path)
         height, width = image.shape[:2]
         camera = Camera(projection[:, :3].clone(), height, width, projection)
         check_image_size(path, camera, labels)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from drivesem.data import coco_labels, kitti_labels
@@ -28,7 +29,7 @@ def detect_layout(path: Path) -> str | None:
         raise FormatError(str(path), "a file or folder of labels", "nothing there")
     if (path / "data.yaml").is_file():
         return "yolo"
-    if any((path / "annotations").glob("instances_*.json")):
+    if coco_labels.find_annotation_files(path):
         return "coco"
     if (path / "vkitti_1.3.1_rgb").is_dir():
         return "vkitti1"
@@ -76,4 +77,5 @@ def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable 
         raise FormatError(str(path), "detections with scores", "Virtual KITTI, which holds labels only")
     from drivesem.data import vkitti1, vkitti2
 
-    return (vkitti1.Vkitti1Dataset if layout == "vkitti1" else vkitti2.Vkitti2Dataset)(path).table()
+    dataset = (vkitti1.Vkitti1Dataset if layout == "vkitti1" else vkitti2.Vkitti2Dataset)(path)
+    return replace(dataset.table(), account=dataset.account())

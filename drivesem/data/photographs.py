@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from drivesem.data.account import IMAGE_SUFFIXES
+from drivesem.data.kitti_labels import NEAR_M
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, make_printable
 from scene_ir.io import to_tensor
@@ -22,13 +23,12 @@ T = TypeVar("T")
 
 PNG_COMPRESSION = 1
 """zlib level for images: several times as fast as the best compression."""
-BOX_MARGIN_PX = 2.0
-"""How far a label's box may reach beyond the image. KITTI's never do (checked on all 7,481); rounding may."""
+BOX_MARGIN = 0.1
+"""How far a label's box may reach beyond the image, in image sizes; beyond it, labels and image do not belong together.
+KITTI's never do (checked on all 7,481); other tools' may, since objects continue there."""
 CENTRE_RANGE = (0.25, 0.75)
 """Range of the principal point, as a fraction of the image; KITTI's lie at 0.46 to 0.50. Beyond it, image and
 calibration do not belong together."""
-NEAR_M = 0.1
-"""Near plane of projected boxes; nothing nearer is visible."""
 DEFAULT_FOCAL = 0.58
 """Default focal length in image widths: KITTI's 721 px of 1242, a field of view of 81 degrees."""
 FILM_MM = 36.0
@@ -160,8 +160,8 @@ def check_image_size(image_path: Path, camera: Camera, labels: Labels | None) ->
     if labels is None:
         return
     boxes = torch.cat([labels.boxes_xyxy, labels.ignore_xyxy])
-    limit = torch.tensor([camera.width, camera.height], dtype=boxes.dtype) - 1 + BOX_MARGIN_PX
-    outside = ((boxes[:, 2:] > limit) | (boxes[:, :2] < -BOX_MARGIN_PX)).any(dim=1)
+    size = torch.tensor([camera.width, camera.height], dtype=boxes.dtype)
+    outside = ((boxes[:, 2:] > (1 + BOX_MARGIN) * size) | (boxes[:, :2] < -BOX_MARGIN * size)).any(dim=1)
     if bool(outside.any()):
         box = [round(v, 2) for v in boxes[outside][0].tolist()]
         raise FormatError(str(image_path), f"an image that holds the label's box {box}", size_text)
@@ -223,16 +223,16 @@ class FocalLength:
         return f"{self.length_px:.1f} px, {self.source}"
 
 
-def read_upright(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
-    """Read pixels as `read_pixels`, turned upright by EXIF, as viewers and OpenCV do.
+def read_upright(path: Path) -> np.ndarray:
+    """Read pixels as `read_pixels`, turned upright by EXIF, as viewers and OpenCV do."""
+    orientation = _to_positive(_read_header(path)[0].get(_ORIENTATION))
+    return turn_pixels(read_pixels(path), orientation)
 
-    If only the stored image has the size `size_hw`, it is not turned.
-    """
-    tags, _, _ = _read_header(path)
-    pixels = np.rot90(read_pixels(path), _quarter_turns(tags))
-    if size_hw not in (None, pixels.shape[:2]):
-        return read_pixels(path, size_hw)
-    return np.ascontiguousarray(pixels[:, ::-1] if _to_positive(tags.get(_ORIENTATION)) in _MIRRORED else pixels)
+
+def turn_pixels(pixels: np.ndarray, orientation: float) -> np.ndarray:
+    """Turn a stored image or mask (H, W, ...) upright. orientation: EXIF's, 1 to 8; others change nothing."""
+    pixels = np.rot90(pixels, _QUARTER_TURNS.get(orientation, 0))
+    return np.ascontiguousarray(pixels[:, ::-1] if orientation in _MIRRORED else pixels)
 
 
 def read_upright_size(path: Path) -> tuple[int, int]:

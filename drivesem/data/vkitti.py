@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -16,9 +16,10 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import torch
 
+from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.ground_truth import Exposure, FrameLocation, TrackedObject
 from drivesem.data.kitti import TYPES
-from drivesem.data.label_table import REGION, LabelTable, is_known_pose
+from drivesem.data.label_table import REGION, WEATHER_VARIATIONS, LabelTable, is_known_pose
 from drivesem.data.photographs import FrameIndex, check_image_size, is_in_front
 from drivesem.data.vkitti_files import FileCache, TableRow, TextTable, format_decimal, read_depth_m
 from scene_ir import files
@@ -343,6 +344,8 @@ class VirtualKittiDataset(FrameIndex[VirtualKittiImage], ABC):
     """Name of the layout."""
     size_hw: tuple[int, int] | None = None
     """Height and width of all images, px; None if images differ."""
+    modalities: tuple[str, ...] = ()
+    """Modalities with an image per frame, besides the photograph."""
 
     def __init__(
         self,
@@ -381,8 +384,31 @@ class VirtualKittiDataset(FrameIndex[VirtualKittiImage], ABC):
         """Return the file of another modality, which may not exist; None if its folder does not exist."""
 
     @abstractmethod
+    def _table_files(self, image: VirtualKittiImage) -> list[Path]:
+        """Return the text files of an image's clip."""
+
+    @abstractmethod
     def _segments(self, image: VirtualKittiImage, size_hw: tuple[int, int]) -> PixelLabels:
         """Read the segmentation images of a frame."""
+
+    def attributes(self, identifier: str) -> Mapping[str, str]:
+        """Return the variation of a frame, which is its weather unless it turns the camera."""
+        variation = self._entry(identifier).variation
+        weather = {"weather": variation} if variation in WEATHER_VARIATIONS else {}
+        return {"variation": variation, **weather}
+
+    def account(self) -> DataAccount:
+        """Account for all files and label rows; reads all labels."""
+        images = [self._entry(name) for name in self.identifiers]
+        read = [f"{image.path}" for image in images]
+        read += [f"{self._image(image, modality)}" for image in images for modality in self.modalities]
+        clips = {(image.scene, image.variation): image for image in images}
+        read += [f"{path}" for image in clips.values() for path in self._table_files(image)]
+        count, skipped = account_for_files(self.root, read)
+        table = self.table()
+        rows = np.bincount(table.kind[table.kind >= 0], minlength=len(table.kinds)).tolist()
+        classes, regions = dict(zip(table.kinds, rows, strict=True)), int((table.kind < 0).sum())
+        return DataAccount(self.layout, len(images), count, skipped, classes, regions)
 
     def image_path(self, identifier: str) -> Path:
         """Return a frame's image file. Raises RangeError for an unknown frame."""
@@ -409,9 +435,9 @@ class VirtualKittiDataset(FrameIndex[VirtualKittiImage], ABC):
     def table(self) -> LabelTable:
         """Read the labels of all frames."""
         height, width = self.size_hw or (0, 0)
-        return objects_to_table(
-            self.identifiers, [self.objects(name) for name in self.identifiers], (width, height)
-        )
+        objects = [self.objects(name) for name in self.identifiers]
+        attributes = {i: self.attributes(name) for i, name in enumerate(self.identifiers)}
+        return replace(objects_to_table(self.identifiers, objects, (width, height)), frame_attributes=attributes)
 
     def extrinsic(self, identifier: str) -> torch.Tensor:
         """Read the matrix from world to camera axes, (4, 4) float64. Raises FormatError."""

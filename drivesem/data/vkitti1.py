@@ -219,6 +219,7 @@ class Vkitti1Dataset(VirtualKittiDataset):
 
     layout = "vkitti1"
     size_hw = SIZE_HW
+    modalities = ("depth", "scene")
 
     def __init__(self, root: Path, variations: Sequence[str] | None = None, with_dont_care: bool = False) -> None:
         root = Path(root)
@@ -268,6 +269,10 @@ class Vkitti1Dataset(VirtualKittiDataset):
     def _camera(self, image: VirtualKittiImage, size_hw: tuple[int, int]) -> Camera:
         (cx, cy), (height, width) = CENTRE_PX, size_hw
         return Camera(torch.tensor([[FOCAL_PX, 0.0, cx], [0.0, FOCAL_PX, cy], [0.0, 0.0, 1.0]]), height, width)
+
+    def _table_files(self, image: VirtualKittiImage) -> list[Path]:
+        encoding = self._file(image, "scenegt", "_scenegt_rgb_encoding")
+        return [self._file(image, "motgt"), self._file(image, "extrinsicsgt"), encoding]
 
     def _segments(self, image: VirtualKittiImage, size_hw: tuple[int, int]) -> PixelLabels:
         scene = self._image(image, "scene")

@@ -283,6 +283,7 @@ class Vkitti2Dataset(VirtualKittiDataset):
     """
 
     layout = "vkitti2"
+    modalities = tuple(_MODALITIES)
 
     def __init__(self, root: Path, cameras: Sequence[int] = (0,), variations: Sequence[str] | None = None) -> None:
         root = Path(root)
@@ -347,6 +348,10 @@ class Vkitti2Dataset(VirtualKittiDataset):
 
     def _extrinsic(self, image: VirtualKittiImage) -> TableRow:
         return self._read_table(image, "extrinsic", EXTRINSIC).row(image.frame, image.camera or 0)
+
+    def _table_files(self, image: VirtualKittiImage) -> list[Path]:
+        names = ("bbox", "pose", "info", "extrinsic", "intrinsic", "colors")
+        return [self._table_path(image, name) for name in names]
 
     def _segments(self, image: VirtualKittiImage, size_hw: tuple[int, int]) -> PixelLabels:
         instances, classes = (self._image(image, modality) for modality in ("instances", "classes"))

@@ -42,6 +42,7 @@ from drivesem.config.constraints import parse_part
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.config.options import FrameCommandConfig, option_name
+from drivesem.data.account import write_account
 from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grading import Grader, make_reference_detector
 from drivesem.failures.margin_oracle import NuisanceMarginOracle

@@ -169,7 +169,7 @@ def training_targets(labels: Labels, difficulty: Difficulty, classes: Sequence[s
         classes: Names of the classes.
     """
     labels = select_road_users(labels)
-    targets = _make_targets(labels)
+    targets = make_targets(labels)
     ignore = targets.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
     own = _places(classes)[targets.labels]
@@ -187,7 +187,7 @@ def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence
         classes: Names of the classes.
     """
     labels = select_road_users(labels)
-    named = _make_targets(labels)
+    named = make_targets(labels)
     ignore = named.ignore.clone()
     ignore[: len(labels.kind)] |= _too_hard(labels, difficulty)
     own = _places(classes)[named.labels]
@@ -199,7 +199,7 @@ def evaluation_targets(labels: Labels, difficulty: Difficulty, classes: Sequence
     return Targets(named.boxes_xyxy[rows], label, torch.cat([ignore[~every], left_out]))
 
 
-def _make_targets(labels: Labels) -> Targets:
+def make_targets(labels: Labels) -> Targets:
     """Return the targets of road users (see `select_road_users`) in file order, then of DontCare regions.
 
     Targets that are ignored for every class have the label 0. Objects with boxes without area are ignored, since no

@@ -57,6 +57,23 @@ def set_field(path: str, column: str, value: str) -> Damage:
     return damage
 
 
+def plain_labels(kinds: Sequence[str], regions: int = 0) -> Labels:
+    """Labels of objects of some types, 50 px high, with unknown 3D boxes, and regions to ignore."""
+    n = len(kinds)
+    unknown = torch.full((n, 3), torch.nan)
+    box = torch.tensor([10.0, 10.0, 60.0, 60.0])
+    return Labels(
+        kind=tuple(kinds),
+        boxes_xyxy=box.repeat(n, 1),
+        truncation=unknown[:, 0],
+        occlusion=torch.full((n,), 3),
+        translation=unknown,
+        yaw=unknown[:, 0],
+        size_lhw=unknown,
+        ignore_xyxy=box.repeat(regions, 1),
+    )
+
+
 def make_object(track: int = 0, kind: str = "Car", **changes: Any) -> TrackedObject:
     """A car a little to the right of the camera, changed as asked."""
     base = TrackedObject(

@@ -14,9 +14,8 @@ from drivesem.config.commands import TrainConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions
 from drivesem.data.ground_truth import Exposure, FrameLocation
-from drivesem.data.kitti import KittiDataset
 from drivesem.data.registry import open_dataset
-from drivesem.data.subsets import PUBLISHED_SPLITS, open_selection, select_split
+from drivesem.data.subsets import PUBLISHED_SPLITS, FrameFilter, open_selection, select_split
 from drivesem.data.vkitti1 import Vkitti1Writer
 from drivesem.scenes.sources import open_source
 from scene_ir import files
@@ -32,11 +31,8 @@ class Named:
     def __init__(self, names: list[str]) -> None:
         self.identifiers = tuple(names)
 
-    def labels(self, identifier: str) -> str:
-        return f"labels of {identifier}"
-
-    def frame(self, identifier: str) -> str:
-        return f"frame {identifier}"
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        return {}
 
 
 def virtual(layout: str) -> list[str]:
@@ -67,11 +63,12 @@ def test_generated_worlds_are_divided_and_read(tmp_path: Path, make_shot: Callab
     writer.finish([writer.write(place, make_shot(375, 1242, camera, place.number)) for place in places])
     dataset = open_dataset("vkitti1", tmp_path)
     tested, trained = (select_split(dataset, split) for split in PUBLISHED_SPLITS)
-    assert (tested.identifiers, trained.identifiers) == (("0006/clone/00068",), ("0006/clone/00069",))
-    labels = tested.labels("0006/clone/00068")
+    assert (tested, trained) == (["0006/clone/00068"], ["0006/clone/00069"])
+    selected = open_selection("vkitti1", tmp_path, FrameFilter(split="3d-sdn"))
+    labels = selected.labels("0006/clone/00068")
     assert labels is not None
     assert labels.kind == ("Car", "Car", "Van")
-    assert tested.frame("0006/clone/00068").photograph.shape == (3, 375, 1242)
+    assert selected.frame("0006/clone/00068").photograph.shape == (3, 375, 1242)
     source = open_source(SceneOptions(dataset="vkitti1", root=str(tmp_path), split="3d-sdn-train"))
     assert list(source.identifiers()) == ["0006/clone/00069"]
 
@@ -81,7 +78,7 @@ def test_a_share_at_random_and_all_others_are_the_whole_in_its_order() -> None:
     some, others = (select_split(dataset, f"random:0.75{rest}") for rest in ("", ":rest"))
     assert len(some) == round(0.75 * len(dataset.identifiers))
     assert sorted((*some, *others)) == sorted(dataset.identifiers)
-    assert some == tuple(sorted(some, key=dataset.identifiers.index)) == select_split(dataset, "random:.75")
+    assert some == sorted(some, key=dataset.identifiers.index) == select_split(dataset, "random:.75")
     worlds = [{name[:10] for name in part} for part in (some, others)]
     assert worlds[0] == worlds[1]  # the same drives
     with pytest.raises(FormatError):
@@ -92,10 +89,7 @@ def test_names_in_a_file_are_taken_in_the_data_sets_order(tmp_path: Path) -> Non
     dataset = Named(["0001/clone/00000", "0001/clone/00001", "a.b"])
     listed = tmp_path / "names.txt"
     listed.write_text("a.b\n\n0001/clone/00000.png\n")
-    found = select_split(dataset, str(listed))
-    assert found.identifiers == ("0001/clone/00000", "a.b")
-    assert found.labels("a.b") == "labels of a.b"
-    assert found.frame("a.b") == "frame a.b"
+    assert select_split(dataset, str(listed)) == ["0001/clone/00000", "a.b"]
 
 
 def test_invalid_splits_are_refused(tmp_path: Path) -> None:
@@ -149,8 +143,35 @@ def test_frames_of_both_folders_in_order(tmp_path: Path) -> None:
         assert torch.equal(joined.frame(name).photograph, torch.full((3, 40, 120), value / 255))
 
 
-def test_one_folder_stays_itself(tmp_path: Path) -> None:
-    assert isinstance(open_selection("kitti", str(_kitti(tmp_path, ["000000"], 10))), KittiDataset)
+def test_frames_with_attributes_are_selected(tmp_path: Path, make_shot: Callable[..., Exposure]) -> None:
+    writer = Vkitti1Writer(tmp_path)
+    camera = Camera(torch.tensor([[725.0, 0, 620.5], [0, 725, 187], [0, 0, 1]]), 375, 1242)
+    weathers = ("clone", "fog", "rain", "15-deg-left")
+    places = [FrameLocation(i, "01", weather, 0, "train") for i, weather in enumerate(weathers)]
+    writer.finish([writer.write(place, make_shot(375, 1242, camera, place.number)) for place in places])
+    chosen = open_selection("vkitti1", tmp_path, FrameFilter(where={"weather": ("fog", "rain")}))
+    assert chosen.identifiers == ("0001/fog/00000", "0001/rain/00000")
+    assert chosen.frame("0001/fog/00000").attributes == {"variation": "fog", "weather": "fog"}
+    account = chosen.account()
+    assert (account.frames, account.selection) == (4, "used: 2 images (weather fog or rain)")
+    assert account.files + sum(account.skipped.values()) == sum(p.is_file() for p in tmp_path.rglob("*"))
+    with pytest.raises(FormatError, match="--where weather: expected one of clone, fog, rain, found 'snow'"):
+        open_selection("vkitti1", tmp_path, FrameFilter(where={"weather": ("snow",)}))
+    with pytest.raises(FormatError, match="--where time: expected one of variation, weather, found 'time'"):
+        open_selection("vkitti1", tmp_path, FrameFilter(where={"time": ("night",)}))
+
+
+def test_own_splits_and_class_names(tmp_path: Path) -> None:
+    root = _kitti(tmp_path, ["000000", "000001"], 10)
+    files.write_text(root / "ImageSets/val.txt", "000001\n")
+    chosen = open_selection("kitti", root, FrameFilter("val", mapping={"Car": "truck"}))
+    assert chosen.identifiers == ("000001",)
+    labels = chosen.labels("000001")
+    assert labels is not None
+    assert labels.kind == ("Truck",)
+    assert chosen.account().by_role()["mapped"] == {"Car as Truck": 2}
+    with pytest.raises(FormatError, match="--split: expected one of val, random:FRACTION, or a file of names"):
+        open_selection("kitti", root, FrameFilter("train"))
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:

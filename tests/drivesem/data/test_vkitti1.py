@@ -227,7 +227,7 @@ FAULTS: tuple[tuple[Damage, str], ...] = (
     (replace_text(MOTGT, "orig_label", "original"), r"clone\.txt:1: orig_label: expected a column"),
     (set_field(MOTGT, "color", ""), r"0001_clone\.txt:2: expected 25 fields, found 24"),
     (set_field(MOTGT, "tid", "3"), r"0001_clone\.txt:3: tid: expected each once in a frame, found 3 twice"),
-    (set_field(MOTGT, "r", "1250"), r"00000\.png: expected an image that holds .*1250"),
+    (set_field(MOTGT, "r", "1450"), r"00000\.png: expected an image that holds .*1450"),
     (remove(ENCODING), r"encoding\.txt: expected a readable file"),
     (replace_text(ENCODING, "(:id)", ""), r"encoding\.txt:1: Category\(:id\): expected a column of that"),
     (replace_text(ENCODING, "Car:3", "Car:x"), "Car:x: expected a whole number after the colon, found 'x'"),
