@@ -2,18 +2,22 @@
 
 Boxes in the file are COCO's: x, y, width, height, where pixel column j spans [j, j + 1]. Here it spans
 [j - 0.5, j + 0.5] (scene_ir/conventions.md), so x is left + 0.5. Masks are run-length encoded and exact.
-Format: cocodataset.org/#format-data; pycocotools is the definition. A label table accepts any truncation, occlusion
-and pose under these names; a scene accepts only those of this project.
+Format: cocodataset.org/#format-data; pycocotools is the definition.
+
+Images are turned upright by EXIF. Where the file states the size of the stored, unturned image, boxes and masks are
+of stored pixels, and are turned with it; otherwise they are upright already. Where both sizes are equal (squares,
+half turns), they are taken as upright, as annotation tools and OpenCV show images.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from os.path import isfile  # False for names that are too long
-from pathlib import Path
+from os.path import isfile
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -21,13 +25,15 @@ import torch
 from numpy.typing import NDArray
 from pycocotools import mask as run_length
 
+from drivesem.data.account import DataAccount
 from drivesem.data.coco_labels import (
     AnnotationFile,
+    CocoFiles,
     JsonRows,
     first_occurrences,
-    frame_identifier,
-    list_annotation_files,
     parse_numbers,
+    read_turn,
+    turn_boxes,
 )
 from drivesem.data.ground_truth import Exposure, FrameLocation, TrackedObject
 from drivesem.data.label_table import (
@@ -48,6 +54,8 @@ from drivesem.data.photographs import (
     pinhole_camera,
     read_focal_length,
     read_upright,
+    read_upright_size,
+    turn_pixels,
 )
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
@@ -215,13 +223,14 @@ def _pose_entry(size_lhw: Sequence[float], translation: Sequence[float], yaw: fl
 
 
 def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> WriteSummary:
-    """Write a table with all its values.
+    """Write a table with all its values, classes in its order, images under their names.
 
-    A region becomes a crowd of every class, marked "dontcare"; `read_table` merges these again.
+    A region becomes a crowd of every class, marked "dontcare"; `coco_labels.read_table` merges these again.
 
     Args:
         table: Labels or detections.
-        out: A .json file, or a folder for `annotations/instances_all.json`.
+        out: A .json file, or a folder for `annotations/instances_SPLIT.json`, one for each split ("all" without
+            splits, "rest" for frames of none), and `images/SPLIT` (`images` without splits).
         images: Images to copy, by frame identifier.
 
     Returns:
@@ -232,41 +241,93 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     """
     table.require_sizes("coco")
     table = table.with_box_format("xywh")
-    names, renamed = table.file_names()
+    single = out.suffix.lower() == ".json"
+    split_of = {} if single else {i: name for name, rows in reversed(table.splits.items()) for i in rows}
+    parts: dict[str, list[int]] = {name: [] for name in table.splits} if split_of else {}
+    for i in range(len(table.frames)):
+        parts.setdefault(split_of.get(i, "rest" if split_of else "all"), []).append(i)
+    flat, _ = table.file_names()
+    names = [_file_name(table, i, name, images) for i, name in enumerate(flat)]
+    repeated = {
+        key for key, n in Counter((split_of.get(i), name) for i, name in enumerate(names)).items() if n > 1
+    }
+    names = [
+        f"{flat[i]}{PurePosixPath(name).suffix}" if (split_of.get(i), name) in repeated else name
+        for i, name in enumerate(names)
+    ]
+    count, targets = 0, dict[str, Path]()
+    folder = (out.parent if single else out) / "images"
+    for part, frames in parts.items():
+        path = out if single else out / "annotations" / f"instances_{part}.json"
+        files.write_text(path, _format_table(table, frames, names))
+        count += 1
+        place = folder / part if split_of else folder
+        targets |= {table.frames[i]: place / PurePosixPath(names[i]).with_suffix("") for i in frames}
+    lost = {
+        "/ in frame names": sum("/" in f and "/" not in name for name, f in zip(names, table.frames, strict=True)),
+        "split": sum(map(len, table.splits.values())) if single else 0,
+    }
+    return WriteSummary.from_counts(count + copy_images(targets, images), lost)
+
+
+def _file_name(table: LabelTable, i: int, name: str, images: Mapping[str, Path]) -> str:
+    """Return an image's file name: its own if it is named after its frame, or stays where it is; else `name`."""
+    identifier, own = table.frames[i], table.image_files.get(i, "")
+    if identifier not in images:
+        return own or f"{name}.png"
+    suffix = images[identifier].suffix.lower()
+    if own and PurePosixPath(own).stem in (name, identifier.rpartition("/")[2]):
+        return PurePosixPath(own).with_suffix(suffix).as_posix()
+    return f"{name}{suffix}"
+
+
+def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]) -> str:
+    """Format the file of some frames.
+
+    Args:
+        table: All frames.
+        frames: Indices of the file's frames.
+        names: File names of all images.
+
+    Returns:
+        The file's text.
+    """
     if table.kind_ids is not None:
-        categories = list(zip(table.kinds, table.kind_ids.tolist(), strict=True))
-        numbers = table.kind_ids.tolist()
+        numbers: list[int] = table.kind_ids.tolist()
+        categories = list(zip(table.kinds, numbers, strict=True))
     else:
-        fixed = set(table.kinds) <= set(CATEGORIES)
-        categories = [(kind, i + 1) for i, kind in enumerate(CATEGORIES if fixed else table.kinds)]
+        of_kitti = table.account is not None and table.account.layout in _KITTI_LAYOUTS
+        of_kitti = of_kitti and set(table.kinds) <= set(CATEGORIES)
+        categories = [(kind, i + 1) for i, kind in enumerate(CATEGORIES if of_kitti else table.kinds)]
         numbers = [dict(categories)[kind] for kind in table.kinds]
     image_ids = (np.arange(1, len(names) + 1) if table.image_ids is None else table.image_ids).tolist()
     records: list[dict[str, Any]] = []
-    for i, (name, identifier) in enumerate(zip(names, table.frames, strict=True)):
-        suffix = images[identifier].suffix.lower() if identifier in images else ".png"
-        file_name = f"{name}{suffix}" if identifier in images else table.image_files.get(i, f"{name}{suffix}")
-        width, height = table.sizes_wh[i].tolist()
-        record = {"id": image_ids[i], "file_name": file_name, "width": width, "height": height}
-        record |= {"camera": table.cameras[i]} if i in table.cameras else {}
-        records.append(record | ({"drivesem": table.frame_attributes[i]} if i in table.frame_attributes else {}))
     annotations: list[dict[str, Any]] = []
     box_ids = [] if table.box_ids is None else table.box_ids.tolist()
     next_id = max(box_ids, default=0) + 1
-    for row, kind in enumerate(table.kind.tolist()):
-        entry = _row_annotation(table, row)
-        for label in [number for _, number in categories] if kind == REGION else [numbers[kind]]:
-            number = next_id
-            if box_ids and kind != REGION:
-                number = box_ids[row]
-            else:
-                next_id += 1
-            annotation = {"id": number, "image_id": image_ids[table.frame[row]], "category_id": label, **entry}
-            annotations.append(annotation | ({"dontcare": True} if kind == REGION else {}))
-    path = out if out.suffix.lower() == ".json" else out / "annotations" / "instances_all.json"
-    files.write_text(path, _format_dataset(records, annotations, categories))
-    folder = (path.parent if path == out else out) / "images"
-    targets = {identifier: folder / name for identifier, name in zip(table.frames, names, strict=True)}
-    return WriteSummary.from_counts(1 + copy_images(targets, images), renamed)
+    by_frame = table.rows_by_frame()
+    for i in frames:
+        width, height = table.sizes_wh[i].tolist()
+        record = {"id": image_ids[i], "file_name": names[i], "width": width, "height": height}
+        record |= {"camera": table.cameras[i]} if i in table.cameras else {}
+        attributes = dict(table.frame_attributes.get(i, {}))
+        exported = attributes.pop("drivesem", None)
+        record |= {"attributes": attributes} if attributes else {}
+        records.append(record | ({} if exported is None else {"drivesem": exported}))
+        for row in by_frame[i]:
+            kind, entry = int(table.kind[row]), _row_annotation(table, row)
+            for label in [number for _, number in categories] if kind == REGION else [numbers[kind]]:
+                number = next_id
+                if box_ids and kind != REGION:
+                    number = box_ids[row]
+                else:
+                    next_id += 1
+                annotation = {"id": number, "image_id": image_ids[i], "category_id": label, **entry}
+                annotations.append(annotation | ({"dontcare": True} if kind == REGION else {}))
+    return _format_dataset(records, annotations, categories)
+
+
+_KITTI_LAYOUTS = ("kitti", "vkitti1", "vkitti2")
 
 
 def _row_annotation(table: LabelTable, row: int) -> dict[str, Any]:
@@ -290,17 +351,13 @@ def _row_annotation(table: LabelTable, row: int) -> dict[str, Any]:
 
 
 def find_images(path: Path, frames: Sequence[str]) -> dict[str, Path]:
-    """Find the images that a data set's file names, or else those named after the frames, in its image folder."""
-    (path,) = list_annotation_files(path)
-    folder, data = _find_image_folder(path), AnnotationFile(path, files.read_json(path))
-    names = data.frame_names()
-    named = {names[i]: folder / name for i, name in data.file_names().items() if _is_inside(Path(name))}
-    return match_images([folder], frames) | {name: image for name, image in named.items() if isfile(image)}
-
-
-def _is_inside(file_name: Path) -> bool:
-    """Whether a relative file name stays inside its folder."""
-    return not (file_name.is_absolute() or ".." in file_name.parts)
+    """Find the images that a data set's files name, or else those named after the frames, in its image folders."""
+    data = CocoFiles(path)
+    found = match_images([part.folder for part in data.parts], frames)
+    for part, names in zip(data.parts, data.names, strict=True):
+        paths = zip(names, part.paths, strict=True)
+        found |= {name: Path(image) for name, image in paths if image is not None and isfile(image)}
+    return {name: found[name] for name in frames if name in found}
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,111 +366,141 @@ class _CocoImage:
 
     file: AnnotationFile
     """The annotation file."""
-    path: Path
-    """The image file."""
-    record: Mapping[str, Any]
-    """Its entry in "images"."""
+    index: int
+    """Index in the file's images."""
     rows: list[int]
     """Indices of its annotations."""
 
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """Entry in "images"."""
+        return self.file.images.rows[self.index]
+
+    def require_path(self) -> Path:
+        """Return the image's path. Raises FormatError if it has none inside of the data set."""
+        path = self.file.paths[self.index]
+        if path is None:
+            name = self.record.get("file_name")
+            where = self.file.images.locate(self.index, "file_name")
+            raise FormatError(where, f"a file in {self.file.folder}", "none" if name is None else repr(name))
+        return Path(path)
+
 
 class CocoDataset(FrameIndex[_CocoImage]):
-    """The frames of a COCO data set.
+    """The frames of a COCO data set, of all its files; an image may be missing until its frame is read.
 
-    A frame's identifier is its file name without suffix, folders joined by "_". `kind` is the category's name as
-    written. Unknown truncation and 3D boxes are NaN, unknown occlusion is 3, as
-    in KITTI; crowds are regions to ignore. Images are turned upright by EXIF, unless the file states the stored size.
+    A frame's identifier is that of `coco_labels.CocoFiles`, its splits are the files. `kind` is the category's name as
+    written. Unknown truncation and 3D boxes are NaN, unknown occlusion is 3, as in KITTI; so are values that a scene
+    cannot use. Crowds are regions to ignore.
 
     Args:
-        root: Folder with `annotations/instances_*.json`, all of which are read, or one JSON file.
-        images: Folder of the images; by default the first of `images/PART`, `PART`, `images` (next to
-            `annotations`) and the JSON's own folder that exists.
+        root: Folder with annotation files, all of which are read, or one JSON file.
         focal_px: Focal length of images without "camera"; by default EXIF's, or DEFAULT_FOCAL.
-        kinds: Categories to read as objects, others are background; None: all.
 
     Raises:
         FormatError: Names file and field. A frame's own faults are raised by `labels` and `frame` only.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        images: Path | None = None,
-        focal_px: float | None = None,
-        kinds: Collection[str] | None = None,
-    ) -> None:
-        root = Path(root)
+    def __init__(self, root: Path, focal_px: float | None = None) -> None:
         check_focal(focal_px)
         self.focal_px = focal_px
-        self._kinds = kinds
-        paths = list_annotation_files(root)
-        if not paths:
-            expected = "a COCO folder, with annotations/instances_*.json, or such a file (--root FILE.json)"
-            raise FormatError(str(root), expected, "neither")
+        self._files = CocoFiles(Path(root))
         entries: dict[str, _CocoImage] = {}
-        for path in paths:
-            data = AnnotationFile(path, files.read_json(path))
-            folder = _find_image_folder(path) if images is None else Path(images)
-            by_image: list[list[int]] = [[] for _ in data.images.rows]
+        for data, names in zip(self._files.parts, self._files.names, strict=True):
+            by_image: list[list[int]] = [[] for _ in names]
             for row, frame in enumerate(data.annotation_image.tolist()):
                 by_image[frame].append(row)
-            for i, record in enumerate(data.images.rows):
-                for key in ("height", "width"):
-                    if type(record.get(key)) is not int or record[key] < 1:
-                        value = json.dumps(record.get(key))
-                        raise FormatError(data.images.locate(i, key), "a positive integer", value)
-                if "file_name" not in record:
-                    raise FormatError(data.images.locate(i, "file_name"), "a value", "none")
-                name = Path(str(record["file_name"]))
-                if not _is_inside(name):
-                    raise FormatError(data.images.locate(i, "file_name"), f"a file in {folder}", repr(str(name)))
-                identifier = frame_identifier(record)
-                if identifier in entries:
-                    found = f"{name}, twice: open one file alone"
-                    raise FormatError(data.images.locate(i, "file_name"), "a unique name", found)
-                entries[identifier] = _CocoImage(data, folder / name, record, by_image[i])
+            entries |= {name: _CocoImage(data, i, by_image[i]) for i, name in enumerate(names)}
         super().__init__("the COCO file", dict(sorted(entries.items())))
 
-    def _frame_annotations(self, identifier: str) -> tuple[JsonRows, LabelTable, NDArray[np.int64]]:
-        """Return a frame's annotations of the selected kinds, their table, and the rows that are objects."""
+    def splits(self) -> Mapping[str, tuple[str, ...]]:
+        """Identifiers by split, if there are several annotation files."""
+        return {name: tuple(sorted(frames)) for name, frames in self._files.splits().items()}
+
+    def account(self) -> DataAccount:
+        """Account for all files and annotations."""
+        sizes = {id(part): part.sizes_wh().tolist() for part in self._files.parts}
+        broken = 0
+        for name in self.identifiers:
+            image = self._entry(name)
+            width, height = sizes[id(image.file)][image.index]
+            for row in image.rows:
+                segmentation = image.file.annotations.rows[row].get("segmentation")
+                broken += bool(segmentation) and _is_broken(segmentation, (height, width))
+        return self._files.account(
+            {"outlines that are broken (no masks of their frames)": broken} if broken else {}
+        )
+
+    def attributes(self, identifier: str) -> dict[str, str]:
+        """Attributes that the file states of an image."""
         image = self._entry(identifier)
-        data, kinds = image.file, self._kinds
-        selected = [r for r in image.rows if kinds is None or data.kinds[data.annotation_category[r]] in kinds]
-        rows = data.annotations.select(selected)
-        category = data.annotation_category[selected]
+        values = image.file.attributes(image.index).items()
+        return {name: str(value) for name, value in values if isinstance(value, str | int | float)}
+
+    def _size_wh(self, image: _CocoImage) -> list[int]:
+        """Return the size that the file states, else that of the upright image."""
+        size = [image.record.get(key) for key in ("width", "height")]
+        good = all(type(value) in (int, float) and value > 0 for value in size)
+        return [int(v) for v in size if v] if good else list(read_upright_size(image.require_path()))
+
+    def _frame_annotations(self, identifier: str) -> tuple[JsonRows, LabelTable, NDArray[np.int64]]:
+        """Return a frame's annotations, their table as in the file, and the rows that are objects."""
+        image = self._entry(identifier)
+        data = image.file
+        rows = data.annotations.select(image.rows)
+        category = data.annotation_category[image.rows]
         frame = np.zeros(len(rows), np.int64)
         table = rows.to_table((identifier,), data.kinds, data.category_ids, frame, category, False)
-        ignore = np.array([bool(row.get("iscrowd") or row.get("ignore")) for row in rows.rows], np.bool_)
-        return rows, replace(table, ignore=ignore), np.flatnonzero(~ignore)
+        return rows, table, np.flatnonzero(~table.ignore)
 
     def labels(self, identifier: str) -> Labels:
         """Read the labels of one frame. Raises FormatError naming the annotation and its field."""
-        rows, table, objects = self._frame_annotations(identifier)
-        rows.select(objects.tolist()).check_scene()
+        image = self._entry(identifier)
+        _, table, _ = self._frame_annotations(identifier)
+        path = image.file.paths[image.index]
+        if path is not None and isfile(path):
+            size_wh = self._size_wh(image)
+            table = replace(table, boxes=turn_boxes(table.boxes, read_turn(path, size_wh), size_wh))
+        usable = (table.truncation >= 0) & (table.truncation <= 1)
+        table = replace(
+            table,
+            truncation=np.where(usable, table.truncation, -1.0),
+            occlusion=np.where(np.isin(table.occlusion, range(4)), table.occlusion, -1),
+        )
         places = enumerate(zip(table.boxes.tolist(), table.ignore.tolist(), strict=True))
         first = first_occurrences(tuple(box) if ignored else i for i, (box, ignored) in places)
         return table.select(first).to_labels()
 
     def frame(self, identifier: str) -> Frame:
-        """Read one frame: photograph, camera, labels, and masks (M, H, W) if every object has a segmentation.
+        """Read one frame: photograph, camera, labels, and masks (M, H, W) if every object has a valid segmentation.
 
-        Raises FormatError naming file and field: a missing image or one of another size, an invalid camera, a
-        segmentation that does not decode.
+        Raises FormatError naming file and field: a missing image or one of another size, an invalid camera.
         """
         entry = self._entry(identifier)
-        path, record = entry.file.path, entry.record
-        size_hw = (record["height"], record["width"])
-        image = read_upright(entry.path, size_hw)
-        camera, camera_provenance = self._camera(entry)
+        path = entry.require_path()
+        size_wh = self._size_wh(entry)
+        orientation = read_turn(path, size_wh)
+        width, height = size_wh if orientation == 1 else size_wh[::-1]
+        image = read_upright(path)
+        if image.shape[:2] != (height, width):
+            raise FormatError(str(path), f"{width}x{height} px", f"{image.shape[1]}x{image.shape[0]} px")
+        if orientation == 1:
+            camera, camera_provenance = self._camera(entry, path, height, width)
+        else:  # a camera would be of the stored image
+            focal = read_focal_length(path, self.focal_px)
+            camera, camera_provenance = pinhole_camera(height, width, focal.length_px), {"focal": str(focal)}
         labels = self.labels(identifier)
         rows, _, objects = self._frame_annotations(identifier)
-        rows = rows.select(objects.tolist())
+        outlines = [rows.rows[i].get("segmentation") for i in objects.tolist()]
         masks = None
-        if all(row.get("segmentation") for row in rows.rows):
-            masks = torch.zeros(len(rows), camera.height, camera.width)
-            for i, row in enumerate(rows.rows):
-                mask = _decode_mask(rows.locate(i, "segmentation"), row["segmentation"], masks[i].shape)
-                masks[i] = torch.from_numpy(mask)
+        if all(outlines):
+            try:
+                decoded = [_decode_mask(identifier, outline, size_wh[::-1]) for outline in outlines]
+                masks = torch.zeros(len(decoded), height, width)
+                for i, mask in enumerate(decoded):
+                    masks[i] = torch.from_numpy(turn_pixels(mask, orientation))
+            except FormatError:
+                pass  # masks are unknown; `account` counts their outlines
         return Frame(
             identifier=identifier,
             photograph=to_tensor(image),
@@ -422,18 +509,27 @@ class CocoDataset(FrameIndex[_CocoImage]):
             masks=masks,
             provenance={
                 "dataset": "coco",
-                "image": str(record["file_name"]),
-                "folder": path.name,
+                "image": str(entry.record["file_name"]),
+                "folder": entry.file.path.name,
                 **camera_provenance,
             },
         )
 
-    def _camera(self, entry: _CocoImage) -> tuple[Camera, dict[str, str]]:
-        """Return the camera of an image and its provenance."""
+    def _camera(self, entry: _CocoImage, path: Path, height: int, width: int) -> tuple[Camera, dict[str, str]]:
+        """Return the camera of an image and its provenance.
+
+        Args:
+            entry: The image.
+            path: Its file.
+            height: Height, px.
+            width: Width, px.
+
+        Raises:
+            FormatError: An invalid camera.
+        """
         record, where = entry.record, f"{entry.file.path}: {entry.record['file_name']}"
-        height, width = record["height"], record["width"]
         if "camera" not in record:
-            focal = read_focal_length(entry.path, self.focal_px)
+            focal = read_focal_length(path, self.focal_px)
             return pinhole_camera(height, width, focal.length_px), {"focal": str(focal)}
         camera = record["camera"] if isinstance(record["camera"], dict) else {}
         if "projection" in camera:
@@ -451,12 +547,27 @@ class CocoDataset(FrameIndex[_CocoImage]):
             raise FormatError(f"{where}: {error.field}", error.expected, error.actual) from error
 
 
-def _find_image_folder(path: Path) -> Path:
-    """Find the images of an annotation file; see `CocoDataset`."""
-    part = path.stem.removeprefix("instances_")
-    root = path.parent.parent if path.parent.name == "annotations" else path.parent
-    candidates = (root / "images" / part, root / part, root / "images")
-    return next((folder for folder in candidates if folder.is_dir()), path.parent)
+def _is_broken(segmentation: Any, size_hw: Sequence[int]) -> bool:
+    """Whether a segmentation is no outline, by its form; run lengths are not decoded."""
+    if isinstance(segmentation, dict):
+        return segmentation.get("size") != list(size_hw) or not segmentation.get("counts")
+    try:
+        _check_polygons("", segmentation, size_hw)
+    except FormatError:
+        return True
+    return False
+
+
+def _check_polygons(where: str, segmentation: Any, size_hw: Sequence[int]) -> None:
+    """Raise FormatError unless a segmentation is a list of polygons of three or more corners near the image."""
+    if not isinstance(segmentation, list):
+        raise FormatError(
+            where, f"polygons, or run lengths of {size_hw[1]}x{size_hw[0]} px", type(segmentation).__name__
+        )
+    for i, polygon in enumerate(segmentation):
+        corners = parse_numbers(f"{where}[{i}]", polygon, len(polygon) if isinstance(polygon, list) else 6)
+        if len(corners) < 6 or len(corners) % 2 or max(map(abs, corners)) > 2 * max(size_hw):
+            raise FormatError(f"{where}[{i}]", "x and y of three or more corners", json.dumps(polygon)[:60])
 
 
 def _decode_runs(counts: str) -> list[int]:
@@ -486,16 +597,11 @@ def _decode_mask(where: str, segmentation: Any, size_hw: Sequence[int]) -> np.nd
     """Decode a mask (H, W) uint8 of run lengths, compressed or not, or of polygons. Raises FormatError."""
     height, width = size_hw
     counts: Any = None
-    if isinstance(segmentation, list):
-        for i, polygon in enumerate(segmentation):
-            corners = parse_numbers(f"{where}[{i}]", polygon, len(polygon) if isinstance(polygon, list) else 6)
-            if len(corners) < 6 or len(corners) % 2 or max(map(abs, corners)) > 2 * max(height, width):
-                raise FormatError(f"{where}[{i}]", "x and y of three or more corners", json.dumps(polygon)[:60])
-        counts = _decode_counts(run_length.merge(run_length.frPyObjects(segmentation, height, width)))
-    elif isinstance(segmentation, dict) and segmentation.get("size") == [height, width]:
+    if isinstance(segmentation, dict) and segmentation.get("size") == [height, width]:
         counts = segmentation.get("counts")
     else:
-        raise FormatError(where, f"polygons, or run lengths of {width}x{height} px", json.dumps(segmentation)[:60])
+        _check_polygons(where, segmentation, size_hw)
+        counts = _decode_counts(run_length.merge(run_length.frPyObjects(segmentation, height, width)))
     try:
         runs = np.array(_decode_runs(counts) if isinstance(counts, str) else counts, dtype=np.int64)
     except (ValueError, TypeError, OverflowError) as error:

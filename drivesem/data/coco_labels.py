@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from os.path import isfile  # False for names that are too long or have a NUL
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.label_table import REGION, LabelTable
 from scene_ir import files
 from scene_ir.errors import FormatError
 
-_FOLDER_OR_HIDDEN = re.compile(r"[/\\:]|^\.")
-"""Matches file names that are more than a stem and a suffix."""
+_UNUSUAL_NAME = re.compile(r"[\\:]|^/|(^|/)\.\.?(/|$)")
+"""Matches file names that are no plain relative paths: URLs, absolute ones, with backslashes, or with ".."."""
+_OTHER_TASKS = ("person_keypoints_", "captions_", "stuff_", "panoptic_", "image_info_")
+"""Beginnings of the names of COCO's annotation files without boxes of all objects."""
+_HEAD_BYTES = 1 << 16
+_DATASET_START = re.compile(rb'"(images|annotations|categories)"\s*:\s*\[|"labels"\s*:\s*\{')
+"""Matches the first keys of a data set's file; results are a list."""
+_ORIENTATION = 0x0112
+"""EXIF's tag of the orientation."""
 Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _MAX_VALUE = 2**31
 """Exclusive limit of occlusions, box coordinates and image sides."""
@@ -105,15 +117,20 @@ class JsonRows:
         values = self.values(key)
         return np.array(values, np.str_) if values and set(map(type, values)) == {str} else self.integers(key)
 
-    def unique_ids(self, key: str) -> Ids:
-        """Return ids as `ids`, each unique."""
-        ids = self.ids(key)
-        seen: set[int | str] = set()
-        for i, value in enumerate(ids.tolist()):
-            if value in seen:
-                raise FormatError(self.locate(i, key), "a unique id", value)
-            seen.add(value)
-        return ids
+    def drop_repeated(self, repairs: Counter[str]) -> JsonRows:
+        """Drop entries that the list has twice, and count them.
+
+        Raises FormatError naming two different entries with one id.
+        """
+        first: dict[int | str, int] = {}
+        for i, value in enumerate(self.ids("id").tolist()):
+            if self.rows[first.setdefault(value, i)] != self.rows[i]:
+                found = f"{value}, as {self.locate(first[value], 'id')}"
+                raise FormatError(self.locate(i, "id"), "a unique id", found)
+        if len(first) == len(self):
+            return self
+        repairs["entries that are given twice"] += len(self) - len(first)
+        return self.select(list(first.values()))
 
     def column(self, key: str, missing: float | None) -> NDArray[np.float64]:
         """Return finite numbers (N,) of a key, `missing` if a row has none; None: each row must have one."""
@@ -188,25 +205,46 @@ class JsonRows:
         return index
 
     def pose(self, i: int) -> list[float]:
-        """Return length, height, width, x, y, z, yaw; NaN if missing. Raises FormatError for another project's pose."""
-        pose, where = self.rows[i].get("pose"), self.locate(i, "pose")
-        if pose is None:
-            return [math.nan] * 7
+        """Return length, height, width, x, y, z, yaw; NaN if missing, or of another form."""
+        pose = self.rows[i].get("pose")
         if not isinstance(pose, dict):
-            raise FormatError(where, "translation, yaw and size_lhw", json.dumps(pose)[:60])
-        translation = parse_numbers(f"{where}.translation", pose.get("translation"), 3)
-        yaw = parse_numbers(f"{where}.yaw", [pose.get("yaw")], 1)
-        size_lhw = parse_numbers(f"{where}.size_lhw", pose.get("size_lhw"), 3)
-        if min(size_lhw) <= 0:
-            raise FormatError(f"{where}.size_lhw", "positive metres", size_lhw)
-        return [*size_lhw, *translation, *yaw]
-
-    def pose_or_nan(self, i: int) -> list[float]:
-        """Return the pose; NaN for another project's."""
+            return [math.nan] * 7
+        where = self.locate(i, "pose")
         try:
-            return self.pose(i)
+            size_lhw = parse_numbers(where, pose.get("size_lhw"), 3)
+            position = parse_numbers(where, pose.get("translation"), 3)
+            values = [*size_lhw, *position, *parse_numbers(where, [pose.get("yaw")], 1)]
         except FormatError:
             return [math.nan] * 7
+        return values if min(values[:3]) > 0 else [math.nan] * 7
+
+    def is_numeric(self, key: str) -> bool:
+        """Whether a key has numbers only; it may be missing."""
+        return {type(row.get(key)) for row in self.rows} <= {int, float, type(None)}
+
+    def regions(self) -> NDArray[np.bool_]:
+        """Return which rows (N,) are crowds or regions to ignore.
+
+        pycocotools overwrites "ignore" by "iscrowd"; here both are regions.
+        """
+        return np.array([bool(row.get("iscrowd") or row.get("ignore")) for row in self.rows], np.bool_)
+
+    def count_unusable(self) -> dict[str, int]:
+        """Count the values that a scene cannot use, and which it takes for unknown."""
+        keys = set().union(*self.rows)
+        counts: dict[str, int] = {}
+        if "truncation" in keys:
+            bad = (row.get("truncation") for row in self.rows)
+            counts["truncations outside [0, 1]"] = sum(
+                v not in (None, -1) and not (type(v) in (int, float) and 0 <= v <= 1) for v in bad
+            )
+        if "occlusion" in keys:
+            bad = (row.get("occlusion") for row in self.rows)
+            counts["occlusions other than 0 to 3"] = sum(v not in (None, -1, 0, 1, 2, 3) for v in bad)
+        if "pose" in keys:
+            given = (i for i, row in enumerate(self.rows) if row.get("pose") is not None)
+            counts["3D boxes that cannot be used"] = sum(math.isnan(self.pose(i)[0]) for i in given)
+        return {name: count for name, count in counts.items() if count}
 
     def to_table(
         self,
@@ -238,10 +276,12 @@ class JsonRows:
         boxes = self.boxes()
         area = np.full(len(self), np.nan) if scored else column("area")
         numbers = self.values("id") if "id" in keys else []
-        names = [] if scored else sorted(keys - _TABLE_COLUMNS)
+        texts = {key for key in ("truncation", "occlusion", "alpha") if not self.is_numeric(key)}
+        names = [] if scored else sorted((keys - _TABLE_COLUMNS) | texts)
+        keys -= texts
         pose = np.full((len(self), 7), np.nan)
         if "pose" in keys:
-            pose[:] = [self.pose_or_nan(i) for i in range(len(self))]
+            pose[:] = [self.pose(i) for i in range(len(self))]
         return LabelTable.from_columns(
             frames,
             kinds,
@@ -249,9 +289,7 @@ class JsonRows:
             kind,
             boxes,
             "xywh",
-            ignore=np.array(list(map(bool, self.values("iscrowd"))), np.bool_)
-            if "iscrowd" in keys
-            else np.zeros(len(self), np.bool_),
+            ignore=self.regions() if keys & {"iscrowd", "ignore"} else np.zeros(len(self), np.bool_),
             score=self.column("score", None) if scored else np.full(len(self), np.nan),
             truncation=column("truncation", -1.0),
             occlusion=self.flags("occlusion", -1) if "occlusion" in keys else np.full(len(self), -1),
@@ -262,19 +300,6 @@ class JsonRows:
             kind_ids=kind_ids,
             extra={name: self.values(name) for name in names},
         )
-
-    def check_scene(self) -> None:
-        """Raise FormatError for a truncation, an occlusion or a pose that a scene cannot use."""
-        for i, row in enumerate(self.rows):
-            truncation, occlusion = row.get("truncation"), row.get("occlusion")
-            if (
-                truncation is not None
-                and not 0 <= parse_numbers(self.locate(i, "truncation"), [truncation], 1)[0] <= 1
-            ):
-                raise FormatError(self.locate(i, "truncation"), "[0, 1]", truncation)
-            if occlusion is not None and (type(occlusion) is not int or not 0 <= occlusion <= 3):
-                raise FormatError(self.locate(i, "occlusion"), "0, 1, 2 or 3", json.dumps(occlusion))
-            self.pose(i)
 
 
 _TABLE_COLUMNS = {
@@ -287,52 +312,478 @@ _TABLE_COLUMNS = {
 class AnnotationFile:
     """A data set's file: images and categories sorted by id, annotations in file order, each with both.
 
-    Raises FormatError for a file that is not of this form.
+    Repeated ids of annotations are numbered anew, and categories of one name are one class; `repairs` counts them.
+
+    Args:
+        path: The file.
+        content: Its content.
+        split: Name of the split, by which its images are found; by default the file's, without "instances_".
+
+    Raises:
+        FormatError: Not of this form; two entries with one id, or images with one file name, that differ.
     """
 
-    def __init__(self, path: Path, content: Any) -> None:
+    def __init__(self, path: Path, content: Any, split: str | None = None) -> None:
         if not isinstance(content, dict):
             found = "a list (of results?)" if isinstance(content, list) else type(content).__name__
             raise FormatError(str(path), "images, annotations and categories", found)
         self.path = path
+        self.split = path.stem.removeprefix("instances_") if split is None else split
+        self.repairs: Counter[str] = Counter()
         tables = {
             n: JsonRows.from_list(f"{path}: {n}", content.get(n)) for n in ("images", "categories", "annotations")
         }
-        self.images, self.image_ids = _sort_by_id(tables["images"], tables["images"].unique_ids("id"))
-        tables["categories"].unique_ids("id")
-        self.categories, self.category_ids = _sort_by_id(tables["categories"], tables["categories"].integers("id"))
-        self.kinds = [str(row.get("name", row["id"])) for row in self.categories.rows]
-        self.annotations = tables["annotations"]
+        self.images, self.image_ids = _sort_by_id(tables["images"].drop_repeated(self.repairs))
+        tables["categories"].integers("id")
+        categories, category_ids = _sort_by_id(tables["categories"].drop_repeated(self.repairs))
+        categories.check_texts("name")
+        self.annotations = self._number_anew(tables["annotations"])
+        self._check_file_names()
+        self.annotation_image = self.annotations.indices("image_id", self.image_ids, "images")
+        category = self.annotations.indices("category_id", category_ids, "categories")
+        self._merge_categories(
+            [str(row.get("name", row["id"])) for row in categories.rows], category_ids, category
+        )
+        self._find_images()
+
+    def _number_anew(self, rows: JsonRows) -> JsonRows:
+        """Give annotations whole numbers that no other one has, where they repeat one."""
+        numbers = [row["id"] for row in rows.rows if type(row.get("id")) is int]
+        if len(set(numbers)) == len(numbers):
+            return rows
+        following, seen, renewed = max(numbers) + 1, set[int](), list(rows.rows)
+        for i, row in enumerate(renewed):
+            number = row.get("id")
+            if type(number) is int and number in seen:
+                renewed[i] = {**row, "id": following}
+                following += 1
+                self.repairs["annotation ids numbered anew"] += 1
+            elif type(number) is int:
+                seen.add(number)
+        return replace(rows, rows=renewed)
+
+    def _merge_categories(self, names: Sequence[str], ids: Ids, category: NDArray[np.int64]) -> None:
+        """Make one class of the categories of one name; its id is the first one with annotations."""
+        used = set(category.tolist())
+        chosen: dict[str, int] = {}
+        for i in sorted(range(len(names)), key=lambda i: (i not in used, i)):
+            chosen.setdefault(names[i], i)
+        order = sorted(chosen.values())
+        place = {names[i]: k for k, i in enumerate(order)}
+        self.kinds, self.category_ids = [names[i] for i in order], ids[order]
+        self.annotation_category = np.array([place[name] for name in names], np.int64)[category]
+        others = sorted(set(range(len(names))) - set(order))
+        self.merged_ids = {int(ids[i]): place[names[i]] for i in others}
+        """Index of the class by the id of a category that was merged into it."""
+        if others:
+            self.repairs["categories merged into another of their name"] += len(others)
+
+    def _check_file_names(self) -> None:
         self.images.check_texts("file_name")
+        first: dict[str, int] = {}
         for i, name in enumerate(self.images.values("file_name")):
             if name and name[-1] in "./" and not Path(name).name:
                 raise FormatError(self.images.locate(i, "file_name"), "the name of a file", json.dumps(name))
-        self.categories.check_texts("name")
-        self.annotation_image = self.annotations.indices("image_id", self.image_ids, "images")
-        self.annotation_category = self.annotations.indices("category_id", self.category_ids, "categories")
+            if name and first.setdefault(name, i) != i:
+                found = f"{name!r}, as {self.images.locate(first[name], 'file_name')}"
+                raise FormatError(self.images.locate(i, "file_name"), "a unique name", found)
 
-    def frame_names(self) -> list[str]:
-        """Return the images' names in a table: those of their files, or their ids if file names are not unique."""
-        names = [frame_identifier(row) for row in self.images.rows]
-        return names if len(set(names)) == len(names) else [str(i) for i in self.image_ids.tolist()]
+    def _find_images(self) -> None:
+        """Find the folder of the images, and each image in it."""
+        base = self.path.parent.parent if self.path.parent.name == "annotations" else self.path.parent
+        places = (base / "images" / self.split, base / self.split, base / "images", base / "data", base)
+        folders = [folder for folder in places if folder.is_dir()]
+        names = [name or "" for name in self.images.values("file_name")]
 
-    def file_names(self) -> dict[int, str]:
-        """Return the images' file names by index; an image may have none."""
-        return {i: name for i, name in enumerate(self.images.values("file_name")) if name}
+        def has_images(folder: Path) -> bool:
+            return any(isfile(found) for name in names if (found := _resolve_name(name, folder, base)))
+
+        self.folder = next(filter(has_images, folders), folders[0])
+        """Folder of the images."""
+        self.paths = [_resolve_name(name, self.folder, base) for name in names]
+        """Path of each image, which may be missing; None without a name, or where it leads out of the data set."""
+        found = zip(names, self.paths, strict=True)
+        changed = sum(path is not None and path != os.path.join(self.folder, name) for name, path in found)
+        if changed:
+            self.repairs["file names found by their ending, or with backslashes"] += changed
+        first: dict[str, int] = {}
+        for i, path in enumerate(self.paths):
+            if path is not None and first.setdefault(path, i) != i:
+                found = f"{path}, as {self.images.locate(first[path], 'file_name')}"
+                raise FormatError(self.images.locate(i, "file_name"), "another image", found)
+
+    def relative_names(self) -> list[str]:
+        """Return the images' paths below their folder, with "/"; "" without a file name."""
+        relative = [name or "" for name in self.images.values("file_name")]
+        for i, (name, path) in enumerate(zip(relative, self.paths, strict=True)):
+            if path is None:
+                relative[i] = (_split_name(name) or [""])[-1]
+            elif path != os.path.join(self.folder, name):
+                inside = os.path.relpath(path, self.folder)
+                relative[i] = os.path.basename(path) if inside.startswith("..") else inside.replace(os.sep, "/")
+        return relative
+
+    def sizes_wh(self) -> NDArray[np.int64]:
+        """Return the sizes of the images (F, 2) px: those of the file, else of the upright images, else 0."""
+        sizes = np.stack([self.images.flags(key, 0) for key in ("width", "height")], axis=1)
+        for i in np.flatnonzero((sizes <= 0).any(axis=1)).tolist():
+            path = self.paths[i]
+            sizes[i] = read_upright_size(path) if path is not None and isfile(path) else 0
+        return sizes
+
+    def attributes(self, i: int) -> dict[str, Any]:
+        """Return the attributes of an image."""
+        values = self.images.rows[i].get("attributes")
+        return values if isinstance(values, dict) else {}
+
+    def to_table(self, frames: Sequence[str], scored: bool) -> LabelTable:
+        """Convert the annotations to columns, sorted by frame. frames: Names of the images."""
+        rows, images = self.annotations, self.images.rows
+        table = rows.to_table(
+            frames, self.kinds, self.category_ids, self.annotation_image, self.annotation_category, scored
+        )
+        exported = {i: {"drivesem": row["drivesem"]} for i, row in enumerate(images) if "drivesem" in row}
+        attributes = {i: self.attributes(i) for i in range(len(images))}
+        return replace(
+            _merge_regions(table.select(np.argsort(table.frame, kind="stable"))),
+            sizes_wh=self.sizes_wh(),
+            image_ids=self.image_ids,
+            merged_kind_ids=self.merged_ids,
+            cameras={i: row["camera"] for i, row in enumerate(images) if "camera" in row},
+            image_files={i: name for i, name in enumerate(self.relative_names()) if name},
+            frame_attributes={i: a | exported.get(i, {}) for i, a in attributes.items() if a or i in exported},
+        )
 
 
-def _sort_by_id(rows: JsonRows, ids: Ids) -> tuple[JsonRows, Any]:
+def _split_name(name: str) -> list[str]:
+    """Split a file name, absolute or not, or a URL into folders and name."""
+    if "://" in name:
+        name = unquote(urlsplit(name).path)
+    return [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
+
+
+def _resolve_name(name: str, folder: Path, base: Path) -> str | None:
+    """Find the image that a file names.
+
+    Args:
+        name: Its "file_name": a path, or a URL, of which the last part counts. "\\" separates folders where no such
+            file exists.
+        folder: Folder of the images.
+        base: Folder of the data set; nothing outside is found.
+
+    Returns:
+        The path, of a file that may be missing; None if there is no name, or it leads out of the data set.
+    """
+    if not name or "\0" in name:
+        return None
+    path = os.path.join(folder, name)
+    if not _UNUSUAL_NAME.search(name) or (not os.path.isabs(name) and ".." not in name and isfile(path)):
+        return path
+    parts = _split_name(name)
+    if not parts:
+        return None
+    if "://" in name:
+        return os.path.join(folder, parts[-1]) if parts[-1] != ".." else None
+    absolute = re.match(r"[/\\]|[A-Za-z]:[/\\]", name) is not None
+    if absolute or ".." in parts:
+        inside = os.path.abspath(name if absolute else os.path.join(folder, *parts))
+        if Path(inside).is_relative_to(base.absolute()) and isfile(inside):
+            return os.path.normpath(os.path.join(folder, os.path.relpath(inside, folder)))
+    if ".." in parts:
+        return None
+    endings = [os.path.join(folder, *parts[k:]) for k in range(len(parts) if absolute else 1)]
+    return next((path for path in endings if isfile(path)), None if absolute else endings[0])
+
+
+def _sort_by_id(rows: JsonRows) -> tuple[JsonRows, Any]:
+    ids = rows.ids("id")
     order = np.argsort(ids, kind="stable")
     return rows.select(order.tolist()), ids[order]
 
 
-def list_annotation_files(path: Path) -> list[Path]:
-    """List the annotation files of a folder, or the file itself."""
-    return [path] if path.is_file() else sorted((path / "annotations").glob("instances_*.json"))
+def is_dataset_file(path: Path) -> bool:
+    """Whether a JSON file begins as a data set: an object with images, annotations, categories or labels."""
+    if not isfile(path):
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{") and _DATASET_START.search(head) is not None
+
+
+def find_annotation_files(path: Path) -> dict[Path, str]:
+    """Find the annotation files of a data set, and their splits; a file is one itself.
+
+    They are annotations/instances_SPLIT.json, else annotations/SPLIT.json, else SPLIT.json, or one in each folder
+    SPLIT (such as train/_annotations.coco.json).
+    """
+    if path.is_file():
+        return {path: path.stem.removeprefix("instances_")}
+    files_there = sorted(file for file in (path / "annotations").glob("[!.]*.json") if file.is_file())
+    instances = [file for file in files_there if file.name.startswith("instances_")]
+    if instances:
+        return {file: file.stem.removeprefix("instances_") for file in instances}
+    for found in (files_there, sorted(path.glob("[!.]*.json"))):
+        others = [file for file in found if not file.name.startswith(_OTHER_TASKS) and is_dataset_file(file)]
+        if others:
+            return {file: file.stem for file in others}
+    found = sorted(path.glob("[!.]*/[!.]*.json"))
+    return {
+        file: file.parent.name for file in found if file.parent.name != "annotations" and is_dataset_file(file)
+    }
+
+
+class CocoFiles:
+    """The annotation files of a data set.
+
+    A frame's identifier is its file name without suffix; if some are alike, its path below the folders of the images.
+
+    Args:
+        root: Folder, see `find_annotation_files`, or one file.
+
+    Raises:
+        FormatError: There is no such file; as `AnnotationFile`.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        found = find_annotation_files(root)
+        if not found:
+            expected = "a COCO folder, with annotations/instances_*.json, or such a file (--root FILE.json)"
+            raise FormatError(str(root), expected, "neither")
+        for path in found:
+            if not files.read_bytes(path).strip():
+                raise FormatError(str(path), "COCO annotations or results", "an empty file")
+        self.parts = [AnnotationFile(path, _read_content(path), split) for path, split in found.items()]
+        self.names = self._name_frames()
+        """Identifiers of the images of each file."""
+
+    def _name_frames(self) -> list[list[str]]:
+        common = os.path.commonpath([os.path.abspath(part.folder) for part in self.parts])
+        starts = [os.path.relpath(os.path.abspath(part.folder), common) for part in self.parts]
+        paths: list[list[str]] = []
+        for part, start in zip(self.parts, starts, strict=True):
+            start = "" if start == "." else f"{start.replace(os.sep, '/')}/"
+            ids = map(str, part.image_ids.tolist())
+            relative = part.relative_names()
+            paths.append([start + name if name else number for name, number in zip(relative, ids, strict=True)])
+        stems = [[os.path.splitext(name.rpartition("/")[2])[0] for name in names] for names in paths]
+        for names in (stems, [[os.path.splitext(name)[0] for name in part] for part in paths], paths):
+            alike = [name for name, count in Counter(name for part in names for name in part).items() if count > 1]
+            if not alike:
+                return names
+        where = next(f"{part.path}" for part, names in zip(self.parts, paths, strict=True) if alike[0] in names)
+        raise FormatError(where, "images that differ in their names", f"{alike[0]!r} twice")
+
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Identifiers by split, if there are several files."""
+        joined: dict[str, tuple[str, ...]] = {}
+        for part, names in zip(self.parts, self.names, strict=True) if len(self.parts) > 1 else ():
+            joined[part.split] = (*joined.get(part.split, ()), *names)
+        return joined
+
+    def account(self, repairs: Mapping[str, int] | None = None) -> DataAccount:
+        """Account for all files and annotations. repairs: Further ones."""
+        existing = [os.path.abspath(path) for part in self.parts for path in part.paths if path and isfile(path)]
+        counted = Counter(repairs or {})
+        classes: Counter[str] = Counter()
+        regions = unlabelled = 0
+        for part in self.parts:
+            counted.update(part.repairs)
+            counted.update(part.annotations.count_unusable())
+            ignored = part.annotations.regions()
+            counts = np.bincount(part.annotation_category[~ignored], minlength=len(part.kinds)).tolist()
+            classes.update({name: count for name, count in zip(part.kinds, counts, strict=True) if count})
+            regions += int(ignored.sum())
+            unlabelled += len(part.images) - len(np.unique(part.annotation_image))
+        count, skipped = 1, {}
+        if self.root.is_dir() or existing:
+            root = Path(os.path.abspath(self.root if self.root.is_dir() else self.parts[0].folder))
+            read = [*existing, *(os.path.abspath(part.path) for part in self.parts)]
+            reasons = {
+                f"{path}": "annotations of another task, or not named instances_*"
+                for path in (root / "annotations").glob("*.json")
+            }
+            count, skipped = account_for_files(root, read, reasons)
+        splits = self.splits()
+        frames = sum(map(len, self.names))
+        return DataAccount(
+            "coco",
+            frames,
+            count,
+            skipped,
+            dict(classes),
+            regions,
+            unlabelled,
+            frames - len(existing),
+            {name: len(names) for name, names in splits.items()},
+            repairs=dict(counted),
+        )
+
+    def to_table(self, scored: bool) -> LabelTable:
+        """Convert all files to one table."""
+        tables = [part.to_table(names, scored) for part, names in zip(self.parts, self.names, strict=True)]
+        table = tables[0] if len(tables) == 1 else _join_tables(tables)
+        position = {name: i for i, name in enumerate(table.frames)}
+        splits = {name: [position[frame] for frame in frames] for name, frames in self.splits().items()}
+        return replace(table, splits=splits, account=self.account())
+
+
+def _read_content(path: Path) -> Any:
+    """Read a data set's file; FiftyOne's own form is converted."""
+    content = files.read_json(path)
+    if isinstance(content, dict) and isinstance(content.get("labels"), dict) and "annotations" not in content:
+        from drivesem.data.fiftyone import to_coco
+
+        return to_coco(path, content)
+    return content
+
+
+def _join_tables(tables: Sequence[LabelTable]) -> LabelTable:
+    """Join tables of different frames. Ids that are not unique, or differ between the tables, are dropped."""
+    kinds = list(dict.fromkeys(kind for table in tables for kind in table.kinds))
+    starts = np.cumsum([0, *(len(table.frames) for table in tables)]).tolist()
+    numbers: dict[str, set[int]] = {}
+    for table in tables:
+        for kind, number in zip(table.kinds, (table.kind_ids if table.kind_ids is not None else []), strict=True):
+            numbers.setdefault(kind, set()).add(int(number))
+    known = len(numbers) == len(kinds) and all(len(ids) == 1 for ids in numbers.values())
+    kind_ids = [next(iter(numbers[kind])) for kind in kinds] if known else []
+    names = sorted({name for table in tables for name in table.extra})
+    columns = ("boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area", "sizes_wh")
+    maps = ("cameras", "image_files", "frame_attributes")
+    parts = list(zip(tables, starts, strict=False))
+
+    def unique(values: Sequence[Any]) -> Any:
+        if any(value is None for value in values) or len({value.dtype.kind for value in values}) > 1:
+            return None
+        joined = np.concatenate(values)
+        return joined if len(np.unique(joined)) == len(joined) else None
+
+    return replace(
+        tables[0],
+        frames=tuple(name for table in tables for name in table.frames),
+        kinds=tuple(kinds),
+        frame=np.concatenate([table.frame + start for table, start in parts]),
+        kind=np.concatenate(
+            [np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind] for table in tables]
+        ),
+        **{name: np.concatenate([getattr(table, name) for table in tables]) for name in columns},
+        image_ids=unique([table.image_ids for table in tables]),
+        box_ids=unique([table.box_ids for table in tables]),
+        kind_ids=np.array(kind_ids, np.int64) if known and len(set(kind_ids)) == len(kinds) else None,
+        merged_kind_ids={},
+        extra={
+            name: [v for table in tables for v in table.extra.get(name, [None] * len(table))] for name in names
+        },
+        **{
+            name: {i + start: value for table, start in parts for i, value in getattr(table, name).items()}
+            for name in maps
+        },
+    )
+
+
+def read_orientation(path: str | Path) -> int:
+    """Read EXIF's orientation of an image, 1 to 8; 1 if there is none, or no file."""
+    if not isfile(path):
+        return 1
+    if str(path).lower().endswith((".jpg", ".jpeg", ".png")):  # faster than to parse the header
+        with open(path, "rb") as stream:
+            head = stream.read(_HEAD_BYTES)
+        if b"Exif\0\0" not in head and b"eXIf" not in head:
+            return 1
+    return _read_header(path)[0]
+
+
+def read_upright_size(path: str | Path) -> tuple[int, int]:
+    """Read width and height of the upright image from its header. Raises FormatError."""
+    orientation, width, height = _read_header(path)
+    return (height, width) if orientation > 4 else (width, height)
+
+
+def _read_header(path: str | Path) -> tuple[int, int, int]:
+    """Read an image's orientation, width and height, as stored. Raises FormatError."""
+    from PIL import Image
+
+    with files.open_image(Path(path)) as image:
+        orientation = Image.Image.getexif(image).get(_ORIENTATION)  # PNG's own method would decode all pixels
+        return (orientation if orientation in range(1, 9) else 1, *image.size)
+
+
+def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:
+    """Return the orientation by which an image's labels must be turned, 5 to 8; 1 if they are upright.
+
+    Args:
+        path: The image.
+        size_wh: Its size in the annotation file. Labels are of stored pixels where only the stored image has this
+            size; where both have it, they are of the upright image.
+    """
+    if path is None or size_wh[0] == size_wh[1] or read_orientation(path) < 5:
+        return 1
+    orientation, width, height = _read_header(path)
+    return orientation if (width, height) == tuple(size_wh) else 1
+
+
+def turn_points(points: NDArray[np.float64], orientation: int, size_wh: Sequence[int]) -> NDArray[np.float64]:
+    """Turn points (..., 2) of COCO's pixels upright.
+
+    Args:
+        points: Points of the stored image.
+        orientation: EXIF's, 5 to 8; 1 changes nothing.
+        size_wh: Size of the stored image.
+    """
+    x, y, (width, height) = points[..., 0], points[..., 1], size_wh
+    turned = {5: (y, x), 6: (height - y, x), 7: (height - y, width - x), 8: (y, width - x)}
+    return np.stack(turned.get(orientation, (x, y)), axis=-1)
+
+
+def turn_boxes(boxes: NDArray[np.float64], orientation: int, size_wh: Sequence[int]) -> NDArray[np.float64]:
+    """Turn boxes (N, 4), left, top, width, height, upright; see `turn_points`."""
+    corners = np.stack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+    corners = turn_points(corners, orientation, size_wh)
+    low = corners.min(axis=1)
+    return np.concatenate([low, corners.max(axis=1) - low], axis=1)
+
+
+def turn_upright(table: LabelTable, images: Mapping[str, Path]) -> LabelTable:
+    """Turn the boxes, outlines and sizes of those frames that refer to the stored pixels of a turned image.
+
+    Outlines that are run lengths, cameras and keypoints of turned frames are dropped.
+
+    Args:
+        table: Labels of a COCO data set.
+        images: Images by frame identifier.
+
+    Returns:
+        The table, of upright images.
+    """
+    boxes, sizes_wh, cameras = table.boxes.copy(), table.sizes_wh.copy(), dict(table.cameras)
+    extra = {name: list(values) for name, values in table.extra.items()}
+    for i, rows in enumerate(table.rows_by_frame()):
+        size_wh = sizes_wh[i].tolist()
+        orientation = read_turn(images.get(table.frames[i]), size_wh)
+        if orientation == 1:
+            continue
+        boxes[rows.start : rows.stop] = turn_boxes(boxes[rows.start : rows.stop], orientation, size_wh)
+        sizes_wh[i] = size_wh[::-1]
+        cameras.pop(i, None)
+        for row in rows:
+            for name in ("segmentation", "keypoints"):
+                if name in extra:
+                    extra[name][row] = _turn_outline(extra[name][row], orientation, size_wh)
+    return replace(table, boxes=boxes, sizes_wh=sizes_wh, cameras=cameras, extra=extra)
+
+
+def _turn_outline(polygons: Any, orientation: int, size_wh: Sequence[int]) -> Any:
+    """Turn polygons; None for other outlines."""
+    try:
+        flat = [np.array(polygon, np.float64).reshape(-1, 2) for polygon in polygons]
+        return [turn_points(points, orientation, size_wh).ravel().tolist() for points in flat] or None
+    except (ValueError, TypeError):
+        return None
 
 
 def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable:
-    """Read labels or detections of a data set's file, or of the folder with one.
+    """Read labels or detections of a data set, in the pixels of its files; see `turn_upright`.
 
     Args:
         path: File or folder.
@@ -345,28 +796,9 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
     Raises:
         FormatError: Names the file and the entry.
     """
-    paths = list_annotation_files(path)
-    if len(paths) != 1:
-        raise FormatError(str(path), "one COCO file (name it)", ", ".join(p.name for p in paths) or "none")
-    path = paths[0]
-    if not files.read_bytes(path).strip():
-        raise FormatError(str(path), "COCO annotations or results", "an empty file")
-    content = files.read_json(path)
-    if isinstance(content, list) and scored:
-        return _read_results(path, content, truth)
-    data = AnnotationFile(path, content)
-    frames = data.frame_names()
-    sizes_wh = np.stack([data.images.flags(key, 0) for key in ("width", "height")], axis=1)
-    table = data.annotations.to_table(
-        frames, data.kinds, data.category_ids, data.annotation_image, data.annotation_category, scored
-    )
-    return replace(
-        _merge_regions(table.select(np.argsort(table.frame, kind="stable"))),
-        sizes_wh=sizes_wh,
-        image_ids=data.image_ids,
-        cameras={i: row["camera"] for i, row in enumerate(data.images.rows) if "camera" in row},
-        image_files=data.file_names(),
-    )
+    if scored and path.is_file() and files.read_bytes(path).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"[":
+        return _read_results(path, files.read_json(path), truth)
+    return CocoFiles(path).to_table(scored)
 
 
 def _merge_regions(table: LabelTable) -> LabelTable:
@@ -394,21 +826,19 @@ def _read_results(path: Path, content: list[Any], truth: LabelTable | None) -> L
     if truth is None:
         raise FormatError(str(path), "labels for a list of results", "none")
     if truth.kind_ids is None:
-        raise FormatError(str(path), "categories (a COCO data set), as the labels are no COCO file", "a list")
+        raise FormatError(
+            str(path), "labels of one COCO file, to which the ids of a list of results refer", "others"
+        )
+    if not content:
+        raise FormatError(str(path), "at least one detection", "an empty list")
     image_ids: Ids | None = truth.image_ids
     if image_ids is None:
         image_ids = np.array([int(name) if name.isdecimal() else -1 for name in truth.frames], np.int64)
     rows = JsonRows.from_list(str(path), content)
     frame = rows.indices("image_id", image_ids, "images")
-    kind = rows.indices("category_id", truth.kind_ids, "categories")
+    merged = truth.merged_kind_ids
+    ids = np.concatenate([truth.kind_ids, np.array(list(merged), np.int64)])
+    classes = np.array([*range(len(truth.kinds)), *merged.values()], np.int64)
+    kind = classes[rows.indices("category_id", ids, "categories")]
     table = rows.to_table(truth.frames, truth.kinds, truth.kind_ids, frame, kind, True)
     return replace(table.select(np.argsort(table.frame, kind="stable")), image_ids=truth.image_ids)
-
-
-def frame_identifier(row: Mapping[str, Any]) -> str:
-    """Return an image's name: its file name without suffix, folders joined by "_", or its id."""
-    name = row.get("file_name")
-    if name and not _FOLDER_OR_HIDDEN.search(name):
-        stem, _, suffix = name.rpartition(".")
-        return stem if stem and suffix else name
-    return "_".join(Path(str(name)).with_suffix("").parts) if name else str(row["id"])

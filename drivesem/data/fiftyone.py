@@ -1,4 +1,4 @@
-"""FiftyOne's layout of detection data sets, `data/NAME.png` and `labels.json`: writer of label tables.
+"""FiftyOne's layout of detection data sets, `data/NAME.png` and `labels.json`: reader, and writer of label tables.
 
 Format: docs.voxel51.com, "FiftyOneImageDetectionDataset": `classes`, and under `labels` for each image's name
 without suffix a list of `label` (an index into the classes), `bounding_box` (left, top, width, height as shares of
@@ -13,8 +13,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from drivesem.data.account import IMAGE_SUFFIXES
 from drivesem.data.label_table import REGION, LabelTable, WriteSummary, copy_images, is_known_pose
 from scene_ir import files
+from scene_ir.errors import FormatError
 
 
 def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> WriteSummary:
@@ -51,7 +53,8 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
 def _detection(table: LabelTable, row: int, frame: int) -> dict[str, Any]:
     left, top, wide, high = table.boxes[row].tolist()
     width, height = table.sizes_wh[frame].tolist()
-    frame_attributes = table.frame_attributes.get(frame, {})
+    frame_attributes = dict(table.frame_attributes.get(frame, {}))
+    frame_attributes |= frame_attributes.pop("drivesem", {})
     score, pose = float(table.score[row]), table.pose[row].tolist()
     attributes: dict[str, Any] = {
         "truncation": _none_if_unknown(float(table.truncation[row])),
@@ -73,3 +76,40 @@ def _detection(table: LabelTable, row: int, frame: int) -> dict[str, Any]:
 def _none_if_unknown(value: float) -> float | None:
     """Return None for -1, the mark of unknown values."""
     return None if value < 0 else value
+
+
+def to_coco(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the content of a `labels.json` to COCO's form; boxes become px of the images in `data`.
+
+    Raises FormatError for another form, and a labelled image that is missing.
+    """
+    from drivesem.data.coco_labels import read_upright_size
+
+    classes = content.get("classes")
+    if not isinstance(classes, list):
+        raise FormatError(f"{path}: classes", "a list of names", type(classes).__name__)
+    there = (file for file in (path.parent / "data").rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
+    paths = {file.relative_to(path.parent / "data").with_suffix("").as_posix(): file for file in there}
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for name, objects in content["labels"].items():
+        where = f"{path}: labels.{name}"
+        if name not in paths:
+            raise FormatError(where, f"an image in {path.parent / 'data'}", "none")
+        width, height = read_upright_size(paths[name])
+        file_name = paths[name].relative_to(path.parent / "data").as_posix()
+        images.append({"id": len(images) + 1, "file_name": file_name, "width": width, "height": height})
+        for row in objects or []:
+            try:
+                left, top, wide, high = map(float, row["bounding_box"])
+                label = range(len(classes))[row["label"]]
+            except (TypeError, ValueError, KeyError, IndexError) as error:
+                raise FormatError(
+                    where, "label, a class number, and bounding_box, 4 shares", str(error)
+                ) from error
+            box = [left * width, top * height, wide * width, high * height]
+            entry = {"image_id": len(images), "category_id": label, "bbox": box, **(row.get("attributes") or {})}
+            entry |= {"score": row["confidence"]} if "confidence" in row else {}
+            annotations.append({"id": len(annotations) + 1, **entry})
+    categories = [{"id": i, "name": str(name)} for i, name in enumerate(classes)]
+    return {"images": images, "annotations": annotations, "categories": categories}

@@ -93,6 +93,8 @@ class LabelTable:
     """COCO's ids of the boxes (N,)."""
     kind_ids: NDArray[np.int64] | None = None
     """COCO's ids of `kinds`."""
+    merged_kind_ids: Mapping[int, int] = field(default_factory=dict)
+    """Index of a kind by the id of another COCO category of its name."""
     extra: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     """Further columns (N,) by name; None where a box has no value."""
     cameras: Mapping[int, Any] = field(default_factory=dict)

@@ -129,7 +129,7 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_p
 
 
 _CONTENTS = {
-    "coco": "annotations/instances_*.json, or such a file itself",
+    "coco": "annotations/instances_*.json, one JSON file with images or in each split's folder, or such a file itself",
     "kitti": "training/image_2, label_2 and calib",
     "vkitti1": "vkitti_1.3.1_rgb and similar folders",
     "vkitti2": "Scene01 and similar folders",

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from drivesem.config.errors import UsageError
+from drivesem.data.coco_labels import turn_upright
 from drivesem.data.kitti import read_calibration
 from drivesem.data.kitti_labels import TYPES, find_label_folder, read_label_files
 from drivesem.data.label_table import REGION, LabelTable, WriteSummary, make_camera_entry, shortest_decimals
@@ -78,10 +79,12 @@ def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> Wri
         table = _turn_unsupported_into_regions(table, settings)
     image_paths = match_images([settings.images], table.frames) if settings.images is not None else {}
     if settings.images is None and (
-        settings.copy_images or (not table.sizes_wh.all() and settings.size_wh is None)
+        layout == "coco" or settings.copy_images or (not table.sizes_wh.all() and settings.size_wh is None)
     ):
         find = find_counterexamples if layout == "run" else partial(find_images, layout=layout)
         image_paths = find(source, frames=table.frames)
+    if layout == "coco":
+        table = turn_upright(table, image_paths)
     if settings.size_wh is not None:
         table = replace(table, sizes_wh=np.tile(np.array(settings.size_wh, np.int64), (len(table.frames), 1)))
     elif not table.sizes_wh.all() and settings.to_format in ("coco", "yolo", "fiftyone"):
@@ -180,7 +183,7 @@ def read_training_labels(run: Path, frames: Sequence[str] | None = None) -> Labe
         extra={**table.extra, "failure": failure},
         cameras={i: make_camera_entry(load_camera(folder / "scene").matrix) for i, folder in enumerate(folders)},
         image_files={i: f"{name}/{COUNTEREXAMPLE}" for i, name in enumerate(names)},
-        frame_attributes={i: provenance(run, result) for i, result in enumerate(results)},
+        frame_attributes={i: {"drivesem": provenance(run, result)} for i, result in enumerate(results)},
     )
 
 

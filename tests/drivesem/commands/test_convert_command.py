@@ -269,13 +269,54 @@ def test_images_below_folders_are_found_by_name_and_none_outside(
     content["images"][0]["file_name"] = "day/1.jpg"
     source.write_text(json.dumps(content))
     convert(source, "--to", "yolo", "--copy-images", "--out", tmp_path / "yolo")
-    assert (tmp_path / "yolo/images/train/day_1.jpg").is_file()
-    for name in ("../val/000001.jpg", str(two_parts / "images/val/000001.jpg"), f"{'x' * 300}.jpg"):
+    (copied,) = (tmp_path / "yolo/images").rglob("*1.jpg")
+    assert copied.read_bytes() == (two_parts / "images/train/day/1.jpg").read_bytes()
+    outside = tmp_path / "000001.jpg"
+    outside.write_bytes(copied.read_bytes())
+    for name in ("../../../000001.jpg", str(outside), f"{'x' * 300}.jpg"):
         content["images"][0]["file_name"] = name
         source.write_text(json.dumps(content))
         words = [str(source), "--to", "yolo", "--copy-images", "--out", str(tmp_path / "none")]
         assert main(["convert", *words]) == 2
         assert "--copy-images: expected an image of each of 1 frames, found 0" in capsys.readouterr().err
+
+
+def test_a_file_with_splits_is_written_with_its_splits_names_and_attributes(
+    convert: Convert, two_parts: Path, tmp_path: Path
+):
+    for part, weather in (("train", "rainy"), ("val", "clear")):
+        source = two_parts / f"annotations/instances_{part}.json"
+        content = json.loads(source.read_text())
+        content["images"][0] |= {"attributes": {"weather": weather}, "file_name": "day/1.jpg"}
+        (two_parts / f"images/{part}/day").mkdir()
+        (two_parts / f"images/{part}/000001.jpg").rename(two_parts / f"images/{part}/day/1.jpg")
+        source.write_text(json.dumps(content))
+    assert "nothing lost" in convert(two_parts, "--to", "coco", "--copy-images", "--out", tmp_path / "out")
+    for part in ("train", "val"):
+        path = f"annotations/instances_{part}.json"
+        written, content = (json.loads((root / path).read_text()) for root in (tmp_path / "out", two_parts))
+        for row in (*written["images"], *content["images"], *content["annotations"], *written["annotations"]):
+            row.pop("id")
+            row.pop("image_id", None)
+            row.pop("area", None)
+        assert written["images"] == content["images"]
+        assert written["annotations"] == content["annotations"]
+        copy, image = (root / "images" / part / "day/1.jpg" for root in (tmp_path / "out", two_parts))
+        assert copy.read_bytes() == image.read_bytes()
+    assert "split of 2" in convert(two_parts, "--to", "coco", "--out", tmp_path / "a.json")
+
+
+def test_classes_of_coco_follow_those_of_yolo(convert: Convert, tmp_path: Path):
+    root = tmp_path / "yolo"
+    (root / "images/train").mkdir(parents=True)
+    (root / "labels/train").mkdir(parents=True)
+    Image.new("RGB", (100, 60)).save(root / "images/train/a.jpg")
+    (root / "labels/train/a.txt").write_text("1 0.5 0.5 0.2 0.2\n")
+    (root / "data.yaml").write_text("train: images/train\nval: images/train\nnames: [Pedestrian, Car]\n")
+    convert(root, "--to", "coco", "--out", tmp_path / "a.json")
+    content = json.loads((tmp_path / "a.json").read_text())
+    assert [(row["id"], row["name"]) for row in content["categories"]] == [(1, "Pedestrian"), (2, "Car")]
+    assert content["annotations"][0]["category_id"] == 2
 
 
 def test_names_of_images_that_stay_where_they_are(convert: Convert, two_parts: Path, tmp_path: Path):

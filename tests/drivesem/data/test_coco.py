@@ -5,6 +5,7 @@ import io
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,20 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageOps
 from pycocotools import mask as run_length
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from drivesem.data import coco, coco_labels
-from drivesem.data.classes import COCO_ROAD_USERS
+from drivesem.data import coco, coco_labels, fiftyone
+from drivesem.data.account import DataAccount
 from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.label_table import coco_to_xyxy, shortest_decimals, xyxy_to_coco
+from drivesem.data.layouts import detect_layout
 from drivesem.data.registry import WRITERS, open_dataset
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import to_uint8
-from scene_ir.types import Category
 
 LABEL_FIELDS = ("boxes_xyxy", "truncation", "occlusion", "translation", "yaw", "size_lhw", "ignore_xyxy")
 
@@ -236,12 +237,6 @@ def test_a_file_from_elsewhere(tmp_path: Path) -> None:
     frame = coco.CocoDataset(tmp_path, focal_px=70.0).frame("000000000139")
     assert frame.camera.intrinsics.tolist() == [[70, 0, 39.5], [0, 70, 19.5], [0, 0, 1]]
     assert frame.masks is None  # the chair has no outline
-    road = coco.CocoDataset(tmp_path, focal_px=70.0, kinds=COCO_ROAD_USERS.classes).frame("000000000139")
-    assert road.labels is not None
-    assert road.labels.kind == ("car",)
-    assert road.masks is not None
-    assert 180 <= int(road.masks.sum()) <= 231
-    assert COCO_ROAD_USERS.targets(road.labels).labels.tolist() == [Category.CAR, 0]
 
 
 def texts(content: dict[str, Any]) -> dict[str, Any]:
@@ -289,12 +284,17 @@ IMAGE = {"id": 139, "file_name": "000000000139.png", "height": 40, "width": 80}
 BAD_FILES = [
     ({"images": 3}, "json: images: expected a list, found int"),
     (
-        {"images": [{"id": 139, "height": 4, "width": 8}]},
-        r"json: images\[0\]\.file_name: expected a value, found none",
+        {"images": [IMAGE, IMAGE | {"width": 9}]},
+        r"images\[1\]\.id: expected a unique id, found 139, as .*\[0\]\.id",
     ),
-    ({"images": [IMAGE | {"height": 0}]}, r"images\[0\]\.height: expected a positive integer, found 0"),
-    ({"images": [IMAGE, IMAGE]}, r"images\[1\]\.id: expected a unique id, found 139"),
-    ({"images": [IMAGE, IMAGE | {"id": 200}]}, r"images\[1\]\.file_name: expected a unique name"),
+    (
+        {"images": [IMAGE, IMAGE | {"id": 200}]},
+        r"images\[1\]\.file_name: expected a unique name, .*\[0\]\.file_name",
+    ),
+    (
+        {"images": [IMAGE, IMAGE | {"id": 200, "file_name": "/x/000000000139.png"}]},
+        r"images\[1\]\.file_name: expected another image, .*\[0\]\.file_name",
+    ),
     (annotation(image_id="gone"), r"annotations\[0\]\.image_id: expected a whole number, found null"),
     (annotation(image_id=3), r"annotations\[0\]\.image_id: expected ids of the 1 images, found 1 others \(3\)"),
     (
@@ -317,19 +317,6 @@ BAD_ANNOTATIONS = [
     ({"bbox": [1, 2, "3", 4]}, "bbox: expected x, y, width, height"),
     ({"bbox": [1, 2, -1, 4]}, "bbox: expected numbers below 2,147,483,648, width and height of at least 0"),
     ({"bbox": [1, 2, 3, 1e308]}, "bbox: expected numbers below 2,147,483,648, width and height of at least 0"),
-    ({"truncation": 2}, r"truncation: expected \[0, 1\], found 2"),
-    ({"occlusion": 0.5}, "occlusion: expected 0, 1, 2 or 3, found 0.5"),
-    ({"pose": 3}, "pose: expected translation, yaw and size_lhw, found 3"),
-    ({"pose": POSE | {"yaw": None}}, "pose.yaw: expected 1 finite numbers"),
-    ({"pose": POSE | {"size_lhw": [4, 0, 2]}}, "pose.size_lhw: expected positive metres"),
-    ({"segmentation": [[1, 2, 3, 4]]}, r"segmentation\[0\]: expected x and y of three or more corners"),
-    ({"segmentation": [[1, 2, 3, 4, 1e9, 3]]}, r"segmentation\[0\]: expected x and y of three or more corners"),
-    ({"segmentation": [3]}, r"segmentation\[0\]: expected 6 finite numbers, found 3"),
-    ({"segmentation": {"size": [4, 5], "counts": ""}}, "segmentation: expected polygons, or run .* 80x40 px"),
-    ({"segmentation": {"size": [40, 80], "counts": [1, 2]}}, "counts: expected runs that fill 3200 px, found 3"),
-    ({"segmentation": {"size": [40, 80], "counts": "041"}}, "counts: expected runs that fill 3200 px, found 5"),
-    ({"segmentation": {"size": [40, 80], "counts": "P"}}, "counts: expected run lengths, found a number that is"),
-    ({"segmentation": {"size": [40, 80]}}, "counts: expected run"),
 ]
 
 
@@ -339,6 +326,54 @@ def test_a_bad_annotation_is_named(changes: dict[str, Any], message: str, tmp_pa
     with pytest.raises(FormatError, match=rf"json: annotations\[0\]\.?.*{message}") as caught:
         dataset.frame("000000000139")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "segmentation",
+    [
+        [[1, 2, 3, 4]],
+        [[1, 2, 3, 4, 1e9, 3]],
+        [3],
+        "x",
+        {"size": [4, 5], "counts": "a"},
+        {"size": [40, 80], "counts": [1, 2]},
+        {"size": [40, 80], "counts": "041"},
+        {"size": [40, 80], "counts": "P"},
+        {"size": [40, 80]},
+    ],
+)
+def test_a_broken_outline_costs_the_masks_alone(segmentation: Any, tmp_path: Path) -> None:
+    dataset = coco.CocoDataset(foreign(tmp_path, **annotation(segmentation=segmentation)), focal_px=70.0)
+    frame = dataset.frame("000000000139")
+    assert frame.masks is None
+    assert frame.labels is not None
+    assert frame.labels.boxes_xyxy.tolist() == [[9.5, 4.5, 29.5, 14.5]]
+    decoded = isinstance(segmentation, dict) and segmentation["size"] == [40, 80] and segmentation.get("counts")
+    broken = {} if decoded else {"outlines that are broken (no masks of their frames)": 1}
+    assert dataset.account().repairs == broken
+
+
+@pytest.mark.parametrize(
+    ("changes", "repair"),
+    [
+        ({"truncation": 2}, "truncations outside [0, 1]"),
+        ({"truncation": "half"}, "truncations outside [0, 1]"),
+        ({"occlusion": 0.5}, "occlusions other than 0 to 3"),
+        ({"occlusion": 9}, "occlusions other than 0 to 3"),
+        ({"pose": 3}, "3D boxes that cannot be used"),
+        ({"pose": POSE | {"yaw": None}}, "3D boxes that cannot be used"),
+        ({"pose": POSE | {"size_lhw": [4, 0, 2]}}, "3D boxes that cannot be used"),
+    ],
+)
+def test_values_that_a_scene_cannot_use_are_unknown(changes: dict[str, Any], repair: str, tmp_path: Path) -> None:
+    path = foreign(tmp_path, **annotation(**changes))
+    dataset = coco.CocoDataset(path)
+    labels = dataset.labels("000000000139")
+    assert dataset.account().repairs == {repair: 1}
+    assert math.isnan(labels.yaw[0])
+    assert math.isnan(labels.truncation[0])
+    assert labels.occlusion.tolist() == [3] if "occlusion" in changes and changes["occlusion"] == 9 else True
+    assert len(coco_labels.read_table(path, False, None)) == 1
 
 
 @pytest.mark.parametrize(
@@ -391,31 +426,219 @@ def test_regions_are_of_the_object_they_lie_on(make_exposure: Callable[..., Expo
     assert coco._region_kinds([5, 12, 24, 23], tracked_objects) == tuple(coco.CATEGORIES)  # the car has a label
 
 
-@given(st.text(st.sampled_from("ab. /\\:"), min_size=1, max_size=7))
-def test_a_frame_is_called_as_its_file_without_suffix(name: str) -> None:
-    try:
-        record = "_".join(Path(name).with_suffix("").parts)
-    except ValueError:
-        with pytest.raises(ValueError, match="empty name"):
-            coco_labels.frame_identifier({"file_name": name})
-        return
-    assert coco_labels.frame_identifier({"file_name": name}) == record
+CORNER_BOX = {5: [0, 0, 2, 4], 6: [38, 0, 2, 4], 7: [38, 76, 2, 4], 8: [0, 76, 2, 4]}
+"""Where the stored box [0, 0, 4, 2] of an 80x40 image lies after it was turned upright, by orientation."""
 
 
-@pytest.mark.parametrize(
-    ("orientation", "size_wh", "turned"), [(3, (80, 40), 2), (6, (40, 80), 3), (6, (80, 40), 0)]
-)
-def test_images_are_upright_unless_the_file_has_the_stored_size(
-    orientation: int, size_wh: tuple[int, int], turned: int, tmp_path: Path
-) -> None:
-    record = IMAGE | {"width": size_wh[0], "height": size_wh[1]}
-    path = foreign(tmp_path, images=[record], annotations=[])
+@pytest.mark.parametrize("stored", [True, False])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_boxes_and_masks_turn_with_their_image(orientation: int, stored: bool, tmp_path: Path) -> None:
+    turned = orientation > 4
+    upright_wh = (40, 80) if turned else (80, 40)
+    size_wh = (80, 40) if stored else upright_wh
     exif = Image.Exif()
     exif[0x0112] = orientation
-    pixels = np.random.default_rng(0).integers(0, 256, (40, 80, 3)).astype(np.uint8)
+    pixels = np.zeros((40, 80, 3), np.uint8)
+    pixels[:2, :4] = 255
+    # where the size is that of the upright image, so is the box
+    upright = np.asarray(ImageOps.exif_transpose(_with_orientation(pixels, orientation)))[..., 0] > 0
+    rows, columns = np.nonzero(upright)
+    corner = [int(columns.min()), int(rows.min()), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1]
+    if turned:
+        assert corner == CORNER_BOX[orientation]
+    x, y, w, h = box = [0, 0, 4, 2] if stored and turned else corner
+    mask = np.zeros(size_wh[::-1], np.bool_)
+    mask[y : y + h, x : x + w] = True
+    path = foreign(
+        tmp_path,
+        images=[IMAGE | {"width": size_wh[0], "height": size_wh[1]}],
+        **annotation(bbox=box, segmentation=coco._encode_mask(mask)),
+    )
     Image.fromarray(pixels).save(tmp_path / "val2017" / IMAGE["file_name"], exif=exif)
     frame = coco.CocoDataset(path).frame("000000000139")
-    assert np.array_equal(to_uint8(frame.photograph), np.rot90(pixels, turned))
+    assert frame.labels is not None
+    assert frame.masks is not None
+    assert frame.labels.boxes_xyxy[0].tolist() == coco_to_xyxy(np.array(corner, float)).tolist()
+    assert np.array_equal(frame.masks[0].numpy() > 0, upright)
+    assert np.array_equal(to_uint8(frame.photograph)[..., 0] > 0, upright)
+    table = coco_labels.turn_upright(
+        coco_labels.read_table(path, False, None), coco.find_images(path, ["000000000139"])
+    )
+    assert table.boxes.tolist() == [corner]
+    assert table.sizes_wh.tolist() == [list(upright_wh)]
+
+
+def _with_orientation(pixels: np.ndarray, orientation: int) -> Image.Image:
+    image = Image.fromarray(pixels)
+    image.getexif()[0x0112] = orientation
+    return image
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "RGBA", "LA", "1"])
+def test_images_of_other_modes(mode: str, tmp_path: Path) -> None:
+    path = foreign(tmp_path)
+    image = Image.fromarray(np.full((40, 80, 3), 255, np.uint8)).convert(mode)
+    image.save(tmp_path / "val2017" / IMAGE["file_name"])
+    assert coco.CocoDataset(path).frame("000000000139").photograph.min() == 1
+
+
+def test_an_image_of_16_bits_is_refused(tmp_path: Path) -> None:
+    path = foreign(tmp_path)
+    Image.fromarray(np.zeros((40, 80), np.uint16)).save(tmp_path / "val2017" / IMAGE["file_name"])
+    with pytest.raises(FormatError, match=r"000000000139\.png: expected .*8") as caught:
+        coco.CocoDataset(path).frame("000000000139")
+    assert "\n" not in str(caught.value)
+
+
+def _write_layout(root: Path, images: dict[str, str], names: dict[str, str] | None = None) -> None:
+    """Write images, and annotation files with one box per image.
+
+    Args:
+        root: Folder of the data set.
+        images: Annotation file by image.
+        names: "file_name" by image; by default the name alone.
+    """
+    contents: dict[str, Any] = {}
+    for i, (image, file) in enumerate(images.items()):
+        path = root / image
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (80, 40), (i, 0, 0)).save(path)
+        content = contents.setdefault(
+            file, {"images": [], "annotations": [], "categories": [{"id": 3, "name": "car"}]}
+        )
+        name = (names or {}).get(image, path.name)
+        content["images"].append({"id": i, "file_name": name, "width": 80, "height": 40})
+        content["annotations"].append({"id": i, "image_id": i, "category_id": 3, "bbox": [i, 2, 10, 20]})
+    for file, content in contents.items():
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
+        (root / file).write_text(json.dumps(content))
+
+
+LAYOUTS = {
+    "one file": ({"images/a.jpg": "annotations.json", "images/b.JPG": "annotations.json"}, None),
+    "Label Studio": (
+        {"images/a.jpg": "result.json", "images/b.jpg": "result.json"},
+        {"images/a.jpg": "images/a.jpg", "images/b.jpg": "images\\b.jpg"},
+    ),
+    "absolute": (
+        {"images/a.jpg": "result.json", "images/s/b.jpg": "result.json"},
+        {"images/a.jpg": "/data/upload/1/a.jpg", "images/s/b.jpg": "C:\\x\\s\\b.jpg"},
+    ),
+    "URL": (
+        {"images/a.jpg": "r.json", "images/b.jpg": "r.json"},
+        {"images/a.jpg": "https://x.org/y/a.jpg?z=1", "images/b.jpg": "http://x.org/b.jpg"},
+    ),
+    "beside": ({"a.jpg": "coco.json", "b.jpg": "coco.json"}, None),
+    "Roboflow": (
+        {
+            f"{part}/{name}.jpg": f"{part}/_annotations.coco.json"
+            for part, name in (("train", "a"), ("valid", "b"))
+        },
+        None,
+    ),
+    "FiftyOne": ({"data/a.jpg": "labels.json", "data/b.jpg": "labels.json"}, None),
+    "annotations": ({f"{p}/{p}.jpg": f"annotations/{p}.json" for p in ("train", "val")}, None),
+    "sub-folders": (
+        {f"images/{p}/1.jpg": "annotations/instances_all.json" for p in ("x", "y")},
+        {f"images/{p}/1.jpg": f"{p}/1.jpg" for p in ("x", "y")},
+    ),
+    "parts": ({f"images/{p}/1.jpg": f"annotations/instances_{p}.json" for p in ("train", "val")}, None),
+}
+SPLITS = {"Roboflow": ["train", "valid"], "annotations": ["train", "val"], "parts": ["train", "val"]}
+IDENTIFIERS = {
+    "annotations": ("train", "val"),
+    "sub-folders": ("x/1", "y/1"),
+    "parts": ("train/1", "val/1"),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts(name: str, tmp_path: Path) -> None:
+    images, names = LAYOUTS[name]
+    _write_layout(tmp_path, images, names)
+    extra = ("README.txt", "images/more.png", "annotations/captions_train.json")
+    for path in extra:
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).write_text('{"annotations": [')
+    assert detect_layout(tmp_path) == "coco"
+    dataset = open_dataset("coco", tmp_path)
+    assert dataset.identifiers == IDENTIFIERS.get(name, ("a", "b"))
+    for i, identifier in enumerate(dataset.identifiers):
+        frame = dataset.frame(identifier)
+        assert to_uint8(frame.photograph)[0, 0, 0] in range(3)
+        assert frame.labels is not None
+        assert frame.labels.boxes_xyxy[0].tolist() == [i - 0.5, 1.5, i + 9.5, 21.5]
+    table = coco_labels.read_table(tmp_path, False, None)
+    assert (table.frames, table.boxes[:, 0].tolist()) == (dataset.identifiers, [0, 1])
+    assert sorted(table.splits) == sorted(dataset.splits()) == SPLITS.get(name, [])
+    for account in (dataset.account(), table.account):
+        assert account is not None
+        assert account.files + sum(account.skipped.values()) == sum(p.is_file() for p in tmp_path.rglob("*"))
+        assert sum(account.skipped.values()) == len(extra)
+        assert (account.frames, account.classes, account.without_image) == (2, {"car": 2}, 0)
+
+
+def test_accounts_count_every_row_and_repair(tmp_path: Path) -> None:
+    rows = [
+        {"id": 1, "image_id": 139, "category_id": 3, "bbox": [1, 2, 3, 4]},
+        {"id": 1, "image_id": 139, "category_id": 4, "bbox": [1, 2, 3, 4]},
+        {"id": 3, "image_id": 139, "category_id": 3, "bbox": [1, 2, 3, 4], "iscrowd": 1},
+        {"id": 4, "image_id": 139, "category_id": 3, "bbox": [1, 2, 3, 4], "ignore": 1},
+    ]
+    categories = [{"id": 3, "name": "car"}, {"id": 4, "name": "car"}, {"id": 5, "name": "bus"}]
+    other = IMAGE | {
+        "id": 7,
+        "file_name": "gone.png",
+        "attributes": {"weather": "rainy", "night": True, "boxes": []},
+    }
+    path = foreign(tmp_path, images=[IMAGE, IMAGE, other], annotations=rows, categories=categories)
+    table = coco_labels.read_table(path, False, None)
+    assert table.kinds == ("car", "bus")
+    assert table.box_ids is not None
+    assert table.box_ids.tolist() == [1, 5, 3, 4]
+    assert table.ignore.tolist() == [False, False, True, True]
+    dataset = coco.CocoDataset(path)
+    assert dataset.attributes("gone") == {"weather": "rainy", "night": "True"}
+    assert table.frame_attributes == {0: other["attributes"]}
+    expected = DataAccount("coco", 2, 1, {}, {"car": 2}, regions=2, unlabelled=1, without_image=1)
+    expected = replace(
+        expected,
+        repairs={
+            "entries that are given twice": 1,
+            "annotation ids numbered anew": 1,
+            "categories merged into another of their name": 1,
+        },
+    )
+    assert dataset.account() == table.account == expected
+    with pytest.raises(FormatError, match=r"gone\.png: expected a readable file"):
+        dataset.frame("gone")
+
+
+def test_sizes_come_from_the_images_where_the_file_has_none(tmp_path: Path) -> None:
+    path = foreign(tmp_path, images=[{"id": 139, "file_name": IMAGE["file_name"], "width": 0}])
+    assert coco_labels.read_table(path, False, None).sizes_wh.tolist() == [[80, 40]]
+    assert coco.CocoDataset(path).frame("000000000139").camera.width == 80
+
+
+@pytest.mark.parametrize("name", ["../../outside.png", "/outside.png", "a/../../../x.png"])
+def test_images_outside_of_the_data_set_are_not_opened(name: str, tmp_path: Path) -> None:
+    Image.new("RGB", (80, 40)).save(tmp_path / "outside.png")
+    path = foreign(tmp_path / "root", images=[IMAGE | {"file_name": name}])
+    dataset = coco.CocoDataset(path)
+    assert dataset.account().without_image == 1
+    with pytest.raises(FormatError, match=r"images\[0\]\.file_name: expected a file in "):
+        dataset.frame(dataset.identifiers[0])
+
+
+def test_fiftyone_reads_back(tmp_path: Path) -> None:
+    _write_layout(tmp_path / "in", LAYOUTS["one file"][0])
+    table = coco_labels.read_table(tmp_path / "in", False, None)
+    fiftyone.write_table(table, tmp_path / "out", coco.find_images(tmp_path / "in", table.frames))
+    assert detect_layout(tmp_path / "out") == "coco"
+    again = coco_labels.read_table(tmp_path / "out", False, None)
+    assert (again.frames, again.kinds) == (table.frames, table.kinds)
+    np.testing.assert_allclose(again.boxes, table.boxes, atol=1e-9)
+    assert coco.CocoDataset(tmp_path / "out").frame("b").labels is not None
 
 
 @pytest.mark.parametrize("name", [".", "/", "./"])

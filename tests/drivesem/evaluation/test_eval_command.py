@@ -137,11 +137,44 @@ def test_coco_stats_are_those_of_pycocotools(run: Run, tmp_path: Path, seed: int
     assert data["metrics"]["AP"] == pytest.approx(data["stats"][0], abs=1e-12)
 
 
-def test_coco_without_detections(run: Run, tmp_path: Path):
-    gt, pred, _ = _coco(tmp_path)
-    pred.write_text("[]")
-    code, data, _ = run("--gt", gt, "--pred", pred)
-    assert (code, data["stats"]) == (0, [0.0] * 12)
+def _repeat_ids(content: dict) -> None:
+    for row in content["annotations"]:
+        row["id"] = 1 + row["id"] % 4
+
+
+def _split_category(content: dict) -> None:
+    """Half of the trucks belong to a second category of their name; a third one is an unused parent."""
+    content["categories"] += [{"id": 9, "name": "truck"}, {"id": 0, "name": "car", "supercategory": "none"}]
+    for row in [row for row in content["annotations"] if row["category_id"] == 8][::2]:
+        row["category_id"] = 9
+
+
+def _break_outlines(content: dict) -> None:
+    for i, row in enumerate(content["annotations"]):
+        row["segmentation"] = [[[1, 2, 3, 4]], [], [[1, 2, 3]], None, "x"][i % 5]
+
+
+def _move_out(content: dict) -> None:
+    for row in content["annotations"][::3]:
+        row["bbox"][0] -= 400
+
+
+@pytest.mark.parametrize("change", [_repeat_ids, _split_category, _break_outlines, _move_out])
+def test_the_two_tables_agree_on_unusual_files(run: Run, tmp_path: Path, change: Callable[[dict], None]):
+    gt, pred, results = _coco(tmp_path)
+    content = json.loads(gt.read_text())
+    if change is _move_out:
+        change(content)
+        gt.write_text(json.dumps(content))
+    expected = _pycocotools(gt, results)  # of the file without the fault
+    if change is not _move_out:
+        change(content)
+        gt.write_text(json.dumps(content))
+    code, data, _ = run("--gt", gt, "--pred", pred, "--bootstrap", 0)
+    assert code == 0
+    assert data["stats"] == pytest.approx(expected, abs=1e-9)
+    assert data["metrics"]["AP"] == pytest.approx(data["stats"][0], abs=1e-12)
+    assert [row["class"] for row in data["classes"]] == ["car", "truck"]
 
 
 def test_one_set_in_three_layouts_gives_the_same_metrics(run: Run, kitti: tuple[Path, Path], tmp_path: Path):
@@ -271,6 +304,10 @@ def _broken(folder: Path, name: str) -> list[object]:
             detected.write_text(json.dumps([results[0] | {"score": float("nan")}]))
         elif name == "coco no score":
             detected.write_text(json.dumps([{k: v for k, v in results[0].items() if k != "score"}]))
+        elif name == "coco none":
+            detected.write_text("[]")
+        elif name == "coco texts":
+            detected.write_text(json.dumps([row | {"image_id": str(row["image_id"])} for row in results]))
         elif name == "coco empty":
             detected.write_text("")
         elif name == "coco no json":
@@ -301,6 +338,11 @@ def _broken(folder: Path, name: str) -> list[object]:
         ("coco NaN", r"\[0\]\.score: expected a finite number, found NaN"),
         ("coco no score", r"\[0\]\.score: expected a finite number, found null"),
         ("coco empty", r"pred\.json: expected COCO annotations or results, found an empty file"),
+        ("coco none", r"pred\.json: expected at least one detection, found an empty list"),
+        (
+            "coco texts",
+            r"pred\.json\[0\]\.image_id: expected whole numbers, as the ids of the images are, found \"",
+        ),
         ("coco no json", r"pred\.json:1:2: expected JSON"),
         ("coco box", r"\[0\]\.bbox: expected x, y, width, height"),
     ],
