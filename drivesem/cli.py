@@ -14,13 +14,14 @@ TOPICS = {
     "Find failures": ("attack", "drive", "classify"),
     "Validate and explain": ("verify", "confirm", "explain", "holes", "transfer"),
     "Improve": ("gate", "retrain", "train", "eval", "export"),
-    "Data and scenes": ("convert", "derender", "edit", "render", "view", "synth"),
+    "Data and scenes": ("inspect", "convert", "derender", "edit", "render", "view", "synth"),
     "Setup": ("check", "doctor", "bench", "report", "runs"),
 }
 """Every command, by purpose."""
 EXAMPLES = {
     "drivesem attack --combo 2": "attack the shipped detector on ten generated streets; needs no data",
     "drivesem attack --dataset kitti --root KITTI --limit 20 --out runs/a": "attack it on your photographs",
+    "drivesem inspect KITTI": "see what is read of your data, and what is not",
     "drivesem attack --config quick": "use a preset; --config list prints them",
     "drivesem explain runs/a": "find out why it fails",
     "drivesem export runs/a --to coco --out for-training": "turn the counterexamples into training data",
@@ -28,7 +29,7 @@ EXAMPLES = {
 _MODULES = {
     "analyses": ("confirm", "drive", "explain", "gate", "holes", "transfer"),
     "attack": ("attack", "report"),
-    "data": ("convert", "export"),
+    "data": ("convert", "export", "inspect"),
     "scenes": ("edit", "render"),
     "training": ("train", "retrain"),
 }

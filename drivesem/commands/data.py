@@ -1,22 +1,89 @@
-"""`drivesem convert` and `drivesem export`: labels and counterexamples in the formats of other tools."""
+"""`drivesem inspect`, `convert` and `export`: data sets, and labels in the formats of other tools."""
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from drivesem.config.commands import ConvertConfig, ExportConfig
+from rich.table import Table
+
+from drivesem.config.commands import ConvertConfig, ExportConfig, InspectConfig
 from drivesem.config.constraints import parse_class_map
 from drivesem.config.errors import UsageError
+from drivesem.config.options import DATASETS
+from drivesem.data.account import DataAccount, write_account
 from drivesem.data.label_table import WriteSummary
+from drivesem.data.layouts import detect_layout
+from drivesem.data.subsets import FrameFilter, open_selection
+from drivesem.report.drawing import write_picture
 from drivesem.report.tables import format_count, print_json
+from drivesem.report.terminal import Console
 from drivesem.run.conversion import ConversionSettings, convert_labels
 from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
 from drivesem.run.finished import load_runs
 from drivesem.run.labels import detect_labels_layout
+from drivesem.store import local_copy
+
+
+def inspect_command(config: InspectConfig) -> int:
+    """`drivesem inspect`: account for a data set, and draw some of its images."""
+    from drivesem.scenes.contact_sheet import draw_contact_sheet
+
+    root = local_copy(config.root)
+    layout = detect_layout(root) if config.dataset == "auto" else config.dataset
+    if layout is None:
+        raise UsageError(config.root, f"a data set as one of {', '.join(DATASETS)}", "none of them")
+    dataset = open_selection(layout, config.root, FrameFilter.from_options(config))
+    account = dataset.account()
+    if config.images:
+        write_picture(Path(config.out), draw_contact_sheet(dataset, config.images))
+    if config.json:
+        print_json({"data": write_account(account), "sheet": config.out if config.images else None})
+        return 0
+    write_account(account)
+    console = Console()
+    for table in _account_tables(account):
+        console.print(table)
+    if config.images:
+        console.print(f"contact sheet: {config.out}", soft_wrap=True)
+    return 0
+
+
+def _account_tables(account: DataAccount) -> list[Table]:
+    """Make tables of classes and of files."""
+    classes = _make_table(f"{account.layout}: classes", ("class", "use", "boxes"))
+    for role, rows in account.by_role().items():
+        for name, count in sorted(rows.items(), key=lambda row: -row[1]):
+            classes.add_row(name, role, f"{count:,}")
+    if account.regions:
+        classes.add_row("crowds and regions", "ignored", f"{account.regions:,}")
+    table = _make_table("files", ("", "number"))
+    table.add_row("images", f"{account.frames:,}")
+    table.add_row("files read", f"{account.files:,}")
+    counts = {
+        **{f"split {name}": count for name, count in account.splits.items()},
+        "images without labels": account.unlabelled,
+        "labels without image": account.without_image,
+        **{f"skipped: {reason}": count for reason, count in account.skipped.items()},
+        **{f"repaired: {what}": count for what, count in account.repairs.items()},
+    }
+    for name, count in counts.items():
+        if count:
+            table.add_row(name, f"{count:,}")
+    for key in account.unused_keys:
+        table.add_row(f"key not used: {key}", "")
+    return [classes, table]
+
+
+def _make_table(title: str, columns: Sequence[str]) -> Table:
+    """Make an empty table with its numbers, in the last column, on the right."""
+    table = Table(title=title, title_justify="left")
+    for name in columns:
+        table.add_column(name, justify="right" if name == columns[-1] else "left")
+    return table
 
 
 def convert_command(config: ConvertConfig) -> int:

@@ -580,6 +580,20 @@ class CheckConfig(TileOption, DeviceOption, CommandConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
+class InspectConfig(FrameFilterOptions, CommandConfig):
+    """Show what is read of a data set: files, classes, splits, and a contact sheet."""
+
+    root: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ROOT")]
+    """Folder or URL of the data set, or its COCO or YOLO file."""
+    dataset: Annotated[str, OneOf(("auto", *DATASETS))] = "auto"
+    """Layout: kitti, vkitti1, vkitti2, coco, yolo, voc, bdd100k; auto detects it."""
+    images: NotNegative = 12
+    """Number of images on the contact sheet, evenly spaced; 0 for no sheet."""
+    out: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "contact-sheet.jpg"
+    """File of the contact sheet, JPEG or PNG; an existing one is replaced."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ConvertConfig(CommandConfig):
     """Convert labels between formats."""
 
@@ -884,6 +898,7 @@ COMMANDS: dict[str, type[CommandConfig]] = {
     "train": TrainConfig,
     "eval": EvalConfig,
     "export": ExportConfig,
+    "inspect": InspectConfig,
     "convert": ConvertConfig,
     "derender": DerenderConfig,
     "edit": EditConfig,
