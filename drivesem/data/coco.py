@@ -242,7 +242,7 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     table.require_sizes("coco")
     table = table.with_box_format("xywh")
     single = out.suffix.lower() == ".json"
-    split_of = {} if single else {i: name for name, rows in reversed(table.splits.items()) for i in rows}
+    split_of = {} if single else {i: name for name, rows in reversed([*table.splits.items()]) for i in rows}
     parts: dict[str, list[int]] = {name: [] for name in table.splits} if split_of else {}
     for i in range(len(table.frames)):
         parts.setdefault(split_of.get(i, "rest" if split_of else "all"), []).append(i)
@@ -296,7 +296,8 @@ def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]
         numbers: list[int] = table.kind_ids.tolist()
         categories = list(zip(table.kinds, numbers, strict=True))
     else:
-        of_kitti = table.account is not None and table.account.layout in _KITTI_LAYOUTS
+        of_run = table.account is None and any("drivesem" in values for values in table.frame_attributes.values())
+        of_kitti = of_run or (table.account is not None and table.account.layout in _KITTI_LAYOUTS)
         of_kitti = of_kitti and set(table.kinds) <= set(CATEGORIES)
         categories = [(kind, i + 1) for i, kind in enumerate(CATEGORIES if of_kitti else table.kinds)]
         numbers = [dict(categories)[kind] for kind in table.kinds]
@@ -328,6 +329,7 @@ def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]
 
 
 _KITTI_LAYOUTS = ("kitti", "vkitti1", "vkitti2")
+"""Layouts with KITTI's types, whose ids are CATEGORY_IDS, as those of runs."""
 
 
 def _row_annotation(table: LabelTable, row: int) -> dict[str, Any]:
@@ -426,7 +428,7 @@ class CocoDataset(FrameIndex[_CocoImage]):
             width, height = sizes[id(image.file)][image.index]
             for row in image.rows:
                 segmentation = image.file.annotations.rows[row].get("segmentation")
-                broken += bool(segmentation) and _is_broken(segmentation, (height, width))
+                broken += bool(segmentation) and height > 0 and _is_broken(segmentation, (height, width))
         return self._files.account(
             {"outlines that are broken (no masks of their frames)": broken} if broken else {}
         )
@@ -440,8 +442,8 @@ class CocoDataset(FrameIndex[_CocoImage]):
     def _size_wh(self, image: _CocoImage) -> list[int]:
         """Return the size that the file states, else that of the upright image."""
         size = [image.record.get(key) for key in ("width", "height")]
-        good = all(type(value) in (int, float) and value > 0 for value in size)
-        return [int(v) for v in size if v] if good else list(read_upright_size(image.require_path()))
+        known = [int(value) for value in size if isinstance(value, int | float) and value > 0]
+        return known if len(known) == 2 else list(read_upright_size(image.require_path()))
 
     def _frame_annotations(self, identifier: str) -> tuple[JsonRows, LabelTable, NDArray[np.int64]]:
         """Return a frame's annotations, their table as in the file, and the rows that are objects."""
@@ -551,6 +553,8 @@ def _is_broken(segmentation: Any, size_hw: Sequence[int]) -> bool:
     """Whether a segmentation is no outline, by its form; run lengths are not decoded."""
     if isinstance(segmentation, dict):
         return segmentation.get("size") != list(size_hw) or not segmentation.get("counts")
+    if not isinstance(segmentation, list):
+        return True
     try:
         _check_polygons("", segmentation, size_hw)
     except FormatError:
@@ -558,12 +562,8 @@ def _is_broken(segmentation: Any, size_hw: Sequence[int]) -> bool:
     return False
 
 
-def _check_polygons(where: str, segmentation: Any, size_hw: Sequence[int]) -> None:
-    """Raise FormatError unless a segmentation is a list of polygons of three or more corners near the image."""
-    if not isinstance(segmentation, list):
-        raise FormatError(
-            where, f"polygons, or run lengths of {size_hw[1]}x{size_hw[0]} px", type(segmentation).__name__
-        )
+def _check_polygons(where: str, segmentation: Sequence[Any], size_hw: Sequence[int]) -> None:
+    """Raise FormatError unless polygons have three or more corners near the image."""
     for i, polygon in enumerate(segmentation):
         corners = parse_numbers(f"{where}[{i}]", polygon, len(polygon) if isinstance(polygon, list) else 6)
         if len(corners) < 6 or len(corners) % 2 or max(map(abs, corners)) > 2 * max(size_hw):
@@ -597,11 +597,13 @@ def _decode_mask(where: str, segmentation: Any, size_hw: Sequence[int]) -> np.nd
     """Decode a mask (H, W) uint8 of run lengths, compressed or not, or of polygons. Raises FormatError."""
     height, width = size_hw
     counts: Any = None
-    if isinstance(segmentation, dict) and segmentation.get("size") == [height, width]:
-        counts = segmentation.get("counts")
-    else:
+    if isinstance(segmentation, list):
         _check_polygons(where, segmentation, size_hw)
         counts = _decode_counts(run_length.merge(run_length.frPyObjects(segmentation, height, width)))
+    elif isinstance(segmentation, dict) and segmentation.get("size") == [height, width]:
+        counts = segmentation.get("counts")
+    else:
+        raise FormatError(where, f"polygons, or run lengths of {width}x{height} px", json.dumps(segmentation)[:60])
     try:
         runs = np.array(_decode_runs(counts) if isinstance(counts, str) else counts, dtype=np.int64)
     except (ValueError, TypeError, OverflowError) as error:

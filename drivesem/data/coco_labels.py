@@ -18,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.data import fiftyone
 from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.label_table import REGION, LabelTable
 from scene_ir import files
@@ -335,7 +336,8 @@ class AnnotationFile:
         }
         self.images, self.image_ids = _sort_by_id(tables["images"].drop_repeated(self.repairs))
         tables["categories"].integers("id")
-        categories, category_ids = _sort_by_id(tables["categories"].drop_repeated(self.repairs))
+        categories, _ = _sort_by_id(tables["categories"].drop_repeated(self.repairs))
+        category_ids = categories.integers("id")
         categories.check_texts("name")
         self.annotations = self._number_anew(tables["annotations"])
         self._check_file_names()
@@ -362,7 +364,7 @@ class AnnotationFile:
                 seen.add(number)
         return replace(rows, rows=renewed)
 
-    def _merge_categories(self, names: Sequence[str], ids: Ids, category: NDArray[np.int64]) -> None:
+    def _merge_categories(self, names: Sequence[str], ids: NDArray[np.int64], category: NDArray[np.int64]) -> None:
         """Make one class of the categories of one name; its id is the first one with annotations."""
         used = set(category.tolist())
         chosen: dict[str, int] = {}
@@ -632,9 +634,7 @@ def _read_content(path: Path) -> Any:
     """Read a data set's file; FiftyOne's own form is converted."""
     content = files.read_json(path)
     if isinstance(content, dict) and isinstance(content.get("labels"), dict) and "annotations" not in content:
-        from drivesem.data.fiftyone import to_coco
-
-        return to_coco(path, content)
+        return fiftyone.to_coco(path, content, read_upright_size)
     return content
 
 
@@ -706,7 +706,7 @@ def _read_header(path: str | Path) -> tuple[int, int, int]:
 
     with files.open_image(Path(path)) as image:
         orientation = Image.Image.getexif(image).get(_ORIENTATION)  # PNG's own method would decode all pixels
-        return (orientation if orientation in range(1, 9) else 1, *image.size)
+        return (orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1, *image.size)
 
 
 def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,13 +78,22 @@ def _none_if_unknown(value: float) -> float | None:
     return None if value < 0 else value
 
 
-def to_coco(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+def to_coco(
+    path: Path, content: Mapping[str, Any], read_size: Callable[[Path], tuple[int, int]]
+) -> dict[str, Any]:
     """Convert the content of a `labels.json` to COCO's form; boxes become px of the images in `data`.
 
-    Raises FormatError for another form, and a labelled image that is missing.
-    """
-    from drivesem.data.coco_labels import read_upright_size
+    Args:
+        path: The file.
+        content: Its content, with "labels".
+        read_size: Reads width and height of an image.
 
+    Returns:
+        The content of a COCO file.
+
+    Raises:
+        FormatError: Another form, or a labelled image that is missing.
+    """
     classes = content.get("classes")
     if not isinstance(classes, list):
         raise FormatError(f"{path}: classes", "a list of names", type(classes).__name__)
@@ -96,7 +105,7 @@ def to_coco(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
         where = f"{path}: labels.{name}"
         if name not in paths:
             raise FormatError(where, f"an image in {path.parent / 'data'}", "none")
-        width, height = read_upright_size(paths[name])
+        width, height = read_size(paths[name])
         file_name = paths[name].relative_to(path.parent / "data").as_posix()
         images.append({"id": len(images) + 1, "file_name": file_name, "width": width, "height": height})
         for row in objects or []:
