@@ -329,7 +329,7 @@ def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]
 
 
 _KITTI_LAYOUTS = ("kitti", "vkitti1", "vkitti2")
-"""Layouts with KITTI's types, whose ids are CATEGORY_IDS, as those of runs."""
+"""Layouts with KITTI's types; their ids, and those of runs, are CATEGORY_IDS."""
 
 
 def _row_annotation(table: LabelTable, row: int) -> dict[str, Any]:
