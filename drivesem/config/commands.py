@@ -501,7 +501,7 @@ class BenchConfig(BenchOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalConfig(TileOption, WorkerOptions, CommandConfig):
+class EvalConfig(FrameFilterOptions, TileOption, WorkerOptions, CommandConfig):
     """Compute detection metrics (COCO, KITTI, VOC) for a detector or a prediction file."""
 
     gt: FolderOrUrl = None
@@ -519,13 +519,17 @@ class EvalConfig(TileOption, WorkerOptions, CommandConfig):
     small_detections: Literal["ignore", "count"] = "ignore"
     """KITTI detections below the minimum height: ignored (development kit of 2017) or counted (the older one)."""
     map: ClassMap | None = None
-    """Class names of the detections, such as car=Car,person=Pedestrian; bus=- leaves a class out."""
+    """Class names of the detections (with --detector: of the data set), such as person=Pedestrian; bus=- drops one."""
     map_gt: ClassMap | None = None
     """Class names of the labels, in the same form."""
     classes: str | None = None
     """Classes to evaluate, with commas (default: all)."""
     frames: str | None = None
     """File of the frames to evaluate, one identifier per line (default: all)."""
+    by: str | None = None
+    """Attributes of frames, such as weather,timeofday: a table of recall by condition, at equal box heights too."""
+    reference: str | None = None
+    """Values of --by whose box heights count, such as clear,daytime (default: the condition with most frames)."""
     stage: Stage = "attacked"
     """Detections of a run: after the attack by moved or benign labels, re-rendered, or in the photograph."""
     stage_b: Stage | None = None
@@ -565,6 +569,8 @@ class EvalConfig(TileOption, WorkerOptions, CommandConfig):
         refuse(bool(changed) and not detector, option_name("".join(changed[:1])), "--detector", "none")
         nowhere = self.pictures > 0 and (not detector or self.out is None)
         refuse(nowhere, "--pictures", "--detector and --out", "one of them missing")
+        refuse(self.reference is not None and self.by is None, "--reference", "--by", "none")
+        refuse(self.split is not None and not detector, "--split", "--detector", "none")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -128,28 +128,35 @@ def open_selection(
     dataset = opened[0] if len(opened) == 1 else JoinedDataset(opened)
     selected = dataset.identifiers if choice.split is None else select_split(dataset, choice.split)
     if choice.where:
-        selected = _select_by_attributes(dataset, selected, choice.where)
+        selected = select_by_attributes({name: dataset.attributes(name) for name in selected}, choice.where)
     return DatasetSelection(dataset, selected, choice)
 
 
-def _select_by_attributes(
-    dataset: Dataset, identifiers: Sequence[str], where: Mapping[str, tuple[str, ...]]
+def select_by_attributes(
+    attributes: Mapping[str, Mapping[str, str]], where: Mapping[str, tuple[str, ...]]
 ) -> list[str]:
-    values = {identifier: dataset.attributes(identifier) for identifier in identifiers}
-    known = {name: sorted({str(v[name]) for v in values.values() if name in v}) for name in where}
+    """Return the identifiers of frames with allowed attributes.
+
+    Args:
+        attributes: Attributes of each frame.
+        where: Allowed values by attribute.
+
+    Raises:
+        FormatError: An attribute or a value that no frame has, or no frame with all of them.
+    """
     for name, wanted in where.items():
-        if not known[name]:
-            there = sorted({key for v in values.values() for key in v})
-            raise FormatError(
-                f"--where {name}", f"one of {', '.join(there)}" if there else "no filter", repr(name)
-            )
+        known = sorted({values[name] for values in attributes.values() if name in values})
+        if not known:
+            there = sorted({key for values in attributes.values() for key in values})
+            expected = f"one of {', '.join(there)}" if there else "a data set with attributes"
+            raise FormatError(f"--where {name}", expected, repr(name))
         for value in wanted:
-            if value not in known[name]:
-                raise FormatError(f"--where {name}", f"one of {', '.join(known[name])}", repr(value))
-    selected = [i for i in identifiers if all(values[i].get(name) in wanted for name, wanted in where.items())]
-    if not selected:
-        raise FormatError("--where", "at least one frame", f"none of {len(identifiers)}")
-    return selected
+            if value not in known:
+                raise FormatError(f"--where {name}", f"one of {', '.join(known)}", repr(value))
+    chosen = [i for i, values in attributes.items() if all(values.get(k) in wanted for k, wanted in where.items())]
+    if not chosen:
+        raise FormatError("--where", "at least one frame", f"none of {len(attributes)}")
+    return chosen
 
 
 def select_split(dataset: Dataset, split: str) -> list[str]:

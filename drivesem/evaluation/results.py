@@ -6,7 +6,7 @@ belongs to no object and counts in every part, so precision in a small part is l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.evaluation import coco
+from drivesem.evaluation.conditions import ConditionRow
 from drivesem.evaluation.curves import InterpolationRule, average_precision
 from drivesem.evaluation.instances import Booleans, GroundTruthTable
 from drivesem.evaluation.matching import CandidatePairs, MatchResult
@@ -116,6 +117,10 @@ class EvaluationMetrics:
     """Differences to another detector."""
     notes: tuple[str, ...] = ()
     """Remarks on the evaluation."""
+    conditions: tuple[ConditionRow, ...] = ()
+    """Recall by condition."""
+    data: Mapping[str, Any] = field(default_factory=dict)
+    """Files and rows of the labels, and what became of them."""
 
     def to_json(self) -> dict[str, Any]:
         """What `--json` prints and metrics.json holds."""
@@ -135,6 +140,8 @@ class EvaluationMetrics:
             "comparison": [asdict(difference) for difference in self.comparison],
             "curves": self.curves,
             "notes": list(self.notes),
+            "conditions": [asdict(row) for row in self.conditions],
+            "data": dict(self.data),
         }
 
 

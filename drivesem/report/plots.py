@@ -91,6 +91,34 @@ def write_bars(
     write_figure(path, figure)
 
 
+def write_intervals(
+    path: Path,
+    title: str,
+    names: Sequence[str],
+    values: Sequence[tuple[float, float | None, float | None]],
+    x_label: str,
+) -> None:
+    """Plot fractions with their intervals, one below the other.
+
+    Args:
+        path: PNG file.
+        title: Title of the plot.
+        names: Names, from the top.
+        values: Value and ends of its interval, in [0, 1]; None without an interval.
+        x_label: Label of the axis of values.
+    """
+    figure, axes = _create_axes(title)
+    figure.set_figheight(1.2 + 0.3 * len(names))
+    for place, (value, low, high) in enumerate(values):
+        ends = [0.0, 0.0] if low is None or high is None else [max(value - low, 0.0), max(high - value, 0.0)]
+        spread = [[100 * ends[0]], [100 * ends[1]]]
+        axes.errorbar(100 * value, place, xerr=spread, fmt="o", color=PLOT_COLOURS[0], capsize=3)
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set(xlabel=x_label, xlim=(0, 100))
+    write_figure(path, figure)
+
+
 def _add_legend(axes: Axes, entries: int) -> None:
     """Put a legend below the axes, where it hides nothing."""
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(entries, 3), fontsize=9)

@@ -17,13 +17,22 @@ from rich.table import Table
 from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
 from detectors.types import Detections
+from drivesem.analysis.evaluate.conditions import (
+    CONDITION_COLUMNS,
+    measure_conditions,
+    tabulate_conditions,
+    write_conditions,
+)
 from drivesem.analysis.evaluate.files import MANY_FRAMES
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.targets import HEADLINE, EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError
-from drivesem.data.registry import Dataset, open_dataset
+from drivesem.data.account import write_account
+from drivesem.data.registry import Dataset
+from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.evaluation import coco
+from drivesem.evaluation.conditions import ConditionRow, DetectedObjects
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.matched_class import FrameMarks, MatchedClass
 from drivesem.evaluation.resampling import DRAWS, Interval
@@ -57,12 +66,15 @@ class DetectorMetrics:
     """Scores by class."""
     intervals: Sequence[Interval]
     """Bootstrap intervals of the headline class."""
+    conditions: Sequence[ConditionRow]
+    """Recall of the headline class by condition, with `--by`."""
 
 
 def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
     """Evaluate a detector on a data set, and write the results. Raises UsageError or SceneError for bad input."""
-    dataset = open_dataset(config.dataset, config.root or "")
+    dataset = open_selection(config.dataset, config.root or "", FrameFilter.from_options(config))
     detector = _detector(config)
+    account = write_account(dataset.account())
     names = dataset.identifiers[: config.limit]
     frame_detector, make_detector = _FrameDetector(config, dataset, detector), partial(_FrameDetector, config)
     jobs = run_frame_jobs(names, frame_detector, make_detector, config, ProgressSettings("frames", keep=False))
@@ -74,15 +86,24 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
     judged = EvaluatedClasses.from_detector(detector).names
     limits = adapt_limits(Difficulty(config.min_height, config.max_occlusion, config.max_truncation), labels)
     targets = [evaluation_targets(one, limits, judged) for one in labels]
+    if not any(bool((~one.ignore).any()) for one in targets):
+        expected = f"objects of {', '.join(judged)} that count (see --map, --min-height)"
+        raise UsageError("--root", expected, f"none in {format_count(len(names), 'frame')}")
     scores = coco.evaluate(targets, found, judged, t_star, HEADLINE)
     outcome = MatchedClass.from_frames(targets, found, judged.index(HEADLINE))
     draws = config.bootstrap
     if draws is None:
         draws = 0 if len(names) > MANY_FRAMES else DRAWS
     spread = outcome.intervals(draws, config.seed) if draws else []
+    conditions: list[ConditionRow] = []
+    if config.by is not None:
+        attributes = [dataset.attributes(name) for name in names]
+        objects = DetectedObjects.from_matches(outcome.candidates, outcome.match, 0, t_star)
+        conditions = measure_conditions(config, {HEADLINE: objects}, attributes, draws)
     data: dict[str, Any] = {
         "detector": config.detector,
         "dataset": config.dataset,
+        "data": account,
         "frames": len(names),
         "failed": dict(sorted(jobs.failed.items())),
         "headline": HEADLINE,
@@ -94,12 +115,14 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
         **scores.to_json(),
         "bootstrap": draws,
         "intervals": [asdict(one) for one in spread],
+        "conditions": [asdict(row) for row in conditions],
     }
     if config.out is not None:
         _write(Path(config.out), data, names, found, judged)
+        write_conditions(Path(config.out), conditions)
         if config.pictures:
             _draw(config, dataset, names, outcome, t_star)
-    return DetectorMetrics(data, scores.per_class, spread)
+    return DetectorMetrics(data, scores.per_class, spread, conditions)
 
 
 def _draw(
@@ -129,7 +152,8 @@ class _FrameDetector:
     def __init__(
         self, config: EvalConfig, dataset: Dataset | None = None, detector: Predictor | None = None
     ) -> None:
-        self._dataset = dataset or open_dataset(config.dataset, config.root or "")
+        choice = FrameFilter.from_options(config)
+        self._dataset = dataset or open_selection(config.dataset, config.root or "", choice)
         self._detector = detector or _detector(config)
         self._device = config.device
 
@@ -179,6 +203,9 @@ def print_detector_metrics(metrics: DetectorMetrics, console: Console) -> None:
     for name, scores in metrics.per_class.items():
         table.add_row(name, *map(format_percent, scores.columns), str(scores.objects))
     console.print(table)
+    if metrics.conditions:
+        sheet = tabulate_conditions(metrics.conditions)
+        console.print(*sheet.fit_to_console(console, CONDITION_COLUMNS, min_width=console.width), sep="\n")
     for one in metrics.intervals:
         if one.low is not None and one.high is not None:
             ends = f"{format_percent(one.low)} to {format_percent(one.high)}"

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from drivesem.analysis.evaluate.conditions import measure_conditions, write_conditions
 from drivesem.analysis.evaluate.report import write_evaluation
 from drivesem.analysis.evaluate.sets import EvaluationData, load_evaluation_data, parse_class_list
 from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError, refuse
 from drivesem.evaluation import coco, kitti
 from drivesem.evaluation import results as breakdown
+from drivesem.evaluation.conditions import ConditionRow, DetectedObjects
 from drivesem.evaluation.curves import ClassMatches, InterpolationRule, average_precision, sampled_curve
 from drivesem.evaluation.instances import EVERY_CLASS, DetectionTable, GroundTruthTable
 from drivesem.evaluation.matching import CandidatePairs, MatchResult, mean_of_known
@@ -44,6 +46,7 @@ def evaluate_files(config: EvalConfig) -> EvaluationMetrics:
         result = evaluate(config, load_evaluation_data(config))
     if config.out is not None:
         write_evaluation(Path(config.out), result)
+        write_conditions(Path(config.out), result.conditions)
     return result
 
 
@@ -75,6 +78,15 @@ def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
         second = evaluator.evaluate(sets.found[1])
         compared = paired_differences(first.metrics, second.metrics, sets.truths.frames, draws, generator)
     stats, facts = evaluator.stats(sets.found[0])
+    conditions: list[ConditionRow] = []
+    if config.by is not None:
+        thresholds = {row.name: row.t_star for row in first.classes if row.t_star is not None}
+        pairs = [(i, name) for i, name in enumerate(evaluator.names) if name in thresholds]
+        objects = {
+            name: DetectedObjects.from_matches(first.candidates, first.matches[i], i, thresholds[name])
+            for i, name in pairs
+        }
+        conditions = measure_conditions(config, objects, sets.attributes, draws)
     counted = sets.truths.label[~sets.truths.ignore]
     return EvaluationMetrics(
         protocol=config.protocol,
@@ -99,6 +111,8 @@ def evaluate(config: EvalConfig, sets: EvaluationData) -> EvaluationMetrics:
         intervals=tuple(spread),
         comparison=tuple(compared),
         notes=sets.notes,
+        conditions=tuple(conditions),
+        data=sets.account,
     )
 
 

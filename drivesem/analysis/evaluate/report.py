@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from drivesem.analysis.evaluate.conditions import CONDITION_COLUMNS, tabulate_conditions
 from drivesem.evaluation.coco import STATS
 from drivesem.evaluation.results import EvaluationMetrics
 from drivesem.report.plots import write_bars, write_curves
@@ -17,7 +18,7 @@ _COCO_DESCRIPTIONS = (
     *("AP, IoU 0.50:0.95", "AP, IoU 0.50", "AP, IoU 0.75", "AP, small", "AP, medium", "AP, large"),
     *("AR, 1 detection", "AR, 10 detections", "AR, 100 detections", "AR, small", "AR, medium", "AR, large"),
 )
-_TEXT_COLUMNS = ("class", "figure", "what", "difficulty", "by", "part")
+_TEXT_COLUMNS = ("class", "metric", "what", "difficulty", "by", "part", *CONDITION_COLUMNS)
 """Columns of text; the others hold numbers."""
 _AXES = {"distance": "distance", "size": "height", "occlusion": "occlusion as labelled", "weather": "weather"}
 
@@ -31,7 +32,7 @@ def build_evaluation_tables(result: EvaluationMetrics, wide: bool = False) -> li
     found: list[ReportTable] = []
     if result.stats is not None:
         rows = zip(STATS, _COCO_DESCRIPTIONS, map(format_percent, result.stats), strict=True)
-        found.append(ReportTable("COCO, all classes, %", ("figure", "what", "%"), tuple(rows)))
+        found.append(ReportTable("COCO, all classes, %", ("metric", "what", "%"), tuple(rows)))
     if result.rows:
         kit = result.facts["small_detections"]
         found.append(
@@ -81,12 +82,14 @@ def build_evaluation_tables(result: EvaluationMetrics, wide: bool = False) -> li
     )
     if result.parts:
         found.append(_wide_parts(result) if wide else _parts(result))
+    if result.conditions:
+        found.append(tabulate_conditions(result.conditions))
     if result.intervals:
         draws, frames = result.facts["bootstrap"], result.facts["frames"]
         found.append(
             ReportTable(
                 f"95 % intervals, %; {format_count(draws, 'bootstrap draw')} of {format_count(frames, 'frame')}",
-                ("figure", "value", "low", "high"),
+                ("metric", "value", "low", "high"),
                 tuple(
                     (i.name, format_percent(i.value), format_percent(i.low), format_percent(i.high))
                     for i in result.intervals
@@ -97,7 +100,7 @@ def build_evaluation_tables(result: EvaluationMetrics, wide: bool = False) -> li
         found.append(
             ReportTable(
                 "Second minus first, percentage points; paired over frames",
-                ("figure", "first", "second", "difference", "low", "high", "p"),
+                ("metric", "first", "second", "difference", "low", "high", "p"),
                 tuple(
                     (
                         *(d.name, format_percent(d.first), format_percent(d.second), _signed(d.difference)),

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drivesem.config.commands import EvalConfig
-from drivesem.config.constraints import parse_class_map
+from drivesem.config.constraints import parse_attributes, parse_class_map
 from drivesem.config.errors import UsageError
+from drivesem.data.account import write_account
+from drivesem.data.classes import object_type
 from drivesem.data.kitti_labels import TYPES
 from drivesem.data.label_table import REGION, LabelTable
+from drivesem.data.subsets import select_by_attributes
 from drivesem.evaluation import kitti
 from drivesem.evaluation.instances import DetectionTable, GroundTruthTable, boxes_from_xywh, boxes_from_xyxy
 from drivesem.report.tables import format_count
@@ -42,6 +46,10 @@ class EvaluationData:
     """Weather of each frame, if known."""
     notes: tuple[str, ...] = ()
     """Remarks on the evaluation."""
+    attributes: tuple[Mapping[str, str], ...] = ()
+    """Attributes of each frame."""
+    account: Mapping[str, Any] = field(default_factory=dict)
+    """Files and rows of the labels, as JSON."""
 
 
 def load_evaluation_data(config: EvalConfig) -> EvaluationData:
@@ -54,6 +62,7 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
     paths = [local_copy(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
     gt_layout = detect_labels_layout(gt_path) if config.gt_format == "auto" else config.gt_format
     truth = read_labels(gt_path, gt_layout, stage=config.stage)
+    account = write_account(truth.account, roles=False)
     wanted = _wanted(config, truth)
     gt_known = _known(gt_layout, truth)
     stages = (config.stage, config.stage_b or config.stage)
@@ -84,7 +93,19 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
         for table, path in zip(tables, paths, strict=True)
     ]
     judged = tuple(classes) if chosen is None else tuple(chosen)
-    return EvaluationData(truth.frames, judged, truths, found, ids, tuple(truth.weather()), _notes(config, truths))
+    if truths.ignore.all():
+        raise UsageError(str(gt_path), f"objects of {', '.join(judged) or 'some class'} to evaluate", "none")
+    return EvaluationData(
+        truth.frames,
+        judged,
+        truths,
+        found,
+        ids,
+        tuple(truth.weather()),
+        _notes(config, truths),
+        _attributes(truth),
+        account,
+    )
 
 
 def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
@@ -98,6 +119,9 @@ def _known(layout: str, truth: LabelTable) -> tuple[str, ...]:
 
 
 def _wanted(config: EvalConfig, truth: LabelTable) -> tuple[str, ...] | None:
+    if config.where is not None:
+        attributes = dict(zip(truth.frames, _attributes(truth), strict=True))
+        return tuple(select_by_attributes(attributes, parse_attributes("--where", config.where)))
     if config.frames is None:
         return None
     names = [line.strip() for line in files.read_text(Path(config.frames)).splitlines() if line.strip()]
@@ -105,6 +129,12 @@ def _wanted(config: EvalConfig, truth: LabelTable) -> tuple[str, ...] | None:
     if missing or not names:
         raise UsageError("--frames", f"identifiers of {config.gt}", _some(missing) if missing else "none")
     return tuple(dict.fromkeys(names))
+
+
+def _attributes(table: LabelTable) -> tuple[Mapping[str, str], ...]:
+    """Return the attributes of each frame that are texts."""
+    rows = (table.frame_attributes.get(i, {}) for i in range(len(table.frames)))
+    return tuple({name: value for name, value in row.items() if isinstance(value, str)} for row in rows)
 
 
 def _some(names: Sequence[str]) -> str:
@@ -177,6 +207,8 @@ def _renamed(
     """
     index = {name.lower(): i for i, name in reversed(list(enumerate(classes)))}
     exact = {name: i for i, name in enumerate(classes)}
+    types = [object_type(name) for name in classes]
+    meant = {kind: i for i, kind in enumerate(types) if kind is not None and types.count(kind) == 1}
     unknown = sorted(set(mapping) - set(table.kinds))
     if unknown and not set(mapping) & set(table.kinds):
         raise UsageError(option, f"classes of {path} ({', '.join(table.kinds) or 'none'})", _some(unknown))
@@ -187,8 +219,8 @@ def _renamed(
         if name is None:
             places[i] = out
             continue
-        # letter case decides only where two classes differ by nothing else
-        place = exact.get(name, index.get(name.lower()))
+        # letter case decides only where two classes differ by nothing else, synonyms only where names do not match
+        place = exact.get(name, index.get(name.lower(), meant.get(object_type(name))))
         if place is None:
             if not (table.kind == i).any():
                 place = out
