@@ -62,7 +62,7 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
     paths = [local_copy(p, "--pred") for p in (config.pred, config.pred_b) if p is not None]
     gt_layout = detect_labels_layout(gt_path) if config.gt_format == "auto" else config.gt_format
     truth = read_labels(gt_path, gt_layout, stage=config.stage)
-    account = write_account(truth.account, roles=False)
+    account = truth.account
     wanted = _wanted(config, truth)
     gt_known = _known(gt_layout, truth)
     stages = (config.stage, config.stage_b or config.stage)
@@ -104,7 +104,7 @@ def load_evaluation_data(config: EvalConfig) -> EvaluationData:
         tuple(truth.weather()),
         _notes(config, truths),
         _attributes(truth),
-        account,
+        write_account(account, roles=False),
     )
 
 
