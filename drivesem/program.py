@@ -161,7 +161,7 @@ def _report_code(config: CommandConfig) -> None:
 
 def _user_detector_error(error: Exception) -> UsageError | None:
     """An error that a user's own detector raised, as a UsageError of the option that names it."""
-    module = sys.modules.get("detectors.adapters.module")  # imports nothing heavy
+    module = sys.modules.get("detectors.adapters.network")  # imports nothing heavy
     if module is None or _is_bad_input(error):
         return None
     found = module.describe_user_error(error)

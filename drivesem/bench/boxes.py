@@ -20,8 +20,8 @@ from torch import Tensor
 from detectors.base import Detector
 from drivesem.attack.space import combo_parameters
 from drivesem.bench.scenes import HEIGHT, WIDTH
+from drivesem.bench.session import Columns
 from drivesem.bench.step import AttackSteps, time_pair
-from drivesem.bench.tables import Columns
 from drivesem.bench.timing import PairedTimer, Spread
 from drivesem.config.options import DEFAULT_KEEP_MB
 from drivesem.data.kitti import read_calibration, read_labels

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesem.bench.scenes import BenchScene, PackedMeshes, build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import PairedTimer, Spread, TimeBudget, repetitions
 from scene_ir.raster import verbs
 from scene_ir.render.compositor import Compositor

@@ -16,7 +16,7 @@ from drivesem.attack.labels import Labeller
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace, combo_parameters
 from drivesem.bench.scenes import BenchScene, build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
 from drivesem.config.commands import AttackConfig
 from drivesem.config.options import DEFAULT_KEEP_MB

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.attack import Attacker
-from drivesem.classify.methods import choose_loss
-from drivesem.classify.objective import ClassifierObjective
+from drivesem.classify.objective import ClassifierObjective, choose_loss
 from drivesem.classify.pictures import ObjectView
 from drivesem.classify.results import SCHEMA, ClassifiedPicture
 from drivesem.config.commands import ClassifyConfig

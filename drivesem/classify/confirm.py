@@ -12,8 +12,13 @@ import torch
 
 from drivesem.classify.analysis import ClassifyRun
 from drivesem.classify.attack import Attacker
-from drivesem.classify.report import SECOND_PICTURE, write_run_report
-from drivesem.classify.results import SCHEMA, ClassifyMetrics, SecondRenderComparison
+from drivesem.classify.results import (
+    SCHEMA,
+    SECOND_PICTURE,
+    ClassifyMetrics,
+    SecondRenderComparison,
+    write_run_report,
+)
 from drivesem.classify.scenes import picture_camera
 from drivesem.classify.second_renderer import PosedObject, measure_agreement, open_second_renderer
 from drivesem.config.commands import ClassifyConfig

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
 from detectors.training import CHECKPOINT, PRECISIONS, optimiser_state, restore_optimiser, split_by_section
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import load_for_training, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS

@@ -12,8 +12,7 @@ from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.bench import boxes, night, render, step
 from drivesem.bench.scenes import MAX_CARS
-from drivesem.bench.session import BenchResult, run_benchmark, show_progress
-from drivesem.bench.tables import BenchTable
+from drivesem.bench.session import BenchResult, BenchTable, run_benchmark, show_progress
 from drivesem.config.commands import BenchConfig
 from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError

@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from detectors.adapters.module import RAISES_NOTHING
+from detectors.adapters.network import RAISES_NOTHING
 from detectors.base import DetectorError
 from detectors.check import ContractReport, check_detector
 from detectors.registry import load_predictor

@@ -12,8 +12,7 @@ from drivesem.classify.explain import explain_failures
 from drivesem.classify.gate import compare_networks
 from drivesem.classify.holes import find_pose_regions
 from drivesem.classify.pictures import write_pictures
-from drivesem.classify.report import format_accuracy
-from drivesem.classify.results import ClassCounts, ClassifyMetrics
+from drivesem.classify.results import ClassCounts, ClassifyMetrics, format_accuracy
 from drivesem.classify.training import train_classifier
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.devices import check_device

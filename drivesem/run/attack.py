@@ -26,13 +26,16 @@ from drivesem.attack.changes import (
     propose_scenes,
 )
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
-from drivesem.attack.methods.climb import Climb
-from drivesem.attack.methods.gradient_ascent import FGSM, SGD, SiFGSM
-from drivesem.attack.methods.gradient_free import CMAES, Sampling
-from drivesem.attack.methods.margin_search import FIRST_HELD_OUT_SAMPLE, Corners, MarginSearch, margin_objective
-from drivesem.attack.methods.placebo import FixedTheta, Placebo
+from drivesem.attack.methods.gradient_ascent import APGD, FGSM, SGD, SiFGSM
+from drivesem.attack.methods.gradient_free import CMAES, FixedTheta, Placebo, Sampling
+from drivesem.attack.methods.margin_search import (
+    FIRST_HELD_OUT_SAMPLE,
+    Climb,
+    Corners,
+    MarginSearch,
+    margin_objective,
+)
 from drivesem.attack.methods.scw import SCW
 from drivesem.attack.objective import GRADIENT_FREE_TERMS, Objective
 from drivesem.attack.space import Parameter

@@ -18,7 +18,7 @@ from drivesem.attack.feasibility_check import available_check_method, check_scen
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import SceneLabels, to_kitti_labels, visible_boxes
 from drivesem.attack.methods.base import AttackResult
-from drivesem.attack.methods.placebo import Placebo
+from drivesem.attack.methods.gradient_free import Placebo
 from drivesem.attack.objective import Objective, RenderEvaluation
 from drivesem.attack.targets import EvaluatedClasses
 from drivesem.data import kitti

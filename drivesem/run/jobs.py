@@ -11,7 +11,7 @@ from typing import Any, NoReturn, TypeVar
 
 import torch
 
-from detectors.adapters.module import RAISES_NOTHING, describe_user_error
+from detectors.adapters.network import RAISES_NOTHING, describe_user_error
 from detectors.base import DetectorError
 from drivesem import store
 from drivesem.config.errors import UsageError

@@ -7,8 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from drivesem.classify.networks.architectures import PooledVGG16
-from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
+from drivesem.classify.networks.architectures import IMAGENET_MEAN, IMAGENET_STD, PooledVGG16
 from tests.tools.loading import tool
 
 vgg16 = tool("fetch_vgg16")

@@ -12,7 +12,7 @@ from torch import Tensor
 from detectors.base import AnchorPredictions, Detector
 from detectors.registry import load_detector
 from drivesem.bench.scenes import build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
 from tools.bench import memory
 from tools.bench.probe import ProbeOrder, image_gradient, probe

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from drivesem.bench.scenes import build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from scene_ir.io import save_scene
 from tools.bench.probe import ProbeOrder, ResidentMemory, probe
 

@@ -14,7 +14,7 @@ import torch
 
 from drivesem.bench.render import RenderTimes, SceneSize, round_median, time_render
 from drivesem.bench.scenes import BenchScene, PackedMeshes, build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import PairedTimer, TimeBudget
 from scene_ir.types import convert_scene
 from tools.bench import renderers

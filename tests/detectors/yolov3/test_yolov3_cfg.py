@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from detectors.base import DetectorError
-from detectors.yolov3 import layouts
+from detectors.yolov3 import cfg as layouts
 from detectors.yolov3.cfg import (
     ConvolutionLayer,
     MaxPoolLayer,

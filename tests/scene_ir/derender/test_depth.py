@@ -12,7 +12,7 @@ import torch
 from drivesem.synth.frames import SynthFrame, SynthSettings, generate_frame
 from drivesem.synth.soup import Material
 from scene_ir.derender import depth
-from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import depth as maps
 from scene_ir.derender.depth import DepthConstraints
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from scene_ir.derender import alignment as stand
 from scene_ir.derender import silhouette
-from scene_ir.derender import template_choice as stand
 from scene_ir.derender.silhouette import LabelBoxes, Placement
 from tests.scene_ir.derender.painting import CAMERA, NOTHING, painted
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from drivesem.attack.feasible.weather import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
+from drivesem.attack.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
 from drivesem.attack.space import behind_camera
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
