@@ -1,4 +1,4 @@
-"""`python -m tools.beside`: two checkouts in turn, a folder each, and one line for what does not work."""
+"""`python -m tools.compare_checkouts`: two checkouts in turn, a folder each, and one line for what does not work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tools import beside
+from tools import compare_checkouts as beside
 
 _BUSY = """
 import sys, time

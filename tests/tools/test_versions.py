@@ -29,13 +29,13 @@ class Recorder:
         if self.failing and self.failing in line:
             return StepResult("no such version")
         if "sys.version_info" in line:
-            return StepResult(said="3.13\n")
+            return StepResult(output="3.13\n")
         if "importlib.metadata" in line:
-            return StepResult(said=json.dumps({"Python": "9.0.1", "torch": "9.1"}))
+            return StepResult(output=json.dumps({"Python": "9.0.1", "torch": "9.1"}))
         if "doctor" in line:
-            return StepResult(said=json.dumps({"parts": [{"name": "EGL", "status": self.egl}]}))
+            return StepResult(output=json.dumps({"parts": [{"name": "EGL", "status": self.egl}]}))
         return StepResult(
-            said=json.dumps({"frames": 10, "grades": {"certain": 3}, "more": 0}) if "attack" in line else ""
+            output=json.dumps({"frames": 10, "grades": {"certain": 3}, "more": 0}) if "attack" in line else ""
         )
 
 
@@ -109,7 +109,7 @@ def test_what_is_hidden_is_not_there(tmp_path: Path) -> None:
     hidden = run_words(
         [*hiding_prefix(tmp_path), "sh", "-c", "ls /usr/bin/env /usr/bin/*gcc* /usr/lib/*/libEGL*"], tmp_path
     )
-    assert hidden.said == "/usr/bin/env\n"
+    assert hidden.output == "/usr/bin/env\n"
     assert "cannot access" in hidden.failed
 
 

@@ -8,29 +8,22 @@ import numpy as np
 import pytest
 
 from detectors.planted import PlantedFault
-from drivesem.analysis.holes.rules import FeatureSamples
 from tools.bench.planted.across import (
     AS_PHOTOGRAPHED,
     CARS,
     FRAMES,
     HIT,
     KINDS,
-    NeighbourhoodSamples,
-    SharedFaultFrame,
-    SharedFaultSearch,
     plant_shared_fault,
 )
 from tools.bench.planted.across_report import (
     ALL,
-    CONTRAST,
     FaultRuleRow,
     chance_rows,
-    drawn_evidence,
     rule_rows,
-    searched_evidence,
     summary_rows,
 )
-from tools.bench.planted.pool import CAMERA_DRAWS, CarObservation, FramePool
+from tools.bench.planted.pool import CarObservation, FramePool
 
 NAMES = ("height_px", "aspect", "across", "lightness", "contrast", "moved_m")
 T_STAR = 0.5
@@ -89,20 +82,6 @@ def test_faults_hide_few_cars_as_photographed_and_some_others(
     assert len({frame for frame, _ in hidden}) >= FRAMES
 
 
-def test_what_no_car_reaches_is_not_planted() -> None:
-    assert plant_shared_fault(world(2, 4), ("height_px",), 0) is None, "too few frames"
-    assert plant_shared_fault([], ("height_px",), 0) is None
-
-
-def test_a_frame_without_cars_changes_nothing(pools: list[FramePool]) -> None:
-    empty = FramePool("empty", T_STAR, (), ((),) * CAMERA_DRAWS, ((),) * 12)
-    with_it, without = (plant_shared_fault(all_of, KINDS[0], 0) for all_of in ([*pools, empty], pools))
-    assert with_it is not None
-    assert without is not None
-    assert (with_it.fault, with_it.sharp) == (without.fault, without.sharp)
-    assert rule_rows([with_it], [*pools, empty], [], ())[0].named == rule_rows([without], pools, [], ())[0].named
-
-
 def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
     """At least two of three, the third in part: a rule may take a second feature along."""
     kinds = (KINDS[0], KINDS[3], KINDS[8])
@@ -115,29 +94,6 @@ def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
         assert all(name in row.rules[0] for name in kind)
         assert row.passes == 20 * 12
     assert (none.rules, none.named, none.failures) == ((), False, 0)
-
-
-def test_searches_bring_their_samples_and_their_passes(pools: list[FramePool]) -> None:
-    fault = PlantedFault.parse("height_px=30:40")
-    around = FeatureSamples(NAMES, ((35.0, 1.5, 0.5, 0.3, 0.2, 0.1),) * 3, (-1.0, -1.0, 2.0))
-    attempt = SharedFaultSearch("003", fault.text, "climb", 1, 1, 24, (NeighbourhoodSamples(2, around),))
-    others = [replace(attempt, fault=""), replace(attempt, method="halton")]
-    frames = [SharedFaultFrame("003", "", (attempt, *others))]
-    found = searched_evidence(fault, "climb", pools, frames)
-    plain = drawn_evidence(fault, pools, CONTRAST)
-    assert len(found.fails) == len(plain.fails) + 3
-    assert found.fails.sum() == plain.fails.sum() + 2
-    assert found.objects[-3:].tolist() == [3002] * 3
-    assert found.passes == CONTRAST * 20 + 24 + 3
-    assert found.columns["height_px"][-1] == 35
-
-
-def test_cars_that_are_hidden_as_photographed_are_no_evidence(pools: list[FramePool]) -> None:
-    fault = PlantedFault.parse("height_px=30:40")
-    evidence = drawn_evidence(fault, pools, 12)
-    before = sum(len(pool.hidden_as_photographed(fault)) for pool in pools)
-    assert before > 0
-    assert len(evidence.fails) == 12 * (5 * 20 - before)
 
 
 def test_chance_has_no_name(pools: list[FramePool]) -> None:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from drivesem.bench.tables import BenchTable, build_terminal_table
+from drivesem.bench.session import BenchTable, build_terminal_table
 from tools.bench.planted.summary import kind_columns, kind_rows, method_rows
-from tools.bench.planted.yardstick import METHODS, NO_FAULT, FaultSearch, FrameSearches
+from tools.bench.planted.yardstick import NO_FAULT, FaultSearch, FrameSearches
 
 FIRST = FaultSearch("a", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 3, 2, 1, 50, 4.0)
 
@@ -60,8 +60,3 @@ def test_names_are_counted_where_somebody_asked() -> None:
 def test_what_was_judged_comes_back_from_json() -> None:
     for judged in frames():
         assert FrameSearches.of_json(judged.to_json()) == judged
-
-
-def test_methods_are_those_of_the_command() -> None:
-    assert {"si-fgsm", "halton", "cma-es", "corners", "climb"} <= set(METHODS)
-    assert "placebo" not in METHODS

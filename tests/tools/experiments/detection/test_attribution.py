@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 
 from drivesem.config.commands import AttackConfig
 from drivesem.run.protocol import follows_paper
+from tests.tools.experiments.detection.conftest import counted, frame
 from tools.experiments.detection.arms import PAPER_PROTOCOL
 from tools.experiments.detection.attribution import (
     COUNTED_LABELS,
@@ -63,7 +63,7 @@ def test_a_way_changes_one_factor_at_a_time_and_the_factors_start_as_ours() -> N
 
 
 @pytest.fixture
-def found(frame: Callable[..., Any], counted: Callable[..., Any]) -> Attribution:
+def found() -> Attribution:
     """Labels that are aimed at lose a car in two frames of six; what is not projected drives it away in all."""
     plan, runs = plan_of(limit=FRAMES), []
     for arm in plan.arms():
@@ -102,9 +102,7 @@ def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
     assert 0 < shares["labels aimed at"].p <= 1
 
 
-def test_a_detector_counts_with_what_its_fall_begins_from(
-    frame: Callable[..., Any], counted: Callable[..., Any]
-) -> None:
+def test_a_detector_counts_with_what_its_fall_begins_from() -> None:
     """A detector that finds one car less before, and yet another less after, has fallen by the latter alone."""
     plan, runs = plan_of(limit=FRAMES, other_detector="other"), []
     for arm in plan.arms():
@@ -139,8 +137,3 @@ def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture is not None
     assert picture.std() > 10
-
-
-def test_the_other_detector_is_of_this_study_alone(refused: Callable[..., str]) -> None:
-    assert "--other-detector: expected" in refused("multi", "--other-detector", "yolov3")
-    StudyConfig(name="attribution", other_detector="yolov3-slim").check()

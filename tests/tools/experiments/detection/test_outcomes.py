@@ -12,6 +12,7 @@ import pytest
 
 from drivesem.failures.grades import Certificate, Grade, Kind, SecondOpinion
 from drivesem.run.results import Failure, FrameResult
+from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
 from tools.experiments.detection.arms import PLACEBO, ArmRun
 from tools.experiments.detection.comparison import compare_arms
 from tools.experiments.detection.counts import ArmCounts, StudyCounts
@@ -40,7 +41,7 @@ def failure(grade: Grade, kind: Kind = Kind.MISSED, second: SecondOpinion | None
 
 
 @pytest.fixture
-def graded_runs(frame, counted, arm) -> list:
+def graded_runs() -> list:
     """Four frames of two cars, failures of each grade in the first three; a control fails by threshold."""
     of = [
         (failure(Grade.THRESHOLD), failure(Grade.CERTAIN, second=REQUIRED_KEYS)),
@@ -79,14 +80,14 @@ def test_what_survives_is_a_share_of_what_was_requested(grades: ArmGrades) -> No
     assert 0 <= low < 2 / 3 <= high == 1
 
 
-def test_ignored_objects_are_nothing_to_lose(frame, counted, arm) -> None:
+def test_ignored_objects_are_nothing_to_lose() -> None:
     result: FrameResult = frame("0")
     first, second = result.targets_benign
     ignored = replace(result, targets_benign=(replace(first, ignore=True), second))
     assert count_grades(counted(arm("a"), [ignored]), 0, 0).objects == 1
 
 
-def test_bounds_are_those_of_drawing_frames(frame, counted, arm) -> None:
+def test_bounds_are_those_of_drawing_frames() -> None:
     """Equal frames leave nothing to chance; without draws there are no bounds."""
     alike = [replace(frame(str(i)), failures=(failure(Grade.CERTAIN),)) for i in range(5)]
     one = count_grades(counted(arm("a"), alike), DRAWS, 0).rates[Grade.CERTAIN]
@@ -126,7 +127,7 @@ def lost(index: int, grade: Grade = Grade.CERTAIN) -> Failure:
 
 
 @pytest.fixture
-def search_runs(frame, arm_run, arm) -> list[ArmRun]:
+def search_runs() -> list[ArmRun]:
     """Four frames of two cars: the first arm loses three for certain, the second one, the placebo the far one."""
 
     def of(failures: Sequence[tuple[Failure, ...]], passes: int, seconds: float) -> list:
@@ -212,7 +213,7 @@ def test_search_tables(counts: StudyCounts) -> None:
 
 
 @pytest.fixture
-def success_runs(frame, counted, arm):
+def success_runs():
     """One arm that breaks frames after 1, 3, 3 queries and one never; one that needs 8 in two of them."""
     quick = [(1, True), (3, True), (3, True), (10, False)]
     slow = [(8, True), (8, True), (64, False), (64, False)]
@@ -256,7 +257,7 @@ def test_one_arm_against_the_end_of_another(success_runs) -> None:
     assert compare_success(success_runs[0], 3, success_runs[1], 0, 0).difference == pytest.approx(0.25)
 
 
-def test_how_many_queries_an_arm_may_take(frame, counted, arm) -> None:
+def test_how_many_queries_an_arm_may_take() -> None:
     requested = {"si-fgsm": 7, "fgsm": 1, "halton": 32}
     for method, most in requested.items():
         queries = 32 if method == "halton" else None

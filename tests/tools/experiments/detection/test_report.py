@@ -18,6 +18,7 @@ from drivesem.evaluation.resampling import Interval
 from drivesem.report.plots import PLOT_COLOURS
 from drivesem.run.folder import ARMS
 from scene_ir import files
+from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
 from tools.experiments.detection.arms import PLACEBO, RANDOM
 from tools.experiments.detection.comparison import compare_arms
 from tools.experiments.detection.counts import ArmCounts, StudyCounts
@@ -38,7 +39,7 @@ DRAWS = 10
 
 
 @pytest.fixture
-def controlled(frame, counted, arm) -> StudyResults:
+def controlled() -> StudyResults:
     """Two parameters; one frame of four is broken by the attack, none by its controls."""
     runs = []
     for name, reference in (("rotate", 0.982), ("mesh", 0.987)):
@@ -51,7 +52,7 @@ def controlled(frame, counted, arm) -> StudyResults:
 
 
 @pytest.fixture
-def sampled(frame, counted, arm) -> StudyResults:
+def sampled() -> StudyResults:
     """An arm of 10 queries, one of 64, and one of a single query."""
     runs = [
         counted(arm("si-fgsm"), [frame("0", queries=2, success=True), frame("1", queries=5, success=True)]),
@@ -72,7 +73,7 @@ def sampled(frame, counted, arm) -> StudyResults:
 
 
 @pytest.fixture
-def labelled(frame, arm_run, arm) -> StudyResults:
+def labelled() -> StudyResults:
     run = arm_run(arm("translate"), [frame("0", moved_by=40.0), frame("1")])
     counts = StudyCounts((ArmCounts.from_run(run),), 0, {})
     sets = [compare_labels("translate", compare_frame_labels(run))]
@@ -165,7 +166,7 @@ def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
     assert found.rows[0].name in stream.getvalue()
 
 
-def test_nothing_to_attack(frame, counted, arm, tmp_path: Path) -> None:
+def test_nothing_to_attack(tmp_path: Path) -> None:
     """No frame has a vehicle: the tables have dashes, and nothing fails."""
     runs = [counted(arm("rotate", 0.982), []), counted(arm("rotate placebo", control=(PLACEBO, "rotate")), [])]
     runs.append(counted(arm("rotate random", control=(RANDOM, "rotate")), []))
@@ -186,7 +187,7 @@ def test_more_series_than_colours_are_reported_apart() -> None:
 
 
 @pytest.fixture
-def runs(frame, arm_run, arm):
+def runs():
     """Two attacks, of which each changes other frames more, and a control that changes all frames most."""
     small = [frame(f"{i:03d}", yaw=0.01 * i) for i in range(MAX_CHANGES + 3)]
     turned = [frame(f"{i:03d}", yaw=-0.02 if i else 0.3) for i in range(MAX_CHANGES + 3)]
@@ -210,7 +211,7 @@ def test_each_frame_once_by_the_arm_that_changed_it_most(runs) -> None:
     assert found[0].folder == Path("out", ARMS, "turned", "frames", "000")
 
 
-def test_what_was_not_changed_is_not_given(frame, arm_run, arm, tmp_path: Path) -> None:
+def test_what_was_not_changed_is_not_given(tmp_path: Path) -> None:
     still = arm_run(arm("still"), [frame("000", yaw=0.0)])
     assert find_largest_changes([still], tmp_path) == []
     write_largest_changes(tmp_path / "largest.png", [])

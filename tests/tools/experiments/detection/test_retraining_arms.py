@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from scene_ir import files
 from scene_ir.errors import SceneError
 from scene_ir.io import SCHEMA, VERSION
 from scene_ir.types import Labels
+from tests.tools.experiments.detection.conftest import frame
 from tools.experiments.detection import retraining_arms
 from tools.experiments.detection.retraining import prepare_retraining
 from tools.experiments.detection.retraining_arms import (
@@ -70,7 +71,7 @@ def labelled(x: float, kind: str = "Car") -> Labels:
 
 
 @pytest.fixture
-def attacked(frame: Callable[..., object], tmp_path: Path) -> list[AttackedFrame]:
+def attacked(tmp_path: Path) -> list[AttackedFrame]:
     """Three frames: the first is not broken. Cars are at 10 by the benign labels, at 20 by moved ones."""
     found = []
     for i in range(3):
