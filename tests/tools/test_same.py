@@ -84,19 +84,6 @@ def test_every_case_can_begin() -> None:
     assert {"--help", "retrain --help"} <= set(cases["help"])
 
 
-def test_paths_are_seen_from_where_a_command_runs(tmp_path: Path) -> None:
-    case = tmp_path / "edit"
-    line = "edit @derender/scenes -o @/edit.png"
-    assert same.command_words(line, case, case) == [
-        "drivesem.cli",
-        "edit",
-        "../derender/scenes",
-        "-o",
-        "./edit.png",
-    ]
-    assert same.command_words(line, case, case / "empty")[2] == "../../derender/scenes"
-
-
 def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before, after = tmp_path / "before.txt", tmp_path / "after.txt"
     before.write_text("a/x y.txt 1\na/z 2\nb/x 3\n")

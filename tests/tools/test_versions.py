@@ -122,13 +122,6 @@ def test_a_failure_ends_one_set_alone(capsys: pytest.CaptureFixture[str]) -> Non
     assert len([line for line in run.steps if "doctor" in line]) == 1
 
 
-def test_resolving_installs_nothing() -> None:
-    run = Recorder()
-    assert main(["--python", "python9", "--resolve", "--versions", "lowest"], run) == 0
-    assert [line for line in run.steps if " install " in line and "--dry-run" not in line] == []
-    assert not any("drivesem.cli" in line for line in run.steps)
-
-
 def test_words_are_run(tmp_path: Path) -> None:
     assert run_words(["python3", "-c", "print(7)"], tmp_path) == StepResult("", "7\n")
     assert run_words(["python3", "-c", "raise ValueError('so')"], tmp_path).failed == "ValueError: so"

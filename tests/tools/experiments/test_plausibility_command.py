@@ -1,4 +1,4 @@
-"""`drivesem plausibility` on the folder of a run."""
+"""Experiment `plausibility` on the folder of a run."""
 
 from __future__ import annotations
 

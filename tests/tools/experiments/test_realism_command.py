@@ -1,4 +1,4 @@
-"""`drivesem realism` on hand-made runs."""
+"""Experiment `realism` on hand-made runs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivesem.evaluation.resampling import Interval
 from drivesem.run.results import dump_frame, load_frame
 from scene_ir import files
 from scene_ir.errors import ShapeError
 from tests.drivesem.commands.conftest import write_finished_run
 from tools.experiments.__main__ import main
-from tools.experiments.realism import comparison
 from tools.experiments.realism.comparison import crop_window, enclosing_rectangle, vehicle_boxes
 from tools.experiments.realism.metrics import MIN_SIDE_PX
 
@@ -127,11 +125,3 @@ def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
     never = (replace(benign[0], xyxy=nowhere, ignore=True), benign[1])
     files.write_text(path, dump_frame(replace(result, targets_benign=never, targets_moved=left)))
     assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 5
-
-
-def test_bounds_of_psnr_swap_with_those_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small error is a large PSNR, and no error an infinite one."""
-    monkeypatch.setattr(comparison, "bootstrap_intervals", lambda *_: [Interval("", 25.0, 0.0, 100.0)])
-    part = comparison.PictureRegion(None, "", {"psnr": dict.fromkeys(comparison.PAIRS, 25.0)}, {})
-    row = comparison.realism_rows([comparison.FrameRegions("a", (part,))], ["psnr"], 1, 0)[0]
-    assert (row.low, row.high) == (pytest.approx(20 * np.log10(25.5)), None)

@@ -1,4 +1,4 @@
-"""`drivesem study` on one embedded frame: files, figures, going on; each arm is an attack like any other."""
+"""Studies on one embedded frame: files, metrics, resuming; each arm is an attack like any other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`drivesem worth` on hand-made runs and tables."""
+"""Experiment `worth` on hand-made runs and tables."""
 
 from __future__ import annotations
 
@@ -76,15 +76,6 @@ def test_runs(worth: Callable[..., Any], run: Path) -> None:
     assert "| run (rotate): counterexamples |" in (run / "worth" / "worth.md").read_text()
 
 
-def test_bases_and_no_realism(tmp_path: Path, worth: Callable[..., Any], run: Path) -> None:
-    plain = worth(run, "--distance", "none", "--out", tmp_path / "e")
-    assert plain["distance"] is None
-    assert len(plain["rows"]) == 4
-    two = worth(run, "--distance", "none", "--base", "2", "--out", tmp_path / "2")
-    for a, b in zip(plain["rows"], two["rows"], strict=True):
-        assert b["value"] == pytest.approx(a["value"] / math.log(2))
-
-
 def test_nothing_changed(tmp_path: Path, worth: Callable[..., Any]) -> None:
     data = worth(write_finished_run(tmp_path / "same", same=True), "--distance", "perceptual")
     for kind in ("binary", "fractional"):
@@ -119,20 +110,6 @@ def fingerprints(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(looking, "detector_fingerprint", read)
     return found
-
-
-def test_weights_are_not_read_for_each_picture(
-    tmp_path: Path, worth: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, fingerprints: list[str]
-) -> None:
-    monkeypatch.setattr(looking, "load_predictor", lambda *_: Sees(2))
-    runs = [write_finished_run(tmp_path / name) for name in ("one", "two")]
-    worth(*runs, "--distance", "none", "--second", "sees")
-    # what is remembered, and one look at all pictures
-    assert fingerprints == ["sees"] * 2
-    fingerprints.clear()
-    study = write_study(tmp_path / "study", "multi", "combo-1", "combo-2")
-    worth("--study", study, "--metrics", "ssim", "--distance", "none", "--second", "sees")
-    assert fingerprints == ["sees"] * 2
 
 
 def test_a_folder_of_retrain_is_a_second_detector(

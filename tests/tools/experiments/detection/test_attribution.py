@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -100,26 +99,6 @@ def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
     # ten of twelve cars are found, nothing else: precision is 1 up to a recall of 10 / 12
     assert shares["labels aimed at"].alone.value == pytest.approx(1 - 84 / 101)
     assert 0 < shares["labels aimed at"].p <= 1
-
-
-def test_a_detector_counts_with_what_its_fall_begins_from() -> None:
-    """A detector that finds one car less before, and yet another less after, has fallen by the latter alone."""
-    plan, runs = plan_of(limit=FRAMES, other_detector="other"), []
-    for arm in plan.arms():
-        results = [frame(f"{i}") for i in range(FRAMES)]
-        if arm.config.detector == "other":
-            one = results[0].detections_benign[:1]
-            results[0] = replace(results[0], detections_benign=one, detections_attacked=one)
-            results[1] = replace(results[1], detections_attacked=one)
-        runs.append(counted(arm, results))
-    study = StudyConfig(name="attribution", bootstrap=DRAWS, other_detector="other")
-    found = attribute_drop(study, StudyCounts(tuple(runs), 0, {}))
-    *factors, detector, _, _ = found.shares
-    assert detector.name == "detector"
-    # 11 of 12 cars are found before, 10 after, nothing else: precision is 1 up to these recalls
-    assert (found.ours, found.papers) == (0, pytest.approx((92 - 84) / 101))
-    assert detector.points.value == pytest.approx(found.papers, abs=1e-12)
-    assert [share.points.value for share in factors] == [0] * 6
 
 
 def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:

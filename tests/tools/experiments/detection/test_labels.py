@@ -38,9 +38,3 @@ def test_a_car_that_is_really_lost_is_lost_by_both() -> None:
     one = sets_of(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counts[0.5]
     assert (one.paper, one.moved, one.only_unmoved) == (1, 1, 0)
     assert (one.lost_paper, one.lost_only_unmoved) == (1, 0)
-
-
-def test_no_objects() -> None:
-    found = sets_of(arm_run(arm("mesh"), []))
-    assert found.objects == 0
-    assert set(found.iou.values()) == set(found.below.values()) == {None}

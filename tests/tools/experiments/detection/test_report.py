@@ -10,12 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
-from drivesem.evaluation.resampling import Interval
-from drivesem.report.plots import PLOT_COLOURS
 from drivesem.run.folder import ARMS
 from scene_ir import files
 from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
@@ -27,7 +24,6 @@ from tools.experiments.detection.outcomes import compare_success, success_curve
 from tools.experiments.detection.plots import (
     MAX_CHANGES,
     PICTURE_WIDTH_PX,
-    draw_bars,
     find_largest_changes,
     write_largest_changes,
     write_plot,
@@ -120,12 +116,6 @@ def test_what_survives_the_second_renderer_stands_next_to(controlled: StudyResul
     assert "survive_share" not in controlled.to_json()["rows"][0]
 
 
-def test_json_has_what_others_read(controlled: StudyResults) -> None:
-    data = controlled.to_json()
-    assert (data["frames"], data["feasible_fraction"]) == (4, 1.0)
-    assert [row["name"] for row in data["rows"]] == ["rotate", "mesh"]
-
-
 def test_success_after_queries(sampled: StudyResults) -> None:
     first = cells(sampled, "Frames broken", "si-fgsm")
     assert [first[mark].split(" [")[0] for mark in ("1", "2", "5", "10", "20")] == [
@@ -179,13 +169,6 @@ def test_nothing_to_attack(tmp_path: Path) -> None:
     write_plot(tmp_path / "study.png", found)
 
 
-def test_more_series_than_colours_are_reported_apart() -> None:
-    """Each has a look of its own, by colour or hatch."""
-    axes = Figure().add_subplot()
-    draw_bars(axes, {f"detector {i}": [Interval("ap50", 0.5, 0.4, 0.6)] for i in range(2 * len(PLOT_COLOURS) + 1)})
-    assert len({(bar.get_facecolor(), bar.get_hatch()) for bar in axes.patches}) == 2 * len(PLOT_COLOURS) + 1
-
-
 @pytest.fixture
 def runs():
     """Two attacks, of which each changes other frames more, and a control that changes all frames most."""
@@ -209,13 +192,6 @@ def test_each_frame_once_by_the_arm_that_changed_it_most(runs) -> None:
     assert len(found) == MAX_CHANGES
     assert found[0].size == pytest.approx(0.3 / 0.7)
     assert found[0].folder == Path("out", ARMS, "turned", "frames", "000")
-
-
-def test_what_was_not_changed_is_not_given(tmp_path: Path) -> None:
-    still = arm_run(arm("still"), [frame("000", yaw=0.0)])
-    assert find_largest_changes([still], tmp_path) == []
-    write_largest_changes(tmp_path / "largest.png", [])
-    assert not (tmp_path / "largest.png").exists()
 
 
 def test_the_sheet_shows_photographs_next_to_counterexamples(runs, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from detectors.registry import load_detector, save_detector
+from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.analysis.transfer.matrix import (
     SourceRun,
@@ -28,14 +28,14 @@ from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.frame import detections_from_records
 from drivesem.run.protocol import PROTOCOL
 from drivesem.run.results import FrameResult
-from tests.tools.experiments.detection.conftest import arm, arm_run, frame
 from tests.tools.experiments.conftest import REQUIRED_KEYS
+from tests.tools.experiments.detection.conftest import arm, arm_run, frame
 from tools.experiments.__main__ import main
 from tools.experiments.detection import retraining, retraining_arms
 from tools.experiments.detection.arms import AttackTotals
 from tools.experiments.detection.counts import ArmCounts
 from tools.experiments.detection.report import OWN_PROTOCOL
-from tools.experiments.detection.retraining import cached_detections, set_threshold
+from tools.experiments.detection.retraining import cached_detections
 from tools.experiments.detection.retraining_arms import BENIGN, build_retraining_arms, paper_reference
 from tools.experiments.detection.retraining_report import retraining_report
 from tools.experiments.detection.retraining_results import (
@@ -205,17 +205,6 @@ def test_benign_frames_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.Mo
     store.digest = "of others"  # pyright: ignore[reportAttributeAccessIssue]
     cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     assert looks == [2, 2, 1, 1], "other weights, other frames, other pictures"
-
-
-def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
-    weights = tmp_path / "w.safetensors"
-    detector = load_detector("squeezedet")
-    save_detector(detector, weights, {"retrained_from": "squeezedet", "steps": "2"})
-    set_threshold(detector, weights, 0.123456789)
-    assert load_detector(weights).t_star == detector.t_star == 0.123457
-    written = weights.stat().st_mtime_ns
-    set_threshold(load_detector(weights), weights, 0.123456789)
-    assert weights.stat().st_mtime_ns == written
 
 
 @pytest.mark.slow

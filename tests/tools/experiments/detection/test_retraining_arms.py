@@ -34,7 +34,6 @@ from tools.experiments.detection.retraining_arms import (
     OURS,
     RETRAINING_ARMS,
     FrameDivision,
-    FrameSubset,
     RetrainingArm,
     TrainingPictures,
     benign_samples,
@@ -103,21 +102,6 @@ def test_ours_is_the_preset() -> None:
     assert parse(["retrain", "--run", "", "--config", str(PRESETS / "retrain-paper.yaml")]) == paper.config
 
 
-def test_the_ablation_differs_in_its_pictures_alone() -> None:
-    for study in (
-        StudyConfig(name="retrain", quick=True),
-        StudyConfig(name="retrain", train_steps=7, mix="replace"),
-    ):
-        ablation, ours, *further = build_retraining_arms(study)
-        assert (ablation.pictures, ours.pictures) == ("rerender", "counterexample")
-        assert ablation.config == ours.config
-        assert len(further) == (not study.quick)
-        if study.train_steps is not None:
-            assert {lesson.config.steps for lesson in (ours, *further)} == {7}
-            assert (ours.config.mix, further[0].config.mix) == ("replace", "replace")
-    assert build_retraining_arms(StudyConfig(name="retrain"))[1].config.mix == "add"
-
-
 def test_arms_differ_in_their_pictures_alone() -> None:
     study = StudyConfig(name="retrain", arms=",".join(RETRAINING_ARMS), seeds=2, consistency=0.5)
     lessons = build_retraining_arms(study)
@@ -152,14 +136,6 @@ def test_what_is_attacked_to_train_on() -> None:
     placebo = placebo_attack(arm, Path("out"))
     assert (placebo.config.method, placebo.config.like) == ("placebo", "out/arms/attacked")
     assert (placebo.config.params, placebo.config.passes, placebo.config.limit) == ("weather,rotate", None, 3)
-
-
-def test_weights_from_elsewhere_keep_their_loss() -> None:
-    losses = {
-        d: build_retraining_arms(StudyConfig(name="retrain", detector=d))[1].config.loss
-        for d in ("squeezedet", "own.safetensors")
-    }
-    assert losses == {"squeezedet": "quality", "own.safetensors": "published"}
 
 
 def test_held_out_frames_are_never_trained_on(tmp_path: Path) -> None:
@@ -221,14 +197,6 @@ def test_frames_without_vehicles_show_before_anything_is_done(tmp_path: Path) ->
     ready = prepare_retraining(replace(study, held_out=str(kitti_folder(tmp_path / "held_out", 1))), OUT)
     assert [arm.folder for arm in ready.attacks] == ["combo-2"]
     assert list(ready.workers[0].source.identifiers()) == ["000000", "000001"]
-
-
-def test_a_source_among_names() -> None:
-    class Source:
-        def identifiers(self) -> Sequence[str]:
-            return "c", "a", "b"
-
-    assert list(FrameSubset(Source(), frozenset(("a", "c"))).identifiers()) == ["c", "a"]  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture
