@@ -1,7 +1,5 @@
 """`python -m tools.compare_checkouts`: two checkouts in turn, a folder each, and one line for what does not work."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The converter behind the optional pack of vehicles and skies, on made-up packages."""
 
-from __future__ import annotations
-
 import base64
 import io
 import sys

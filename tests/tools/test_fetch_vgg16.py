@@ -1,7 +1,5 @@
 """VGG-16's convolutions from elsewhere: torchvision's names, the same numbers from differently prepared pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

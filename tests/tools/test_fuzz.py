@@ -1,7 +1,5 @@
 """The fuzzer: are faults of every kind told, and is what is damaged the same each time?"""
 
-from __future__ import annotations
-
 import json
 import os
 import time

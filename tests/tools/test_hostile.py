@@ -1,7 +1,5 @@
 """Hostile inputs: defects are reported, and some quick cases pass."""
 
-from __future__ import annotations
-
 import json
 import signal
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The lock file: every tested release has a hash, and it says what constraints.txt says."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The comparison of two versions: what its hashes ignore, the order of cases, renamed words."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

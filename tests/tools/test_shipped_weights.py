@@ -1,7 +1,5 @@
 """The shipped detectors on pictures of the generator that they were trained with, from the held-out split."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Training the network that cuts vehicles out, on a tiny set: what it learns from, and runs that are stopped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

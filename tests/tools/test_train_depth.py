@@ -1,7 +1,5 @@
 """Training of the depth network: what it is shown, what it should say, and that a run can be gone on with."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The maintainers' script behind the shipped pose network: crops, targets, steps that can be stopped, figures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Training of the segmentation network: what it is shown, what it should say, and that a run can be gone on
 with."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

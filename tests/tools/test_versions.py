@@ -1,7 +1,5 @@
 """`python -m tools.versions`: which steps it takes for which Python and versions, without taking them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Darknet's `.cfg`: what is read, what is written, what is refused; the published networks."""
 
-from __future__ import annotations
-
 import pytest
 
 from detectors.base import DetectorError

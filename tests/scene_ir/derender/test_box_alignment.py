@@ -1,7 +1,5 @@
 """Cars moved until they fill their 2D boxes, as little as that asks for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

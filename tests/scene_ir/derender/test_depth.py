@@ -1,7 +1,5 @@
 """Depth of a photograph's surroundings: the shipped network, and what ties it to what is known."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Edges of meshes against edges of pictures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ground plane, horizon, depth and sun by rule."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

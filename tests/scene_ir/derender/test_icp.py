@@ -1,7 +1,5 @@
 """Meshes brought to the laser's points on them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

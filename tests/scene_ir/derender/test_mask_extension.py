@@ -1,7 +1,5 @@
 """Masks of large vehicles grow to what counts like the vehicle neighbour them, and no farther."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What stands in front of vehicles, found by labels, masks and depth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

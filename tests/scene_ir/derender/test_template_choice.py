@@ -1,7 +1,5 @@
 """Meshes and headings told from one another before there is a mask."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

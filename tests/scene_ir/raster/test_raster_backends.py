@@ -1,8 +1,6 @@
 """Both backends on random closed meshes (clipped, inside out, degenerate, culled, shared, empty), on threads, and at
 depths from 0.5 m to 200 m."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Depth of surroundings beside the truth, a laser and fog."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

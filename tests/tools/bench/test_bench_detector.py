@@ -1,7 +1,5 @@
 """`python -m tools.bench detector`: consistent metrics, and a gradient that is one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

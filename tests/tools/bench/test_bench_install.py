@@ -1,7 +1,5 @@
 """`python -m tools.bench install` as a maintainer types it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

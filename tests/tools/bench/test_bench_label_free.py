@@ -1,7 +1,5 @@
 """What is estimated without labels, held against labels."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Cars moved far beside the generator's truth: a perfect scene gets good marks, and what cannot be is left out."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The second renderer beside the photograph: what bench redraw counts, by a detector that sees what it is told."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Gradients against central differences: the measures themselves, and a whole check of a small street."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What each benchmark refuses, in one line that names the option."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Fixtures of the experiments: finished runs, a browser, and their command line."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

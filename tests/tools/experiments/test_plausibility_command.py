@@ -1,7 +1,5 @@
 """Experiment `plausibility` on the folder of a run."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable

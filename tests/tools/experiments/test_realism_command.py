@@ -1,7 +1,5 @@
 """Experiment `realism` on hand-made runs."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable

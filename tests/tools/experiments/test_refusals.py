@@ -1,7 +1,5 @@
 """What each experiment refuses, in one line that names the option."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

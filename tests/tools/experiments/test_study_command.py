@@ -1,7 +1,5 @@
 """Studies on one embedded frame: files, metrics, resuming; each arm is an attack like any other."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The survey's page, what it tells and what not; and what people said, counted by hand."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import hashlib

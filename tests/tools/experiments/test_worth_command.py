@@ -1,7 +1,5 @@
 """Experiment `worth` on hand-made runs and tables."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

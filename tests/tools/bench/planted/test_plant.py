@@ -1,7 +1,5 @@
 """Faults that are planted for a frame: clear of what is photographed, within reach, and as rare as was asked."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Faults of a whole detector, and what pooled rules say of them, in a made-up world of cars."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

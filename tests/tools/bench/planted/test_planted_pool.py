@@ -1,7 +1,5 @@
 """What a fault does to cars that were seen without it: by hand, and beside the detector that has the fault."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

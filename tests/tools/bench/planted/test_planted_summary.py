@@ -1,7 +1,5 @@
 """Figures of the yardstick, of attempts counted by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

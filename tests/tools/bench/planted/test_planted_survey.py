@@ -1,7 +1,5 @@
 """Features of a real frame's cars, as labels and pictures have them, and what is inside of a fault's region."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Rows of the table: cosines, signs, what is kept, bands of distance."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`drivesem gradcheck --reach`: options, what is printed and written, and that finished frames are kept."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Gradients and slopes of margins that are known in full."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

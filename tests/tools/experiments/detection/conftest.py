@@ -1,7 +1,5 @@
 """Arms of two classes on hand-made frames: no renderer, no detector."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

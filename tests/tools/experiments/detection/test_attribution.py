@@ -1,7 +1,5 @@
 """Points of each factor of the protocol."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Metrics of an arm: drops, by which labels, and beyond the controls."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

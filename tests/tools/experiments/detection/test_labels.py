@@ -1,7 +1,5 @@
 """Benign and moved labels of attacked frames."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.tools.experiments.detection.conftest import arm, arm_run, frame

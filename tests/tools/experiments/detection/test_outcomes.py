@@ -1,7 +1,5 @@
 """Grades, cost, success curves and withstanding objects, from hand-made frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

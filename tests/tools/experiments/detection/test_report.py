@@ -1,7 +1,5 @@
 """Tables, files and pictures of a study, from hand-made frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 from dataclasses import replace

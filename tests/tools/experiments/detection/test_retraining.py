@@ -1,7 +1,5 @@
 """The study `retrain`: results, report, and the whole on embedded frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

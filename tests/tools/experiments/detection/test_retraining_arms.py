@@ -1,7 +1,5 @@
 """Arms of the study `retrain`, their frames and pictures."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Sequence

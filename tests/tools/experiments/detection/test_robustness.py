@@ -1,7 +1,5 @@
 """How likely arms miss a car, from hand-made counts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stored results: read back they give the same tables, and damaged ones are refused in one line."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from collections.abc import Sequence

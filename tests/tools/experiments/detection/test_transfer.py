@@ -1,7 +1,5 @@
 """The study `transfer` on an embedded frame."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Percentiles of places, headings and sizes: by hand on made-up distributions, and what KITTI's own say."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

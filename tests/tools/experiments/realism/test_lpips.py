@@ -1,7 +1,5 @@
 """LPIPS and the networks behind it, against its formula written out in float64 with the weights' own names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

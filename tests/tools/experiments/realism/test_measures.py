@@ -1,7 +1,5 @@
 """Measures by name: known values, identity, and weights that are missing, wrong, or where they are looked for."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

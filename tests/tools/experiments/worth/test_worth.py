@@ -1,7 +1,5 @@
 """Information worth: cases worked out by hand, bounds, and detection's points."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
