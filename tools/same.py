@@ -354,7 +354,7 @@ def suite() -> dict[str, list[str]]:
 
 
 def required_cases(name: str, cases: dict[str, list[str]]) -> set[str]:
-    """Cases whose files a case reads."""
+    """Cases that wrote the files a case reads."""
     return set(MADE[name][1]) if name in MADE else set(re.findall(r"@([a-z0-9-]+)", " ".join(cases[name])))
 
 
@@ -400,7 +400,7 @@ class Hasher:
     def plain(self, value: Any) -> Any:
         """A JSON value without the keys of VARYING."""
         if isinstance(value, dict):
-            return {self.text(key): self.plain(item) for key, item in value.items() if key not in VARYING}
+            return {self.text(str(key)): self.plain(item) for key, item in value.items() if key not in VARYING}
         if isinstance(value, list):
             return [self.plain(item) for item in value]
         return self.text(value) if isinstance(value, str) else value
@@ -588,7 +588,7 @@ def run_suite(only: str, work: Path, jobs: int, console: Console) -> dict[str, s
 
 
 def read_table(path: Path, only: str) -> dict[str, str]:
-    """Hashes by file of the cases whose names match."""
+    """Hashes by file of the cases with matching names."""
     rows = dict(line.rsplit(" ", 1) for line in path.read_text().splitlines())
     return {name: value for name, value in rows.items() if re.search(only, name.partition("/")[0])}
 
