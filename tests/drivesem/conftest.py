@@ -100,7 +100,9 @@ def refused(
         folder.mkdir()
         monkeypatch.chdir(folder)
         assert command_line(list(words)) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        printed = capsys.readouterr()
+        (line,) = printed.err.splitlines()
+        assert printed.out == ""
         assert not list(folder.iterdir())
         return line
 

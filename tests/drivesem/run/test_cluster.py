@@ -20,11 +20,12 @@ import ray
 from drivesem.cli import main
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
-from drivesem.run import cluster as clusters
+from drivesem.run import workers as clusters
 from drivesem.run.workers import run_jobs
 from drivesem.store import local_copy
 from scene_ir.errors import FormatError, SceneError
 from tests.drivesem.commands.test_attack_command import contents
+from tests.drivesem.invoke import refusal
 
 
 @pytest.fixture
@@ -134,10 +135,9 @@ def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch
         ray.shutdown()
 
 
-def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     words = ["attack", "--limit", "1", "--engine", "ray", "--address", "127.0.0.1:1", "--out", str(tmp_path / "a")]
-    assert main(words) == 2
-    assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
+    assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in refusal(*words)
     with pytest.raises(UsageError, match="--address"):
         WorkerOptions(address="auto").check()
 
@@ -146,9 +146,7 @@ Alike = Callable[..., None]
 
 
 @pytest.fixture
-def alike(
-    tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Alike:
+def alike(tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch) -> Alike:
     """Runs a command here and on the cluster, and compares its two folders, but for the files that are named."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
