@@ -21,7 +21,7 @@ from drivesem.failures.grades import Grade
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.driver import CachedFrameResult, FrameAnalyser, ProgressSettings, analyse_frames
 from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_referenced_files, claim_folder
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json, load_record
 from scene_ir import files
 from scene_ir.errors import FormatError

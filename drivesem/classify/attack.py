@@ -42,7 +42,7 @@ from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, SecondO
 from drivesem.failures.nuisances import Nuisances, NuisanceSample
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import FRAMES, claim_folder, resolve_output_folder
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.records import dump_record
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError

@@ -26,7 +26,7 @@ from drivesem.failures.grades import Grade
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.lock import acquire_folder_lock
 from drivesem.run.records import dump_record
 from scene_ir import files

@@ -1,4 +1,4 @@
-"""The objective of an attack on a classifier: theta to picture to loss, prediction and gradient."""
+"""The objective of an attack on a classifier, theta to loss and gradient; and the search methods with their defaults."""
 
 from __future__ import annotations
 

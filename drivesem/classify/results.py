@@ -1,4 +1,4 @@
-"""Results of an attack on a classifier: one record per picture, and the metrics of a run."""
+"""Results of an attack on a classifier: a record per picture, the metrics of a run, its table and page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivesem.report.drawing import encode_jpeg_data_url
 from drivesem.report.tables import format_percent, rows_to_csv
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.records import load_record
 from drivesem.run.run_report import PAGE
 from scene_ir import files

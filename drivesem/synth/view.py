@@ -1,4 +1,4 @@
-"""What a street is photographed with, and what the camera sees of it."""
+"""What a street is photographed with, and what the camera sees of it; textures of noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constraints on vehicles: limits, a scene's bounds and their violations; road, gaps and overlaps."""
+"""Constraints: limits and violations of road, gaps and overlaps; strain of meshes; combinations of weather codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gradient ascent on the loss: si-FGSM, FGSM and SGD on semantic parameters, after the paper's equations."""
+"""Gradient ascent on the loss: si-FGSM, FGSM, SGD and Auto-PGD on semantic parameters, after the paper's equations."""
 
 from __future__ import annotations
 

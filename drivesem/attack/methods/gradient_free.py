@@ -1,4 +1,4 @@
-"""Gradient-free searches, which project and score thetas one by one: random and Halton samples, CMA-ES.
+"""Gradient-free searches, which project and score thetas one by one: random and Halton samples, CMA-ES; the placebo.
 
 Batches are not faster on a CPU: renders take the same time, and the detector's working set leaves the cache
 (measured: 97 ms for a single image, 123 ms for each in a batch of eight).
