@@ -1,4 +1,4 @@
-"""The objective of an attack on a classifier, theta to loss and gradient; and the search methods with their defaults."""
+"""The objective of an attack on a classifier, theta to loss and gradient, and the search methods with defaults."""
 
 from __future__ import annotations
 
