@@ -99,6 +99,7 @@ def refused(
         folder = tmp_path / "empty"
         folder.mkdir()
         monkeypatch.chdir(folder)
+        capsys.readouterr()
         assert command_line(list(words)) == 2
         printed = capsys.readouterr()
         (line,) = printed.err.splitlines()
