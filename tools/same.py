@@ -5,7 +5,7 @@ python tools/same.py --out after.txt             # with the new code
 python tools/same.py --compare before.txt after.txt
 
 A line of a table is `case/file hash`; hashes ignore times, versions and paths. Both tables must come from one
-machine. `--only 'convert|eval'` takes the cases whose names match, after those that they need. `--work DIR` keeps
+machine. `--only 'convert|eval'` takes the cases with matching names, after those that they need. `--work DIR` keeps
 the files of the commands in DIR. Commands run with the Python and the `drivesem` of this script.
 
 With `--renamed FILE`, `--compare` takes two such folders and compares values of JSON, YAML and CSV files after it

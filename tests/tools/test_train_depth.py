@@ -77,7 +77,7 @@ def test_the_truth_costs_least(store: Any) -> None:
 
 def test_judged_beside_walls_by_rule(streets: list[Any]) -> None:
     network = DepthNet().eval()
-    figures = training.judge(network, streets[:1])
-    assert set(figures) == {"walls by rule", "network", "both"}
-    assert all(error >= 0 and 0 <= near <= 1 for error, near in figures.values())
-    assert training.format_table(figures).count("\n") == 1 + len(figures)
+    metrics = training.judge(network, streets[:1])
+    assert set(metrics) == {"walls by rule", "network", "both"}
+    assert all(error >= 0 and 0 <= near <= 1 for error, near in metrics.values())
+    assert training.format_table(metrics).count("\n") == 1 + len(metrics)

@@ -76,7 +76,7 @@ def test_the_truth_costs_least(store: Any) -> None:
 
 
 def test_judged_by_overlap(streets: list[Any]) -> None:
-    figures = training.judge(training.SegmentRun(SETTINGS).averaged(), streets)
-    assert set(figures) == set(training.JUDGED)
-    assert all(0 <= whole <= 1 for whole, _ in figures.values())
-    assert training.format_table(figures).count("\n") == 1 + len(figures)
+    metrics = training.judge(training.SegmentRun(SETTINGS).averaged(), streets)
+    assert set(metrics) == set(training.JUDGED)
+    assert all(0 <= whole <= 1 for whole, _ in metrics.values())
+    assert training.format_table(metrics).count("\n") == 1 + len(metrics)

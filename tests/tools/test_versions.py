@@ -66,7 +66,7 @@ def test_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ("python8", "lowest", ""), ("python8", "highest", ""),
     ]  # fmt: skip
     assert told[0]["found"] == {"Python": "9.0.1", "torch": "9.1"}
-    assert told[0]["figures"] == {"frames": 10, "grades": {"certain": 3}}
+    assert told[0]["metrics"] == {"frames": 10, "grades": {"certain": 3}}
     out = capsys.readouterr().out
     assert "python9, highest: works\n    {'frames': 10, 'grades': {'certain': 3}}; without EGL\n" in out
     assert "| 9.0.1 | highest | 9.1 |" in out

@@ -88,7 +88,7 @@ def test_a_line_counts_what_both_see() -> None:
     nearer, farther, turned, share = moves.summary(rows)
     assert (farther["split"], farther["change"], farther["count"]) == ("train", "1 m farther", 3)
     assert (farther["psnr_db"], farther["tail_db"]) == (25.0, 21.0)
-    assert (farther["found"], farther["kept"], farther["agree"]) == (2, 1, 0.667)
+    assert (farther["found"], farther["detected_ours"], farther["agree"]) == (2, 1, 0.667)
     assert farther["score_apart"] == farther["score_tail"] == pytest.approx(0.2)
     assert [line["change"] for line in (nearer, turned)] == ["1 m nearer", "5 degrees"]
     # One metre of twenty.

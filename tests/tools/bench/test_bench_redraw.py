@@ -36,7 +36,7 @@ class Twice:
 
 
 def row(name: str, **changes: object) -> redraw.RedrawRow:
-    facts = {"cars": 2, "apart": 3.0, "psnr_db": 30.0, "apart_beside": 0.5, "psnr_moved_db": 25.0}
+    facts = {"cars": 2, "apart": 3.0, "psnr_db": 30.0, "apart_outside": 0.5, "psnr_moved_db": 25.0}
     facts |= {"photograph": 2, "ours": 2, "second": 1, "moved": 1, "ours_moved": 1, "second_moved": 0}
     return redraw.RedrawRow(frame=name, **facts | {"made_s": 1.0, "picture_s": 0.25} | changes)
 

@@ -15,7 +15,7 @@ from drivesem.config.commands import ClassifyConfig
 from drivesem.config.presets import find_presets
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import ARMS, FRAMES, SHARING, claim_folder
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from scene_ir import files
 from tools.experiments.settings import StudyConfig
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.analysis.transfer.run import split_list
+from drivesem.analysis.transfer import split_list
 from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
 from drivesem.classify.objects.embedded import open_objects

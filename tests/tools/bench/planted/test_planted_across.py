@@ -97,7 +97,7 @@ def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
 def test_chance_has_no_name(pools: list[FramePool]) -> None:
     rows = chance_rows(pools, 0, shams=6)
     assert [row["faults"] for row in rows] == [6, 6]
-    assert sum(row["told"] for row in rows) <= 1
+    assert sum(row["with_rule"] for row in rows) <= 1
 
 
 def test_rows_are_summed_by_what_named_them() -> None:
@@ -106,8 +106,8 @@ def test_rows_are_summed_by_what_named_them() -> None:
     blunt = replace(one, named=False, rules=(), further=0, passes=100, sharp=0.1)
     planted, sharp, none = summary_rows([one, blunt, replace(one, fault="", sharp=None, further=2)])
     assert (sharp["by"], sharp["faults"], sharp["named"]) == ("climb, sharp faults", 1, 1)
-    assert (planted["faults"], planted["named"], planted["in_part"], planted["told"]) == (2, 1, 2, 1)
+    assert (planted["faults"], planted["named"], planted["in_part"], planted["with_rule"]) == (2, 1, 2, 1)
     assert planted["low"] < 0.5 < planted["high"]
     assert (planted["further"], planted["passes"]) == (1, 200)
-    assert (none["by"], none["named"], none["told"], none["further"]) == ("climb, no fault", None, 1, 2)
+    assert (none["by"], none["named"], none["with_rule"], none["further"]) == ("climb, no fault", None, 1, 2)
     assert one.to_json()["rule"] == "a"

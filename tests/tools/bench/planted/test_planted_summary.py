@@ -50,8 +50,14 @@ def test_names_are_counted_where_somebody_asked() -> None:
     none = replace(FIRST, kind=NO_FAULT, rarity=NO_FAULT, fault="", rule="moved_m 0 to 1", naming=90)
     judged = [FrameSearches("a", (told, none), ()), FrameSearches("b", (anywhere,), ())]
     easy, control = method_rows(judged, ("halton",), 0)
-    assert (easy["asked"], easy["told"], easy["named"], easy["in_part"], easy["naming"]) == (2, 1, 1, 1, 180)
-    assert (control["rarity"], control["told"], control["named"]) == (NO_FAULT, 1, 0)
+    assert (easy["explained"], easy["with_rule"], easy["named"], easy["in_part"], easy["naming"]) == (
+        2,
+        1,
+        1,
+        1,
+        180,
+    )
+    assert (control["rarity"], control["with_rule"], control["named"]) == (NO_FAULT, 1, 0)
     assert {row["kind"] for row in kind_rows(judged, ("halton",))} == {"aspect easy"}
 
 

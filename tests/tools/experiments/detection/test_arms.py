@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from drivesem.run.protocol import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
+from drivesem.run.run_report import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
 from scene_ir.errors import FormatError
 from tools.experiments.detection.arms import (
     PAPER_PROTOCOL,

@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 from drivesem.config.commands import AttackConfig
-from drivesem.run.protocol import follows_paper
+from drivesem.run.run_report import follows_paper
 from tests.tools.experiments.detection.conftest import counted, frame
 from tools.experiments.detection.arms import PAPER_PROTOCOL
 from tools.experiments.detection.attribution import (

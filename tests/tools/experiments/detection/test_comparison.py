@@ -6,7 +6,7 @@ import pytest
 
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.resampling import holm
-from drivesem.run.protocol import PAPER_BENIGN
+from drivesem.run.run_report import PAPER_BENIGN
 from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
 from tools.experiments.detection.arms import PLACEBO, RANDOM
 from tools.experiments.detection.comparison import compare_arms

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
+from drivesem.analysis.confirm import Confirmation, SurvivalRate
 from drivesem.run.folder import ARMS
 from scene_ir import files
 from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame

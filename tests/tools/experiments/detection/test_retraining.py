@@ -16,7 +16,7 @@ from rich.console import Console
 
 from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.transfer.matrix import (
+from drivesem.analysis.transfer import (
     SourceRun,
     TransferCounts,
     TransferTarget,
@@ -24,8 +24,8 @@ from drivesem.analysis.transfer.matrix import (
 from drivesem.attack.methods.base import Attack
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.frame import detections_from_records
-from drivesem.run.protocol import PROTOCOL
 from drivesem.run.results import FrameResult
+from drivesem.run.run_report import PROTOCOL
 from tests.tools.experiments.conftest import REQUIRED_KEYS
 from tests.tools.experiments.detection.conftest import arm, arm_run, frame
 from tools.experiments.__main__ import main

@@ -20,7 +20,7 @@ from drivesem.data import kitti
 from drivesem.data.kitti import KittiWriter
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.run.results import dump_frame
-from drivesem.training.samples import AttackedFrame, TrainingMixture
+from drivesem.training.frames import AttackedFrame, TrainingMixture
 from scene_ir import files
 from scene_ir.errors import SceneError
 from scene_ir.io import SCHEMA, VERSION

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors.types import CLASSES
-from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
-from drivesem.analysis.transfer.matrix import SourceRun, TransferCounts, TransferTarget
+from drivesem.analysis.confirm import Confirmation, SurvivalRate
+from drivesem.analysis.transfer import SourceRun, TransferCounts, TransferTarget
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.matched_class import FALSE, IGNORED, TRUE, ThresholdMatches

@@ -15,7 +15,7 @@ import torch
 from detectors.types import Detections
 from drivesem.attack.methods.base import Attack
 from drivesem.run import detection_cache as looking
-from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS
+from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS
 from tests.tools.experiments.conftest import REQUIRED_KEYS
 from tools.experiments.__main__ import main
 from tools.experiments.detection import transfer
