@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import subprocess
@@ -151,12 +152,12 @@ def alike(tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch) -> Alik
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    def run(words: list[str], out: str, *varying: str) -> None:
+    def run(words: list[str], out: str, *varying: str, program: str = "drivesem.cli") -> None:
         contents_by_run, others = [], (*varying, "config.yaml", ".lock")
-        alone = [sys.executable, "-m", "drivesem.cli", *words, "--workers", "1", "--out", str(tmp_path / out)]
+        alone = [sys.executable, "-m", program, *words, "--workers", "1", "--out", str(tmp_path / out)]
         subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
         shared = ["--engine", "ray", "--address", cluster.address, "--out", str(tmp_path / f"{out}-ray"), "--json"]
-        assert main([*words, *shared]) == 0
+        assert importlib.import_module(program).main([*words, *shared]) == 0
         for folder in (out, f"{out}-ray"):
             contents_by_run.append(
                 {n: x for n, x in contents(tmp_path / folder).items() if not n.startswith(others)}
@@ -187,21 +188,10 @@ def test_frames_from_a_cluster_equal_local_ones(tmp_path: Path, cluster: Any, al
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_analyses_on_a_cluster_equal_local_ones(tmp_path: Path, alike: Alike) -> None:
-    study = [
-        "study",
-        "labels",
-        "--quick",
-        "--limit",
-        "1",
-        "--steps",
-        "1",
-        "--second-detector",
-        "off",
-        "--bootstrap",
-        "0",
-    ]
-    place_and_time = ("kept/study.json", "kept/frames.csv", "arms/translate/config.yaml")
-    alike(study, "study", "study.", "largest", "label_sets", "arms/combo", *place_and_time)
+    study = ["labels", "--quick", "--limit", "1", "--steps", "1", "--second-detector", "off", "--bootstrap", "0"]
+    place_and_time = ("results/study.json", "results/frames.csv", "arms/translate/config.yaml")
+    varying = ("study.", "largest", "label_sets", "arms/combo", *place_and_time)
+    alike(study, "study", *varying, program="tools.experiments.__main__")
     run = str(tmp_path / "study" / "arms" / "translate")
     alike(["confirm", "--run", run], "confirm")
     alike(["holes", run, "--samples", "24", "--fresh", "8"], "holes")
