@@ -19,9 +19,8 @@ from typing import Any
 import tyro
 
 from drivesem.config.errors import CommandLineError, UsageError
-from drivesem.config.help import format_overview
 from drivesem.config.options import CommandConfig, option_name
-from drivesem.config.parsing import parse
+from drivesem.config.parsing import format_overview, parse
 from scene_ir.errors import make_printable
 
 _EXIT_BAD_INPUT = 2

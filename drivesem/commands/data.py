@@ -91,7 +91,7 @@ def export_command(config: ExportConfig) -> int:
 
 
 def _gltf(config: ExportConfig, out: Path) -> int:
-    from drivesem.run.gltf import export_scenes
+    from drivesem.run.export import export_scenes
 
     written = export_scenes(Path(config.run or ""), out)
     if config.json:
