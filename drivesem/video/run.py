@@ -120,7 +120,8 @@ def to_attack_config(config: DriveConfig) -> AttackConfig:
     settings: dict[str, Any] = {name: getattr(config, name) for name in shared}
     if config.params is None and config.combo is None:
         settings["params"] = DEFAULT_PARAMS
-    attack = AttackConfig(**{**settings, "confirm": False, "second_detector": "off"})
+    settings |= {"confirm": False, "second_detector": "off"}
+    attack = AttackConfig(**settings)
     attack.check()
     return attack
 
