@@ -142,7 +142,7 @@ def _load_adapted(kind: str, rest: str) -> Detector:
 
         return load_torchvision(*arguments, spec=spec)
     if kind == "module":
-        from detectors.adapters.module import load_user_detector
+        from detectors.adapters.network import load_user_detector
 
         return load_user_detector(arguments[0], spec)
     from detectors.adapters import network

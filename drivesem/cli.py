@@ -27,10 +27,10 @@ EXAMPLES = {
     "drivesem export runs/a --to coco --out for-training": "turn the counterexamples into training data",
 }
 _MODULES = {
-    "analyses": ("confirm", "drive", "explain", "gate", "holes", "transfer"),
+    "analyses": ("confirm", "drive", "explain", "gate", "holes", "transfer", "verify"),
     "attack": ("attack", "report"),
     "data": ("convert", "export", "inspect"),
-    "scenes": ("edit", "render"),
+    "scenes": ("derender", "edit", "render"),
     "training": ("train", "retrain"),
 }
 """Modules of `drivesem.commands` with several commands; the others hold the command of their name."""

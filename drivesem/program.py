@@ -19,9 +19,8 @@ from typing import Any
 import tyro
 
 from drivesem.config.errors import CommandLineError, UsageError
-from drivesem.config.help import format_overview
 from drivesem.config.options import CommandConfig, option_name
-from drivesem.config.parsing import parse
+from drivesem.config.parsing import format_overview, parse
 from scene_ir.errors import make_printable
 
 _EXIT_BAD_INPUT = 2
@@ -161,7 +160,7 @@ def _report_code(config: CommandConfig) -> None:
 
 def _user_detector_error(error: Exception) -> UsageError | None:
     """An error that a user's own detector raised, as a UsageError of the option that names it."""
-    module = sys.modules.get("detectors.adapters.module")  # imports nothing heavy
+    module = sys.modules.get("detectors.adapters.network")  # imports nothing heavy
     if module is None or _is_bad_input(error):
         return None
     found = module.describe_user_error(error)

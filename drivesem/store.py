@@ -275,7 +275,7 @@ class RemoteFolder:
 def _track_progress(names: Iterable[str]) -> Iterable[str]:
     from rich.progress import track
 
-    from drivesem.report.terminal import Console
+    from drivesem.report.tables import Console
 
     names = list(names)
     bar = Console(stderr=True)

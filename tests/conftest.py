@@ -42,7 +42,7 @@ QUICK = [
     "drivesem/scenes/test_segmenter.py",
     "drivesem/run/test_results.py",
     "drivesem/training/test_samples.py",
-    "drivesem/analysis/explain/test_shapley.py",
+    "drivesem/analysis/explain/test_shapley_values.py",
     "tools/experiments/survey/test_results.py",
     "drivesem/bench/test_timing.py",
     "drivesem/commands/test_convert_command.py",

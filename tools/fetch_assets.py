@@ -59,7 +59,7 @@ _DARKEST = 0.2
 """Least sRGB value of trim: black plastic reflects about 3 %; some models give 0."""
 SKIES = {"dawn": 5.0, "night": 14.0, "park": 7.0, "sky": 1.5, "sunrise": 11.0, "venice": 20.0}
 """Outdoor skies, and how many degrees their trees and hills rise above the horizon: at 512x256 they are a blur, so
-the sky above is drawn down over them. The other skies are rooms, a forest, and towns whose towers are too high."""
+the sky above is drawn down over them. The other skies are rooms, a forest, and towns with towers that are too high."""
 _FREE_DEG = 50.0
 """From here upwards a sky stays as it is."""
 
@@ -81,7 +81,7 @@ class ModelFile:
     front: str = "+z"
     """The axis that it looks along."""
     plain: tuple[str, ...] = ()
-    """Materials whose texture is too fine to keep."""
+    """Materials with a texture that is too fine."""
     roof_m: float | None = None
     """What lies wholly above this is left out (aerials)."""
 
@@ -255,7 +255,7 @@ def _part(model: ModelFile, material: str) -> Part:
 def _cut(
     shapes: list[tuple[np.ndarray, trimesh.Trimesh, bool]], entry: PackEntry
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """All triangles (F, 3, 3) with their colours (F, 3), and how many each shape gave, as `_CUTS` says.
+    """All triangles (F, 3, 3) with their colours (F, 3), and the number from each shape, see `_CUTS`.
 
     shapes: points in m, faces and texture, and whether they stay whole.
     """
@@ -361,16 +361,16 @@ def facing(corners: np.ndarray, views: int = 60, size_px: int = 640) -> np.ndarr
         rise = 0.999 - 1.499 * i / max(views - 1, 1)
         flat = np.sqrt(1 - rise * rise)
         # The way the camera looks: down where it stands above.
-        look = -np.array([flat * np.cos(golden * i), -rise, flat * np.sin(golden * i)])
-        right = np.cross([0.0, 1.0, 0.0], look)
+        view_direction = -np.array([flat * np.cos(golden * i), -rise, flat * np.sin(golden * i)])
+        right = np.cross([0.0, 1.0, 0.0], view_direction)
         right /= np.linalg.norm(right)
-        turn = np.stack([right, np.cross(look, right), look])
+        turn = np.stack([right, np.cross(view_direction, right), view_direction])
         placed = (centred @ turn.T + [0, 0, far * reach]).astype(np.float32)
         face, _ = rasterise(
             placed, intrinsics, np.array([[0, 0, size_px, size_px]]), np.array([[0, len(corners)]])
         )
         pixels = np.bincount(face[face >= 0], minlength=len(corners))
-        score -= pixels * np.sign(normal @ look + 1e-12)
+        score -= pixels * np.sign(normal @ view_direction + 1e-12)
     return score
 
 

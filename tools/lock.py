@@ -4,7 +4,7 @@
     python -m tools.lock report.json                       # writes constraints.lock
     python -m tools.lock report.json --check               # exit code 1 where it is another
 
-`constraints.txt` holds no hashes itself: pip then refuses whatever has none, an editable project among it. Each
+`constraints.txt` holds no hashes itself: pip then refuses packages without one, an editable project among it. Each
 hash is of the file that pip chose for the interpreter and the machine that it ran on.
 """
 
@@ -48,8 +48,8 @@ def hashes(reports: Sequence[Path]) -> dict[str, str]:
     for path in reports:
         try:
             for one in files.read_json(path)["install"]:
-                told = one["metadata"]
-                release = f"{normalise_name(told['name'])}=={told['version']}"
+                metadata = one["metadata"]
+                release = f"{normalise_name(metadata['name'])}=={metadata['version']}"
                 found[release] = one["download_info"]["archive_info"]["hashes"]["sha256"]
         except (KeyError, TypeError) as error:
             raise FormatError(str(path), "a report of pip install --report", repr(error)) from error

@@ -106,7 +106,7 @@ def draw(mesh: Mesh, clip: Tensor, normals: Tensor, rect: Sequence[int]) -> Vehi
 
 
 def rim(covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels of the mask beside pixels outside it."""
+    """Pixels of the mask next to pixels outside it."""
     return covered & (cv2.erode(covered.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
 
 
@@ -137,7 +137,7 @@ def compare(full: Mesh, coarse: Mesh, view: VehicleView) -> DetailError:
 
 
 def bend(generator: torch.Generator, amplitude: float) -> Tensor:
-    """Random lattice offsets (64, 3), symmetric left to right, the lowest layer kept on the ground."""
+    """Random lattice offsets (64, 3), symmetric left to right, the lowest layer on the ground."""
     offsets = ffd.symmetrise((2 * torch.rand(LATTICE_POINTS, 3, generator=generator) - 1) * amplitude)
     grid = offsets.reshape(4, 4, 4, 3)
     grid[:, -1, :, 1] = 0.0

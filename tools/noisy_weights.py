@@ -17,8 +17,8 @@ from detectors.registry import load_detector, save_detector
 
 
 def with_noise(detector: Detector, share: float, seed: int = 0) -> Detector:
-    """The detector, whose weights of two dimensions or more have noise of so large a share of their standard
-    deviation added, in place. ValueError for a share below 0.
+    """Add noise to the detector's weights of two or more dimensions, in place, of this share of their standard
+    deviation. ValueError for a share below 0.
     """
     if not share >= 0:
         raise ValueError(f"share: expected at least 0, found {share}")

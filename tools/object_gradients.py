@@ -1,17 +1,16 @@
-"""How well gradients to an object's vertices, pose and light tell what happens: derivatives beside differences.
+"""Agreement of gradients to an object's vertices, pose and light with central differences.
 
     python -m tools.object_gradients [bus/0080:left ...] [--params vertex pose lighting] [--points 8]
 
-Along random directions, in which all coordinates move by a step in the root mean square (vertices: each by
-itself), central differences stand beside gradients: through the picture, times smooth noise, and through the
-shipped classifier's score of the true class. Printed are cosines over directions: with the gradient in the middle,
-and with the mean of gradients along the way from the one end of the difference to the other. The first one falls
-short where the slope itself changes over the step, as that of a network does. The second one does not: what
-changes without a jump changes by what its slopes add up to. Of the score, two more say whose doing the
-rest is: the network's gradient in the middle, times how much the picture changes from end to end, beside the
-change of the score, in which no gradient of the renderer has a part; and the whole gradient in the middle beside
-that product, in which the network is the same linear one on both sides. By default of one held-out object of each
-class, in a view that is not straight ahead.
+Along random directions, in which all coordinates move by a step in the root mean square (vertices: each by itself),
+gradients are compared with central differences: through the picture, times smooth noise, and through the shipped
+classifier's score of the true class. The tool prints cosines over directions: with the gradient in the middle, and
+with the mean of gradients along the way between the ends of the difference. The first one is lower where the slope
+itself changes over the step, as a network's does; the second one is not, because a continuous change is the integral
+of its slopes. For the score, two more cosines separate the sources of the rest: the network's gradient in the middle
+times the change of the picture, against the change of the score (no gradient of the renderer involved); and the whole
+gradient in the middle against that product (the same linear network on both sides). By default for one held-out
+object of each class, in a view that is not straight ahead.
 """
 
 from __future__ import annotations
@@ -97,22 +96,22 @@ def main() -> None:
     parser.add_argument("--step", type=float, help="instead of each parameter's own")
     parser.add_argument("--directions", type=int, default=6)
     parser.add_argument("--points", type=int, default=8, help="along each way, at which gradients are taken")
-    told = parser.parse_args()
-    objects = open_objects(told.objects)
+    arguments = parser.parse_args()
+    objects = open_objects(arguments.objects)
     network = load_classifier("squeezenet", objects.classes)
     noise = torch.randn(1, 3, SEEN_PX, SEEN_PX, generator=torch.Generator().manual_seed(0))
     noise = F.avg_pool2d(noise, 9, 1, 4)[0].double()
     views = list(VIEWS)[1:]
     usual = [f"{kind}/0080:{views[place % 3]}" for place, kind in enumerate(objects.classes)]
-    found: dict[str, list[Tensor]] = {name: [] for name in told.params}
+    found: dict[str, list[Tensor]] = {name: [] for name in arguments.params}
     print(
         "cosines through the picture: in the middle, along the way; through the score: the same; "
         "what the network's slope leaves of it, what the renderer's does"
     )
-    for word in told.names or usual:
+    for word in arguments.names or usual:
         name, _, view = word.partition(":")
         scene = ObjectScene(name, objects.load(name), view or views[0], generate_background(name))
-        for parameter in told.params:
+        for parameter in arguments.params:
             space = ObjectSpace(
                 scene.vertices, (ClassifyParameter(parameter),), ParameterAmounts(0.002, 0.15, 0.2)
             )
@@ -124,8 +123,8 @@ def main() -> None:
                 return network(picture[None])[0, label]
 
             values = PictureScore(picture, score, noise)
-            directions = torch.randn(told.directions, space.dim, generator=torch.Generator().manual_seed(1))
-            row = cosines(values, directions, told.step or STEPS[parameter], told.points)
+            directions = torch.randn(arguments.directions, space.dim, generator=torch.Generator().manual_seed(1))
+            row = cosines(values, directions, arguments.step or STEPS[parameter], arguments.points)
             found[parameter].append(row)
             print(f"{word}, {parameter}, {space.dim} coordinates: {_row(row)}", flush=True)
     for parameter, rows in found.items():

@@ -1,12 +1,11 @@
-"""What the renderer takes of a step of an attack on a classifier, and how long an attack's steps take.
+"""Time of the renderer in one step of an attack on a classifier, and of whole attack steps.
 
     python -m tools.object_step [bus/0080:top ...] [--network vgg16] [--rounds 12] [--threads 2]
 
-A step is the gradient of the true class's score to pose and vertices, at a place half a step from the object as
-it is. Measured in turn are the whole step, the picture and its gradient alone, and the network and its gradient to
-the picture alone: medians and quartiles of the processor's milliseconds, which other work on the machine lengthens
-less than the clock's. Then si-FGSM goes five steps that nothing ends early, each with a look at what it leads to.
-Weights are random ones: they do not change how long a network takes.
+A step is the gradient of the true class's score to pose and vertices, half a step away from the original object.
+Measured in turn are the whole step, the picture with its gradient, and the network with its gradient to the picture:
+medians and quartiles of CPU milliseconds, which other work on the machine affects less than wall time. Then si-FGSM
+takes five steps without early stop, each with an evaluation. Weights are random: they do not change the time.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import torch
 
 from drivesem.attack.methods.gradient_ascent import SiFGSM
 from drivesem.bench.timing import CallTime, PairedTimer, Spread
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import ARCHITECTURES, prepare_for_inference
 from drivesem.classify.objective import ClassifierObjective, compute_attack_loss
 from drivesem.classify.objects.embedded import open_objects
@@ -53,7 +52,7 @@ class ObjectStep:
         picture = self.scene.render(self.space.change(leaf))
         torch.autograd.grad(picture, leaf, self.gradient)
 
-    def looking(self) -> None:
+    def run_network(self) -> None:
         """The network's score, and its gradient to the picture."""
         leaf = self.seen.clone().requires_grad_(True)
         torch.autograd.grad(
@@ -75,34 +74,34 @@ def main() -> None:
     parser.add_argument("--network", choices=list(ARCHITECTURES), default="vgg16")
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--threads", type=int, help="of torch and of the kernels")
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     keep_freed_memory()
-    if told.threads is not None:
-        torch.set_num_threads(told.threads)
-    objects = open_objects(told.objects)
+    if arguments.threads is not None:
+        torch.set_num_threads(arguments.threads)
+    objects = open_objects(arguments.objects)
     torch.manual_seed(0)
-    network = prepare_for_inference(ARCHITECTURES[told.network](objects.classes))
-    for word in told.names:
+    network = prepare_for_inference(ARCHITECTURES[arguments.network](objects.classes))
+    for word in arguments.names:
         name, _, view = word.partition(":")
         scene = ObjectScene(name, objects.load(name), view or "forward", generate_background(name))
         stepping, clock = ObjectStep(scene, network), PairedTimer()
-        parts = (stepping.whole, stepping.drawing, stepping.looking)
+        parts = (stepping.whole, stepping.drawing, stepping.run_network)
         for part in parts:
             part()  # what is loaded once
-        taken = [[clock.time_call(part).cpu_ms for part in parts] for _ in range(told.rounds)]
-        step, drawing, looking = (Spread.from_values(column) for column in zip(*taken, strict=True))
-        share = Spread.from_values([100 * drawn / (drawn + looked) for _, drawn, looked in taken])
+        taken = [[clock.time_call(part).cpu_ms for part in parts] for _ in range(arguments.rounds)]
+        step, drawing, network_time = (Spread.from_values(column) for column in zip(*taken, strict=True))
+        share = Spread.from_values([100 * drawn / (drawn + network_ms) for _, drawn, network_ms in taken])
         attack = stepping.attack()
         print(
-            f"{word}, {len(scene.mesh.faces)} triangles, {told.network}: renderer {share.median:.1f} % "
-            f"[{share.q1:.1f}, {share.q3:.1f}] of a step; processor ms: step {_told(step)}, renderer "
-            f"{_told(drawing)}, network {_told(looking)}; {STEPS} steps {attack.ms / 1e3:.2f} s, "
-            f"{attack.cpu_ms / 1e3:.2f} s of the processor",
+            f"{word}, {len(scene.mesh.faces)} triangles, {arguments.network}: renderer {share.median:.1f} % "
+            f"[{share.q1:.1f}, {share.q3:.1f}] of a step; processor ms: step {_format_spread(step)}, renderer "
+            f"{_format_spread(drawing)}, network {_format_spread(network_time)}; {STEPS} steps "
+            f"{attack.ms / 1e3:.2f} s, {attack.cpu_ms / 1e3:.2f} s of the processor",
             flush=True,
         )
 
 
-def _told(spread: Spread) -> str:
+def _format_spread(spread: Spread) -> str:
     return f"{spread.median:.0f} [{spread.q1:.0f}, {spread.q3:.0f}]"
 
 

@@ -40,9 +40,9 @@ def _constant(name: str, array: np.ndarray) -> bytes:
 def constant_graph(
     input_shape: Sequence[int | str], outputs: Mapping[str, np.ndarray], facts: Mapping[str, str] | None = None
 ) -> bytes:
-    """A model (ModelProto) that takes `image` and gives the same outputs whatever it shows. facts: metadata."""
+    """A model (ModelProto) that takes `image` and always gives the same outputs. facts: metadata."""
     graph = b"".join(_field(1, _constant(name, array)) for name, array in outputs.items())
     graph += _field(2, "test") + _field(11, _value("image", input_shape))
     graph += b"".join(_field(12, _value(name, array.shape)) for name, array in outputs.items())
-    told = b"".join(_field(14, _field(1, key) + _field(2, value)) for key, value in (facts or {}).items())
-    return _field(1, 7) + _field(8, _field(2, 13)) + _field(7, graph) + told
+    metadata = b"".join(_field(14, _field(1, key) + _field(2, value)) for key, value in (facts or {}).items())
+    return _field(1, 7) + _field(8, _field(2, 13)) + _field(7, graph) + metadata

@@ -4,7 +4,7 @@
     python -m tools.resident memory.png attack --dataset kitti --root small --workers 1 --out run
 
 Resident memory of the one process is read from outside (Linux's /proc), now and then, with the number of frames
-that are there. Beside the plot stands a JSON file of the same name.
+that are there. A JSON file of the same name is written next to the plot.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ class MemoryTrace:
 
 
 def watch(words: Sequence[str], run: Path) -> MemoryTrace:
-    """Give a command and look at it until it ends. run: the folder that it writes. RuntimeError where it fails; an
-    interrupt is no failure.
+    """Run a command and sample its memory until it ends. run: the folder that it writes. RuntimeError if it fails;
+    an interrupt is no failure.
     """
     start = time.monotonic()
     process = subprocess.Popen([sys.executable, "-m", "drivesem.cli", *words])
-    looks: list[tuple[float, int, float]] = []
+    samples: list[tuple[float, int, float]] = []
     while process.poll() is None:
-        looks.append((round(time.monotonic() - start, 1), _frames_in(run), _resident_mb(process.pid)))
+        samples.append((round(time.monotonic() - start, 1), _frames_in(run), _resident_mb(process.pid)))
         time.sleep(_SECONDS)
     if process.returncode not in (0, *_STOPPED):
         raise RuntimeError(f"exit code {process.returncode}")
-    return summarise_samples("drivesem " + " ".join(words), looks)
+    return summarise_samples("drivesem " + " ".join(words), samples)
 
 
-def summarise_samples(command: str, looks: Sequence[tuple[float, int, float]]) -> MemoryTrace:
+def summarise_samples(command: str, samples: Sequence[tuple[float, int, float]]) -> MemoryTrace:
     """What was seen: seconds, frames, MB."""
-    looks = [look for look in looks if look[2] > 0]  # a process that has just ended has none
-    seconds, frames, mb = (list(column) for column in zip(*looks, strict=True))
-    late = np.array(looks)[np.array(frames) >= _EARLY * max(frames)]
+    samples = [sample for sample in samples if sample[2] > 0]  # a process that has just ended has none
+    seconds, frames, mb = (list(column) for column in zip(*samples, strict=True))
+    late = np.array(samples)[np.array(frames) >= _EARLY * max(frames)]
     slope, level = np.polyfit(late[:, 1], late[:, 2], 1)
     ends = [round(float(level + slope * late[place, 1]), 1) for place in (0, -1)]
     return MemoryTrace(command, seconds, frames, mb, max(mb), round(float(slope) * 1024, 2), *ends)
@@ -110,8 +110,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     found = watch(given.words, Path(given.words[given.words.index("--out") + 1]))
     draw(found, given.picture)
     files.write_json(given.picture.with_suffix(".json"), asdict(found))
-    figures = {name: value for name, value in asdict(found).items() if not isinstance(value, list)}
-    sys.stdout.write(json.dumps(figures | {"frames": max(found.frames)}, indent=1) + "\n")
+    scalars = {name: value for name, value in asdict(found).items() if not isinstance(value, list)}
+    sys.stdout.write(json.dumps(scalars | {"frames": max(found.frames)}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ python tools/same.py --out after.txt             # with the new code
 python tools/same.py --compare before.txt after.txt
 
 A line of a table is `case/file hash`; hashes ignore times, versions and paths. Both tables must come from one
-machine. `--only 'convert|eval'` takes the cases whose names match, after those that they need. `--work DIR` keeps
+machine. `--only 'convert|eval'` takes the cases with matching names, after those that they need. `--work DIR` keeps
 the files of the commands in DIR. Commands run with the Python and the `drivesem` of this script.
 
 With `--renamed FILE`, `--compare` takes two such folders and compares values of JSON, YAML and CSV files after it
@@ -354,7 +354,7 @@ def suite() -> dict[str, list[str]]:
 
 
 def required_cases(name: str, cases: dict[str, list[str]]) -> set[str]:
-    """Cases whose files a case reads."""
+    """Cases that wrote the files a case reads."""
     return set(MADE[name][1]) if name in MADE else set(re.findall(r"@([a-z0-9-]+)", " ".join(cases[name])))
 
 
@@ -400,7 +400,7 @@ class Hasher:
     def plain(self, value: Any) -> Any:
         """A JSON value without the keys of VARYING."""
         if isinstance(value, dict):
-            return {self.text(key): self.plain(item) for key, item in value.items() if key not in VARYING}
+            return {self.text(str(key)): self.plain(item) for key, item in value.items() if key not in VARYING}
         if isinstance(value, list):
             return [self.plain(item) for item in value]
         return self.text(value) if isinstance(value, str) else value
@@ -588,7 +588,7 @@ def run_suite(only: str, work: Path, jobs: int, console: Console) -> dict[str, s
 
 
 def read_table(path: Path, only: str) -> dict[str, str]:
-    """Hashes by file of the cases whose names match."""
+    """Hashes by file of the cases with matching names."""
     rows = dict(line.rsplit(" ", 1) for line in path.read_text().splitlines())
     return {name: value for name, value in rows.items() if re.search(only, name.partition("/")[0])}
 

@@ -29,10 +29,10 @@ def small_frames(folder: Path, count: int, streets: int = STREETS) -> None:
         subprocess.run([sys.executable, "-m", "drivesem.cli", *words], check=True, stdout=subprocess.DEVNULL)
         source = Path(temporary) / "training"
         cars = {path.stem: sort_labels(path) for path in sorted((source / "label_2").glob("*.txt"))}
-        shown = [name for name, (car, *_) in cars.items() if car[0] == "Car" and _is_seen(car)]
+        visible = [name for name, (car, *_) in cars.items() if car[0] == "Car" and _is_seen(car)]
         width, height = _WINDOW_WH
         for number in range(count):
-            name, turn = shown[number % len(shown)], number // len(shown)
+            name, turn = visible[number % len(visible)], number // len(visible)
             left, top, right, bottom = map(float, cars[name][0][4:8])
             # Each time a little to the side: no two pictures are the same.
             down, across = divmod(turn, _ACROSS)
@@ -44,7 +44,7 @@ def small_frames(folder: Path, count: int, streets: int = STREETS) -> None:
 
 
 def _is_seen(car: Sequence[str]) -> bool:
-    """Whether a label is of a car that can be taken apart, and is small enough for the window."""
+    """Whether a label is of a car that can be de-rendered, and is small enough for the window."""
     truncation, occlusion = float(car[1]), int(car[2])
     left, top, right, bottom = map(float, car[4:8])
     width, height = _WINDOW_WH

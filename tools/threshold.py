@@ -1,4 +1,4 @@
-"""Which score a detector's detections should count from, told by frames that had no say in its weights.
+"""Score threshold t* of a detector, from frames outside its training set.
 
     drivesem synth --layout kitti --split heldout --seed 5 --frames 120 --variations clone --out validation
     python -m tools.threshold validation squeezedet yolov3-slim

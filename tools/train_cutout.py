@@ -3,7 +3,7 @@
     python tools/fetch_assets.py build/assets
     python tools/train_cutout.py --assets build/assets
 
-Streets are made and kept first, in `--run`. A run goes on from its last checkpoint, to the same bytes as one that
+Streets are generated first, in `--run`. A run resumes from its last checkpoint, to the same bytes as one that
 was never stopped (one thread, one machine).
 """
 
@@ -51,14 +51,14 @@ Bytes = NDArray[np.uint8]
 LEAST_PX, MOST_PX, LEAST_SEEN = 12.0, 330.0, 0.1
 """Heights and visible share of the vehicles that are learnt from."""
 AROUND = 0.7
-"""What is kept of the photograph on each side of a vehicle, in sides of its box; and 10 px."""
+"""Margin of the stored crop on each side of a vehicle, in sides of its box; and 10 px."""
 CLEAR_M = 0.3
 """What is that much nearer than all of a vehicle stands in front of it."""
 DARK = 0.15
 """Ground that loses that share of its brightness through a vehicle is wholly shadow."""
 LAYERS = ("red", "green", "blue", "visible", "front", "shadow", "nearer", "whole")
-"""Of what is kept, uint8: the photograph; share of each pixel that shows the vehicle, what stands in front of it,
-its or another's shadow on the ground; nearer vehicles; and the share that would show it if nothing hid it."""
+"""Channels of a stored crop, uint8: the photograph; share of each pixel that shows the vehicle, an occluder, its
+or another's shadow on the ground; nearer vehicles; and the share that would show it if nothing hid it."""
 _GROUND = (int(Semantic.ROAD), int(Semantic.TERRAIN))
 VEHICLES = ("Car", "Van", "Truck")
 
@@ -68,7 +68,7 @@ class CutoutCases:
     """K vehicles."""
 
     rect: np.ndarray
-    """X0, y0, x1, y1 of what is kept, px, (K, 4)."""
+    """x0, y0, x1, y1 of the stored crops, px, (K, 4)."""
     start: np.ndarray
     """Its first byte; matrix (K, 3, 4), (K,)."""
     matrix: np.ndarray
@@ -96,7 +96,7 @@ def street_settings(index: int, split: str, pack: Assets) -> SynthSettings:
 
 
 def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]:
-    """What is kept of each usable vehicle of a frame: layers (h, w, 8), and the row of `CutoutCases` without start."""
+    """Yield crop (h, w, 8) and row of `CutoutCases`, without start, of each usable vehicle of a frame."""
     assert frame.background is not None
     samples = blocks(frame.owner)
     lit = frame.background.max(-1).astype(np.float32)
@@ -112,10 +112,10 @@ def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]
             or not np.isfinite(nearest_m(truth, frame))
         ):
             continue
-        x0, y0, x1, y1 = kept_rect(truth, frame)
+        x0, y0, x1, y1 = crop_rect(truth, frame)
         window = (slice(y0, y1), slice(x0, x1))
-        shown = {t.index: share_in(samples, window, t.index + 1) for t in frame.truths}
-        visible = shown[truth.index]
+        shares = {t.index: share_in(samples, window, t.index + 1) for t in frame.truths}
+        visible = shares[truth.index]
         whole = np.zeros(frame.depth_m.shape, np.float32)
         h, w = truth.opacity.values.shape[1:]
         whole[truth.opacity.y0 : truth.opacity.y0 + h, truth.opacity.x0 : truth.opacity.x0 + w] = (
@@ -124,18 +124,18 @@ def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]
         whole = whole[window]
         hiding, nearer = np.zeros_like(whole), np.zeros_like(whole)
         for other in frame.truths:
-            if other is not truth and np.count_nonzero((whole > 0.5) & (shown[other.index] > 0.5)) >= 2:
-                hiding += shown[other.index]
+            if other is not truth and np.count_nonzero((whole > 0.5) & (shares[other.index] > 0.5)) >= 2:
+                hiding += shares[other.index]
             if other.actor.label in VEHICLES and far_m(other) < far_m(truth):
-                nearer += shown[other.index]
+                nearer += shares[other.index]
         near = (frame.depth_m[window] < nearest_m(truth, frame) - CLEAR_M) & ~ground[window]
         # Beyond its own border a pixel's share is unknown: what hides part of it, may hide all.
         hidden = np.where(whole > 0.99, 1 - visible, np.clip(whole - visible, 0, 1))
         front = np.maximum(np.maximum(hiding, near), hidden).clip(0, 1 - visible)
         layers = np.stack([visible, front, dark[window] * (1 - visible - front), nearer, whole], axis=-1)
-        kept = np.concatenate([frame.image[window], np.rint(255 * layers.clip(0, 1)).astype(np.uint8)], axis=-1)
+        stored = np.concatenate([frame.image[window], np.rint(255 * layers.clip(0, 1)).astype(np.uint8)], axis=-1)
         yield (
-            kept,
+            stored,
             {
                 "rect": [x0, y0, x1, y1],
                 "matrix": frame.camera.matrix.numpy(),
@@ -172,8 +172,8 @@ def far_m(truth: Truth) -> float:
     return float(np.hypot(truth.translation[0], truth.translation[2]))
 
 
-def kept_rect(truth: Truth, frame: SynthFrame) -> tuple[int, int, int, int]:
-    """The part of the photograph that is kept of a vehicle, px, half-open."""
+def crop_rect(truth: Truth, frame: SynthFrame) -> tuple[int, int, int, int]:
+    """The stored part of the photograph around a vehicle, px, half-open."""
     x0, y0, x1, y1 = truth.box_xyxy
     wide, high = AROUND * (x1 - x0) + 10, AROUND * (y1 - y0) + 10
     return (
@@ -194,27 +194,27 @@ def make(folder: Path, split: str, seed: int, frames: int, assets: Path | None) 
     made = []
     for first in range(0, frames, CHUNK):
         part = folder / f"{first:05d}"
-        told = {"seed": seed, "split": split, "assets": assets is not None, "generator": GENERATOR_VERSION}
-        told["frames"] = min(CHUNK, frames - first)
+        facts = {"seed": seed, "split": split, "assets": assets is not None, "generator": GENERATOR_VERSION}
+        facts["frames"] = min(CHUNK, frames - first)
         made.append(part)
-        if (part / "made.json").is_file() and files.read_json(part / "made.json") == told:
+        if (part / "made.json").is_file() and files.read_json(part / "made.json") == facts:
             continue
         part.mkdir(parents=True, exist_ok=True)
         rows: list[dict[str, object]] = []
         place = 0
         with (part / "layers.bin").open("wb") as out:
-            for index in range(first, first + told["frames"]):
+            for index in range(first, first + facts["frames"]):
                 frame = render_frame(plan_frame(seed, index, split, street_settings(index, split, pack)), True)
                 assert frame is not None
-                for kept, row in cutout_cases(frame):
-                    out.write(kept.tobytes())
+                for crop, row in cutout_cases(frame):
+                    out.write(crop.tobytes())
                     rows.append(row | {"start": place})
-                    place += kept.size
+                    place += crop.size
         files.write_npz(
             part / "cases.npz", {f.name: np.array([row[f.name] for row in rows]) for f in fields(CutoutCases)}
         )
-        files.write_json(part / "made.json", told)
-        print(f"{split}: {first + told['frames']} streets, {len(rows)} vehicles in the last {CHUNK}", flush=True)
+        files.write_json(part / "made.json", facts)
+        print(f"{split}: {first + facts['frames']} streets, {len(rows)} vehicles in the last {CHUNK}", flush=True)
     return made
 
 
@@ -231,7 +231,7 @@ class CutoutStore:
         return len(self.part)
 
     def layers(self, index: int) -> Bytes:
-        """What is kept of a vehicle (h, w, 8), see `LAYERS`."""
+        """The stored crop of a vehicle (h, w, 8), see `LAYERS`."""
         x0, y0, x1, y1 = self.cases.rect[index].tolist()
         shape = (y1 - y0, x1 - x0, len(LAYERS))
         start = int(self.cases.start[index])
@@ -271,9 +271,9 @@ WRONG_SHARE, LIKELIEST_SHARE = 0.08, 0.6
 """Vehicles that get a template of any kind; of the others, those that get the likeliest."""
 CAMOUFLAGE_SHARE, JPEG_SHARE, POLE_SHARE, GIVEN_SHARE = 0.3, 0.3, 0.15, 0.3
 """Vehicles painted as bright as what is around them; photographs that were compressed; vehicles with a pole in
-front; second looks at a mask instead of a first look."""
+front; refinements start from a mask instead of a first pass."""
 TILES = 2
-"""Second looks a vehicle."""
+"""Refinement tiles per vehicle."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ def make_sample(
     store: CutoutStore, index: int, amount: float, rng: np.random.Generator | None
 ) -> CutoutSample | None:
     """A vehicle with its template off by `amount`; rng: also in other looks. None where the template shows nowhere
-    in what is kept."""
+    in the stored crop."""
     camera = store.camera(index)
     placement = store.disturbed(index, amount, rng or np.random.default_rng(index))
     rect = cutout.crop_rectangle(placement, camera)
@@ -410,9 +410,9 @@ def add_pole(photograph: Bytes, shares: Bytes, rng: np.random.Generator) -> tupl
     colour = rng.uniform(15, 230) * rng.normal(1, 0.1, 3)
     bar = colour * (1 + rng.uniform(-0.5, 0.5) * across.clip(-1, 1))[..., None]
     photograph = np.clip(photograph + (bar - photograph) * alpha[..., None], 0, 255).astype(np.uint8)
-    kept = shares.astype(np.float32) * (1 - alpha[..., None])
-    kept[..., 1] += 255 * alpha
-    return photograph, np.rint(kept).clip(0, 255).astype(np.uint8)
+    composed = shares.astype(np.float32) * (1 - alpha[..., None])
+    composed[..., 1] += 255 * alpha
+    return photograph, np.rint(composed).clip(0, 255).astype(np.uint8)
 
 
 def build_batch(
@@ -445,7 +445,7 @@ def pixel_weights(sample: CutoutSample) -> NDArray[np.float32]:
 
 
 def mirror(
-    crops: Tensor, said: Tensor, truth: Tensor, weight: Tensor, flip: Tensor
+    crops: Tensor, first: Tensor, truth: Tensor, weight: Tensor, flip: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Some of the batch mirrored: what is left of a vehicle is right of it then."""
     sign = torch.ones(cutout.GUIDE_CHANNELS)
@@ -453,7 +453,7 @@ def mirror(
     chosen = flip[:, None, None, None]
     return (
         torch.where(chosen, crops.flip(3), crops),
-        torch.where(chosen, said.flip(3) * sign[:, None, None], said),
+        torch.where(chosen, first.flip(3) * sign[:, None, None], first),
         torch.where(chosen, truth.flip(3), truth),
         torch.where(chosen, weight.flip(3), weight),
     )
@@ -467,10 +467,10 @@ def initial_loss(logits: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
 
 
 def split_tiles(
-    sample: CutoutSample, said: NDArray[np.float32], rng: np.random.Generator
+    sample: CutoutSample, first: NDArray[np.float32], rng: np.random.Generator
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Second looks at a vehicle's borders: inputs (6, 48, 48), and true shares (2, 48, 48) of visible and front.
-    said (3, 96, 160): the first look's shares."""
+    """Refinement tiles at a vehicle's borders: inputs (6, 48, 48), and true shares (2, 48, 48) of visible and front.
+    first (3, 96, 160): shares of the first pass."""
     h, w = sample.photograph.shape[:2]
     rect, (left, top) = sample.rect, sample.offset
     size = (rect[2] - rect[0], rect[3] - rect[1])
@@ -480,7 +480,7 @@ def split_tiles(
         hard[..., 2] = 0
         before = hard.transpose(2, 0, 1)
     else:
-        before = cutout.resize_shares(said, size)[:, top : top + h, left : left + w]
+        before = cutout.resize_shares(first, size)[:, top : top + h, left : left + w]
     side = TILE + 2 * HALO
     both = np.concatenate([sample.photograph.transpose(2, 0, 1) / np.float32(255), before])
     truth = sample.shares[..., :2].transpose(2, 0, 1) / np.float32(255)
@@ -544,13 +544,13 @@ class CutoutRun(AveragedRun[CutoutNet]):
         step, settings = self.step_number, self.settings
         with self.timed():
             samples, rng = build_batch(store, step, settings)
-            crops, said = first_inputs(samples)
+            crops, first = first_inputs(samples)
             truth = torch.from_numpy(np.stack([s.truth for s in samples])).permute(0, 3, 1, 2).float() / 255
             flip = torch.from_numpy(rng.random(len(samples)) < 0.5)
             weight = torch.from_numpy(np.stack([pixel_weights(s) for s in samples])[:, None])
-            crops, said, truth, weight = mirror(crops, said, truth, weight, flip)
+            crops, first, truth, weight = mirror(crops, first, truth, weight, flip)
             with torch.autocast("cpu", torch.bfloat16):
-                logits = self.network(crops, said)
+                logits = self.network(crops, first)
             terms = {"first": initial_loss(logits, truth, weight)}
             seen = logits.detach().float().softmax(1)[:, :3]
             seen = torch.where(flip[:, None, None, None], seen.flip(3), seen).numpy()
@@ -572,7 +572,7 @@ class CutoutRun(AveragedRun[CutoutNet]):
 @torch.no_grad()
 def judge(store: CutoutStore, network: CutoutNet, amount: float, most: int = 200) -> dict[str, float]:
     """Figures over the first `most` vehicles at least 40 px high of which 70% show, and over smaller or hidden
-    ones: IoU of what is visible (median and tenth percentile); of things in front (median over those with some);
+    ones: IoU of what is visible (median and tenth percentile); of occluders (median over vehicles with some);
     mean difference of the shares along the true border, in px of border."""
     large, small, front, border = [], [], [], []
     for index in range(min(len(store), most)):
@@ -612,7 +612,7 @@ CARD = """# Vehicles cut out of photographs, trained on generated streets
 
 - Architecture: `scene_ir.derender.cutout.CutoutNet`, {parameters:,} parameters: an encoder to a sixteenth and back
   on a 96x160 crop around the placed template (colours, the template's coverage and surface, nearness to its
-  footprint, nearer vehicles), and {second:,} for a second look at the photograph's own pixels along the borders.
+  footprint, nearer vehicles), and {second:,} for a refinement at the photograph's own pixels along the borders.
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
 - Data: {frames:,} streets of the project's own generator (version {version}, split train, seed {data_seed}),
   {vehicles:,} vehicles at least {least:.0f} px high of which 10% show; no photographs. Every other street has
@@ -634,7 +634,7 @@ across the true border, in px.
 ## Limits
 
 It has seen generated pictures only. Without a template near its place it finds nothing: it is no detector. On
-photographs it takes dark parts of vehicles for things in front now and then, and misses thin poles and trunks;
+photographs it takes dark parts of vehicles for occluders now and then, and misses thin poles and trunks;
 `believed` keeps of the former only what is shaped like a pole or known from elsewhere. Not for use in a vehicle.
 
 ## Train it again
@@ -652,10 +652,10 @@ COLUMNS = (
 )
 
 
-def format_table(figures: dict[float, dict[str, float]]) -> str:
+def format_table(metrics: dict[float, dict[str, float]]) -> str:
     """A Markdown table, a row an amount."""
     lines = ["| amount | " + " | ".join(c[1] for c in COLUMNS) + " |", "| --- |" + " --- |" * len(COLUMNS)]
-    for amount, row in figures.items():
+    for amount, row in metrics.items():
         lines.append(f"| {amount:g} | " + " | ".join(text.format(row[key]) for key, _, text in COLUMNS) + " |")
     return "\n".join(lines)
 
@@ -699,9 +699,9 @@ def main() -> None:
                 run.save(checkpoint)
                 print(f"step {run.step_number}, {run.seconds:.0f} s: {terms}", flush=True)
     network = run.averaged()
-    figures = {amount: judge(held, network, amount) for amount in AMOUNTS}
-    print(format_table(figures))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    metrics = {amount: judge(held, network, amount) for amount in AMOUNTS}
+    print(format_table(metrics))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
     run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
@@ -721,7 +721,7 @@ def main() -> None:
         seed=settings.seed,
         note=f"\n  {arguments.remark}" if arguments.remark else "",
         held=len(held),
-        table=format_table(figures),
+        table=format_table(metrics),
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

@@ -1,10 +1,10 @@
-"""Train the network that tells how far a photograph's surroundings are (`scene_ir.derender.depth`) on generated
-streets, whose depth is known exactly.
+"""Train the depth network for a photograph's surroundings (`scene_ir.derender.depth`) on generated streets with exact
+depth.
 
     python tools/train_depth.py --run build/depth
 
-A run first makes its frames (they are kept in its folder), then trains, from the segmenter's weights on. It goes
-on where it was stopped, to the same bytes as one that was never stopped (one thread, one machine).
+A run first generates its frames into its folder, then trains from the segmenter's weights. It resumes
+where it was stopped, to the same bytes as one that was never stopped (one thread, one machine).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from train_segmenter import (
 from drivesem.synth.frames import GENERATOR_VERSION, SynthFrame, render_frame
 from scene_ir import files
 from scene_ir.derender import depth, unet
-from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import depth as maps
 from scene_ir.derender import segmentation as segment
 from scene_ir.derender.depth import DepthNet
 from scene_ir.derender.segmentation import StreetClass
@@ -49,9 +49,9 @@ STREAM = 0xDE9
 """Keeps this tool's random numbers apart from the generator's."""
 HIGHER_FROM, HIGHER = 350, (0.6, 1.7)
 """Index of a stream's first frame that is taken from another height than KITTI's, and how many times as high those
-may be: sizes of things alone must not tell how far they are, feet on the ground tell it too."""
+may be: depth must follow not only from objects' sizes, but also from where they stand on the ground."""
 LEAST_NEARNESS = 0.01
-"""Added before logarithms are taken: beyond 165 m nothing tells distances apart, and no fog shows them."""
+"""Added before logarithms are taken: beyond 165 m distances cannot be distinguished, and no fog shows them."""
 
 
 def street(seed: int, index: int, split: str) -> SynthFrame:
@@ -68,13 +68,13 @@ def street(seed: int, index: int, split: str) -> SynthFrame:
 
 
 def depth_to_nearness(depth_m: np.ndarray, height_m: float) -> np.ndarray:
-    """Nearness (h, w) float16 at the size of kept frames. depth_m (H, W): each pixel takes one of its."""
+    """Nearness (h, w) float16 at the size of stored frames. depth_m (H, W): each pixel takes one of its."""
     nearness = (height_m / depth_m).astype(np.float32)
     return cv2.resize(nearness, STORE_HW[::-1], interpolation=cv2.INTER_NEAREST).astype(np.float16)
 
 
 def training_pictures(frame: SynthFrame) -> dict[str, np.ndarray]:
-    """What is kept of a frame with a background: twice, with its actors and without, image (2, h, w, 3) uint8,
+    """Stored arrays of a frame with a background: twice, with its actors and without, image (2, h, w, 3) uint8,
     classes (2, h, w) uint8 and nearness (2, h, w) float16; elevation and the ground's nearness (h, w) float16;
     focal () px.
     """
@@ -104,13 +104,13 @@ class DepthStore:
     def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         stamp = folder / "frames.json"
-        told = {"seed": seed, "split": split}
-        found = files.read_json(stamp) if stamp.is_file() else told | {"frames": 0}
-        if {k: found[k] for k in told} != told:
-            raise ValueError(f"{stamp}: expected frames of {told}, found {found}")
+        wanted = {"seed": seed, "split": split}
+        found = files.read_json(stamp) if stamp.is_file() else wanted | {"frames": 0}
+        if {k: found[k] for k in wanted} != wanted:
+            raise ValueError(f"{stamp}: expected frames of {wanted}, found {found}")
         for index in range(found["frames"], frames):
             files.write_npz(folder / f"{index:05d}.npz", training_pictures(street(seed, index, split)))
-            files.write_json(stamp, told | {"frames": index + 1})
+            files.write_json(stamp, wanted | {"frames": index + 1})
         parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
         self.images, self.classes, self.nearness = (
             np.concatenate([p[name] for p in parts]) for name in ("images", "classes", "nearness")
@@ -140,23 +140,23 @@ _LEVEL = (StreetClass.ROAD, StreetClass.GROUND, StreetClass.GRASS)
 def example(store: DepthStore, index: int, rng: np.random.Generator) -> DepthExample:
     """A part of a picture, zoomed, mirrored or not, in other light and colours.
 
-    Zoomed, all is as near as it seems. What the network is told of the horizon is off, as an estimated plane is;
+    Zoomed, all is as near as it seems. The horizon given to the network is disturbed, as an estimated plane would be;
     the ground is off with it.
     """
     part = window(rng)
     image = resample_crop(store.images[index], part).astype(np.float32) / 255
     classes = resample_crop(store.classes[index], part, cv2.INTER_NEAREST)
     zoom = np.float32(store.focal[index // 2] * part[1, 1] / unet.INPUT_FOCAL_PX)
-    looks = resample_crop(store.elevation[index // 2].astype(np.float32), part) * zoom
+    elevation = resample_crop(store.elevation[index // 2].astype(np.float32), part) * zoom
     ground = resample_crop(store.ground[index // 2].astype(np.float32), part) * zoom
     near = resample_crop(store.nearness[index].astype(np.float32), part, cv2.INTER_NEAREST) * zoom
-    vary_colours(image, classes, looks, rng)
+    vary_colours(image, classes, elevation, rng)
     vary_light(image, classes, rng)
     image = vary_camera(image, rng)
     error = np.float32(rng.normal(0, HORIZON_ERROR))
-    told = np.where(ground > 0, np.maximum(ground - error, 0), 0)
-    near = np.maximum(np.where(np.isin(classes, _LEVEL), near + told - ground, near), told)
-    return DepthExample(image, looks + error, told, near)
+    known = np.where(ground > 0, np.maximum(ground - error, 0), 0)
+    near = np.maximum(np.where(np.isin(classes, _LEVEL), near + known - ground, near), known)
+    return DepthExample(image, elevation + error, known, near)
 
 
 @dataclass(frozen=True)
@@ -187,9 +187,9 @@ def build_batch(store: DepthStore, step: int, settings: DepthSettings) -> Batch:
         order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
         examples.append(example(store, int(order[inside]), np.random.default_rng([settings.seed, step, place])))
     maps_of = (np.stack([getattr(e, name) for e in examples]) for name in ("elevation", "ground", "nearness"))
-    looks, ground, near = (torch.from_numpy(m.astype(np.float32))[:, None] for m in maps_of)
+    elevation, ground, near = (torch.from_numpy(m.astype(np.float32))[:, None] for m in maps_of)
     images = torch.from_numpy(np.stack([e.image for e in examples])).permute(0, 3, 1, 2)
-    return images, looks, ground, near
+    return images, elevation, ground, near
 
 
 def compute_loss(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float) -> Tensor:
@@ -222,10 +222,10 @@ class DepthRun(AveragedRun[DepthNet]):
         """One step of the optimiser; the loss."""
         step, settings = self.step_number, self.settings
         with self.timed():
-            images, looks, ground, near = build_batch(store, step, settings)
+            images, elevation, ground, near = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 50)
             with torch.autocast("cpu", torch.bfloat16):
-                numbers = self.network(images, looks)
+                numbers = self.network(images, elevation)
             loss = compute_loss(numbers.float(), ground, near, settings.gradient)
             self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())
@@ -237,7 +237,7 @@ FAR_M = 120.0
 
 def judge(network: DepthNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[float, float]]:
     """Relative error and share of pixels within a quarter of the truth, means over frames with a background, by
-    what tells the depth: walls by rule, the network, and both, as they are used."""
+    each source of depth: walls by rule, the network, and both combined as in use."""
     found: dict[str, list[tuple[float, float]]] = {}
     for frame in frames:
         assert frame.background is not None
@@ -258,9 +258,9 @@ def judge(network: DepthNet, frames: Sequence[SynthFrame]) -> dict[str, tuple[fl
         known = frame.background_depth_m < FAR_M
         true = frame.background_depth_m[known]
         for name, guess in guesses.items():
-            told = np.minimum(guess[known], 300.0)
-            near = np.maximum(told / true, true / told) < 1.25
-            found.setdefault(name, []).append((float((np.abs(told - true) / true).mean()), float(near.mean())))
+            estimate = np.minimum(guess[known], 300.0)
+            near = np.maximum(estimate / true, true / estimate) < 1.25
+            found.setdefault(name, []).append((float((np.abs(estimate - true) / true).mean()), float(near.mean())))
     means = {name: np.mean(rows, axis=0) for name, rows in found.items()}
     return {name: (float(error), float(near)) for name, (error, near) in means.items()}
 
@@ -283,16 +283,16 @@ CARD = """# Depth of photographs' surroundings, trained on generated streets
 ## Figures
 
 Held out: {held_out} frames of the generator without vehicles (shapes and streets that no training frame has), up
-to {far:.0f} m. Relative error is the mean of |d - d*| / d*; within 1.25 is the share of pixels whose ratio to
+to {far:.0f} m. Relative error is the mean of |d - d*| / d*; within 1.25 is the share of pixels with a ratio to
 the truth is smaller. What a scene keeps is the mean of both, in logarithms.
 
 {table}
 
-Beside a laser, and in fog, on photographs: `python -m tools.bench depth`, docs/research/benchmarks.md.
+Against a laser, and in fog, on photographs: `python -m tools.bench depth`, docs/research/benchmarks.md.
 
 ## Limits
 
-It has seen generated pictures only. On photographs it errs to the far side. Things that stand on no ground that
+It has seen generated pictures only. On photographs it errs to the far side. Objects that stand on no ground that
 is seen, fences that one sees through, trams and bridges it does not know. Not for use in a vehicle, and no
 measurement.
 
@@ -305,9 +305,9 @@ With the same generator, on the same machine, another run gives the same bytes.
 """
 
 
-def format_table(figures: dict[str, tuple[float, float]]) -> str:
-    """A Markdown table, a row each thing that tells depth."""
-    rows = [f"| {name} | {error:.3f} | {near:.3f} |" for name, (error, near) in figures.items()]
+def format_table(metrics: dict[str, tuple[float, float]]) -> str:
+    """Markdown table, one row per source of depth."""
+    rows = [f"| {name} | {error:.3f} | {near:.3f} |" for name, (error, near) in metrics.items()]
     return "\n".join(["| depth by | relative error | within 1.25 |", "| --- | --- | --- |", *rows])
 
 
@@ -328,9 +328,9 @@ def main() -> None:
     if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
         return
     network = run.averaged()
-    figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(format_table(figures))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    metrics = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
+    print(format_table(metrics))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
     run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
@@ -348,7 +348,7 @@ def main() -> None:
         note=f"\n  {arguments.remark}" if arguments.remark else "",
         held_out=arguments.held_out,
         far=FAR_M,
-        table=format_table(figures),
+        table=format_table(metrics),
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

@@ -37,7 +37,7 @@ from scene_ir.types import Camera, Category, Frame, Labels
 
 STORE_HW = (128, 192)
 STORE_CONTEXT = 2.5
-"""Crops are kept larger than the network's, so that boxes can be jittered."""
+"""Crops are stored larger than the network's input, so that boxes can be jittered."""
 LEAST_HEIGHT_PX, MOST_OCCLUSION = 16.0, 2
 JITTER, JITTER_SHARE, JITTER_MOST = (0.02, 0.06, 0.12), (0.35, 0.3, 0.35), 0.28
 """Standard deviations of a box's sides, in its sides, how often each is used, and the most. The shipped detector's
@@ -98,16 +98,16 @@ def true_poses(labels: Labels, rows: Sequence[int], camera: Camera, kinds: Seque
 
 
 class CropStore:
-    """Crops and truths of a folder that the generator wrote, kept in `cache`."""
+    """Crops and truths of a generated folder, cached in `cache`."""
 
     def __init__(self, root: Path, cache: Path) -> None:
         manifest = files.read_json(root / "manifest.json")
         dataset = KittiDataset(root)
         crops_path, truth_path = cache / "crops.npy", cache / "truth.npz"
         stamp = cache / "frames.json"
-        told = {"seed": manifest["seed"], "frames": len(manifest["frames"]), "context": STORE_CONTEXT}
+        facts = {"seed": manifest["seed"], "frames": len(manifest["frames"]), "context": STORE_CONTEXT}
         self.frames = len(manifest["frames"])
-        if not (stamp.is_file() and json.loads(stamp.read_text()) == told):
+        if not (stamp.is_file() and json.loads(stamp.read_text()) == facts):
             cache.mkdir(parents=True, exist_ok=True)
             crops, truths = [], []
             for entry in manifest["frames"]:
@@ -124,7 +124,7 @@ class CropStore:
             np.save(crops_path, np.concatenate(crops))
             joined = {f.name: np.concatenate([getattr(t, f.name) for t in truths]) for f in fields(TruePoses)}
             files.write_npz(truth_path, joined)
-            files.write_json(stamp, told)
+            files.write_json(stamp, facts)
         self.crops = np.load(crops_path, mmap_mode="r")
         arrays = files.read_npz(truth_path)
         self.truth = TruePoses(*(torch.from_numpy(arrays[f.name]) for f in fields(TruePoses)))
@@ -135,7 +135,7 @@ class CropStore:
 
 @dataclass(frozen=True)
 class PoseTargets:
-    """What the network should say of N boxes: see `Said`; kind (N,) int64."""
+    """Targets of the network for N boxes, see `PosePrediction`; kind (N,) int64."""
 
     alpha: Tensor
     offset: Tensor
@@ -212,26 +212,26 @@ def vary_appearance(crops: Tensor, rng: np.random.Generator) -> Tensor:
     return crops.clamp(0, 1)
 
 
-def loss_terms(said: PosePrediction, wanted: PoseTargets) -> dict[str, Tensor]:
+def loss_terms(predicted: PosePrediction, wanted: PoseTargets) -> dict[str, Tensor]:
     """Terms of the loss, means over boxes, and their weighted sum "total"."""
     centre = torch.arange(pose.BINS) * (2 * math.pi / pose.BINS)
     apart = wanted.alpha[:, None] - centre
     near = (apart.cos() > math.cos(1.5 * math.pi / pose.BINS)).float()
     # the truth belongs to the two nearest bins by its distance to each
     share = (1 - (torch.atan2(apart.sin(), apart.cos()).abs() / (2 * math.pi / pose.BINS))).clamp(min=0)
-    bins = -(share * said.bins.log_softmax(1)).sum(1)
-    direction = F.normalize(said.turn, dim=-1, eps=1e-6)
+    bins = -(share * predicted.bins.log_softmax(1)).sum(1)
+    direction = F.normalize(predicted.turn, dim=-1, eps=1e-6)
     apart_vector = (direction - torch.stack([apart.cos(), apart.sin()], -1)).square().sum(-1)
     turn = (torch.sqrt(apart_vector + 1e-4) * near).sum(1) / near.sum(1)
-    depth = (said.depth - wanted.depth).abs() * torch.exp(-said.log_sigma) + said.log_sigma
+    depth = (predicted.depth - wanted.depth).abs() * torch.exp(-predicted.log_sigma) + predicted.log_sigma
     terms = {
         "bins": bins.mean(),
         "turn": turn.mean(),
-        "offset": F.smooth_l1_loss(said.offset, wanted.offset, beta=0.02),
-        "size": F.smooth_l1_loss(said.size, wanted.size, beta=0.02),
+        "offset": F.smooth_l1_loss(predicted.offset, wanted.offset, beta=0.02),
+        "size": F.smooth_l1_loss(predicted.size, wanted.size, beta=0.02),
         "depth": depth.mean(),
-        "depth_error": (said.depth - wanted.depth).abs().mean(),
-        "kind": F.cross_entropy(said.kind, wanted.kind),
+        "depth_error": (predicted.depth - wanted.depth).abs().mean(),
+        "kind": F.cross_entropy(predicted.kind, wanted.kind),
     }
     weights = {"bins": 1.0, "turn": 4.0, "offset": 4.0, "size": 3.0, "depth": 0.3, "depth_error": 4.0, "kind": 0.3}
     return terms | {"total": sum((weights[k] * v for k, v in terms.items()), torch.zeros(()))}
@@ -288,7 +288,7 @@ class PoseErrors:
         if not len(yaw):
             return {"vehicles": 0}
         flipped = yaw > 90
-        figures = {
+        metrics = {
             "vehicles": len(yaw),
             "yaw_deg": float(np.median(yaw)),
             "yaw_deg_p90": float(np.percentile(yaw, 90)),
@@ -298,8 +298,8 @@ class PoseErrors:
             "depth_pc_p90": 100 * float(np.percentile(self.depth, 90)),
             "place_m": float(np.median(self.place_m)),
         }
-        figures |= {f"{n}_pc": 100 * float(np.median(s)) for n, s in zip("lhw", self.size.T, strict=True)}
-        return figures | {"kind": float(self.kind.mean())}
+        metrics |= {f"{n}_pc": 100 * float(np.median(s)) for n, s in zip("lhw", self.size.T, strict=True)}
+        return metrics | {"kind": float(self.kind.mean())}
 
     def chosen(self, mask: np.ndarray) -> PoseErrors:
         """Those of a mask."""
@@ -309,7 +309,7 @@ class PoseErrors:
 def judge(
     frames: Sequence[tuple[Frame, list[int]]], network: PoseNet, found: Sequence[PoseDetections] | None = None
 ) -> PoseErrors:
-    """Errors of the estimate on frames, whose vehicles' templates are given too (-1: not known). Boxes are the
+    """Errors of the estimate on frames with given vehicle templates (-1: unknown). Boxes are the
     labels', or what was `found`, of which those count that meet a label (IoU of at least 0.5).
     """
     rows: list[tuple[float, ...]] = []
@@ -378,7 +378,7 @@ def detected(frames: Sequence[tuple[Frame, list[int]]]) -> list[PoseDetections]:
 
 
 def labelled_frames(root: Path, limit: int | None = None) -> list[tuple[Frame, list[int]]]:
-    """Labelled frames of a KITTI folder, and each label's template, -1 where no manifest tells it."""
+    """Labelled frames of a KITTI folder, and each label's template, -1 where no manifest has it."""
     dataset = KittiDataset(root)
     manifest = root / "manifest.json"
     models = {}
@@ -397,7 +397,7 @@ def labelled_frames(root: Path, limit: int | None = None) -> list[tuple[Frame, l
 CARD = """# Poses of vehicles from 2D boxes, trained on generated streets
 
 - Architecture: `scene_ir.derender.pose.PoseNet`, {parameters:,} parameters: seven 3x3 convolutions on a 64x96 crop
-  around the box, the box's numbers beside them, the head of 3D-SDN (viewing angle in twelve bins with cosine and
+  around the box, the box's coordinates, the head of 3D-SDN (viewing angle in twelve bins with cosine and
   sine, offset of the centre, log sizes, log depth with its uncertainty, template; no deformation code).
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
 - Data: {frames:,} frames of the project's own generator (`{data}`), {boxes:,} vehicles at least 16 px high; no
@@ -438,10 +438,10 @@ COLUMNS = (
 )
 
 
-def format_table(figures: dict[str, dict[str, float]]) -> str:
+def format_table(metrics: dict[str, dict[str, float]]) -> str:
     """A Markdown table, a row a set of vehicles."""
     lines = ["| boxes | " + " | ".join(c[1] for c in COLUMNS) + " |", "| --- |" + " --- |" * len(COLUMNS)]
-    for name, row in figures.items():
+    for name, row in metrics.items():
         cells = [
             text.format(row[key]) if key in row and not math.isnan(row[key]) else "" for key, _, text in COLUMNS
         ]
@@ -451,7 +451,7 @@ def format_table(figures: dict[str, dict[str, float]]) -> str:
 
 def all_metrics(network: PoseNet, held: Path, real: Path | None) -> dict[str, dict[str, float]]:
     """Figures of the model card by the name of their row."""
-    figures = {}
+    metrics = {}
     for name, root in (("generated", held), ("KITTI", real)):
         if root is None:
             continue
@@ -462,15 +462,15 @@ def all_metrics(network: PoseNet, held: Path, real: Path | None) -> dict[str, di
                 row = part.summary()
                 if name == "KITTI":
                     row.pop("kind", None)
-                figures[f"{name}, {boxes}, {level}"] = row
-    return figures
+                metrics[f"{name}, {boxes}, {level}"] = row
+    return metrics
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="generated frames to train on, KITTI layout")
     parser.add_argument("--held-out", type=Path, required=True, help="generated frames to judge by, KITTI layout")
-    parser.add_argument("--also", type=Path, help="labelled photographs whose figures go into the model card")
+    parser.add_argument("--also", type=Path, help="labelled photographs to evaluate for the model card")
     parser.add_argument("--run", type=Path, default=Path("build/pose"), help="checkpoint, log, crops")
     parser.add_argument("--out", type=Path, default=pose.WEIGHTS)
     parser.add_argument("--steps", type=int, default=PoseSettings.steps)
@@ -505,14 +505,14 @@ def main() -> None:
                 run.save(checkpoint)
             if run.step_number % 500 == 0:
                 errors = judge(held[:40], run.averaged())
-                told = {k: round(v, 3) for k, v in errors.chosen(errors.moderate).summary().items()}
-                print(f"step {run.step_number}, {run.seconds:.0f} s: {told}", flush=True)
+                metrics = {k: round(v, 3) for k, v in errors.chosen(errors.moderate).summary().items()}
+                print(f"step {run.step_number}, {run.seconds:.0f} s: {metrics}", flush=True)
     if run.step_number < settings.steps:
         return
     network = run.averaged()
-    figures = all_metrics(network, arguments.held_out, arguments.also)
-    print(format_table(figures))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    metrics = all_metrics(network, arguments.held_out, arguments.also)
+    print(format_table(metrics))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
     run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
@@ -529,7 +529,7 @@ def main() -> None:
         train_seed=files.read_json(arguments.data / "manifest.json")["seed"],
         held_seed=files.read_json(arguments.held_out / "manifest.json")["seed"],
         real=len(KittiDataset(arguments.also)) if arguments.also else 0,
-        table=format_table(figures),
+        table=format_table(metrics),
         version=files.read_json(arguments.data / "manifest.json")["generator"],
         note=f"\n  {arguments.remark}" if arguments.remark else "",
     )

@@ -1,8 +1,8 @@
-"""Train the network that tells sky, foliage and road apart (`scene_ir.derender.segmentation`) on generated streets.
+"""Train the network that segments sky, foliage and road (`scene_ir.derender.segmentation`) on generated streets.
 
     python tools/train_segmenter.py --run build/segment
 
-A run first makes its frames (they are kept in its folder), then trains. It goes on where it was stopped, to the
+A run first generates its frames into its folder, then trains. It resumes where it was stopped, to the
 same bytes as one that was never stopped (one thread, one machine).
 """
 
@@ -45,12 +45,12 @@ from scene_ir.derender.segmentation import SegmentNet, StreetClass
 STREAM = 0x5E6
 """Keeps this tool's random numbers apart from the generator's."""
 MIXED_SHARE, LEAVES_SHARE = 0.5, 0.6
-"""Of frames in weather of their own and not in one of Virtual KITTI's variations; of frames whose foliage is
+"""Of frames in weather of their own and not in one of Virtual KITTI's variations; of frames with foliage
 changed by the generator's codes."""
 LEAVES = ((-0.6, 0.6), (-0.8, 0.6), (-0.6, 0.7))
 """Ranges of those codes: hue, lightness, density."""
 STORE_HW = (192, 624)
-"""Size at which frames are kept: KITTI's, halved."""
+"""Size of stored frames: KITTI's, halved."""
 STORE_FOCAL_PX = 361.0
 CLASS_OF = {
     Material.SKY: StreetClass.SKY,
@@ -101,7 +101,7 @@ def street(seed: int, index: int, split: str) -> SynthFrame:
 
 
 def shrunk(classes: np.ndarray) -> np.ndarray:
-    """The class (h, w) that most of each pixel of a kept frame shows. classes: (H, W)."""
+    """Majority class (h, w) of each pixel of a stored frame. classes: (H, W)."""
     height, width = STORE_HW
     shares = [
         cv2.resize((classes == kind).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
@@ -119,10 +119,10 @@ class SegmentStore:
     def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         stamp = folder / "frames.json"
-        told = {"seed": seed, "split": split}
-        found = files.read_json(stamp) if stamp.is_file() else told | {"frames": 0}
-        if {k: found[k] for k in told} != told:
-            raise ValueError(f"{stamp}: expected frames of {told}, found {found}")
+        wanted = {"seed": seed, "split": split}
+        found = files.read_json(stamp) if stamp.is_file() else wanted | {"frames": 0}
+        if {k: found[k] for k in wanted} != wanted:
+            raise ValueError(f"{stamp}: expected frames of {wanted}, found {found}")
         height, width = STORE_HW
         for index in range(found["frames"], frames):
             frame = street(seed, index, split)
@@ -132,7 +132,7 @@ class SegmentStore:
                 folder / f"{index:05d}.npz",
                 {"image": image, "classes": shrunk(surface_classes(frame)), "elevation": height_of},
             )
-            files.write_json(stamp, told | {"frames": index + 1})
+            files.write_json(stamp, wanted | {"frames": index + 1})
         parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
         self.images = np.stack([p["image"] for p in parts])
         self.classes = np.stack([p["classes"] for p in parts])
@@ -158,7 +158,7 @@ def _smooth(rng: np.random.Generator, cells: int) -> np.ndarray:
 
 
 def window(rng: np.random.Generator) -> np.ndarray:
-    """The map (2, 3) of a kept frame's pixels to those of a part of it, zoomed, mirrored or not."""
+    """The map (2, 3) of a stored frame's pixels to those of a part of it, zoomed, mirrored or not."""
     height, width = CROP_HW
     whole_height, whole_width = STORE_HW
     down = _draw(rng, *ZOOM) * unet.INPUT_FOCAL_PX / STORE_FOCAL_PX
@@ -172,7 +172,7 @@ def window(rng: np.random.Generator) -> np.ndarray:
 
 
 def resample_crop(values: np.ndarray, part: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """A part of what is known of a kept frame. part (2, 3): see `window`; how: OpenCV's interpolation."""
+    """A part of a stored frame's arrays. part (2, 3): see `window`; how: OpenCV's interpolation."""
     return cv2.warpAffine(values, part, CROP_HW[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
 
 
@@ -187,7 +187,7 @@ def random_crop(
 
 
 def vary_surfaces(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
-    """Each kind of thing in colours and light of its own, other skies, unknown things in the way; in place.
+    """Vary colours and light of each class, replace skies, add unknown occluders; in place.
 
     What the generator draws always alike must not be what the network goes by.
     """
@@ -197,12 +197,12 @@ def vary_surfaces(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray,
 
 
 def vary_colours(image: np.ndarray, classes: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> None:
-    """Each kind of thing in colours of its own, other skies; in place."""
+    """Vary colours of each class and replace skies; in place."""
     if rng.random() < 0.4:
         gains = np.exp(rng.normal(0, 0.25, (len(StreetClass), 1)) + rng.normal(0, 0.06, (len(StreetClass), 3)))
         image *= cv2.blur(gains.astype(np.float32)[classes], (5, 5))
     if rng.random() < 0.15:
-        # walls in the sun, as white as the sky beside them
+        # walls in the sun, as white as the sky next to them
         image *= 1 + (classes == StreetClass.OTHER)[..., None] * _draw(rng, 0.5, 2.0)
     if rng.random() < 0.5:
         # leaves and grass in the sun: speckles
@@ -295,7 +295,7 @@ class SegmentSettings:
 
 
 HORIZON_ERROR = 0.012
-"""Standard deviation of the elevation that the network is told: a plane estimated from a photograph is off."""
+"""Standard deviation of the elevation given to the network: a plane estimated from a photograph is off."""
 
 
 def build_batch(store: SegmentStore, step: int, settings: SegmentSettings) -> tuple[Tensor, Tensor, Tensor]:
@@ -391,7 +391,7 @@ CARD = """# Sky, foliage and road in photographs, trained on generated streets
   Eight classes: {classes}.
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
 - Data: {frames:,} frames of the project's own generator, version {version}, in all its weathers, seasons and
-  camera angles; no photographs. Each class in other colours and light, other skies, shade, unknown things in the
+  camera angles; no photographs. Each class in other colours and light, other skies, shade, unknown objects in the
   way; other exposure, contrast and colours, blur, haze, noise, compression; zoomed, mirrored.
 - Training: {steps:,} steps of {batch} crops, {minutes:.0f} minutes of one CPU core, seed {seed}.{note}
 
@@ -418,9 +418,9 @@ With the same generator, on the same machine, another run gives the same bytes.
 """
 
 
-def format_table(figures: dict[str, tuple[float, float]]) -> str:
+def format_table(metrics: dict[str, tuple[float, float]]) -> str:
     """A Markdown table, a row a map."""
-    rows = [f"| {name} | {whole:.3f} | {tail:.3f} |" for name, (whole, tail) in figures.items()]
+    rows = [f"| {name} | {whole:.3f} | {tail:.3f} |" for name, (whole, tail) in metrics.items()]
     return "\n".join(["| map | IoU | 10th percentile |", "| --- | --- | --- |", *rows])
 
 
@@ -447,7 +447,7 @@ def options(about: str | None, run: Path, weights: Path, held_out: int, usual: A
 
 
 def train(run: Any, store: Any, steps: int, folder: Path, pause_after: int | None) -> bool:
-    """Take a run's steps, from its checkpoint in `folder` on, and say whether all are done. pause_after: steps of
+    """Train from the checkpoint in `folder` on; return whether all steps are done. pause_after: steps of
     this call, None for all.
     """
     checkpoint = folder / "checkpoint.safetensors"
@@ -481,9 +481,9 @@ def main() -> None:
     if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
         return
     network = run.averaged()
-    figures = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(format_table(figures))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "figures": json.dumps(figures)}
+    metrics = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
+    print(format_table(metrics))
+    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
     run.ship(arguments.out, facts)
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
@@ -497,7 +497,7 @@ def main() -> None:
         minutes=run.seconds / 60,
         seed=settings.seed,
         held_out=arguments.held_out,
-        table=format_table(figures),
+        table=format_table(metrics),
         note=f"\n  {arguments.remark}" if arguments.remark else "",
     )
     files.write_text(arguments.out.with_suffix(".md"), card)

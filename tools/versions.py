@@ -1,4 +1,4 @@
-"""Does drivesem work with the oldest and the newest of what it says it works with?
+"""Test drivesem with the oldest and the newest dependencies that it supports.
 
     python -m tools.versions                                           # this Python, lowest and highest versions
     python -m tools.versions --python python3.11,python3.13 --tests    # also the quick tests
@@ -6,8 +6,8 @@
     python -m tools.versions --resolve                                 # only: do the versions go together?
 
 For each Python and each of "lowest" (each dependency of pyproject.toml at its lower bound), "pinned" (those of
-constraints.txt) and "highest" (whatever pip finds), a wheel of the working tree is installed into a fresh virtual
-environment. From an empty folder it is asked for `drivesem doctor`, and for the README's attack. The last lines
+constraints.txt) and "highest" (pip's choice), a wheel of the working tree is installed into a fresh virtual
+environment. From an empty folder it runs `drivesem doctor` and the README's attack. The last lines
 are a table. Exit code 1 where anything fails. pip's own settings count, those of the machine too.
 
 --bare needs Linux and `unshare`: each command sees a /usr without these files, in a mount namespace of its own.
@@ -40,7 +40,7 @@ PACKAGES = (
     *("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia", "warp-lang", "open3d"),
     *("trimesh", "matplotlib", "pillow", "tyro"),
 )
-"""Those whose versions are told."""
+"""Packages with versions in the result."""
 HIDDEN = (
     *("bin/*gcc*", "bin/*g++*", "bin/cc", "bin/c++", "bin/*clang*", "bin/ld*", "bin/*-linux-gnu-ld*"),
     *(f"{lib}/{name}*" for lib in ("lib", "lib/*", "lib64") for name in ("libEGL", "libOSMesa", "libusb")),
@@ -57,10 +57,10 @@ print(json.dumps({{"Python": platform.python_version(), **{{name: version(name) 
 
 @dataclass(frozen=True)
 class StepResult:
-    """A step: why it failed, in a line, or nothing; what it said."""
+    """One step: a line with the reason of its failure, or nothing; its output."""
 
     failed: str = ""
-    said: str = ""
+    output: str = ""
 
 
 Run = Callable[[Sequence[str], Path], StepResult]
@@ -78,8 +78,8 @@ class VersionOutcome:
     found: Mapping[str, str] = field(default_factory=dict)
     """Versions of Python and `PACKAGES`."""
     parts: Mapping[str, str] = field(default_factory=dict)
-    """What `drivesem doctor` says of each."""
-    figures: Mapping[str, Any] = field(default_factory=dict)
+    """Status of each part according to `drivesem doctor`."""
+    metrics: Mapping[str, Any] = field(default_factory=dict)
     """The attack's."""
 
 
@@ -89,13 +89,13 @@ def lowest_versions(pyproject: Path, python: str) -> list[str]:
     """
     wanted = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]["dependencies"]
     pins: list[str] = []
-    for told in map(Requirement, wanted):
-        if told.marker is not None and not told.marker.evaluate({"python_version": python}):
+    for requirement in map(Requirement, wanted):
+        if requirement.marker is not None and not requirement.marker.evaluate({"python_version": python}):
             continue
-        bounds = [one.version for one in told.specifier if one.operator == ">="]
+        bounds = [one.version for one in requirement.specifier if one.operator == ">="]
         if not bounds:
-            raise ValueError(f"dependency {str(told)!r}: expected a lower bound, name>=version")
-        pins.append(f"{told.name}=={bounds[0]}")
+            raise ValueError(f"dependency {str(requirement)!r}: expected a lower bound, name>=version")
+        pins.append(f"{requirement.name}=={bounds[0]}")
     return pins
 
 
@@ -135,9 +135,12 @@ def try_versions(
     own = [*before, str(environment / "bin" / "python")]
     install = [*own, "-m", "pip", "install", "-q"]
     if versions == "lowest":
-        told = run([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], work).said.strip()
+        python_version = run(
+            [python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], work
+        ).output.strip()
         files.write_text(
-            work / "lowest.txt", "\n".join(lowest_versions(ROOT / "pyproject.toml", told or "3.11")) + "\n"
+            work / "lowest.txt",
+            "\n".join(lowest_versions(ROOT / "pyproject.toml", python_version or "3.11")) + "\n",
         )
         install += ["-c", str(work / "lowest.txt")]
     if versions == "pinned":
@@ -153,22 +156,22 @@ def try_versions(
         steps["attack"] = [*own, "-m", "drivesem.cli", *ATTACK.split(), *(QUICK.split() if args.quick else [])]
     if args.tests and not args.resolve:
         steps["tests"] = [*own, "-m", "pytest", "-q", "-m", "quick", "-p", "no:cacheprovider", str(ROOT / "tests")]
-    said: dict[str, Any] = {}
+    outputs: dict[str, Any] = {}
     failed = ""
     for name, words in steps.items():
         ended = run(words, ROOT if name == "tests" else empty)
         if ended.failed:
             failed = f"{name}: {ended.failed}"
             break
-        if name in ("versions", "doctor", "attack") and ended.said:
-            said[name] = json.loads(ended.said)
+        if name in ("versions", "doctor", "attack") and ended.output:
+            outputs[name] = json.loads(ended.output)
     shutil.rmtree(environment, ignore_errors=True)  # gigabytes
-    parts = {part["name"]: part["status"] for part in said.get("doctor", {}).get("parts", ())}
+    parts = {part["name"]: part["status"] for part in outputs.get("doctor", {}).get("parts", ())}
     if args.bare and not failed and parts.get("EGL") == "works":
         failed = "doctor: EGL is hidden, and works"
-    figures = {key: said["attack"][key] for key in ("frames", "grades") if key in said.get("attack", {})}
+    metrics = {key: outputs["attack"][key] for key in ("frames", "grades") if key in outputs.get("attack", {})}
     named = f"{versions}, bare" if args.bare else versions
-    return VersionOutcome(python, named, failed, said.get("versions", {}), parts, figures)
+    return VersionOutcome(python, named, failed, outputs.get("versions", {}), parts, metrics)
 
 
 def table(outcomes: Sequence[VersionOutcome]) -> str:
@@ -196,7 +199,7 @@ def main(argv: Sequence[str] | None = None, run: Run = run_words) -> int:
         "--quick", action="store_true", help="one frame and one step instead of the README's attack"
     )
     parser.add_argument("--bare", action="store_true", help="hide compilers, EGL, OSMesa and libusb")
-    parser.add_argument("--resolve", action="store_true", help="only ask pip whether the versions go together")
+    parser.add_argument("--resolve", action="store_true", help="only let pip resolve the versions")
     parser.add_argument("--out", help="JSON file for the outcomes")
     args = parser.parse_args(argv)
     if not set(args.versions.split(",")) <= set(SETS):
@@ -216,7 +219,7 @@ def main(argv: Sequence[str] | None = None, run: Run = run_words) -> int:
                 outcomes.append(outcome)
                 lacking = ", ".join(name for name, status in outcome.parts.items() if status != "works")
                 sys.stdout.write(f"{python}, {versions}: {outcome.failed or 'works'}\n")
-                sys.stdout.write(f"    {dict(outcome.figures)}; without {lacking}\n" if lacking else "")
+                sys.stdout.write(f"    {dict(outcome.metrics)}; without {lacking}\n" if lacking else "")
     sys.stdout.write(f"\n{table(outcomes)}")
     if args.out:
         files.write_json(Path(args.out), [asdict(outcome) for outcome in outcomes])

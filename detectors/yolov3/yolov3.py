@@ -20,7 +20,7 @@ from detectors import boxes
 from detectors.base import AnchorPredictions, Candidates, Detector, DetectorStages
 from detectors.grid import MEETING_IOU, covered_by_ignored
 from detectors.types import CLASSES, Detections, Targets
-from detectors.yolov3 import layouts
+from detectors.yolov3 import cfg as layouts
 from detectors.yolov3.cfg import DarknetCfg
 from detectors.yolov3.network import DarknetNetwork, FoldedNetwork
 

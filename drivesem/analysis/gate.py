@@ -31,8 +31,8 @@ from drivesem.run.folder import (
     load_trusted_config,
     resolve_output_folder,
 )
+from drivesem.run.frame import certain_losses
 from drivesem.run.results import Failure
-from drivesem.run.summary import certain_losses
 from scene_ir import files
 
 _WRITTEN = ("gate.json", "gate.md", "gate.csv", "gate.xml", "runs")

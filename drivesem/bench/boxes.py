@@ -8,10 +8,11 @@ the detections are not.
 from __future__ import annotations
 
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -20,8 +21,8 @@ from torch import Tensor
 from detectors.base import Detector
 from drivesem.attack.space import combo_parameters
 from drivesem.bench.scenes import HEIGHT, WIDTH
-from drivesem.bench.step import AttackSteps, time_pair
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
+from drivesem.bench.step import AttackSteps, pair_medians, time_pair
 from drivesem.bench.timing import PairedTimer, Spread
 from drivesem.config.options import DEFAULT_KEEP_MB
 from drivesem.data.kitti import read_calibration, read_labels
@@ -73,78 +74,24 @@ _HORIZON = 0.46
 """Share of the frame's height at which the ground ends."""
 
 
-@dataclass(frozen=True, slots=True)
-class BoxesRow:
-    """Summary over frames; ratios are of a whole step to the detector's whole pass, times are medians in ms."""
-
-    frames: int
-    """Number of frames."""
-    median_ratio: float
-    """Median."""
-    p90_ratio: float
-    """90th percentile."""
-    worst_ratio: float
-    """Maximum."""
-    median_cpu_ratio: float
-    """Median for processor time."""
-    p90_cpu_ratio: float
-    """90th percentile for processor time."""
-    worst_cpu_ratio: float
-    """Maximum for processor time."""
-    median_first_ratio: float
-    """Median for each frame's first step."""
-    median_vehicles: float
-    """Vehicles per frame."""
-    median_changed: float
-    """Share of pixels covered by vehicles and shadows."""
-    step_ms: float
-    """Whole step."""
-    detector_ms: float
-    """Detector forward and backward."""
-    step_cpu_ms: float
-    """Processor time of the step."""
-    detector_cpu_ms: float
-    """Processor time of the detector."""
-
-    @classmethod
-    def from_frames(cls, frames: Sequence[FrameCost]) -> BoxesRow:
-        """The summary of at least one frame."""
-
-        def at(name: str, share: float = 0.5) -> float:
-            values = torch.tensor([float(getattr(frame, name)) for frame in frames], dtype=torch.float64)
-            return round(float(values.quantile(share)), 4)
-
-        return cls(
-            len(frames), at("ratio"), at("ratio", 0.9), at("ratio", 1.0), at("cpu_ratio"), at("cpu_ratio", 0.9),
-            at("cpu_ratio", 1.0), at("first_ratio"), at("vehicles"), at("changed"), at("step_ms"),
-            at("detector_ms"), at("step_cpu_ms"), at("detector_cpu_ms"),
-        )  # fmt: skip
+_SUMMARY = {
+    "median_ratio": ("ratio", 0.5), "p90_ratio": ("ratio", 0.9), "worst_ratio": ("ratio", 1.0),
+    "median_cpu_ratio": ("cpu_ratio", 0.5), "p90_cpu_ratio": ("cpu_ratio", 0.9),
+    "worst_cpu_ratio": ("cpu_ratio", 1.0), "median_first_ratio": ("first_ratio", 0.5),
+    "median_vehicles": ("vehicles", 0.5), "median_changed": ("changed", 0.5),
+    **{name: (name, 0.5) for name in ("step_ms", "detector_ms", "step_cpu_ms", "detector_cpu_ms")},
+}  # fmt: skip
+"""By field of the summary: the field of a frame, and the quantile over frames."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrameCost:
-    """Measurements in one frame; times are medians in ms."""
+def summarise(costs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Summary of the rows of `measure`, at least one."""
 
-    frame: str
-    """Its name."""
-    vehicles: int
-    """Number of vehicles."""
-    changed: float
-    """Share of pixels covered by vehicles and shadows."""
-    ratio: float
-    """Step over detector."""
-    cpu_ratio: float
-    """The same for processor time."""
-    first_ratio: float
-    """First step over detector."""
-    step_ms: float
-    """Whole step."""
-    detector_ms: float
-    """Detector forward and backward."""
-    step_cpu_ms: float
-    """Processor time of the step."""
-    detector_cpu_ms: float
-    """Processor time of the detector."""
+    def at(name: str, share: float) -> float:
+        values = torch.tensor([float(cost[name]) for cost in costs], dtype=torch.float64)
+        return round(float(values.quantile(share)), 4)
+
+    return {"frames": len(costs)} | {name: at(*quantile) for name, quantile in _SUMMARY.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,8 +160,8 @@ def measure(
     device: str,
     whole: bool = False,
     keep_mb: float = DEFAULT_KEEP_MB,
-) -> Iterator[FrameCost]:
-    """Measure one row per frame.
+) -> Iterator[dict[str, Any]]:
+    """Measure one row per frame; ratios are of a step to the detector, times are medians in ms.
 
     Args:
         frames: What to measure.
@@ -236,19 +183,16 @@ def measure(
         detect()
         first = clock.milliseconds(step)
         pairs = [time_pair(clock, step, detect, swapped=bool(i % 2)) for i in range(_PAIRS)]
-        detector_ms = Spread.from_values([alone.ms for _, alone in pairs]).median
-        yield FrameCost(
-            frame=frame.name,
-            vehicles=len(frame.rows),
-            changed=round(step.drawn_share(), 4),
-            ratio=round(Spread.from_values([step.ms / alone.ms for step, alone in pairs]).median, 4),
-            cpu_ratio=round(Spread.from_values([step.cpu_ms / alone.cpu_ms for step, alone in pairs]).median, 4),
-            first_ratio=round(first / detector_ms, 4),
-            step_ms=round(Spread.from_values([step.ms for step, _ in pairs]).median, 3),
-            detector_ms=round(detector_ms, 3),
-            step_cpu_ms=round(Spread.from_values([step.cpu_ms for step, _ in pairs]).median, 3),
-            detector_cpu_ms=round(Spread.from_values([alone.cpu_ms for _, alone in pairs]).median, 3),
-        )
+        detector_ms, medians = Spread.from_values([alone.ms for _, alone in pairs]).median, pair_medians(pairs)
+        yield {
+            "frame": frame.name,
+            "vehicles": len(frame.rows),
+            "changed": round(step.drawn_share(), 4),
+            "ratio": round(Spread.from_values([step.ms / alone.ms for step, alone in pairs]).median, 4),
+            "cpu_ratio": medians.pop("cpu_ratio"),
+            "first_ratio": round(first / detector_ms, 4),
+            **medians,
+        }
 
 
 def _vehicle_rows(labels: Labels, camera: Camera) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.commands import AttackConfig, BenchConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions, shared_options

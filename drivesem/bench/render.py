@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesem.bench.scenes import BenchScene, PackedMeshes, build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import PairedTimer, Spread, TimeBudget, repetitions
 from scene_ir.raster import verbs
 from scene_ir.render.compositor import Compositor
@@ -62,56 +62,6 @@ class SceneSize:
 
 
 @dataclass(frozen=True, slots=True)
-class RenderRow:
-    """Measurements of the whole picture; times are medians in ms."""
-
-    backend: str
-    """warp or reference."""
-    cars: int
-    """Number of cars."""
-    triangles: int
-    """Per car."""
-    scale: float
-    """Pixels along an axis, as a multiple of 1242x375."""
-    pixels: int
-    """Pixels hit by the meshes."""
-    forward_ms: float
-    """Without gradients."""
-    backward_ms: float
-    """From a gradient of the picture to the cars' parameters."""
-    forward_backward_ms: float
-    """Recorded forward and backward together."""
-    both_cpu_ms: float
-    """Their processor time."""
-    forward_iqr: float
-    """Interquartile range of forward_ms."""
-    backward_iqr: float
-    """Interquartile range of backward_ms."""
-
-
-@dataclass(frozen=True, slots=True)
-class VerbRow:
-    """Measurements of one verb for all cars' rectangles; times are medians in ms."""
-
-    verb: str
-    """Name of the verb."""
-    backend: str
-    """warp or reference."""
-    cars: int
-    """Number of cars."""
-    triangles: int
-    """Per car."""
-    pixels: int
-    """Pixels hit by the meshes."""
-    crop_pixels: int
-    """Pixels of the rectangles."""
-    forward_ms: float
-    """Without gradients."""
-    backward_ms: float | None
-    """None for a verb without gradient."""
-
-
-@dataclass(frozen=True, slots=True)
 class RenderTimes:
     """Times of a call, ms."""
 
@@ -137,8 +87,8 @@ def default_size(cars: Sequence[int], triangles: Sequence[int]) -> SceneSize:
     return SceneSize(8 if 8 in cars else max(cars), max(triangles))
 
 
-def measure(size_list: Sequence[SceneSize], seconds: float, seed: int, device: str) -> Iterator[RenderRow]:
-    """Measure one row per backend and size.
+def measure(size_list: Sequence[SceneSize], seconds: float, seed: int, device: str) -> Iterator[dict[str, Any]]:
+    """Measure one row per backend and size; times are medians in ms.
 
     Args:
         size_list: What to measure.
@@ -155,8 +105,8 @@ def measure(size_list: Sequence[SceneSize], seconds: float, seed: int, device: s
             yield _picture_row(size, bench, backend, (share, seed, device))
 
 
-def measure_verbs(size: SceneSize, seconds: float, seed: int, device: str) -> Iterator[VerbRow]:
-    """Measure the four verbs in both backends.
+def measure_verbs(size: SceneSize, seconds: float, seed: int, device: str) -> Iterator[dict[str, Any]]:
+    """Measure the four verbs in both backends, for all cars together; times are medians in ms.
 
     Args:
         size: The size.
@@ -186,16 +136,16 @@ def measure_verbs(size: SceneSize, seconds: float, seed: int, device: str) -> It
         }
         for verb, (call, leaf) in calls.items():
             times = time_render(call, None if leaf is None else _backward_to(leaf), clock, budget.share())
-            yield VerbRow(
-                verb=verb,
-                backend=backend,
-                cars=size.cars,
-                triangles=size.triangles,
-                pixels=bench.hit_pixels,
-                crop_pixels=layout.size,
-                forward_ms=round_median(times.forward),
-                backward_ms=None if times.backward is None else round_median(times.backward),
-            )
+            yield {
+                "verb": verb,
+                "backend": backend,
+                "cars": size.cars,
+                "triangles": size.triangles,
+                "pixels": bench.hit_pixels,
+                "crop_pixels": layout.size,
+                "forward_ms": round_median(times.forward),
+                "backward_ms": None if times.backward is None else round_median(times.backward),
+            }
 
 
 def _backward_to(leaf: Tensor) -> Callable[[Tensor], object]:
@@ -205,7 +155,7 @@ def _backward_to(leaf: Tensor) -> Callable[[Tensor], object]:
 
 def _picture_row(
     size: SceneSize, bench: BenchScene, backend: verbs.Backend, how: tuple[float, int, str]
-) -> RenderRow:
+) -> dict[str, Any]:
     """Measure the whole re-rendered picture with gradients to pose and shape."""
     seconds, seed, device = how
     scene = convert_scene(bench.scene, torch.float32, device)
@@ -235,19 +185,19 @@ def _picture_row(
     )
     assert times.backward is not None
     assert times.both is not None
-    return RenderRow(
-        backend=backend,
-        cars=size.cars,
-        triangles=size.triangles,
-        scale=size.scale,
-        pixels=bench.hit_pixels,
-        forward_ms=round_median(times.forward),
-        backward_ms=round_median(times.backward),
-        forward_backward_ms=round_median(times.both),
-        both_cpu_ms=round_median(times.cpu),
-        forward_iqr=round(times.forward.iqr, 3),
-        backward_iqr=round(times.backward.iqr, 3),
-    )
+    return {
+        "backend": backend,
+        "cars": size.cars,
+        "triangles": size.triangles,
+        "scale": size.scale,
+        "pixels": bench.hit_pixels,
+        "forward_ms": round_median(times.forward),
+        "backward_ms": round_median(times.backward),
+        "forward_backward_ms": round_median(times.both),
+        "both_cpu_ms": round_median(times.cpu),
+        "forward_iqr": round(times.forward.iqr, 3),
+        "backward_iqr": round(times.backward.iqr, 3),
+    }
 
 
 def time_render(

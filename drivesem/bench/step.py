@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from drivesem.attack.labels import Labeller
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace, combo_parameters
 from drivesem.bench.scenes import BenchScene, build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
 from drivesem.config.commands import AttackConfig
 from drivesem.config.options import DEFAULT_KEEP_MB
@@ -61,6 +62,8 @@ _RESTART = 12
 _FEWEST, _MOST = 3, 200
 _WARM_UP = 1
 _LAYOUT_TRIES = 3
+_PARTS = ("render_forward_ms", "render_backward_ms", "labels_ms", "project_ms")
+"""Results of `AttackSteps.parts`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,52 +78,6 @@ class StepCase:
     """Attacked parameters."""
     lod: bool = True
     """Whether level of detail is on."""
-
-
-@dataclass(frozen=True, slots=True)
-class StepRow:
-    """Measurements of one case; times are medians in ms."""
-
-    cars: int
-    """Number of cars."""
-    triangles: int
-    """Per car, nominal."""
-    triangles_actual: float
-    """Per car, mean."""
-    params: str
-    """Attacked parameters."""
-    lod: bool
-    """Whether level of detail is on."""
-    ratio: float
-    """Step over detector, median of pairs."""
-    ratio_iqr: float
-    """Interquartile range of the ratio."""
-    cpu_ratio: float
-    """Ratio of processor time."""
-    step_ms: float
-    """Whole step."""
-    detector_ms: float
-    """Detector forward and backward."""
-    step_cpu_ms: float
-    """Processor time of the step."""
-    detector_cpu_ms: float
-    """Processor time of the detector."""
-    render_forward_ms: float
-    """Rendering."""
-    render_backward_ms: float
-    """Its gradient."""
-    labels_ms: float
-    """Moved labels."""
-    project_ms: float
-    """Projection to the feasible set."""
-    pixels: int
-    """Pixels hit by the meshes."""
-    crop_pixels: int
-    """Pixels of the rectangles around the meshes."""
-    box_pixels: int
-    """Area of the union of the boxes."""
-    repetitions: int
-    """Number of pairs."""
 
 
 def cases(cars: Sequence[int], triangles: Sequence[int]) -> tuple[list[StepCase], list[StepCase]]:
@@ -141,8 +98,8 @@ def measure(
     device: str,
     whole: bool = False,
     keep_mb: float = DEFAULT_KEEP_MB,
-) -> Iterator[StepRow]:
-    """Measure one row per case.
+) -> Iterator[dict[str, Any]]:
+    """Measure one row per case; ratios are of a step to the detector, times are medians in ms.
 
     Args:
         case_list: What to measure.
@@ -176,7 +133,7 @@ def _row(
     alone: Callable[[], None],
     clock: PairedTimer,
     seconds: float,
-) -> StepRow:
+) -> dict[str, Any]:
     pairs: list[tuple[CallTime, CallTime]] = []
     parts: list[tuple[float, ...]] = []
     # If the time is already used up on a busy machine, one pair per row must suffice.
@@ -186,28 +143,35 @@ def _row(
             parts.append(step.parts(clock))
     ratio = Spread.from_values([whole.ms / single.ms for whole, single in pairs])
     medians = [Spread.from_values(part).median for part in zip(*parts, strict=True)]
-    return StepRow(
-        cars=case.cars,
-        triangles=case.triangles,
-        triangles_actual=bench.triangles_actual,
-        params=",".join(case.params),
-        lod=case.lod,
-        ratio=round(ratio.median, 4),
-        ratio_iqr=round(ratio.iqr, 4),
-        cpu_ratio=round(Spread.from_values([whole.cpu_ms / single.cpu_ms for whole, single in pairs]).median, 4),
-        step_ms=round(Spread.from_values([whole.ms for whole, _ in pairs]).median, 3),
-        detector_ms=round(Spread.from_values([single.ms for _, single in pairs]).median, 3),
-        step_cpu_ms=round(Spread.from_values([whole.cpu_ms for whole, _ in pairs]).median, 3),
-        detector_cpu_ms=round(Spread.from_values([single.cpu_ms for _, single in pairs]).median, 3),
-        render_forward_ms=round(medians[0], 3),
-        render_backward_ms=round(medians[1], 3),
-        labels_ms=round(medians[2], 3),
-        project_ms=round(medians[3], 3),
-        pixels=bench.hit_pixels,
-        crop_pixels=bench.crop_pixels,
-        box_pixels=bench.box_pixels,
-        repetitions=len(pairs),
-    )
+    return {
+        "cars": case.cars,
+        "triangles": case.triangles,
+        "triangles_actual": bench.triangles_actual,
+        "params": ",".join(case.params),
+        "lod": case.lod,
+        "ratio": round(ratio.median, 4),
+        "ratio_iqr": round(ratio.iqr, 4),
+        **pair_medians(pairs),
+        **{name: round(median, 3) for name, median in zip(_PARTS, medians, strict=True)},
+        "pixels": bench.hit_pixels,
+        "crop_pixels": bench.crop_pixels,
+        "box_pixels": bench.box_pixels,
+        "repetitions": len(pairs),
+    }
+
+
+def pair_medians(pairs: Sequence[tuple[CallTime, CallTime]]) -> dict[str, float]:
+    """Medians over pairs of a step and the detector: the ratio of processor time, and times, ms."""
+    times = {
+        "step_ms": [whole.ms for whole, _ in pairs],
+        "detector_ms": [single.ms for _, single in pairs],
+        "step_cpu_ms": [whole.cpu_ms for whole, _ in pairs],
+        "detector_cpu_ms": [single.cpu_ms for _, single in pairs],
+    }
+    cpu_ratio = Spread.from_values([whole.cpu_ms / single.cpu_ms for whole, single in pairs])
+    return {"cpu_ratio": round(cpu_ratio.median, 4)} | {
+        name: round(Spread.from_values(values).median, 3) for name, values in times.items()
+    }
 
 
 def time_pair(

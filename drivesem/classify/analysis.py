@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.attack import Attacker
-from drivesem.classify.methods import choose_loss
-from drivesem.classify.objective import ClassifierObjective
+from drivesem.classify.objective import ClassifierObjective, choose_loss
 from drivesem.classify.pictures import ObjectView
 from drivesem.classify.results import SCHEMA, ClassifiedPicture
 from drivesem.config.commands import ClassifyConfig
@@ -22,7 +21,7 @@ from drivesem.failures.grades import Grade
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.driver import CachedFrameResult, FrameAnalyser, ProgressSettings, analyse_frames
 from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_referenced_files, claim_folder
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json, load_record
 from scene_ir import files
 from scene_ir.errors import FormatError

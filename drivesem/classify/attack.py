@@ -13,19 +13,26 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.methods.base import Attack
-from drivesem.classify.methods import (
+from drivesem.classify.networks.architectures import ImageClassifier
+from drivesem.classify.networks.loading import open_network
+from drivesem.classify.objective import (
+    ClassifierObjective,
+    ClassLogits,
     attacked_parameters,
     choose_loss,
     create_attack,
     parameter_bounds,
     step_sizes,
 )
-from drivesem.classify.networks.base import ImageClassifier
-from drivesem.classify.networks.loading import open_network
-from drivesem.classify.objective import ClassifierObjective, ClassLogits
 from drivesem.classify.pictures import ObjectRenderer, ObjectView, interleave_classes, parse_views
-from drivesem.classify.report import WRITTEN, write_run_report
-from drivesem.classify.results import SCHEMA, ClassifiedPicture, ClassifyMetrics, ClassPrediction
+from drivesem.classify.results import (
+    SCHEMA,
+    WRITTEN,
+    ClassifiedPicture,
+    ClassifyMetrics,
+    ClassPrediction,
+    write_run_report,
+)
 from drivesem.classify.scenes import ObjectScene
 from drivesem.classify.space import ObjectSpace
 from drivesem.config.commands import ClassifyConfig
@@ -35,7 +42,7 @@ from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, SecondO
 from drivesem.failures.nuisances import Nuisances, NuisanceSample
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import FRAMES, claim_folder, resolve_output_folder
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.records import dump_record
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, ShapeError

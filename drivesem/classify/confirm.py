@@ -12,8 +12,13 @@ import torch
 
 from drivesem.classify.analysis import ClassifyRun
 from drivesem.classify.attack import Attacker
-from drivesem.classify.report import SECOND_PICTURE, write_run_report
-from drivesem.classify.results import SCHEMA, ClassifyMetrics, SecondRenderComparison
+from drivesem.classify.results import (
+    SCHEMA,
+    SECOND_PICTURE,
+    ClassifyMetrics,
+    SecondRenderComparison,
+    write_run_report,
+)
 from drivesem.classify.scenes import picture_camera
 from drivesem.classify.second_renderer import PosedObject, measure_agreement, open_second_renderer
 from drivesem.config.commands import ClassifyConfig
@@ -21,7 +26,7 @@ from drivesem.failures.grades import Grade
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.lock import acquire_folder_lock
 from drivesem.run.records import dump_record
 from scene_ir import files

@@ -12,7 +12,7 @@ import torch
 from rich import box
 from torch import Tensor
 
-from drivesem.analysis.explain.minimal import MinimalChangeSearch, ThetaBlock, find_minimal_change
+from drivesem.analysis.explain.attribution import MinimalChangeSearch, ThetaBlock, find_minimal_change
 from drivesem.classify.analysis import FailureAnalyser, analyse_failures
 from drivesem.classify.space import AXES, ClassifyParameter, ObjectSpace
 from drivesem.config.commands import ClassifyConfig

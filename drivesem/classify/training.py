@@ -16,14 +16,14 @@ from torch import Tensor, nn
 from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
 from detectors.training import CHECKPOINT, PRECISIONS, optimiser_state, restore_optimiser, split_by_section
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import load_for_training, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
-from drivesem.report.terminal import Console, progress_bar, training_progress_bar
+from drivesem.report.tables import Console, progress_bar, training_progress_bar
 from drivesem.run.folder import PRESENTATION, claim_folder, resolve_output_folder
 from scene_ir import files
 

@@ -9,8 +9,7 @@ from rich.table import Table
 from drivesem.config.commands import AttackConfig, ReportConfig
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.failures.grades import Grade, Kind
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count, print_json
 from drivesem.run.attack import attack_dataset
 from drivesem.run.report.page import KINDS, NO_KIND
 from drivesem.run.results import RunSummary

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
 from drivesem.bench import boxes, night, render, step
 from drivesem.bench.scenes import MAX_CARS
-from drivesem.bench.session import BenchResult, run_benchmark, show_progress
-from drivesem.bench.tables import BenchTable
+from drivesem.bench.session import BenchResult, BenchTable, run_benchmark, show_progress
 from drivesem.config.commands import BenchConfig
 from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import format_count
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.scenes.sources import open_source
@@ -53,7 +50,7 @@ def _step(config: BenchConfig, console: Console) -> BenchResult:
     measured = step.measure(
         sizes + extra, detector, seconds, config.seed, config.device, config.whole, config.keep_mb
     )
-    rows = _dicts(show_progress(measured, len(sizes) + len(extra), console))
+    rows = list(show_progress(measured, len(sizes) + len(extra), console))
     rows, extra_rows = rows[: len(sizes)], rows[len(sizes) :]
     return BenchResult(
         {"rows": rows, "extra": extra_rows, "method": step.METHOD},
@@ -68,18 +65,18 @@ def _boxes(config: BenchConfig, path: Path, detector: Detector, console: Console
         raise UsageError("--boxes", error.expected, f"{error.field}: {error.actual}") from error
     measured = boxes.measure(frames, detector, config.seed, config.device, config.whole, config.keep_mb)
     costs = list(show_progress(measured, len(frames), console))
-    row = asdict(boxes.BoxesRow.from_frames(costs))
+    row = boxes.summarise(costs)
     return BenchResult(
-        {"what": "step boxes", "boxes": row, "frames": _dicts(costs), "method": boxes.METHOD},
+        {"what": "step boxes", "boxes": row, "frames": costs, "method": boxes.METHOD},
         [BenchTable(boxes.TITLE, boxes.COLUMNS, [row])],
     )
 
 
 def _render(config: BenchConfig, console: Console) -> BenchResult:
     sizes, default_size = render.sizes(*_sizes(config)), render.default_size(*_sizes(config))
-    verbs = _dicts(render.measure_verbs(default_size, _seconds("verbs", config), config.seed, config.device))
+    verbs = list(render.measure_verbs(default_size, _seconds("verbs", config), config.seed, config.device))
     measured = render.measure(sizes, _seconds("render", config), config.seed, config.device)
-    rows = _dicts(show_progress(measured, len(sizes) * len(render.BACKENDS), console))
+    rows = list(show_progress(measured, len(sizes) * len(render.BACKENDS), console))
     return BenchResult(
         {"rows": rows, "verbs": verbs, "method": render.METHOD},
         [
@@ -105,7 +102,12 @@ def _night(config: BenchConfig, console: Console) -> BenchResult:
     night.require_frames(times)
     processes = min(config.processes, len(chosen))
     parts, nights = night.part_rows(times), night.night_rows(times, count, processes, config.seed)
-    fields = {"parts": parts, "nights": nights, "measured": _dicts(times), "failed": failed | timed.failed}
+    fields = {
+        "parts": parts,
+        "nights": nights,
+        "measured": [asdict(one) for one in times],
+        "failed": failed | timed.failed,
+    }
     return BenchResult(
         fields | {"method": night.METHOD},
         [
@@ -121,7 +123,3 @@ def _sizes(config: BenchConfig) -> tuple[list[int], list[int]]:
 
 def _seconds(name: str, config: BenchConfig) -> float:
     return _SECONDS[name][0 if config.quick else 1]
-
-
-def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
-    return [asdict(row) for row in rows]

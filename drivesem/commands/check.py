@@ -9,15 +9,14 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from detectors.adapters.module import RAISES_NOTHING
+from detectors.adapters.network import RAISES_NOTHING
 from detectors.base import DetectorError
 from detectors.check import ContractReport, check_detector
 from detectors.registry import load_predictor
 from drivesem.config.commands import CheckConfig
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, print_json
 
 MIN_SIDE_PX = 64
 """Smallest side of a test picture: its blocks must be larger than a network's stride."""

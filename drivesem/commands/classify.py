@@ -12,13 +12,11 @@ from drivesem.classify.explain import explain_failures
 from drivesem.classify.gate import compare_networks
 from drivesem.classify.holes import find_pose_regions
 from drivesem.classify.pictures import write_pictures
-from drivesem.classify.report import format_accuracy
-from drivesem.classify.results import ClassCounts, ClassifyMetrics
+from drivesem.classify.results import ClassCounts, ClassifyMetrics, format_accuracy
 from drivesem.classify.training import train_classifier
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.devices import check_device
-from drivesem.report.tables import ReportTable, format_count, format_percent, print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, ReportTable, format_count, format_percent, print_json
 from drivesem.run.driver import print_output_folder, publish_report
 from drivesem.run.folder import claim_folder, resolve_output_folder
 from drivesem.run.run_report import PAGE

@@ -19,8 +19,7 @@ from drivesem.data.label_table import WriteSummary
 from drivesem.data.layouts import detect_layout
 from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.report.drawing import write_picture
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count, print_json
 from drivesem.run.conversion import ConversionSettings, convert_labels
 from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
 from drivesem.run.finished import load_runs
@@ -158,7 +157,7 @@ def export_command(config: ExportConfig) -> int:
 
 
 def _gltf(config: ExportConfig, out: Path) -> int:
-    from drivesem.run.gltf import export_scenes
+    from drivesem.run.export import export_scenes
 
     written = export_scenes(Path(config.run or ""), out)
     if config.json:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from drivesem.analysis.evaluate.files import evaluate_files
 from drivesem.analysis.evaluate.report import print_evaluation
 from drivesem.config.commands import EvalConfig
-from drivesem.report.tables import print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, print_json
 
 _FILE_WIDTH = 120
 """Characters per line of tables that go to a file."""

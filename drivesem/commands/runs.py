@@ -13,13 +13,12 @@ from drivesem.commands.attack import summarise_grades
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig, RunsConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count, print_json
+from drivesem.run.attack import merge_runs
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, is_attack_run, load_attack_config, result_settings
 from drivesem.run.labels import list_frames
 from drivesem.run.lock import acquire_folder_lock, is_locked_elsewhere
-from drivesem.run.merge import merge_runs
 from drivesem.store import local_copy
 from scene_ir import files
 

@@ -1,19 +1,21 @@
-"""`drivesem edit` and `drivesem render`: a scene folder, changed by physical amounts or as it is, as a picture."""
+"""`drivesem derender`, `edit` and `render`: photographs to scene folders, and a scene folder to a picture."""
 
 from __future__ import annotations
 
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from drivesem.attack.scene_edits import REMOVED, apply_edit
-from drivesem.config.commands import EditConfig, RenderConfig
+from drivesem.config.commands import DerenderConfig, EditConfig, RenderConfig
 from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting, read_frame_edit
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console
+from drivesem.data.account import write_account
+from drivesem.report.tables import Console, format_count, print_json
 from drivesem.scenes.scene import Scene, check_scene_folder
+from drivesem.scenes.sources import PhotographSource, SceneSource
 from scene_ir import files
 from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene, save_scene
@@ -97,3 +99,46 @@ def picture_path(given: str | None, default: Path) -> Path:
     if path.suffix.lower() != ".png" or path.is_dir():
         raise UsageError("--out", "a .png file", given)
     return path
+
+
+def derender_command(config: DerenderConfig) -> int:
+    """`drivesem derender`: make the scenes that do not exist yet."""
+    from drivesem.run.derender import derender_frames
+
+    console = Console(stderr=True)
+    accounts: list[dict[str, Any]] = []
+
+    def print_source(source: SceneSource) -> None:
+        accounts.append(write_account(source.account()))
+        _print_source(source, config, console)
+
+    result = derender_frames(config, print_source)
+    if config.json:
+        frames = {name: asdict(summary) for name, summary in result.frames.items()}
+        facts = {"failed": result.failed, "seconds": result.seconds, "data": accounts[0]}
+        print_json({"out": str(result.out), "frames": frames, **facts})
+        return 0
+    lines = Console()
+    for name, summary in result.frames.items():
+        duration = "already there" if summary.seconds is None else f"{summary.seconds:.1f} s"
+        lines.print(
+            f"{name}: {format_count(summary.objects, 'vehicle')}, {duration}", soft_wrap=True, highlight=False
+        )
+    for name, reason in result.failed.items():
+        console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
+    lines.print(
+        f"{format_count(len(result.frames), 'scene')} in {result.out} ({result.seconds:.0f} s)", soft_wrap=True
+    )
+    return 0
+
+
+def _print_source(source: SceneSource, config: DerenderConfig, console: Console) -> None:
+    """Print the camera of a photograph, and meshes that cannot be read."""
+    if isinstance(source, PhotographSource) and config.photo is not None:
+        focal = source.focal_length(next(source.identifiers()))
+        console.print(f"camera: focal length {focal.length_px:.0f} px ({focal.source})", soft_wrap=True)
+    if config.meshes is not None:
+        from drivesem.synth.assets import unreadable_in
+
+        for name, fault in unreadable_in(config.meshes):
+            console.print(f"--meshes: {name} is left out: {fault}", soft_wrap=True, highlight=False, markup=False)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from drivesem.config.commands import SynthConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console, progress_bar
+from drivesem.report.tables import Console, format_count, print_json, progress_bar
 from drivesem.run.folder import resolve_output_folder
 from drivesem.run.lock import acquire_folder_lock
 from drivesem.run.workers import make_parallel_map

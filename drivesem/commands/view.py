@@ -7,10 +7,8 @@ import webbrowser
 
 from drivesem.config.commands import ViewConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console
-from drivesem.viewer.frames import ViewerFrames, open_viewer_frames
-from drivesem.viewer.server import HOST, Server, Viewer
+from drivesem.report.tables import Console, format_count, print_json
+from drivesem.viewer.server import HOST, Server, Viewer, ViewerFrames, open_viewer_frames
 
 _PORT = 8321
 """First port to try. Links to states remain valid while the port stays the same."""

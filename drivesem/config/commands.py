@@ -529,7 +529,7 @@ class EvalConfig(FrameFilterOptions, TileOption, WorkerOptions, CommandConfig):
     by: str | None = None
     """Attributes of frames, such as weather,timeofday: a table of recall by condition, at equal box heights too."""
     reference: str | None = None
-    """Values of --by whose box heights count, such as clear,daytime (default: the condition with most frames)."""
+    """Values of --by that give the box heights, such as clear,daytime (default: the condition with most frames)."""
     stage: Stage = "attacked"
     """Detections of a run: after the attack by moved or benign labels, re-rendered, or in the photograph."""
     stage_b: Stage | None = None

@@ -74,7 +74,7 @@ def object_type(name: str) -> str | None:
 
 
 def class_role(name: str, mapping: Mapping[str, str | None]) -> tuple[ClassRole, str]:
-    """Return what becomes of a data set's class, and the class whose objects it holds ("" for none).
+    """Return what becomes of a data set's class, and the class of its objects ("" for none).
 
     Args:
         name: Name in the data set.

@@ -340,7 +340,7 @@ class KittiDataset(FrameIndex[Path]):
     """The frames of a KITTI object folder: every image, in subfolders too, with a label file, if there are labels.
 
     An identifier is the path of an image below image_2, without suffix. Values of a 3D box, truncations and
-    occlusions that a scene cannot use are unknown; so are the 3D boxes of frames without a calibration, whose camera is
+    occlusions that a scene cannot use are unknown; so are the 3D boxes of frames without a calibration. Their camera is
     a pinhole. `account` counts all of them. Images are turned upright by EXIF.
 
     Args:

@@ -321,6 +321,33 @@ def copy_images(targets: Mapping[str, Path], images: Mapping[str, Path], only: s
     return len(images)
 
 
+def select_by_attributes(
+    attributes: Mapping[str, Mapping[str, str]], where: Mapping[str, tuple[str, ...]]
+) -> list[str]:
+    """Return the identifiers of frames with allowed attributes.
+
+    Args:
+        attributes: Attributes of each frame.
+        where: Allowed values by attribute.
+
+    Raises:
+        FormatError: An attribute or a value that no frame has, or no frame with all of them.
+    """
+    for name, wanted in where.items():
+        known = sorted({values[name] for values in attributes.values() if name in values})
+        if not known:
+            there = sorted({key for values in attributes.values() for key in values})
+            expected = f"one of {', '.join(there)}" if there else "a data set with attributes"
+            raise FormatError(f"--where {name}", expected, repr(name))
+        for value in wanted:
+            if value not in known:
+                raise FormatError(f"--where {name}", f"one of {', '.join(known)}", repr(value))
+    chosen = [i for i, values in attributes.items() if all(values.get(k) in wanted for k, wanted in where.items())]
+    if not chosen:
+        raise FormatError("--where", "at least one frame", f"none of {len(attributes)}")
+    return chosen
+
+
 def format_number(value: float) -> str:
     """Format a number with two decimals, as KITTI does, or with more if it needs them."""
     value += 0.0  # no "-0.00"

@@ -15,6 +15,7 @@ from drivesem.data import kitti_tracking
 from drivesem.data.account import DataAccount, sum_accounts
 from drivesem.data.classes import check_class_map, rename_to_types
 from drivesem.data.kitti import KittiDataset
+from drivesem.data.label_table import select_by_attributes
 from drivesem.data.layouts import detect_layout
 from drivesem.data.registry import DATASETS, Dataset, open_dataset
 from drivesem.data.vkitti import VirtualKittiDataset
@@ -130,33 +131,6 @@ def open_selection(
     if choice.where:
         selected = select_by_attributes({name: dataset.attributes(name) for name in selected}, choice.where)
     return DatasetSelection(dataset, selected, choice)
-
-
-def select_by_attributes(
-    attributes: Mapping[str, Mapping[str, str]], where: Mapping[str, tuple[str, ...]]
-) -> list[str]:
-    """Return the identifiers of frames with allowed attributes.
-
-    Args:
-        attributes: Attributes of each frame.
-        where: Allowed values by attribute.
-
-    Raises:
-        FormatError: An attribute or a value that no frame has, or no frame with all of them.
-    """
-    for name, wanted in where.items():
-        known = sorted({values[name] for values in attributes.values() if name in values})
-        if not known:
-            there = sorted({key for values in attributes.values() for key in values})
-            expected = f"one of {', '.join(there)}" if there else "a data set with attributes"
-            raise FormatError(f"--where {name}", expected, repr(name))
-        for value in wanted:
-            if value not in known:
-                raise FormatError(f"--where {name}", f"one of {', '.join(known)}", repr(value))
-    chosen = [i for i, values in attributes.items() if all(values.get(k) in wanted for k, wanted in where.items())]
-    if not chosen:
-        raise FormatError("--where", "at least one frame", f"none of {len(attributes)}")
-    return chosen
 
 
 def select_split(dataset: Dataset, split: str) -> list[str]:

@@ -74,7 +74,7 @@ class ConditionRow:
     equal_high: float | None
     """Upper end."""
     covered: float | None
-    """Share of the reference's objects whose height occurs in this condition; the others do not count."""
+    """Share of the reference's objects in bins of height that occur in this condition; the others do not count."""
 
 
 def group_frames(attributes: Sequence[Mapping[str, str]], names: Sequence[str]) -> dict[str, Integers]:
@@ -108,7 +108,7 @@ def recall_by_condition(
         objects: Objects of all frames.
         frames: Number of frames.
         groups: Indices of frames by condition.
-        reference: Condition whose box heights count; it comes first.
+        reference: Condition that gives the shares of box heights; it comes first.
         draws: Number of bootstrap draws; 0 for no intervals.
         generator: Source of random numbers.
     """

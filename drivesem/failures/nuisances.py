@@ -21,8 +21,7 @@ from torch.autograd.function import once_differentiable
 
 from drivesem.attack.space import ground_axes
 from drivesem.config.errors import UsageError
-from drivesem.failures.jpeg import DifferentiableJpeg
-from drivesem.failures.separable import Matrix, SeparableMap
+from drivesem.failures.jpeg import DifferentiableJpeg, Matrix, SeparableMap
 from scene_ir.types import LATTICE, SceneIR
 
 _MAX_JPEG_QUALITY = 95

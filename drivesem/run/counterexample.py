@@ -33,10 +33,9 @@ from drivesem.config.errors import UsageError
 from drivesem.config.options import FrameCommandConfig, SceneOptions
 from drivesem.report.tables import format_count
 from drivesem.run.attack import AttackWorker, load_named_detector, with_gradient_free_fallback
-from drivesem.run.frame import AttackedScene, frame_result, write_frame
+from drivesem.run.frame import AttackedScene, count_grades, frame_result, write_frame
 from drivesem.run.report import page, pictures
 from drivesem.run.results import Failure, FrameResult
-from drivesem.run.summary import count_grades
 from drivesem.scenes.scene import Scene, encode_png
 from scene_ir.io import to_uint8
 from scene_ir.types import SceneIR

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from drivesem.config.options import WorkerOptions
-from drivesem.report.tables import AnalysisReport, print_json
-from drivesem.report.terminal import Console, progress_bar
+from drivesem.report.tables import AnalysisReport, Console, print_json, progress_bar
 from drivesem.run.finished import AttackRun
 from drivesem.run.folder import FRAMES
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from drivesem.run.records import dump_record, load_record
 from drivesem.run.workers import run_jobs
 from scene_ir import files

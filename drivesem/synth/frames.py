@@ -25,13 +25,12 @@ from drivesem.synth.layout import (
     statistics,
 )
 from drivesem.synth.light import Light, draw_light, draw_response
-from drivesem.synth.noise import noise_set
 from drivesem.synth.render import pixel_sums, rasterise, render, render_without_actors, see
 from drivesem.synth.seasons import leaved
 from drivesem.synth.soup import Material, Soup, box, join, placed, transformed
 from drivesem.synth.variations import MIXED, VARIATIONS, fix_light_in_world, turned, vary
 from drivesem.synth.vehicles import instance_ffd
-from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blocks, fine_matrix
+from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blocks, fine_matrix, noise_set
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix

@@ -17,18 +17,20 @@ import torch
 import warp as wp
 
 from drivesem.synth.layout import Road
-from drivesem.synth.light import PANORAMA_GLARE, Light, Response, develop
-from drivesem.synth.noise import BYTE_SUM_SCALE, SIZE, NoiseSet
-from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.surfaces import (
+from drivesem.synth.light import (
     LEAF_DEPTH_M,
     MIRRORED_GROUND,
+    PANORAMA_GLARE,
     SHADOW_OFFSET_M,
     SHADOW_OFFSET_TEXELS,
     SOAKED,
+    Light,
+    Response,
+    develop,
     ground_light,
 )
-from drivesem.synth.view import Setting, Shadow, Sight, SunMaps, fine_matrix
+from drivesem.synth.soup import GROUND, Material, Semantic, Soup
+from drivesem.synth.view import BYTE_SUM_SCALE, SIZE, NoiseSet, Setting, Shadow, Sight, SunMaps, fine_matrix
 from scene_ir.raster.launch import launch, split_range, start_warp, threads
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, log_
 from scene_ir.raster.verbs import NEAR_M

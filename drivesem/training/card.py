@@ -20,7 +20,7 @@ from detectors.registry import SHIPPED
 from drivesem.attack.labels import Difficulty
 from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.report.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console
 from drivesem.training.frames import TRAINING_LIMITS
 from scene_ir import files
 

@@ -25,11 +25,8 @@ from drivesem.failures.margins import background_margin, object_margins
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood
 from drivesem.failures.nuisances import Nuisances
 from drivesem.run.finished import rebuild_objective
-from drivesem.run.frame import targets_from_records
-from drivesem.run.summary import certain_losses
-from drivesem.training.frames import TRAINING_LIMITS, training_targets
-from drivesem.training.samples import AttackedFrame
-from drivesem.training.semantic import render_state
+from drivesem.run.frame import certain_losses, targets_from_records
+from drivesem.training.frames import TRAINING_LIMITS, AttackedFrame, render_state, training_targets
 from scene_ir import files
 
 POOL_SIZE = 4

@@ -24,16 +24,15 @@ from drivesem.config.errors import UsageError
 from drivesem.data.account import write_account
 from drivesem.data.subsets import open_selection
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
-from drivesem.report.tables import ReportTable, format_percent, rows_to_csv
-from drivesem.report.terminal import Console, training_progress_bar
+from drivesem.report.tables import Console, ReportTable, format_percent, rows_to_csv, training_progress_bar
 from drivesem.run.attack import AttackWorker, attack_frames
 from drivesem.run.folder import SHARING, claim_folder, load_trusted_config
 from drivesem.run.frame import targets_from_records
 from drivesem.training.card import plot_curves, warn_about_overlaps
-from drivesem.training.frames import FrameStore
-from drivesem.training.samples import (
+from drivesem.training.frames import (
     AttackedFrame,
     AttackedSamples,
+    FrameStore,
     MixtureShares,
     Stage,
     TrainingMixture,

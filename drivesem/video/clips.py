@@ -69,7 +69,7 @@ class _DemoFrames:
     """Frames of the embedded clip."""
 
     def __init__(self, source: ClipSource) -> None:
-        from drivesem.synth.drives import make_drive
+        from drivesem.synth.demo import make_drive
 
         self._drive = make_drive(source.seed, source.limit or DEMO_FRAMES)
         self.name = DEMO

@@ -1,9 +1,15 @@
-"""The objective of a clip: from its theta to the mean loss of its frames, each with its own frame objective."""
+"""The objective of a clip: from its theta, one change per car, to the mean loss of its frames.
+
+A car's paint, shape, heading and size change equally in all of its frames, as do weather, foliage and sun. Its place
+follows a smooth path: Bernstein polynomials over the time in which it is visible, with control points as coordinates
+of theta. Their weights sum to one, so a path stays within the bounds of its control points.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import comb
 
 import torch
 from torch import Tensor
@@ -12,13 +18,221 @@ from detectors.base import Predictor
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.methods.base import ParameterGroup, Problem, Score
 from drivesem.attack.objective import Objective, RenderEvaluation
-from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.attack.space import SPECS, Budget, Parameter, ParameterSpace
+from drivesem.attack.theta import ParameterSpec, ProjectedTheta, ThetaSpace
 from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.evaluation.failures import match_detections
 from drivesem.video.clips import DerenderedClip
-from drivesem.video.space import ClipSpace, project_clip
 from scene_ir import ffd
+from scene_ir.errors import RangeError
 from scene_ir.render.compositor import Compositor
+
+_INSIDE = 1 - 1e-5
+"""Factor on a path's bounds, as the sum of its weights is rounded."""
+_SAME = 1e-6
+"""Tolerance within which a frame's projection did not change theta."""
+_ROUNDS = 8
+"""Rounds in which the limits of frames are applied to the clip, in the second half to whole paths; afterwards, cars
+that still violate a constraint lose their changes of shape and place."""
+
+
+class ClipSpace(ThetaSpace[Parameter]):
+    """Parameters of a clip; bounds are the tightest of a car's frames."""
+
+    def __init__(self, spaces: Sequence[ParameterSpace], tracks: Sequence[Sequence[int]], bend: int = 3) -> None:
+        """Combine the spaces of frames.
+
+        Args:
+            spaces: Space of each frame's scene, with equal parameters and budgets.
+            tracks: Track of each object in each frame.
+            bend: Degree of a path's polynomial; 0 for a constant offset.
+        """
+        if bend < 0 or not spaces:
+            raise RangeError("clip", "frames, and a bend of at least 0", f"{len(spaces)} frames, {bend}")
+        self.spaces = tuple(spaces)
+        self.tracks = tuple(sorted({track for of_frame in tracks for track in of_frame}))
+        self.points = bend + 1
+        like = spaces[0].scene.objects.translation
+        super().__init__(spaces[0].params, _specs(self.points), len(self.tracks), like)
+        places = ([self.tracks.index(track) for track in of_frame] for of_frame in tracks)
+        self.rows = [torch.tensor(of_frame, dtype=torch.int64, device=like.device) for of_frame in places]
+        self._weights = _path_weights(self.tracks, tracks, self.points, like)
+        self.lower.fill_(-torch.inf)
+        self.upper.fill_(torch.inf)
+        for space, rows in zip(self.spaces, self.rows, strict=True):
+            for parameter in self.params:
+                self._tighten(parameter, space, rows)
+        for bound in (self.lower, self.upper):
+            bound[~bound.isfinite()] = 0  # cars without any frame do not occur
+
+    def name(self, i: int) -> str:
+        """The name of coordinate `i`, by the car's track: `cars[12].translate.along[0]`."""
+        parameter, owner, k = self._locate(i)
+        spec = self.specs[parameter]
+        return f"cars[{self.tracks[owner]}].{spec.names[k]}" if spec.per_object else spec.names[k]
+
+    def frame_theta(self, theta: Tensor, frame: int) -> Tensor:
+        """Convert theta (D,) to a frame's own space (D',); differentiable."""
+        parts = []
+        for parameter in self.params:
+            block = self.block(theta, parameter)
+            assert block is not None
+            if SPECS[parameter].per_object:
+                block = block[self.rows[frame]]
+            if parameter is Parameter.TRANSLATE:
+                weights = self._weights[frame]
+                block = (weights[:, :, None] * block.reshape(len(block), self.points, 2)).sum(1)
+            parts.append(block.reshape(-1))
+        return torch.cat(parts)
+
+    def restrict(self, theta: Tensor, frame: int, proposed: Tensor, projected: Tensor, whole: bool) -> Tensor:
+        """Apply a frame's projection to theta.
+
+        Args:
+            theta: (D,) of the clip.
+            frame: Number of the frame.
+            proposed: (D',) of the frame before its projection.
+            projected: (D',) of the frame after it.
+            whole: Whether to scale a whole path, instead of the control points that matter in the frame.
+
+        Returns:
+            (D,) of the clip.
+        """
+        theta, space = theta.clone(), self.spaces[frame]
+        for parameter in self.params:
+            block, there = self.block(theta, parameter), space.block(projected, parameter)
+            before = space.block(proposed, parameter)
+            assert block is not None
+            assert there is not None
+            assert before is not None
+            if parameter is Parameter.TRANSLATE:
+                share = torch.where(before.abs() > _SAME, there / before, 1.0).clamp(0, 1)
+                weights = self._weights[frame]
+                matter = torch.ones_like(weights) if whole else weights / weights.amax(1, keepdim=True)
+                path = block.reshape(len(block), self.points, 2)
+                path[self.rows[frame]] *= 1 - matter[:, :, None] * (1 - share[:, None])
+            elif SPECS[parameter].per_object:
+                block[self.rows[frame]] = there
+            else:
+                block.copy_(there)
+        return theta
+
+    def reset_geometry(self, theta: Tensor, cars: Tensor) -> Tensor:
+        """theta (D,) without changes of shape and place of the chosen cars (N,) bool."""
+        theta = theta.clone()
+        for parameter in self.params:
+            block = self.block(theta, parameter)
+            if block is not None and SPECS[parameter].per_object and parameter is not Parameter.COLOR:
+                block[cars] = 0
+        return theta
+
+    def path_offsets(self, theta: Tensor, frame: int) -> Tensor:
+        """Offset (n, 2) m of each object of a frame from its place, along and across its heading."""
+        space = self.spaces[frame]
+        offset = space.block(self.frame_theta(theta, frame), Parameter.TRANSLATE)
+        length_m = space.scene.objects.size_lhw[:, :1]
+        return length_m.new_zeros(len(length_m), 2) if offset is None else offset * length_m
+
+    def physical(self, i: int, value: float) -> tuple[float, str] | None:
+        """Value in metres, degrees or percent, measured in the first frame with the car."""
+        parameter, owner, k = self._locate(i)
+        spec = SPECS[parameter]
+        if not spec.per_object:
+            return None
+        frame = next(f for f, rows in enumerate(self.rows) if bool((rows == owner).any()))
+        place = int((self.rows[frame] == owner).nonzero()[0])
+        space = self.spaces[frame]
+        return space.physical(space.blocks[parameter].start + place * spec.size + k % spec.size, value)
+
+    def _tighten(self, parameter: Parameter, space: ParameterSpace, rows: Tensor) -> None:
+        for own, theirs, tighter in (
+            (self.lower, space.lower, torch.maximum),
+            (self.upper, space.upper, torch.minimum),
+        ):
+            block, there = self.block(own, parameter), space.block(theirs, parameter)
+            assert block is not None
+            assert there is not None
+            if parameter is Parameter.TRANSLATE:
+                block[rows] = tighter(block[rows], _INSIDE * there.repeat(1, self.points))
+            elif SPECS[parameter].per_object:
+                block[rows] = tighter(block[rows], there)
+            else:
+                block.copy_(tighter(block, there))
+        where, there = self.blocks.get(parameter), space.blocks.get(parameter)
+        if where is not None and there is not None and len(space.step[there]):
+            self.step[where] = space.step[there].max()
+
+
+def project_clip(space: ClipSpace, sets: Sequence[FeasibleSet], theta: Tensor) -> ProjectedTheta:
+    """Project theta to what is feasible in every frame. The limits of each frame apply to the whole clip, repeatedly
+    until no frame changes theta; theta = 0 is feasible.
+
+    Args:
+        space: Parameters of the clip.
+        sets: Feasible set of each frame.
+        theta: (D,) of the clip.
+    """
+    theta = torch.minimum(torch.maximum(theta.detach(), space.lower), space.upper)
+    active: list[str] = []
+    for attempt in range(_ROUNDS + space.count + 1):
+        offenders = torch.zeros(space.count, dtype=torch.bool, device=theta.device)
+        held = False
+        for frame, feasible in enumerate(sets):
+            proposed = space.frame_theta(theta, frame)
+            found = feasible.project(proposed)
+            if torch.allclose(found.theta, proposed, rtol=0, atol=_SAME):
+                continue
+            held = True
+            active += [_renamed(name, space, frame) for name in found.active]
+            theta = space.restrict(theta, frame, proposed, found.theta, whole=attempt >= _ROUNDS // 2)
+            offenders[space.rows[frame][_differing(space.spaces[frame], proposed, found.theta)]] = True
+        if not held:
+            return ProjectedTheta(theta, tuple(dict.fromkeys(active)))
+        if attempt >= _ROUNDS:
+            theta = space.reset_geometry(theta, offenders)
+    return ProjectedTheta(torch.zeros_like(theta), tuple(dict.fromkeys(active)))
+
+
+def _differing(space: ParameterSpace, one: Tensor, other: Tensor) -> Tensor:
+    """(n,) bool: objects of a frame for which two thetas (D',) differ."""
+    found = torch.zeros(space.count, dtype=torch.bool, device=one.device)
+    for parameter in space.params:
+        if SPECS[parameter].per_object:
+            a, b = space.block(one, parameter), space.block(other, parameter)
+            assert a is not None
+            assert b is not None
+            found |= ((a - b).abs() > _SAME).any(1)
+    return found
+
+
+def _renamed(name: str, space: ClipSpace, frame: int) -> str:
+    """Convert `objects[3]: collision` of a frame to the car's name."""
+    if not name.startswith("objects["):
+        return name
+    index, _, rest = name.removeprefix("objects[").partition("]")
+    return f"cars[{space.tracks[int(space.rows[frame][int(index)])]}]{rest}"
+
+
+def _specs(points: int) -> dict[Parameter, ParameterSpec]:
+    """The specifications of the parameters, for cars instead of objects."""
+    names = tuple(f"{name}[{k}]" for k in range(points) for name in SPECS[Parameter.TRANSLATE].names)
+    path = ParameterSpec(2 * points, True, SPECS[Parameter.TRANSLATE].unit, names, "cars")
+    return {p: replace(spec, owner="cars") for p, spec in SPECS.items()} | {Parameter.TRANSLATE: path}
+
+
+def _path_weights(cars: Sequence[int], tracks: Sequence[Sequence[int]], points: int, like: Tensor) -> list[Tensor]:
+    """For each frame the weights (n, K) of its objects' control points, by the time since each was first seen."""
+    seen = {car: [f for f, of_frame in enumerate(tracks) if car in of_frame] for car in cars}
+    found = []
+    for frame, of_frame in enumerate(tracks):
+        weights = like.new_zeros(len(of_frame), points)
+        for row, car in enumerate(of_frame):
+            first, last = seen[car][0], seen[car][-1]
+            u = (frame - first) / max(last - first, 1)
+            n = points - 1
+            weights[row] = like.new_tensor([comb(n, k) * u**k * (1 - u) ** (n - k) for k in range(points)])
+        found.append(weights)
+    return found
 
 
 @dataclass(frozen=True, slots=True)

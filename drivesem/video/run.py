@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -14,15 +15,14 @@ from detectors.base import detector_device
 from detectors.types import CLASSES
 from drivesem.attack.budgets import change_limits, parse_budget
 from drivesem.attack.feasibility_check import ChangeLimits, check_scene
-from drivesem.attack.methods.placebo import Placebo
+from drivesem.attack.methods.gradient_free import Placebo
 from drivesem.attack.targets import resolve_t_star
 from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.config.devices import check_device
 from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.grades import Grade
 from drivesem.report.drawing import write_picture
-from drivesem.report.tables import AnalysisReport, format_count
-from drivesem.report.terminal import Console, progress_bar
+from drivesem.report.tables import AnalysisReport, Console, format_count, progress_bar
 from drivesem.run import attack as attacks
 from drivesem.run.folder import FRAMES, PRESENTATION, claim_folder
 from drivesem.run.frame import EvaluatedScene, build_grading_input, detection_records, target_records
@@ -31,8 +31,7 @@ from drivesem.run.report import pictures
 from drivesem.run.results import Failure
 from drivesem.video.clips import ClipDerenderer, ClipSource, DerenderedClip, derender_clip
 from drivesem.video.objective import ClipObjective, FrameDetection
-from drivesem.video.report import build_report, write_page, write_video
-from drivesem.video.results import (
+from drivesem.video.report import (
     ABSENT,
     FOUND,
     LOST,
@@ -41,6 +40,9 @@ from drivesem.video.results import (
     CarResult,
     DriveResult,
     State,
+    build_report,
+    write_page,
+    write_video,
 )
 from scene_ir import files
 from scene_ir.io import to_uint8
@@ -115,10 +117,11 @@ def attack_clip(config: DriveConfig) -> AnalysisReport:
 def to_attack_config(config: DriveConfig) -> AttackConfig:
     """Convert to the settings of an attack on frames. Raises UsageError for settings that conflict."""
     shared = {entry.name for entry in fields(AttackConfig)} & {entry.name for entry in fields(DriveConfig)}
-    settings = {name: getattr(config, name) for name in shared}
+    settings: dict[str, Any] = {name: getattr(config, name) for name in shared}
     if config.params is None and config.combo is None:
         settings["params"] = DEFAULT_PARAMS
-    attack = AttackConfig(**settings | {"confirm": False, "second_detector": "off"})
+    settings |= {"confirm": False, "second_detector": "off"}
+    attack = AttackConfig(**settings)
     attack.check()
     return attack
 

@@ -10,19 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_ir.derender import (
-    cutout,
-    depth,
-    ground_geometry,
-    icp,
-    mask_extension,
-    occluders,
-    paint_mask,
-    segmentation,
-    shadow,
-    silhouette,
-    template_choice,
-)
+from scene_ir.derender import alignment as icp
+from scene_ir.derender import alignment as template_choice
+from scene_ir.derender import cutout, depth, occluders, paint_mask, segmentation, shadow, silhouette
+from scene_ir.derender import depth as ground_geometry
+from scene_ir.derender import matte as mask_extension
 from scene_ir.derender.background_fill import BackgroundFill, BackgroundInputs
 from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.matte import cutout_opacity

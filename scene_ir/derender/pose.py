@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from scene_ir.derender.ground_geometry import CAMERA_HEIGHT_M
+from scene_ir.derender.depth import CAMERA_HEIGHT_M
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.geometry import clip_boxes, project_boxes
 from scene_ir.meshes.outlines import KINDS

@@ -42,8 +42,17 @@ from scene_ir.raster.launch import (
     start_warp,
     threads,
 )
-from scene_ir.raster.layout import Fragments, PixelLayout, RasterPlan, tensor_version
-from scene_ir.raster.plan import gpu_lanes, gpu_parts, int32_faces, split_for_threads, split_outlines
+from scene_ir.raster.layout import (
+    Fragments,
+    PixelLayout,
+    RasterPlan,
+    gpu_lanes,
+    gpu_parts,
+    int32_faces,
+    split_for_threads,
+    split_outlines,
+    tensor_version,
+)
 from scene_ir.raster.reference import DEGENERATE as _DEGENERATE
 from scene_ir.raster.reference import SLACK_PX as _SLACK_PX
 from scene_ir.raster.reference import SNAP_PX as _SNAP_PX

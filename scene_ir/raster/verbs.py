@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.raster.layout import Fragments, PixelLayout
-from scene_ir.raster.plan import index_range
+from scene_ir.raster.layout import Fragments, PixelLayout, index_range
 from scene_ir.types import check_finite, check_shape
 
 __all__ = [

@@ -4,8 +4,6 @@ They inline comprehensions into the function around them, and fail for a name th
 and that another one takes from outside the function.
 """
 
-from __future__ import annotations
-
 import symtable
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Class names are unique, and retired words appear neither in names nor in text: `docs/glossary.md` has the terms."""
 
-from __future__ import annotations
-
 from tools.names import CODE, find_all, find_repeated_classes, iterate_files
 
 PRODUCT = ("scene_ir", "detectors", "drivesem", "docs", "README.md", "CONTRIBUTING.md")

@@ -1,7 +1,5 @@
 """Anchors by k-means: planted clusters, means and overlaps computed by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

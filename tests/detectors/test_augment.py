@@ -1,7 +1,5 @@
 """Views of frames: what happens to pixels happens to boxes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

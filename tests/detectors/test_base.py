@@ -1,7 +1,5 @@
 """Prediction in parts when device memory runs out, and atomic writing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

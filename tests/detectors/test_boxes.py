@@ -1,7 +1,5 @@
 """Overlaps, clipping and suppression of boxes, against plain loops."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

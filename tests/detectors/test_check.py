@@ -1,7 +1,5 @@
 """The contract check: a small detector passes, and each violation is named."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

@@ -1,7 +1,5 @@
 """Convolutions with constant weights against torch's own, for inputs of several sizes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

@@ -1,7 +1,5 @@
 """Ensembles: members' losses, candidates and detections on one scale."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """SqueezeDet with frozen weights against the same layers under autograd."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Planted faults: features, suppression, and gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

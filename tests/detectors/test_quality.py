@@ -1,7 +1,5 @@
 """The quality loss: which anchors answer, and each of its terms by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Detectors by name and by file; files that are something else."""
 
-from __future__ import annotations
-
 import json
 import re
 import resource

@@ -1,7 +1,5 @@
 """SqueezeDet: its layers, its anchors, each term of its loss on planted targets, its decoding."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

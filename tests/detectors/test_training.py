@@ -1,7 +1,5 @@
 """The training loop: it learns, it resumes to the bit, it refuses what it cannot use."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Mapping, Sequence

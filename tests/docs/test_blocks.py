@@ -3,8 +3,6 @@
 A Python block that cannot run here follows a comment, `<!-- not run: needs ... -->`, and must compile.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import pkgutil

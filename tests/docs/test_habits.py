@@ -1,7 +1,5 @@
 """Files that other tools read: citation, hooks, issue templates; and pages that name extras and exit codes."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

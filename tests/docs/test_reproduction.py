@@ -1,7 +1,5 @@
 """Numbers with an interval on the page of the paper's tables are those of the pages that it links to."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

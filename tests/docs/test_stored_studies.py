@@ -5,8 +5,6 @@ table there, and each number with an interval, is in the page that `python -m to
 docs/data/NAME` writes.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -99,8 +99,11 @@ def refused(
         folder = tmp_path / "empty"
         folder.mkdir()
         monkeypatch.chdir(folder)
+        capsys.readouterr()
         assert command_line(list(words)) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        printed = capsys.readouterr()
+        (line,) = printed.err.splitlines()
+        assert printed.out == ""
         assert not list(folder.iterdir())
         return line
 

@@ -6,9 +6,8 @@ from detectors.types import CLASSES
 from drivesem.attack.targets import HEADLINE
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import coco
-from drivesem.run.frame import detections_from_records, targets_from_records
+from drivesem.run.frame import count_grades, detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult, RunSummary
-from drivesem.run.summary import count_grades
 
 T_STAR = 0.5
 

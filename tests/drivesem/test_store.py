@@ -22,6 +22,7 @@ from drivesem.data.registry import open_dataset
 from drivesem.store import RemoteFolder, local_copy
 from scene_ir.errors import FormatError
 from tests.drivesem.commands.test_attack_command import contents, without_times
+from tests.drivesem.invoke import refusal, run_json
 
 ATTACK = [
     "attack",
@@ -278,29 +279,24 @@ def test_a_folder_of_others_is_compared_by_the_metadata_of_the_store(tmp_path: P
         (["runs", "show", "memory://none"], "FOLDER: expected a folder with files"),
     ],
 )
-def test_urls_that_cannot_be_used_are_refused_in_one_line(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
+def test_urls_that_cannot_be_used_are_refused_in_one_line(words: list[str], message: str) -> None:
+    assert message in refusal(*words)
 
 
 def test_an_attack_on_a_store_equals_a_local_one(
-    tmp_path: Path, machine: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, machine: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"plain://{tmp_path}/bucket/run"
     assert main([*ATTACK, "--limit", "1", "--out", str(tmp_path / "here")]) == 0
     Plain.writes_left, Plain.raised = 6, OSError  # some files of the frame are there, and no commit
-    assert main([*ATTACK, "--limit", "1", "--out", url]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
+    error = refusal(*ATTACK, "--limit", "1", "--out", url)
     assert f"--out: expected a store that can be written, found {url}: OSError: cut off" in error
     copy = Path(error.partition("(the results are in ")[2].rstrip(")"))
     assert (copy / "frames" / "demo-000" / "result.json").is_file()
     Plain.writes_left = float("inf")
     here = os.environ["XDG_CACHE_HOME"]
     machine()
-    assert main(["runs", "list", url]) == 2
-    assert f"FOLDER: expected a folder with files, found {url}, which is empty" in capsys.readouterr().err
+    assert f"FOLDER: expected a folder with files, found {url}, which is empty" in refusal("runs", "list", url)
     monkeypatch.setenv("XDG_CACHE_HOME", here)
     written = (copy / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
     assert main([*ATTACK, "--limit", "1", "--out", url]) == 0
@@ -309,15 +305,12 @@ def test_an_attack_on_a_store_equals_a_local_one(
     assert contents(local_copy(url) / "frames") == contents(tmp_path / "here" / "frames")
     metrics = [json.loads((run / "metrics.json").read_text()) for run in (local_copy(url), tmp_path / "here")]
     assert without_times(metrics[0]) == without_times(metrics[1])
-    capsys.readouterr()
-    assert main(["runs", "show", url, "--json"]) == 0
-    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    (run,) = run_json("runs", "show", url)["runs"]
     assert run["finished"]
     assert run["frames"] == 1
     assert main(["runs", "merge", url, "--out", str(tmp_path / "merged")]) == 0
     assert main(["verify", "--run", str(tmp_path / "merged")]) == 0
-    assert main([*ATTACK, "--steps", "3", "--limit", "1", "--out", url]) == 2
-    assert "expected the settings of this run" in capsys.readouterr().err
+    assert "expected the settings of this run" in refusal(*ATTACK, "--steps", "3", "--limit", "1", "--out", url)
 
 
 @pytest.mark.slow

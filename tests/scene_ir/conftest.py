@@ -1,7 +1,5 @@
 """A small street with three box-like cars, drawn by the project itself and then taken apart again."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Files that were made to break a reader: one line that names the file, soon, and without much memory."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Smooth hole filling, and reductions over colour channels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,6 +1,7 @@
 """What the central types refuse: one line with the field, what was expected and what was found."""
 
 import dataclasses
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -28,7 +29,7 @@ H, W, N = 6, 8, 2
 
 def camera(**changes: Any) -> Camera:
     values = {"intrinsics": torch.eye(3) * 100, "height": H, "width": W}
-    return Camera(**{**values, **changes})
+    return Camera(**values | changes)
 
 
 def mesh(**changes: Any) -> Mesh:
@@ -37,7 +38,7 @@ def mesh(**changes: Any) -> Mesh:
         "faces": torch.tensor([[0, 1, 2], [1, 2, 3]]),
         "part": torch.zeros(2).long(),
     }
-    return Mesh(**{**values, **changes})
+    return Mesh(**values | changes)
 
 
 def source(**changes: Any) -> Source:
@@ -52,7 +53,7 @@ def source(**changes: Any) -> Source:
         "paint": torch.zeros(3),
         "sunlight": 0.5,
     }
-    return Source(**{**values, **changes})
+    return Source(**values | changes)
 
 
 def objects(**changes: Any) -> Objects:
@@ -68,7 +69,7 @@ def objects(**changes: Any) -> Objects:
         "truncation": torch.zeros(N),
         "occlusion": torch.zeros(N).long(),
     }
-    return Objects(**{**values, **changes})
+    return Objects(**values | changes)
 
 
 def environment(**changes: Any) -> Environment:
@@ -79,7 +80,7 @@ def environment(**changes: Any) -> Environment:
         "ground": torch.zeros(4),
     }
     maps = {name: torch.zeros(H, W) for name in ("sky", "foliage_map", "road")}
-    return Environment(**{**values, **maps, **changes})
+    return Environment(**values | maps | changes)
 
 
 def scene(**changes: Any) -> SceneIR:
@@ -93,7 +94,7 @@ def scene(**changes: Any) -> SceneIR:
         "depth": torch.ones(H, W),
         "ignore": torch.zeros(0, 4),
     }
-    return SceneIR(**{**values, **changes})
+    return SceneIR(**values | changes)
 
 
 def labels(**changes: Any) -> Labels:
@@ -107,12 +108,12 @@ def labels(**changes: Any) -> Labels:
         "size_lhw": torch.ones(N, 3),
         "ignore_xyxy": torch.zeros(1, 4),
     }
-    return Labels(**{**values, **changes})
+    return Labels(**values | changes)
 
 
 def frame(**changes: Any) -> Frame:
     values = {"identifier": "000008", "photograph": torch.zeros(3, H, W), "camera": camera(), "labels": labels()}
-    return Frame(**{**values, **changes})
+    return Frame(**values | changes)
 
 
 @pytest.mark.parametrize("make", [camera, mesh, source, objects, environment, scene, labels, frame])
@@ -123,82 +124,66 @@ def test_the_plain_case_is_accepted_frozen_and_slotted(make: Callable[[], Any]) 
     assert not hasattr(value, "__dict__")
 
 
-NAN3 = torch.tensor([0.0, 0.0, float("nan")])
+NOT_FINITE = {
+    *("source.translation", "source.yaw", "source.size_lhw", "source.ffd", "source.paint", "objects.box2d"),
+    *("objects.truncation", "environment.sky", "environment.foliage_map", "environment.road"),
+    *("scene.photograph", "scene.background", "scene.depth", "scene.ignore", "labels.boxes_xyxy"),
+    *("labels.truncation", "labels.translation", "labels.yaw", "labels.size_lhw", "labels.ignore_xyxy"),
+    "frame.photograph",
+}
+"""Tensors that may hold values that are not finite, or whose values are checked elsewhere."""
+TENSORS = [
+    (make, field.name)
+    for make in (camera, mesh, source, objects, environment, scene, labels, frame)
+    for field in dataclasses.fields(make())
+    if isinstance(getattr(make(), field.name), torch.Tensor)
+]
+
+
+@pytest.mark.parametrize(("make", "field"), TENSORS, ids=[f"{make.__name__}-{field}" for make, field in TENSORS])
+def test_every_tensor_has_its_type_shape_and_range(make: Callable[..., Any], field: str) -> None:
+    value, name = getattr(make(), field), f"{make.__name__}.{field}"
+    floating = value.is_floating_point()
+    wrong = [
+        (value.tolist(), ShapeError, "expected a torch tensor, found "),
+        (value[None], ShapeError, "expected shape "),
+        (value.long() if floating else value.float(), ShapeError, "expected a"),
+    ]
+    if value.ndim and field != "sky":  # the shape of which is that of other maps
+        wrong.append((torch.cat([value, value], dim=-1), ShapeError, "expected shape "))
+    if floating and name not in NOT_FINITE:
+        wrong.append((value * torch.nan, RangeError, "expected a finite value"))
+    for changed, error, message in wrong:
+        with pytest.raises(error, match=rf"^{re.escape(name)}.*: {message}.*$"):
+            make(**{field: changed})
+
 
 BAD: list[tuple[Callable[..., Any], dict[str, Any], type[SceneError], str]] = [
-    (
-        camera,
-        {"intrinsics": torch.eye(4)},
-        ShapeError,
-        r"camera\.intrinsics: expected shape \(3, 3\), found \(4, 4\)",
-    ),
-    (camera, {"intrinsics": [[1.0]]}, ShapeError, "camera.intrinsics: expected a torch tensor, found list"),
-    (camera, {"intrinsics": torch.eye(3).long()}, ShapeError, "camera.intrinsics: expected a floating dtype"),
-    (
-        camera,
-        {"intrinsics": torch.eye(3) * torch.nan},
-        RangeError,
-        r"camera\.intrinsics\[0, 0\]: expected a finite",
-    ),
     (camera, {"intrinsics": -torch.eye(3)}, RangeError, "focal lengths: expected positive px"),
     (camera, {"projection": torch.eye(3)}, ShapeError, r"camera\.projection: expected shape \(3, 4\)"),
     (camera, {"projection": torch.full((3, 4), torch.inf)}, RangeError, r"camera\.projection\[0, 0\]"),
     (camera, {"height": 0}, RangeError, "camera size: expected at least 1x1 px, found 8x0"),
-    (mesh, {"vertices": torch.zeros(4, 2)}, ShapeError, r"mesh\.vertices: expected shape \('\*', 3\)"),
-    (mesh, {"vertices": NAN3.expand(4, 3)}, RangeError, r"mesh\.vertices\[0, 2\]"),
-    (mesh, {"faces": torch.zeros(2, 3)}, ShapeError, "mesh.faces: expected an integer dtype"),
     (
         mesh,
-        {"faces": torch.tensor([[0, 1, 4], [0, 1, 2]])},
+        {"faces": torch.tensor([[0, 1, 4]]), "part": torch.zeros(1).long()},
         RangeError,
-        r"mesh\.faces: expected indices in \[0, 4\)",
+        r"indices in \[0, 4\)",
     ),
     (mesh, {"faces": torch.tensor([[0, 1, -1], [0, 1, 2]])}, RangeError, "mesh.faces: expected indices"),
     (mesh, {"part": torch.zeros(3).long()}, ShapeError, r"mesh\.part: expected shape \(2,\), found \(3,\)"),
     (mesh, {"colours": torch.zeros(3, 3)}, ShapeError, r"mesh\.colours: expected shape \(4, 3\)"),
     (mesh, {"uv": torch.zeros(4, 3)}, ShapeError, r"mesh\.uv: expected shape \(4, 2\)"),
-    (source, {"yaw": torch.zeros(1)}, ShapeError, r"source\.yaw: expected shape \(\)"),
-    (source, {"ffd": torch.zeros(96)}, ShapeError, r"source\.ffd: expected shape \(64, 3\)"),
-    (
-        source,
-        {"foreground": Crop(torch.zeros(3, 2, 2), 0, 0)},
-        ShapeError,
-        r"source\.foreground: expected shape \(4",
-    ),
+    (source, {"foreground": Crop(torch.zeros(3, 2, 2), 0, 0)}, ShapeError, r"foreground: expected shape \(4"),
     (source, {"shadow": Crop(torch.zeros(1, 2, 2), 0, 0)}, ShapeError, r"source\.shadow: expected shape \(3"),
-    (objects, {"translation": torch.zeros(N, 2)}, ShapeError, r"objects\.translation: expected shape \('\*', 3\)"),
-    (objects, {"translation": 3}, ShapeError, "objects.translation: expected a torch tensor, found int"),
     (objects, {"yaw": torch.zeros(N + 1)}, ShapeError, r"objects\.yaw: expected shape \(2,\), found \(3,\)"),
-    (objects, {"yaw": torch.tensor([0, torch.inf])}, RangeError, r"objects\.yaw\[1\]: expected a finite value"),
-    (objects, {"ffd": torch.zeros(N, 96)}, ShapeError, r"objects\.ffd: expected shape \(2, 64, 3\)"),
-    (objects, {"texture_code": torch.zeros(N, 4)}, ShapeError, r"objects\.texture_code: expected shape \(2, 5\)"),
-    (objects, {"category": torch.zeros(N)}, ShapeError, "objects.category: expected an integer dtype"),
     (objects, {"size_lhw": torch.zeros(N, 3)}, RangeError, r"objects\.size_lhw: expected positive metres"),
-    (objects, {"box2d": torch.zeros(N, 5)}, ShapeError, r"objects\.box2d: expected shape \(2, 4\)"),
-    (objects, {"occlusion": torch.zeros(N)}, ShapeError, "objects.occlusion: expected an integer dtype"),
     (objects, {"source": (source(),)}, ShapeError, r"objects\.source: expected 2 entries or none, found 1"),
-    (environment, {"weather": torch.zeros(3)}, ShapeError, r"environment\.weather: expected shape \(4,\)"),
-    (environment, {"foliage": NAN3}, RangeError, r"environment\.foliage\[2\]: expected a finite"),
-    (environment, {"sun": NAN3}, RangeError, r"environment\.sun\[2\]"),
-    (environment, {"road": torch.zeros(H, W + 1)}, ShapeError, r"environment\.road: expected shape \(6, 8\)"),
-    (scene, {"photograph": torch.zeros(3, W, H)}, ShapeError, r"scene\.photograph: expected shape \(3, 6, 8\)"),
-    (scene, {"background": torch.zeros(H, W, 3)}, ShapeError, r"scene\.background"),
-    (scene, {"depth": torch.zeros(1, H, W)}, ShapeError, r"scene\.depth: expected shape \(6, 8\)"),
-    (scene, {"ignore": torch.zeros(4)}, ShapeError, r"scene\.ignore: expected shape \('\*', 4\)"),
     (scene, {"other_labels": labels()}, ShapeError, r"scene\.ignore: expected shape \(3, 4\), found \(0, 4\)"),
     (scene, {"camera": camera(width=9)}, ShapeError, r"scene\.photograph: expected shape \(3, 6, 9\)"),
     (scene, {"meshes": ()}, RangeError, r"objects\.mesh_index: expected indices in \[0, 0\)"),
-    (
-        scene,
-        {"objects": objects(mesh_index=torch.tensor([0, -1]))},
-        RangeError,
-        "objects.mesh_index: expected indices",
-    ),
+    (scene, {"objects": objects(mesh_index=torch.tensor([0, -1]))}, RangeError, "mesh_index: expected indices"),
     (labels, {"boxes_xyxy": torch.zeros(3, 4)}, ShapeError, r"labels\.boxes_xyxy: expected shape \(2, 4\)"),
     (labels, {"kind": ("Car",)}, ShapeError, r"labels\.boxes_xyxy: expected shape \(1, 4\)"),
-    (labels, {"occlusion": torch.zeros(N)}, ShapeError, "labels.occlusion: expected an integer dtype"),
-    (labels, {"ignore_xyxy": torch.zeros(3)}, ShapeError, r"labels\.ignore_xyxy"),
-    (frame, {"photograph": torch.zeros(3, 5, W)}, ShapeError, r"frame\.photograph: expected shape \(3, 6, 8\)"),
     (frame, {"masks": torch.zeros(3, H, W)}, ShapeError, r"frame\.masks: expected shape \(2, 6, 8\)"),
     (frame, {"depth": torch.zeros(H, 2)}, ShapeError, r"frame\.depth"),
     (frame, {"classes": torch.zeros(H, W)}, ShapeError, r"frame\.classes: expected an integer dtype"),

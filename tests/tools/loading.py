@@ -1,7 +1,5 @@
 """Maintainers' scripts as modules."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training of a small network: the average, rounding, checkpoints, gradients that are not finite."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

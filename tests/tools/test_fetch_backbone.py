@@ -1,7 +1,5 @@
 """Reading the backbone: a pickle of arrays and nothing else, under the detector's names."""
 
-from __future__ import annotations
-
 import io
 import pickle
 from pathlib import Path

@@ -1,14 +1,11 @@
 """VGG-16's convolutions from elsewhere: torchvision's names, the same numbers from differently prepared pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
-from drivesem.classify.networks.architectures import PooledVGG16
-from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
+from drivesem.classify.networks.architectures import IMAGENET_MEAN, IMAGENET_STD, PooledVGG16
 from tests.tools.loading import tool
 
 vgg16 = tool("fetch_vgg16")

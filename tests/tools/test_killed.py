@@ -1,7 +1,5 @@
 """Killed commands: is a command told from one that does not end alike?"""
 
-from __future__ import annotations
-
 import random
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The lock file: every tested release has a hash, and it says what constraints.txt says."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -10,7 +8,7 @@ import pytest
 
 from scene_ir.errors import FormatError
 from tools import lock
-from tools.lock import CONSTRAINTS, LOCK, hashes, main, read_pins
+from tools.lock import CONSTRAINTS, LOCK, main
 
 
 def test_the_lock_has_each_tested_release_once_with_a_hash() -> None:
@@ -51,13 +49,3 @@ def test_reports_become_a_lock(
     assert main(["--check", str(first), str(second)]) == 0
     assert main(["--check", str(first), str(report(tmp_path / "3.json", c="2" * 64))]) == 1
     assert capsys.readouterr().out == "constraints.lock is another\n"
-
-
-def test_what_is_no_report_and_no_constraint(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_text('{"install": [{}]}')
-    with pytest.raises(FormatError, match="expected a report of pip install --report"):
-        hashes([path])
-    path.write_text("a>=1.0\n")
-    with pytest.raises(FormatError, match=r"a\.json:1: expected NAME==VERSION, found 'a>=1.0'"):
-        read_pins(path)

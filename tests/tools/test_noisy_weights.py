@@ -1,7 +1,5 @@
 """Noise in a detector's weights: how much of it there is, and that a file of it is a detector."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

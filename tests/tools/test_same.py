@@ -1,7 +1,5 @@
 """The comparison of two versions: what its hashes ignore, the order of cases, renamed words."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -82,19 +80,6 @@ def test_every_case_can_begin() -> None:
     assert same.sort_cases(["worth-table"], cases) == ["inputs", "worth-table"]
     assert {"attack --combo 7", "render", ""} <= set(cases["refused"])
     assert {"--help", "retrain --help"} <= set(cases["help"])
-
-
-def test_paths_are_seen_from_where_a_command_runs(tmp_path: Path) -> None:
-    case = tmp_path / "edit"
-    line = "edit @derender/scenes -o @/edit.png"
-    assert same.command_words(line, case, case) == [
-        "drivesem.cli",
-        "edit",
-        "../derender/scenes",
-        "-o",
-        "./edit.png",
-    ]
-    assert same.command_words(line, case, case / "empty")[2] == "../../derender/scenes"
 
 
 def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,5 @@
 """The shipped detectors on pictures of the generator that they were trained with, from the held-out split."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ from detectors.types import CLASSES
 from drivesem.data.classes import KITTI
 from drivesem.synth.frames import generate_frame
 from scene_ir import files
-from tools.beside import ROOT
+from tools.compare_checkouts import ROOT
 
 SEED, INDEX = 2026, 13
 """A held-out street; no frame that the detectors were trained, chosen or judged on."""

@@ -1,7 +1,5 @@
 """The documentation site: every page is in the navigation, links lead to pages, and it builds without a warning."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """tools/threshold.py: the score of best F1 on a folder of frames, beside the detector's own."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

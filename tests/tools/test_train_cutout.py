@@ -1,7 +1,5 @@
 """Training the network that cuts vehicles out, on a tiny set: what it learns from, and runs that are stopped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +40,6 @@ def test_without_disturbance_the_template_lies_on_the_vehicle(store: Any) -> Non
     assert np.median(scores) > 0.8
 
 
-def test_looks_keep_size_and_shares(store: Any) -> None:
-    layers = store.layers(0)
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        photograph, shares = train.vary_appearance(
-            np.ascontiguousarray(layers[..., :3]), layers[..., 3:6].copy(), rng
-        )
-        assert photograph.shape == (*layers.shape[:2], 3)
-        assert photograph.dtype == shares.dtype == np.uint8
-        assert (shares.astype(int).sum(-1) <= 255 + 3).all()
-        assert (shares[..., 0] <= layers[..., 3]).all()
-
-
 def test_a_run_that_was_stopped_ends_at_the_same_weights(store: Any, tmp_path: Path) -> None:
     torch.set_num_threads(1)
     whole = train.CutoutRun(SETTINGS)
@@ -72,23 +57,8 @@ def test_a_run_that_was_stopped_ends_at_the_same_weights(store: Any, tmp_path: P
         assert torch.equal(tensor, second.average[name]), name
 
 
-def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
-    train.CutoutRun(SETTINGS).save(tmp_path / "c.safetensors")
-    with pytest.raises(ValueError, match="expected settings"):
-        train.CutoutRun(train.CutoutSettings(cycles=((4, 3e-3),), batch=2)).load(tmp_path / "c.safetensors")
-
-
 def test_streets_are_made_once(store: Any, tmp_path: Path) -> None:
     parts = train.make(tmp_path, "train", 5, 1, None)
     stamp = (parts[0] / "layers.bin").stat().st_mtime_ns
     assert train.make(tmp_path, "train", 5, 1, None) == parts
     assert (parts[0] / "layers.bin").stat().st_mtime_ns == stamp
-
-
-def test_each_cycle_begins_at_its_rate_and_ends_at_nothing() -> None:
-    settings = train.CutoutSettings(cycles=((100, 3e-3), (60, 1e-3)))
-    rates = [settings.rate(step) for step in range(160)]
-    assert max(rates[50:100]) < 3e-3
-    assert rates[99] < 1e-5
-    assert rates[100] == 1e-3
-    assert rates[159] < 1e-5

@@ -1,8 +1,5 @@
 """Training of the depth network: what it is shown, what it should say, and that a run can be gone on with."""
 
-from __future__ import annotations
-
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +26,6 @@ def store(streets: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "street", lambda seed, index, split: streets[index])
         return training.DepthStore(tmp_path_factory.mktemp("depth"), 2, 7, "train")
-
-
-def test_later_streets_are_taken_from_other_heights(streets: list[Any]) -> None:
-    usual, higher = (float(frame.environment.ground[3]) for frame in streets)
-    assert usual == pytest.approx(1.65, abs=0.15)
-    assert abs(np.log(higher / usual)) > 0.05
-    assert training.HIGHER[0] * 1.5 < higher < training.HIGHER[1] * 1.8
 
 
 def test_a_frame_is_kept_with_its_actors_and_without(store: Any, streets: list[Any], tmp_path: Path) -> None:
@@ -85,25 +75,9 @@ def test_the_truth_costs_least(store: Any) -> None:
     assert least < training.compute_loss(right.roll(5, 3), ground, near, 0.5)
 
 
-def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
-    torch.set_num_threads(1)
-    whole = training.DepthRun(SETTINGS)
-    losses = [whole.step(store) for _ in range(4)]
-    first = training.DepthRun(SETTINGS)
-    for _ in range(2):
-        first.step(store)
-    first.save(tmp_path / "checkpoint.safetensors")
-    second = training.DepthRun(SETTINGS)
-    second.load(tmp_path / "checkpoint.safetensors")
-    assert [second.step(store) for _ in range(2)] == losses[2:]
-    other = training.DepthRun(replace(SETTINGS, rate=1e-3))
-    with pytest.raises(ValueError, match="expected settings"):
-        other.load(tmp_path / "checkpoint.safetensors")
-
-
 def test_judged_beside_walls_by_rule(streets: list[Any]) -> None:
     network = DepthNet().eval()
-    figures = training.judge(network, streets[:1])
-    assert set(figures) == {"walls by rule", "network", "both"}
-    assert all(error >= 0 and 0 <= near <= 1 for error, near in figures.values())
-    assert training.format_table(figures).count("\n") == 1 + len(figures)
+    metrics = training.judge(network, streets[:1])
+    assert set(metrics) == {"walls by rule", "network", "both"}
+    assert all(error >= 0 and 0 <= near <= 1 for error, near in metrics.values())
+    assert training.format_table(metrics).count("\n") == 1 + len(metrics)

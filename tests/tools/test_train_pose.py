@@ -1,7 +1,5 @@
 """The maintainers' script behind the shipped pose network: crops, targets, steps that can be stopped, figures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -97,24 +95,6 @@ def test_the_truth_costs_least(store: Any) -> None:
     ):
         wrong = training.loss_terms(said_of(replace(targets, **change), 40.0), targets)
         assert float(wrong["total"]) > float(right["total"]) + 0.05, change.keys()
-
-
-def test_a_run_goes_on_where_it_stopped(store: Any, tmp_path: Path) -> None:
-    torch.set_num_threads(1)
-    whole = training.PoseRun(SETTINGS)
-    terms = [whole.step(store)["total"] for _ in range(6)]
-    first = training.PoseRun(SETTINGS)
-    for _ in range(3):
-        first.step(store)
-    first.save(tmp_path / "checkpoint.safetensors")
-    second = training.PoseRun(SETTINGS)
-    second.load(tmp_path / "checkpoint.safetensors")
-    assert [second.step(store)["total"] for _ in range(3)] == terms[3:]
-    for name, value in whole.average.items():
-        assert torch.equal(value, second.average[name]), name
-    other = training.PoseRun(replace(SETTINGS, rate=1e-3))
-    with pytest.raises(ValueError, match="expected settings"):
-        other.load(tmp_path / "checkpoint.safetensors")
 
 
 def test_judged_by_errors(streets: Path) -> None:

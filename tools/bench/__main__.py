@@ -19,14 +19,12 @@ from drivesem import __version__
 from drivesem.attack.space import parse_params
 from drivesem.bench import render
 from drivesem.bench.scenes import MAX_CARS
-from drivesem.bench.session import BenchResult, output_paths, run_benchmark, show_progress
-from drivesem.bench.tables import BenchTable
+from drivesem.bench.session import BenchResult, BenchTable, output_paths, run_benchmark, show_progress
 from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
 from drivesem.config.options import CommandConfig
 from drivesem.program import Program
-from drivesem.report.tables import format_count
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from scene_ir.derender.derender import DerenderSettings
@@ -57,13 +55,13 @@ from tools.bench.settings import BenchTool, DetectorBenchConfig, GradcheckConfig
 
 _PROGRAM = "python -m tools.bench"
 _RIVAL_SECONDS = (16.0, 180.0)
-"""Seconds for measuring renderers, with --quick and without; imports and scenes take some more."""
+"""Seconds for measuring renderers, with and without --quick, excluding imports and scenes."""
 _DETECTOR_SECONDS = (20.0, 90.0)
-"""The same for measuring detectors."""
+"""Seconds for measuring detectors, with and without --quick."""
 _SECONDS_A_PASS = 0.5
-"""Of an attack on a frame as large as KITTI's, with its certificates and its share of the frame's survey."""
+"""Estimated seconds per detector pass of an attack on a frame of KITTI's size, certificates included."""
 _PLANTED_FRAMES = 3
-"""Frames of `bench planted`, where nobody says how many."""
+"""Frames of `bench planted` without --limit."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -222,9 +220,9 @@ def _install(config: BenchTool, console: Console) -> BenchResult:
     of_kind = [
         (title, columns, [asdict(row) for row in rows if isinstance(row, kind)]) for title, columns, kind in parts
     ]
-    sections = [BenchTable(title, columns, told) for title, columns, told in of_kind if told]
+    sections = [BenchTable(title, columns, table_rows) for title, columns, table_rows in of_kind if table_rows]
     names = ("steps", "sizes", "starts")
-    fields = {name: told for name, (_, _, told) in zip(names, of_kind, strict=True)}
+    fields = {name: table_rows for name, (_, _, table_rows) in zip(names, of_kind, strict=True)}
     return BenchResult({**fields, "method": install.METHOD}, sections)
 
 
@@ -241,7 +239,7 @@ def _memory(config: DetectorBenchConfig, console: Console) -> BenchResult:
 
 
 def _detector(config: DetectorBenchConfig, console: Console) -> BenchResult:
-    """All that are shipped, or the one that was asked for."""
+    """Measure all shipped detectors, or the one of --detector."""
     names = sorted(SHIPPED) if config.detector == DetectorBenchConfig.detector else [config.detector]
     measured = detectors.measure(names, _DETECTOR_SECONDS[0 if config.quick else 1], config.seed, config.device)
     try:
@@ -294,23 +292,23 @@ def _planted_across(config: DetectorBenchConfig, console: Console) -> BenchResul
     second, frames = across.SharedFaultBench.of(config, texts), list(enumerate(pool.frame for pool in pools))
     frames = frames[: config.searched]
     build = partial(across.judge_of, config, texts)
-    asked = run_frame_jobs(
+    searching = run_frame_jobs(
         frames, second.judge, build, config, ProgressSettings("searches", show_remaining=True), lambda job: job[1]
     )
-    judged = [asked.results[job] for job in frames if job in asked.results]
+    judged = [searching.results[job] for job in frames if job in searching.results]
     rows = across_report.rule_rows(faults, pools, judged, tuple(first.workers) if frames else ())
-    told, summed = [row.to_json() for row in rows], across_report.summary_rows(rows)
+    rule_rows, summed = [row.to_json() for row in rows], across_report.summary_rows(rows)
     summed += across_report.chance_rows(pools, config.seed, across_report.CHANCE_DETECTORS)
     return BenchResult(
         {
-            "rows": told,
+            "rows": rule_rows,
             "summary": summed,
             "unplanted": ["+".join(kind) for (kind, _), one in zip(kinds, planted, strict=True) if one is None],
-            "failed": failed | pooling.failed | asked.failed,
+            "failed": failed | pooling.failed | searching.failed,
             "method": across_report.METHOD,
         },
         [
-            BenchTable(across_report.TITLE, across_report.COLUMNS, told),
+            BenchTable(across_report.TITLE, across_report.COLUMNS, rule_rows),
             BenchTable(across_report.SUMMARY_TITLE, across_report.SUMMARY_COLUMNS, summed),
         ],
     )
@@ -327,21 +325,21 @@ def _planted_in_frames(config: DetectorBenchConfig, console: Console) -> BenchRe
         f"{format_count(count, 'attack')} of {format_count(config.passes, 'pass', 'passes')}: "
         f"about {_minutes(count * config.passes)}"
     )
-    asked = run_frame_jobs(
+    searching = run_frame_jobs(
         names,
         judge.judge,
         partial(yardstick.judge_of, config),
         config,
         ProgressSettings("frames", show_remaining=True),
     )
-    judged = [asked.results[name] for name in names if name in asked.results]
+    judged = [searching.results[name] for name in names if name in searching.results]
     rows, kinds = summary.method_rows(judged, methods, config.seed), summary.kind_rows(judged, methods)
     return BenchResult(
         {
             "rows": rows,
             "kinds": kinds,
             "attempts": [asdict(attempt) for frame in judged for attempt in frame.attempts],
-            "failed": failed | asked.failed,
+            "failed": failed | searching.failed,
             "method": summary.METHOD,
         },
         [
@@ -365,7 +363,7 @@ def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
 
 
 def _measured(benchmark: Any, fields: dict[str, Any]) -> BenchResult:
-    """What a benchmark, one of the modules here, found; its table shows the summary, where there is one."""
+    """Build the result of a benchmark module; its table shows the summary, if there is one."""
     rows = fields.get("summary", fields["rows"])
     return BenchResult(
         {**fields, "method": benchmark.METHOD}, [BenchTable(benchmark.TITLE, benchmark.COLUMNS, rows)]
@@ -382,7 +380,7 @@ def _frames(config: BenchTool, benchmark: Any) -> int:
 
 
 def _sheets(config: BenchTool) -> Path | None:
-    """The folder for pictures, beside the results."""
+    """Folder of the pictures, in the folder of the results; None without results on disk."""
     targets = output_paths(config)
     return None if targets is None else targets[0].with_suffix("")
 

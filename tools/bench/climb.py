@@ -13,7 +13,7 @@ from detectors.base import Detector
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import Parameter, ParameterSpace
 from drivesem.bench.scenes import build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import Spread
 from drivesem.config.commands import AttackConfig
 from drivesem.failures.margin_oracle import NuisanceMarginOracle

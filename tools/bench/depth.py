@@ -1,4 +1,4 @@
-"""How far away a photograph's surroundings are taken to be, beside the truth, beside a laser, and in fog."""
+"""Error of the estimated depth of a photograph's surroundings, against exact depth, a laser, and in fog."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.options import DEMO
 from drivesem.data.registry import open_dataset
 from drivesem.report.drawing import write_picture
 from drivesem.synth.frames import SynthSettings, generate_frame
 from scene_ir.derender import depth
-from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import depth as maps
 from scene_ir.derender import segmentation as segment
 from scene_ir.derender.derender import derender
 from scene_ir.geometry import to_clip
@@ -40,12 +40,12 @@ COLUMNS: Columns = {
     "bands_px": ("bands in fog, px", "bands"), "worst_px": ("most bands, px", "worst"),
 }  # fmt: skip
 METHOD = (
-    "Frames are taken apart. Compared is the depth of the street behind and beside the vehicles: walls "
+    "Frames are de-rendered. Compared is the depth of the street behind and around the vehicles: walls "
     "guessed on the upper end of the ground (what drivesem used before), those walls relaxed along the "
     "picture's edges (Min et al. 2014), the network's, and the mean of the two in logarithms, which drivesem "
     "uses. Generated frames, of the held-out pools, are held against the generator's depth up to 120 m, "
-    "KITTI's against the laser's points beside the vehicles, where a frame has any (bands are counted in all "
-    "frames). Relative error: mean of |d - d*| / d*; within 1.25: share of pixels whose ratio is smaller; "
+    "KITTI's against the laser's points outside the vehicles, where a frame has any (bands are counted in all "
+    "frames). Relative error: mean of |d - d*| / d*; within 1.25: share of pixels with a smaller ratio; "
     "upright: of what is at least 10 % nearer than the ground. Bands in fog: at code 1, transmission changes "
     "by more than 0.12 within 2.6 % of the width, though the picture's smoothed colours change by less than "
     "0.06, in runs of at least 24 rows; rows of such runs, px a frame. 'exact' is the generator's own depth: "
@@ -120,7 +120,7 @@ def bands_px(depth_m: Array, picture: Array) -> float:
 
 
 def laser_m(points: Tensor, scene: SceneIR) -> Array:
-    """Depth (H, W) m of the laser's points (P, 3) that the camera sees beside the vehicles; inf where none is."""
+    """Depth (H, W) m of the laser's points (P, 3) that the camera sees outside the vehicles; inf elsewhere."""
     camera = scene.camera
     clip = to_clip(points.double(), camera.matrix.double()).numpy()
     clip = clip[clip[:, 2] > 1]
@@ -161,8 +161,8 @@ def depth_row(
     error, ratio = np.abs(guess - true) / true, np.maximum(guess / true, true / guess)
     up = true < 0.9 * maps.compute_plane_depth(street.plane, street.camera)[known]
     near = ratio < 1.25
-    figures = [float(m.mean()) for m in (error, near, error[up], near[up])]
-    return DepthRow(source, name, kind, bands, *(round(figure, 4) for figure in figures))
+    metrics = [float(m.mean()) for m in (error, near, error[up], near[up])]
+    return DepthRow(source, name, kind, bands, *(round(figure, 4) for figure in metrics))
 
 
 def judge(source: str, name: str, scene: SceneIR, truth: Array | None, sheets: Path | None) -> list[DepthRow]:

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.synth.demo import take_apart
 from drivesem.synth.edits import FrameEdit, ObjectEdit, apply_edit
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, Truth, full_boxes, plan_frame, render_frame
@@ -47,22 +47,22 @@ from tools.experiments.realism.perceptual import PERCEPTUAL, PerceptualDistance,
 
 Mask = NDArray[np.bool_]
 
-TITLE = "De-rendering beside the generator's truth"
+TITLE = "De-rendering against the generator's truth"
 COLUMNS: Columns = {
     "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
     "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
 }  # fmt: skip
 METHOD = (
     "Frames of the generator's held-out pools, clear and mixed weather in turn, each with a vehicle that can be "
-    "moved. derender sees RGB, camera and labels whose 3D boxes are off by 0.2 m on the ground, 5 degrees and 5 % "
-    "in each size, in random directions; 2D boxes are kept; no mask, no depth. Silhouettes: IoU with the "
+    "moved. derender sees RGB, camera and labels with 3D boxes off by 0.2 m on the ground, 5 degrees and 5 % "
+    "in each size, in random directions; 2D boxes are exact; no mask, no depth. Silhouettes: IoU with the "
     "generator's mask (pixels at least half covered) of vehicles of at least 40 px, at least 70 % visible; mesh: "
     "pixels the fitted mesh covers at least half and no nearer mesh does, counted outside what truly hides the "
-    "vehicle; matte: pixels the scene draws as this vehicle; true template withheld: taken apart once more, "
+    "vehicle; matte: pixels the scene draws as this vehicle; true template withheld: de-rendered once more, "
     "without the template of each vehicle's own kind. Move: one vehicle by 0.5 m along or across and 10 "
     "degrees, free of collision, rendered by the compositor and by the generator, compared over both pictures' "
     "true masks grown by 3 px and all pixels that truly changed by more than 2 levels; unchanged: the photograph "
-    "itself as the answer. never seen: share of the moved vehicle's pixels whose surface the photograph did not "
+    "itself as the answer. never seen: share of the moved vehicle's pixels with a surface that the photograph did not "
     "show. Zones: outline, within 2 px of the true new border; seen and never seen, inside it; uncovered, the old "
     "mask beyond it; ground, the rest. Remove: all vehicles that became objects, and those hardly to be seen. "
     f"{EXACT_DB:.0f} dB stands for equal. The {PERCEPTUAL}: unit-length features of conv1, fire3, fire5, squared "
@@ -92,7 +92,7 @@ _ATTEMPTS = 200
 _STREAM = 0xDE4E
 """Keeps this benchmark's random numbers apart from the generator's."""
 _WORST, _TYPICAL = 8, 4
-"""Sheets that are kept."""
+"""Number of sheets written."""
 _KB = 1024.0
 ZONES = ("seen", "never seen", "outline", "uncovered", "ground")
 ABLATIONS = (
@@ -156,7 +156,7 @@ class SilhouetteOverlap:
 
 @dataclass(frozen=True, slots=True)
 class EditAccuracy:
-    """A scene's edited picture beside the truth."""
+    """A scene's edited picture against the truth."""
 
     psnr_db: float
     unchanged_db: float
@@ -210,7 +210,7 @@ class DerenderTask:
     sheets: Path | None = None
     """Folder for its sheet, or None."""
     settings: DerenderSettings = field(default_factory=DerenderSettings)
-    """How it is taken apart."""
+    """De-rendering settings."""
 
 
 def measure(
@@ -222,7 +222,7 @@ def measure(
     settings: DerenderSettings | None = None,
 ) -> Iterator[DerenderRow]:
     """One row a frame, in order. sheets: a folder that gets the worst and some typical frames as pictures;
-    settings: how frames are taken apart.
+    settings: De-rendering settings.
 
     Raises RangeError for no frames or no processes.
     """
@@ -238,7 +238,7 @@ def measure(
             found.append(row)
             yield row
         if folder is not None and sheets is not None:
-            _keep_sheets(found, folder, sheets)
+            _copy_worst_sheets(found, folder, sheets)
 
 
 def _in_processes(tasks: Sequence[DerenderTask], workers: int) -> Iterator[DerenderRow]:
@@ -283,7 +283,7 @@ def work(task: DerenderTask) -> DerenderRow:
 
 
 def _withheld(case: EditedStreet, frame: Frame, settings: DerenderSettings) -> tuple[SilhouetteOverlap, ...]:
-    """The shapes of the frame taken apart with templates of other kinds than the vehicles are of."""
+    """Shape errors of the frame de-rendered with templates of other kinds than the vehicles'."""
     kinds = tuple(t.actor.kind for t in case.before.truths if t.labelled)
     scene = derender(frame, replace(settings, withheld=kinds))
     return tuple(compare_silhouettes(case, Compositor(scene), match_tracks(scene, case.before), None))
@@ -386,7 +386,7 @@ def is_free(plan: Plan, actor: Actor, move: VehicleMove) -> bool:
 
 
 def _raised(road: Road, corners: np.ndarray) -> int:
-    """How many of the corners (4, 2), (x, z) m, lie on something raised beside the road."""
+    """Number of corners (4, 2), (x, z) m, on raised ground next to the road."""
     x, z = corners.T
     s = z.copy()
     d = x.copy()
@@ -413,12 +413,12 @@ def disturb_labels(frame: SynthFrame, rng: np.random.Generator) -> Labels:
         size_lhw=(labels.size_lhw * stretch).float(),
     )
     boxes = project_boxes(off.size_lhw, off.yaw, off.translation, frame.camera.matrix)
-    kept = torch.isfinite(boxes).all(dim=1)
+    finite = torch.isfinite(boxes).all(dim=1)
     return replace(
         off,
-        translation=torch.where(kept[:, None], off.translation, labels.translation),
-        yaw=torch.where(kept, off.yaw, labels.yaw),
-        size_lhw=torch.where(kept[:, None], off.size_lhw, labels.size_lhw),
+        translation=torch.where(finite[:, None], off.translation, labels.translation),
+        yaw=torch.where(finite, off.yaw, labels.yaw),
+        size_lhw=torch.where(finite[:, None], off.size_lhw, labels.size_lhw),
     )
 
 
@@ -448,7 +448,7 @@ def judge(
 ) -> tuple[DerenderRow, list[SheetStrip]]:
     """Hold a scene against the truth. tracks: of its objects; labels: that it was made from, if any.
 
-    -> what was found (no time, no memory), and strips to look at.
+    -> errors (without time and memory), and strips for the sheets.
     """
     before, move = case.before, case.move
     compositor = Compositor(scene)
@@ -483,9 +483,9 @@ def judge(
         shadow_iou=round(shade, 4),
         sun_deg=round(sun, 2) if before.manifest["weather"] == "sun" else None,
     )
-    told = f"{truth.actor.kind} moved {move.shift_m[0]:+.1f} {move.shift_m[1]:+.1f} m, {row.turn_deg:+.0f} deg"
+    caption = f"{truth.actor.kind} moved {move.shift_m[0]:+.1f} {move.shift_m[1]:+.1f} m, {row.turn_deg:+.0f} deg"
     strips = [
-        SheetStrip(before.image, ours, case.moved.image, region, f"{index}, {told}: {edited.psnr_db:.1f} dB"),
+        SheetStrip(before.image, ours, case.moved.image, region, f"{index}, {caption}: {edited.psnr_db:.1f} dB"),
         SheetStrip(before.image, cleared, empty.image, hole, f"all removed: {removed.psnr_db:.1f} dB"),
     ]
     return row, strips
@@ -494,21 +494,21 @@ def judge(
 def compare_shadows(
     scene: SceneIR, before: SynthFrame, empty: SynthFrame, gone: Sequence[int]
 ) -> tuple[float, float]:
-    """Of the shadows that a scene's vehicles cast: IoU of where they darken the ground beside the vehicles, with
+    """Errors of the vehicles' shadows: IoU of where they darken the ground outside the vehicles, with
     the truth; and degrees between the sun's azimuths. gone: tracks of the vehicles that `empty` lacks."""
     seen = np.zeros(before.image.shape[:2], bool)
     for track in gone:
         seen |= track_coverage(before, track) > 0
-    beside = ~silhouette.grow_mask(seen, _GROW_PX)
+    surroundings = ~silhouette.grow_mask(seen, _GROW_PX)
     bright = [frame.image.max(axis=2).astype(np.float32) + 1 for frame in (before, empty)]
-    true = (bright[0] < _SHADED * bright[1]) & beside
+    true = (bright[0] < _SHADED * bright[1]) & surroundings
     factor = np.ones(seen.shape, np.float32)
     for source in scene.objects.source:
         if source.shadow is not None and source.shadow.values.numel():
             crop = source.shadow
             h, w = crop.values.shape[1:]
             factor[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] *= crop.values.amax(dim=0).numpy()
-    ours = (factor < _SHADED) & beside
+    ours = (factor < _SHADED) & surroundings
     either = np.count_nonzero(true | ours)
     suns = (scene.environment.sun, before.environment.sun)
     azimuths = [math.atan2(float(sun[2]), float(sun[0])) for sun in suns]
@@ -531,8 +531,8 @@ def apply_move(case: EditedStreet, scene: SceneIR, tracks: Sequence[int]) -> Sce
 
 
 def _removable(frame: SynthFrame) -> list[int]:
-    """Tracks of the vehicles that must be found, and of those that show too little to be: whatever becomes of
-    them, what they hide must not appear."""
+    """Tracks of the vehicles that must be found, and of those that show too little: what the latter
+    hide must not appear either."""
     vehicles = [t for t in frame.truths if t.actor.label in VEHICLE_CATEGORIES]
     return [t.actor.track for t in vehicles if eligible(t) or t.visible < _HARDLY_SEEN]
 
@@ -610,7 +610,7 @@ def _identity(compositor: Compositor) -> tuple[float, bool]:
         for crop, where in reached:
             h, w = where.shape
             touched[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] |= where.numpy()
-    for crop in (thing.foreground for thing in scene.occluders):
+    for crop in (occluder.foreground for occluder in scene.occluders):
         h, w = crop.values.shape[1:]
         touched[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] |= crop.values[3].numpy() > 0
     apart = (image - scene.photograph).double().numpy().transpose(1, 2, 0)
@@ -700,7 +700,7 @@ def _far_to_near(scene: SceneIR) -> list[int]:
 
 
 def never_seen(case: EditedStreet) -> Mask:
-    """Pixels (H, W) of the moved vehicle whose surface the photograph did not show: turned away, hidden or out of
+    """Pixels (H, W) of the moved vehicle with a surface not visible in the photograph: turned away, hidden or out of
     the image."""
     before, after = case.before, case.moved
     old, new = true_shape(before, case.move.track), true_shape(after, case.move.track)
@@ -718,15 +718,15 @@ def never_seen(case: EditedStreet) -> Mask:
     z = place[:, 2] - centre[2]
     u, v = (np.rint(homogeneous[:, k] / homogeneous[:, 2]).astype(np.int64) for k in (0, 1))
     height, width = before.depth_m.shape
-    shown = np.zeros(len(rows), bool)
+    visible = np.zeros(len(rows), bool)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             y, x = v + dy, u + dx
             inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
             y, x = y.clip(0, height - 1), x.clip(0, width - 1)
             near = np.abs(before.depth_m[y, x] - z) < _DEPTH_TOLERANCE_M
-            shown |= inside & near & (before.instance[y, x] == value)
-    unseen[rows, columns] = ~shown
+            visible |= inside & near & (before.instance[y, x] == value)
+    unseen[rows, columns] = ~visible
     return unseen
 
 
@@ -891,7 +891,7 @@ def _line(
     }
 
 
-def _keep_sheets(rows: Sequence[DerenderRow], made: Path, kept: Path) -> None:
+def _copy_worst_sheets(rows: Sequence[DerenderRow], made: Path, destination: Path) -> None:
     """The worst sheets by the move's PSNR, and those next to its median."""
     order = sorted(rows, key=lambda row: row.move.psnr_db)
     worst = order[:_WORST]
@@ -901,7 +901,7 @@ def _keep_sheets(rows: Sequence[DerenderRow], made: Path, kept: Path) -> None:
     for name, group in (("worst", worst), ("typical", typical)):
         for place, row in enumerate(group, start=1):
             data = files.read_bytes(made / f"{row.index}.png")
-            files.write_bytes(kept / f"{name}-{place}-frame-{row.index}.png", data)
+            files.write_bytes(destination / f"{name}-{place}-frame-{row.index}.png", data)
 
 
 def _reset_peak() -> bool:

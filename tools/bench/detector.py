@@ -12,7 +12,7 @@ from torch import Tensor
 from detectors.base import AnchorPredictions, Detector
 from detectors.registry import load_detector
 from drivesem.bench.scenes import build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions
 from tools.bench import memory
 from tools.bench.probe import ProbeOrder, image_gradient, probe
@@ -33,7 +33,7 @@ METHOD = (
     "forward and backward: raw predictions, the loss that attacks raise for one object, and its gradient to the "
     "image; decode: scores, the best of them and non-maximum suppression, of what was predicted and, at worst, "
     "with every anchor confident. All are measured in turn in one process after a warm-up; the median of the "
-    "rounds stands beside the fastest, which is what an idle machine does. Processor ms: by the processor's time, "
+    "rounds stands next to the fastest, which is what an idle machine does. Processor ms: by the processor's time, "
     "all threads together, of a picture by itself, and of each of four in one batch. Peak memory is that of a "
     "process of its own, forward and backward, above what it holds once the detector is loaded."
 )
@@ -44,7 +44,7 @@ _FEWEST, _MOST = 3, 400
 _SURE = 30.0
 """Added to the logits of all confidences: every anchor is a candidate."""
 _STEPS = 6
-"""Of the process whose memory is measured: the peak is reached in the first steps."""
+"""Steps of the process for memory; its peak is reached in the first ones."""
 _KB = 1024.0
 
 
@@ -69,14 +69,14 @@ class DetectorRow:
     peak_mb: float | None
     """MB above the loaded detector, None where it is not measured."""
     rounds: int
-    """How often each was done. each: of `_BATCH` at once."""
+    """Repetitions. each: of `_BATCH` at once."""
 
 
 def measure(names: Sequence[str], seconds: float, seed: int, device: str) -> Iterator[DetectorRow]:
-    """One row a detector and size, within about `seconds` for all of them.
+    """Yield one row per detector and size, within about `seconds` in total.
 
-    DetectorError for a detector that cannot be had or has no gradient, FormatError where the process that tells
-    the memory ends without a result.
+    DetectorError for a missing detector or one without gradients, FormatError if the process that measures
+    memory ends without a result.
     """
     photograph = build_bench_scene(_CARS, _TRIANGLES, seed).scene.photograph[None].float()
     budget = TimeBudget(seconds, len(names) * len(SIZES_HW))

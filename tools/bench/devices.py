@@ -1,4 +1,4 @@
-"""A GPU beside the processor: the same pictures, gradients and detections, and how long a step takes on each."""
+"""A GPU against the CPU: differences of pictures, gradients and detections, and the time of a step on each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from detectors.types import Detections
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.objective import Objective
 from drivesem.attack.space import ParameterSpace, parse_params
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import PairedTimer, Spread
 from drivesem.synth import frames as generated
 from drivesem.synth.frames import SPLITS, SynthSettings
@@ -27,25 +27,25 @@ from scene_ir.render.compositor import Compositor
 from scene_ir.types import Frame, SceneIR, convert_scene
 from tools.bench.weather import rendered, to_tensor
 
-TITLE = "A GPU beside the processor"
+TITLE = "A GPU against the CPU"
 COLUMNS: Columns = {
     "state": ("state", "state"), "frames": ("frames", "frames"),
     "least_psnr_db": ("PSNR, the least, dB", "PSNR"), "furthest": ("furthest pixel, of 255", "furthest"),
     "moved_share": ("pixels off by over 1 of 255, %", "off, %"),
     "loss_off": ("loss, off by, %", "loss, %"),
     "cosine": ("cosine of gradients, the least", "cosine"), "worst": ("of the parameter", "of"),
-    "again": ("device beside itself", "itself"),
+    "again": ("device against itself", "itself"),
     "found_off": ("detections more or fewer", "found"),
     "score_off": ("score, the furthest", "score"), "box_off_px": ("box, the furthest, px", "box, px"),
     "step_ms": ("step, ms", "step ms"), "step_cpu_ms": ("step on the processor, ms", "processor ms"),
 }  # fmt: skip
 METHOD = (
-    "Generated frames of both pools, taken apart with their labels; the photograph, and feasible states of "
+    "Generated frames of both pools, de-rendered with their labels; the photograph, and feasible states of "
     "combination 2 and of all six parameters, random within ten steps of an attack. The same theta is drawn, seen "
     "by the detector and differentiated on --device and on the processor. PSNR of one picture to the other, the "
     "least of the frames; pixels off by more than 1 of 255; loss (objectness) and its gradient by parameter, the "
-    "least cosine; device beside itself: the least cosine of two gradients at the same theta, whose sums run in "
-    "another order; detections over t*, each beside the one that it meets best. Milliseconds of loss and "
+    "least cosine; device against itself: the least cosine of two gradients at the same theta, with sums in "
+    "another order; detections over t*, each against its best match. Milliseconds of loss and "
     "gradient: medians of 10 after 2, the two in turn."
 )
 QUICK_FRAMES, FULL_FRAMES = 2, 12
@@ -94,8 +94,8 @@ def _row(state: str, scene: SceneIR, number: int, there: Detector, here: Detecto
     ours, other = _objective(scene, state, here, "cpu"), _objective(scene, state, there, device)
     theta = ours.space.theta0 if state == "photograph" else _random(ours.space, number)
     moved = theta.to(other.space.theta0)
-    picture, found = _looked(ours, theta)
-    picture_there, found_there = _looked(other, moved)
+    picture, found = _render_and_detect(ours, theta)
+    picture_there, found_there = _render_and_detect(other, moved)
     off = 255 * (picture - picture_there).abs()
     loss, gradient = ours.loss_and_grad(theta)
     (loss_there, gradient_there), (_, again) = other.loss_and_grad(moved), other.loss_and_grad(moved)
@@ -138,7 +138,7 @@ def _random(space: ParameterSpace, seed: int) -> Tensor:
 
 
 @torch.no_grad()
-def _looked(objective: Objective, theta: Tensor) -> tuple[Tensor, Detections]:
+def _render_and_detect(objective: Objective, theta: Tensor) -> tuple[Tensor, Detections]:
     """The picture (3, H, W) at theta, on the processor, and what is found in it, from t* on."""
     scene = objective.space.apply(objective.space.scene, theta)
     render = objective.compositor.render(scene)

@@ -1,4 +1,4 @@
-"""What `drivesem eval` takes for many frames, files included, beside pycocotools alone."""
+"""Time of `drivesem eval` for many frames, files included, against pycocotools alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.evaluation.coco import fastest_engine
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -103,17 +103,17 @@ def _write(folder: Path, frames: int, seed: int) -> int:
         regions = draw.random(_OBJECTS) < 0.1
         near = np.repeat(objects, _AROUND, 0) + draw.normal(0, 3, (_OBJECTS * _AROUND, 4))
         boxes = np.round(_inside(np.concatenate([near, _boxes(draw, _ELSEWHERE)])), 2)
-        said = np.concatenate([np.repeat(labels, _AROUND), draw.integers(0, len(_CLASSES), _ELSEWHERE)])
+        detected_labels = np.concatenate([np.repeat(labels, _AROUND), draw.integers(0, len(_CLASSES), _ELSEWHERE)])
         scores = np.round(draw.random(len(boxes)), 4)
         for box, label, region in zip(objects.tolist(), labels.tolist(), regions.tolist(), strict=True):
             truth.append(_annotation(box, frame, label) | {"id": len(truth) + 1, "iscrowd": int(region)})
-        for box, label, score in zip(boxes.tolist(), said.tolist(), scores.tolist(), strict=True):
+        for box, label, score in zip(boxes.tolist(), detected_labels.tolist(), scores.tolist(), strict=True):
             found.append(_annotation(box, frame, label) | {"score": score})
         lines = [
             _kitti("DontCare" if r else _CLASSES[k], b) for b, k, r in zip(objects, labels, regions, strict=True)
         ]
         (folder / "label_2" / f"{name}.txt").write_text("\n".join(lines) + "\n")
-        lines = [f"{_kitti(_CLASSES[k], b)} {s}" for b, k, s in zip(boxes, said, scores, strict=True)]
+        lines = [f"{_kitti(_CLASSES[k], b)} {s}" for b, k, s in zip(boxes, detected_labels, scores, strict=True)]
         (folder / "found" / f"{name}.txt").write_text("\n".join(lines) + "\n")
     categories = [{"id": k + 1, "name": name} for k, name in enumerate(_CLASSES)]
     files.write_json(folder / "truth.json", {"images": images, "categories": categories, "annotations": truth})

@@ -1,4 +1,4 @@
-"""The compositor's foliage beside the generator's: crowns and grass under other hues, lightness and density."""
+"""The compositor's foliage against the generator's: crowns and grass under other hues, lightness and density."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.edits import FOLIAGE_CODES, FrameEdit
 from drivesem.report.drawing import write_picture
 from drivesem.synth import frames as generated
@@ -22,15 +22,15 @@ from scene_ir.types import Frame
 from tools.bench.pictures import SheetStrip, psnr, sheet
 from tools.bench.weather import rendered, to_tensor
 
-TITLE = "Foliage, ours beside the generator's"
+TITLE = "Foliage, ours against the generator's"
 COLUMNS: Columns = {
     "pool": ("pool", "pool"), "foliage": ("foliage", "foliage"), "frames": ("frames", "frames"),
     "crowns_db": ("PSNR of crowns, dB", "crowns"), "crowns_unchanged_db": ("unchanged", "unchanged"),
     "grass_db": ("PSNR of grass, dB", "grass"), "grass_unchanged_db": ("unchanged ", "unchanged"),
 }  # fmt: skip
 METHOD = (
-    "Clear generated frames of both pools, taken apart with their labels alone; a code of foliage is drawn by the "
-    "compositor on the photograph and by the generator in its world, whose leaves fall or grow. Where the "
+    "Clear generated frames of both pools, de-rendered from their labels alone; a code of foliage is drawn by the "
+    "compositor on the photograph and by the generator in its world, where leaves fall or grow. Where the "
     "scene's map has at least half foliage: crowns stand above the ground, grass does not. PSNR of one picture to "
     "the other, at most 99, means over frames with 500 such pixels; unchanged: the photograph as the answer."
 )
@@ -80,12 +80,12 @@ def foliage_rows(pool: str, number: int, plan: Plan, sheets: Path | None = None)
         ours = to_uint8(compositor.render(changed).image)
         edited = apply_edit(plan, edit)
         truth = rendered(edited, generated.build_street(edited)).image
-        figures = [
+        metrics = [
             round(psnr(picture, truth, zone), 4) if int(zone.sum()) >= _LEAST_PIXELS else None
             for zone in zones
             for picture in (ours, made.image)
         ]
-        rows.append(FoliageRow(pool, f"{number:03d}", name, *figures))
+        rows.append(FoliageRow(pool, f"{number:03d}", name, *metrics))
         strips.append(SheetStrip(made.image, ours, truth, np.ones(leaves.shape, bool), name))
     if sheets is not None:
         write_picture(sheets / f"{number:03d}_{pool}.png", sheet(strips, 3200))
@@ -102,7 +102,7 @@ def summary(rows: Sequence[FoliageRow]) -> list[dict[str, Any]]:
                 continue
             line: dict[str, Any] = {"pool": pool, "foliage": name, "frames": len(chosen)}
             for figure in ("crowns_db", "crowns_unchanged_db", "grass_db", "grass_unchanged_db"):
-                told = [value for value in (getattr(row, figure) for row in chosen) if value is not None]
-                line[figure] = round(float(np.mean(told)), 2) if told else None
+                values = [value for value in (getattr(row, figure) for row in chosen) if value is not None]
+                line[figure] = round(float(np.mean(values)), 2) if values else None
             out.append(line)
     return out

@@ -1,6 +1,6 @@
 """A detector's judgement of de-rendered photographs: are removed cars found again, and moved ones where they are?
 
-The photograph is asked first, so that only what the detector knows is counted. What it finds after all cars are
+Only cars that the detector finds in the photograph count. What it finds after all cars are
 taken out is a remnant; a car that it no longer finds after a small move was drawn badly.
 """
 
@@ -26,7 +26,7 @@ from detectors.types import Detections
 from drivesem.attack.feasibility_check import check_places
 from drivesem.attack.labels import Labeller, SceneLabels
 from drivesem.attack.scene_edits import apply_changes
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.options import SceneOptions
 from drivesem.evaluation.resampling import wilson
@@ -51,8 +51,8 @@ COLUMNS: Columns = {
 METHOD = (
     "Cars (KITTI's Car and Van) that became objects. Found: a detection of class Car with a score above 0.3 and "
     "an IoU of at least 0.5 with the box, each detection for one car only. Removed: of the cars found in the "
-    "photograph, those found again at their old boxes after all objects were taken out; beside it at an IoU of "
-    "0.3 already, as a vehicle of any class, at a score of 0.1 already, and those in whose old boxes at least "
+    "photograph, those found again at their old boxes after all objects were taken out; also at an IoU of "
+    "0.3 already, as a vehicle of any class, at a score of 0.1 already, and those with old boxes in which at least "
     "half of a car lies that the photograph did not have. Moved: each car by 0.5 m along its heading and by 10 "
     "degrees, signs by seed such that it leaves neither road nor picture, hits nothing and stays as visible; one "
     "at a time, and all together; of those found in the photograph, the ones found at their moved boxes; as "
@@ -60,7 +60,7 @@ METHOD = (
     "as labelled. Intervals: Wilson, 95 %. Pictures are rounded to 8 bits before they are judged."
 )
 FAINT_SCORE, LOOSE_IOU = 0.1, 0.3
-"""At which removal is looked at more strictly, beside."""
+"""Stricter thresholds that removal is also measured at."""
 MOVE_M, TURN_RAD = 0.5, math.radians(10.0)
 LEAST_HEIGHT_PX, MOST_OCCLUSION = 25.0, 1
 _MORE_CUT = 0.05
@@ -119,9 +119,9 @@ def _in_process(config: BenchTool, sheets: Path | None) -> Callable[[str], list[
 
 
 def open_scene_source(config: BenchTool) -> SceneSource:
-    """The scenes that are asked for: of a data set, or a folder of them."""
-    asked = SceneOptions(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
-    return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(asked)
+    """Scenes of a data set, or of a folder of scenes."""
+    scene_options = SceneOptions(dataset=config.dataset, root=config.root, seed=config.seed, limit=config.limit)
+    return SceneFolder(Path(config.scenes)) if config.scenes is not None else open_source(scene_options)
 
 
 def frame_names(config: BenchTool) -> list[str]:
@@ -180,14 +180,14 @@ def judge(
         return []
     eye = DetectorView(predictor)
     moves = CarMoves(scene, rows, rng)
-    photograph = eye.look(scene.photograph, scene.objects.box2d)
-    emptied = eye.look(_emptied(scene), scene.objects.box2d)
+    photograph = eye.view_cars(scene.photograph, scene.objects.box2d)
+    emptied = eye.view_cars(_emptied(scene), scene.objects.box2d)
     together = moves.together()
-    crowd = eye.look(together.image, together.boxes_xyxy)
+    crowd = eye.view_cars(together.image, together.boxes_xyxy)
     found: list[CarRow] = []
     for row in rows:
         chosen = moves.alone.get(row)
-        alone = None if chosen is None else eye.look(chosen.image, chosen.boxes_xyxy)
+        alone = None if chosen is None else eye.view_cars(chosen.image, chosen.boxes_xyxy)
         box, occlusion = scene.objects.box2d[row].tolist(), int(scene.objects.occlusion[row])
         height = box[3] - box[1]
         car = CarRow(
@@ -214,10 +214,10 @@ def judge(
             view = {"removed": emptied, "alone": alone, "together": crowd}[kind]
             assert view is not None
             now = {"removed": car.removed, "alone": car.alone, "together": car.together}[kind] or UNSEEN
-            told = f"{name} row {row}, {kind}: IoU {car.before.iou:.2f}, score {car.before.score:.2f} before, "
-            told += f"{now.iou:.2f}, {now.score:.2f} now"
+            caption = f"{name} row {row}, {kind}: IoU {car.before.iou:.2f}, score {car.before.score:.2f} before, "
+            caption += f"{now.iou:.2f}, {now.score:.2f} now"
             files.write_png(
-                sheets / f"{kind}-{_plain(name)}-{row}.png", failure_sheet(photograph, view, row, told)
+                sheets / f"{kind}-{_plain(name)}-{row}.png", failure_sheet(photograph, view, row, caption)
             )
     return found
 
@@ -347,16 +347,16 @@ def rank_sheets(cars: Sequence[CarRow], folder: Path) -> None:
 
     Pictures of earlier runs go.
     """
-    kept: set[str] = set()
+    written: set[str] = set()
     for kind in ("removed", "alone", "together"):
         failed = [c for c in cars if kind in failures(c)]
         failed.sort(key=lambda c: (not c.judged, -(c.removed.score if kind == "removed" else c.before.score)))
         for place, car in enumerate(failed, start=1):
             name = f"{_plain(car.frame)}-{car.row}.png"
-            kept.add(f"{kind}-{place:02d}-{name}")
+            written.add(f"{kind}-{place:02d}-{name}")
             (folder / f"{kind}-{name}").replace(folder / f"{kind}-{place:02d}-{name}")
         for old in folder.glob(f"{kind}-*.png"):
-            if old.name not in kept:
+            if old.name not in written:
                 old.unlink()
 
 
@@ -393,8 +393,8 @@ def failure_sheet(before: CarView, after: CarView, row: int, caption: str) -> Pi
             near = iou_matrix(found.boxes_xyxy, boxes).amax(dim=1) > _NEAR_IOU
             found = Detections(found.boxes_xyxy[near], found.labels[near], found.scores[near])
             for box, score, label in zip(found.boxes_xyxy, found.scores, found.labels, strict=True):
-                told = f"{view.classes[int(label)]} {float(score):.2f}"
-                _draw(drawn, box, colour, told, (left, top, scale))
+                caption = f"{view.classes[int(label)]} {float(score):.2f}"
+                _draw(drawn, box, colour, caption, (left, top, scale))
         panels.append(np.concatenate([plain, drawn]))
     gap = np.full((panels[0].shape[0], _GAP_PX, 3), PAPER_COLOUR, np.uint8)
     picture = np.concatenate([panels[0], gap, panels[1]], axis=1)

@@ -1,6 +1,6 @@
 """The gradients that attacks follow against central differences.
 
-A scene is looked at as photographed (theta0) and at a random feasible theta that moves all six parameters. There,
+A scene is checked as photographed (theta0) and at a random feasible theta that moves all six parameters. There,
 for each parameter with all objects together, the gradient in float64 with backend `reference` and in float32 with
 `warp`, the one that attacks follow, is held against differences in float64 with `reference`. What is
 differentiated: smooth random functionals of the picture, and the detector's loss as attacks raise it, with labels
@@ -41,8 +41,7 @@ from drivesem.attack.labels import Labeller
 from drivesem.attack.space import COMBOS, PAPER_PARAMETERS, Parameter, ParameterSpace, StepSizes
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import format_count, print_json
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count, print_json
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, print_output_folder, run_frame_jobs
 from drivesem.scenes.sources import SceneSource, open_source
@@ -67,7 +66,7 @@ PICTURE, LOSS = "picture", "detector loss"
 TERM = "objectness"
 """The term of the detector's loss that attacks raise."""
 COMBO = 2
-"""The combination whose concatenated gradient is compared besides, through the detector."""
+"""Combination with a concatenated gradient that is also checked through the detector."""
 FUNCTIONALS = 3
 SMOOTHING_PX = 2.5
 """Standard deviation of the Gaussian that smooths a functional's weights, so that none hangs on single pixels."""
@@ -198,7 +197,7 @@ class _Path:
         return scene.with_environment(weather=start.weather + part.weather, foliage=start.foliage + part.foliage)
 
     def detect(self, picture: Tensor) -> AnchorPredictions:
-        """What the detector says of a picture (3, H, W)."""
+        """The detector's scores of a picture (3, H, W)."""
         return self.detector((picture + self._dither)[None])
 
     def loss(self, picture: Tensor, assignment: AnchorAssignment) -> Tensor:
@@ -237,7 +236,7 @@ class _Path:
 
 
 class SceneCheck:
-    """One scene, to be looked at at several points. detectors: by backend, of its precision; seed: of the
+    """Checks one scene at several points. detectors: by backend, of its precision; seed: of the
     functionals, of the random theta and of the directions; directions: K, at most."""
 
     def __init__(self, scene: SceneIR, detectors: dict[Backend, SqueezeDet], seed: int, directions: int) -> None:
@@ -421,7 +420,7 @@ _PACKAGES = ("drivesem", "torch", "kornia", "numpy", "warp-lang")
 
 
 def run(config: GradcheckConfig) -> int:
-    """Check the scenes asked for; exit code 0 where all is inside the tolerance, 1 where something is not.
+    """Check the chosen scenes; exit code 0 if all gradients are within the tolerance, else 1.
 
     Raises UsageError or SceneError for bad input.
     """
@@ -471,8 +470,8 @@ def _reach(config: GradcheckConfig) -> int:
     worker = ReachWorker.of(config)
     names, _, unreadable = select_frames(worker.source, replace(config, limit=config.limit or _DEFAULT_SCENES))
     bar = ProgressSettings("comparing gradients and slopes", show_remaining=True)
-    asked = run_frame_jobs(names, worker.measure, partial(build_reach_worker, config), config, bar)
-    rows = reach_rows([asked.results[name] for name in names if name in asked.results], config.seed)
+    measuring = run_frame_jobs(names, worker.measure, partial(build_reach_worker, config), config, bar)
+    rows = reach_rows([measuring.results[name] for name in names if name in measuring.results], config.seed)
     if not rows:
         raise UsageError("gradcheck --reach", "at least one vehicle that the detector finds", "none")
     facts = {
@@ -481,19 +480,19 @@ def _reach(config: GradcheckConfig) -> int:
             "detector": config.detector,
             "seed": config.seed,
             "draws": config.draws,
-            "frames": len(asked.results),
+            "frames": len(measuring.results),
             "steps": asdict(StepSizes()),
         },
     }
-    answer = reach_answer(Path(config.out or "."), rows, facts, unreadable | asked.failed)
+    report = reach_answer(Path(config.out or "."), rows, facts, unreadable | measuring.failed)
     if config.out:
-        answer.write()
+        report.write()
     if config.json:
-        print_json(answer.data)
+        print_json(report.data)
     else:
-        answer.print(Console(width=None if sys.stdout.isatty() else _FILE_WIDTH))
+        report.print(Console(width=None if sys.stdout.isatty() else _FILE_WIDTH))
     if config.out:
-        print_output_folder(answer.out, Console(stderr=True), answer.failed)
+        print_output_folder(report.out, Console(stderr=True), report.failed)
     return 0
 
 
@@ -520,7 +519,7 @@ class GradcheckWorker:
         self._current: tuple[str, SceneCheck] | None = None
 
     def do(self, task: _Task) -> Gradients | FiniteDifferences:
-        """One task; the scene is kept for the next one."""
+        """Run one task; the scene is cached for the next one."""
         if self._current is None or self._current[0] != task.identifier:
             self._current = None
             scene = self.source.scene(task.identifier)
@@ -572,7 +571,7 @@ def _detector(name: str, device: str) -> SqueezeDet:
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if not isinstance(detector, SqueezeDet):
-        raise UsageError("--detector", "one whose anchors can be held fixed: SqueezeDet", type(detector).__name__)
+        raise UsageError("--detector", "one with anchors that can be fixed: SqueezeDet", type(detector).__name__)
     return detector
 
 

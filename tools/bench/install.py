@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import Spread
 from drivesem.config.errors import UsageError
 from tools.versions import ROOT, Run, StepResult, run_words
@@ -28,7 +28,7 @@ METHOD = (
     "attack on ten generated streets, which compiles the renderer's kernels first. Seconds of the clock. MB are a "
     "million bytes of files. Packages: the largest of that environment by the files that each one lists, and "
     "drivesem by its wheel. Starts: commands in that environment, each a process of its own, from its start to "
-    "its end; first: the first one, which reads files that the system may not have at hand; then the median and "
+    "its end; first: the first one, which may read files that the system has not cached; then the median and "
     "quartiles of the others. With --quick the environment is the one that measures."
 )
 ATTACK = ("attack", "--combo", "2")
@@ -130,7 +130,7 @@ def _steps(work: Path, run: Run) -> Iterator[InstallStepRow]:
 
 
 def _kernels(work: Path) -> list[str]:
-    """Words before a command: compiled kernels are kept there, not where those of other runs are."""
+    """Environment assignment before a command: its own cache of compiled kernels."""
     return ["env", f"WARP_CACHE_PATH={work / 'kernels'}"]
 
 
@@ -138,8 +138,8 @@ def _sizes(python: str, work: Path, run: Run) -> Iterator[SizeRow]:
     """drivesem's wheel, the largest packages, the others."""
     wheels = work / "wheels"
     _timed([python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(ROOT)], work, run)
-    _, said = _timed([python, "-c", _SIZES], work, run)
-    found: list[tuple[str, str, int]] = [(name, version, size) for name, version, size in json.loads(said)]
+    _, output = _timed([python, "-c", _SIZES], work, run)
+    found: list[tuple[str, str, int]] = [(name, version, size) for name, version, size in json.loads(output)]
     own = next((version for name, version, _ in found if name == "drivesem"), "")
     yield SizeRow("drivesem, its wheel", own, round(_mb(wheels), 1))
     ordered = sorted((one for one in found if one[0] != "drivesem"), key=lambda one: -one[2])
@@ -169,12 +169,12 @@ def _start(command: tuple[str, Sequence[str]], repetitions: int, folder: Path, r
 
 
 def _timed(words: Sequence[str], folder: Path, run: Run) -> tuple[float, str]:
-    """Seconds, and what was said."""
+    """Seconds, and standard output."""
     start = time.perf_counter()
     ended: StepResult = run(words, folder)
     if ended.failed:
         raise UsageError("bench install", "steps that work", f"{' '.join(words)[:200]}: {ended.failed}")
-    return time.perf_counter() - start, ended.said
+    return time.perf_counter() - start, ended.output
 
 
 def _mb(path: Path) -> float:

@@ -16,14 +16,14 @@ import torch
 from torch import Tensor
 
 from detectors.boxes import iou_matrix
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.options import DEMO
 from drivesem.run.workers import run_jobs
 from scene_ir.derender.derender import VEHICLE_CATEGORIES, DerenderSettings, place_vehicles
 from scene_ir.types import Camera, Frame, Labels
 from tools.bench.settings import BenchTool
 
-TITLE = "Photographs without labels, beside labels that were hidden"
+TITLE = "Photographs without labels, against hidden labels"
 COLUMNS: Columns = {
     "measure": ("figure", "figure"), "median": ("median", "median"), "tail": ("tail", "tail"),
     "worst": ("worst", "worst"), "count": ("count", "count"), "goal": ("goal", "goal"),
@@ -173,7 +173,7 @@ def nearest(labels: Labels) -> list[int]:
 
 
 def vehicle_error(labels: Labels, row: int, translation: Tensor, yaw: float, camera: Camera) -> VehicleError:
-    """Of an estimate beside a label."""
+    """Errors of an estimate against a label."""
     true = labels.translation[row].double()
     apart = translation.double() - true
     offset = float(camera.matrix[2, 3])
@@ -202,14 +202,14 @@ def summary(frames: Sequence[FrameRows]) -> list[dict[str, Any]]:
         if not errors:
             continue
         yaw = np.array([e.yaw_deg for e in errors])
-        figures = {
+        metrics = {
             "heading, degrees": yaw,
             "axis, degrees": np.minimum(yaw, 180 - yaw),
             "depth, relative": np.array([e.depth for e in errors]),
             "place, m": np.array([e.place_m for e in errors]),
         }
         when = "as placed" if stage == "before" else "after the fit"
-        for name, values in figures.items():
+        for name, values in metrics.items():
             goal = _GOALS.get(name) if stage == "after" else None
             lines.append(_line(f"{name}, {when}", values) | {"goal": goal})
         share = round(float((yaw > 90).mean()), 4)

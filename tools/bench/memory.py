@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from drivesem.bench.scenes import build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from scene_ir.io import save_scene
 from tools.bench.probe import ProbeOrder, ResidentMemory, probe
 
@@ -43,7 +43,7 @@ _ASKER = "bench memory"
 
 @dataclass(frozen=True, slots=True)
 class MemoryRow:
-    """What was measured; MB unless said otherwise."""
+    """Memory of one case; MB unless noted."""
 
     sweep: str
     """What this row is about, cars, batch or steps."""
@@ -126,5 +126,5 @@ def _slope(rss_kb: Sequence[int]) -> float:
 
 
 def supported() -> bool:
-    """Whether this system tells the peak of a process's resident memory."""
+    """Whether this system reports the peak resident memory of a process."""
     return os.name == "posix"

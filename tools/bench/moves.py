@@ -1,6 +1,6 @@
-"""How far a car of a photograph can be moved until the picture no longer holds: moved cars beside the generator's.
+"""Accuracy of pictures with moved cars against the generator's, by distance.
 
-Budgets end where this table says so (docs/guide/attack.md).
+The limits of budgets follow from this table (docs/guide/attack.md).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 from detectors.boxes import iou_matrix
 from detectors.registry import load_predictor
 from drivesem.attack.budgets import PAPER, PRESETS, STREET
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.run.workers import run_jobs
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, SynthFrame, Truth, render_frame
@@ -49,7 +49,7 @@ COLUMNS: Columns = {
     "split": ("streets", "streets"), "change": ("change", "change"), "count": ("cars", "cars"),
     "psnr_db": ("in the box, dB", "dB"), "tail_db": ("tail", "tail"), "unchanged_db": ("unchanged", "unchanged"),
     "region_db": ("all that changed, dB", "all"), "found": ("found, truth", "true"),
-    "kept": ("of these, ours", "ours"), "agree": ("agree", "agree"), "score_apart": ("score apart", "apart"),
+    "detected_ours": ("of these, ours", "ours"), "agree": ("agree", "agree"), "score_apart": ("score apart", "apart"),
     "score_tail": ("tail", "tail"),
     "invented": ("invented", "invented"),
 }  # fmt: skip
@@ -61,7 +61,7 @@ METHOD = (
     "Anywhere in a budget: along, across, turned and grown at random within it. In the box: PSNR in the "
     "vehicle's true new box, ours to the generator's picture of the changed street; tail: the 10th percentile;"
     " unchanged: the photograph as the answer; all that changed: the region of derender, with the ground that "
-    "it left. The detector looks at both pictures: how many it finds in the generator's (a Car above 0.3, IoU "
+    "it left. The detector runs on both pictures: how many it finds in the generator's (a Car above 0.3, IoU "
     "of at least 0.5), how many of these in ours; agree: found in both or in none; score apart: median "
     "difference of scores where found in both, and its 90th percentile; invented: Cars in ours, a picture, "
     "that meet no vehicle and nothing that it finds in the generator's."
@@ -80,7 +80,7 @@ _BUDGETS = (PAPER, STREET)
 _TRIES = 8
 """Random places in a budget of which the first is taken that keeps the rules."""
 _SHEET_CHANGES = 7
-"""Pictures of a frame that are kept."""
+"""Pictures per frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +160,7 @@ def judge(
         box = _inside(new, before.image.shape[:2])
         boxes = torch.tensor(np.stack([new.box_xyxy, *_others(changed.moved, case.move.track)])).float()
         true = torch.from_numpy(changed.moved.image.transpose(2, 0, 1).astype(np.float32) / 255)
-        theirs, ours = (eye.look(picture, boxes) for picture in (true, image))
+        theirs, ours = (eye.view_cars(picture, boxes) for picture in (true, image))
         region = changed_region(before, changed.moved, [case.move.track])
         row = MovedRow(
             split="train",
@@ -178,8 +178,8 @@ def judge(
             invented=_invented(ours, theirs),
         )
         rows.append(row)
-        told = f"{new.actor.kind} {change}: {row.psnr_db:.1f} dB, score {row.found} and {row.ours}"
-        strips.append((row.psnr_db, SheetStrip(before.image, ours.picture, changed.moved.image, region, told)))
+        caption = f"{new.actor.kind} {change}: {row.psnr_db:.1f} dB, score {row.found} and {row.ours}"
+        strips.append((row.psnr_db, SheetStrip(before.image, ours.picture, changed.moved.image, region, caption)))
     return rows, [strip for _, strip in sorted(strips, key=lambda pair: pair[0])]
 
 
@@ -223,8 +223,8 @@ def changed_case(case: EditedStreet, move: VehicleMove) -> EditedStreet | None:
         return None
     new = true_shape(moved, move.track)
     high = [float(t.box_xyxy[3] - t.box_xyxy[1]) for t in (old, new)]
-    kept = new.labelled and new.visible >= _VISIBLE and new.truncation <= _CUT
-    return replace(case, move=move, moved=moved) if kept and high[1] >= _MIN_HEIGHT_RATIO * high[0] else None
+    judged = new.labelled and new.visible >= _VISIBLE and new.truncation <= _CUT
+    return replace(case, move=move, moved=moved) if judged and high[1] >= _MIN_HEIGHT_RATIO * high[0] else None
 
 
 def _others(frame: SynthFrame, track: int) -> list[np.ndarray]:
@@ -279,7 +279,7 @@ def _line(rows: Sequence[MovedRow]) -> dict[str, Any]:
         "region_db": round(float(np.median([row.region_db for row in rows])), 1),
         "unchanged_db": round(float(np.median([row.unchanged_db for row in rows])), 1),
         "found": len(seen),
-        "kept": sum(row.ours is not None for row in seen),
+        "detected_ours": sum(row.ours is not None for row in seen),
         "agree": round(float(np.mean([(row.found is None) == (row.ours is None) for row in rows])), 3),
         "score_apart": round(float(np.median(both)), 3) if both else None,
         "score_tail": round(float(np.percentile(both, 90)), 3) if both else None,

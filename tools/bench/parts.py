@@ -1,4 +1,4 @@
-"""Where the processor's time goes while photographs are taken apart, with a fit and with --fast."""
+"""CPU time of each part of de-rendering, with a fit and with --fast."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from statistics import mean, median
 from typing import Any
 from unittest.mock import patch
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
+from scene_ir.derender import alignment as stand
 from scene_ir.derender import background_fill as behind
 from scene_ir.derender import depth, shadow, silhouette
 from scene_ir.derender import derender as taking
 from scene_ir.derender import occluders as front
 from scene_ir.derender import paint_mask as paint
 from scene_ir.derender import segmentation as segment
-from scene_ir.derender import template_choice as stand
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.types import Frame
 from tools.bench.label_free import load_frame_without_labels, names
@@ -30,14 +30,14 @@ COLUMNS: Columns = {
     "fast_s": ("--fast, s a frame", "--fast"), "fast_median": ("median", "median"),
 }  # fmt: skip
 METHOD = (
-    "Seconds of the processor, one thread, over all frames: the mean, and the median. Each frame is taken apart "
+    "Seconds of the processor, one thread, over all frames: the mean, and the median. Each frame is de-rendered "
     "with both settings in turn, after one that is not counted. A part's time is that of the functions that do it."
 )
 PARTS: dict[str, Sequence[tuple[Any, str]]] = {
     "template and heading": [(stand, "choose_pose")],
-    "what is whose pixel": [(taking._VehicleSegmenter, "first_mask"), (taking._VehicleSegmenter, "cut_out")],
+    "segmentation": [(taking._VehicleSegmenter, "first_mask"), (taking._VehicleSegmenter, "cut_out")],
     "fit": [(silhouette, "fit_silhouettes")],
-    "things in front": [(front, "find_labelled_occluders"), (front, "compute_opacities")],
+    "occluders": [(front, "find_labelled_occluders"), (front, "compute_opacities")],
     "maps": [(segment, "segment_photograph")],
     "light and shadows": [(shadow, "estimate_ground_light"), (taking, "_find_shadows")],
     "fill behind": [(behind.BackgroundFill, "fill_hole")],
@@ -101,11 +101,11 @@ def summary(rows: Sequence[DerenderedStreet]) -> list[dict[str, Any]]:
     found = []
     for part in (*PARTS, REST, WHOLE):
         fit, fast = ([getattr(row, way)[part] for row in rows] for way in ("fit", "fast"))
-        figures = {
+        metrics = {
             "fit_s": mean(fit),
             "fit_median": median(fit),
             "fast_s": mean(fast),
             "fast_median": median(fast),
         }
-        found.append({"part": part} | {name: round(value, 3) for name, value in figures.items()})
+        found.append({"part": part} | {name: round(value, 3) for name, value in metrics.items()})
     return found

@@ -1,4 +1,4 @@
-"""The processes whose memory is measured: `python -m tools.bench.probe detector|attack ORDER FILE`.
+"""Processes for memory measurements: `python -m tools.bench.probe detector|attack ORDER FILE`.
 
 Each imports only what it runs: what the detector alone does not need counts against the attack.
 """
@@ -149,7 +149,7 @@ def _resident_kb() -> int:
 def _peak_kb() -> int:
     """The largest resident memory that this process has had, KB.
 
-    Not `getrusage`, whose figure begins with that of the process that started this one.
+    Not `getrusage`, which starts from the value of the parent process.
     """
     for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
         if line.startswith("VmHWM:"):
@@ -158,7 +158,7 @@ def _peak_kb() -> int:
 
 
 def main(words: list[str]) -> None:
-    """Run what the words ask for and leave the result in the file."""
+    """Run the measurement that the arguments name and write its result to the file."""
     from drivesem.run.allocation import keep_freed_memory
     from scene_ir.files import write_json
 

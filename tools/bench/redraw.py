@@ -1,4 +1,4 @@
-"""The second renderer of photographs beside the photograph and the compositor: pixels, and a detector's judgement.
+"""The second renderer of photographs against the photograph and the compositor: pixels and detections.
 
 Pyrender draws each scene as it was photographed, and once more with its cars moved. A picture in which a detector
 that was trained elsewhere finds cars less often than in the photograph would confirm failures that are its own.
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.registry import load_predictor
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.report.drawing import PAPER_COLOUR, write_text
 from drivesem.run.workers import run_jobs
@@ -35,7 +35,7 @@ from tools.bench.sights import CarView, DetectorView
 TITLE = "The second renderer of photographs"
 COLUMNS: Columns = {
     "frame": ("frame", "frame"), "cars": ("cars", "cars"), "apart": ("apart on vehicles, levels", "apart"),
-    "psnr_db": ("PSNR there, dB", "PSNR"), "apart_beside": ("apart beside them, levels", "beside"),
+    "psnr_db": ("PSNR there, dB", "PSNR"), "apart_outside": ("apart outside them, levels", "outside"),
     "psnr_moved_db": ("moved, PSNR to ours, dB", "moved"), "photograph": ("found in the photograph", "photo"),
     "ours": ("in ours", "ours"), "second": ("in the second's", "second"), "moved": ("moved cars", "moved cars"),
     "ours_moved": ("found in ours", "ours"), "second_moved": ("in the second's ", "second"),
@@ -61,7 +61,7 @@ class RedrawRow:
     """Judged."""
     apart: float | None
     psnr_db: float | None
-    apart_beside: float
+    apart_outside: float
     psnr_moved_db: float | None
     photograph: int
     """Of these found in the pictures without a change."""
@@ -126,8 +126,8 @@ def judge(
     ours_moved = compositor.render(together.scene)
     moved = second.render(together.scene)
     row_of_moved = [i for i in judged if i in moves.in_crowd]
-    first = [eye.look(image, objects.box2d) for image in (scene.photograph, ours.image, drawn.image)]
-    then = [eye.look(image, together.boxes_xyxy) for image in (ours_moved.image, moved.image)]
+    first = [eye.view_cars(image, objects.box2d) for image in (scene.photograph, ours.image, drawn.image)]
+    then = [eye.view_cars(image, together.boxes_xyxy) for image in (ours_moved.image, moved.image)]
     if sheets is not None:
         pictures = [view.picture for view in (first[0], first[2], *then)]
         files.write_png(sheets / f"{name.replace('/', '-')}.png", _sheet(name, pictures))
@@ -137,7 +137,7 @@ def judge(
         cars=len(judged),
         apart=_apart(drawn.image, scene.photograph, on),
         psnr_db=_psnr(drawn.image, scene.photograph, on),
-        apart_beside=_apart(drawn.image, scene.photograph, ~on) or 0.0,
+        apart_outside=_apart(drawn.image, scene.photograph, ~on) or 0.0,
         psnr_moved_db=_psnr(moved.image, ours_moved.image, ours_moved.object_id > 0),
         photograph=_found(first[0], judged),
         ours=_found(first[1], judged),
@@ -152,13 +152,13 @@ def judge(
 
 def summary(rows: Sequence[RedrawRow]) -> list[dict[str, Any]]:
     """A line a frame with vehicles, and one of all: sums of cars, means of the rest."""
-    shown = [row for row in rows if row.apart is not None]
-    lines: list[dict[str, Any]] = [{key: getattr(row, key) for key in COLUMNS} for row in shown]
-    if not shown:
+    redrawn = [row for row in rows if row.apart is not None]
+    lines: list[dict[str, Any]] = [{key: getattr(row, key) for key in COLUMNS} for row in redrawn]
+    if not redrawn:
         return lines
     total: dict[str, Any] = {"frame": "all"}
     for key in list(COLUMNS)[1:]:
-        values = [value for row in shown if (value := getattr(row, key)) is not None]
+        values = [value for row in redrawn if (value := getattr(row, key)) is not None]
         counts = all(isinstance(value, int) for value in values)
         total[key] = sum(values) if counts else round(sum(values) / len(values), 2) if values else None
     return [*lines, total]

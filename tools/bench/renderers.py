@@ -1,7 +1,7 @@
 """Other renderers on the same meshes: whole frames from vertices that are new in every call, as in an attack.
 
 They draw less than the project's renderer does, which textures by the photograph, completes it, adds shadows and
-blends: each says what it `shows`. All of them are optional; one that cannot be had says why.
+blends: each names what it `shows`. All are optional; a missing one gives the reason.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PLATFORM = "egl"
 
 
 class UnavailableError(Exception):
-    """A renderer that is not installed or cannot run here; the message says why, on one line."""
+    """A renderer that is not installed or cannot run here; the message gives the reason on one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +265,7 @@ def _load(load: Callable[[], Any]) -> Any:
     """What an import gives. UnavailableError where it fails."""
     try:
         return load()
-    except Exception as error:  # also what a library raises whose own libraries are missing
+    except Exception as error:  # also a library's error about its own missing libraries
         raise UnavailableError(_line(error)) from error
 
 

@@ -1,4 +1,4 @@
-"""Other renderers beside the project's own four verbs, at the same job."""
+"""Other renderers against the project's own four verbs, at the same job."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch
 
 from drivesem.bench.render import RenderTimes, SceneSize, round_median, time_render
 from drivesem.bench.scenes import BenchScene, PackedMeshes, build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import PairedTimer, TimeBudget
 from scene_ir.types import convert_scene
 from tools.bench import renderers
@@ -33,8 +33,8 @@ COLUMNS: Columns = {
 METHOD = (
     "All draw the same meshes, whole frames (warp-verbs: the cars' rectangles), from vertices that are new in "
     "each call: see `shows`. What drivesem bench render measures is the whole picture: texture from the "
-    "photograph, completion, halo, shadows, blending. forward_ms: no gradients recorded, where the backend can "
-    "tell; backward_ms: from a random gradient of the picture to the vertices; forward_backward_ms: recorded "
+    "photograph, completion, halo, shadows, blending. forward_ms: no gradients recorded, if the backend "
+    "allows it; backward_ms: from a random gradient of the picture to the vertices; forward_backward_ms: recorded "
     "forward and backward together; processor ms: of both, or of forward where there is no backward, by the "
     "processor's time, all threads together. Medians after a warm-up. scale: pixels along an axis, as a multiple "
     "of 1242x375; pixels: hits of the meshes, car by car; visible_pixels: pixels of the frame that show a car, as "
@@ -49,7 +49,7 @@ _PATIENCE = 4.0
 
 @dataclass(frozen=True, slots=True)
 class RivalRow:
-    """What was measured; times in ms, None where the backend has no such thing or cannot run: `unavailable`."""
+    """What was measured; times in ms, None where the backend lacks it or cannot run: `unavailable`."""
 
     backend: str
     cars: int
@@ -153,7 +153,7 @@ def _unavailable(name: str, task: tuple[SceneSize, int, RenderTask], reason: str
 
 
 def _quieten(threads: int) -> None:
-    """A rival's process says nothing: standard output belongs to the results."""
+    """A rival's process prints nothing: standard output belongs to the results."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -169,7 +169,7 @@ def _measure_rival(name: str, task: tuple[SceneSize, int, RenderTask], seconds: 
     try:
         times = time_render(renderer.forward, renderer.backward, PairedTimer(device), seconds)
         return _row(name, size, pixels, renderer.shows, times, renderer.hits(renderer.forward()))
-    except Exception as error:  # whatever a library raises once it draws
+    except Exception as error:  # anything a library raises while it draws
         return _unavailable(name, task, f"{type(error).__name__}: {' '.join(str(error).split())}"[:160])
 
 

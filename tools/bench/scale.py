@@ -13,7 +13,7 @@ from typing import Literal
 from detectors.base import Detector
 from detectors.registry import load_detector
 from drivesem.bench.scenes import build_bench_scene
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import Spread
 from drivesem.config.commands import AttackConfig
 from drivesem.run.attack import AttackWorker
@@ -25,7 +25,7 @@ from tools.bench.settings import DetectorBenchConfig
 
 Engine = Literal["local", "ray"]
 FRAMES, QUICK_FRAMES = 200, 40
-"""Frames for each, where nobody says how many, and with --quick."""
+"""Frames per engine, by default and with --quick."""
 _ROUNDS, _QUICK_ROUNDS = 4, 2
 _CARS, _TRIANGLES, _SCALE = 2, 300, 0.5
 TITLE = "Frames shared by processes of this machine, and by Ray"
@@ -39,7 +39,7 @@ COLUMNS: Columns = {
     "frame_iqr": ("IQR", "IQR"),
     "own_ms": ("of it its own work, ms", "own work, ms"),
     "own_iqr": ("IQR", None),
-    "over_ms": ("beside it, ms", "beside, ms"),
+    "over_ms": ("overhead, ms", "over, ms"),
     "same": ("frames as the other's", "same"),
 }
 METHOD = (
@@ -47,7 +47,7 @@ METHOD = (
     "by as many processes of either kind, in rounds in turn (local, ray, ray, local, ...). First start: until "
     "the first frame begins, on a cluster that is begun for it; later starts: the same of the rounds, median. A "
     "frame: from the first frame of a round to its last, for each frame and process, its own work included; "
-    "medians and quartiles over rounds, of its own work over frames. Beside it: the difference to the "
+    "medians and quartiles over rounds, of its own work over frames. Overhead: the difference to the "
     "mean of its own work."
 )
 
@@ -71,14 +71,14 @@ class ScaleRow:
 
 @dataclass(frozen=True, slots=True)
 class _ScaleRound:
-    """start_s: until the first frame began; frame_ms: of a process for each frame; own_ms: of each frame; told:
-    what came of each, by number.
+    """start_s: until the first frame began; frame_ms: per frame of a process; own_ms: of each frame; digests: SHA-256
+    of each frame's result, by number.
     """
 
     start_s: float
     frame_ms: float
     own_ms: list[float]
-    told: dict[int, str]
+    digests: dict[int, str]
 
 
 def measure(config: DetectorBenchConfig) -> Iterator[ScaleRow]:
@@ -94,8 +94,8 @@ def measure(config: DetectorBenchConfig) -> Iterator[ScaleRow]:
         for engine in engines if number % 2 == 0 else engines[::-1]:
             numbers = range(number * a_round, (number + 1) * a_round)
             rounds[engine].append(_round(work, settings[engine], numbers))
-    told = {engine: {k: v for one in rounds[engine] for k, v in one.told.items()} for engine in engines}
-    same = sum(told["local"][number] == told["ray"][number] for number in told["local"])
+    digests = {engine: {k: v for one in rounds[engine] for k, v in one.digests.items()} for engine in engines}
+    same = sum(digests["local"][number] == digests["ray"][number] for number in digests["local"])
     for engine in engines:
         times = rounds[engine]
         frame = Spread.from_values([one.frame_ms for one in times])
@@ -123,15 +123,15 @@ def _settings(config: DetectorBenchConfig, engine: Engine) -> DetectorBenchConfi
 
 def _round(work: Callable[[int], tuple[float, str]], config: DetectorBenchConfig, numbers: range) -> _ScaleRound:
     begun = time.perf_counter()
-    ends, own_ms, told = [], [], {}
+    ends, own_ms, digests = [], [], {}
     build = partial(_worker, config.detector)
     for number, outcome in run_jobs(work, build, list(numbers), config, in_subprocess=True):
-        seconds, told[number] = outcome()
+        seconds, digests[number] = outcome()
         ends.append(time.perf_counter())
         own_ms.append(1e3 * seconds)
     start = ends[0] - own_ms[0] / 1e3
     wall = 1e3 * (ends[-1] - start)
-    return _ScaleRound(start - begun, wall * config.processes / len(ends), own_ms, told)
+    return _ScaleRound(start - begun, wall * config.processes / len(ends), own_ms, digests)
 
 
 def _worker(name: str) -> Callable[[int], tuple[float, str]]:
@@ -146,5 +146,5 @@ def _frame(number: int, detector: Detector) -> tuple[float, str]:
     attacked = AttackWorker.from_config(config, detector).attack_scene(f"bench-{number}", scene)
     with tempfile.TemporaryDirectory(prefix="drivesem-scale-") as folder:
         write_frame(attacked, Path(folder) / "frame")
-        told = files.sha256_digest(Path(folder) / "frame" / PICTURES["attacked"])
-    return time.perf_counter() - begun, told
+        digest = files.sha256_digest(Path(folder) / "frame" / PICTURES["attacked"])
+    return time.perf_counter() - begun, digest

@@ -1,4 +1,4 @@
-"""What a maintainers' benchmark may be told."""
+"""Settings of the maintainers' benchmarks."""
 
 from __future__ import annotations
 
@@ -25,60 +25,56 @@ from drivesem.config.options import (
 
 @dataclass(frozen=True, kw_only=True)
 class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
-    """Measure what shows maintainers that drivesem works: pictures beside the truth, speed beside others'."""
+    """Measure accuracy against the generator's truth, and speed against other programs."""
 
     what: CommandName = ""
-    """derender: de-rendered generated frames beside the generator's truth; parts: where the
-    time of that goes, with a fit and with --fast; depth: how far surroundings are, beside
-    the generator's truth, a laser, and in fog; found: whether a detector finds removed
-    cars again, and moved ones where they are; label-free: vehicles of photographs whose labels are hidden, beside
-    those labels; moves: cars moved farther and farther, beside the generator's truth; redraw: the second renderer
-    of photographs beside the photograph and ours; weather, foliage: the compositor's beside the generator's;
-    synth: the scene generator; rivals: other renderers beside the project's verbs; devices: a GPU (--device)
-    beside the processor; eval: drivesem eval of many
-    frames beside pycocotools; viewer: how long drivesem view takes to answer a slider; install: megabytes and
-    seconds from a clone to the first report, and of each start."""
+    """Benchmark. derender: de-rendered generated frames against the generator's truth; parts: the time of each part
+    of de-rendering, with a fit and with --fast; depth: depth of the surroundings against the generator's truth, a
+    laser, and in fog; found: whether a detector still finds removed cars, and finds moved ones; label-free:
+    vehicles of photographs with hidden labels against those labels; moves: cars moved farther and farther, against
+    the generator's truth; redraw: the second renderer of photographs against the photograph and the compositor;
+    weather, foliage: the compositor against the generator; synth: the scene generator; rivals: other renderers
+    against the project's; devices: a GPU (--device) against the processor; eval: drivesem eval of many frames
+    against pycocotools; viewer: response time of drivesem view to a slider; install: megabytes and seconds from a
+    clone to the first report, and of each start."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, ParsedBy(parse_integers)] = "1,4,8,16"
-    """Of rivals: how many cars, 1 to 16, with commas."""
+    """rivals: numbers of cars, 1 to 16, with commas."""
     triangles: Annotated[str, ParsedBy(partial(parse_integers, minimum=4))] = "2000,5000"
-    """Of rivals: triangles a car, with commas."""
+    """rivals: triangles per car, with commas."""
     frames: int | None = None
-    """Frames that synth makes in each row, by default 200, with --quick 40; that derender takes apart, by default
-    100, with --quick 12; that moves does, by default 80, with --quick 6; that depth does, by default 40, with
-    --quick 6; that weather and foliage do, by default 24, with --quick 4; that devices draws, by default 12, with
-    --quick 2; that label-free and parts look at, by default 60, with --quick 12; or that eval counts, by default
-    20,000, with --quick 1,000."""
+    """Frames: generated per row by synth (default: 200, with --quick 40); de-rendered by derender (100, 12); used by
+    moves (80, 6), depth (40, 6), weather and foliage (24, 4), devices (12, 2), label-free and parts (60, 12), or
+    evaluated by eval (20,000, 1,000)."""
     ablate: Flag = False
-    """Of derender: also with labels, masks, geometry, mattes or background given by the generator."""
+    """derender: also with labels, masks, geometry, mattes or background from the generator."""
     fast: Flag = False
-    """Of derender: as drivesem derender --fast does."""
+    """derender: as drivesem derender --fast."""
     threads: Count | None = None
-    """Threads of torch and of the kernels; by default as many as torch chooses."""
+    """Threads of torch and of the kernels (default: torch's choice)."""
     detector: str = "squeezedet"
-    """Of devices, found, moves, redraw, weather and viewer: name of a shipped detector, a .safetensors file of
-    one, or onnx:FILE, a detector that was trained elsewhere."""
+    """devices, found, moves, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or onnx:FILE."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """Of found, label-free, parts, redraw and depth: demo (generated scenes, needs no data), kitti, vkitti1,
-    vkitti2, coco or yolo."""
+    """found, label-free, parts, redraw, depth: demo (generated scenes; needs no data), kitti, vkitti1, vkitti2, coco
+    or yolo."""
     root: str | None = None
-    """Of found, label-free, parts, redraw and depth: the data set's folder, such as KITTI's with training/image_2,
+    """found, label-free, parts, redraw, depth: folder of the data set, such as KITTI's with training/image_2,
     label_2, calib."""
     scenes: str | None = None
-    """A folder of scenes that drivesem derender wrote. Of found and redraw: instead of a data set; of depth:
-    besides one; of viewer: whose first is moved, by default an embedded one."""
+    """Folder of scenes written by drivesem derender. found, redraw: instead of a data set; depth: in addition to one;
+    viewer: the first one is moved (default: an embedded scene)."""
     markdown: str | None = None
-    """A Markdown file whose section on this benchmark is written anew (docs/research/benchmarks.md)."""
+    """Markdown file in which this benchmark's section is replaced (docs/research/benchmarks.md)."""
 
     def check(self) -> None:
         super().check()
         fewest = 10 if self.what == "synth" else 1
         few = self.frames is not None and self.frames < fewest
         refuse(few, "--frames", f"at least {fewest}", self.frames)
-        refuse(self.fast and self.what != "derender", "--fast", "derender before it", self.what)
+        refuse(self.fast and self.what != "derender", "--fast", "the benchmark derender", self.what)
         both = self.what != "depth" and self.scenes is not None and self.dataset != DEMO
-        refuse(both, "--scenes", "no --dataset beside it", f"--dataset {self.dataset}")
+        refuse(both, "--scenes", "no --dataset", f"--dataset {self.dataset}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,61 +82,57 @@ class DetectorBenchConfig(BenchOptions):
     """Measure memory, detectors, attacks on planted faults, and a cluster."""
 
     what: CommandName = ""
-    """Benchmark. memory: peak memory above the detector's own; detector: its forward and backward pass;
-    climb: a search by climb and the parts of its passes; planted: planted faults that each attack finds; scale: frames
+    """Benchmark. memory: peak memory in excess of the detector's own; detector: its forward and backward pass; climb:
+    a search by climb and the parts of its passes; planted: planted faults found by each attack; scale: frames
     shared by Ray compared with local processes."""
     methods: str = "climb,corners,si-fgsm,halton,cma-es"
-    """Planted: attacks to judge, with commas (drivesem attack --method)."""
+    """planted: attacks to compare, with commas (drivesem attack --method)."""
     passes: Annotated[int, at_least(MIN_PASSES)] = 90
-    """Climb and planted: passes of the detector that each attack may take, a gradient counted as 3."""
+    """climb, planted: detector passes of each attack (a gradient counts as 3)."""
     params: str = "color,weather,foliage,translate,rotate,mesh"
-    """Climb and planted: what attacks may move, with commas."""
+    """climb, planted: parameters that attacks may change, with commas."""
     faults: Count | None = None
-    """Planted: so many faults a frame, easy and rare ones in turn, in each frame others; by default all kinds."""
+    """planted: faults per frame, alternately easy and rare, different ones in each frame (default: all kinds)."""
     budget: str = "paper"
-    """Planted: how far attacks may go (drivesem attack --budget)."""
+    """planted: limits of the change (drivesem attack --budget)."""
     across: Count | None = None
-    """Planted: instead, one fault a detector, for the cars of all frames, and rules of what all frames tell; so
-    many of Halton's states a frame serve all faults. --faults: so many are searched for in a frame, in turn."""
+    """planted: plant one fault per detector for the cars of all frames, and fit rules to all frames. The number of
+    Halton states per frame, shared by all faults. --faults: number of faults searched for per frame, in turn."""
     each: Count = 1
-    """Planted, with --across: so many faults of each kind."""
+    """planted with --across: faults of each kind."""
     searched: NotNegative | None = None
-    """Planted, with --across: frames that are searched, by default all; 0 leaves it at Halton's states."""
+    """planted with --across: frames to search (default: all); 0 uses only the Halton states."""
     naming: str | None = None
-    """Planted: of these of --methods, with commas, also ask, as drivesem holes does, what tells a failing car, and
-    whether that is the fault; the same of the detector without a fault."""
+    """planted: those of --methods, with commas, with failures explained by rules too, as in drivesem holes, and
+    compared with the fault; the same for the detector without a fault."""
     limit: Count | None = None
-    """Planted: the first N frames, by default 3. Scale: so many frames for each, by default 200."""
+    """planted: number of frames (default: 3). scale: frames per engine (default: 200)."""
 
     def check(self) -> None:
         super().check()
-        refuse(
-            self.across is not None and self.naming is not None, "--naming", "no --across beside it", self.naming
-        )
-        refuse(
-            self.across is None and self.searched is not None, "--searched", "--across beside it", self.searched
-        )
+        refuse(self.across is not None and self.naming is not None, "--naming", "no --across", self.naming)
+        refuse(self.across is None and self.searched is not None, "--searched", "--across", self.searched)
         demo = self.what == "planted" or self.dataset == DEMO
         refuse(not demo, "--dataset", "--dataset demo, but for planted", self.dataset)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GradcheckConfig(SceneOptions, FrameCommandConfig):
-    """Compare gradients with central differences; exit code 1 where they disagree. One scene without --limit."""
+    """Compare gradients with central differences; exit code 1 on a mismatch. One scene without --limit."""
 
     detector: str = "squeezedet"
-    """Name of a shipped detector, or a .safetensors file of one."""
+    """A shipped detector, or a .safetensors file of one."""
     directions: Count = 2
-    """Random directions of each parameter along which differences are taken; each costs six renders a point."""
+    """Random directions per parameter for differences; each takes six renders per point."""
     min_cosine: Annotated[float, NumberRange(-1, 1)] = 0.99
-    """Least cosine between gradient and differences."""
+    """Smallest cosine between gradient and differences."""
     max_error: Annotated[float, NumberRange(0, ends="(]", expected="a positive number")] = 0.05
     """Largest relative error of the gradient."""
     reach: Flag = False
-    """Instead: how far the gradient of each object's margin tells what 1, 4 and 16 steps of an attack do to it, by
-    parameter and distance; some minutes a frame."""
-    draws: Annotated[Count, at_least(2, "of which two halves are compared")] = 4
-    """Of --reach: draws of a camera's small changes that margins and gradients are averaged over."""
+    """Instead: how well the gradient of each object's margin predicts the effect of 1, 4 and 16 attack steps, by
+    parameter and distance; some minutes per frame."""
+    draws: Annotated[Count, at_least(2, "to compare two halves")] = 4
+    """With --reach: nuisance samples that margins and gradients are averaged over."""
 
     def check(self) -> None:
         super().check()
@@ -149,7 +141,7 @@ class GradcheckConfig(SceneOptions, FrameCommandConfig):
             refuse(
                 self.reach and value != getattr(GradcheckConfig, name),
                 f"--{name.replace('_', '-')}",
-                "no --reach beside it",
+                "no --reach",
                 value,
             )
-        refuse(not self.reach and self.draws != GradcheckConfig.draws, "--draws", "--reach beside it", self.draws)
+        refuse(not self.reach and self.draws != GradcheckConfig.draws, "--draws", "--reach", self.draws)

@@ -56,7 +56,7 @@ class CarView:
     """What was given to each object, as a car."""
 
     def sight(self, row: int, names: Sequence[str], score: float = SCORE) -> DetectorSight:
-        """The best overlap with an object's box of all that is called so, whatever else it may belong to."""
+        """Best overlap with an object's box of all detections of its class, also those of other objects."""
         found = self.named(names, score)
         if not len(found):
             return UNSEEN
@@ -87,12 +87,12 @@ class CarView:
 
 
 class DetectorView:
-    """A detector that looks at pictures as they are written to files."""
+    """A detector for pictures as they are written to files."""
 
     def __init__(self, predictor: Predictor) -> None:
         self._predictor = predictor
 
-    def look(self, image: Tensor, boxes_xyxy: Tensor) -> CarView:
+    def view_cars(self, image: Tensor, boxes_xyxy: Tensor) -> CarView:
         """image (3, H, W) in [0, 1]; boxes (N, 4) px of the objects in it."""
         picture = to_uint8(image)
         given = torch.from_numpy(picture.transpose(2, 0, 1).copy()).float() / 255

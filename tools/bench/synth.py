@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.options import WorkerOptions
 from drivesem.run.workers import make_parallel_map
 from drivesem.synth.variations import MIXED

@@ -18,7 +18,7 @@ from urllib.parse import urlencode
 
 from detectors.base import Predictor
 from drivesem.attack.budgets import PRESETS, STREET
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.bench.timing import Spread
 from drivesem.scenes.scene import demo_scene
 from drivesem.scenes.sources import find_scene_folders
@@ -35,7 +35,7 @@ COLUMNS: Columns = {
     "cpu_ms": ("of the processor, ms", "CPU"),
 }  # fmt: skip
 METHOD = (
-    "The server of drivesem view in this process, asked over its port as the page asks it: picture and detections "
+    "The server of drivesem view in this process, queried over its port as by the page: picture and detections "
     "of a state at once, on two connections that stay open, each state new. HTTP: from the request to the last "
     "byte. Browser: in headless Chromium, from the slider's event to the decoded picture, and to the boxes that "
     "are drawn; left out where Debian's chromium or Playwright is missing. Medians and quartiles; the processor's "
@@ -45,7 +45,7 @@ METHOD = (
 QUICK_STATES, FULL_STATES = 10, 30
 _LASTS = ("translate.along", "yaw", "paint.lightness")
 _SCENE = "weather.fog"
-_ASK = """async ([name, value]) => {
+_FETCH_SCRIPT = """async ([name, value]) => {
     const slider = document.querySelector(`input[data-name="${name}"]`), view = document.getElementById("view");
     slider.value = value;
     slider.dispatchEvent(new Event("input", {bubbles: true}));
@@ -114,8 +114,10 @@ def _over_http(
         for value in _values(knob, states):
             query = urlencode({"frame": name, knob.name: value})
             cpu = time.process_time()
-            asked = [pool.submit(_get, line, f"{path}?{query}") for line, path in zip(lines, _PATHS, strict=True)]
-            picture, detections = (one.result() for one in asked)
+            responses = [
+                pool.submit(_get, line, f"{path}?{query}") for line, path in zip(lines, _PATHS, strict=True)
+            ]
+            picture, detections = (one.result() for one in responses)
             found.append((picture, detections, 1e3 * (time.process_time() - cpu)))
     for line in lines:
         line.close()
@@ -141,8 +143,8 @@ def _get(line: http.client.HTTPConnection, path: str) -> float:
 
 
 def _in_browser(page: Any, knob: Slider, states: int) -> tuple[list[float], list[float], None]:
-    times = [page.evaluate(_ASK, [knob.name, value]) for value in _values(knob, states)][1:]
-    page.evaluate(_ASK, [knob.name, 0])
+    times = [page.evaluate(_FETCH_SCRIPT, [knob.name, value]) for value in _values(knob, states)][1:]
+    page.evaluate(_FETCH_SCRIPT, [knob.name, 0])
     return [picture for picture, _ in times], [detections for _, detections in times], None
 
 

@@ -1,6 +1,6 @@
-"""The compositor's weather and sun beside the generator's: brightness, contrast and a detector's scores.
+"""The compositor's weather and sun against the generator's: brightness, contrast and a detector's scores.
 
-A failure that only the compositor's weather causes does not survive the second renderer. This says where the two
+A failure that only the compositor's weather causes does not survive the second renderer. This measures where the two
 part: for each effect, at half and at full strength, in the boxes of the labelled vehicles; and how far the sun can
 be moved, while the shadows of all but vehicles stay those of the photograph.
 """
@@ -22,7 +22,7 @@ from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
 from drivesem.attack.losses import candidates_from_detections
 from drivesem.attack.targets import resolve_t_star
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.config.edits import FrameEdit
 from drivesem.failures.margins import object_margins
 from drivesem.report.drawing import write_picture
@@ -40,7 +40,7 @@ from tools.bench.settings import BenchTool
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-TITLE = "Weather and sun, ours beside the generator's"
+TITLE = "Weather and sun, ours against the generator's"
 COLUMNS: Columns = {
     "pool": ("pool", "pool"), "weather": ("weather", "weather"), "frames": ("frames", "frames"),
     "cars": ("vehicles", "cars"), "psnr_db": ("PSNR in the boxes, dB", "PSNR"),
@@ -50,7 +50,7 @@ COLUMNS: Columns = {
     "margin": ("margin, ours, logits", "margin"), "margin_true": ("the generator's  ", "true"),
 }  # fmt: skip
 METHOD = (
-    "Clear generated frames of both pools, taken apart with their labels alone; a code of weather or another sun "
+    "Clear generated frames of both pools, de-rendered from their labels alone; a code of weather or another sun "
     "is drawn by the compositor on the photograph and by the generator in its world. In the boxes of labelled "
     "vehicles, at least 25 px high and half in view, grown by 15 % of their size each way: mean luma and its "
     "standard deviation (contrast), display values of [0, 1], and PSNR of one picture to the other; tail: "
@@ -110,7 +110,7 @@ class WeatherRow:
 
 
 def measure(config: BenchTool, frames: int, sheets: Path | None) -> Iterator[list[WeatherRow]]:
-    """Rows of a frame at a time, pools in turn; frames without a vehicle to look at have none."""
+    """Rows of a frame at a time, pools in turn; frames without a judged vehicle have none."""
     detector = load_predictor(config.detector)
     for number in range(frames):
         pool = SPLITS[number % len(SPLITS)]
@@ -125,15 +125,15 @@ def weather_rows(
     street = generated.build_street(plan)
     made = rendered(plan, street)
     scene = derender(Frame(f"{number:03d}", to_tensor(made.image), made.camera, made.labels))
-    shown = [truth for truth in made.truths if _shown(truth)]
-    if not shown:
+    judged = [truth for truth in made.truths if _is_judged(truth)]
+    if not judged:
         return []
     compositor = Compositor(scene)
     rows, strips = [], []
     for name, edit in CODES.items():
         ours = to_uint8(compositor.render(_under(scene, edit)).image)
         truth = rendered(apply_edit(plan, edit), street).image
-        rows.append(_row((pool, f"{number:03d}", name), made.image, ours, truth, shown, detector))
+        rows.append(_row((pool, f"{number:03d}", name), made.image, ours, truth, judged, detector))
         region = np.ones(ours.shape[:2], bool)
         strips.append(SheetStrip(made.image, ours, truth, region, f"{name}: {rows[-1].psnr_db:.1f} dB"))
     if sheets is not None:
@@ -144,7 +144,7 @@ def weather_rows(
 def summary(rows: Sequence[WeatherRow]) -> list[dict[str, Any]]:
     """Means over vehicles, by pool and weather."""
     out: list[dict[str, Any]] = []
-    figures = (
+    averaged = (
         "psnr_db",
         "mean",
         "mean_true",
@@ -160,11 +160,11 @@ def summary(rows: Sequence[WeatherRow]) -> list[dict[str, Any]]:
             if not chosen:
                 continue
             cars = [row.cars for row in chosen]
-            table = np.array([[getattr(row, figure) for figure in figures] for row in chosen])
+            table = np.array([[getattr(row, figure) for figure in averaged] for row in chosen])
             means = np.average(table, axis=0, weights=cars).round(3).tolist()
             row: dict[str, Any] = {"pool": pool, "weather": name, "frames": len(chosen), "cars": sum(cars)}
             row["tail_db"] = round(float(np.percentile([db for one in chosen for db in one.each_db], 10)), 3)
-            out.append({**row, **dict(zip(figures, means, strict=True))})
+            out.append({**row, **dict(zip(averaged, means, strict=True))})
     return out
 
 
@@ -173,24 +173,24 @@ def _row(
     before: Picture,
     ours: Picture,
     truth: Picture,
-    shown: Sequence[Truth],
+    cars: Sequence[Truth],
     detector: Predictor,
 ) -> WeatherRow:
-    figures = []
-    margins = [_margins(picture, shown, detector) for picture in (ours, truth)]
-    for i, car in enumerate(shown):
+    per_car = []
+    margins = [_margins(picture, cars, detector) for picture in (ours, truth)]
+    for i, car in enumerate(cars):
         region = _region(car, ours.shape[:2])
         lights = [(picture[region] @ np.array(LUMA)) / 255 for picture in (ours, truth)]
         spread = [value for light in lights for value in (light.mean(), light.std())]
-        figures.append([psnr(ours, truth, region), spread[0], spread[2], spread[1], spread[3]])
-        figures[-1] += [float(margin[i]) for margin in margins] + [psnr(before, truth, region)]
-    means = np.mean(figures, axis=0).round(4).tolist()
-    return WeatherRow(*name, len(shown), *means, each_db=tuple(round(float(f[0]), 4) for f in figures))
+        per_car.append([psnr(ours, truth, region), spread[0], spread[2], spread[1], spread[3]])
+        per_car[-1] += [float(margin[i]) for margin in margins] + [psnr(before, truth, region)]
+    means = np.mean(per_car, axis=0).round(4).tolist()
+    return WeatherRow(*name, len(cars), *means, each_db=tuple(round(float(f[0]), 4) for f in per_car))
 
 
-def _margins(picture: Picture, shown: Sequence[Truth], detector: Predictor) -> Tensor:
-    boxes = torch.tensor(np.stack([car.box_xyxy for car in shown]), dtype=torch.float32)
-    labels = torch.tensor([int(VEHICLE_CATEGORIES[car.actor.label]) for car in shown])
+def _margins(picture: Picture, cars: Sequence[Truth], detector: Predictor) -> Tensor:
+    boxes = torch.tensor(np.stack([car.box_xyxy for car in cars]), dtype=torch.float32)
+    labels = torch.tensor([int(VEHICLE_CATEGORIES[car.actor.label]) for car in cars])
     found = candidates_from_detections(predict(detector, to_tensor(picture)[None])[0], len(detector.classes))
     return object_margins(found, boxes, labels, boxes, resolve_t_star(detector))
 
@@ -204,7 +204,7 @@ def _region(car: Truth, size: tuple[int, int]) -> Mask:
     return region
 
 
-def _shown(truth: Truth) -> bool:
+def _is_judged(truth: Truth) -> bool:
     tall = truth.box_xyxy[3] - truth.box_xyxy[1] >= _LEAST_PX
     return (
         truth.labelled and truth.actor.label in VEHICLE_CATEGORIES and bool(tall) and truth.visible >= _LEAST_SEEN

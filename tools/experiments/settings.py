@@ -29,114 +29,109 @@ from drivesem.config.options import (
 )
 
 _REPORT_SETTINGS = ("name", "results", "out", "bootstrap", "json")
-"""Settings of a study that is told again."""
+"""Settings that --from accepts."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameCommandConfig):
-    """The paper's experiments, and others: every arm an attack on the same frames."""
+    """Experiments of the paper and others: every arm attacks the same frames."""
 
     name: CommandName = ""
-    """single: the six parameters, each alone; multi: the combinations 1 to 4; grades: how sure failures are, by
-    gradient, sampling and placebo; searches: which method finds failures that hold, at as many passes each;
-    samples: success against queries for each algorithm; steps: success against number and size of steps; labels:
-    what labels that stay behind make of an attack; attribution: which part of the paper's protocol takes how many
-    points; transfer: counterexamples of combination 2 before other
-    detectors; retrain: detectors trained on with counterexamples, before benign frames, known and fresh
-    counterexamples; classification: the paper's tables for image classifiers (docs/guide/classifiers.md)."""
+    """Experiment. single: the six parameters, one at a time; multi: the combinations 1 to 4; grades: reliability of
+    failures by gradient, sampling and placebo; searches: methods at an equal number of passes; samples: success
+    against queries for each algorithm; steps: success against number and size of steps; labels: effect of labels
+    that do not move with the cars; attribution: points of score due to each part of the paper's protocol;
+    transfer: counterexamples of combination 2 on other detectors; retrain: detectors fine-tuned on
+    counterexamples, tested on benign frames, known and fresh counterexamples; classification: the paper's tables
+    for image classifiers (docs/guide/classifiers.md)."""
     out: FolderOrUrl = None
-    """Folder for the results, or its URL (docs/guide/scale.md); a second run with the same goes on where it stopped."""
+    """Folder of the results, or its URL (docs/guide/scale.md); the same command resumes what it finds there."""
     results: Annotated[str | None, ExistingFolder(), tyro.conf.arg(aliases=["--from"])] = None
-    """Folder of stored results, such as OUT/results or docs/data/NAME: report them again without data or attacks. Only
-    --out, --bootstrap and --json go with it."""
+    """Folder of stored results, such as OUT/results or docs/data/NAME: report them again without data or attacks.
+    Only --out, --bootstrap and --json go with it."""
     quick: Flag = False
-    """6 frames instead of 200, and fewer arms: minutes. The full study goes on in the same folder; that of
-    retrain, which trains on other frames, in another."""
+    """6 frames instead of 200, and fewer arms: takes minutes. The full study resumes in the same folder; retrain,
+    which trains on other frames, needs another one."""
     detector: str = "squeezedet"
-    """A shipped detector, a file, or another project's that has a gradient (docs/reference/detectors.md)."""
+    """Detector with gradients: a shipped one, a file, or another project's (docs/reference/detectors.md)."""
     bootstrap: NotNegative | None = None
-    """Draws of frames for intervals, by default 1000, of classification 200; 0 leaves them out."""
+    """Bootstrap samples of frames for intervals (default: 1000, classification 200); 0 for no intervals."""
     steps: Count = 10
-    """Steps of the attack; steps goes twice as far."""
+    """Steps of the attack; the experiment steps takes up to twice as many."""
     queries: Count = 64
-    """Samples: queries of each method without gradient."""
+    """samples: queries of each gradient-free method."""
     passes: Annotated[int, at_least(MIN_PASSES, "which the search needs")] = 90
-    """Searches, and retrain with climb: passes of the detector that each method may take for a frame, a gradient
-    counted as 3."""
+    """searches, and retrain with climb: detector passes of each method per frame (a gradient counts as 3)."""
     pace: Annotated[str | None, ExistingFolder()] = None
-    """Searches: folder of such a study; each method takes as many more passes as fit into the seconds that the
-    slowest took there for a frame."""
+    """searches: folder of such a study; each method gets as many more passes as fit into the seconds per frame of the
+    slowest method there."""
     params: str | None = None
-    """Searches, retrain: what is changed, with commas: color, weather, foliage, translate, rotate, mesh; by
-    default as combination 2."""
+    """searches, retrain: parameters to change, with commas: color, weather, foliage, translate, rotate, mesh
+    (default: those of combination 2)."""
     objective_labels: LabelMode = "moved"
-    """Labels the attacks aim at: moved with the cars, or the benign ones as in the paper (labels has both)."""
+    """Labels in the attack's objective: moved with the cars, or benign as in the paper (labels has both)."""
     method: Literal["si-fgsm", "apgd", "climb"] = "si-fgsm"
-    """Single, multi, labels, transfer, retrain: the attack of all arms; si-fgsm is the paper's; climb, of retrain
-    alone, finds failures that hold."""
+    """single, multi, labels, transfer, retrain: attack of all arms; si-fgsm is the paper's; climb, only for retrain,
+    finds failures that hold."""
     controls: bool = True
-    """Single, multi: beside each arm random samples of the same box, and one random edit of the same size."""
+    """single, multi: add to each arm random samples of the same box, and one random edit of the same size."""
     seeds: Count | None = None
-    """Single, multi: seeds of random numbers for each control, by default 3, 1 with --quick. Retrain: seeds by
-    which benign, random, certain and consistent are trained, by default one."""
+    """single, multi: seeds of each control (default: 3, with --quick 1). retrain: seeds of the arms benign, random,
+    certain and consistent (default: 1)."""
     paper_protocol: bool = True
-    """Single, multi: beside each arm the same by the paper's exact protocol (--config paper), where the detector
-    has its loss."""
+    """single, multi: add each arm under the paper's exact protocol (--config paper), if the detector has its loss."""
     confirm: Flag = False
-    """Single, multi, labels: have a second renderer draw each attack's pictures again, as drivesem confirm does.
-    What is certain is drawn by it in any case."""
+    """single, multi, labels: also re-render the pictures of each attack with a second renderer, like drivesem
+    confirm. Certain failures are always re-rendered."""
     other_detector: str | None = None
-    """Attribution: a detector that is the paper's where ours is --detector, as one more factor."""
+    """attribution: the paper's detector, if --detector is another one, as one more factor."""
     detectors: str = "squeezedet,yolov3-slim"
-    """Transfer: detectors to ask, with commas: shipped ones, files, or other projects', also without gradient."""
+    """transfer: detectors to test, with commas: shipped ones, files, or other projects', also without gradients."""
     sources: str | None = None
-    """Transfer: detectors that are attacked, with commas; by default --detector alone."""
+    """transfer: detectors to attack, with commas (default: only --detector)."""
     benign_root: str | None = None
-    """Retrain: folders of further benign frames to train on, with commas; by default all of --root."""
+    """retrain: folders of additional benign training frames, with commas (default: all frames of --root)."""
     held_out: str | None = None
-    """Retrain: folder of frames that are never trained on; by default a quarter of --root's."""
+    """retrain: folder of frames that are never trained on (default: a quarter of --root's)."""
     validation: str | None = None
-    """Retrain: folder of further frames, of the same layout, on which retrained detectors' t* is chosen; by
-    default the benign frames that judge them."""
+    """retrain: folder of frames of the same layout that set t* of retrained detectors (default: the benign test
+    frames)."""
     arms: str | None = None
-    """Retrain: what is trained, with commas: benign, re-rendered, random, generator, ours, certain, consistent,
-    worst, paper (docs/research/detection.md); by default re-rendered, ours and, without --quick, paper."""
+    """retrain: training arms, with commas: benign, re-rendered, random, generator, ours, certain, consistent, worst,
+    paper (docs/research/detection.md; default: re-rendered, ours and, without --quick, paper)."""
     states: NotNegative = 16
-    """Retrain: states of each held-out frame in which all detectors look for its cars; 0 leaves this out."""
+    """retrain: states of each held-out frame in which all detectors are tested; 0 for none."""
     consistency: Annotated[float, POSITIVE] = 1.0
-    """Retrain: weight of the further term of consistent, which compares margins of objects and of background in
-    a failure's two pictures, and of worst, which asks for the object in the worst of four and for nothing beside
-    it."""
+    """retrain: weight of the additional loss of consistent, which compares margins of objects and background in the
+    two pictures of a failure, and of worst, which uses the worst of four pictures."""
     fraction: Fraction = 0.25
-    """Retrain: share of the extra pictures among all that is shown; not of the paper's protocol."""
+    """retrain: share of the extra pictures in a batch; not in the paper's protocol."""
     near: Annotated[float, NumberRange(0, 1, expected="a share from 0 to 1")] = 0.5
-    """Retrain: share of the states around a failure that lie near it."""
+    """retrain: share of the states around a failure that are close to it."""
     reattack: bool = True
-    """Retrain: attack held-out frames against each retrained detector too, not against the detector as it was
-    alone."""
+    """retrain: also attack held-out frames against each retrained detector, not only against the original one."""
     benign_frames: Count | None = None
-    """Retrain: the first so many of these judge what is benign; by default 1000, 12 with --quick."""
+    """retrain: number of benign test frames (default: 1000, with --quick 12)."""
     fresh: Count | None = None
-    """Retrain: the first so many of these are attacked, with every detector; by default 200, 3 with --quick."""
+    """retrain: number of frames to attack with every detector (default: 200, with --quick 3)."""
     train_steps: Count | None = None
-    """Retrain: steps of training; by default 1500, of the paper's protocol 6000; 40 with --quick."""
+    """retrain: training steps (default: 1500, 6000 for the paper's protocol, 40 with --quick)."""
     mix: Literal["add", "replace"] = "add"
-    """Retrain: counterexamples beside benign frames, or in the place of some; not of the paper's protocol."""
+    """retrain: add counterexamples to the benign frames, or replace some of them; not in the paper's protocol."""
     label_mode: LabelMode = "moved"
-    """Retrain: labels of counterexamples in training; not of the paper's protocol."""
+    """retrain: labels of counterexamples in training; not in the paper's protocol."""
     networks: str = "squeezenet"
-    """Classification: networks to attack, with commas: squeezenet, or weights that classify train wrote."""
+    """classification: networks to attack, with commas: squeezenet, or weights of drivesem classify train."""
     objects: str | None = None
-    """Classification: where objects come from, as in drivesem classify; --limit counts their pictures, by default
-    480, 36 with --quick, and --fresh those on which retrained networks are attacked, 232, 36 with --quick."""
+    """classification: source of objects, as in drivesem classify; --limit counts their pictures (default: 480, with
+    --quick 36), --fresh those on which retrained networks are attacked (default: 232, with --quick 36)."""
     backgrounds: Annotated[str, ExistingFolder("a folder of photographs")] | None = None
-    """Classification: photographs to put behind objects; by default pictures that are made."""
+    """classification: folder of photographs as backgrounds (default: generated pictures)."""
     train_pictures: Count | None = None
-    """Classification: pictures to retrain on, of which half become counterexamples; by default 960, 144 with
-    --quick."""
+    """classification: training pictures, of which half become counterexamples (default: 960, with --quick 144)."""
     tables: str | None = None
-    """Classification: which of them, with commas: degradation, parameters, hyperparameters, retraining,
-    robustness, worth, realism, transfer, pixels, sizes; by default all."""
+    """classification: tables to compute, with commas: degradation, parameters, hyperparameters, retraining,
+    robustness, worth, realism, transfer, pixels, sizes (default: all)."""
 
     def check(self) -> None:
         super().check()
@@ -144,133 +139,133 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
         refuse(
             self.dataset == DEMO and further, "--held-out, --benign-root", "none with the embedded frames", "one"
         )
-        beside = self.name
+        experiment = self.name
         if self.results is not None:
             for field in fields(self):
                 value, alone = getattr(self, field.name), "none with --from, which uses the study's own settings"
                 changed = field.name not in _REPORT_SETTINGS and value != field.default
                 refuse(changed, option_name(field.name), alone, value)
-        refuse(self.pace is not None and self.name != "searches", "--pace", "study searches", beside)
+        refuse(self.pace is not None and self.name != "searches", "--pace", "experiment searches", experiment)
         divided = self.split is not None and self.name == "retrain"
-        refuse(divided, "--split", "none with study retrain, which divides --root itself (--held-out)", self.split)
+        refuse(divided, "--split", "none with retrain, which divides --root itself (--held-out)", self.split)
         other = self.other_detector is not None and self.name != "attribution"
-        refuse(other, "--other-detector", "study attribution", beside)
+        refuse(other, "--other-detector", "experiment attribution", experiment)
         climbs = self.method == "climb" and self.name != "retrain"
-        refuse(climbs, "--method", "si-fgsm or apgd; climb with study retrain alone", self.method)
+        refuse(climbs, "--method", "si-fgsm or apgd; climb only with retrain", self.method)
         made = self.dataset == DEMO and self.validation is not None
         refuse(made, "--validation", "none with the embedded frames", self.validation)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RealismConfig(SeededBootstrapOptions, CommandConfig):
-    """How far re-renders and counterexamples are from their photographs: PSNR, SSIM, LPIPS, FID and their kin."""
+    """Measure how far re-renders and counterexamples are from their photographs: PSNR, SSIM, LPIPS, FID and others."""
 
     runs: RunFolders = ()
-    """Folders of runs of drivesem attack; a table each."""
+    """Folders of runs of drivesem attack; one table each."""
     metrics: str = "available"
-    """With commas: psnr, ssim, perceptual, lpips-alex, lpips-vgg, lpips-squeeze, frechet, frechet-mobilenet,
-    frechet-inception, fid; or available: those whose weights are on disk (docs/research/realism.md)."""
+    """Metrics, with commas: psnr, ssim, perceptual, lpips-alex, lpips-vgg, lpips-squeeze, frechet, frechet-mobilenet,
+    frechet-inception, fid; or available: all with weights on disk (docs/research/realism.md)."""
     weights: Annotated[str, ExistingFolder()] | None = None
-    """A folder of weight files, looked at before torch's own cache."""
+    """Folder of weight files, searched before torch's own cache."""
     fetch: Flag = False
-    """Download missing weights into torch's cache, from where their publishers keep them."""
+    """Download missing weights from their publishers into torch's cache."""
     successes: Flag = False
     """Only frames in which the attack succeeded."""
     limit: Count | None = None
-    """Take the first N frames of each run."""
+    """Number of frames per run, from the first."""
     out: str | None = None
-    """Folder for the results; by default realism in the first run's folder."""
+    """Folder of the results (default: realism in the first run's folder)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorthConfig(SeededBootstrapOptions, CommandConfig):
-    """Information worth of counterexamples, and what a second or retrained detector gained (section 3)."""
+    """Measure the information worth of counterexamples and the gain of a second or retrained detector (section 3)."""
 
     runs: RunArguments = ()
     """Folders of runs of drivesem attack against one detector; each object and as many empty places are points."""
     second: str | None = None
-    """A second detector, or a folder of drivesem retrain: the gain is what its worth is less."""
+    """Second detector, or a folder of drivesem retrain; the gain is the decrease in worth."""
     table: str | None = None
-    """Instead of runs, a classifier's answers: a CSV file of label, a probability a class, and distance or realism
-    where known."""
+    """Instead of runs, a classifier's predictions: a CSV file of label, one probability per class, and optionally
+    distance or realism."""
     after: str | None = None
     """The same table of a second or retrained classifier."""
     study: str | None = None
-    """Instead of runs, the folder of a finished study, such as multi, single or retrain: of each arm how real
-    its pictures are, as drivesem realism tells it, and their worth; of retrain also what its detectors gained."""
+    """Instead of runs, the folder of a finished study, such as multi, single or retrain: realism and worth of each
+    arm's pictures; with retrain also the gain of its detectors."""
     metrics: str = "available"
-    """With --study, as of drivesem realism."""
+    """With --study: metrics, as in the experiment realism."""
     bootstrap: NotNegative | None = None
-    """With --study: draws of frames for intervals of its distances, by default 200; 0 leaves them out."""
+    """With --study: bootstrap samples of frames for intervals of distances (default: 200); 0 for no intervals."""
     distance: str | None = None
-    """What realism is counted from: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none; by default
-    lpips-alex where its weights are on disk, else perceptual (docs/research/realism.md)."""
+    """Distance that defines realism: lpips-alex, lpips-vgg, lpips-squeeze, perceptual, or none (default: lpips-alex
+    if its weights are on disk, else perceptual; docs/research/realism.md)."""
     weights: Annotated[str, ExistingFolder()] | None = None
-    """A folder of weight files of that distance, looked at before torch's own cache."""
+    """Folder of weight files of that distance, searched before torch's own cache."""
     base: str = "e"
     """Base of the logarithm: e, 2, 10 or another number above 1."""
     limit: Count | None = None
-    """Take the first N frames of each run."""
+    """Number of frames per run, from the first."""
     device: str = "cpu"
     """torch device of the second detector: cpu, cuda, cuda:1, ..."""
     tiles: Literal["auto", "off"] = "auto"
-    """Of a second detector in ONNX: auto looks at the whole frame and at overlapping parts of it, enlarged."""
+    """Tiling of a second ONNX detector: auto adds enlarged, overlapping parts of the frame."""
     out: str | None = None
-    """Folder for the results; by default worth in the first run's folder, or beside the table."""
+    """Folder of the results (default: worth in the first run's folder, or in the table's)."""
 
     def check(self) -> None:
         super().check()
         given = sum((bool(self.runs), self.table is not None, self.study is not None))
-        ways = "folders of drivesem attack, or --table, or --study"
-        refuse(given != 1, "RUN", ways, "several of them" if given else "nothing")
-        refuse(self.after is not None and self.table is None, "--after", "--table beside it", "none")
+        sources = "folders of drivesem attack, or --table, or --study"
+        refuse(given != 1, "RUN", sources, "several of them" if given else "nothing")
+        refuse(self.after is not None and self.table is None, "--after", "--table", "none")
         twice = self.second is not None and self.table is not None
         refuse(twice, "--second", "runs (--after is a second table)", f"--table {self.table}")
         other = self.metrics != "available" and self.study is None
-        refuse(other, "--metrics", "--study beside it (drivesem realism measures runs)", "none")
+        refuse(other, "--metrics", "--study (for runs: realism)", "none")
         drawn = self.bootstrap is not None and self.study is None
-        refuse(drawn, "--bootstrap", "--study beside it (worth itself has the jackknife's intervals)", "none")
+        refuse(drawn, "--bootstrap", "--study (worth itself has jackknife intervals)", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlausibilityConfig(RunOption, CommandConfig):
-    """How common the vehicles of a run stand and are built, before and after the attack, by KITTI's labels."""
+    """Compare the poses and shapes of a run's vehicles, before and after the attack, with KITTI's labels."""
 
     out: str | None = None
-    """Folder for the results; by default plausibility in the run's folder."""
+    """Folder of the results (default: plausibility in the run's folder)."""
     limit: Count | None = None
-    """Take the first N frames."""
+    """Number of frames, from the first."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyConfig(CommandConfig):
-    """A page that asks people what they see and how real it looks, as the paper did; it needs no network."""
+    """Build an offline page on which people name what they see and rate how real it looks, as in the paper."""
 
     runs: RunFolders = ()
     """Folders of runs of drivesem attack."""
     items: Count = 15
-    """Counterexamples that are shown, as in the paper; successes before others, drawn at random."""
+    """Number of counterexamples, as in the paper: successes first, drawn at random."""
     controls: NotNegative = 0
-    """Beside them so many re-renders without any change: what people say of nothing."""
+    """Number of additional re-renders without any change, as controls."""
     seed: int = 0
-    """Seed of the draw; the page itself asks everybody in an order of their own."""
+    """Seed of the draw; the page orders its items at random for each participant."""
     out: str | None = None
-    """Folder for survey.html and its key; by default survey in the first run's folder."""
+    """Folder of survey.html and its key (default: survey in the first run's folder)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyResultsConfig(SeededBootstrapOptions, CommandConfig):
-    """What people said: share that was named rightly, realism, agreement."""
+    """Evaluate survey answers: share named correctly, realism, agreement."""
 
     answers: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         tyro.conf.arg(metavar="CSV..."),
-        Required("files that the page of drivesem survey saved", "CSV"),
+        Required("files saved by the survey page", "CSV"),
     ] = ()
-    """Files that the page saved."""
-    survey: Annotated[str | None, Required("the folder of drivesem survey")] = None
-    """The folder of drivesem survey, or its key."""
+    """Files saved by the survey page."""
+    survey: Annotated[str | None, Required("the folder of a survey")] = None
+    """Folder of the survey, or its key."""
     bootstrap: NotNegative | None = None
-    """Draws of people for intervals, by default 200; 0 leaves them out."""
+    """Bootstrap samples of participants for intervals (default: 200); 0 for no intervals."""
     out: str | None = None
-    """Folder for the results; by default results beside the key."""
+    """Folder of the results (default: results in the key's folder)."""

@@ -126,7 +126,7 @@ def study_command(study: StudyConfig) -> str:
 
 
 def read_metadata(folder: Path, kind: type[T], name: str) -> T:
-    """Read METADATA as a dataclass whose field `settings` holds the study's settings.
+    """Read METADATA as a dataclass with the study's settings in its field `settings`.
 
     Raises FormatError unless it is of a study called `name` with valid settings.
     """

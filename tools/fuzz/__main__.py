@@ -1,12 +1,12 @@
 """Damaged files of every format, given to the project's readers: does anything but one of its own errors come?
 
-    python -m tools.fuzz --count 100000 --seed 1 --out fuzz        # what shows a fault is kept in fuzz/
+    python -m tools.fuzz --count 100000 --seed 1 --out fuzz        # inputs that show a fault go to fuzz/
     python -m tools.fuzz --formats "coco json,run" --count 2000
     python -m tools.fuzz --formats "coco json" --seed 1 --show 17  # one input again, with its whole traceback
 
 Each input is a small valid folder of which a file or two are damaged, by format, seed and number alone. Readers
-run in a child with limits: 5 s of the processor and 1 GB more memory than before. Wrong is whatever is raised
-beside the project's own errors, any warning, and a child that dies. Exit code 1 where anything is wrong.
+run in a child with limits: 5 s of the processor and 1 GB more memory than before. Faults are exceptions
+other than the project's own errors, warnings, and a child that dies. Exit code 1 if there are any.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     every = sum(form.share for form in forms)
     counts = [math.ceil(given.count * form.share / every) for form in forms]
     outcomes = [
-        fuzz(form, given.seed, count, given.out, tell=True) for form, count in zip(forms, counts, strict=True)
+        fuzz(form, given.seed, count, given.out, verbose=True) for form, count in zip(forms, counts, strict=True)
     ]
     _print(outcomes, given.seed)
     if given.out is not None:

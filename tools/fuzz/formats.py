@@ -20,14 +20,14 @@ from detectors.registry import load_detector, save_detector
 from detectors.yolov3 import darknet
 from detectors.yolov3.cfg import CfgSection, build
 from detectors.yolov3.yolov3 import YoloV3
-from drivesem.analysis.transfer.matrix import (
+from drivesem.analysis.transfer import (
     EVALUATED_PICTURES,
     FrameLosses,
     SourceRun,
     TransferCounts,
     TransferTarget,
 )
-from drivesem.analysis.verify.checks import THETA, CheckLog, check_change
+from drivesem.analysis.verify import THETA, CheckLog, check_change
 from drivesem.attack.budgets import parse_budget
 from drivesem.attack.space import Parameter, ParameterSpace, parse_params
 from drivesem.attack.targets import EvaluatedClasses
@@ -42,9 +42,9 @@ from drivesem.data.photographs import read_photograph
 from drivesem.data.registry import DATASETS, WRITERS, write_table
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.finished import load_run
+from drivesem.run.frame import summarise_frames
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, RunSummary, dump_frame, load_frame
 from drivesem.run.run_report import build_reports
-from drivesem.run.summary import summarise_frames
 from drivesem.scenes.segmenter import OnnxSegmenter
 from scene_ir import files
 from scene_ir.io import load_scene, save_scene

@@ -1,4 +1,4 @@
-"""Damage: bytes of a valid file changed at random, or what they say, so that checks of the outer form hold."""
+"""Damage: random changes of a valid file's bytes, or of its decoded values so that checks of the outer form pass."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ Damage = Callable[[bytes, random.Random], bytes]
 
 
 def mutate(name: str, data: bytes, rng: random.Random) -> bytes:
-    """Other bytes for the file `name`, whose suffix tells its form."""
+    """Mutated bytes of the file `name`, by the form of its suffix."""
     own = _BY_SUFFIX.get(PurePath(name).suffix.lower())
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         chosen = raw if own is None or rng.random() < 0.3 else own
@@ -133,7 +133,7 @@ def mutate(name: str, data: bytes, rng: random.Random) -> bytes:
             zlib.error,
             yaml.YAMLError,
         ):
-            data = raw(data, rng)  # an earlier change left nothing that could be taken apart
+            data = raw(data, rng)  # an earlier change left nothing to parse
     return data
 
 
@@ -267,7 +267,7 @@ def _png(data: bytes, rng: random.Random) -> bytes:
 
 
 def _archive(data: bytes, rng: random.Random) -> bytes:
-    """A member of a ZIP archive changed, the archive whole; or what its directory says of a member's size."""
+    """A member of a ZIP archive changed, the archive whole; or a member's size in its directory."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     name = rng.choice(list(members))
@@ -317,8 +317,8 @@ def _safetensors(data: bytes, rng: random.Random) -> bytes:
     facts = header.get("__metadata__", {})
     if facts and rng.random() < 0.6:
         name = rng.choice(list(facts))
-        told = facts[name].encode()
-        facts[name] = (_json if told[:1] in (b"[", b"{") else text)(told, rng).decode("utf-8", "replace")
+        old = facts[name].encode()
+        facts[name] = (_json if old[:1] in (b"[", b"{") else text)(old, rng).decode("utf-8", "replace")
     else:
         header = value(header, rng)
     packed = json.dumps(header).encode()

@@ -31,9 +31,9 @@ MEMORY_MB = 1024
 SECONDS = 5.0
 """Of the processor, for an input."""
 _STUCK_SECONDS = 120.0
-"""By the clock, after which a child that says nothing is ended: it waits for something."""
+"""Wall-clock seconds without output after which a child is ended."""
 _STATE = struct.Struct("<5q2d")
-"""What the child tells while it works: next input, tried, accepted, refused, wrong; most CPU seconds, most MB."""
+"""Counters that the child shares: next input, tried, accepted, refused, wrong; most CPU seconds, most MB."""
 
 
 @dataclass
@@ -96,9 +96,9 @@ def find_fault(form: Format, root: Path) -> tuple[str, bool]:
     return "", True
 
 
-def _short(said: str) -> str:
+def _short(message: str) -> str:
     """Of a message, so much that faults of one kind look alike."""
-    return " ".join(said.split())[:60]
+    return " ".join(message.split())[:60]
 
 
 def _place(trace: TracebackType | None) -> str:
@@ -125,17 +125,17 @@ def _time_limit() -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def fuzz(form: Format, seed: int, count: int, keep: Path | None = None, tell: bool = False) -> FuzzOutcome:
-    """Give `count` damaged inputs to a format's readers. keep: where those that showed a fault are kept."""
+def fuzz(form: Format, seed: int, count: int, keep: Path | None = None, verbose: bool = False) -> FuzzOutcome:
+    """Give `count` damaged inputs to a format's readers. keep: folder for inputs that showed a fault."""
     outcome = FuzzOutcome(form.name)
     start = 0
     while start < count:
-        start = _in_child(form, seed, start, count, outcome, keep, tell)
+        start = _in_child(form, seed, start, count, outcome, keep, verbose)
     return outcome
 
 
 def _in_child(
-    form: Format, seed: int, start: int, count: int, outcome: FuzzOutcome, keep: Path | None, tell: bool
+    form: Format, seed: int, start: int, count: int, outcome: FuzzOutcome, keep: Path | None, verbose: bool
 ) -> int:
     """Fork a child that goes on from `start`: where the next has to begin."""
     shared = mmap.mmap(-1, _STATE.size)
@@ -153,38 +153,38 @@ def _in_child(
         finally:
             os._exit(code)
     os.close(writing)
-    said, why = _watched(pid, reading, shared)
+    output, why = _watched(pid, reading, shared)
     state = _STATE.unpack(shared[:])
     outcome.tried += state[1]
     outcome.accepted += state[2]
     outcome.refused += state[3]
     outcome.seconds, outcome.mb = max(outcome.seconds, state[5]), max(outcome.mb, state[6])
-    for line in said.splitlines():
+    for line in output.splitlines():
         fault, number = json.loads(line)
-        _add(outcome, fault, number, tell)
+        _add(outcome, fault, number, verbose)
     if not why:
         return count
     outcome.tried += 1
-    _add(outcome, why, state[0], tell)
+    _add(outcome, why, state[0], verbose)
     return state[0] + 1
 
 
-def _add(outcome: FuzzOutcome, fault: str, number: int, tell: bool) -> None:
-    if tell and fault not in outcome.wrong:
+def _add(outcome: FuzzOutcome, fault: str, number: int, verbose: bool) -> None:
+    if verbose and fault not in outcome.wrong:
         print(f"{outcome.name}: {number}: {fault}", flush=True)
     outcome.wrong.setdefault(fault, []).append(number)
 
 
 def _watched(pid: int, reading: int, shared: mmap.mmap) -> tuple[str, str]:
-    """What a child says until it ends, and why it ended early, "" where it did not."""
-    said, since, last, why = b"", time.monotonic(), -1, ""
+    """Output of a child, and why it ended early ("" if it did not)."""
+    output, since, last, why = b"", time.monotonic(), -1, ""
     while True:
         ready, _, _ = select.select([reading], [], [], 1.0)
         if ready:
             part = os.read(reading, 1 << 16)
             if not part:
                 break
-            said += part
+            output += part
         (number,) = struct.unpack_from("<q", shared, 0)
         if number != last:
             last, since = number, time.monotonic()
@@ -197,14 +197,14 @@ def _watched(pid: int, reading: int, shared: mmap.mmap) -> tuple[str, str]:
     code = os.waitstatus_to_exitcode(status)
     if not why and code != 0:
         why = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-    return said.decode(), why
+    return output.decode(), why
 
 
 def _work(form: Format, seed: int, numbers: range, shared: mmap.mmap, writing: int, keep: Path | None) -> None:
-    """The child: inputs one after the other, each told before it is read."""
+    """The child process: reads inputs one after the other and reports each beforehand."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)  # libraries in C say there what they think
+    os.dup2(nowhere, 2)  # C libraries write there
     tried = accepted = refused = wrong = 0
     most_seconds = most_mb = 0.0
     with tempfile.TemporaryDirectory(prefix="fuzz") as folder:

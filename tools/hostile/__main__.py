@@ -1,7 +1,7 @@
 """Run commands on hostile inputs: each must fail with one clear line, soon, and in little memory.
 
     python -m tools.hostile                        # all; --json: outcomes as JSON on standard output
-    python -m tools.hostile --only signals         # cases whose family or name contains this
+    python -m tools.hostile --only signals         # cases with this in family or name
     python -m tools.hostile --only bomb --work DIR # DIR keeps inputs and outputs
 
 A case passes with the expected exit code (2; 1 for `verify`; 130 and 143 if interrupted) and a last line on standard
@@ -23,7 +23,7 @@ from typing import Any
 
 from rich.table import Table
 
-from drivesem.report.terminal import Console, progress_bar
+from drivesem.report.tables import Console, progress_bar
 from tools.hostile.cases import FAMILIES, cases
 from tools.hostile.inputs import ValidInputs
 from tools.hostile.trial import CaseResult, HostileCase, error_lines, judge, notes, run

@@ -191,7 +191,7 @@ def pickled_weights(name: str) -> Make:
 
 
 def png(name: str, width: int, height: int) -> Make:
-    """A PNG whose header declares a size that its data do not have.
+    """Write a PNG with a header that declares another size than its data have.
 
     Args:
         name: File to write.

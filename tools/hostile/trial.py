@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivesem.report.tables import format_count
-from tools.beside import ROOT
+from tools.compare_checkouts import ROOT
 from tools.hostile.inputs import MARK, ValidInputs
 from tools.same import environment
 

@@ -20,7 +20,7 @@ from mkdocs.structure.pages import Page
 
 from drivesem.cli import TOPICS
 from drivesem.config.commands import COMMANDS
-from drivesem.config.help import print_help
+from drivesem.config.parsing import print_help
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES_OUTSIDE_DOCS = {

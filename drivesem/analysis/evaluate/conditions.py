@@ -18,7 +18,7 @@ from scene_ir import files
 CONDITION_COLUMNS = ("condition",)
 """Columns of text in the table of conditions; the others hold numbers."""
 _FEW_OBJECTS = 30
-"""Fewer objects are marked in the table: their interval says little."""
+"""Fewer objects are marked in the table, since their interval is wide."""
 
 
 def measure_conditions(

@@ -45,8 +45,7 @@ from drivesem.report.drawing import (
     LabelLayout,
     TextLabel,
 )
-from drivesem.report.tables import format_count, format_percent
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, format_count, format_percent
 from drivesem.run.detection_cache import detect_objects
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.training.frames import adapt_limits, evaluation_targets

@@ -1,14 +1,18 @@
-"""Splits a change theta into parts (parameters, objects) and computes their Shapley values.
+"""Smallest failing part of a change theta, and the Shapley values of its parts (parameters, objects).
 
 A part's Shapley value is what it adds on average over all orders in which the parts may be applied. A game gives
 values (K,) of any subset of its P players, several games at once if they share their cost. Contributions add up to
 the value of all players minus that of none, in the sampled form too, as the gains along each order do.
+
+The change theta is scaled by s from 1 to 0, and every point is projected onto the feasible set. Failing need not
+be monotone in s, as objects are lost and found again. So scales are evaluated on a grid first, and the smallest
+that fails is bisected against its neighbour, which does not. Failures between two neighbours are missed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import comb
 from typing import Literal
@@ -19,7 +23,153 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import RangeError
+
+SCHEMA = 1
+EXPLANATION = "explain.json"
+"""File of a frame's explanation."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartOutcome:
+    """The detector's result at one theta, with moved labels."""
+
+    loss: float
+    """The attack's objective."""
+    lost: int
+    """Number of lost objects."""
+    phantoms: int
+    """Number of phantoms."""
+    success: bool
+    """Whether the detector fails."""
+    held_back: bool
+    """Whether the projection onto the feasible set changed theta."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """Contribution of one part of the change: a parameter or an object."""
+
+    kind: str
+    """"parameter" or "object"."""
+    name: str
+    """Name of the part."""
+    loss: float
+    """Shapley value of the loss."""
+    loss_error: float | None
+    """Its standard error, if orders were sampled."""
+    fails: float
+    """Shapley value of failing (1) or not (0)."""
+    fails_error: float | None
+    """Its standard error, if orders were sampled."""
+    gradient: float | None
+    """Sum of gradient at theta0 times theta; None without a gradient."""
+    gradient_share: float | None
+    """Share of the sum of |gradient times theta| over all parts; None without a gradient."""
+    alone: PartOutcome
+    """Result of this part only."""
+    without: PartOutcome
+    """Result of all other parts."""
+
+
+@dataclass(frozen=True, slots=True)
+class MinimalChange:
+    """The smallest change found that still fails."""
+
+    scan: tuple[bool, ...]
+    """Whether the whole change fails at each scale of the grid, 0 and 1 included."""
+    sign_changes: int
+    """Changes between failing and not failing along the grid."""
+    scale_whole: float
+    """Smallest failing scale of the whole change, in [0, 1]."""
+    scale: float
+    """Smallest failing scale after dropping parts, in [0, 1]."""
+    dropped: tuple[str, ...]
+    """Names of the dropped parts, in order."""
+    norm_found: float
+    """Size of the counterexample, steps."""
+    norm_whole: float
+    """Size of the whole change at `scale_whole`, steps."""
+    norm: float
+    """Size of the minimal change, steps."""
+    outcome: PartOutcome
+    """The detector's result at the minimal change."""
+    violations: tuple[str, ...]
+    """Violations found by the independent feasibility check."""
+    sizes: tuple[ChangeSize, ...]
+    """Size of each parameter of each object."""
+    failures: tuple[Failure, ...]
+    """Failures at the minimal change."""
+    theta: tuple[Coordinate, ...]
+    """Coordinates of the minimal change that are not 0."""
+
+    @property
+    def left(self) -> float:
+        """Size relative to the counterexample's."""
+        return self.norm / self.norm_found
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Parameters of the minimal change."""
+        return tuple(dict.fromkeys(size.parameter for size in self.sizes))
+
+    @property
+    def objects(self) -> tuple[int, ...]:
+        """Objects that the minimal change moves."""
+        return tuple(sorted({size.object for size in self.sizes if size.object is not None}))
+
+
+@dataclass(frozen=True, slots=True)
+class PixelSensitivity:
+    """Distribution of |d loss / d pixel| over one picture."""
+
+    objects: tuple[float, ...]
+    """Share on each object, in [0, 1]."""
+    background: float
+    """Share on the background, in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Explanation of one counterexample."""
+
+    identifier: str
+    """The frame."""
+    source: str
+    """Digest of the run's result.json."""
+    objects: int
+    """Number of objects in the scene."""
+    benign: PartOutcome
+    """The detector's result at theta0."""
+    found: PartOutcome
+    """Its result at the counterexample."""
+    contributions: tuple[Contribution, ...]
+    """Contributions of parameters, then of objects."""
+    exact: tuple[str, ...]
+    """Kinds of parts with exact Shapley values."""
+    sizes: tuple[ChangeSize, ...]
+    """Size of each parameter of each object."""
+    least: MinimalChange
+    """The minimal change."""
+    sensitivity: dict[str, PixelSensitivity]
+    """Pixel gradients of `benign` and `counterexample`; empty without a gradient."""
+    renders: int
+    """Number of thetas evaluated."""
+    seconds: float
+    """Run time; the only field that may differ between two calls."""
+
+    @property
+    def by_exchange(self) -> bool:
+        """Whether the scene fails at theta0 already, by the exchange of vehicles alone; there are no contributions
+        then, and the minimal change is empty.
+        """
+        return self.least.scan[0]
+
+    def of_kind(self, kind: str) -> tuple[Contribution, ...]:
+        """Return the contributions of one kind, `parameter` or `object`."""
+        return tuple(c for c in self.contributions if c.kind == kind)
+
 
 Kind = Literal["parameter", "object"]
 SURROUNDINGS = "surroundings"
@@ -231,3 +381,134 @@ def _marginal_gains(game: Game, order: NDArray[np.int64]) -> Floats:
     gains = np.zeros((len(order), len(values[0])))
     gains[order] = np.diff(np.stack(values), axis=0)
     return gains
+
+
+_HALVINGS = 5
+"""Bisection steps between two neighbours of the grid; a grid of 16 points resolves a scale to 1/512."""
+_ROUNDING = 1e-5
+"""Relative rounding error of norms in float32."""
+
+
+@dataclass(frozen=True, slots=True)
+class ThetaBlock:
+    """Coordinates that are dropped together."""
+
+    name: str
+    """Name of the block."""
+    mask: Tensor
+    """Its coordinates (D,) bool."""
+
+
+@dataclass(frozen=True, slots=True)
+class MinimalChangeSearch:
+    """Functions of theta (D,) that define the search."""
+
+    project: Callable[[Tensor], Tensor]
+    """Projects onto the feasible set."""
+    fails: Callable[[Tensor], bool]
+    """Whether the detector fails at a feasible theta."""
+    size: Callable[[Tensor], float]
+    """The norm to minimise."""
+    points: int
+    """Points of the grid of scales, without 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShortenedChange:
+    """Result of the search."""
+
+    theta: Tensor
+    """Smallest change found (D,), feasible and failing."""
+    scale: float
+    """Its scale relative to the remaining blocks, in [0, 1]."""
+    scan: tuple[bool, ...]
+    """Whether the whole change fails at each scale of the grid, 0 and 1 included."""
+    shortened: Tensor
+    """The whole change (D,) after the first bisection."""
+    shortened_scale: float
+    """Its scale, in [0, 1]."""
+    dropped: tuple[str, ...]
+    """Names of the dropped blocks, in order."""
+
+    @property
+    def sign_changes(self) -> int:
+        """Changes between failing and not failing along the grid; 1 if monotone."""
+        return sum(a != b for a, b in zip(self.scan, self.scan[1:], strict=False))
+
+
+def find_minimal_change(
+    theta: Tensor, blocks: Sequence[ThetaBlock], search: MinimalChangeSearch
+) -> ShortenedChange:
+    """Find the smallest part of a change that fails.
+
+    A block is dropped if the rest, at some scale, still fails and is no larger than before. This is repeated until
+    no block can be dropped.
+
+    Args:
+        theta: The change (D,).
+        blocks: Blocks to drop, in this order.
+        search: Functions that define the search.
+
+    Raises:
+        RangeError: The change does not fail, or no change is needed.
+    """
+    scan = tuple(_fails_at(theta, k / search.points, search) for k in range(search.points + 1))
+    if not scan[-1] or scan[0]:
+        actual = "one that does not" if not scan[-1] else "a failure without any change"
+        raise RangeError("theta", "a change that fails", actual)
+    first = scan.index(True)
+    scale = _bisect(theta, (first - 1) / search.points, first / search.points, search)
+    shortened, shortened_scale = search.project(theta * scale), scale
+    direction, dropped = theta, []
+    again = True
+    while again:
+        again = False
+        for block in blocks:
+            rest = torch.where(block.mask, torch.zeros_like(direction), direction)
+            if torch.equal(rest, direction) or not bool(rest.any()):
+                continue
+            rest_scale = _failing_scale_within(rest, search.size(search.project(direction * scale)), search)
+            if rest_scale is not None:
+                direction, scale, again = rest, rest_scale, True
+                dropped.append(block.name)
+    if dropped:
+        scale = _smallest_failing_scale(direction, scale, search)
+    return ShortenedChange(
+        search.project(direction * scale), scale, scan, shortened, shortened_scale, tuple(dropped)
+    )
+
+
+def _fails_at(direction: Tensor, scale: float, search: MinimalChangeSearch) -> bool:
+    return search.fails(search.project(direction * scale))
+
+
+def _failing_scale_within(direction: Tensor, max_size: float, search: MinimalChangeSearch) -> float | None:
+    """Return the smallest failing scale on half the grid with a change not larger than `max_size`, or None."""
+    limit = min(1.0, max_size / search.size(direction))
+    points = max(search.points // 2, 1)
+    for k in range(1, points + 1):
+        scale = limit * k / points
+        theta = search.project(direction * scale)
+        # projected, a change may be longer than its scale implies: the feasible set need not be star-shaped
+        if search.size(theta) <= max_size * (1 + _ROUNDING) and search.fails(theta):
+            return scale
+    return None
+
+
+def _smallest_failing_scale(direction: Tensor, scale: float, search: MinimalChangeSearch) -> float:
+    """Return the smallest failing scale up to `scale`, which fails, by grid and bisection."""
+    for k in range(1, search.points):
+        if _fails_at(direction, scale * k / search.points, search):
+            return _bisect(direction, scale * (k - 1) / search.points, scale * k / search.points, search)
+    return _bisect(direction, scale * (search.points - 1) / search.points, scale, search)
+
+
+def _bisect(direction: Tensor, low: float, high: float, search: MinimalChangeSearch) -> float:
+    """Bisect an interval of scales; its upper end fails, its lower end does not. Return its failing end."""
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        if _fails_at(direction, middle, search):
+            high = middle
+        else:
+            low = middle
+    return high

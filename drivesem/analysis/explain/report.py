@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich import box
 
-from drivesem.analysis.explain.attribution import ChangeSize
-from drivesem.analysis.explain.results import Contribution, Explanation, PartOutcome
+from drivesem.analysis.explain.attribution import ChangeSize, Contribution, Explanation, PartOutcome
 from drivesem.evaluation.curves import ClassMatches
 from drivesem.evaluation.resampling import Interval, NamedMetric, WeightedRecall, bootstrap_intervals
 from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure

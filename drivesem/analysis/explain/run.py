@@ -17,31 +17,32 @@ from detectors.base import Detector
 from detectors.types import CLASSES
 from drivesem.analysis.explain import sensitivity
 from drivesem.analysis.explain.attribution import (
+    EXPLANATION,
     MOST_EXACT,
+    SCHEMA,
+    Contribution,
+    Explanation,
     Flags,
     Floats,
+    MinimalChange,
+    MinimalChangeSearch,
+    PartOutcome,
+    PixelSensitivity,
+    ShortenedChange,
+    ThetaBlock,
     ThetaPart,
+    find_minimal_change,
     list_object_parameters,
     measure_change,
     shapley_values,
     split_by_object,
     split_by_parameter,
 )
-from drivesem.analysis.explain.minimal import MinimalChangeSearch, ShortenedChange, ThetaBlock, find_minimal_change
 from drivesem.analysis.explain.report import (
     build_explain_report,
     exchange_note,
     plot_waterfalls,
     summarise_parameters,
-)
-from drivesem.analysis.explain.results import (
-    EXPLANATION,
-    SCHEMA,
-    Contribution,
-    Explanation,
-    MinimalChange,
-    PartOutcome,
-    PixelSensitivity,
 )
 from drivesem.attack.budgets import change_limits
 from drivesem.attack.feasibility_check import check_scene

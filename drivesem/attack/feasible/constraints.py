@@ -1,30 +1,36 @@
-"""Constraints on vehicles: limits, a scene's bounds and their violations; road, gaps and overlaps."""
+"""Constraints: limits and violations of road, gaps and overlaps; strain of meshes; combinations of weather codes."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
 
-from drivesem.attack.feasible.camera import (
-    NEAR_M,
-    CameraProjection,
-    VehicleProjections,
-    VehicleVisibility,
-    VisibilityRays,
-)
 from drivesem.attack.feasible.vehicles import (
+    NEAR_M,
     TOLERANCE,
     Array,
+    CameraProjection,
     Flags,
     Indices,
     Turns,
+    Values,
     VehicleBoxes,
+    VehicleProjections,
+    VehicleVisibility,
+    VisibilityRays,
     cell_centres,
     footprint_centres,
     to_float64_array,
 )
-from scene_ir.types import SceneIR
+from drivesem.attack.space import ParameterSpace
+from scene_ir import ffd
+from scene_ir.types import LATTICE, SceneIR
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,3 +291,237 @@ class RoadMap:
         count = inside.sum(axis=1)
         share = ((top + down * (bottom - top)) * inside).sum(axis=1) / np.maximum(count, 1)
         return np.where(count * 4 >= inside.shape[1], share, 1.0)
+
+
+_STRAIN_GRID = (5, 5, 5)
+"""Grid points of the unit box at which strain is bounded; the independent check uses a finer grid."""
+
+
+class StrainBound:
+    """Bounds on the deformation of N vehicles: singular values, determinant of its Jacobian, nothing below y = 0.
+
+    All is measured at P points of the unit box. A bound that a vehicle violates at theta = 0 is widened to its
+    value there; `violated_at_start` (N,) lists those vehicles.
+    """
+
+    def __init__(self, source: Array, strain: tuple[float, float]) -> None:
+        axes = [np.linspace(0, 1, n) for n in _STRAIN_GRID]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) - [0.5, 1.0, 0.5]
+        mirrored = source.reshape(-1, *LATTICE, 3)[:, :, :, ::-1] * [1.0, 1.0, -1.0]
+        if np.array_equal(mirrored.reshape(source.shape), source):
+            grid = grid[grid[:, 2] <= 0]  # codes are symmetric: left and right are strained equally
+        unit, start = torch.from_numpy(grid), torch.from_numpy(source)
+        # Jacobian and height are linear in the codes: one matrix (96, 10 P).
+        basis = ffd.from_symmetric(torch.eye(ffd.SYMMETRIC_DIM, dtype=torch.float64))
+        weights, rest = ffd.lattice_weights(unit), torch.eye(3, dtype=torch.float64)
+        self._linear = _jacobian_and_height(ffd.jacobian(unit, basis) - rest, (weights @ basis)[..., 1])
+        self._linear = self._linear.reshape(ffd.SYMMETRIC_DIM, -1)
+        jacobian, height = ffd.jacobian(unit, start), unit[:, 1] + (weights @ start)[..., 1]
+        self._start = _jacobian_and_height(jacobian, height)
+        values = np.linalg.svd(jacobian.numpy(), compute_uv=False)
+        self._smallest, largest = values.min(axis=2), values.max(axis=2)
+        self._inverted = (np.linalg.det(jacobian.numpy()) <= 0).any(axis=1)
+        deepest = height.numpy().max(axis=1)
+        self.violated_at_start: Flags = (
+            (self._smallest.min(axis=1) < strain[0] - TOLERANCE)
+            | (largest.max(axis=1) > strain[1] + TOLERANCE)
+            | (deepest > TOLERANCE)
+            | self._inverted
+        )
+        self._low = np.minimum(strain[0], self._smallest.min(axis=1)) - TOLERANCE
+        self._high = np.maximum(strain[1], largest.max(axis=1)) + TOLERANCE
+        self._floor = np.maximum(0.0, deepest) + TOLERANCE
+        # A Jacobian that changes by less, in the Frobenius norm, stays within the bounds (Weyl's inequality).
+        self._room = np.minimum(self._smallest - self._low[:, None], self._high[:, None] - largest)
+
+    def change(self, mesh: Values) -> Array:
+        """Change (N, 10, P) of Jacobian and height under mesh codes (N, 96)."""
+        return (mesh @ self._linear).reshape(len(mesh), 10, -1)
+
+    def path(self, change: Array, cars: Flags, slack: float = 0.0) -> _StrainPath:
+        """The straight path from theta = 0 to a strain change.
+
+        Args:
+            change: (N, 10, P), as `change` returns it.
+            cars: (N,), the vehicles in question.
+            slack: by how much the bounds are tightened.
+        """
+        slopes = change[:, :9]
+        norm = np.sqrt(np.einsum("ncp,ncp->np", slopes, slopes))
+        owner, point = np.nonzero((norm >= self._room - slack) & cars[:, None])
+        low, high = self._low[owner] + slack, self._high[owner] - slack
+        # Only beyond the smallest singular value can a point turn inside out.
+        flips = (norm[owner, point] >= self._smallest[owner, point]) & ~self._inverted[owner]
+        return _StrainPath(
+            owner=owner,
+            start=self._start[owner, :9, point].T.copy(),
+            slope=slopes[owner, :, point].T.copy(),
+            bounds=np.stack([low * np.abs(low), high * high])[:, None],
+            flips=np.flatnonzero(flips),
+            height=self._start[:, 9],
+            rise=change[:, 9] * cars[:, None],
+            floor=self._floor - slack,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _StrainPath:
+    """Strain of N vehicles on the straight path from theta = 0 to a mesh code, at the K points that could violate
+    it.
+    """
+
+    owner: Indices
+    """(K,), the vehicle of each point."""
+    start: Array
+    """(9, K), Jacobian at theta = 0."""
+    slope: Array
+    """(9, K), change of the Jacobian along the path."""
+    bounds: Array
+    """(2, 1, K), smallest and largest square of a singular value."""
+    flips: Indices
+    """Points that could turn inside out."""
+    height: Array
+    """(N, P), height of all points at theta = 0, in unit boxes, y down."""
+    rise: Array
+    """(N, P), change of the height along the path."""
+    floor: Array
+    """(N,), largest allowed height."""
+
+    def violated_at(self, scale: Array) -> Flags:
+        """(N,), which vehicles are out of bounds at scales (N,) of the path.
+
+        Singular values lie in [low, high] where J J' - low^2 is positive definite and J J' - high^2 negative
+        definite. Leading minors decide that (Sylvester) at a tenth of the cost of a singular value decomposition.
+        """
+        wrong: Flags = (self.height + scale[:, None] * self.rise).max(axis=1) > self.floor
+        jacobian = (self.start + scale[self.owner] * self.slope).reshape(3, 3, -1)
+        # Dot products of the rows: 0 0, 1 1, 2 2, and 0 1, 1 2, 2 0.
+        squares, (g01, g12, g20) = (jacobian**2).sum(axis=1), (jacobian * jacobian[[1, 2, 0]]).sum(axis=1)
+        diagonal = squares - self.bounds
+        d0, d1, d2 = diagonal[:, 0], diagonal[:, 1], diagonal[:, 2]
+        minor01, minor02, mixed = d0 * d1 - g01 * g01, d0 * d2 - g20 * g20, d0 * g12 - g01 * g20
+        # The determinant times d0, which has its sign where the matrix is definite.
+        determinant = minor01 * minor02 - mixed * mixed
+        good = ((minor01 > 0) & (determinant > 0)).all(axis=0) & (d0[0] > 0) & (d0[1] < 0)
+        wrong[self.owner[~good]] = True
+        if len(self.flips):
+            flipped = np.linalg.det(jacobian[:, :, self.flips].transpose(2, 0, 1)) <= 0
+            wrong[self.owner[self.flips[flipped]]] = True
+        return wrong
+
+
+def _jacobian_and_height(jacobian: Tensor, height: Tensor) -> Array:
+    """Jacobian (N, P, 3, 3) and height (N, P) as (N, 10, P)."""
+    parts = [jacobian.flatten(2), height[..., None]]
+    return np.ascontiguousarray(torch.cat(parts, dim=2).transpose(1, 2).numpy())
+
+
+FindInvisible = Callable[[Array], Flags]
+"""Which objects (N,) are no longer visible under weather codes (4,)."""
+
+_DUSK = math.log10(15_000 / 3.4)
+"""Decades of illuminance (lx) from daylight (10,000 to 20,000 without direct sun) to the end of civil twilight,
+until which one sees without lamps: vehicles here have none lit. Illuminances, here and below, are from the RCA
+Electro-Optics Handbook (1974) and Schlyter's Radiometry and photometry in astronomy."""
+_COVER = math.log10(400 / 40)
+"""Decades that a closed cloud cover absorbs. Fog is a cloud cover on the ground."""
+_STORM = math.log10(2_000 / 200)
+"""Decades by which the clouds of strong rain are darker than other clouds."""
+_BRIGHT_RAIN = 0.5
+"""Maximum rain from a sky no more covered than in the photograph: showers in sunshine are light to moderate,
+strong rain needs deep, wide clouds (WMO, International Cloud Atlas: nimbostratus, cumulonimbus)."""
+CODE_SUMS = np.array(
+    [
+        # Drops of rain wash those of fog out of the air, the faster the stronger it rains; fog in rain forms where
+        # weak rain evaporates into cold air (AMS Glossary of Meteorology: washout, precipitation fog).
+        [1.0, 1.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0, -1.0],
+        [_COVER / _DUSK, _STORM / _DUSK, 1.0, _COVER / _DUSK],
+    ]
+)
+"""Sums (3, 4) of the codes of fog, rain, time of day and overcast."""
+CODE_SUM_LIMITS = np.array([1.0, _BRIGHT_RAIN, 1.0])
+"""Upper limits (3,) of CODE_SUMS."""
+RULE_NAMES = ("fog in rain", "rain without cover", "dark")
+_HALVINGS = 5
+"""Bisection steps of the visibility limit, to 1/32 of a change."""
+
+
+class WeatherSet:
+    """The feasible weather of one scene: a convex set of codes, restricted to those that keep vehicles visible."""
+
+    def __init__(
+        self, space: ParameterSpace, where: slice, joint: bool, find_invisible: FindInvisible | None
+    ) -> None:
+        """Prepare the set.
+
+        Args:
+            space: the scene's parameter space.
+            where: the weather block of theta.
+            joint: whether the codes are bounded together.
+            find_invisible: which objects are no longer visible under which codes; None: all stay visible.
+        """
+        self._where, self._find_invisible = where, find_invisible
+        self._start = to_float64_array(space.scene.environment.weather)
+        self._lower, self._upper = to_float64_array(space.lower)[where], to_float64_array(space.upper)[where]
+        # Sums that the photographed scene already exceeds may only not grow.
+        self._room = (
+            np.maximum(CODE_SUM_LIMITS - CODE_SUMS @ self._start, 0.0)
+            if joint
+            else np.full(len(CODE_SUM_LIMITS), np.inf)
+        )
+
+    def violations(self, values: Values) -> list[str]:
+        """Violations of theta (D,), which is inside its bounds, such as `weather: fog in rain`."""
+        change = values[self._where].astype(np.float64)
+        return [f"weather: {RULE_NAMES[k]}" for k in np.flatnonzero(self._exceeded(change))] + self._invisible(
+            change
+        )
+
+    def project(self, values: Values, unclipped: Values) -> list[str]:
+        """Move theta into the set, in place: first to the nearest codes that occur together, then towards the
+        photograph until all vehicles are visible.
+
+        Args:
+            values: theta (D,), inside its bounds.
+            unclipped: theta (D,) before it was clipped to its bounds; the nearest codes are nearest to it.
+
+        Returns:
+            The active constraints.
+        """
+        change = values[self._where]
+        active = [f"weather: {RULE_NAMES[k]}" for k in np.flatnonzero(self._exceeded(change.astype(np.float64)))]
+        if active:
+            change[:] = np.clip(
+                self._find_nearest(unclipped[self._where].astype(np.float64)), self._lower, self._upper
+            )
+        invisible = self._invisible(change.astype(np.float64))
+        if invisible:
+            goal, low, high = change.copy(), 0.0, 1.0
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (low + high)
+                # Test what is returned: codes rounded as theta is.
+                change[:] = goal * middle
+                low, high = (low, middle) if self._invisible(change.astype(np.float64)) else (middle, high)
+            change[:] = goal * low
+        return active + invisible
+
+    def _exceeded(self, change: Array) -> Flags:
+        """(3,), which of CODE_SUMS exceed their limits."""
+        return CODE_SUMS @ change > self._room + TOLERANCE
+
+    def _invisible(self, change: Array) -> list[str]:
+        if self._find_invisible is None or not change.any():
+            return []
+        return [f"objects[{i}]: contrast" for i in np.flatnonzero(self._find_invisible(self._start + change))]
+
+    def _find_nearest(self, codes: Array) -> Array:
+        """The point (4,) of the set nearest to codes (4,), exactly: the distance to a polyhedron by non-negative
+        least squares (Lawson and Hanson 1974, chapter 23).
+        """
+        axes = np.eye(len(codes))
+        rows = np.concatenate([-CODE_SUMS, axes, -axes])
+        offsets = np.concatenate([-self._room, self._lower, -self._upper]) - rows @ codes
+        system, target = np.vstack([rows.T, offsets]), np.append(np.zeros(len(codes)), 1.0)
+        residual = system @ nnls(system, target)[0] - target
+        return codes - residual[:-1] / residual[-1]

@@ -22,10 +22,12 @@ from drivesem.attack.feasible.constraints import (
     ConstraintBounds,
     ConstraintViolations,
     FeasibilityLimits,
+    FindInvisible,
     MeasuredScene,
+    StrainBound,
+    WeatherSet,
     find_occluders,
 )
-from drivesem.attack.feasible.strain import StrainBound
 from drivesem.attack.feasible.vehicles import (
     TOLERANCE,
     Array,
@@ -39,7 +41,6 @@ from drivesem.attack.feasible.vehicles import (
     to_float64_array,
     unit_complex,
 )
-from drivesem.attack.feasible.weather import FindInvisible, WeatherSet
 from drivesem.attack.space import Parameter, ParameterSpace, behind_camera, ground_axes
 from drivesem.attack.theta import ProjectedTheta
 

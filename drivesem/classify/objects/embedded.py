@@ -7,14 +7,17 @@ from zlib import crc32
 
 import numpy as np
 
-from drivesem.classify.objects.generated.airplanes import AIRPLANES
-from drivesem.classify.objects.generated.boats import BOATS
-from drivesem.classify.objects.generated.builder import ObjectBuilder
-from drivesem.classify.objects.generated.cycles import MOTORCYCLES, SKATEBOARDS
-from drivesem.classify.objects.generated.helmets import HELMETS
-from drivesem.classify.objects.generated.street import BENCHES, MAILBOXES, TRASHCANS
-from drivesem.classify.objects.generated.towers import TOWERS
-from drivesem.classify.objects.generated.vehicles import BUSES, CARS, TRAINS
+from drivesem.classify.objects.generated.shapes import ObjectBuilder
+from drivesem.classify.objects.generated.structures import BENCHES, HELMETS, MAILBOXES, TOWERS, TRASHCANS
+from drivesem.classify.objects.generated.vehicles import (
+    AIRPLANES,
+    BOATS,
+    BUSES,
+    CARS,
+    MOTORCYCLES,
+    SKATEBOARDS,
+    TRAINS,
+)
 from drivesem.classify.objects.types import CLASSES, ObjectModel, ObjectSet, Split
 from scene_ir.errors import RangeError
 

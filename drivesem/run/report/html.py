@@ -16,9 +16,16 @@ from drivesem.failures.grades import Grade
 from drivesem.report import web
 from drivesem.report.tables import format_count
 from drivesem.run.report import page as grading
-from drivesem.run.report.charts import MetricDrop, curve_chart, drop_chart, legend_key, loss_trace_chart
 from drivesem.run.report.frames import CloseUp, FrameCard, build_cards, describe_outcome, format_size
-from drivesem.run.report.page import ReportedRun, ReportPage
+from drivesem.run.report.page import (
+    MetricDrop,
+    ReportedRun,
+    ReportPage,
+    curve_chart,
+    drop_chart,
+    legend_key,
+    loss_trace_chart,
+)
 from drivesem.run.results import RunSummary
 
 _COLUMNS = {

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from scene_ir.raster.launch import array, launch, split_range, start_warp
-from scene_ir.raster.plan import int32_faces
+from scene_ir.raster.layout import int32_faces
 
 start_warp()
 wp.set_module_options({"fuse_fp": False, "fast_math": False, "enable_backward": False})

@@ -1,7 +1,5 @@
 """The shared loss and decoding of dense detectors, with values computed by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

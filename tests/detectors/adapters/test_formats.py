@@ -1,7 +1,5 @@
 """Outputs of the known families, planted by hand, and the YAML files that say how to read others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """TorchScript and torch.export files and user classes as differentiable detectors; invalid files."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from pathlib import Path

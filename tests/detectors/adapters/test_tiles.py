@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from detectors.adapters.tiles import MAX_ENLARGEMENT, OVERLAP, Tile, is_cut_by_tile, make_tiles, merge_tiles
+from detectors.adapters.onnx import MAX_ENLARGEMENT, OVERLAP, Tile, is_cut_by_tile, make_tiles, merge_tiles
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """torchvision's detection models behind the contract; untrained, their normalisation settled on one picture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A detector of the Ultralytics package behind the contract; untrained, as its own file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

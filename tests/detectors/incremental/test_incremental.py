@@ -1,7 +1,5 @@
 """Passes on changed regions against whole passes: values, gradients, memory, and when they give way."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Regions against masks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A network of the family that is small enough for tests."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Darknet's `.weights`: equal outputs after writing and reading; order by hand; files that do not fit."""
 
-from __future__ import annotations
-
 import resource
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """YOLOv3: places of anchors, the loss by hand, decoding, gradients, the folded network."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

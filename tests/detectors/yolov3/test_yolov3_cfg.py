@@ -1,11 +1,9 @@
 """Darknet's `.cfg`: what is read, what is written, what is refused; the published networks."""
 
-from __future__ import annotations
-
 import pytest
 
 from detectors.base import DetectorError
-from detectors.yolov3 import layouts
+from detectors.yolov3 import cfg as layouts
 from detectors.yolov3.cfg import (
     ConvolutionLayer,
     MaxPoolLayer,

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.feasible.constraints import FeasibilityLimits
+from drivesem.attack.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, FeasibilityLimits
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.feasible.weather import CODE_SUM_LIMITS, CODE_SUMS
 from drivesem.attack.space import Budget, ParameterSpace
 
 EXACT = 2e-3

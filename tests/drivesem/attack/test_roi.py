@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from drivesem.attack.budgets import PRESETS, change_limits
 from drivesem.attack.feasibility_check import check_limits, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.roi import RegionsOfInterest
-from drivesem.attack.space import COMBOS, Budget, ParameterSpace
+from drivesem.attack.space import COMBOS, Budget, ParameterSpace, RegionsOfInterest
 from scene_ir.errors import FormatError
 
 NEAR = ((-2.0, 9.0), (2.4, 13.0), (0.4, 24.0))

@@ -146,7 +146,7 @@ def test_flatten_rejects_what_does_not_fit(street):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_theta0_changes_nothing_to_the_bit(street, dtype):
+def test_theta0_gives_the_same_scene_to_the_bit(street, dtype):
     generator = torch.Generator().manual_seed(3)
     scene = street(dtype=dtype, tilt=0.02)
     scene = scene.with_objects(

@@ -74,11 +74,11 @@ def test_a_frame_is_measured(tmp_path: Path) -> None:
     assert isinstance(detector, Detector)
     frames = boxes.read_labelled_frames(archive(tmp_path / "a.tar.xz", {"000001": [CAR]}), 1)
     (cost,) = boxes.measure(frames, detector, 0, "cpu")
-    assert (cost.frame, cost.vehicles) == ("000001", 1)
-    assert 0.001 < cost.changed < 0.1
-    assert min(cost.ratio, cost.first_ratio, cost.step_ms, cost.detector_ms) > 0
-    row = boxes.BoxesRow.from_frames([cost, cost])
-    assert (row.frames, row.median_ratio, row.p90_ratio, row.worst_ratio) == (2, *(cost.ratio,) * 3)
-    assert cost.cpu_ratio > 0
-    assert (row.median_cpu_ratio, row.p90_cpu_ratio, row.worst_cpu_ratio) == (cost.cpu_ratio,) * 3
-    assert 0 < cost.step_cpu_ms < torch.get_num_threads() * 2 * cost.step_ms + 20
+    assert (cost["frame"], cost["vehicles"]) == ("000001", 1)
+    assert 0.001 < cost["changed"] < 0.1
+    assert min(cost["ratio"], cost["first_ratio"], cost["step_ms"], cost["detector_ms"]) > 0
+    row = boxes.summarise([cost, cost])
+    assert (row["frames"], row["median_ratio"], row["p90_ratio"], row["worst_ratio"]) == (2, *(cost["ratio"],) * 3)
+    assert cost["cpu_ratio"] > 0
+    assert (row["median_cpu_ratio"], row["p90_cpu_ratio"], row["worst_cpu_ratio"]) == (cost["cpu_ratio"],) * 3
+    assert 0 < cost["step_cpu_ms"] < torch.get_num_threads() * 2 * cost["step_ms"] + 20

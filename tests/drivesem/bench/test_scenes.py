@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.bench.remesh import set_triangle_count
-from drivesem.bench.scenes import HEIGHT, KITTI_BOX_PIXELS, WIDTH, PackedMeshes, build_bench_scene
+from drivesem.bench.scenes import (
+    HEIGHT,
+    KITTI_BOX_PIXELS,
+    WIDTH,
+    PackedMeshes,
+    build_bench_scene,
+    set_triangle_count,
+)
 from scene_ir.errors import RangeError
 from scene_ir.meshes.templates import template
 from scene_ir.render.compositor import Compositor

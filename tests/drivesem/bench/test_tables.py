@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from drivesem.bench import step, tables
+from drivesem.bench import session as tables
+from drivesem.bench import step
 from scene_ir.errors import FormatError
 from tools.bench import memory
 

@@ -8,7 +8,7 @@ import trimesh
 from torch import nn
 
 from drivesem.classify import attack, gate, pictures, training
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import prepare_for_inference
 from drivesem.classify.objects.types import ObjectModel
 from drivesem.cli import main

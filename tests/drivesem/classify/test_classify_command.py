@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from drivesem.classify import attack, pictures, training
-from drivesem.classify.methods import attacked_parameters, parameter_bounds, step_sizes
 from drivesem.classify.networks import loading
+from drivesem.classify.objective import attacked_parameters, parameter_bounds, step_sizes
 from drivesem.config.parsing import parse
 from scene_ir import files
 from tests.drivesem.classify.conftest import ColourClassifier, error_line, use_solids

@@ -49,7 +49,7 @@ def frame_result(name: str, found: tuple[bool, bool] = (False, True), score: flo
     )
 
 
-def _write(folder: Path, same: bool = False, params: str = "rotate") -> Path:
+def write_finished_run(folder: Path, same: bool = False, params: str = "rotate") -> Path:
     """same: the counterexample is the photograph."""
     names = ("a", "b", "c")
     files.write_text(folder / "config.yaml", to_yaml(AttackConfig(params=params)))
@@ -70,4 +70,4 @@ def _write(folder: Path, same: bool = False, params: str = "rotate") -> Path:
 
 @pytest.fixture
 def write_run() -> Callable[..., Path]:
-    return _write
+    return write_finished_run

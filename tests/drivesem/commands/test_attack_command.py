@@ -21,16 +21,10 @@ from drivesem.run.results import load_frame
 from drivesem.synth.demo import demo_scene
 from drivesem.synth.write import Order, synthesise
 from scene_ir.io import load_scene
+from tests.drivesem.invoke import invoke, refusal, run_json
 
-WORDS = ["attack", "--combo", "2", "--steps", "2", "--json"]
+WORDS = ["attack", "--combo", "2", "--steps", "2"]
 PARTS = ("benign.png", "rerender.png", "counterexample.png", "overlay.png", "difference.png", "theta.json")
-
-
-def attack(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """Run a command that must succeed and print one JSON object on standard output, and nothing else."""
-    capsys.readouterr()
-    assert main(words) == 0
-    return json.loads(capsys.readouterr().out)
 
 
 def without_times(value: Any) -> Any:
@@ -56,7 +50,7 @@ def contents(folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "whole"
-    assert main([*WORDS, "--limit", "2", "--out", str(out)]) == 0
+    run_json(*WORDS, "--limit", "2", "--out", out)
     return out
 
 
@@ -92,38 +86,35 @@ def test_folder(finished: Path) -> None:
     assert "https://" not in page
 
 
-def test_a_stopped_run_goes_on_and_ends_the_same(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stopped_run_goes_on_and_ends_the_same(finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped"
     shutil.copytree(finished, out)
     shutil.rmtree(out / "frames" / "demo-001")
     for name in ("metrics.json", "manifest.json", "report.html"):
         (out / name).unlink()
     retained = (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
-    attack([*WORDS, "--limit", "2", "--out", str(out)], capsys)
+    run_json(*WORDS, "--limit", "2", "--out", out)
     assert (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == retained
     assert contents(out) == contents(finished)
 
 
-def test_other_settings_do_not_mix(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_settings_do_not_mix(finished: Path) -> None:
     before = contents(finished)
-    assert main([*WORDS, "--limit", "2", "--out", str(finished), "--seed", "5"]) == 2
-    assert "seed" in capsys.readouterr().err
+    assert "seed" in refusal(*WORDS, "--limit", "2", "--out", finished, "--seed", "5")
     assert contents(finished) == before
 
 
-def test_a_run_with_other_settings_is_refused(finished: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_run_with_other_settings_is_refused(finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(finished, out)
-    assert main([*WORDS, "--limit", "2", "--target-classes", "Car", "--out", str(out)]) == 2
-    assert "found other values of target_classes" in capsys.readouterr().err
+    assert "found other values of target_classes" in refusal(
+        *WORDS, "--limit", "2", "--target-classes", "Car", "--out", out
+    )
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    assert main([*WORDS, "--limit", "1", "--out", str(tmp_path)]) == 2
-    assert "--out" in capsys.readouterr().err
+    assert "--out" in refusal(*WORDS, "--limit", "1", "--out", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -141,12 +132,11 @@ def kitti_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_kitti_folder(kitti_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_kitti_folder(kitti_folder: Path, tmp_path: Path) -> None:
     words = [*WORDS, "--dataset", "kitti", "--root", str(kitti_folder), "--no-fit", "--out", str(tmp_path / "run")]
-    assert main(words) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
+    error = refusal(*words)
     assert "000002.txt" in error
-    metrics = attack([*words, "--keep-going"], capsys)
+    metrics = run_json(*words, "--keep-going")
     assert metrics["frames"] == 1
     assert metrics["frames_without_vehicles"] == 2
     assert list(metrics["frames_failed"]) == ["000002"]
@@ -171,11 +161,11 @@ class Blinking:
 
 @pytest.mark.parametrize("method", ["random", "cma-es"])
 def test_searches_run_on_a_detector_without_gradient(
-    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blinking())
-    words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--json", "--out", str(tmp_path)]
-    metrics = attack([*words, "--method", method, "--queries", "2", "--t-star", "0.2"], capsys)
+    words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--out", str(tmp_path)]
+    metrics = run_json(*words, "--method", method, "--queries", "2", "--t-star", "0.2")
     assert metrics["queries"] == 2
     assert metrics["t_star"] == 0.2
     assert metrics["feasible_fraction"] == 1.0
@@ -244,14 +234,12 @@ class Timid:
         return Detections(boxes, labels, torch.linspace(0.9, 0.6, len(boxes)))
 
 
-def test_failures_have_kinds_and_grades(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failures_have_kinds_and_grades(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     timid = Timid()
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: timid)
     words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--params", "weather"]
     words += ["--method", "random", "--queries", "2", "--nuisances", "off", "--budget", "weather=0.2"]
-    metrics = attack([*words, "--json", "--out", str(tmp_path / "run")], capsys)
+    metrics = run_json(*words, "--out", tmp_path / "run")
     grades, kinds = metrics["grades"], metrics["kinds"]
     assert list(grades) == ["threshold", "certain", "confirmed", "shared"]
     assert grades["threshold"] == metrics["lost_objects"] + metrics["phantoms"]
@@ -271,8 +259,7 @@ def test_failures_have_kinds_and_grades(
     }
     assert {f.grade for f in result.failures if f.error is None} == {"threshold"}
     assert all((f.count.before, f.count.after) == (16, 16) for f in result.failures if f.error and f.count)
-    assert main([*words, "--out", str(tmp_path / "run")]) == 0
-    captured = " ".join(capsys.readouterr().out.split())
+    captured = " ".join(invoke(*words, "--out", tmp_path / "run").out.split())
     assert f"failures: 5 certain, 5 confirmed, 0 shared, of {grades['threshold']} by threshold" in captured
     assert "1 missed, 1 wrong class, 1 badly placed, 1 found twice, 1 on nothing" in captured
 
@@ -355,11 +342,9 @@ def test_methods_are_those_that_need_no_gradient() -> None:
         *(pytest.param(name, marks=pytest.mark.slow) for name in ("hide", "phantom", "localisation")),
     ],
 )
-def test_objectives_are_recorded_and_raised(
-    objective: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_objectives_are_recorded_and_raised(objective: str, tmp_path: Path) -> None:
     words = ["attack", "--params", "rotate", "--steps", "2", "--limit", "1", "--json", "--objective", objective]
-    attack([*words, "--out", str(tmp_path / "run")], capsys)
+    run_json(*words, "--out", tmp_path / "run")
     (folder,) = (tmp_path / "run" / "frames").iterdir()
     result = load_frame(folder / "result.json")
     if not result.failures:  # then the loss alone chose among the iterates
@@ -368,19 +353,20 @@ def test_objectives_are_recorded_and_raised(
 
 
 @pytest.mark.slow
-def test_what_is_not_aimed_at_is_no_success(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_aimed_at_is_no_success(tmp_path: Path) -> None:
     aimed = [*WORDS, "--limit", "2", "--target-objects", "0"]
-    attack([*aimed, "--out", str(tmp_path / "one")], capsys)
+    run_json(*aimed, "--out", tmp_path / "one")
     for folder in (tmp_path / "one" / "frames").iterdir():
         result = load_frame(folder / "result.json")
         assert all(failure.kind == "lost" and failure.index == 0 for failure in result.failures)
         assert result.success_moved == bool(result.failures)
-    assert main([*WORDS, "--limit", "1", "--target-objects", "99", "--out", str(tmp_path / "none")]) == 2
-    assert "1 frame without" in capsys.readouterr().err
+    assert "1 frame without" in refusal(
+        *WORDS, "--limit", "1", "--target-objects", "99", "--out", tmp_path / "none"
+    )
 
 
 def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = torch.autograd.grad
     frames: list[int] = []
@@ -394,31 +380,33 @@ def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
 
     monkeypatch.setattr("drivesem.attack.objective.torch.autograd.grad", broken)
     words = ["attack", "--params", "rotate", "--steps", "1", "--limit", "2", "--workers", "1"]
-    assert main([*words, "--out", str(tmp_path / "ends")]) == 2
-    (line,) = [ln for ln in capsys.readouterr().err.splitlines() if ln.startswith("drivesem:")]
+    (line,) = [
+        ln
+        for ln in invoke(*words, "--out", tmp_path / "ends", code=2).err.splitlines()
+        if ln.startswith("drivesem:")
+    ]
     assert "gradient of objects[0].yaw: expected a finite value, found nan" in line
     assert line.startswith("drivesem: frame ")
     frames.clear()
-    captured = attack([*words, "--json", "--keep-going", "--out", str(tmp_path / "goes")], capsys)
+    captured = run_json(*words, "--keep-going", "--out", tmp_path / "goes")
     ((name, reason),) = captured["frames_failed"].items()
     assert captured["frames"] == 1
     assert reason.startswith(f"frame {name}: gradient of objects[0].yaw")
 
 
 def test_incremental_passes_that_differ_are_reported_and_whole_ones_used(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """With a limit below 0, every detector's incremental passes differ."""
     words = [*WORDS, "--limit", "2", "--workers", "1"]
-    expected = attack([*words, "--whole", "--out", str(tmp_path / "whole")], capsys)
+    expected = run_json(*words, "--whole", "--out", tmp_path / "whole")
     monkeypatch.setattr(reference, "MAX_LOGIT_DIFFERENCE", -1.0)
     passes = []
     changed = reference.ReferencePass._changed
     monkeypatch.setattr(
         reference.ReferencePass, "_changed", lambda self, *given: passes.append(0) or changed(self, *given)
     )
-    assert main([*words, "--out", str(tmp_path / "regions")]) == 0
-    captured = capsys.readouterr()
+    captured = invoke(*words, "--json", "--out", tmp_path / "regions")
     assert captured.err.count("incremental passes differ from whole ones") == 1
     assert len(passes) == 1
     (line,) = [line for line in captured.err.splitlines() if "incremental passes differ" in line]

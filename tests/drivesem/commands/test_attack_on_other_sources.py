@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -16,6 +14,7 @@ from drivesem.run.results import load_frame
 from drivesem.synth.write import Order, synthesise
 from scene_ir import files
 from scene_ir.io import load_scene
+from tests.drivesem.invoke import invoke, refusal, run_json
 
 ATTACK = [
     "attack",
@@ -32,12 +31,6 @@ ATTACK = [
 ]
 OWN = ("camera", "truncation", "visible", "occlusion", "track", "pose")
 """What only this project's COCO files say."""
-
-
-def run(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    capsys.readouterr()
-    assert main(words) == 0
-    return json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture(scope="module")
@@ -70,11 +63,9 @@ def plain_coco(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_coco_is_attacked_by_its_2d_boxes(
-    plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_coco_is_attacked_by_its_2d_boxes(plain_coco: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    summary = run([*ATTACK, "--dataset", "coco", "--root", str(plain_coco), "--out", str(out)], capsys)
+    summary = run_json(*ATTACK, "--dataset", "coco", "--root", plain_coco, "--out", out)
     assert summary["frames"] == 2
     assert summary["objects"] >= 4
     assert summary["feasible_fraction"] == 1.0
@@ -94,28 +85,23 @@ def test_coco_is_attacked_by_its_2d_boxes(
         for box in scene.objects.box2d:
             assert float((torch.tensor(given) - box).abs().amax(1).min()) < 0.01
         assert result.identity_psnr_db is None or result.identity_psnr_db > 40
-    capsys.readouterr()
     assert main(["verify", str(out), "--json"]) == 0
 
 
-def test_yolo_is_attacked_and_a_focal_length_may_be_given(
-    plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_yolo_is_attacked_and_a_focal_length_may_be_given(plain_coco: Path, tmp_path: Path) -> None:
     folder = tmp_path / "yolo"
     assert main(["convert", str(plain_coco), "--to", "yolo", "--out", str(folder), "--copy-images"]) == 0
     words = [*ATTACK, "--dataset", "yolo", "--root", str(folder), "--focal", "650", "--limit", "1"]
-    assert run([*words, "--out", str(tmp_path / "run")], capsys)["frames"] == 1
+    assert run_json(*words, "--out", tmp_path / "run")["frames"] == 1
     (frame,) = (tmp_path / "run" / "frames").iterdir()
     assert load_scene(frame / "scene").provenance["focal"] == "650.0 px, given"
 
 
-def test_coco_is_trained_on_and_judged(
-    plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_coco_is_trained_on_and_judged(plain_coco: Path, tmp_path: Path) -> None:
     data = ["--dataset", "coco", "--root", str(plain_coco)]
     words = ["train", *data, "--steps", "1", "--batch", "2", "--window", "320x160", "--evaluate-every", "0"]
-    assert run([*words, "--json", "--out", str(tmp_path / "T")], capsys)["frames"] == 2
-    assert run(["eval", "--detector", "squeezedet", *data, "--json", "--workers", "1"], capsys)["frames"] == 2
+    assert run_json(*words, "--json", "--out", tmp_path / "T")["frames"] == 2
+    assert run_json("eval", "--detector", "squeezedet", *data, "--json", "--workers", "1")["frames"] == 2
 
 
 @pytest.fixture(scope="module")
@@ -127,84 +113,59 @@ def photographs(plain_coco: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.mark.slow
-def test_photographs_without_labels_are_attacked(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_photographs_without_labels_are_attacked(photographs: Path, tmp_path: Path) -> None:
     words = [*ATTACK, "--dataset", "photographs", "--root", str(photographs), "--focal", "650"]
-    summary = run([*words, "--finder", "yolov3-slim", "--out", str(tmp_path / "run")], capsys)
+    summary = run_json(*words, "--finder", "yolov3-slim", "--out", tmp_path / "run")
     assert summary["frames"] >= 1
     one = next(photographs.iterdir())
-    alone = run([*words[:-3], str(one), "--out", str(tmp_path / "one")], capsys)
+    alone = run_json(*words[:-3], one, "--out", tmp_path / "one")
     assert alone["frames"] == 1
     (frame,) = (tmp_path / "one" / "frames").iterdir()
     assert frame.name == one.stem
 
 
-def test_a_photograph_is_taken_apart_by_another_detector(
-    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_photograph_is_taken_apart_by_another_detector(photographs: Path, tmp_path: Path) -> None:
     one = sorted(photographs.iterdir())[-1]
     words = ["derender", str(one), "--fast", "--json", "--workers", "1", "--focal", "650"]
-    own = run([*words, "--out", str(tmp_path / "a")], capsys)
-    other = run([*words, "--detector", "yolov3-slim", "--out", str(tmp_path / "b")], capsys)
+    own = run_json(*words, "--out", tmp_path / "a")
+    other = run_json(*words, "--detector", "yolov3-slim", "--out", tmp_path / "b")
     assert list(own["frames"]) == list(other["frames"]) == [one.stem]
     boxes = [load_scene(tmp_path / name / one.stem).objects.box2d for name in ("a", "b")]
     assert boxes[0].shape != boxes[1].shape or not torch.equal(boxes[0], boxes[1])
-    assert main([*words, "--detector", "none", "--out", str(tmp_path / "c")]) == 2
-    assert "--finder: expected a detector" in capsys.readouterr().err
+    assert "--finder: expected a detector" in refusal(*words, "--detector", "none", "--out", tmp_path / "c")
 
 
 @pytest.mark.slow
-def test_scenes_are_attacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_are_attacked(tmp_path: Path) -> None:
     scenes = tmp_path / "scenes"
     assert main(["derender", "--limit", "2", "--out", str(scenes), "--workers", "1"]) == 0
     words = [*ATTACK, "--dataset", "scenes", "--root"]
-    assert run([*words, str(scenes), "--out", str(tmp_path / "both")], capsys)["frames"] == 2
-    assert run([*words, str(scenes / "demo-001"), "--out", str(tmp_path / "one")], capsys)["frames"] == 1
-    demo = run([*ATTACK, "--limit", "2", "--out", str(tmp_path / "demo")], capsys)
+    assert run_json(*words, scenes, "--out", tmp_path / "both")["frames"] == 2
+    assert run_json(*words, scenes / "demo-001", "--out", tmp_path / "one")["frames"] == 1
+    demo = run_json(*ATTACK, "--limit", "2", "--out", tmp_path / "demo")
     for name in ("demo-000", "demo-001"):
         results = [load_frame(tmp_path / run / "frames" / name / "result.json") for run in ("both", "demo")]
         assert results[0].theta == results[1].theta  # a scene from its folder is the scene
     assert demo["frames"] == 2
     # a counterexample's own scene, as it was photographed
-    again = run([*words, str(tmp_path / "demo"), "--out", str(tmp_path / "again")], capsys)
+    again = run_json(*words, tmp_path / "demo", "--out", tmp_path / "again")
     assert again["frames"] == 2
     assert (tmp_path / "again" / "frames" / "demo-000").is_dir()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--dataset", "scenes", "--root", "."], r"expected a scene of drivesem derender"),
-        (["--dataset", "photographs", "--root", "."], r"expected photographs (.png, .jpg), found none"),
-        (["--dataset", "photographs"], "--root: expected the folder of data set 'photographs'"),
-        (["--dataset", "coco", "--root", "."], "found neither"),
-        (
-            ["--dataset", "coco", "--root", "none"],
-            "none: expected the folder of a data set (coco: ann",
-        ),
-        (["--focal", "700"], "--focal: expected --dataset coco, yolo, photographs"),
-        (["--finder", "yolov3-slim"], "--finder: expected --dataset photographs"),
-    ],
-)
-def test_bad_sources_are_one_line(words: list[str], message: str, refused: Any) -> None:
-    assert message in refused("attack", *words)
+def test_a_folder_of_another_layout_is_recognised(plain_coco: Path) -> None:
+    assert "it looks like coco (--dataset coco)" in refusal(*ATTACK, "--dataset", "kitti", "--root", plain_coco)
+    assert "it looks like coco (--dataset coco)" in refusal(
+        "eval", "--detector", "squeezedet", "--dataset", "yolo", "--root", plain_coco
+    )
 
 
-def test_a_folder_of_another_layout_is_recognised(plain_coco: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*ATTACK, "--dataset", "kitti", "--root", str(plain_coco)]) == 2
-    assert "it looks like coco (--dataset coco)" in capsys.readouterr().err
-    assert main(["eval", "--detector", "squeezedet", "--dataset", "yolo", "--root", str(plain_coco)]) == 2
-    assert "it looks like coco (--dataset coco)" in capsys.readouterr().err
-
-
-def test_nothing_to_attack_is_reported(
-    plain_coco: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_to_attack_is_reported(plain_coco: Path, tmp_path: Path) -> None:
     root = shutil.copytree(plain_coco, tmp_path / "coco")
     (path,) = (root / "annotations").iterdir()
     files.write_json(path, files.read_json(path) | {"annotations": []})
-    assert main([*ATTACK, "--dataset", "coco", "--root", str(root), "--out", str(tmp_path / "run")]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = invoke(
+        *ATTACK, "--dataset", "coco", "--root", root, "--out", tmp_path / "run", code=2
+    ).err.splitlines()
     assert line.endswith("found 2 frames without")
     assert str(root) in line

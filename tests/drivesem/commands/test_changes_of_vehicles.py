@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -69,20 +68,3 @@ def test_the_same_from_python(monkeypatch: pytest.MonkeyPatch) -> None:
     )  # fmt: skip
     assert "parks as" in found.result.change
     assert found.feasible
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--changes", "fly", *WORDS), "--changes: expected each at most once of leave, park, swap, load"),
-        (
-            ("--changes", "leave", "--method", "climb"),
-            "--changes: expected --budget street, found --budget paper",
-        ),
-        (("--changes", "leave", "--budget", "street"), "--changes: expected only with --method climb, corners"),
-        (("--mesh", "car.obj", *WORDS), "--mesh: expected --changes, found none"),
-        (("--changes", "park", "--mesh", "no.obj", *WORDS), "no.obj: expected"),
-    ],
-)
-def test_what_cannot_be_is_one_line(refused: Callable[..., str], words: tuple[str, ...], message: str) -> None:
-    assert refused("attack", "--limit", "1", *words).startswith(f"drivesem: {message}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,18 @@ import numpy as np
 import pytest
 import yaml
 
-from drivesem.analysis.confirm.comparison import ConfirmedFrame
+from drivesem.analysis.confirm import ConfirmedFrame
 from drivesem.cli import main
 from drivesem.failures.second_renderer import opengl as screen
 from drivesem.failures.second_renderer.generator import GeneratorRenderer
 from drivesem.run.records import load_record
 from drivesem.run.results import load_frame
 from scene_ir import files
+from tests.drivesem.invoke import invoke, run_json
+
+
+def confirm(run: Path, *words: object) -> Any:
+    return run_json("confirm", "--run", run, "--workers", "1", *words)
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +45,6 @@ def confirmed(attacked: Path) -> Path:
 @pytest.fixture
 def run(confirmed: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(confirmed, tmp_path / "source"))
-
-
-@pytest.fixture
-def confirm(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    def call(run: Path, *words: object) -> dict[str, Any]:
-        capsys.readouterr()
-        assert main(["confirm", "--run", str(run), "--workers", "1", "--json", *map(str, words)]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    return call
 
 
 def test_vehicles_stand_where_the_compositor_put_them(run: Path) -> None:
@@ -90,7 +84,7 @@ def test_files(run: Path) -> None:
 
 
 def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
-    run: Path, confirm: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = json.loads((run / "confirm" / "confirm.json").read_text())
     draws: list[int] = []
@@ -105,32 +99,25 @@ def test_a_second_call_draws_nothing_and_a_changed_frame_is_drawn_again(
     assert draws == [1, 1]
 
 
-def test_another_picture_is_refused(
-    run: Path, confirm: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_picture_is_refused(run: Path) -> None:
     benign = run / "frames" / "demo-000" / "scene" / "photograph.png"
     image = files.read_image(benign)
     image[5, 5] ^= 64
     files.write_png(benign, image)
     out = run / "again"
-    assert main(["confirm", "--run", str(run), "--workers", "1", "--out", str(out)]) == 2
-    output = " ".join(capsys.readouterr().err.split())
+    output = " ".join(invoke("confirm", "--run", run, "--workers", "1", "--out", out, code=2).err.split())
     assert (
         "photograph of demo-000: expected the image that the generator renders, found one 64 levels off" in output
     )
     words = ("--run", str(run), "--workers", "1", "--out", str(out), "--keep-going")
-    assert main(["confirm", *words]) == 2
-    assert "a run with frames that can be used" in " ".join(capsys.readouterr().err.split())
+    assert "a run with frames that can be used" in " ".join(invoke("confirm", *words, code=2).err.split())
 
 
-def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(run: Path, tmp_path: Path) -> None:
     def refused(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["confirm", "--workers", "1", *map(str, words)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        (line,) = invoke("confirm", "--workers", "1", *words, code=2).err.splitlines()
         return line.removeprefix("drivesem: ")
 
-    assert refused() == "--run: expected a folder of drivesem attack, found nothing"
     assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")
     assert refused("--run", run, "--root", tmp_path).startswith("--root: expected none for the embedded scenes")
     (run / "metrics.json").unlink()
@@ -151,7 +138,7 @@ def photographs(run: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("screen")
-def test_photographs_are_drawn_by_pyrender(photographs: Path, confirm: Callable[..., dict[str, Any]]) -> None:
+def test_photographs_are_drawn_by_pyrender(photographs: Path) -> None:
     data = confirm(photographs)
     assert (data["frames"], data["not_carried"]) == (1, {})
     assert data["box_iou"]["least"] > 0.99

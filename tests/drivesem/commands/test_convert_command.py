@@ -1,7 +1,6 @@
 """`drivesem convert`: there and back between layouts, and what it says is lost."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +8,13 @@ import pytest
 import torch
 from PIL import Image
 
-from drivesem.cli import main
 from drivesem.data.coco import CocoDataset
 from drivesem.data.kitti import KittiDataset, read_labels
 from drivesem.data.vkitti1 import Vkitti1Dataset
 from drivesem.data.vkitti2 import Vkitti2Dataset
 from drivesem.data.yolo import YoloDataset
+from tests.drivesem.invoke import invoke, refusal, run_json
 
-Convert = Callable[..., str]
 LABELS = """\
 Car 0.00 0 -1.57 100.41 106.40 229.75 189.25 1.55 1.63 3.89 -2.85 1.63 12.34 -1.80
 Van 0.35 3 1.85 0.00 100.02 81.33 200.50 2.11 1.90 5.08 -8.40 1.70 11.02 1.12
@@ -26,13 +24,8 @@ DontCare -1 -1 -10 240.79 112.01 260.53 118.90 -1 -1 -1 -1000 -1000 -1000 -10
 CALIB = "P2: 721.5377 0 180.5593 44.85728 0 721.5377 100.854 0.2163791 0 0 1 0.002745884\n"
 
 
-@pytest.fixture
-def convert(capsys: pytest.CaptureFixture[str]) -> Convert:
-    def call(*words: object) -> str:
-        assert main(["convert", *map(str, words)]) == 0
-        return capsys.readouterr().err
-
-    return call
+def convert(*words: object) -> str:
+    return invoke("convert", *words).err
 
 
 @pytest.fixture
@@ -55,7 +48,7 @@ def _labels(folder: Path) -> dict[str, list[list[str]]]:
     return {p.name: [line.split() for line in p.read_text().splitlines()] for p in sorted(folder.glob("*.txt"))}
 
 
-def test_kitti_to_coco_and_back(convert: Convert, kitti: Path, tmp_path: Path):
+def test_kitti_to_coco_and_back(kitti: Path, tmp_path: Path):
     text = convert(kitti, "--to", "coco", "--out", tmp_path / "coco", "--copy-images")
     assert "nothing lost" in text
     dataset = CocoDataset(tmp_path / "coco")
@@ -76,7 +69,7 @@ def test_kitti_to_coco_and_back(convert: Convert, kitti: Path, tmp_path: Path):
     assert KittiDataset(tmp_path / "back").frame("000003").camera.matrix.tolist() == theirs.camera.matrix.tolist()
 
 
-def test_coco_keeps_its_ids_and_keys(convert: Convert, tmp_path: Path):
+def test_coco_keeps_its_ids_and_keys(tmp_path: Path):
     content = {
         "images": [{"id": 42, "file_name": "b.jpg", "width": 640, "height": 480}],
         "annotations": [
@@ -99,7 +92,7 @@ def test_coco_keeps_its_ids_and_keys(convert: Convert, tmp_path: Path):
     assert (tmp_path / "kitti/b.txt").read_text().startswith("DontCare -1 -1 -10 -0.50 -0.50 29.50 39.50 -1")
 
 
-def test_kitti_to_yolo_and_back(convert: Convert, kitti: Path, tmp_path: Path):
+def test_kitti_to_yolo_and_back(kitti: Path, tmp_path: Path):
     text = convert(kitti, "--to", "yolo", "--out", tmp_path / "yolo", "--copy-images")
     assert "lost: 3D box of 3, alpha of 3, occlusion of 3, region of 1, truncation of 3" in text
     frame = YoloDataset(tmp_path / "yolo").frame("000003")
@@ -116,7 +109,7 @@ def test_kitti_to_yolo_and_back(convert: Convert, kitti: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize("layout", ["vkitti1", "vkitti2"])
-def test_kitti_to_virtual_kitti_and_back(convert: Convert, kitti: Path, tmp_path: Path, layout: str):
+def test_kitti_to_virtual_kitti_and_back(kitti: Path, tmp_path: Path, layout: str):
     text = convert(kitti, "--to", layout, "--out", tmp_path / "virtual", "--copy-images")
     assert "fraction of a pixel of 3" in text
     assert "region of 1" in text
@@ -142,7 +135,7 @@ def test_kitti_to_virtual_kitti_and_back(convert: Convert, kitti: Path, tmp_path
             assert (tmp_path / "again" / relative).read_text() == path.read_text(), relative
 
 
-def test_no_digit_is_lost_through_coco_and_yolo(convert: Convert, tmp_path: Path):
+def test_no_digit_is_lost_through_coco_and_yolo(tmp_path: Path):
     draw = np.random.default_rng(4)
     (tmp_path / "in").mkdir()
     lines = []
@@ -166,7 +159,7 @@ def test_no_digit_is_lost_through_coco_and_yolo(convert: Convert, tmp_path: Path
     assert boxes == [line.split()[4:8] for line in lines]
 
 
-def test_results_keep_their_scores(convert: Convert, tmp_path: Path):
+def test_results_keep_their_scores(tmp_path: Path):
     (tmp_path / "results").mkdir()
     line = "Car -1 -1 -10 100.41 106.40 229.75 189.25 -1 -1 -1 -1000 -1000 -1000 -10 0.123456789"
     (tmp_path / "results/000000.txt").write_text(line + "\n")
@@ -177,9 +170,8 @@ def test_results_keep_their_scores(convert: Convert, tmp_path: Path):
     assert (tmp_path / "back/000000.txt").read_text() == line + "\n"
 
 
-def test_json(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["convert", str(kitti), "--to", "yolo", "--out", str(tmp_path / "yolo"), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+def test_json(kitti: Path, tmp_path: Path):
+    data = run_json("convert", kitti, "--to", "yolo", "--out", tmp_path / "yolo")
     assert data["lost"]["3D box"] == 3
     assert data["assumed"] == {}
 
@@ -204,9 +196,7 @@ def test_json(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
         (["{dog}", "--to", "kitti", "--out", "{out}"], "class 'dog': expected one of Car, "),
     ],
 )
-def test_one_line_and_exit_code_2(
-    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-):
+def test_one_line_and_exit_code_2(kitti: Path, tmp_path: Path, words: list[str], message: str):
     flat = tmp_path / "flat"
     flat.mkdir()
     (flat / "000000.txt").write_text("Car 0 0 -10 1 2 30 40 -1 -1 -1 -1000 -1000 -1000 -10\n")
@@ -217,8 +207,7 @@ def test_one_line_and_exit_code_2(
     }
     (tmp_path / "dog.json").write_text(json.dumps(dog))
     places = {"kitti": kitti, "flat": flat, "dog": tmp_path / "dog.json", "out": tmp_path / "new"}
-    assert main(["convert", *(word.format(**places) for word in words)]) == 2
-    text = capsys.readouterr().err
+    text = invoke("convert", *(word.format(**places) for word in words), code=2).err
     assert len(text.splitlines()) == 1
     assert message in text
 
@@ -240,9 +229,7 @@ def two_parts(tmp_path: Path) -> Path:
     return root
 
 
-def test_images_of_coco_are_those_of_its_part(
-    convert: Convert, two_parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_images_of_coco_are_those_of_its_part(two_parts: Path, tmp_path: Path):
     source = two_parts / "annotations/instances_val.json"
     words = (source, "--to", "yolo", "--copy-images", "--out")
     convert(*words, tmp_path / "yolo")
@@ -255,13 +242,12 @@ def test_images_of_coco_are_those_of_its_part(
     assert (tmp_path / "again/images/train/000001.jpeg").read_bytes() == copied.read_bytes()
     # another part's is none
     picture.with_suffix(".jpeg").unlink()
-    assert main(["convert", *map(str, words), str(tmp_path / "none")]) == 2
-    assert "--copy-images: expected an image of each of 1 frames, found 0" in capsys.readouterr().err
+    assert "--copy-images: expected an image of each of 1 frames, found 0" in refusal(
+        "convert", *words, tmp_path / "none"
+    )
 
 
-def test_images_below_folders_are_found_by_name_and_none_outside(
-    convert: Convert, two_parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_images_below_folders_are_found_by_name_and_none_outside(two_parts: Path, tmp_path: Path):
     source = two_parts / "annotations/instances_train.json"
     content = json.loads(source.read_text())
     (two_parts / "images/train/day").mkdir()
@@ -277,13 +263,10 @@ def test_images_below_folders_are_found_by_name_and_none_outside(
         content["images"][0]["file_name"] = name
         source.write_text(json.dumps(content))
         words = [str(source), "--to", "yolo", "--copy-images", "--out", str(tmp_path / "none")]
-        assert main(["convert", *words]) == 2
-        assert "--copy-images: expected an image of each of 1 frames, found 0" in capsys.readouterr().err
+        assert "--copy-images: expected an image of each of 1 frames, found 0" in refusal("convert", *words)
 
 
-def test_a_file_with_splits_is_written_with_its_splits_names_and_attributes(
-    convert: Convert, two_parts: Path, tmp_path: Path
-):
+def test_a_file_with_splits_is_written_with_its_splits_names_and_attributes(two_parts: Path, tmp_path: Path):
     for part, weather in (("train", "rainy"), ("val", "clear")):
         source = two_parts / f"annotations/instances_{part}.json"
         content = json.loads(source.read_text())
@@ -306,7 +289,7 @@ def test_a_file_with_splits_is_written_with_its_splits_names_and_attributes(
     assert "split of 2" in convert(two_parts, "--to", "coco", "--out", tmp_path / "a.json")
 
 
-def test_classes_of_coco_follow_those_of_yolo(convert: Convert, tmp_path: Path):
+def test_classes_of_coco_follow_those_of_yolo(tmp_path: Path):
     root = tmp_path / "yolo"
     (root / "images/train").mkdir(parents=True)
     (root / "labels/train").mkdir(parents=True)
@@ -319,7 +302,7 @@ def test_classes_of_coco_follow_those_of_yolo(convert: Convert, tmp_path: Path):
     assert content["annotations"][0]["category_id"] == 2
 
 
-def test_names_of_images_that_stay_where_they_are(convert: Convert, two_parts: Path, tmp_path: Path):
+def test_names_of_images_that_stay_where_they_are(two_parts: Path, tmp_path: Path):
     source = two_parts / "annotations/instances_val.json"
     for words in ((), ("--map", "car=Car")):
         out = tmp_path / f"{len(words)}.json"
@@ -330,7 +313,7 @@ def test_names_of_images_that_stay_where_they_are(convert: Convert, two_parts: P
     assert json.loads((tmp_path / "of-yolo.json").read_text())["images"][0]["file_name"] == "000001.jpg"
 
 
-def test_regions_alone_are_no_detections(convert: Convert, tmp_path: Path):
+def test_regions_alone_are_no_detections(tmp_path: Path):
     (tmp_path / "in").mkdir()
     region = LABELS.splitlines(keepends=True)[-1]
     (tmp_path / "in/000000.txt").write_text(region)
@@ -338,7 +321,7 @@ def test_regions_alone_are_no_detections(convert: Convert, tmp_path: Path):
     assert (tmp_path / "out/000000.txt").read_text().startswith("DontCare -1 -1 -10 240.79 112.01 260.53 118.90")
 
 
-def test_images_of_kitti_labels_keep_their_suffix(convert: Convert, kitti: Path, tmp_path: Path):
+def test_images_of_kitti_labels_keep_their_suffix(kitti: Path, tmp_path: Path):
     for path in (kitti / "training/image_2").glob("*.png"):
         Image.open(path).save(path.with_suffix(".jpg"))
         path.unlink()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 
 import pytest
 
-from drivesem.cli import main
 from drivesem.commands import doctor
 from drivesem.commands.doctor import FEATURES, OptionalFeature, check_features
+from tests.drivesem.invoke import invoke, run_json
 
 
 def feature(code: str, name: str = "extra", needed: bool = False) -> OptionalFeature:
@@ -50,27 +49,24 @@ def test_results_keep_the_order() -> None:
     assert len(done) == 6
 
 
-def test_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(monkeypatch: pytest.MonkeyPatch) -> None:
     features = (
         feature("print('7')", "core", needed=True),
         feature("import no_such_thing", "extra"),
         feature("1 / 0", "sick"),
     )
     monkeypatch.setattr(doctor, "FEATURES", features)
-    assert main(["doctor"]) == 0
-    text = capsys.readouterr().out
+    text = invoke("doctor").out
     assert "extra: pip install extra" in text
     assert "ZeroDivisionError: division by zero" in text
     assert "everything that is required works" in text
-    assert main(["doctor", "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = run_json("doctor")
     assert (data["fit"], data["python"]) == (True, sys.version.split()[0])
     assert [(row["name"], row["status"]) for row in data["parts"]] == [
         ("core", "works"), ("extra", "missing"), ("sick", "broken"),
     ]  # fmt: skip
     monkeypatch.setattr(doctor, "FEATURES", (feature("import no_such_thing", "core", needed=True),))
-    assert main(["doctor"]) == 1
-    assert "drivesem cannot work here" in capsys.readouterr().out
+    assert "drivesem cannot work here" in invoke("doctor", code=1).out
 
 
 def test_probes_are_python() -> None:
@@ -89,6 +85,5 @@ def test_the_command_imports_no_feature() -> None:
 
 
 @pytest.mark.slow
-def test_this_machine_is_fit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["fit"]
+def test_this_machine_is_fit() -> None:
+    assert run_json("doctor")["fit"]

@@ -18,9 +18,9 @@ import torch
 from detectors.base import Detector
 from detectors.types import CLASSES, Detections
 from drivesem.analysis.explain import run as explaining
-from drivesem.analysis.explain.results import SCHEMA, Explanation
+from drivesem.analysis.explain.attribution import SCHEMA, Explanation
 from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.methods.placebo import FixedTheta
+from drivesem.attack.methods.gradient_free import FixedTheta
 from drivesem.attack.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
@@ -36,11 +36,16 @@ from scene_ir.io import load_scene
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
+from tests.drivesem.invoke import invoke, run_json
 
-EXPLAIN = ["explain", "--workers", "1", "--points", "4", "--json"]
+EXPLAIN = ["explain", "--workers", "1", "--points", "4"]
 T_STAR = 0.5
 GAIN = 2e3
 """Of brightness into score: moved by a few steps, the cars brighten one side of the picture enough to fail."""
+
+
+def explain(*words: object) -> Any:
+    return run_json(*EXPLAIN, *words)
 
 
 class Raw:
@@ -135,23 +140,13 @@ def explained(attacked: Path, tmp_path_factory: pytest.TempPathFactory, scene: S
     run = Path(shutil.copytree(attacked, tmp_path_factory.mktemp("explained") / "source"))
     with pytest.MonkeyPatch.context() as patch:
         _patch(patch, scene)
-        assert main([*EXPLAIN, "--run", str(run), "--bootstrap", "5"]) == 0
+        run_json(*EXPLAIN, "--run", run, "--bootstrap", "5")
     return run
 
 
 @pytest.fixture
 def run(attacked: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(attacked, tmp_path / "source"))
-
-
-@pytest.fixture
-def explain(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    def call(*words: object) -> dict[str, Any]:
-        capsys.readouterr()
-        assert main([*EXPLAIN, *map(str, words)]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    return call
 
 
 def test_a_frame_explained(explained: Path) -> None:
@@ -218,9 +213,7 @@ def test_files(explained: Path) -> None:
         assert f"({picture})" in page or picture.endswith("minimal.png")
 
 
-def test_a_second_call_explains_nothing_twice(
-    run: Path, explain: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_call_explains_nothing_twice(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = explain("--run", run)
     assert json.loads((run / "explain" / "explain.json").read_text()) == first
     explained_frames: list[str] = []
@@ -236,9 +229,7 @@ def test_a_second_call_explains_nothing_twice(
     assert main(["explain", "--run", str(run), "--workers", "1", "--points", "5"]) == 2
 
 
-def test_without_gradient(
-    run: Path, explain: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_gradient(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_folder, "load_predictor", lambda *_: Nameless())
     data = explain("--run", run, "--out", run / "other", "--least", "lost")
     assert data["rows"][0]["gradient_share"] is None
@@ -268,9 +259,7 @@ def exchanged(run: Path, name: str, share: float, scene: SceneIR) -> None:
     (run / "manifest.json").write_text(json.dumps(manifest))
 
 
-def test_frames_that_fail_by_the_exchange_alone_are_left_out(
-    run: Path, explain: Callable[..., dict[str, Any]], scene: SceneIR, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_that_fail_by_the_exchange_alone_are_left_out(run: Path, scene: SceneIR) -> None:
     alone = explain("--run", run, "--out", run / "alone")
     exchanged(run, "demo-001", 0.0, scene)
     exchanged(run, "demo-002", 0.1, scene)
@@ -287,19 +276,18 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(
         assert (found.contributions, found.least.theta, found.least.norm) == ((), (), 0)
         assert found.least.outcome == found.benign
         assert found.least.failures
-    capsys.readouterr()
-    assert main(["explain", "--run", str(run), "--workers", "1", "--frame", "demo-001", "--points", "4"]) == 2
-    error_line = " ".join(capsys.readouterr().err.split())
+    error_line = " ".join(
+        invoke(
+            "explain", "--run", run, "--workers", "1", "--frame", "demo-001", "--points", "4", code=2
+        ).err.split()
+    )
     assert error_line.endswith("found frames that fail by the exchange of vehicles alone: demo-001")
 
 
-def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(run: Path, tmp_path: Path) -> None:
     def refused(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["explain", "--workers", "1", *map(str, words)]) == 2
-        return " ".join(capsys.readouterr().err.split())
+        return " ".join(invoke("explain", "--workers", "1", *words, code=2).err.split())
 
-    assert refused() == "drivesem: --run: expected a folder of drivesem attack, found nothing"
     assert "--run: expected a folder of drivesem attack" in refused("--run", tmp_path / "none")
     assert "--points: expected at least 1" in refused("--run", run, "--points", "0")
     assert "--permutations: expected an even number" in refused("--run", run, "--permutations", "3")
@@ -320,12 +308,9 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "found demo-000, which does not" in refused("--run", run, "--frame", "demo-000")
 
 
-def test_a_counterexample_that_does_not_fail_here_is_named(
-    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_counterexample_that_does_not_fail_here_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calm = Jumpy()
     monkeypatch.setattr(calm, "decode", lambda raw: [_nothing()] * len(raw))
     monkeypatch.setattr(run_folder, "load_predictor", lambda *_: calm)
-    assert main(["explain", "--run", str(run), "--workers", "1"]) == 2
-    error = " ".join(capsys.readouterr().err.split())
+    error = " ".join(invoke("explain", "--run", run, "--workers", "1", code=2).err.split())
     assert "demo-000: expected a counterexample that fails, found one that the detector gets right here" in error

@@ -25,6 +25,7 @@ from drivesem.run.results import FrameResult
 from drivesem.scenes.sources import DatasetSource
 from scene_ir import files
 from scene_ir.types import SceneIR
+from tests.drivesem.invoke import invoke, refusal
 from tools.same import copy_crop, sort_labels
 
 NAMES = ("000000", "000001", "000002")
@@ -102,20 +103,15 @@ COMMANDS = {
 }
 
 
-def run_refused(name: str, kitti: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
+def run_refused(name: str, kitti: Path, out: Path) -> str:
     """The last line of a command that is refused."""
     words = [word.format(kitti=kitti) for word in COMMANDS[name]]
-    assert main([*words, "--out", str(out)]) == 2
-    return capsys.readouterr().err.splitlines()[-1]
+    return refusal(*words, "--out", out)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_place_that_cannot_be_written_is_one_line(
-    name: str,
-    tiny_kitti: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    name: str, tiny_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mkdir = Path.mkdir
 
@@ -125,22 +121,18 @@ def test_a_place_that_cannot_be_written_is_one_line(
         mkdir(self, *words, **options)  # pyright: ignore[reportArgumentType]
 
     monkeypatch.setattr(Path, "mkdir", reads_only)
-    line = run_refused(name, tiny_kitti, tmp_path / "a" / "run", capsys)
-    assert line.startswith(f"drivesem: {tmp_path}")
+    line = run_refused(name, tiny_kitti, tmp_path / "a" / "run")
+    assert line.startswith(str(tmp_path))
     assert line.endswith("expected a place that can be written, found read-only file system")
 
 
 @pytest.mark.parametrize("name", ["train", "synth", "derender"])
 def test_a_full_disk_leaves_no_half(
-    name: str,
-    tiny_kitti: Path,
-    tmp_path: Path,
-    full_disk: Callable[[int], AbstractContextManager[None]],
-    capsys: pytest.CaptureFixture[str],
+    name: str, tiny_kitti: Path, tmp_path: Path, full_disk: Callable[[int], AbstractContextManager[None]]
 ) -> None:
     out = tmp_path / "run"
     with full_disk(20_000):
-        line = run_refused(name, tiny_kitti, out, capsys)
+        line = run_refused(name, tiny_kitti, out)
     assert "expected a place that can be written, found file too large" in line
     assert not files.find_leftovers(out)
     assert not [path for path in out.rglob("*") if path.suffix in (".png", ".npz", ".safetensors")]
@@ -190,14 +182,15 @@ def test_a_picture_in_the_middle_of_a_data_set(
 
 
 @pytest.mark.parametrize("name", ["arrays.npz", "meshes/0.glb", "background.png", "scene.json"])
-def test_a_damaged_scene_of_a_run_is_named(
-    name: str, small_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_scene_of_a_run_is_named(name: str, small_run: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(small_run, tmp_path / "run"))
     path = run / "frames" / "demo-000" / "scene" / name
     cut_short(path)
-    assert main(["confirm", "--run", str(run), "--workers", "1", "--out", str(tmp_path / "c")]) == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith(f"drivesem: {path}")
+    assert (
+        invoke("confirm", "--run", run, "--workers", "1", "--out", tmp_path / "c", code=2)
+        .err.splitlines()[-1]
+        .startswith(f"drivesem: {path}")
+    )
 
 
 def test_a_clock_that_jumps_changes_nothing(

@@ -29,6 +29,7 @@ from drivesem.run.records import load_record
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
+from tests.drivesem.invoke import invoke, refusal, run_json
 
 ATTACK = [
     "attack",
@@ -128,12 +129,6 @@ def patched(monkeypatch: pytest.MonkeyPatch, scene: SceneIR, blind: Blind) -> No
     _patch(monkeypatch, scene, blind)
 
 
-def holes(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    capsys.readouterr()
-    assert main(["holes", *words]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 @pytest.fixture(scope="module")
 def mapped(attacked: Path, tmp_path_factory: pytest.TempPathFactory, scene: SceneIR, blind: Blind) -> Path:
     """What is written of that run."""
@@ -166,30 +161,26 @@ def test_the_feature_and_the_band_are_named(attacked: Path, mapped: Path, blind:
     assert "lightness" in (mapped / "holes.md").read_text()
 
 
-def test_a_second_call_resumes_with_equal_results(
-    attacked: Path, mapped: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_second_call_resumes_with_equal_results(attacked: Path, mapped: Path) -> None:
     before, cached = (
         (mapped / "holes.json").read_text(),
         mapped / "runs" / "0" / "frames" / "demo-000" / "holes.json",
     )
     written = cached.stat().st_mtime_ns
-    holes([str(attacked), *HOLES, "--out", str(mapped)], capsys)
+    run_json("holes", attacked, *HOLES, "--out", mapped)
     assert (mapped / "holes.json").read_text() == before
     assert cached.stat().st_mtime_ns == written
 
 
 @pytest.mark.slow
-def test_a_rule_is_checked_by_draws_of_its_own(
-    attacked: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rule_is_checked_by_draws_of_its_own(attacked: Path, mapped: Path, tmp_path: Path) -> None:
     """After the holes, which are kept: of seeds that neither the rule nor its probability knew."""
     out, name = tmp_path / "holes", Path("0") / "frames" / "demo-000"
     shutil.copytree(mapped, out)
     cached = out / "runs" / name / "holes.json"
     written = cached.stat().st_mtime_ns
     words = [str(attacked), *HOLES, "--out", str(out)]
-    found = holes([*words, "--recheck", "16"], capsys)
+    found = run_json("holes", *words, "--recheck", "16")
     assert cached.stat().st_mtime_ns == written
     assert (found["rechecked"], found["hold"]) == (len(found["holes"]), len(found["holes"]))
     (checked,) = (out / "rechecks" / "16" / "0").glob("*/frames/demo-000/recheck.json")
@@ -215,9 +206,9 @@ def test_a_rule_is_checked_by_draws_of_its_own(
     assert next(csv.DictReader(rows))["holds"] == "True"
 
     checked_at = checked.stat().st_mtime_ns
-    assert holes([*words, "--recheck", "16"], capsys) == found
+    assert run_json("holes", *words, "--recheck", "16") == found
     assert checked.stat().st_mtime_ns == checked_at
-    assert holes(words, capsys)["holes"][0]["recheck"] is None
+    assert run_json("holes", *words)["holes"][0]["recheck"] is None
 
 
 def test_other_cars_are_sampled_too(mapped: Path) -> None:
@@ -229,11 +220,9 @@ def test_other_cars_are_sampled_too(mapped: Path) -> None:
     assert all(len(samples.margins) == 4 for samples in contrast.by_object().values())
 
 
-def test_without_contrast_there_are_none(
-    attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_contrast_there_are_none(attacked: Path, tmp_path: Path) -> None:
     words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--contrast", "0"]
-    holes([*words, "--out", str(tmp_path / "out")], capsys)
+    run_json("holes", *words, "--out", tmp_path / "out")
     assert (
         load_record(tmp_path / "out" / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3).contrast
         == ()
@@ -241,26 +230,24 @@ def test_without_contrast_there_are_none(
 
 
 def test_an_answer_of_an_older_version_is_refused_in_one_line(
-    attacked: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    attacked: Path, mapped: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "holes"
     shutil.copytree(mapped, out)
     cached = out / "runs" / "0" / "frames" / "demo-000" / "holes.json"
     old = json.loads(cached.read_text())
     cached.write_text(json.dumps(old | {"schema": 2}))
-    capsys.readouterr()
-    assert main(["holes", str(attacked), *HOLES, "--out", str(out)]) == 2
-    error_line = capsys.readouterr().err.strip().splitlines()[-1]
+    error_line = invoke("holes", attacked, *HOLES, "--out", out, code=2).err.strip().splitlines()[-1]
     assert error_line.startswith("drivesem: ")
     assert "holes.json" in error_line
 
 
 @pytest.mark.slow
-def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path) -> None:
     cached = []
     for name, seed in (("one", "0"), ("again", "0"), ("other", "1")):
         words = [str(attacked), "--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--seed", seed]
-        holes([*words, "--out", str(tmp_path / name)], capsys)
+        run_json("holes", *words, "--out", tmp_path / name)
         cached.append(
             load_record(
                 tmp_path / name / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3
@@ -270,13 +257,11 @@ def test_samples_follow_from_the_seed(attacked: Path, tmp_path: Path, capsys: py
     assert one == again != other
 
 
-def test_a_run_without_certain_failures(
-    tmp_path: Path, scene: SceneIR, blind: Blind, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_without_certain_failures(tmp_path: Path, scene: SceneIR, blind: Blind) -> None:
     with pytest.MonkeyPatch.context() as patch:
         _patch(patch, scene, Blind(blind.boxes, (2.0, 3.0)))
         assert main([*ATTACK, *STILL, "--out", str(tmp_path / "fine")]) == 0
-    found = holes([str(tmp_path / "fine"), *HOLES], capsys)
+    found = run_json("holes", tmp_path / "fine", *HOLES)
     assert found["holes"] == []
     assert "no certain failure" in (tmp_path / "fine" / "holes" / "holes.md").read_text()
 
@@ -347,17 +332,13 @@ def test_one_that_sees_what_is_not_there_does_not_pass(
 
 
 def test_frames_that_cannot_be_compared_do_not_pass(
-    gate: Callable[[str], tuple[int, dict[str, Any]]],
-    attacked: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    gate: Callable[[str], tuple[int, dict[str, Any]]], attacked: Path, tmp_path: Path
 ) -> None:
     """The run is kept without its scenes."""
     run, out = tmp_path / "run", tmp_path / "out"
     shutil.copytree(attacked, run, ignore=shutil.ignore_patterns("scene"))
     words = ["gate", str(run), "--before", "any", "--after", "any", "--workers", "1", "--out", str(out)]
-    assert main([*words, "--keep-going", "--json"]) == 1
-    data = json.loads(capsys.readouterr().out)
+    data = run_json(*words, "--keep-going", code=1)
     assert (data["passed"], data["rows"]) == (False, [])
     (reason,) = data["frames_failed"].values()
     assert "scene" in reason
@@ -371,51 +352,32 @@ def test_frames_that_cannot_be_compared_do_not_pass(
     assert "no certain failure" not in page
 
 
-@pytest.fixture
-def error_line(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """The one line of a gate that is refused."""
-
-    def call(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["gate", *map(str, words)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        return line.removeprefix("drivesem: ")
-
-    return call
-
-
 @pytest.mark.usefixtures("gate")
-def test_other_classes_are_no_comparison(attacked: Path, error_line: Callable[..., str]) -> None:
-    other = error_line(attacked, "--after", "other")
+def test_other_classes_are_no_comparison(attacked: Path) -> None:
+    other = refusal("gate", attacked, "--after", "other")
     assert other == "--after: expected the classes of --before, found Bus, which --before does not know"
-    fewer = error_line(attacked, "--before", "other", "--after", "any")
+    fewer = refusal("gate", attacked, "--before", "other", "--after", "any")
     assert fewer == "--after: expected the classes of --before, found no Bus"
 
 
-def test_the_gate_needs_the_new_detector(attacked: Path, error_line: Callable[..., str]) -> None:
+def test_the_gate_needs_the_new_detector(attacked: Path) -> None:
     """The old detector compared with itself would always pass."""
     wanted = "the detector that replaces --before"
-    assert error_line(attacked) == f"--after: expected {wanted}, found nothing"
+    assert refusal("gate", attacked) == f"--after: expected {wanted}, found nothing"
     assert not (attacked / "gate").exists()
 
 
 def test_before_defaults_to_the_detector_of_the_runs(
-    gate: Callable[[str], tuple[int, dict[str, Any]]],
-    attacked: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    gate: Callable[[str], tuple[int, dict[str, Any]]], attacked: Path, tmp_path: Path
 ) -> None:
     _, named = gate("worse")
     words = ["--after", "worse", "--samples", "20", "--workers", "1"]
-    assert main(["gate", str(attacked), *words, "--json", "--out", str(tmp_path / "own")]) == 1
-    data = json.loads(capsys.readouterr().out)
+    data = run_json("gate", attacked, *words, "--out", tmp_path / "own", code=1)
     assert (data["before"], data["rows"]) == ("any", named["rows"])
     assert "before: any" in (tmp_path / "own" / "config.yaml").read_text()
 
 
-def test_runs_without_a_usable_detector_need_before(
-    attacked: Path, tmp_path: Path, error_line: Callable[..., str]
-) -> None:
+def test_runs_without_a_usable_detector_need_before(attacked: Path, tmp_path: Path) -> None:
     run = shutil.copytree(attacked, tmp_path / "run")
     config, as_it_was = run / "config.yaml", (run / "config.yaml").read_text()
 
@@ -424,28 +386,14 @@ def test_runs_without_a_usable_detector_need_before(
 
     of("better")
     several = "the current detector, as these runs have several"
-    assert error_line(attacked, run, "--after", "worse") == f"--before: expected {several}, found any, better"
+    assert refusal("gate", attacked, run, "--after", "worse") == f"--before: expected {several}, found any, better"
     of("module:evil.py:D")
     trusted = f"{config}: detector: expected a detector that is data alone, or --trust"
-    assert error_line(run, "--after", "worse").startswith(trusted)
+    assert refusal("gate", run, "--after", "worse").startswith(trusted)
     # weights that were written over: the new detector may be in the old one's file
     weights = tmp_path / "weights.safetensors"
     weights.write_bytes(b"new")
     of(str(weights))
     (run / "files.json").write_text(json.dumps({str(weights): "0" * 64}))
     made_with = f"expected the files that this run was made with, found another {weights}"
-    assert made_with in error_line(run, "--after", "worse")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "RUN: expected folders of drivesem attack"),
-        (["nowhere"], "RUN: expected a folder of drivesem attack, found nowhere"),
-        (["nowhere", "--samples", "9"], "--samples: expected at least 24, which a rule needs, found 9"),
-        (["nowhere", "--recheck", "0"], "--recheck: expected at least 1, found 0"),
-        (["nowhere", "--reach", "0"], "--reach: expected a fraction above 0, up to 1, found 0"),
-    ],
-)
-def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
-    assert refused("holes", *words).startswith(f"drivesem: {message}")
+    assert made_with in refusal("gate", run, "--after", "worse")

@@ -18,22 +18,9 @@ from drivesem import program
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from scene_ir import files
+from tests.drivesem.invoke import invoke, refusal
 
 CAR = "Car {truncated} 0 1.50 120 40 200 80 {height} 1.60 4.00 0.00 1.65 15.00 0.00\n"
-
-
-@pytest.fixture
-def refusal(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """The last line of a command that refuses its input; before it there may be a bar of progress."""
-
-    def call(*words: object) -> str:
-        capsys.readouterr()
-        assert main([*map(str, words)]) == 2
-        error = capsys.readouterr().err
-        assert "Traceback" not in error
-        return error.splitlines()[-1]
-
-    return call
 
 
 @pytest.fixture
@@ -59,15 +46,13 @@ def folder(tmp_path: Path) -> Callable[..., Path]:
         ({"cars": 3000}, "frame 000000: labels: expected at most 500 labelled objects, found 3000"),
     ],
 )
-def test_frames(
-    folder: Callable[..., Path], refusal: Callable[..., str], given: Any, message: str, tmp_path: Path
-) -> None:
+def test_frames(folder: Callable[..., Path], given: Any, message: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     line = refusal("derender", "--dataset", "kitti", "--root", folder(**given), "--workers", "1", "--out", out)
     assert message in line
 
 
-def test_photographs(folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path) -> None:
+def test_photographs(folder: Callable[..., Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     files.write_png(tmp_path / "one.png", np.zeros((1, 1, 3), np.uint8))
     assert "expected at least 16x16 px, found 1x1 px" in refusal("derender", tmp_path / "one.png", "--out", out)
@@ -99,9 +84,7 @@ def test_photographs(folder: Callable[..., Path], refusal: Callable[..., str], t
         ),
     ],
 )
-def test_labels_that_are_converted(
-    folder: Callable[..., Path], refusal: Callable[..., str], given: Any, message: str, tmp_path: Path
-) -> None:
+def test_labels_that_are_converted(folder: Callable[..., Path], given: Any, message: str, tmp_path: Path) -> None:
     assert message in refusal("convert", folder(**given), "--to", "coco", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -120,7 +103,7 @@ def test_labels_that_are_converted(
         ("images", "id", 10**30, "an integer of 31 digits"),
     ],
 )
-def test_coco(refusal: Callable[..., str], tmp_path: Path, table: str, key: str, value: Any, message: str) -> None:
+def test_coco(tmp_path: Path, table: str, key: str, value: Any, message: str) -> None:
     content = {
         "images": [{"id": 1, "file_name": "a.png", "height": 96, "width": 320}],
         "categories": [{"id": 1, "name": "Car"}],
@@ -133,7 +116,7 @@ def test_coco(refusal: Callable[..., str], tmp_path: Path, table: str, key: str,
 
 
 @pytest.mark.parametrize("name", ["../../secret.png", "/dev/zero"])
-def test_coco_names_stay_in_their_folder(refusal: Callable[..., str], tmp_path: Path, name: str) -> None:
+def test_coco_names_stay_in_their_folder(tmp_path: Path, name: str) -> None:
     content = {
         "images": [{"id": 1, "file_name": name, "height": 96, "width": 320}],
         "categories": [],
@@ -146,7 +129,7 @@ def test_coco_names_stay_in_their_folder(refusal: Callable[..., str], tmp_path: 
     assert "images[0].file_name: expected a file in" in refusal(*words)
 
 
-def test_many_equal_detections(folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path) -> None:
+def test_many_equal_detections(folder: Callable[..., Path], tmp_path: Path) -> None:
     line = CAR.format(truncated="0", height="1.5").strip() + " 0.5\n"
     files.write_text(tmp_path / "found" / "000000.txt", line * 80_000)
     words = ("eval", "--gt", folder(), "--pred", tmp_path / "found", "--protocol", "kitti")
@@ -183,7 +166,6 @@ def edit(path: Path, *keys: Any, value: Any) -> None:
 )
 def test_runs(
     write_run: Callable[..., Path],
-    refusal: Callable[..., str],
     tmp_path: Path,
     file: str,
     keys: tuple[Any, ...],
@@ -206,7 +188,7 @@ def test_runs(
     ],
 )
 def test_settings_of_runs(
-    write_run: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path, old: str, new: str, message: str
+    write_run: Callable[..., Path], tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     run = write_run(tmp_path / "run")
     text = (run / "config.yaml").read_text()
@@ -241,7 +223,7 @@ def broken(:
         ("Net", "(mine.py:12, in forward)"),
     ],
 )
-def test_a_detector_that_raises(refusal: Callable[..., str], tmp_path: Path, name: str, message: str) -> None:
+def test_a_detector_that_raises(tmp_path: Path, name: str, message: str) -> None:
     path = tmp_path / "mine.py"
     path.write_text(RAISING.replace("def broken(:", ""))
     assert message in refusal("check", "--detector", f"module:{path}:{name}")
@@ -259,15 +241,13 @@ class Late(SqueezeDet):
 """
 
 
-def test_a_detector_that_raises_when_it_is_attacked(
-    refusal: Callable[..., str], small_kitti: Path, tmp_path: Path
-) -> None:
+def test_a_detector_that_raises_when_it_is_attacked(small_kitti: Path, tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(LATE)
     words = ("attack", "--dataset", "kitti", "--root", small_kitti, "--no-fit", "--params", "translate")
     line = refusal(*words, "--workers", "1", "--out", tmp_path / "out", "--detector", f"module:{path}:Late")
     expected = "--detector: expected methods that raise nothing, found KeyError: 'wheels' (mine.py:6, in decode)"
-    assert line == f"drivesem: {expected}"
+    assert line == expected
 
 
 @pytest.mark.parametrize(
@@ -279,14 +259,14 @@ def test_a_detector_that_raises_when_it_is_attacked(
         ({"anchors": "[" * 100_000}, "recursion"),
     ],
 )
-def test_weights(refusal: Callable[..., str], tmp_path: Path, changed: dict[str, str], message: str) -> None:
+def test_weights(tmp_path: Path, changed: dict[str, str], message: str) -> None:
     metadata, tensors = read_weights(SHIPPED["squeezedet"])
     path = tmp_path / "weights.safetensors"
     write_weights(path, metadata | changed, tensors)
     assert message in refusal("check", "--detector", path)
 
 
-def test_darknet_files(refusal: Callable[..., str], tmp_path: Path) -> None:
+def test_darknet_files(tmp_path: Path) -> None:
     path = tmp_path / "net.cfg"
     path.write_text("[net]\nchannels=3\n" + "[shortcut]\nfrom=-1\n" * 20_000)
     words = ("check", "--detector", f"darknet:{path}")
@@ -314,13 +294,11 @@ class Blind:
         return [nothing] * len(raw)
 
 
-def test_a_detector_that_finds_nothing_is_not_attacked(
-    refusal: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_detector_that_finds_nothing_is_not_attacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blind())
     words = ("attack", "--method", "random", "--queries", "1", "--workers", "1", "--params", "weather")
     line = refusal(*words, "--limit", "2", "--out", tmp_path / "run")
-    assert line.startswith("drivesem: --detector: expected one that finds something, with a score of 0.5 or more")
+    assert line.startswith("--detector: expected one that finds something, with a score of 0.5 or more")
     assert "no detection at all in 2 photographs" in line
     assert not (tmp_path / "run" / "metrics.json").exists()
     # One photograph in which nothing is found says nothing of the detector.
@@ -331,9 +309,7 @@ NAMES = ("[/red]", "[bold]", "\x1b]0;title\x07", "\x1b[31m", "<b>")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_names_that_a_terminal_or_a_table_would_obey(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_that_a_terminal_or_a_table_would_obey(name: str, tmp_path: Path) -> None:
     content = {
         "images": [{"id": 1, "file_name": "a.png", "height": 96, "width": 320}],
         "categories": [{"id": 1, "name": name}],
@@ -343,13 +319,11 @@ def test_names_that_a_terminal_or_a_table_would_obey(
     found = [{"image_id": 1, "category_id": 1, "bbox": [10, 10, 50, 40], "score": 0.9}]
     (tmp_path / "found.json").write_text(json.dumps(found))
     words = ["--gt", str(tmp_path / "true.json"), "--pred", str(tmp_path / "found.json"), "--classes", name]
-    assert main(["eval", *words]) == 0
-    output = capsys.readouterr()
-    refusal = output.out + output.err
-    assert refusal.replace("\n", "").isprintable()
-    assert name.encode("unicode_escape").decode() in refusal
-    assert main(["convert", str(tmp_path / "true.json"), "--to", "kitti", "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err[:-1].isprintable()
+    output = invoke("eval", *words)
+    printed = output.out + output.err
+    assert printed.replace("\n", "").isprintable()
+    assert name.encode("unicode_escape").decode() in printed
+    assert refusal("convert", tmp_path / "true.json", "--to", "kitti", "--out", tmp_path / "out").isprintable()
 
 
 @pytest.mark.parametrize(
@@ -363,7 +337,7 @@ def test_names_that_a_terminal_or_a_table_would_obey(
     ],
 )
 def test_numbers_that_no_column_holds(
-    folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path, line: str, message: str
+    folder: Callable[..., Path], tmp_path: Path, line: str, message: str
 ) -> None:
     files.write_text(tmp_path / "found" / "000000.txt", line + "\n")
     output = refusal("eval", "--gt", folder(), "--pred", tmp_path / "found")
@@ -371,14 +345,12 @@ def test_numbers_that_no_column_holds(
     assert len(output) < 2000
 
 
-def test_a_frame_of_a_million_lines(
-    folder: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path
-) -> None:
+def test_a_frame_of_a_million_lines(folder: Callable[..., Path], tmp_path: Path) -> None:
     words = ("derender", "--dataset", "kitti", "--workers", "1", "--out", tmp_path / "out", "--root")
     assert "000000.txt: expected at most 10,000 lines, found 1,000,000" in refusal(*words, folder(cars=10**6))
 
 
-def test_coco_s_cameras_of_other_projects(refusal: Callable[..., str], tmp_path: Path) -> None:
+def test_coco_s_cameras_of_other_projects(tmp_path: Path) -> None:
     content: dict[str, Any] = {
         "images": [
             {"id": 1, "file_name": "a.png", "height": 96, "width": 320, "camera": {"projection": [[1], 2]}}
@@ -392,7 +364,7 @@ def test_coco_s_cameras_of_other_projects(refusal: Callable[..., str], tmp_path:
     assert message in refusal("convert", path, "--to", "kitti", "--out", tmp_path / "out")
 
 
-def test_coco_keys_with_values_beyond_json(refusal: Callable[..., str], tmp_path: Path) -> None:
+def test_coco_keys_with_values_beyond_json(tmp_path: Path) -> None:
     row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 5, 4], "area": 20, "mood": float("nan")}
     image = {"id": 1, "file_name": "a.png", "height": 96, "width": 320}
     content = {"images": [image], "categories": [{"id": 1, "name": "Car"}], "annotations": [row]}
@@ -403,9 +375,7 @@ def test_coco_keys_with_values_beyond_json(refusal: Callable[..., str], tmp_path
 
 
 @pytest.mark.parametrize("name", ["result.json", "scene/depth.bin", "counterexample.png"])
-def test_links_of_a_run_stay_in_it(
-    write_run: Callable[..., Path], refusal: Callable[..., str], tmp_path: Path, name: str
-) -> None:
+def test_links_of_a_run_stay_in_it(write_run: Callable[..., Path], tmp_path: Path, name: str) -> None:
     run = write_run(tmp_path / "run")
     path = run / "frames" / "b" / name
     path.parent.mkdir(exist_ok=True)
@@ -422,12 +392,11 @@ def test_links_of_a_run_stay_in_it(
     assert "config.yaml: expected a file in" in refusal("holes", run)
 
 
-def test_a_command_names_the_code_that_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_names_the_code_that_it_runs(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text("class A:\n    pass\n")
-    assert main(["check", "--detector", f"planted:height_px=30:38@module:{path}:A"]) == 2
-    first, _ = capsys.readouterr().err.splitlines()
+    first, _ = invoke("check", "--detector", f"planted:height_px=30:38@module:{path}:A", code=2).err.splitlines()
     assert first == f"drivesem: --detector: runs the code in {path}:A"
     for kind in registry.KINDS:
-        refusal = program.RUNS_CODE.findall(f"squeezedet,{kind}:a.b")
-        assert refusal == (["a.b"] if kind in registry.RUNS_CODE else [])
+        named = program.RUNS_CODE.findall(f"squeezedet,{kind}:a.b")
+        assert named == (["a.b"] if kind in registry.RUNS_CODE else [])

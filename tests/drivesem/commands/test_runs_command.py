@@ -7,13 +7,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from drivesem.cli import main
 from scene_ir import files
 from tests.drivesem.commands.test_attack_command import without_times
+from tests.drivesem.invoke import invoke, refusal, run_json
 
 WORDS = [
     "attack",
@@ -40,63 +40,47 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def run_json(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    capsys.readouterr()
-    assert main(["runs", *words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 @pytest.mark.slow
-def test_parts_are_every_nth_frame_and_merge_into_the_whole(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_are_every_nth_frame_and_merge_into_the_whole(parts: Path, tmp_path: Path) -> None:
     names = {folder: {p.name for p in (parts / folder / "frames").iterdir()} for folder in ("part1", "part2")}
     assert names == {"part1": {"demo-000", "demo-002"}, "part2": {"demo-001"}}
     out = tmp_path / "merged"
     both = [str(parts / "part1"), str(parts / "part2")]
-    merged = run_json(["merge", *both, str(parts / "whole"), "--out", str(out)], capsys)
+    merged = run_json("runs", "merge", *both, str(parts / "whole"), "--out", str(out))
     whole = json.loads((parts / "whole" / "metrics.json").read_text())
     assert without_times(merged) == without_times(whole)
     hashes = [json.loads((folder / "manifest.json").read_text()) for folder in (out, parts / "whole")]
     assert hashes[0] == hashes[1]
     assert main(["verify", "--run", str(out)]) == 0
-    assert run_json(["merge", *both, "--out", str(out)], capsys)["frames"] == 3, "it goes on"
+    assert run_json("runs", "merge", *both, "--out", str(out))["frames"] == 3, "it goes on"
 
 
-def test_frames_that_differ_and_other_settings_are_refused(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_that_differ_and_other_settings_are_refused(parts: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(parts / "part2", other)
     result = other / "frames" / "demo-001" / "result.json"
     result.write_text(json.dumps(json.loads(result.read_text()) | {"objects": 99}))
     merge = ["runs", "merge", str(parts / "part2"), str(other), "--out", str(tmp_path / "merged")]
-    assert main(merge) == 2
     assert "FOLDER: expected runs in which a frame is the same, found two results of frame demo-001" in (
-        capsys.readouterr().err
+        refusal(*merge)
     )
     config = other / "config.yaml"
     config.write_text(config.read_text().replace("seed: 0", "seed: 7"))
-    assert main(merge) == 2
-    assert f"found {other}: another seed" in capsys.readouterr().err
+    assert f"found {other}: another seed" in refusal(*merge)
 
 
-def test_a_part_that_takes_the_others_keeps_its_frames(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_part_that_takes_the_others_keeps_its_frames(parts: Path, tmp_path: Path) -> None:
     """Also one that was made with --no-resume, which removes frames that are there."""
     own = tmp_path / "own"
     shutil.copytree(parts / "part1", own)
     config = own / "config.yaml"
     config.write_text(config.read_text().replace("resume: true", "resume: false"))
-    merged = run_json(["merge", str(own), str(parts / "part2"), "--out", str(own)], capsys)
+    merged = run_json("runs", "merge", str(own), str(parts / "part2"), "--out", str(own))
     assert without_times(merged) == without_times(json.loads((parts / "whole" / "metrics.json").read_text()))
     assert "resume: true" in config.read_text()
 
 
-def test_frames_that_are_there_are_compared_with_the_parts(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_that_are_there_are_compared_with_the_parts(parts: Path, tmp_path: Path) -> None:
     part, out = tmp_path / "part", tmp_path / "merged"
     shutil.copytree(parts / "part2", part)
     merge = ["runs", "merge", str(part), "--out", str(out)]
@@ -104,17 +88,14 @@ def test_frames_that_are_there_are_compared_with_the_parts(
     metrics = (out / "metrics.json").read_text()
     result = part / "frames" / "demo-001" / "result.json"
     files.write_json(result, json.loads(result.read_text()) | {"objects": 99})
-    assert main(merge) == 2
     assert f"--out: expected a new folder, or one of the same frames, found another demo-001 in {out}" in (
-        capsys.readouterr().err
+        refusal(*merge)
     )
     assert (out / "metrics.json").read_text() == metrics
 
 
 @pytest.mark.slow
-def test_parts_with_nothing_to_attack_merge_into_the_whole(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_with_nothing_to_attack_merge_into_the_whole(tmp_path: Path) -> None:
     """Frames whose vehicles cannot be attacked count once, whichever part had them; a part may have no frame."""
     words = [*WORDS, "--no-grade", "--target-objects", "6"]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0
@@ -127,51 +108,42 @@ def test_parts_with_nothing_to_attack_merge_into_the_whole(
     whole = json.loads((tmp_path / "whole" / "metrics.json").read_text())
     assert whole["frames_without_vehicles"] == 2
     for runs in (names, [*names, str(tmp_path / "whole")]):
-        merged = run_json(["merge", *runs, "--out", str(tmp_path / "merged")], capsys)
+        merged = run_json("runs", "merge", *runs, "--out", str(tmp_path / "merged"))
         assert without_times(merged) == without_times(whole)
-    assert main(["runs", "merge", names[3], "--out", str(tmp_path / "nothing")]) == 2
-    assert f"FOLDER: expected runs with frames, found none in {names[3]}" in capsys.readouterr().err
+    assert f"FOLDER: expected runs with frames, found none in {names[3]}" in refusal(
+        "runs", "merge", names[3], "--out", tmp_path / "nothing"
+    )
 
 
-def test_list_and_show(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = {Path(row["run"]).name: row for row in run_json(["list", str(parts)], capsys)["runs"]}
+def test_list_and_show(parts: Path) -> None:
+    rows = {Path(row["run"]).name: row for row in run_json("runs", "list", str(parts))["runs"]}
     assert {name: row["frames"] for name, row in rows.items()} == {"part1": 2, "part2": 1, "whole": 3}
     assert rows["whole"]["params"] == "color"
     assert rows["whole"]["finished"]
-    (row,) = run_json(["show", str(parts / "whole")], capsys)["runs"]
+    (row,) = run_json("runs", "show", str(parts / "whole"))["runs"]
     assert row["settings"] == {"params": "color", "method": "fgsm", "second_detector": "off"}
-    assert main(["runs", "list", str(parts)]) == 0
-    output = capsys.readouterr().out
+    output = invoke("runs", "list", parts).out
     assert "whole: 3 frames, " in output
     assert "color by fgsm on squeezedet" in output
-    assert main(["runs", "show", str(parts / "whole")]) == 0
-    assert "  method: fgsm\n" in capsys.readouterr().out
+    assert "  method: fgsm\n" in invoke("runs", "show", parts / "whole").out
 
 
-def test_a_run_that_stopped_early_is_listed(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_stopped_early_is_listed(parts: Path, tmp_path: Path) -> None:
     shutil.copytree(parts / "part2", tmp_path / "run")
     (tmp_path / "run" / "metrics.json").unlink()
-    assert main(["runs", "list", str(tmp_path)]) == 0
-    assert "run: 1 frame, unfinished (the same command resumes)" in capsys.readouterr().out
+    assert "run: 1 frame, unfinished (the same command resumes)" in invoke("runs", "list", tmp_path).out
 
 
-def test_runs_of_other_commands_are_passed_over(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_of_other_commands_are_passed_over(parts: Path, tmp_path: Path) -> None:
     """`drivesem drive` puts its folder beside them, with frames too."""
     shutil.copytree(parts / "part2", tmp_path / "run")
     (tmp_path / "clip" / "frames").mkdir(parents=True)
     (tmp_path / "clip" / "config.yaml").write_text("detector: squeezedet\nclip: null\nbend: 3\n")
-    assert [row["run"] for row in run_json(["list", str(tmp_path)], capsys)["runs"]] == [str(tmp_path / "run")]
-    assert main(["runs", "list", str(tmp_path / "clip")]) == 2
-    assert "expected a run of drivesem attack, found" in capsys.readouterr().err
+    assert [row["run"] for row in run_json("runs", "list", str(tmp_path))["runs"]] == [str(tmp_path / "run")]
+    assert "expected a run of drivesem attack, found" in refusal("runs", "list", tmp_path / "clip")
 
 
-def test_prune_removes_what_a_killed_command_left(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prune_removes_what_a_killed_command_left(parts: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(parts / "part2", run)
     half = run / "frames" / ".demo-002.0123abcd.tmp"
@@ -179,9 +151,9 @@ def test_prune_removes_what_a_killed_command_left(
     (half / ".benign.png.89abcdef.tmp").write_bytes(b"half")
     before = {p for p in run.rglob("*") if half not in (p, *p.parents) and p.name != ".lock"}
     assert files.find_leftovers(run) == [half]
-    assert run_json(["prune", str(run), "--dry"], capsys) == {"removed": [str(half)]}
+    assert run_json("runs", "prune", str(run), "--dry") == {"removed": [str(half)]}
     assert half.is_dir()
-    assert run_json(["prune", str(run)], capsys) == {"removed": [str(half)]}
+    assert run_json("runs", "prune", str(run)) == {"removed": [str(half)]}
     assert {p for p in run.rglob("*") if p.name != ".lock"} == before
 
 
@@ -195,9 +167,7 @@ sys.stdin.read()
 """
 
 
-def test_prune_passes_over_what_a_question_is_writing(
-    parts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prune_passes_over_what_a_question_is_writing(parts: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(parts / "part2", run)
     halves = [run / question / "frames" / ".demo-001.0123abcd.tmp" for question in ("explain", "holes")]
@@ -208,29 +178,7 @@ def test_prune_passes_over_what_a_question_is_writing(
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        assert run_json(["prune", str(run)], capsys) == {"removed": [str(halves[1])]}
+        assert run_json("runs", "prune", str(run)) == {"removed": [str(halves[1])]}
         holder.communicate()
     assert halves[0].is_dir()
-    assert run_json(["prune", str(run)], capsys) == {"removed": [str(halves[0])]}
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["runs", "merge", "a"], "--out: expected the folder of the merged run, found nothing"),
-        (["runs", "show", "a", "--out", "b"], "--out: expected only with merge, found show"),
-        (
-            ["runs", "merge", "a", "--out", "b\udcff"],
-            r"--out: expected text that UTF-8 holds, found 'b\udcff'",
-        ),
-        (["runs", "show"], "FOLDER: expected runs to show, found nothing"),
-        (["runs", "show", "a/nope"], "FOLDER: expected a run's folder, with its config.yaml, found a/nope"),
-        (["runs", "prune", "a", "--dry"], "FOLDER: expected a run's folder, with its config.yaml, found a"),
-        (["runs", "list", "nowhere"], "FOLDER: expected a folder with runs of drivesem attack, found nowhere"),
-        (["runs", "list", "--dry"], "--dry: expected only with prune, found list"),
-        (["attack", "--part", "3/2"], "--part: expected K/N, the K-th of N parts, such as 2/4, found '3/2'"),
-    ],
-)
-def test_bad_input(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words) == 2
-    assert capsys.readouterr().err == f"drivesem: {message}\n"
+    assert run_json("runs", "prune", str(run)) == {"removed": [str(halves[0])]}

@@ -17,9 +17,9 @@ from drivesem.data.registry import Dataset, open_dataset
 from drivesem.run.results import Failure
 from drivesem.training import retrain
 from drivesem.training.failure_neighbourhoods import FailureNeighbourhoods
-from drivesem.training.frames import FrameStore
-from drivesem.training.samples import AttackedFrame, load_attacked_frames
+from drivesem.training.frames import AttackedFrame, FrameStore, load_attacked_frames
 from scene_ir import files
+from tests.drivesem.invoke import invoke, run_json
 
 NAMES = [f"Scene0{scene}/clone/Camera_0/0000{i}" for scene in (1, 2) for i in (0, 1)]
 
@@ -49,16 +49,14 @@ def run(small_run: Path, tmp_path: Path) -> Path:
     return out
 
 
-def test_its_frames_are_counted(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_its_frames_are_counted(run: Path) -> None:
     whole = run / "frames" / NAMES[0]
     shutil.copytree(whole, whole.with_name(".00000.abcdef12.tmp"))  # of a command that was killed
-    assert main(["runs", "list", str(run.parent)]) == 0
-    assert "run: 4 frames" in capsys.readouterr().out
+    assert "run: 4 frames" in invoke("runs", "list", run.parent).out
 
 
-def test_it_is_judged(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["eval", "--gt", str(run), "--pred", str(run), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"] == 4
+def test_it_is_judged(run: Path) -> None:
+    assert run_json("eval", "--gt", run, "--pred", run)["frames"] == 4
 
 
 @pytest.mark.parametrize("layout", [[], ["--from", "run"]])

@@ -6,7 +6,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -29,26 +28,9 @@ from scene_ir.errors import RangeError
 from scene_ir.io import VERSION, load_scene, save_scene
 from scene_ir.meshes.templates import template
 from scene_ir.types import Camera, Mesh
+from tests.drivesem.invoke import invoke, refusal, run_json
 
 KITTI = Path(__file__).parents[3].parent / "shared" / "data" / "kitti"
-
-
-def succeed(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
-    """What a command prints with --json, and what it says on standard error."""
-    capsys.readouterr()
-    assert main([*words, "--json"]) == 0
-    captured = capsys.readouterr()
-    return json.loads(captured.out), captured.err
-
-
-def fail(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line of a command that is refused."""
-    capsys.readouterr()
-    assert main(words) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    return captured.err
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -89,45 +71,6 @@ def test_data_sets_are_those_that_can_be_read() -> None:
     assert sorted(DATASETS) == sorted(READERS)
 
 
-@pytest.mark.parametrize("command", ["derender", "attack", "bench"])
-def test_an_unknown_data_set_is_one_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    output = fail([command, "--dataset", "kitty", "--root", "."], capsys)
-    assert (
-        "--dataset: expected one of demo, kitti, vkitti1, vkitti2, coco, yolo, photographs, scenes, found 'kitty'"
-        in output
-    )
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--dataset", "kitti"], "--root"),
-        (["--root", "somewhere"], "--root"),
-        (["--velodyne"], "--velodyne: expected --dataset kitti"),
-        (["--device", "cuda"], "--device: expected cpu"),
-        (["--meshes", "."], "--meshes: expected a PHOTO or a --dataset"),
-        (["photo.png", "--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
-        (
-            ["--dataset", "kitti", "--root", "nowhere"],
-            "nowhere: expected the folder of a data set (kitti: training/image_2, label_2 and calib)",
-        ),
-        (["--dataset", "coco", "--root", "nowhere"], "nowhere"),
-        (["--limit", "0"], "--limit"),
-        (["photo.png"], "photo.png"),
-    ],
-)
-def test_derender_refuses(
-    words: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert message in fail(["derender", *words], capsys)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_folder_a_frame(taken: Path) -> None:
     assert sorted(p.name for p in taken.iterdir()) == [LOCK, "config.yaml", "demo-000", "demo-001"]
     found = {p.name for p in (taken / "demo-000").iterdir()}
@@ -148,34 +91,33 @@ def empty_streets(root: Path, calibrated: tuple[int, ...], count: int = 3) -> np
 
 
 @pytest.mark.slow
-def test_processes_do_not_matter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_processes_do_not_matter(tmp_path: Path) -> None:
     root = tmp_path / "D"
     empty_streets(root, (0, 2))
     words = ["derender", "--dataset", "kitti", "--root", str(root), "--keep-going"]
     found = {}
     for count in ("1", "2"):
-        found[count], _ = succeed([*words, "--workers", count, "--out", str(tmp_path / count)], capsys)
+        found[count] = run_json(*words, "--workers", count, "--out", tmp_path / count)
     for folder in ("000000", "000002"):
         assert contents(tmp_path / "1" / folder) == contents(tmp_path / "2" / folder) != {}
     assert found["1"]["failed"] == found["2"]["failed"]
     assert list(found["2"]["frames"]) == ["000000", "000002"]
 
 
-def test_frames_are_summarised(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_are_summarised(taken: Path, tmp_path: Path) -> None:
     out = tmp_path / "S"
     words = ["derender", "--limit", "1", "--workers", "1", "--sheet", "--out", str(out)]
-    found, _ = succeed(words, capsys)
+    found = run_json(*words)
     assert contents(out / "demo-000") == contents(taken / "demo-000")
     frame = found["frames"]["demo-000"]
     assert frame["objects"] == len(load_scene(out / "demo-000").objects)
     assert 0 < frame["seconds"] <= found["seconds"]
     assert found["failed"] == {}
     assert Path(found["out"]) == out
-    assert main(words) == 0
-    assert f"demo-000: {frame['objects']} vehicles, already there" in capsys.readouterr().out
+    assert f"demo-000: {frame['objects']} vehicles, already there" in invoke(*words).out
 
 
-def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path) -> None:
     out = tmp_path / "S"
     shutil.copytree(taken, out)
     before = contents(out)
@@ -183,60 +125,53 @@ def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path, capsys: pytest
     (out / "demo-000" / "sheet.jpg").unlink()
     mark = (out / "demo-000" / "scene.json").stat().st_mtime_ns
     words = ["derender", "--limit", "2", "--workers", "1", "--out", str(out)]
-    found, _ = succeed([*words, "--sheet"], capsys)
+    found = run_json(*words, "--sheet")
     assert found["frames"]["demo-000"]["seconds"] is None
     assert found["frames"]["demo-001"]["seconds"] > 0
     assert (out / "demo-000" / "scene.json").stat().st_mtime_ns == mark
     after = contents(out)
     assert after.keys() == before.keys()
     assert all(after[name] == before[name] for name in before if name != "config.yaml")
-    again, _ = succeed(words, capsys)
+    again = run_json(*words)
     assert all(frame["seconds"] is None for frame in again["frames"].values())
     assert again["frames"]["demo-000"]["objects"] == found["frames"]["demo-000"]["objects"]
 
 
-def test_a_scene_of_another_version_is_refused(
-    taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_of_another_version_is_refused(taken: Path, tmp_path: Path) -> None:
     out = tmp_path / "S"
     shutil.copytree(taken, out)
     record = out / "demo-001" / "scene.json"
     record.write_text(record.read_text().replace(f'"version": {VERSION}', '"version": 99'))
-    output = fail(["derender", "--limit", "2", "--workers", "1", "--out", str(out)], capsys)
+    output = refusal("derender", "--limit", "2", "--workers", "1", "--out", out)
     assert f"scene.json: version: expected version {VERSION}, found version 99" in output
 
 
-def test_other_settings_need_another_folder(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = fail(["derender", "--limit", "2", "--out", str(taken), "--seed", "1"], capsys)
+def test_other_settings_need_another_folder(taken: Path) -> None:
+    output = refusal("derender", "--limit", "2", "--out", taken, "--seed", "1")
     assert "other values of seed" in output
-    output = fail(["derender", "--limit", "2", "--out", str(taken), "--fast"], capsys)
+    output = refusal("derender", "--limit", "2", "--out", taken, "--fast")
     assert "other values of fit" in output
-    assert "which holds other files" in fail(["derender", "--out", str(taken / "demo-000")], capsys)
+    assert "which holds other files" in refusal("derender", "--out", taken / "demo-000")
 
 
-def test_no_resume_starts_again(tmp_path: Path, taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_resume_starts_again(tmp_path: Path, taken: Path) -> None:
     out = tmp_path / "S"
     shutil.copytree(taken, out)
     (out / "mine.txt").write_text("kept")
     words = ["derender", "--limit", "1", "--workers", "1", "--fast", "--no-resume", "--out", str(out)]
-    found, _ = succeed(words, capsys)
+    found = run_json(*words)
     assert found["frames"]["demo-000"]["seconds"] > 0
     assert not (out / "demo-000" / "sheet.jpg").exists()
     assert "fit: false" in (out / "config.yaml").read_text()
     assert (out / "mine.txt").read_text() == "kept"
 
 
-def test_identifiers_with_slashes_become_nested_folders(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_identifiers_with_slashes_become_nested_folders(tmp_path: Path) -> None:
     root, out = tmp_path / "D", tmp_path / "S"
-    succeed(
-        ["synth", "--layout", "vkitti2", "--frames", "1", "--sequence", "1", "--workers", "1", "--out", str(root)],
-        capsys,
-    )
+    run_json("synth", "--layout", "vkitti2", "--frames", "1", "--sequence", "1", "--workers", "1", "--out", root)
     (name,) = open_dataset("vkitti2", root).identifiers
     words = ["derender", "--dataset", "vkitti2", "--root", str(root), "--fast", "--workers", "1"]
-    found, _ = succeed([*words, "--out", str(out)], capsys)
+    found = run_json(*words, "--out", out)
     assert list(found["frames"]) == [name]
     assert name.count("/") == 3
     scene = load_scene(out / name)
@@ -244,14 +179,13 @@ def test_identifiers_with_slashes_become_nested_folders(
     assert "fit: false" in (out / "config.yaml").read_text()
 
 
-def test_frames_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_that_cannot_be_used(tmp_path: Path) -> None:
     root = tmp_path / "D"
     image = empty_streets(root, (1,), count=2)
     (root / "training" / "velodyne").mkdir()
     words = ["derender", "--dataset", "kitti", "--root", str(root), "--workers", "1", "--velodyne"]
-    assert main([*words, "--out", str(tmp_path / "A")]) == 2
-    assert "000000.txt: expected a readable file" in capsys.readouterr().err.splitlines()[-1]
-    found, _ = succeed([*words, "--out", str(tmp_path / "B"), "--keep-going"], capsys)
+    assert "000000.txt: expected a readable file" in refusal(*words, "--out", tmp_path / "A")
+    found = run_json(*words, "--out", tmp_path / "B", "--keep-going")
     assert list(found["failed"]) == ["000000"]
     assert found["frames"]["000001"]["objects"] == 0
     assert main(["render", str(tmp_path / "B" / "000001")]) == 0
@@ -275,7 +209,7 @@ def street_with(mesh: Mesh, root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path) -> None:
     shape = template("pickup")
     street_with(shape, tmp_path / "D")
     (tmp_path / "meshes").mkdir()
@@ -290,7 +224,7 @@ def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path, capsys: pytes
         chosen[name] = load_scene(tmp_path / name / "000000").provenance["objects[0].mesh"]
     assert chosen["A"] != chosen["B"] == "my-pickup"
     assert '"my-pickup"' in (tmp_path / "B" / "000000" / "scene.json").read_text()
-    output = fail([*words, "--out", str(tmp_path / "B")], capsys)
+    output = refusal(*words, "--out", tmp_path / "B")
     assert "other values of meshes" in output
 
 
@@ -299,32 +233,28 @@ def test_points_are_kittis(tmp_path: Path) -> None:
         open_dataset("coco", tmp_path, with_points=True)
 
 
-def test_an_unperturbed_render_is_the_photograph(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found, _ = succeed(["render", str(demo), "-o", str(tmp_path / "a.png")], capsys)
+def test_an_unperturbed_render_is_the_photograph(demo: Path, tmp_path: Path) -> None:
+    found = run_json("render", demo, "-o", tmp_path / "a.png")
     assert found["objects"] == len(load_scene(demo).objects)
     assert Path(found["out"]) == tmp_path / "a.png"
     assert np.array_equal(files.read_image(tmp_path / "a.png"), files.read_image(demo / "photograph.png"))
 
 
-def test_a_scene_that_went_through_files_renders_alike(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_that_went_through_files_renders_alike(demo: Path, tmp_path: Path) -> None:
     turn = ["--set", "objects[0].rotate=5deg", "--set", "weather.fog=0.3"]
-    succeed(["edit", str(demo), *turn, "--save", str(tmp_path / "S"), "-o", str(tmp_path / "a.png")], capsys)
-    succeed(["render", str(tmp_path / "S")], capsys)
+    run_json("edit", demo, *turn, "--save", tmp_path / "S", "-o", tmp_path / "a.png")
+    run_json("render", tmp_path / "S")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "S" / "render.png").read_bytes()
     again = load_scene(tmp_path / "S")
     save_scene(again, tmp_path / "T")
     assert contents(tmp_path / "T") == {k: v for k, v in contents(tmp_path / "S").items() if k != "render.png"}
 
 
-def test_an_edit_moves_what_it_should(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_edit_moves_what_it_should(demo: Path, tmp_path: Path) -> None:
     scene = load_scene(demo)
     row = int(scene.objects.box2d[:, 3].argmax())
     out = tmp_path / "a.png"
-    succeed(["edit", str(demo), "--set", f"objects[{row}].translate=0.5m,0m", "-o", str(out)], capsys)
+    run_json("edit", demo, "--set", f"objects[{row}].translate=0.5m,0m", "-o", out)
     changed = np.abs(files.read_image(out).astype(int) - files.read_image(demo / "photograph.png")).max(axis=2)
     x0, y0, x1, y1 = scene.objects.box2d[row].round().int().tolist()
     assert (changed[y0:y1, x0:x1] > 8).mean() > 0.1
@@ -335,11 +265,11 @@ def test_an_edit_moves_what_it_should(demo: Path, tmp_path: Path, capsys: pytest
     assert not changed[~near].any()
 
 
-def test_saved_edits_are_in_physical_units(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_saved_edits_are_in_physical_units(demo: Path, tmp_path: Path) -> None:
     path = tmp_path / "edit.yaml"
     path.write_text("objects:\n  0: {translate: [0.5m, 0.25m], rotate: 10deg}\n  1: {remove: true}\n")
     words = ["edit", str(demo), "--edits", str(path), "--set", "objects[0].rotate=20deg", "--save"]
-    found, _ = succeed([*words, str(tmp_path / "S")], capsys)
+    found = run_json(*words, tmp_path / "S")
     assert "out" not in found, "nothing is drawn where only a folder is asked for"
     before, after = load_scene(demo).objects, load_scene(tmp_path / "S").objects
     assert len(after) == found["objects"] == len(before) - 1
@@ -350,18 +280,16 @@ def test_saved_edits_are_in_physical_units(demo: Path, tmp_path: Path, capsys: p
     assert read_frame_edit(path)["objects"][1] == {"remove": True}
 
 
-def test_an_edit_begins_with_the_photograph_again(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_edit_begins_with_the_photograph_again(demo: Path, tmp_path: Path) -> None:
     still, changed = tmp_path / "still.png", tmp_path / "S"
     words = ["edit", str(demo), "--set", "objects[0].rotate=10deg", "--set", "weather.fog=0.5"]
-    succeed([*words, "--save", str(changed)], capsys)
-    succeed(["edit", str(changed), "--photographed", "-o", str(still)], capsys)
+    run_json(*words, "--save", changed)
+    run_json("edit", changed, "--photographed", "-o", still)
     assert np.array_equal(files.read_image(still), files.read_image(demo / "photograph.png"))
     once, again = tmp_path / "once.png", tmp_path / "again.png"
-    succeed(["edit", str(demo), "--set", "objects[0].rotate=4deg", "-o", str(once)], capsys)
+    run_json("edit", demo, "--set", "objects[0].rotate=4deg", "-o", once)
     words = ["edit", str(changed), "--photographed", "--set", "objects[0].rotate=4deg", "-o", str(again)]
-    succeed(words, capsys)
+    run_json(*words)
     assert np.array_equal(files.read_image(once), files.read_image(again))
     assert not np.array_equal(files.read_image(once), files.read_image(still))
 
@@ -375,34 +303,28 @@ def test_removed_vehicles_stay_removed_and_are_reported(
     left = len(load_scene(demo).objects) - 1
     assert f"S: {left} vehicles, 1 removed (" in capsys.readouterr().out
     words = ["edit", str(changed), "--photographed", "-o", str(still)]
-    found, output = succeed(words, capsys)
+    printed = invoke(*words, "--json")
+    found, output = json.loads(printed.out), printed.err
     note = "not the photograph: vehicles that were removed, exchanged, added or loaded remain so"
     assert output == f"drivesem: {note}\n"
     assert (found["notes"], found["objects"]) == ([note], left)
-    assert main(words) == 0
-    assert f"still.png: {left} vehicles (" in capsys.readouterr().out
+    assert f"still.png: {left} vehicles (" in invoke(*words).out
     assert not np.array_equal(files.read_image(still), files.read_image(demo / "photograph.png"))
     once = tmp_path / "once.png"
-    succeed(["edit", str(demo), "--remove", "0", "-o", str(once)], capsys)
+    run_json("edit", demo, "--remove", "0", "-o", once)
     assert np.array_equal(files.read_image(once), files.read_image(still))
-    assert succeed(["edit", str(changed), "--set", "weather=fog", "-o", str(once)], capsys)[1] == ""
+    assert invoke("edit", changed, "--set", "weather=fog", "-o", once).err == ""
 
 
-def test_without_vehicles_the_background_is_left(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found, _ = succeed(["edit", str(demo), "--remove", "all", "-o", str(tmp_path / "a.png")], capsys)
+def test_without_vehicles_the_background_is_left(demo: Path, tmp_path: Path) -> None:
+    found = run_json("edit", demo, "--remove", "all", "-o", tmp_path / "a.png")
     assert found["objects"] == 0
     assert np.array_equal(files.read_image(tmp_path / "a.png"), files.read_image(demo / "background.png"))
-    found, _ = succeed(
-        ["edit", str(demo), "--remove", "0,2", "--remove", "1", "-o", str(tmp_path / "b.png")], capsys
-    )
+    found = run_json("edit", demo, "--remove", "0,2", "--remove", "1", "-o", tmp_path / "b.png")
     assert found["objects"] == len(load_scene(demo).objects) - 3
 
 
-def test_infeasible_positions_are_reported_and_rendered(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_infeasible_positions_are_reported_and_rendered(demo: Path, tmp_path: Path) -> None:
     scene = load_scene(demo)
     gap = scene.objects.translation[1:] - scene.objects.translation[0]
     other = 1 + int(gap.norm(dim=1).argmin())
@@ -410,13 +332,14 @@ def test_infeasible_positions_are_reported_and_rendered(
     x, z = gap[other - 1][[0, 2]].tolist()
     onto = f"objects[0].translate={c * x - s * z}m,{s * x + c * z}m"
     words = ["edit", str(demo), "--set", onto, "-o", str(tmp_path / "a.png")]
-    found, output = succeed(words, capsys)
+    printed = invoke(*words, "--json")
+    found, output = json.loads(printed.out), printed.err
     lines = output.splitlines()
     assert lines
     assert all(line.startswith("drivesem: objects[") for line in lines)
     assert f"objects[{other}]: collision with objects[0]" in output
     assert found["notes"] == [line.removeprefix("drivesem: ") for line in lines]
-    _, output = succeed([*words, "--remove", str(other)], capsys)
+    output = invoke(*words, "--remove", other).err
     assert f"objects[{other}]" not in output
 
 
@@ -438,30 +361,23 @@ def test_infeasible_positions_are_reported_and_rendered(
     ],
 )
 def test_edit_refuses(
-    words: list[str],
-    message: str,
-    demo: Path,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    words: list[str], message: str, demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "mine.txt").write_text("kept")
     monkeypatch.chdir(tmp_path)
-    assert message in fail(["edit", str(demo), *words], capsys)
+    assert message in refusal("edit", demo, *words)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.parametrize("command", [["render"], ["edit", "--remove", "0"]])
-def test_what_is_no_scene_is_named(
-    command: list[str], taken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "expected a folder with a scene" in fail([*command, str(tmp_path / "nowhere")], capsys)
-    assert "scene.json" in fail([*command, str(taken)], capsys)
+def test_what_is_no_scene_is_named(command: list[str], taken: Path, tmp_path: Path) -> None:
+    assert "expected a folder with a scene" in refusal(*command, tmp_path / "nowhere")
+    assert "scene.json" in refusal(*command, taken)
     broken = tmp_path / "broken"
     shutil.copytree(taken / "demo-000", broken)
     (broken / "arrays.npz").write_bytes(b"no archive")
-    assert "arrays.npz" in fail([*command, str(broken)], capsys)
-    assert "SCENE" in fail(command, capsys)
+    assert "arrays.npz" in refusal(*command, broken)
+    assert "SCENE" in refusal(*command)
 
 
 def test_the_sheet_shows_photograph_background_and_no_difference(taken: Path) -> None:
@@ -503,13 +419,13 @@ def test_the_sheet_states_the_difference(taken: Path) -> None:
 
 
 @pytest.mark.skipif(not KITTI.is_dir(), reason="needs ../shared/data/kitti")
-def test_a_photograph_of_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_photograph_of_kitti(tmp_path: Path) -> None:
     out = tmp_path / "S"
     words = ["derender", "--dataset", "kitti", "--root", str(KITTI), "--out", str(out)]
-    found, _ = succeed([*words, "--fast", "--velodyne", "--limit", "2", "--workers", "1"], capsys)
+    found = run_json(*words, "--fast", "--velodyne", "--limit", "2", "--workers", "1")
     assert list(found["frames"]) == ["000000", "000001"]
     for name in found["frames"]:
-        succeed(["render", str(out / name)], capsys)
+        run_json("render", out / name)
         picture, photograph = (files.read_image(out / name / f"{n}.png") for n in ("render", "photograph"))
         assert np.abs(picture.astype(int) - photograph).max() <= 1
         assert np.array_equal(photograph, files.read_image(KITTI / "training" / "image_2" / f"{name}.png"))

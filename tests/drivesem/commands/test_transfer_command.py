@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,15 @@ import pytest
 import torch
 
 from detectors.types import Detections
-from drivesem.analysis.transfer import run as transfer_run
+from drivesem.analysis import transfer as transfer_run
 from drivesem.cli import main
 from drivesem.run import detection_cache
 from drivesem.run.results import load_frame
+from tests.drivesem.invoke import invoke, refusal, run_json
+
+
+def transfer(*words: object) -> Any:
+    return run_json("transfer", "--workers", "1", *words)
 
 
 class Blind:
@@ -50,17 +54,7 @@ def run(attacked: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(attacked, tmp_path / "source"))
 
 
-@pytest.fixture
-def transfer(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    def call(*words: object) -> dict[str, Any]:
-        capsys.readouterr()
-        assert main(["transfer", "--workers", "1", "--json", *map(str, words)]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    return call
-
-
-def test_the_source_detector_reproduces_the_run(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+def test_the_source_detector_reproduces_the_run(run: Path) -> None:
     (row,) = transfer("--run", run, "--detectors", "squeezedet")["rows"]
     metrics = json.loads((run / "metrics.json").read_text())
     for key in ("ap50", "ap70", "recall_at_t_star"):
@@ -76,7 +70,7 @@ def test_the_source_detector_reproduces_the_run(run: Path, transfer: Callable[..
     assert (row["transfer_rate"] is None) == (metrics["lost_objects"] == 0)
 
 
-def test_files(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+def test_files(run: Path) -> None:
     data = transfer("--run", run, "--detectors", "squeezedet", "--bootstrap", "10")
     out = run / "transfer"
     assert json.loads((out / "transfer.json").read_text()) == data
@@ -87,9 +81,7 @@ def test_files(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
     assert min(picture.shape[:2]) > 200
 
 
-def test_a_second_call_detects_nothing_again(
-    run: Path, transfer: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_call_detects_nothing_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = transfer("--run", run, "--detectors", "squeezedet")
     cached = sorted((run / "transfer" / "detections").rglob("*.json"))
     assert len(cached) == 4
@@ -103,9 +95,7 @@ def test_a_second_call_detects_nothing_again(
     assert len(calls) == 5
 
 
-def test_what_another_detector_loses(
-    run: Path, transfer: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_another_detector_loses(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that finds all cars in the photographs, and nothing once anything moves, loses them all."""
     seen = {}
     lost = known = 0
@@ -134,7 +124,7 @@ def test_what_another_detector_loses(
     assert high["lost_rate"] is None
 
 
-def test_a_matrix_of_two_runs(run: Path, tmp_path: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+def test_a_matrix_of_two_runs(run: Path, tmp_path: Path) -> None:
     other = shutil.copytree(run, tmp_path / "again")
     out = tmp_path / "matrix"
     rows = transfer("--run", f"{run},{other}", "--detectors", "squeezedet", "--out", out, "--limit", "1")["rows"]
@@ -173,15 +163,12 @@ def test_names_lose_their_folders_where_that_is_clear() -> None:
     assert transfer_run.shorten_detector_names(["darknet:x/c.cfg,x/c.weights"]) == ["darknet:c.cfg,c.weights"]
 
 
-def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(run: Path, tmp_path: Path) -> None:
     def refused(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["transfer", "--workers", "1", *map(str, words)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        (line,) = invoke("transfer", "--workers", "1", *words, code=2).err.splitlines()
         return line.removeprefix("drivesem: ")
 
     detectors = ("--detectors", "squeezedet")
-    assert refused(*detectors) == "--run: expected a folder of drivesem attack, found nothing"
     assert refused("--run", tmp_path / "none", *detectors).startswith(
         "--run: expected a folder of drivesem attack"
     )
@@ -197,15 +184,16 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     broken = run / "frames" / "demo-001" / "counterexample.png"
     broken.write_bytes(broken.read_bytes()[:999])
     # its progress bar may stand before the line
-    assert main(["transfer", "--run", str(run), *detectors, "--workers", "1"]) == 2
-    assert str(broken) in " ".join(capsys.readouterr().err.split())
+    assert str(broken) in " ".join(
+        invoke("transfer", "--run", run, *detectors, "--workers", "1", code=2).err.split()
+    )
     (run / "metrics.json").unlink()
     assert "a finished run" in refused("--run", run, *detectors)
     (run / "config.yaml").write_text("photo: street.png\n")
     assert "a run of another command" in refused("--run", run, *detectors)
 
 
-def test_bad_frames_are_left_out_with_keep_going(run: Path, transfer: Callable[..., dict[str, Any]]) -> None:
+def test_bad_frames_are_left_out_with_keep_going(run: Path) -> None:
     broken = run / "frames" / "demo-001" / "counterexample.png"
     broken.write_bytes(b"no picture")
     data = transfer("--run", run, "--detectors", "squeezedet", "--keep-going")
@@ -213,11 +201,10 @@ def test_bad_frames_are_left_out_with_keep_going(run: Path, transfer: Callable[.
     assert list(data["frames_failed"]) == [str(broken)]
 
 
-def test_a_detector_without_cars_is_refused(
-    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_detector_without_cars_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     blind = Blind({})
     monkeypatch.setattr(blind, "classes", ("bus",), raising=False)
     monkeypatch.setattr(detection_cache, "load_predictor", lambda *_: blind)
-    assert main(["transfer", "--run", str(run), "--detectors", "onnx:blind.onnx"]) == 2
-    assert "expected one that knows Car, found bus" in capsys.readouterr().err
+    assert "expected one that knows Car, found bus" in refusal(
+        "transfer", "--run", run, "--detectors", "onnx:blind.onnx"
+    )

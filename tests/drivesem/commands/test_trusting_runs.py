@@ -14,6 +14,7 @@ from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import to_yaml
 from drivesem.run.folder import load_attack_config, load_trusted_config
+from tests.drivesem.invoke import invoke
 
 CODE = """
 from pathlib import Path
@@ -73,19 +74,14 @@ def test_each_setting_that_names_a_detector(foreign: Callable[[str], Path], sett
     ids=lambda words: words[0],
 )
 def test_each_command_that_loads_a_run_s_detector(
-    words: list[str],
-    write_run: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    words: list[str], write_run: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = write_run(tmp_path / "source")
     Path("evil.py").write_text(CODE.format(mark=str(tmp_path / "mark")))
     (run / "config.yaml").write_text(to_yaml(AttackConfig(params="rotate", detector="module:evil.py:D")))
     before = sorted(tmp_path.rglob("*"))
-    assert main([*words, str(run)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = invoke(*words, run, code=2).err.splitlines()
     assert line.startswith(f"drivesem: {run}/config.yaml: detector: expected a detector that is data alone")
     assert "--trust" in line
     assert sorted(tmp_path.rglob("*")) == before

@@ -15,7 +15,7 @@ import torch
 import yaml
 
 from detectors.types import CLASSES, Detections
-from drivesem.analysis.verify.checks import CHECKS
+from drivesem.analysis.verify import CHECKS
 from drivesem.attack.budgets import PRESETS
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import ParameterSpace, parse_params
@@ -26,9 +26,16 @@ from drivesem.run.finished import rebuild_objective
 from drivesem.run.results import load_frame
 from scene_ir import files
 from scene_ir.io import load_scene
+from tests.drivesem.invoke import invoke, refusal, run_json
 
 FRAME = Path("frames") / "demo-000"
 WORDS = ("--detector", "any", "--limit", "1", "--workers", "1", "--json", "--params", "weather,translate")
+
+
+def verify(run: Path, *words: object, code: int = 1) -> Any:
+    data = run_json("verify", "--run", run, "--workers", "1", *words, code=code)
+    assert data["agree"] == (code == 0)
+    return data
 
 
 class Drifting:
@@ -67,18 +74,6 @@ def run(finished: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(finished, tmp_path / "source"))
 
 
-@pytest.fixture
-def verify(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    def call(run: Path, *words: object, code: int = 1) -> dict[str, Any]:
-        capsys.readouterr()
-        assert main(["verify", "--run", str(run), "--workers", "1", "--json", *map(str, words)]) == code
-        data = json.loads(capsys.readouterr().out)
-        assert data["agree"] == (code == 0)
-        return data
-
-    return call
-
-
 def change(path: Path, edit: Callable[[Any], None]) -> None:
     """Edit a JSON file in place."""
     data = json.loads(path.read_text())
@@ -96,7 +91,7 @@ def checks(data: dict[str, Any]) -> set[str]:
     return {row["name"] for row in data["checks"] if row["differing"]}
 
 
-def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_a_fresh_run_agrees(run: Path) -> None:
     result = load_frame(run / FRAME / "result.json")
     assert (result.success_moved, result.success_paper) == (True, True)
     saved = load_scene(run / FRAME / "scene").as_photographed()
@@ -113,7 +108,7 @@ def test_a_fresh_run_agrees(run: Path, verify: Callable[..., dict[str, Any]]) ->
 
 
 def test_a_run_of_places_in_the_picture_agrees_goes_on_and_may_leave_the_ground(
-    drifting: None, tmp_path: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+    drifting: None, tmp_path: Path
 ) -> None:
     words = ("attack", *WORDS, "--parametrisation", "roi", "--project", "bounds")
     words = (
@@ -138,13 +133,10 @@ def test_a_run_of_places_in_the_picture_agrees_goes_on_and_may_leave_the_ground(
     assert any("off the ground" in line for line in result.violations)
     assert result.failures
     assert not result.graded
-    assert main([*words, "--parametrisation", "ground"]) == 2
-    assert "parametrisation" in capsys.readouterr().err
+    assert "parametrisation" in refusal(*words, "--parametrisation", "ground")
 
 
-def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
-    drifting: None, tmp_path: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(drifting: None, tmp_path: Path) -> None:
     words = (
         "--method",
         "random",
@@ -158,8 +150,7 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
         "3",
     )
     out = tmp_path / "street"
-    assert main(["attack", *WORDS, *words, "--out", str(out)]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = json.loads(invoke("attack", *WORDS, *words, "--out", out).out)
     assert data["feasible_fraction"] == 1.0
     assert yaml.safe_load((out / "config.yaml").read_text())["budget"] == "street"
     theta = [c for c in load_frame(out / FRAME / "result.json").theta if c.name.endswith("along")]
@@ -182,20 +173,17 @@ def test_a_run_beyond_the_paper_s_budget_agrees_and_is_feasible_in_its_own(
     found = differing_fields(verify(out))
     assert "own lengths" in found["violations"]["found"]
     (out / "config.yaml").write_text(change_text.replace("budget: street,translate=0.25", "budget: paper"))
-    assert main(["verify", "--run", str(out)]) == 2
-    assert "params: size: expected a budget in which size may change" in capsys.readouterr().err
+    assert "params: size: expected a budget in which size may change" in refusal("verify", "--run", out)
 
 
-def test_for_people_and_elsewhere(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_for_people_and_elsewhere(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "told.json"
-    capsys.readouterr()
-    assert main(["verify", "--run", str(run), "--limit", "1", "--workers", "1", "--out", str(out)]) == 0
-    assert "no differences" in capsys.readouterr().out
+    assert "no differences" in invoke("verify", "--run", run, "--limit", "1", "--workers", "1", "--out", out).out
     assert json.loads(out.read_text())["frames"] == 1
     assert not (run / "verify.json").exists()
 
 
-def test_changed_pixels(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_changed_pixels(run: Path) -> None:
     pictures = {
         "benign.png": "detections_benign",
         "rerender.png": "detections_rerendered",
@@ -213,15 +201,13 @@ def test_changed_pixels(run: Path, verify: Callable[..., dict[str, Any]]) -> Non
     assert found == dict.fromkeys(pictures, share)
 
 
-def test_many_differences_hide_no_other(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_many_differences_hide_no_other(run: Path) -> None:
     """A picture with other detections makes differences by the dozen."""
     result = run / FRAME / "result.json"
     change(result, lambda data: data["detections_benign"].extend(data["detections_benign"] * 40))
     settings = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(settings.replace("steps: 10", "steps: 99"))
-    capsys.readouterr()
-    assert main(["verify", "--run", str(run), "--workers", "1"]) == 1
-    output = capsys.readouterr().out
+    output = invoke("verify", "--run", run, "--workers", "1", code=1).out
     lines = [line for line in output.splitlines() if ": expected " in line]
     assert lines[0].startswith("(run): ")
     assert "(run): settings: config.yaml: steps: expected 99, found 10" in lines
@@ -229,7 +215,7 @@ def test_many_differences_hide_no_other(run: Path, capsys: pytest.CaptureFixture
     assert re.search(r"^and \d+ more$", output, re.MULTILINE)
 
 
-def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_a_changed_label_in_either_file(run: Path) -> None:
     for name in ("labels_paper.txt", "labels_moved.txt"):
         lines = (run / FRAME / name).read_text().splitlines()
         words = lines[1].split()
@@ -243,9 +229,7 @@ def test_a_changed_label_in_either_file(run: Path, verify: Callable[..., dict[st
     assert checks(data) == {"files", "labels"}
 
 
-def test_an_object_struck_from_the_labels_and_another_sum(
-    run: Path, verify: Callable[..., dict[str, Any]]
-) -> None:
+def test_an_object_struck_from_the_labels_and_another_sum(run: Path) -> None:
     path = run / FRAME / "labels_moved.txt"
     path.write_text("".join(f"{line}\n" for line in path.read_text().splitlines()[1:]))
     change(run / "metrics.json", lambda data: data.update(successes_paper=7))
@@ -255,7 +239,7 @@ def test_an_object_struck_from_the_labels_and_another_sum(
     assert data["differences"][-1]["expected"] == "7"
 
 
-def test_a_success_that_is_none(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_a_success_that_is_none(run: Path) -> None:
     def flip(data: dict[str, Any]) -> None:
         data["success_moved"] = not data["success_moved"]
 
@@ -272,7 +256,7 @@ def test_a_success_that_is_none(run: Path, verify: Callable[..., dict[str, Any]]
     assert checks(data) == {"files", "success", "totals"}
 
 
-def test_failures_detections_and_targets_that_are_others(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_failures_detections_and_targets_that_are_others(run: Path) -> None:
     def spoil(data: dict[str, Any]) -> None:
         (phantom,) = data["failures"]
         data["failures"] = [phantom | {"kind": "lost", "index": 1, "score": None}]
@@ -287,7 +271,7 @@ def test_failures_detections_and_targets_that_are_others(run: Path, verify: Call
     assert "detections_rerendered" in found
 
 
-def test_another_grade_kind_or_count(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_another_grade_kind_or_count(run: Path) -> None:
     path = run / FRAME / "result.json"
     (failure,) = load_frame(path).failures
     assert (failure.error, failure.grade) == ("background", "threshold")
@@ -317,12 +301,9 @@ def test_another_grade_kind_or_count(run: Path, verify: Callable[..., dict[str, 
     verify(run, code=0)
 
 
-def test_a_run_of_an_earlier_schema_is_refused_with_the_version_that_made_it(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_an_earlier_schema_is_refused_with_the_version_that_made_it(run: Path) -> None:
     change(run / "metrics.json", lambda data: data.update(schema=1))
-    assert main(["verify", "--run", str(run), "--workers", "1"]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    (line,) = invoke("verify", "--run", run, "--workers", "1", code=2).err.strip().splitlines()
     assert "expected a run of this version" in line
     assert "made by an earlier drivesem 0.1.0" in line
 
@@ -359,9 +340,7 @@ def by_another_judge(data: Any) -> None:
         (nested("frames_failed", value={"demo-007": "why"}), "metrics.json: frames_failed"),
     ],
 )
-def test_each_figure_of_the_run(
-    run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
-) -> None:
+def test_each_figure_of_the_run(run: Path, edit: Callable[[Any], None], field: str) -> None:
     change(run / "metrics.json", edit)
     assert field in differing_fields(verify(run))
 
@@ -386,23 +365,19 @@ def test_each_figure_of_the_run(
         (nested("grade_notes", value=["no peer"]), "result.json: grade_notes"),
     ],
 )
-def test_each_figure_of_a_frame(
-    run: Path, verify: Callable[..., dict[str, Any]], edit: Callable[[Any], None], field: str
-) -> None:
+def test_each_figure_of_a_frame(run: Path, edit: Callable[[Any], None], field: str) -> None:
     change(run / FRAME / "result.json", edit)
     assert {field, "result.json"} <= set(differing_fields(verify(run)))
 
 
-def test_runs_from_before_values_had_hashes_of_their_own(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_runs_from_before_values_had_hashes_of_their_own(run: Path) -> None:
     change(run / "manifest.json", lambda data: data.pop("fields"))
     verify(run, code=0)
     change(run / FRAME / "result.json", nested("loss_trace", value=[9.0]))
     assert set(differing_fields(verify(run))) == {"result.json"}
 
 
-def test_settings_overlays_and_files_that_were_added_or_taken_away(
-    run: Path, verify: Callable[..., dict[str, Any]]
-) -> None:
+def test_settings_overlays_and_files_that_were_added_or_taken_away(run: Path) -> None:
     settings = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(settings.replace("steps: 10", "steps: 99").replace("limit: 1", "limit: 7"))
     files.write_png(run / FRAME / "overlay.png", files.read_image(run / FRAME / "benign.png"))
@@ -415,7 +390,7 @@ def test_settings_overlays_and_files_that_were_added_or_taken_away(
     assert found["difference.png"]["found"] == found["scene/more.txt"]["expected"] == "no file"
 
 
-def test_times_and_places_may_be_others(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_times_and_places_may_be_others(run: Path) -> None:
     change(run / FRAME / "result.json", nested("seconds", value=1.0))
     change(run / "metrics.json", lambda data: data.update(seconds=1.0, out="elsewhere"))
     verify(run, code=0)
@@ -425,9 +400,7 @@ def shift(data: dict[str, Any], metres: float) -> None:
     data["objects"]["translation"][0][0] += metres
 
 
-def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(
-    run: Path, verify: Callable[..., dict[str, Any]]
-) -> None:
+def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(run: Path) -> None:
     change(run / FRAME / "scene" / "scene.json", lambda data: shift(data, 0.15))
     data = verify(run)
     found = differing_fields(data)
@@ -437,16 +410,14 @@ def test_a_scene_moved_within_the_paper_s_budget_and_beyond_the_run_s(
     assert {"pictures", "feasibility", "theta", "labels"} <= checks(data)
 
 
-def test_a_scene_that_cannot_be(run: Path, verify: Callable[..., dict[str, Any]]) -> None:
+def test_a_scene_that_cannot_be(run: Path) -> None:
     change(run / FRAME / "scene" / "scene.json", lambda data: shift(data, 3.0))
     found = differing_fields(verify(run))
     assert found["violations"]["expected"] == "none"
     assert "own lengths" in found["violations"]["found"]
 
 
-def test_theta_beyond_the_budget_and_another_in_its_own_file(
-    run: Path, verify: Callable[..., dict[str, Any]]
-) -> None:
+def test_theta_beyond_the_budget_and_another_in_its_own_file(run: Path) -> None:
     def beyond(data: dict[str, Any]) -> None:
         (own,) = [c for c in data["theta"] if c["name"] == "weather.fog"]
         own["value"] = own["upper"] = 0.9
@@ -462,26 +433,20 @@ def test_theta_beyond_the_budget_and_another_in_its_own_file(
     assert found["weather.fog, budget"]["expected"] == "a value in [0, 0.5]"
 
 
-def test_what_cannot_be_read(
-    run: Path, verify: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_read(run: Path) -> None:
     (run / FRAME / "scene" / "arrays.npz").write_bytes(b"no archive")
-    assert main(["verify", "--run", str(run), "--workers", "1"]) == 2
-    line = capsys.readouterr().err.strip().splitlines()[-1]
+    line = refusal("verify", "--run", run, "--workers", "1")
     assert "arrays.npz" in line
     data = verify(run, "--keep-going")
     assert list(data["frames_failed"]) == ["demo-000"]
     assert data["frames"] == 0
 
 
-def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(run: Path, tmp_path: Path) -> None:
     def refused(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["verify", "--workers", "1", *map(str, words)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        (line,) = invoke("verify", "--workers", "1", *words, code=2).err.splitlines()
         return line.removeprefix("drivesem: ")
 
-    assert refused() == "--run: expected a folder of drivesem attack, found nothing"
     assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")
     assert refused("--run", run, "--limit", "0") == "--limit: expected at least 1, found 0"
     assert refused("--run", run, "--out", tmp_path).startswith("--out: expected a file")

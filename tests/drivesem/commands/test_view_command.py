@@ -20,7 +20,7 @@ from drivesem.cli import main
 from drivesem.commands import view
 from drivesem.config.commands import ViewConfig
 from drivesem.config.parsing import parse
-from drivesem.viewer import frames
+from drivesem.viewer import server as frames
 from scene_ir.io import load_scene, save_scene
 
 Refused = Callable[..., str]
@@ -61,23 +61,6 @@ def test_scenes_of_derender_are_no_run(two_scenes: Path) -> None:
 def test_it_begins_with_a_frame_that_has_vehicles(two_scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frames, "count_objects", lambda folder: 1 if folder.name == "b" else 0)
     assert list(frames.open_viewer_frames(ViewConfig(scene=str(two_scenes))).frames) == ["b", "a"]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (
-            ["nowhere"],
-            "SCENE|RUN: expected a scene of drivesem derender, a folder of some, or a run, found nowhere",
-        ),
-        (["nowhere", "--port", "65536"], "--port: expected 0 (any that is free) to 65535, found 65536"),
-        (["nowhere", "--port", "-1"], "--port: expected 0"),
-        (["nowhere", "--budget", "moon"], "--budget: expected paper, parking, street"),
-        ([], "SCENE|RUN"),
-    ],
-)
-def test_refuses(words: list[str], message: str, refused: Refused) -> None:
-    assert message in refused("view", *words)
 
 
 def test_refuses_what_a_folder_lacks(two_scenes: Path, small_run: Path, refused: Refused) -> None:

@@ -9,16 +9,15 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import pytest
 
 from drivesem.cli import EXAMPLES, TOPICS, main
 from drivesem.config import presets as preset_files
 from drivesem.config.commands import COMMANDS
-from drivesem.config.help import field_texts
 from drivesem.config.options import option_name
-from drivesem.config.parsing import parse
+from drivesem.config.parsing import field_texts, parse
 from drivesem.config.presets import find_presets, resolve_preset
 
 
@@ -107,12 +106,6 @@ def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed[1]["about"].startswith("A first look")
     assert "train-squeezedet-whole" in printed(["train", "--config", "list"], capsys)
     assert printed(["doctor", "--config", "list"], capsys) == "no presets for doctor\n"
-
-
-@pytest.mark.parametrize("words", [["--config", "fast"], ["--config", "elsewhere/quick.yaml"], ["--config"]])
-def test_an_unknown_preset_is_refused_with_the_known_ones(words: list[str], refused: Any) -> None:
-    line = refused("attack", *words)
-    assert "--config: expected a YAML file, or a preset: paper, quick, found" in line
 
 
 def test_a_file_of_ones_own_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

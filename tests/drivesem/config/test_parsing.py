@@ -16,7 +16,6 @@ import pytest
 import yaml
 
 import drivesem
-from drivesem.cli import main
 from drivesem.config.commands import COMMANDS, AttackConfig, DriveConfig, ExplainConfig, SynthConfig, TrainConfig
 from drivesem.config.constraints import (
     AllowsUrl,
@@ -32,6 +31,7 @@ from drivesem.config.options import CommandConfig, InferenceOptions, find_constr
 from drivesem.config.parsing import parse
 from drivesem.config.presets import preset_commands, preset_words
 from drivesem.run.folder import load_attack_config
+from tests.drivesem.invoke import invoke
 from tools.experiments.__main__ import EXPERIMENTS
 from tools.experiments.settings import StudyConfig
 
@@ -137,76 +137,6 @@ def test_bad_preset(tmp_path: Path, text: str, message: str) -> None:
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["attack", "--combo", "7"], "--combo: expected 1, 2, 3 or 4, found 7"),
-        (["attack", "--combo", "2", "--params", "mesh"], "--params: expected no --combo"),
-        (["attack", "--params", "wheels"], "wheels"),
-        (["attack", "--steps", "0"], "--steps: expected at least 1, found 0"),
-        (["attack", "--steps", "many"], "--steps"),
-        (["attack", "--limit", "0"], "--limit"),
-        (["attack", "--workers", "0"], "--workers"),
-        (["attack", "--dataset", "kitti"], "--root"),
-        (["attack", "--dataset", "kitty", "--root", "."], "kitty"),
-        (["attack", "--root", "somewhere"], "--root"),
-        (["attack", "--objective-labels", "mine"], "--objective-labels"),
-        (["attack", "--frobnicate"], "frobnicate"),
-        (["attack", "--config", "nowhere.yaml"], "nowhere.yaml"),
-        (["attack", "--config"], "--config"),
-        (["attack", "--config="], "--config: expected a YAML file, or a preset: paper, quick, found nothing"),
-        (["attack", "--config=", "--json"], "preset: paper, quick, found nothing"),
-        (["attack", "--config", ""], "--config: expected a YAML file, or a preset: paper, quick, found nothing"),
-        (["attack", "--out", "b\udcffd"], r"--out: expected text that UTF-8 holds, found 'b\udcffd'"),
-        (["attack", "--config", "qick"], "or a preset: paper, quick, found qick; did you mean quick?"),
-        (["view"], "Missing from drivesem view: SCENE|RUN"),
-        (["export", "runs/a"], "Missing from drivesem export: --to"),
-        (["classify"], "Missing from drivesem classify: {data,train,attack,confirm,explain,holes,gate}"),
-        (["attack", "--detector", "nowhere.safetensors"], "nowhere.safetensors"),
-        (
-            ["attack", "--detector", "retinanot"],
-            "--detector: expected a detector (squeezedet, yolov3-slim, a path.s",
-        ),
-        (["attack", "--detector", "retinanot"], "module:, ensemble: or planted:), found 'retinanot'"),
-        (["gate", "run"], "--after: expected the detector that replaces --before, found nothing"),
-        (
-            ["classify", "gate", "run"],
-            "--network: expected the network that replaces the run's, found",
-        ),
-        (["attack", "--device", "quantum"], "quantum"),
-        (["frobnicate"], "frobnicate"),
-        (["attak"], "found attak; did you mean attack?"),
-        (["attack", "--limt", "3"], "found --limt; did you mean --limit?"),
-        (["attack", "--limt=3"], "found --limt; did you mean --limit?"),
-        (
-            ["attack", "--method", "climbs"],
-            "invalid choice 'climbs' for argument '--method'. Expected one of ('si-fgsm'",
-        ),
-        (["attack", "--steps", "many"], "Error parsing --steps: "),
-        (["attack", "--workers", "many"], "Error parsing --workers: "),
-        (["train", "--root", "frames", "--anchors", "0"], "--anchors: expected a number above 0"),
-        (["attack", "stray"], "expected options of drivesem attack (--help-all lists them), found stray"),
-        (["verify", "--limit", "2"], "--run: expected a folder of drivesem attack, found nothing"),
-        (["verify", "nowhere"], "nowhere"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    words: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(words) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    assert captured.err.startswith("drivesem: ")
-    assert message in captured.err
-    assert not list(tmp_path.iterdir()), "bad settings leave nothing behind"
-
-
 _TAKE_RUNS = ["verify", "explain", "confirm", "transfer --detectors squeezedet"]
 
 
@@ -274,11 +204,8 @@ def test_values_that_a_type_excludes_are_refused(name: str, field: str, constrai
         for value in outside(constraint, int)[:1]
     ],
 )
-def test_a_value_outside_its_range_is_one_line(
-    name: str, field: str, value: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([name, *_NEEDED.get(name, ()), f"{option_name(field)}={value}"]) == 2
-    captured = capsys.readouterr()
+def test_a_value_outside_its_range_is_one_line(name: str, field: str, value: int) -> None:
+    captured = invoke(name, *_NEEDED.get(name, ()), f"{option_name(field)}={value}", code=2)
     assert captured.out == ""
     assert captured.err.startswith(f"drivesem: {option_name(field)}: expected ")
     assert captured.err.count("\n") == 1
@@ -324,9 +251,8 @@ def test_a_run_opens_with_its_keys_in_any_order(tmp_path: Path) -> None:
     assert load_attack_config(tmp_path) == AttackConfig(steps=3, t_star=0.4)
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"drivesem {drivesem.__version__}\n"
+def test_version() -> None:
+    assert invoke("--version").out == f"drivesem {drivesem.__version__}\n"
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert drivesem.__version__ == declared
 

@@ -79,15 +79,23 @@ BUILDERS: dict[str, Callable[[Path, list[str]], None]] = {
     "bdd100k": write_bdd100k,
 }
 NAMES = st.lists(st.from_regex(r"[a-c]{1,2}[0-9]{1,3}", fullmatch=True), min_size=1, max_size=4, unique=True)
-FOLDERS = st.sampled_from(["", "images", "training/image_2", "training/label_2", "labels/train", "Annotations", "x/y"])
-FILES = st.sampled_from(["a1.png", "b.JPG", "n.webp", "z.heic", "a1.txt", "q.md", "none", ".hidden", "c.xml", "c.yml"])
+FOLDERS = st.sampled_from(
+    ["", "images", "training/image_2", "training/label_2", "labels/train", "Annotations", "x/y"]
+)
+FILES = st.sampled_from(
+    ["a1.png", "b.JPG", "n.webp", "z.heic", "a1.txt", "q.md", "none", ".hidden", "c.xml", "c.yml"]
+)
 
 
 @pytest.mark.parametrize("layout", BUILDERS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(names=NAMES, others=st.lists(st.tuples(FOLDERS, FILES), max_size=6), lost=st.integers(0, 9))
 def test_every_file_is_read_or_skipped(
-    layout: str, names: list[str], others: list[tuple[str, str]], lost: int, tmp_path_factory: pytest.TempPathFactory
+    layout: str,
+    names: list[str],
+    others: list[tuple[str, str]],
+    lost: int,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     root = tmp_path_factory.mktemp(layout)
     BUILDERS[layout](root, names)
@@ -147,7 +155,9 @@ def test_the_line_names_the_largest_ten(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_a_map_of_an_unknown_class_is_refused() -> None:
     account = DataAccount("coco", 1, 1, {}, {"car": 1}, mapping={"cart": "Van"})
-    with pytest.raises(UsageError, match=r"--map cart: expected a class of the data set \(car\), found no such class"):
+    with pytest.raises(
+        UsageError, match=r"--map cart: expected a class of the data set \(car\), found no such class"
+    ):
         write_account(account)
 
 

@@ -26,7 +26,7 @@ def only(scene: SceneIR, number: int = 0, **ranges: float) -> NuisanceSample:
     return dataclasses.replace(OFF, **ranges).sample("test", number, scene)
 
 
-def test_off_changes_nothing(scene: SceneIR) -> None:
+def test_off_returns_the_photograph(scene: SceneIR) -> None:
     draw = OFF.sample("test", 0, scene)
     torch.testing.assert_close(
         draw.degrade_image(scene.photograph), scene.photograph, atol=0.5 / 255 + 1e-6, rtol=0

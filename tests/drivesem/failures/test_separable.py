@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from drivesem.failures.separable import BandedMatrix, Matrix, SeparableMap
+from drivesem.failures.jpeg import BandedMatrix, Matrix, SeparableMap
 
 
 def random_band(outputs: int, inputs: int, seed: int) -> Matrix:

@@ -5,8 +5,7 @@ import io
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report.tables import ReportTable, format_count, rows_to_csv
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console, ReportTable, format_count, rows_to_csv
 
 COLUMNS = ("arm", "where", "PSNR, dB", "perceptual distance", "FID")
 ROWS = (

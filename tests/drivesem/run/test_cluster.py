@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import subprocess
@@ -20,11 +21,12 @@ import ray
 from drivesem.cli import main
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
-from drivesem.run import cluster as clusters
+from drivesem.run import workers as clusters
 from drivesem.run.workers import run_jobs
 from drivesem.store import local_copy
 from scene_ir.errors import FormatError, SceneError
 from tests.drivesem.commands.test_attack_command import contents
+from tests.drivesem.invoke import refusal
 
 
 @pytest.fixture
@@ -134,10 +136,9 @@ def test_without_an_address_it_is_this_machine_alone(tmp_path: Path, monkeypatch
         ray.shutdown()
 
 
-def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     words = ["attack", "--limit", "1", "--engine", "ray", "--address", "127.0.0.1:1", "--out", str(tmp_path / "a")]
-    assert main(words) == 2
-    assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in capsys.readouterr().err.splitlines()[-1]
+    assert "--address: expected a Ray cluster, found 127.0.0.1:1: " in refusal(*words)
     with pytest.raises(UsageError, match="--address"):
         WorkerOptions(address="auto").check()
 
@@ -146,19 +147,17 @@ Alike = Callable[..., None]
 
 
 @pytest.fixture
-def alike(
-    tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Alike:
+def alike(tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch) -> Alike:
     """Runs a command here and on the cluster, and compares its two folders, but for the files that are named."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    def run(words: list[str], out: str, *varying: str) -> None:
+    def run(words: list[str], out: str, *varying: str, program: str = "drivesem.cli") -> None:
         contents_by_run, others = [], (*varying, "config.yaml", ".lock")
-        alone = [sys.executable, "-m", "drivesem.cli", *words, "--workers", "1", "--out", str(tmp_path / out)]
+        alone = [sys.executable, "-m", program, *words, "--workers", "1", "--out", str(tmp_path / out)]
         subprocess.run(alone, check=True, cwd=Path(__file__).parents[3])
         shared = ["--engine", "ray", "--address", cluster.address, "--out", str(tmp_path / f"{out}-ray"), "--json"]
-        assert main([*words, *shared]) == 0
+        assert importlib.import_module(program).main([*words, *shared]) == 0
         for folder in (out, f"{out}-ray"):
             contents_by_run.append(
                 {n: x for n, x in contents(tmp_path / folder).items() if not n.startswith(others)}
@@ -189,21 +188,10 @@ def test_frames_from_a_cluster_equal_local_ones(tmp_path: Path, cluster: Any, al
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_analyses_on_a_cluster_equal_local_ones(tmp_path: Path, alike: Alike) -> None:
-    study = [
-        "study",
-        "labels",
-        "--quick",
-        "--limit",
-        "1",
-        "--steps",
-        "1",
-        "--second-detector",
-        "off",
-        "--bootstrap",
-        "0",
-    ]
-    place_and_time = ("kept/study.json", "kept/frames.csv", "arms/translate/config.yaml")
-    alike(study, "study", "study.", "largest", "label_sets", "arms/combo", *place_and_time)
+    study = ["labels", "--quick", "--limit", "1", "--steps", "1", "--second-detector", "off", "--bootstrap", "0"]
+    place_and_time = ("results/study.json", "results/frames.csv", "arms/translate/config.yaml")
+    varying = ("study.", "largest", "label_sets", "arms/combo", *place_and_time)
+    alike(study, "study", *varying, program="tools.experiments.__main__")
     run = str(tmp_path / "study" / "arms" / "translate")
     alike(["confirm", "--run", run], "confirm")
     alike(["holes", run, "--samples", "24", "--fresh", "8"], "holes")

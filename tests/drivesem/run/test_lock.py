@@ -13,6 +13,7 @@ import pytest
 from drivesem.cli import main
 from drivesem.config.errors import UsageError
 from drivesem.run.lock import LOCK, acquire_folder_lock, is_locked_elsewhere, release_folder_locks
+from tests.drivesem.invoke import invoke, refusal
 
 OTHER = """
 import sys
@@ -43,23 +44,18 @@ def another_process(folder: Path) -> Iterator[Callable[[], None]]:
             kill()
 
 
-def test_a_run_that_is_being_made_is_no_run_that_stopped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_is_being_made_is_no_run_that_stopped(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     config = "detector: squeezedet\ndataset: demo\nparams: null\ncombo: null\nmethod: si-fgsm\n"
     (folder / "config.yaml").write_text(config)
     with another_process(folder):
         assert is_locked_elsewhere(folder)
-        assert main(["explain", str(folder)]) == 2
-        assert f"found {folder}, into which an attack is still writing" in capsys.readouterr().err
+        assert f"found {folder}, into which an attack is still writing" in refusal("explain", folder)
         (folder / "frames").mkdir()
-        assert main(["runs", "list", str(tmp_path)]) == 0
-        assert "run: 0 frames, running; combo 2 by si-fgsm" in capsys.readouterr().out
+        assert "run: 0 frames, running; combo 2 by si-fgsm" in invoke("runs", "list", tmp_path).out
     assert not is_locked_elsewhere(folder)
-    assert main(["explain", str(folder)]) == 2
-    assert f"found {folder}, which stopped early" in capsys.readouterr().err
+    assert f"found {folder}, which stopped early" in refusal("explain", folder)
     acquire_folder_lock(folder)  # by this process: nobody else
     assert not is_locked_elsewhere(folder)
 

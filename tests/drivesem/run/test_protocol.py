@@ -11,7 +11,7 @@ import yaml
 from drivesem.attack.budgets import format_budget, parse_budget
 from drivesem.config.commands import AttackConfig
 from drivesem.config.parsing import parse
-from drivesem.run.protocol import PROTOCOL, follows_paper
+from drivesem.run.run_report import PROTOCOL, follows_paper
 
 PRESET = Path(__file__).parents[3] / "configs" / "paper.yaml"
 

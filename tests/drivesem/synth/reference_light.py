@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivesem.synth.light import PANORAMA_GLARE, Light, Panorama
-from drivesem.synth.noise import BYTE_SUM_SCALE, SIZE, NoiseSet
+from drivesem.synth.view import BYTE_SUM_SCALE, SIZE, NoiseSet
 
 
 def sample(texture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivesem.synth.light import develop
+from drivesem.synth.light import LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS, develop
 from drivesem.synth.render import SHADOW_TEXELS, grain_number, rasterise, sun_rows, through_lens
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.surfaces import LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS
 from drivesem.synth.view import (
     SHADOW_VIEWS_M,
     SUPERSAMPLING,

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivesem.synth.layout import Road
-from drivesem.synth.light import Light
-from drivesem.synth.noise import NoiseSet
+from drivesem.synth.light import MIRRORED_GROUND, SOAKED, Light, ground_light
 from drivesem.synth.soup import GROUND, Material
-from drivesem.synth.surfaces import MIRRORED_GROUND, SOAKED, ground_light
+from drivesem.synth.view import NoiseSet
 from tests.drivesem.synth.reference_light import reflected_radiance, sample
 
 _F = np.float32

@@ -10,8 +10,8 @@ import yaml
 
 from drivesem.synth import assets
 from drivesem.synth.light import draw_light
-from drivesem.synth.noise import noise_set
 from drivesem.synth.soup import Material
+from drivesem.synth.view import noise_set
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.meshes.load import save_mesh
 from scene_ir.meshes.templates import template

@@ -30,7 +30,7 @@ def write(tmp_path, text):
     return path
 
 
-def test_no_edit_changes_nothing(plan):
+def test_an_empty_edit_returns_the_plan(plan):
     assert apply_edit(plan, FrameEdit(objects={ALL: ObjectEdit()})) == plan
 
 

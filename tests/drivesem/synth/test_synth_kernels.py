@@ -11,10 +11,9 @@ from drivesem.synth import render as rendering
 from drivesem.synth.frames import SynthSettings, actor_soups, plan_frame
 from drivesem.synth.layout import Marking, Road
 from drivesem.synth.light import Light, Panorama, Response, develop
-from drivesem.synth.noise import noise_set
 from drivesem.synth.render import render, see, sun_maps, take
 from drivesem.synth.soup import Material, box, join, make, placed
-from drivesem.synth.view import Setting, Shadow, View, blocks, fine_matrix
+from drivesem.synth.view import Setting, Shadow, View, blocks, fine_matrix, noise_set
 from scene_ir.types import Camera
 from tests.drivesem.synth import reference_render as reference
 from tests.drivesem.synth.reference_light import reflected_radiance, sky_radiance, white_noise

@@ -6,8 +6,8 @@ import torch
 
 from drivesem.synth import buildings, flora, people
 from drivesem.synth.light import develop, draw_light, draw_response
-from drivesem.synth.noise import SIZE, noise_set
 from drivesem.synth.soup import Material, Soup, ball, box, creased_normals, join, make, placed, stick, unit_sphere
+from drivesem.synth.view import SIZE, noise_set
 from scene_ir.geometry import place_vertices
 from tests.drivesem.synth.reference_light import sample, sky_radiance
 

@@ -270,7 +270,7 @@ def test_right_camera_is_written_with_the_left(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["kitti", "vkitti2"])
-def test_workers_change_nothing(tmp_path, layout):
+def test_any_number_of_workers_writes_equal_files(tmp_path, layout):
     one, two = (order_for(tmp_path / str(n), layout, frames=4) for n in (1, 2))
     list(synthesise(one))
     list(synthesise(two, make_parallel_map(WorkerOptions(workers=2))))

@@ -10,8 +10,8 @@ import pytest
 
 from detectors.anchors import mean_best_iou
 from detectors.squeezedet import ANCHOR_SIZES_WH
-from drivesem.cli import main
 from scene_ir import files
+from tests.drivesem.invoke import invoke
 
 CALIB = "P2: 700 0 300 0 0 700 90 0 0 0 1 0\n"
 
@@ -35,15 +35,14 @@ def kitti(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def fitted(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict:
-    assert main(["train", *words, "--json"]) == 0
-    out = capsys.readouterr().out
+def fitted(words: list[str]) -> dict:
+    out = invoke("train", *words, "--json").out
     assert out.count("\n") == 1
     return json.loads(out)
 
 
-def test_clusters_of_all_boxes_that_are_not_ignored(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result = fitted(["--root", str(kitti), "--anchors", "3"], capsys)
+def test_clusters_of_all_boxes_that_are_not_ignored(kitti: Path) -> None:
+    result = fitted(["--root", str(kitti), "--anchors", "3"])
     assert result["anchors"] == [[20.0, 21.0], [20.0, 50.0], [62.0, 40.0]]
     assert (result["frames"], result["boxes"]) == (2, 5)
     overlaps = [60 / 62, 62 / 64, 1.0, 20 / 21, 21 / 22]
@@ -54,14 +53,13 @@ def test_clusters_of_all_boxes_that_are_not_ignored(kitti: Path, capsys: pytest.
     assert published < result["mean_iou"]
 
 
-def test_limit(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    first = fitted(["--root", str(kitti), "--anchors", "2", "--limit", "1"], capsys)
+def test_limit(kitti: Path) -> None:
+    first = fitted(["--root", str(kitti), "--anchors", "2", "--limit", "1"])
     assert first["anchors"] == [[20.0, 50.0], [62.0, 40.0]]
 
 
-def test_a_table_for_people(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "--root", str(kitti), "--anchors", "3"]) == 0
-    captured = capsys.readouterr()
+def test_a_table_for_people(kitti: Path) -> None:
+    captured = invoke("train", "--root", kitti, "--anchors", "3")
     assert captured.out == ""
     assert "published" in captured.err
     assert "62 x 40" in captured.err
@@ -74,10 +72,7 @@ def test_a_table_for_people(kitti: Path, capsys: pytest.CaptureFixture[str]) -> 
         (["--anchors", "6"], "--anchors: expected at most 5, the number of different sizes, found 6"),
     ],
 )
-def test_bad_input_is_one_line(
-    words: list[str], message: str, kitti: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["train", "--root", str(kitti), *words]) == 2
-    captured = capsys.readouterr()
+def test_bad_input_is_one_line(words: list[str], message: str, kitti: Path) -> None:
+    captured = invoke("train", "--root", kitti, *words, code=2)
     assert captured.err.count("\n") == 1
     assert message in captured.err

@@ -27,7 +27,7 @@ from drivesem.training.failure_neighbourhoods import (
     margin_difference,
     smallest_margin_loss,
 )
-from drivesem.training.samples import AttackedFrame, GeneratorSamples, load_attacked_frames
+from drivesem.training.frames import AttackedFrame, GeneratorSamples, load_attacked_frames
 
 BOX = torch.tensor([[10.0, 20.0, 60.0, 50.0]], dtype=torch.float64)
 CAR = torch.zeros(1, dtype=torch.int64)

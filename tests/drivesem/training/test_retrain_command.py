@@ -11,21 +11,20 @@ import pytest
 from detectors.registry import load_detector
 from detectors.training import LOG
 from drivesem.cli import main
+from tests.drivesem.invoke import invoke, run_json
 
 
 @pytest.mark.slow
-def test_a_run_is_learned_from_and_attacked_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_learned_from_and_attacked_again(tmp_path: Path) -> None:
     run, out = tmp_path / "run", tmp_path / "out"
     attack = ["attack", "--limit", "6", "--combo", "1", "--steps", "3", "--workers", "1", "--out", str(run)]
     assert main(attack) == 0
     won = [json.loads(path.read_text())["success_moved"] for path in sorted(run.glob("frames/*/result.json"))]
     assert len(won) == 6
     assert any(won), "the demo's frames break the shipped detector"
-    capsys.readouterr()
     words = ["retrain", "--run", str(run), "--label-mode", "moved", "--steps", "3", "--batch", "2"]
     words += ["--window", "160x96", "--fraction", "0.5", "--ramp", "0.5", "--fresh", "1", "--workers", "1"]
-    assert main([*words, "--out", str(out), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = run_json(*words, "--out", out)
     rows = {(row["set"], row["labels"], row["detector"]): row for row in data["rows"]}
     assert len(rows) == 8
     assert {name for name, *_ in rows} == {"benign", "counterexamples of the run", "fresh counterexamples"}
@@ -53,18 +52,11 @@ def test_a_run_is_learned_from_and_attacked_again(tmp_path: Path, capsys: pytest
         (["--run", "run", "--root", "x"], "--dataset and --root: expected both or none"),
     ],
 )
-def test_bad_settings(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    words: list[str],
-    message: str,
-) -> None:
+def test_bad_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str) -> None:
     monkeypatch.chdir(tmp_path)
     for name, text in (("run", "dataset: demo\n"), ("other", "photo: a.png\n")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.yaml").write_text(text)
-    assert main(["retrain", *words]) == 2
-    error = capsys.readouterr().err
+    error = invoke("retrain", *words, code=2).err
     assert message in error
     assert error.count("\n") == 1

@@ -8,7 +8,7 @@ import torch
 
 from detectors.training import Sample
 from detectors.types import Targets
-from drivesem.training.samples import Mix, MixtureShares, TrainingMixture
+from drivesem.training.frames import Mix, MixtureShares, TrainingMixture
 
 NOTHING = Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
 

@@ -16,9 +16,17 @@ from drivesem.attack.labels import Labeller, append_other_labels, to_kitti_label
 from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
 from drivesem.data import kitti
 from drivesem.data.kitti import KittiDataset
-from drivesem.training.frames import TRAINING_LIMITS, FrameStore, training_targets
-from drivesem.training.samples import AttackedSamples, Stage, load_attacked_frames
-from drivesem.training.semantic import VARIANTS, PerturbedFrames, render_state
+from drivesem.training.frames import (
+    TRAINING_LIMITS,
+    VARIANTS,
+    AttackedSamples,
+    FrameStore,
+    PerturbedFrames,
+    Stage,
+    load_attacked_frames,
+    render_state,
+    training_targets,
+)
 from scene_ir.io import load_scene, save_scene
 from scene_ir.render.compositor import Compositor
 

@@ -19,6 +19,7 @@ from detectors.registry import load_detector, read_weights
 from detectors.training import CHECKPOINT, LOG
 from drivesem.cli import main
 from drivesem.training.validation import BEST, CURVES, EVALUATIONS
+from tests.drivesem.invoke import invoke, refusal, run_json
 
 STEPS = ["--steps", "4", "--batch", "2", "--window", "96x64", "--rate", "1e-4", "--checkpoint-every", "2"]
 
@@ -53,18 +54,17 @@ def test_validation_chooses_and_held_out_frames_judge(
     assert "3 held-out frames" in alone
     assert "chosen on\nthem too" in alone
     again = ["train", *frames, "--validation", frames[-1], *STEPS, "--out", str(tmp_path / "again")]
-    assert main(again) == 0
-    assert "also selects the weights and t*: its metrics are optimistic" in capsys.readouterr().err
-    assert main(["train", *frames[:2], "--validation", str(validation)]) == 2
-    assert "--held-out: expected frames to judge by, beside --validation" in capsys.readouterr().err
+    assert "also selects the weights and t*: its metrics are optimistic" in invoke(*again).err
+    assert "--held-out: expected frames to judge by, beside --validation" in refusal(
+        "train", *frames[:2], "--validation", validation
+    )
 
 
 @pytest.mark.parametrize("detector", ["squeezedet", pytest.param("yolov3-slim", marks=pytest.mark.slow)])
-def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[str], detector: str) -> None:
+def test_a_run(tmp_path: Path, frames: list[str], detector: str) -> None:
     out = tmp_path / "run"
     command = ["train", "--detector", detector, *frames, *STEPS, "--evaluate-every", "2", "--out", str(out)]
-    assert main([*command, "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = run_json(*command)
     assert (data["frames"], data["steps"], data["steps_now"]) == (5, 4, 4)
     assert data["images_a_second"] > 0
     exported = load_detector(out / f"{detector}.safetensors")
@@ -84,22 +84,22 @@ def test_a_run(tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[
     before = (out / LOG).read_text()
     assert main(command) == 0, "a run that is over stays as it is"
     assert (out / LOG).read_text() == before
-    assert main([*command, "--rate", "1e-5"]) == 2
-    assert "--no-resume" in capsys.readouterr().err
+    assert "--no-resume" in refusal(*command, "--rate", "1e-5")
     assert main([*command, "--rate", "1e-5", "--no-resume"]) == 0
     assert (out / LOG).read_text() != before
 
 
 def test_warns_about_frames_used_for_training_and_evaluation(
-    tmp_path: Path, kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, kitti_folder: Callable[..., Path]
 ) -> None:
     folder, other = kitti_folder(tmp_path / "train", 2), kitti_folder(tmp_path / "other", 2, seed=1)
     words = ["train", "--root", f"{other},{folder}", *STEPS, "--steps", "1", "--held-out"]
-    assert main([*words, str(folder / ".." / "train"), "--out", str(tmp_path / "a")]) == 0
-    assert "is also trained on: its metrics and t* do not apply to other images" in capsys.readouterr().err
+    assert (
+        "is also trained on: its metrics and t* do not apply to other images"
+        in invoke(*words, folder / ".." / "train", "--out", tmp_path / "a").err
+    )
     apart = kitti_folder(tmp_path / "apart", 2, seed=2)
-    assert main([*words, str(apart), "--out", str(tmp_path / "b")]) == 0
-    assert "is trained on too" not in capsys.readouterr().err
+    assert "is trained on too" not in invoke(*words, apart, "--out", tmp_path / "b").err
 
 
 def test_it_starts_from_weights_and_checkpoints(tmp_path: Path, frames: list[str]) -> None:
@@ -140,36 +140,33 @@ def test_it_starts_from_weights_and_checkpoints(tmp_path: Path, frames: list[str
 def test_bad_settings(
     tmp_path: Path,
     kitti_folder: Callable[..., Path],
-    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     words: list[str],
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     root = kitti_folder(tmp_path / "frames", 2)
-    assert main(["train", "--root", str(root), "--out", str(tmp_path / "run"), *words]) == 2
-    error = capsys.readouterr().err
+    error = invoke("train", "--root", root, "--out", tmp_path / "run", *words, code=2).err
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_data_without_boxes_or_frames(
-    tmp_path: Path, kitti_folder: Callable[..., Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_without_boxes_or_frames(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:
     root = kitti_folder(tmp_path / "trams", 2, kind="Tram")
-    assert main(["train", "--root", str(root), "--out", str(tmp_path / "run")]) == 2
-    assert "expected frames with objects of Car, Truck, Pedestrian, Cyclist, found none" in capsys.readouterr().err
+    assert "expected frames with objects of Car, Truck, Pedestrian, Cyclist, found none" in refusal(
+        "train", "--root", root, "--out", tmp_path / "run"
+    )
     (tmp_path / "empty" / "training" / "image_2").mkdir(parents=True)
-    assert main(["train", "--root", str(tmp_path / "empty"), "--out", str(tmp_path / "run2")]) == 2
-    assert "expected at least one .png" in capsys.readouterr().err
+    assert "expected at least one .png" in refusal(
+        "train", "--root", tmp_path / "empty", "--out", tmp_path / "run2"
+    )
 
 
-def test_a_rate_at_which_training_breaks(
-    tmp_path: Path, frames: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rate_at_which_training_breaks(tmp_path: Path, frames: list[str]) -> None:
     words = ["train", *frames, *STEPS, "--rate", "1e30", "--clip", "1e30", "--optimiser", "sgd"]
-    assert main([*words, "--warmup", "0", "--out", str(tmp_path / "run")]) == 2
-    assert "--rate: expected one at which the loss stays finite, found step" in capsys.readouterr().err
+    assert "--rate: expected one at which the loss stays finite, found step" in refusal(
+        *words, "--warmup", "0", "--out", tmp_path / "run"
+    )
 
 
 def _drivesem(*words: str) -> list[str]:

@@ -20,11 +20,11 @@ from drivesem.synth.write import Order, synthesise
 from drivesem.video import clips as taking
 from drivesem.video import run as running
 from drivesem.video.clips import DerenderedClip
-from drivesem.video.report import write_page
-from drivesem.video.results import DriveResult
+from drivesem.video.report import DriveResult, write_page
 from scene_ir import files
 from scene_ir.io import load_scene
 from scene_ir.types import SceneIR
+from tests.drivesem.invoke import invoke, refusal, run_json
 from tests.drivesem.video.clips import clip_of
 
 WORDS = ["drive", "--params", "color,translate", "--steps", "1", "--keys", "2", "--keep", "last", "--json"]
@@ -48,16 +48,11 @@ def finished(taken: DerenderedClip, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.mark.parametrize("words", ["export --to kitti --out out", "retrain --out out", "verify", "explain"])
 def test_a_clip_is_not_taken_for_an_interrupted_attack(
-    words: str,
-    finished: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    words: str, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     command, *rest = words.split()
-    assert main([command, str(finished), *rest]) == 2
-    error = capsys.readouterr().err
+    error = refusal(command, finished, *rest)
     assert "--run: expected a" in error
     assert "of drivesem attack, found" in error
     assert "stopped early" not in error
@@ -99,30 +94,24 @@ def test_the_video_has_all_frames(finished: Path) -> None:
     assert (finished / "clip.webm").read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
 
 
-def test_resume_prints_the_finished_result(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main([*WORDS, "--limit", "3", "--out", str(finished)]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads((finished / "drive.json").read_text())
-    assert main([*WORDS, "--out", str(finished), "--limit", "2"]) == 2
-    assert "other values of limit" in capsys.readouterr().err
+def test_resume_prints_the_finished_result(finished: Path) -> None:
+    assert json.loads(invoke(*WORDS, "--limit", "3", "--out", finished).out) == json.loads(
+        (finished / "drive.json").read_text()
+    )
+    assert "other values of limit" in refusal(*WORDS, "--out", finished, "--limit", "2")
 
 
-def test_a_clip_that_memory_cannot_hold_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clip_that_memory_cannot_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(taking, "memory_gb", lambda: 0.5)
-    assert main(["drive", "--limit", "30", "--out", str(tmp_path / "out")]) == 2
-    output = capsys.readouterr().err.strip()
+    output = invoke("drive", "--limit", "30", "--out", tmp_path / "out", code=2).err.strip()
     assert output.endswith(
         "CLIP: frames: expected at most 6 frames, which fit into 0.5 GB of memory (--limit takes the first), found 30"
     )
     assert not (tmp_path / "out" / "scenes").exists()
 
 
-def test_the_table_names_cars(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main([*(word for word in WORDS if word != "--json"), "--limit", "3", "--out", str(finished)]) == 0
-    output = capsys.readouterr().out
+def test_the_table_names_cars(finished: Path) -> None:
+    output = invoke(*(word for word in WORDS if word != "--json"), "--limit", "3", "--out", finished).out
     assert "4 Car" in output
     assert "by a random change" in output
 
@@ -162,33 +151,9 @@ def test_a_slider_shows_frames_in_a_browser(chromium: Any, finished: Path) -> No
     assert not complaints
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["none"], "none: expected a folder of clips: Virtual KITTI"),
-        (["--sequence", "0001"], "--sequence: expected a CLIP, found none"),
-        (["--combo", "1", "--params", "mesh"], "--params: expected no --combo, found --combo 1"),
-        (["--params", "wheels"], "wheels"),
-        (["--bend", "9"], "--bend: expected 0 to 5, found 9"),
-        (["--params", "sun"], "params: sun"),
-        (["--method", "climb"], "--method"),
-        (["--detector", "none.onnx"], "--detector: expected a detector"),
-    ],
-)
-def test_bad_input_is_a_line(
-    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["drive", *words]) == 2
-    output = capsys.readouterr()
-    assert message in output.err
-    assert output.err.count("\n") == 1
-    assert output.out == ""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["vkitti2", "kitti"])
-def test_what_the_generator_wrote(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_generator_wrote(layout: str, tmp_path: Path) -> None:
     people = layout == "kitti"
     variations = ("mixed",) if people else ("clone",)
     order = Order(tmp_path / "data", 3, 5, layout, sequence=3, people=people, variations=variations)
@@ -196,9 +161,7 @@ def test_what_the_generator_wrote(layout: str, tmp_path: Path, capsys: pytest.Ca
     out = tmp_path / "out"
     words = ["drive", str(tmp_path / "data"), "--params", "color", "--steps", "1", "--certify", "0", "--no-fit"]
     words += ["--workers", "1", "--out", str(out), "--json"]
-    capsys.readouterr()
-    assert main(words) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = json.loads(invoke(*words).out)
     assert data["frames"] == 3
     assert data["cars"]
     meshes: dict[str, set[str]] = {}
@@ -213,7 +176,7 @@ def test_what_the_generator_wrote(layout: str, tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.slow
-def test_a_killed_command_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_killed_command_goes_on(tmp_path: Path) -> None:
     """What was taken apart stays, and the end is the same."""
     words = ["drive", "--limit", "2", "--params", "color", "--steps", "1", "--certify", "0", "--workers", "1"]
     found = []
@@ -224,9 +187,7 @@ def test_a_killed_command_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[
             shutil.rmtree(out / "scenes" / "drive-001")
             for path in (out / "drive.json", out / "frames"):
                 path.unlink() if path.is_file() else shutil.rmtree(path)
-        capsys.readouterr()
-        assert main([*words, "--out", str(out), "--json"]) == 0
-        data = json.loads(capsys.readouterr().out)
+        data = run_json(*words, "--out", out)
         found.append({key: value for key, value in data.items() if key not in ("out", "seconds")})
     assert found[0] == found[1]
     assert len(found[0]["cars"]) >= 3

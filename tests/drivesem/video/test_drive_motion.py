@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from drivesem.attack.space import ParameterSpace
-from drivesem.synth.drives import make_drive
+from drivesem.synth.demo import make_drive
 from drivesem.video.clips import DerenderedClip, object_tracks
-from drivesem.video.space import ClipSpace
+from drivesem.video.objective import ClipSpace
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
 from scene_ir.render.compositor import Compositor

@@ -3,9 +3,8 @@
 import io
 from pathlib import Path
 
-from drivesem.report.terminal import Console
-from drivesem.video.report import build_report, format_summary
-from drivesem.video.results import STATES, CarResult, DriveResult
+from drivesem.report.tables import Console
+from drivesem.video.report import STATES, CarResult, DriveResult, build_report, format_summary
 
 
 def _result(out: Path, frames: int, *cars: tuple[int, str]) -> DriveResult:

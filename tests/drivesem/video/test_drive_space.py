@@ -10,8 +10,8 @@ import torch
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.space import Budget, Parameter, ParameterSpace
 from drivesem.video.clips import DerenderedClip
-from drivesem.video.results import CarResult, MissedInterval
-from drivesem.video.space import ClipSpace, project_clip
+from drivesem.video.objective import ClipSpace, project_clip
+from drivesem.video.report import CarResult, MissedInterval
 from scene_ir.types import SceneIR
 from tests.drivesem.video.clips import clip_of
 

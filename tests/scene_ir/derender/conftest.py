@@ -1,8 +1,6 @@
 """A street made by code, of which everything is known: its photograph, its background, its car and the car's
 mask."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

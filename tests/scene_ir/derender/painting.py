@@ -1,7 +1,5 @@
 """Pictures of cars whose parts have plain colours."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import torch

@@ -1,7 +1,5 @@
 """The street behind vehicles at a part of the photograph's size: the same street; nothing changes elsewhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,13 +1,12 @@
 """Cars moved until they fill their 2D boxes, as little as that asks for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import box_alignment, silhouette
-from scene_ir.derender.box_alignment import BoxAlignmentSettings, align_to_boxes
+from scene_ir.derender import alignment as box_alignment
+from scene_ir.derender import silhouette
+from scene_ir.derender.alignment import BoxAlignmentSettings, align_to_boxes
 from scene_ir.derender.silhouette import LabelBoxes, Placement
 from scene_ir.types import Camera
 

@@ -1,7 +1,5 @@
 """Vehicles cut out by the network: the crops it sees, and what it says of generated streets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path

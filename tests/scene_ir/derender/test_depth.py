@@ -1,7 +1,5 @@
 """Depth of a photograph's surroundings: the shipped network, and what ties it to what is known."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import cv2
@@ -12,7 +10,7 @@ import torch
 from drivesem.synth.frames import SynthFrame, SynthSettings, generate_frame
 from drivesem.synth.soup import Material
 from scene_ir.derender import depth
-from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import depth as maps
 from scene_ir.derender.depth import DepthConstraints
 from scene_ir.errors import FormatError
 from scene_ir.types import Camera

@@ -1,7 +1,5 @@
 """From a photograph to a scene and back."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

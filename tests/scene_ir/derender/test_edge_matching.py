@@ -1,15 +1,13 @@
 """Edges of meshes against edges of pictures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import edge_matching as borders
 from scene_ir.derender import silhouette
+from scene_ir.derender import silhouette as borders
 from scene_ir.derender.silhouette import FitEvidence, FitSettings, LabelBoxes, Placement
 from scene_ir.geometry import to_clip
 from tests.scene_ir.derender.painting import CAMERA, NOTHING, drawn, painted

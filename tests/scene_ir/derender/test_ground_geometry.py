@@ -1,14 +1,12 @@
 """Ground plane, horizon, depth and sun by rule."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import depth as maps
 from scene_ir.types import Camera, Labels
 
 CAMERA = Camera(torch.tensor([[380.0, 0, 239.5], [0, 380.0, 88.0], [0, 0, 1.0]]), 200, 480)

@@ -1,13 +1,11 @@
 """Meshes brought to the laser's points on them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
 from scene_ir.derender import silhouette
-from scene_ir.derender.icp import BOUND, LABEL_SIGMAS, align_to_points, points_near_box
+from scene_ir.derender.alignment import BOUND, LABEL_SIGMAS, align_to_points, points_near_box
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs

@@ -1,12 +1,10 @@
 """Masks of large vehicles grow to what counts like the vehicle neighbour them, and no farther."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from scene_ir.derender import cutout
-from scene_ir.derender import mask_extension as widen
+from scene_ir.derender import matte as widen
 from scene_ir.derender.cutout import Cutout
 from scene_ir.derender.derender import DerenderSettings, place_vehicles
 

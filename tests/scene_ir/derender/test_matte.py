@@ -1,7 +1,5 @@
 """Opacity along a car's border."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

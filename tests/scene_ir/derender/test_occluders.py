@@ -1,12 +1,10 @@
 """What stands in front of vehicles, found by labels, masks and depth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import ground_geometry as maps
+from scene_ir.derender import depth as maps
 from scene_ir.derender import occluders as front
 from scene_ir.derender import silhouette
 from scene_ir.derender.derender import DerenderSettings, derender

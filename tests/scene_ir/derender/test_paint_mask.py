@@ -1,7 +1,5 @@
 """Which pixels are paint."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Filling holes from the same photograph."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

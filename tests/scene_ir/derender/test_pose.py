@@ -1,7 +1,5 @@
 """Poses from 2D boxes: what is done with the network's words, and what the shipped network says."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Soft maps of sky, foliage, road: by the shipped network, a user's segmenter, a data set's classes."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shadows on the ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Outlines, masks and the fit of one to the other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Copying what stands beside a hole into it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

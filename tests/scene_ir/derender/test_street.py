@@ -1,7 +1,5 @@
 """Continuing a street's structure behind what hides it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Meshes and headings told from one another before there is a mask."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -9,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from scene_ir.derender import alignment as stand
 from scene_ir.derender import silhouette
-from scene_ir.derender import template_choice as stand
 from scene_ir.derender.silhouette import LabelBoxes, Placement
 from tests.scene_ir.derender.painting import CAMERA, NOTHING, painted
 

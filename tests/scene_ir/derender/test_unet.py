@@ -1,7 +1,5 @@
 """What the networks that look at streets share: how a photograph is shown to them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

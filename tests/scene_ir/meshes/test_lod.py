@@ -1,7 +1,5 @@
 """Levels of detail stay closed, keep parts and colours, and stay near the surface."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

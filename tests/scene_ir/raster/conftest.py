@@ -1,7 +1,5 @@
 """Vehicles placed at random in front of a camera, rendered by this and other renderers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Depth and silhouettes against rays cast by Open3D (Embree), an independent implementation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Depth and silhouettes against OpenGL, through pyrender."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Iterator

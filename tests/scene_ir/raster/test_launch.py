@@ -1,7 +1,5 @@
 """Tensors as kernel arrays: equal to Warp's own, which are computed once per kind."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

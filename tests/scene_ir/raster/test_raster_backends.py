@@ -1,8 +1,6 @@
 """Both backends on random closed meshes (clipped, inside out, degenerate, culled, shared, empty), on threads, and at
 depths from 0.5 m to 200 m."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -19,7 +17,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from scene_ir.errors import RangeError
-from scene_ir.raster import kernels, launch, plan, verbs
+from scene_ir.raster import kernels, launch, verbs
+from scene_ir.raster import layout as plan
 
 RECTS = torch.tensor(
     [[0, 0, 60, 44], [20, 10, 41, 33], [7, 7, 7, 20], [0, 0, 60, 44], [30, 20, 31, 21], [5, 0, 75, 9]]

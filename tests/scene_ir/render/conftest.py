@@ -1,7 +1,5 @@
 """Checks that several tests of the renderer share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

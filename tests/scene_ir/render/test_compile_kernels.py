@@ -1,7 +1,5 @@
 """Parallel compilation of the kernels, and its progress lines."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Re-rendering: identity, moved vehicles against ground truth, order, shadows, borders."""
 
-from __future__ import annotations
-
 import gc
 import math
 import weakref

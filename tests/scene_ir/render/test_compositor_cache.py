@@ -1,7 +1,5 @@
 """Caches of a compositor are never stale: a reused one renders like a new one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

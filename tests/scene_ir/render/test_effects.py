@@ -1,7 +1,5 @@
 """The fused kernels of weather, foliage and paint against their reference in plain torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Weather, time of day and foliage."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The fast path against the reference, and batches of scenes against single renders."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

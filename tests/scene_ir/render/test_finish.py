@@ -1,7 +1,5 @@
 """The finish of templates, and the light on them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

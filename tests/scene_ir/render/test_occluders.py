@@ -1,7 +1,5 @@
 """Occluders: drawn over vehicles behind them, under those in front, and part of none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

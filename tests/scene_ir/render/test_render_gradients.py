@@ -1,7 +1,5 @@
 """Analytic gradients of the rendered picture against central differences, per parameter."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The moving sun: identity, position, shadows and light."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

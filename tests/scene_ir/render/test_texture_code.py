@@ -1,7 +1,5 @@
 """Texture codes, lookup weights, and texels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

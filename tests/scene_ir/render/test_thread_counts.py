@@ -1,7 +1,5 @@
 """Decomposition gives the same bits for any number of torch threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import pytest

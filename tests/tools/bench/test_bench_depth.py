@@ -1,7 +1,5 @@
 """Depth of surroundings beside the truth, a laser and fog."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -50,27 +48,6 @@ def test_a_step_at_an_edge_of_the_picture_is_none() -> None:
     assert bench.bands_px(step(), elsewhere) > 0.9 * HEIGHT
 
 
-def test_texture_is_no_edge_and_short_steps_are_no_bands() -> None:
-    rng = np.random.default_rng(0)
-    leaves = np.repeat(rng.uniform(0.3, 0.7, (HEIGHT, WIDTH, 1)).astype(np.float32), 3, axis=2)
-    assert bench.bands_px(step(), leaves) > 0.5 * HEIGHT
-    short = np.full((HEIGHT, WIDTH), 60.0, np.float32)
-    short[40:50, :200] = 10
-    assert bench.bands_px(short, np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)) == 0
-
-
-def test_the_lasers_points_lie_where_the_camera_sees_them(scene: SceneIR) -> None:
-    matrix = scene.camera.matrix.double()
-    inverse = torch.linalg.inv(matrix[:, :3])
-    kept = (scene.background == scene.photograph).all(0)
-    v, u = (int(i) for i in kept.nonzero()[0])
-    pixel = torch.tensor([u, v, 1.0]).double()
-    points = torch.stack([inverse @ (z * pixel - matrix[:, 3]) for z in (12.0, 40.0)])
-    depth = bench.laser_m(points.float(), scene)
-    assert depth[v, u] == pytest.approx(12, abs=1e-3)
-    assert np.isfinite(depth).sum() == 1
-
-
 def test_errors_are_relative_and_told_apart(street: DepthStreet) -> None:
     shape = street.ties.sky.shape
     truth = np.full(shape, np.inf, np.float32)
@@ -112,18 +89,6 @@ def test_summary_is_a_line_for_each_source_and_depth() -> None:
     first, second = bench.summary(rows)
     assert (first["frames"], first["bands_px"], first["worst_px"], first["abs_rel"]) == (2, 20.0, 30.0, 0.1)
     assert (second["depth"], second["abs_rel"]) == ("b", None)
-
-
-def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, message in (
-        (["--dataset", "kitti", "--root", "nowhere"], "nowhere"),
-        (["--scenes", "nowhere"], "nowhere"),
-        (["--device", "meta"], "--device: expected cpu"),
-    ):
-        assert main(["depth", *words]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert message in said
 
 
 @pytest.mark.slow

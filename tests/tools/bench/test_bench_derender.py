@@ -11,10 +11,6 @@ import pytest
 import torch
 
 from drivesem.synth.frames import SynthFrame
-from drivesem.synth.layout import Strip as Kerb
-from drivesem.synth.soup import Material
-from scene_ir import files
-from scene_ir.errors import RangeError
 from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 from tools.bench import derender as bench
@@ -84,17 +80,6 @@ def test_the_perfect_scene_gets_nearly_perfect_marks(
     json.dumps(bench.summary([row]), allow_nan=False)
 
 
-def test_the_moved_scene_moves_as_the_truth_does(case: EditedStreet, tracks: list[int], perfect: SceneIR) -> None:
-    moved = bench.apply_move(case, perfect, tracks)
-    i = tracks.index(case.move.track)
-    truth = next(t for t in case.moved.truths if t.actor.track == case.move.track)
-    assert moved.objects.translation[i].numpy() == pytest.approx(truth.translation, abs=1e-5)
-    assert math.remainder(float(moved.objects.yaw[i]) - truth.yaw, 2 * math.pi) == pytest.approx(0, abs=1e-5)
-    others = [j for j in range(len(tracks)) if j != i]
-    assert torch.equal(moved.objects.translation[others], perfect.objects.translation[others])
-    assert bench.apply_move(case, perfect, [-1] * len(tracks)) is perfect
-
-
 def test_misplaced_and_missing_vehicles_lose_marks(
     case: EditedStreet, tracks: list[int], perfect: SceneIR
 ) -> None:
@@ -122,16 +107,6 @@ def test_labels_are_off_by_what_they_should_be(case: EditedStreet) -> None:
     assert not torch.equal(other.translation, off.translation)
 
 
-def test_a_label_behind_the_camera_stays(case: EditedStreet) -> None:
-    before = case.before
-    near = before.labels.translation.clone()
-    near[0] = torch.tensor([0.0, 1.6, -6.0])
-    frame = replace(before, labels=replace(before.labels, translation=near))
-    off = bench.disturb_labels(frame, np.random.default_rng(0))
-    assert torch.equal(off.translation[0], near[0])
-    assert not torch.equal(off.translation[1:], near[1:])
-
-
 def test_de_rendering_is_given_neither_mask_nor_depth(case: EditedStreet) -> None:
     frame = bench.synthetic_photograph(case.before, case.before.labels)
     assert frame.masks is None
@@ -154,44 +129,6 @@ def test_what_is_in_the_way_forbids_a_move(case: EditedStreet) -> None:
     place = (x + ahead[0] * cos + ahead[1] * sin, z - ahead[0] * sin + ahead[1] * cos)
     blocked = replace(plan, actors=(*plan.actors, replace(actor, position_xz=place, track=99)))
     assert not bench.is_free(blocked, actor, case.move)
-
-
-def test_a_kerb_is_raised(case: EditedStreet) -> None:
-    road = replace(case.plan.setting.road, curvature=0.01, strips=(Kerb(3.0, 5.0, Material.PAVEMENT, 0.12),))
-    x, z = road.point(np.array([2.5, 3.5, 4.5, 5.5]), np.array([20.0, 30.0, 10.0, 25.0]))
-    corners = np.stack([x, z], axis=1)
-    assert bench._raised(road, corners) == 2
-    flat = replace(road, strips=(Kerb(3.0, 5.0, Material.ROAD, 0.0),))
-    assert bench._raised(flat, corners) == 0
-
-
-def _share(mask: np.ndarray, region: np.ndarray) -> float:
-    assert not (mask & ~region).any()
-    return np.count_nonzero(mask & region) / np.count_nonzero(region)
-
-
-def test_what_the_photograph_never_saw(case: EditedStreet) -> None:
-    still = replace(case, moved=case.before, move=replace(case.move, shift_m=(0.0, 0.0), turn=0.0))
-    seen = bench.track_coverage(case.before, case.move.track) > 0
-    assert _share(bench.never_seen(still), seen) < 0.01
-    assert 0 < _share(bench.never_seen(case), bench.track_coverage(case.moved, case.move.track) > 0) < 0.6
-    old = next(t for t in case.before.truths if t.actor.track == case.move.track)
-    turned = tuple(replace(t, yaw=t.yaw + math.pi) if t is old else t for t in case.before.truths)
-    about = replace(still, moved=replace(case.before, truths=turned))
-    assert _share(bench.never_seen(about), seen) > 0.8
-
-
-def test_the_region_is_what_changes(case: EditedStreet) -> None:
-    none = bench.changed_region(case.before, case.before, [])
-    assert not none.any()
-    same = bench.changed_region(case.before, case.before, [case.move.track])
-    seen = bench.track_coverage(case.before, case.move.track) > 0
-    assert same[seen].all()
-    assert np.count_nonzero(seen) < np.count_nonzero(same) < 3 * np.count_nonzero(seen)
-    whole = bench.changed_region(case.before, case.moved, [case.move.track])
-    assert whole[same].all()
-    apart = np.abs(case.before.image.astype(int) - case.moved.image).max(axis=2)
-    assert apart[~whole].max() <= 2
 
 
 def _row(index: int, move_db: float, **changes: Any) -> DerenderRow:
@@ -219,45 +156,6 @@ def test_summary_lines() -> None:
     given = [replace(row, ablations={"true masks": {"move_db": 30.0, "remove_db": 31.0}}) for row in rows[:2]]
     more = {line["measure"]: line for line in bench.summary(given)}
     assert more["true masks: remove, PSNR, dB"]["median"] == 31
-
-
-def test_the_worst_and_typical_sheets_are_kept(tmp_path: Path) -> None:
-    made, kept = tmp_path / "made", tmp_path / "kept"
-    rows = [_row(i, 20.0 + (7 * i) % 15) for i in range(15)]
-    for row in rows:
-        files.write_png(made / f"{row.index}.png", np.full((2, 2, 3), row.index, np.uint8))
-    bench._keep_sheets(rows, made, kept)
-    names = sorted(p.name for p in kept.iterdir())
-    assert len(names) == 12
-    assert names[4] == "worst-1-frame-0.png"
-    assert files.read_bytes(kept / names[4]) == files.read_bytes(made / "0.png")
-    assert sum(name.startswith("typical") for name in names) == 4
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--frames", "0"], "--frames: expected at least 1, found 0"),
-        (["--frames", "-3"], "--frames: expected at least 1, found -3"),
-        (["--workers", "0"], "--workers"),
-        (["--device", "quantum"], "quantum"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["derender", *words]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    assert message in captured.err
-
-
-def test_no_street_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "_promising", lambda plan: False)
-    monkeypatch.setattr(bench, "_ATTEMPTS", 2)
-    with pytest.raises(RangeError, match="street 3 of seed 0"):
-        bench.make_case(0, 3)
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """`python -m tools.bench detector`: consistent metrics, and a gradient that is one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -79,10 +77,3 @@ def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyP
     assert f"### {detector.TITLE}" in text
     assert "| forward and backward, ms |" in text
     assert "`python -m tools.bench detector --quick --threads 1`" in text
-
-
-def test_a_detector_without_a_gradient_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["detector", "--detector", "onnx:graph.onnx"]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1
-    assert "--detector: expected a detector with gradients" in captured.err

@@ -1,7 +1,5 @@
 """`python -m tools.bench eval`: the same frames in both layouts, and the whole command timed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The benchmark of foliage: figures of one frame, and what they are means of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -21,7 +21,7 @@ from scene_ir.io import save_scene
 from scene_ir.types import SceneIR
 from tools.bench import found
 from tools.bench.__main__ import main
-from tools.bench.sights import SCORE, CarView, DetectorSight, assign
+from tools.bench.sights import SCORE, DetectorSight
 
 CLASSES = ("person", "Car", "truck")
 PERSON, CAR, TRUCK = range(3)
@@ -66,16 +66,6 @@ def moved_boxes(scene: SceneIR) -> tuple[dict[int, Tensor], Tensor, list[int]]:
     return {row: move.boxes_xyxy for row, move in moves.alone.items()}, boxes, moves.in_crowd
 
 
-def test_each_detection_is_one_cars_only() -> None:
-    boxes = torch.tensor([[0.0, 0, 10, 10], [2.0, 0, 12, 10], [50.0, 0, 60, 10]])
-    one = assign(boxes, detections([((1.5, 0, 11.5, 10), CAR, 0.6)]))
-    assert [sight.found for sight in one] == [False, True, False]
-    assert one[1] == DetectorSight(iou=round(9.5 / 10.5, 4), score=0.6)
-    two = assign(boxes, detections([((1.5, 0, 11.5, 10), CAR, 0.6), ((0, 0, 11, 10), CAR, 0.5)]))
-    assert [sight.score for sight in two] == [0.5, 0.6, 0.0]
-    assert assign(boxes[:0], detections([])) == []
-
-
 def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> None:
     scene = street()
     moves = found.CarMoves(scene, range(4), np.random.default_rng(3))
@@ -89,12 +79,6 @@ def test_moves_are_free_and_all_their_size(street: Callable[..., SceneIR]) -> No
         torch.testing.assert_close(turned.abs(), np.pi / 18 * expected, atol=1e-5, rtol=0)
         assert check_places(scene, move.scene, range(4)) == []
         torch.testing.assert_close(move.boxes_xyxy, Labeller(scene).moved(move.scene).boxes_xyxy)
-
-
-def test_a_car_between_others_stays(street: Callable[..., SceneIR]) -> None:
-    # bumper to bumper: no way along the heading
-    scene = street(positions_xz=((0.0, 9.0), (0.0, 13.3), (0.0, 17.6)))
-    assert 1 not in found.CarMoves(scene, range(3), np.random.default_rng(0)).alone
 
 
 def test_what_is_counted(street: Callable[..., SceneIR]) -> None:
@@ -154,18 +138,6 @@ def test_small_and_hidden_cars_are_beside(street: Callable[..., SceneIR]) -> Non
     assert [(line["which"], line["cars"]) for line in lines] == [("judged", 2), ("all", 4)]
 
 
-def test_a_ghost_is_new_and_inside() -> None:
-    box = torch.tensor([[100.0, 100, 200, 150]])
-
-    def view(rows: Rows) -> CarView:
-        return CarView(np.zeros((9, 9, 3), np.uint8), box, detections(rows), CLASSES, [])
-
-    part, beyond = (110.0, 110, 150, 140), (180.0, 110, 240, 140)
-    assert view([(part, CAR, 0.4), (beyond, CAR, 0.9)]).ghost(0, view([])) == DetectorSight(iou=0.24, score=0.4)
-    assert view([(part, CAR, 0.4)]).ghost(0, view([(part, CAR, 0.35)])) == DetectorSight()
-    assert view([(part, TRUCK, 0.4), (part, CAR, 0.2)]).ghost(0, view([])) == DetectorSight()
-
-
 def test_a_detector_without_cars_is_refused(street: Callable[..., SceneIR]) -> None:
     told = Told([])
     told.classes = ("cat",)  # type: ignore[assignment]
@@ -204,29 +176,6 @@ def test_the_command_reads_scenes_and_draws_failures(
     assert [name for name in names if name.startswith("removed")] == [
         *("removed-01-a-1.png", "removed-02-b_c-1.png", "removed-03-a-0.png", "removed-04-b_c-0.png"),
     ]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--detector", "onnx:gone.onnx"], "gone.onnx: expected an ONNX file, found none"),
-        (["--detector", "nowhere"], "--detector: expected a detector (squeezedet"),
-        (["--dataset", "kitti"], "--root: expected the folder of data set 'kitti'"),
-        (["--dataset", "kitti", "--root", ".", "--scenes", "."], "--scenes: expected no --dataset beside it"),
-        (["--device", "meta"], "--device: expected cpu"),
-        (["--scenes", "EMPTY"], "expected scenes as drivesem derender writes them, found none"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(
-    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "EMPTY").mkdir()
-    given = [str(tmp_path / "EMPTY") if word == "EMPTY" else word for word in words]
-    assert main(["found", *given]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    assert message in captured.err
 
 
 @pytest.mark.slow

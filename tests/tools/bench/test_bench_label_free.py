@@ -1,7 +1,5 @@
 """What is estimated without labels, held against labels."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -13,7 +11,6 @@ from scene_ir.types import Camera, Labels
 from tools.bench import label_free as bench
 from tools.bench.__main__ import main
 from tools.bench.label_free import FrameRows, VehicleError, VehicleRow
-from tools.bench.settings import BenchTool
 
 CAMERA = Camera(torch.tensor([[720.0, 0, 620.0], [0, 720.0, 180.0], [0, 0, 1.0]]), 375, 1242)
 
@@ -38,13 +35,6 @@ def labels() -> Labels:
 
 def test_what_is_judged() -> None:
     assert bench.judged(labels()) == [0]
-
-
-def test_what_is_very_near() -> None:
-    """Cut or not, but not hidden; 60 px is not near."""
-    shown = labels()
-    shown.boxes_xyxy[:, 3] = torch.tensor([160.0, 120, 230, 230, 220, 230])
-    assert bench.nearest(shown) == [3, 4]
 
 
 def test_errors_are_of_heading_depth_and_place() -> None:
@@ -75,22 +65,6 @@ def test_summary_keeps_both_stages_apart() -> None:
     assert lines["axis, degrees, as placed"]["worst"] == 8
     assert lines["turned, share, as placed"]["median"] == pytest.approx(1 / 6, abs=1e-3)
     assert bench.summary([FrameRows(0, ())]) == []
-
-
-def test_frames_by_name() -> None:
-    assert bench.names(BenchTool(what="label-free", frames=2)) == ["000", "001"]
-    assert len(bench.names(BenchTool(what="label-free", quick=True))) == bench.QUICK_FRAMES
-
-
-def test_bad_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, message in (
-        (["--dataset", "kitti", "--root", "nowhere"], "nowhere"),
-        (["--device", "meta"], "--device: expected cpu"),
-    ):
-        assert main(["label-free", *words]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert message in said
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """`python -m tools.bench parts`: the parts of a frame's time are those of its functions, and sum to all of it."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Frames shared by Ray beside frames shared by processes: what is reckoned of rounds, and real ones."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 

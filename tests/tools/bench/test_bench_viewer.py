@@ -1,7 +1,5 @@
 """`python -m tools.bench viewer` as a maintainer types it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

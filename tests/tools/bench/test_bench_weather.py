@@ -1,11 +1,7 @@
 """The benchmark of weather: figures of one frame, and what they are means of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import pytest
 
 from detectors.registry import load_predictor
@@ -47,14 +43,3 @@ def test_the_summary_weighs_frames_by_their_vehicles(rows: list[weather.WeatherR
     assert (told["pool"], told["weather"], told["frames"]) == ("train", "none", 2)
     assert told["cars"] == 4 * first.cars
     assert told["margin"] == pytest.approx(first.margin + 3.0, abs=1e-3)
-
-
-def test_a_region_is_the_box_grown_within_the_picture() -> None:
-    class Car:
-        box_xyxy = np.array([0.0, 10.0, 20.0, 20.0])
-
-    car: Any = Car()
-    region = weather._region(car, (40, 60))  # pyright: ignore[reportPrivateUsage]
-    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
-    assert (rows[0], rows[-1]) == (8, 22)
-    assert (columns[0], columns[-1]) == (0, 23)

@@ -130,25 +130,6 @@ def test_planted_across(
     assert "faults of a detector" in (tmp_path / "planted.md").read_text()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["planted", "--across", "4", "--naming", "climb"], "--naming: expected no --across"),
-        (["planted", "--searched", "4"], "--searched: expected --across"),
-        (["planted", "--across", "4", "--budget", "mars"], "--budget: expected"),
-        (["planted", "--methods", "halton,luck"], "--methods: expected names among"),
-        (
-            ["planted", "--methods", "halton,climb", "--naming", "corners"],
-            "--naming: expected names among halton, climb",
-        ),
-        (["planted", "--passes", "3"], "--passes: expected at least"),
-    ],
-)
-def test_bad_input_of_planted(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words) == 2
-    assert message in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_climb(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(climb, "PRECISIONS", {"float32": None})
@@ -161,8 +142,3 @@ def test_climb(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     assert row["gradient_ms"] > row["detector_ms"]
     # At least as long as its passes' detector, a gradient being one that is counted as three.
     assert row["search_s"] * 1e3 > 24 / 3 * 0.5 * row["detector_ms"]
-
-
-def test_climb_asks_for_a_processor(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["climb", "--device", "cuda"]) == 2
-    assert "--device" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 """The benchmark of devices: its rows on one device, and what the table tells of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,11 +1,12 @@
-"""`drivesem plausibility` on the folder of a run."""
-
-from __future__ import annotations
+"""Experiment `plausibility` on the folder of a run."""
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,9 +74,8 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def test_before_and_after(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plausibility", "--run", str(run), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+def test_before_and_after(run: Path, output_json: Callable[..., Any]) -> None:
+    data = output_json("plausibility", "--run", run)
     out = run / "plausibility"
     assert json.loads((out / "plausibility.json").read_text()) == data
     rows = {row["name"]: row for row in data["rows"]}
@@ -101,31 +101,26 @@ def test_a_table_for_people(run: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert len((tmp_path / "p" / "plausibility.csv").read_text().splitlines()) == 3
 
 
-def test_weather_and_what_of_it_comes_together(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weather_and_what_of_it_comes_together(run: Path, output_json: Callable[..., Any]) -> None:
     codes = {"weather.fog": 0.75, "weather.rain": 0.75, "weather.time_of_day": 0.0, "weather.overcast": 0.5}
     theta = tuple(Coordinate(name, "code", value, 0.0, 1.0, "") for name, value in codes.items())
     files.write_text(run / "frames" / "a" / "result.json", dump_frame(replace(result("a"), theta=theta)))
-    assert main(["plausibility", "--run", str(run), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = output_json("plausibility", "--run", run)
     assert [frame["weather"] for frame in data["by_frame"]] == [1.5, None]
     assert data["weather_beyond"] == ["a"]
     written = (run / "plausibility" / "plausibility.md").read_text()
     assert "| a | 0.75 | 0.75 | 0.00 | 0.50 | 150.0 | fog in rain |" in written
 
 
-def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def refused(*words: object) -> str:
-        capsys.readouterr()
-        assert main(["plausibility", *map(str, words)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        return line.removeprefix("python -m tools.experiments: ")
-
-    assert refused() == "--run: expected a folder of drivesem attack, found nothing"
-    assert refused("--run", tmp_path).startswith("--run: expected a folder of drivesem attack")
-    assert "--limit: expected at least 1" in refused("--run", run, "--limit", "0")
-    assert "--out: expected a folder" in refused("--run", run, "--out", run / "metrics.json")
+def test_a_bad_folder_or_labels_that_do_not_fit_are_refused(
+    run: Path, refused: Callable[..., str], tmp_path: Path
+) -> None:
+    out = ["--out", str(run / "metrics.json")]
+    assert "--out: expected a folder" in refused("plausibility", "--run", str(run), *out)
+    (tmp_path / "empty").rmdir()
     write_labels(run / "frames" / "a" / "labels_moved.txt", labels(YAW, 20))
-    assert "expected the 2 vehicles of labels_paper.txt, found 1" in refused("--run", run)
-    for name, side in (("a", "paper"), ("a", "moved"), ("b", "paper"), ("b", "moved")):
+    assert "expected the 2 vehicles of labels_paper.txt, found 1" in refused("plausibility", "--run", str(run))
+    (tmp_path / "empty").rmdir()
+    for name, side in product("ab", ("paper", "moved")):
         write_labels(run / "frames" / name / f"labels_{side}.txt", labels(YAW))
-    assert "a run with vehicles" in refused("--run", run)
+    assert "a run with vehicles" in refused("plausibility", "--run", str(run))

@@ -1,44 +1,36 @@
-"""`drivesem realism` on hand-made runs."""
-
-from __future__ import annotations
+"""Experiment `realism` on hand-made runs."""
 
 import csv
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivesem.evaluation.resampling import Interval
 from drivesem.run.results import dump_frame, load_frame
 from scene_ir import files
 from scene_ir.errors import ShapeError
+from tests.drivesem.commands.conftest import write_finished_run
 from tools.experiments.__main__ import main
-from tools.experiments.realism import comparison
 from tools.experiments.realism.comparison import crop_window, enclosing_rectangle, vehicle_boxes
 from tools.experiments.realism.metrics import MIN_SIDE_PX
 
 
 @pytest.fixture
-def realism(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    def call(*words: object) -> dict[str, Any]:
-        capsys.readouterr()
-        assert main(["realism", "--bootstrap", "20", "--json", *map(str, words)]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    return call
+def realism(output_json: Callable[..., Any]) -> Callable[..., Any]:
+    return partial(output_json, "realism", "--bootstrap", "20")
 
 
 def rows_of(data: dict[str, Any], **which: object) -> list[dict[str, Any]]:
     return [row for row in data["rows"] if all(row[key] == value for key, value in which.items())]
 
 
-def test_identity(write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]) -> None:
-    run = write_run(tmp_path / "run", same=True)
-    data = realism(run, "--metrics", "psnr,ssim,perceptual,frechet")
+def test_identity(tmp_path: Path, realism: Callable[..., Any]) -> None:
+    data = realism(write_finished_run(tmp_path / "same", same=True), "--metrics", "psnr,ssim,perceptual,frechet")
     for row in data["rows"]:
         expected = {"psnr": None, "ssim": pytest.approx(1), "perceptual": 0, "frechet": 0}[row["metric"]]
         assert row["value"] == expected
@@ -48,8 +40,10 @@ def test_identity(write_run: Callable[..., Path], tmp_path: Path, realism: Calla
     assert {row["pictures"] for row in rows_of(data, region="boxes")} == {6}
 
 
-def test_metrics(write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]) -> None:
-    runs = [write_run(tmp_path / name, params=params) for name, params in (("one", "rotate"), ("two", "mesh"))]
+def test_metrics(tmp_path: Path, realism: Callable[..., Any]) -> None:
+    runs = [
+        write_finished_run(tmp_path / name, params=params) for name, params in (("one", "rotate"), ("two", "mesh"))
+    ]
     data = realism(*runs, "--metrics", "psnr,ssim,perceptual,frechet", "--out", tmp_path / "out")
     assert json.loads((tmp_path / "out" / "realism.json").read_text()) == data
     assert [(one["run"], one["params"], one["frames"], one["vehicles"]) for one in data["runs"]] == [
@@ -84,18 +78,12 @@ def test_metrics(write_run: Callable[..., Path], tmp_path: Path, realism: Callab
     assert "| one | rotate | frame | PSNR, dB | inf |" in (tmp_path / "out" / "realism.md").read_text()
 
 
-def test_successes_alone(
-    write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]
-) -> None:
-    run = write_run(tmp_path / "run")
+def test_successes_alone(realism: Callable[..., Any], run: Path) -> None:
     assert realism(run, "--metrics", "psnr", "--successes")["runs"][0]["frames"] == 2
     assert realism(run, "--metrics", "psnr", "--limit", "1")["runs"][0]["frames"] == 1
 
 
-def test_a_table_for_people(
-    write_run: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = write_run(tmp_path / "run")
+def test_a_table_for_people(capsys: pytest.CaptureFixture[str], run: Path) -> None:
     assert main(["realism", str(run), "--metrics", "ssim", "--bootstrap", "0"]) == 0
     output = capsys.readouterr()
     assert "distances between pictures" in output.out
@@ -116,7 +104,7 @@ def test_windows() -> None:
 
 
 def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
-    write_run: Callable[..., Path], tmp_path: Path, realism: Callable[..., dict[str, Any]]
+    realism: Callable[..., Any], run: Path
 ) -> None:
     nowhere, box = (0.0, 0.0, 0.0, 0.0), (210.0, 120.0, 290.0, 190.0)
     assert (
@@ -125,7 +113,6 @@ def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
         == crop_window([box], 200, 300)
     )
     assert enclosing_rectangle([nowhere, box]) == box
-    run = write_run(tmp_path / "run")
     path = run / "frames" / "a" / "result.json"
     result = load_frame(path)
     benign, moved = result.targets_benign, result.targets_moved
@@ -136,37 +123,3 @@ def test_the_window_of_a_vehicle_that_left_or_parked_is_where_it_is_seen(
     never = (replace(benign[0], xyxy=nowhere, ignore=True), benign[1])
     files.write_text(path, dump_frame(replace(result, targets_benign=never, targets_moved=left)))
     assert realism(run, "--metrics", "ssim")["runs"][0]["vehicles"] == 5
-
-
-def test_bounds_of_psnr_swap_with_those_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small error is a large PSNR, and no error an infinite one."""
-    monkeypatch.setattr(comparison, "bootstrap_intervals", lambda *_: [Interval("", 25.0, 0.0, 100.0)])
-    part = comparison.PictureRegion(None, "", {"psnr": dict.fromkeys(comparison.PAIRS, 25.0)}, {})
-    row = comparison.realism_rows([comparison.FrameRegions("a", (part,))], ["psnr"], 1, 0)[0]
-    assert (row.low, row.high) == (pytest.approx(20 * np.log10(25.5)), None)
-
-
-def test_bad_input(
-    write_run: Callable[..., Path], tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
-    run = write_run(tmp_path / "run")
-
-    def says(*words: object) -> str:
-        line = refused("realism", *map(str, words))
-        (tmp_path / "empty").rmdir()
-        return line
-
-    assert "RUN: expected folders of drivesem attack, found nothing" in says()
-    assert "RUN: expected a folder of drivesem attack" in says(tmp_path)
-    assert "each run once" in says(run, run)
-    assert "--metrics: expected available, or psnr" in says(run, "--metrics", "psnr,beauty")
-    assert "alexnet-owt-*.pth" in says(run, "--metrics", "lpips-alex")
-    assert "--weights: expected a folder" in says(run, "--weights", run / "metrics.json")
-    assert "--limit: expected at least 1" in says(run, "--limit", "0")
-    assert "--bootstrap: expected at least 0" in says(run, "--bootstrap", "-1")
-    assert "--out: expected a folder" in says(run, "--out", run / "metrics.json")
-    files.write_png(run / "frames" / "a" / "rerender.png", np.zeros((70, 90, 3), np.uint8))
-    assert "expected pictures of one size" in says(run, "--metrics", "psnr")
-    (run / "frames" / "a" / "counterexample.png").write_bytes(b"no picture")
-    assert "counterexample.png: expected an image" in says(run, "--metrics", "psnr")

@@ -1,7 +1,5 @@
 """The survey's page, what it tells and what not; and what people said, counted by hand."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import hashlib
@@ -19,16 +17,18 @@ import pytest
 from drivesem.run.finished import load_run
 from drivesem.run.results import BoxRecord, dump_frame, load_frame
 from scene_ir.errors import ShapeError
+from tests.drivesem.commands.conftest import write_finished_run
 from tools.experiments.__main__ import main
 from tools.experiments.survey.page import COLUMNS, draw_items
 
 
-@pytest.fixture
-def survey(write_run: Callable[..., Path], tmp_path: Path) -> Path:
-    """Two counterexamples and a control."""
-    words = ["--items", "2", "--controls", "1", "--out", str(tmp_path / "survey")]
-    assert main(["survey", str(write_run(tmp_path / "run")), *words]) == 0
-    return tmp_path / "survey"
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two counterexamples and a control, of the run beside it."""
+    out = tmp_path_factory.mktemp("survey") / "survey"
+    words = ["--items", "2", "--controls", "1", "--out", str(out)]
+    assert main(["survey", str(write_finished_run(out.parent / "run")), *words]) == 0
+    return out
 
 
 def key_of(folder: Path) -> dict[str, Any]:
@@ -75,27 +75,25 @@ def test_the_page_stands_alone_and_keeps_the_truth_to_itself(survey: Path) -> No
 
 
 def test_the_same_command_makes_the_same_survey(survey: Path, tmp_path: Path) -> None:
-    words = ["survey", str(tmp_path / "run"), "--items", "2", "--controls", "1", "--out"]
+    words = ["survey", str(survey.parent / "run"), "--items", "2", "--controls", "1", "--out"]
     assert main([*words, str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "survey.html").read_bytes() == (survey / "survey.html").read_bytes()
     assert main([*words, str(tmp_path / "other"), "--seed", "1"]) == 0
     assert key_of(tmp_path / "other")["survey"] != key_of(survey)["survey"]
 
 
-def test_of_vehicles_that_left_or_parked_those_are_given_that_the_picture_has(
-    write_run: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_of_vehicles_that_left_or_parked_those_are_given_that_the_picture_has(run: Path) -> None:
     """The first car left and a lorry parked; people are asked about the lorry, where it stands, and of the picture
     without any change about the car."""
-    folder, nowhere = write_run(tmp_path / "run"), (0.0, 0.0, 0.0, 0.0)
-    for path in (folder / "frames" / "a").glob("*.png"):
+    nowhere = (0.0, 0.0, 0.0, 0.0)
+    for path in (run / "frames" / "a").glob("*.png"):
         cv2.imwrite(str(path), np.zeros((400, 800, 3), np.uint8))
-    path = folder / "frames" / "a" / "result.json"
+    path = run / "frames" / "a" / "result.json"
     result, car, lorry = load_frame(path), (20.0, 200.0, 80.0, 240.0), (600.0, 300.0, 700.0, 360.0)
     before = (BoxRecord(car, "Car", index=0), BoxRecord(nowhere, "Truck", ignore=True, index=1))
     after = (BoxRecord(nowhere, "Car", ignore=True, index=0), BoxRecord(lorry, "Truck", ignore=True, index=1))
     path.write_text(dump_frame(replace(result, targets_benign=before, targets_moved=after)))
-    found = {item.kind: (item, view) for item, view in draw_items([load_run(folder, limit=1)], 1, 1, 0)}
+    found = {item.kind: (item, view) for item, view in draw_items([load_run(run, limit=1)], 1, 1, 0)}
     (changed, view), (unchanged, _) = found["counterexample"], found["unchanged"]
     assert (changed.object, changed.truth) == (1, "Truck")
     assert (unchanged.object, unchanged.truth) == (0, "Car")
@@ -105,19 +103,17 @@ def test_of_vehicles_that_left_or_parked_those_are_given_that_the_picture_has(
     gone = replace(result, targets_benign=before[:1], targets_moved=after[:1])
     path.write_text(dump_frame(gone))
     with pytest.raises(ShapeError, match="expected a run with vehicles"):
-        draw_items([load_run(folder, limit=1)], 1, 1, 0)
+        draw_items([load_run(run, limit=1)], 1, 1, 0)
 
 
-def test_fewer_frames_than_requested_for(
-    write_run: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["survey", str(write_run(tmp_path / "run")), "--json"]) == 0
+def test_fewer_frames_than_requested_for(capsys: pytest.CaptureFixture[str], run: Path) -> None:
+    assert main(["survey", str(run), "--json"]) == 0
     output = capsys.readouterr()
     assert json.loads(output.out)["counterexample"] == 3
     assert "only 3 of 15 pictures" in output.err
 
 
-def test_results(survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results(survey: Path, tmp_path: Path, output_json: Callable[..., Any]) -> None:
     key = key_of(survey)
     name = key["survey"]
     one, two = (item["item"] for item in key["items"] if item["kind"] == "counterexample")
@@ -127,9 +123,7 @@ def test_results(survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
         answers(tmp_path / "b.csv", name, "bob", (one, "Car", 6), (two, "Car", 4), (same, "Car", 10)),
         answers(tmp_path / "c.csv", name, "cem", (one, "Car", 7)),
     ]
-    capsys.readouterr()
-    assert main(["survey-results", *map(str, files), "--survey", str(survey), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = output_json("survey-results", *files, "--survey", survey)
     assert json.loads((survey / "results" / "survey.json").read_text()) == data
     assert (data["people"], data["answers"]) == (3, 7)
     changed, control = data["kinds"]["counterexample"], data["kinds"]["unchanged"]
@@ -151,38 +145,52 @@ def test_results(survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "| named correctly, % | 80.0" in (survey / "results" / "survey.md").read_text()
 
 
-def test_bad_input(survey: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
-    name, item = key_of(survey)["survey"], key_of(survey)["items"][0]["item"]
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "none in them"),
+        ([{"survey": "x"}], "bad.csv:2: survey: expected "),
+        ([{"item": "x"}], "bad.csv:2: item: expected an item"),
+        ([{"named": "Ship"}], "bad.csv:2: named: expected one of Car"),
+        *(
+            ([{"realism": x}], "bad.csv:2: realism: expected a whole number from 1 to 10")
+            for x in ("0", "11", "5.5")
+        ),
+        *(([{"realism": x}], "bad.csv:2: realism: expected a whole number from 1 to 10") for x in ("", "nan")),
+        ([{"participant": ""}], "bad.csv:2: participant"),
+        ([{}, {"realism": "6"}], "bad.csv:3: expected each item once"),
+    ],
+)
+def test_bad_answers(
+    rows: list[dict[str, str]], message: str, survey: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    key = key_of(survey)
+    good = {"survey": key["survey"], "participant": "ann", "item": key["items"][0]["item"], "named": "Car"}
+    with (tmp_path / "bad.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, restval="5")
+        writer.writeheader()
+        writer.writerows([good | row for row in rows])
+    assert message in refused("survey-results", str(tmp_path / "bad.csv"), "--survey", str(survey))
 
-    def says(*words: object) -> str:
-        line = refused(*map(str, words))
-        (tmp_path / "empty").rmdir()
-        return line
 
-    def of(*rows: tuple[str, str, object], name: str = name, person: str = "ann") -> str:
-        path = answers(tmp_path / "bad.csv", name, person, *rows)
-        return says("survey-results", path, "--survey", survey)
-
-    good = answers(tmp_path / "good.csv", name, "ann", (item, "Car", 5))
-    assert "CSV: expected files" in says("survey-results", "--survey", survey)
-    assert "--survey: expected the folder" in says("survey-results", good)
-    assert "survey-key.json: expected a readable file" in says("survey-results", good, "--survey", tmp_path)
-    assert "ann again" in says("survey-results", good, good, "--survey", survey)
-    assert "none in them" in of()
-    assert f"bad.csv:2: survey: expected {name}, found 'x'" in of((item, "Car", 5), name="x")
-    assert "bad.csv:2: item: expected an item" in of(("x", "Car", 5))
-    assert "bad.csv:2: named: expected one of Car" in of((item, "Ship", 5))
-    for rating in ("0", "11", "5.5", "", "nan"):
-        assert "bad.csv:2: realism: expected a whole number from 1 to 10" in of((item, "Car", rating))
-    assert "bad.csv:2: participant" in of((item, "Car", 5), person="")
-    assert "bad.csv:3: expected each item once" in of((item, "Car", 5), (item, "Car", 6))
-    (tmp_path / "bad.csv").write_text("a,b\n1,2\n")
-    assert "no survey" in says("survey-results", tmp_path / "bad.csv", "--survey", survey)
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--survey {survey}", "CSV: expected files"),
+        ("{good}", "--survey: expected the folder"),
+        ("{good} --survey {good.parent}", "survey-key.json: expected a readable file"),
+        ("{good} {good} --survey {survey}", "ann again"),
+        ("{table} --survey {survey}", "no survey"),
+        ("{good} --survey {key}", "expected a key"),
+    ],
+)
+def test_bad_files(words: str, message: str, survey: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+    key = key_of(survey)
+    good = answers(tmp_path / "good.csv", key["survey"], "ann", (key["items"][0]["item"], "Car", 5))
+    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
     (tmp_path / "key.json").write_text("{}")
-    assert "expected a key" in says("survey-results", good, "--survey", tmp_path / "key.json")
-    assert "RUN: expected folders" in says("survey")
-    assert "--items: expected at least 1" in says("survey", tmp_path / "run", "--items", "0")
-    assert "--out: expected a folder" in says("survey", tmp_path / "run", "--out", good)
+    paths = {"survey": survey, "good": good, "table": tmp_path / "table.csv", "key": tmp_path / "key.json"}
+    assert message in refused("survey-results", *words.format_map(paths).split())
 
 
 @pytest.mark.slow

@@ -1,11 +1,10 @@
-"""`drivesem worth` on hand-made runs and tables."""
-
-from __future__ import annotations
+"""Experiment `worth` on hand-made runs and tables."""
 
 import csv
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from detectors.types import Detections
 from drivesem.run import detection_cache as looking
 from drivesem.training.retrain import WEIGHTS
 from scene_ir import files
+from tests.drivesem.commands.conftest import write_finished_run
 from tools.experiments.__main__ import main
 
 CARS = [[13.0, 20.0, 63.0, 50.0], [73.0, 10.0, 128.0, 60.0]]
@@ -40,13 +40,8 @@ class Sees:
 
 
 @pytest.fixture
-def worth(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
-    def call(*words: object) -> dict[str, Any]:
-        capsys.readouterr()
-        assert main(["worth", "--json", *map(str, words)]) == 0
-        return json.loads(capsys.readouterr().out)
-
-    return call
+def worth(output_json: Callable[..., Any]) -> Callable[..., Any]:
+    return partial(output_json, "worth")
 
 
 def pick(data: dict[str, Any], of: str, **which: object) -> dict[str, Any]:
@@ -59,9 +54,8 @@ def entropy(*shares: float) -> float:
     return -sum(p * math.log(p) for p in shares if p)
 
 
-def test_runs(write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]) -> None:
+def test_runs(worth: Callable[..., Any], run: Path) -> None:
     """Three frames of two cars; afterwards a car of two frames is lost: 4 cars, and 2 cars with 6 empty places."""
-    run = write_run(tmp_path / "run")
     data = worth(run, "--distance", "perceptual")
     assert json.loads((run / "worth" / "worth.json").read_text()) == data
     before = pick(data, "photographs", membership="binary", realism_weight=False)
@@ -80,22 +74,8 @@ def test_runs(write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..
     assert "| run (rotate): counterexamples |" in (run / "worth" / "worth.md").read_text()
 
 
-def test_bases_and_no_realism(
-    write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]
-) -> None:
-    run = write_run(tmp_path / "run")
-    plain = worth(run, "--distance", "none", "--out", tmp_path / "e")
-    assert plain["distance"] is None
-    assert len(plain["rows"]) == 4
-    two = worth(run, "--distance", "none", "--base", "2", "--out", tmp_path / "2")
-    for a, b in zip(plain["rows"], two["rows"], strict=True):
-        assert b["value"] == pytest.approx(a["value"] / math.log(2))
-
-
-def test_nothing_changed(
-    write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]
-) -> None:
-    data = worth(write_run(tmp_path / "run", same=True), "--distance", "perceptual")
+def test_nothing_changed(tmp_path: Path, worth: Callable[..., Any]) -> None:
+    data = worth(write_finished_run(tmp_path / "same", same=True), "--distance", "perceptual")
     for kind in ("binary", "fractional"):
         for weighted in (False, True):
             which = {"membership": kind, "realism_weight": weighted}
@@ -105,15 +85,10 @@ def test_nothing_changed(
 
 @pytest.mark.parametrize(("count", "gain"), [(2, 8 / 12 * entropy(2 / 8, 6 / 8)), (0, None)])
 def test_gain_of_a_second_detector(
-    count: int,
-    gain: float | None,
-    write_run: Callable[..., Path],
-    tmp_path: Path,
-    worth: Callable[..., dict[str, Any]],
-    monkeypatch: pytest.MonkeyPatch,
+    count: int, gain: float | None, worth: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, run: Path
 ) -> None:
     monkeypatch.setattr(looking, "load_predictor", lambda *_: Sees(count))
-    data = worth(write_run(tmp_path / "run"), "--distance", "none", "--second", "sees")
+    data = worth(run, "--distance", "none", "--second", "sees")
     assert data["detectors"] == ["squeezedet", "sees"]
     row = pick(data, "counterexamples", membership="binary", what="gain")
     if gain is None:
@@ -135,29 +110,8 @@ def fingerprints(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return found
 
 
-def test_weights_are_not_read_for_each_picture(
-    write_run: Callable[..., Path],
-    tmp_path: Path,
-    worth: Callable[..., dict[str, Any]],
-    monkeypatch: pytest.MonkeyPatch,
-    fingerprints: list[str],
-) -> None:
-    monkeypatch.setattr(looking, "load_predictor", lambda *_: Sees(2))
-    runs = [write_run(tmp_path / name) for name in ("one", "two")]
-    worth(*runs, "--distance", "none", "--second", "sees")
-    # what is remembered, and one look at all pictures
-    assert fingerprints == ["sees"] * 2
-    fingerprints.clear()
-    study = study_of(write_run, tmp_path / "study", "multi", "combo-1", "combo-2")
-    worth("--study", study, "--metrics", "ssim", "--distance", "none", "--second", "sees")
-    assert fingerprints == ["sees"] * 2
-
-
 def test_a_folder_of_retrain_is_a_second_detector(
-    write_run: Callable[..., Path],
-    tmp_path: Path,
-    worth: Callable[..., dict[str, Any]],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, worth: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, run: Path
 ) -> None:
     weights = tmp_path / "retrained" / WEIGHTS
     weights.parent.mkdir()
@@ -169,14 +123,14 @@ def test_a_folder_of_retrain_is_a_second_detector(
         return Sees(2)
 
     monkeypatch.setattr(looking, "load_predictor", load)
-    data = worth(write_run(tmp_path / "run"), "--distance", "none", "--second", weights.parent)
+    data = worth(run, "--distance", "none", "--second", weights.parent)
     assert set(loaded) == {str(weights)} == {data["detectors"][1]}
 
 
 TABLE = "label,bench,bus,distance\nbench,0.9,0.1,0\nbench,0.3,0.7,0.2\nbus,0.2,0.8,0.4\n"
 
 
-def test_tables(tmp_path: Path, worth: Callable[..., dict[str, Any]]) -> None:
+def test_tables(tmp_path: Path, worth: Callable[..., Any]) -> None:
     path = tmp_path / "answers.csv"
     path.write_text(TABLE)
     data = worth("--table", path)
@@ -192,19 +146,17 @@ def test_tables(tmp_path: Path, worth: Callable[..., dict[str, Any]]) -> None:
     assert (tmp_path / "worth" / "worth.json").is_file()
 
 
-def study_of(write_run: Callable[..., Path], folder: Path, name: str, *arms: str) -> Path:
+def write_study(folder: Path, name: str, *arms: str) -> Path:
     """A finished study whose arms are these runs; in the first nothing is changed."""
     for place, arm in enumerate(arms):
-        write_run(folder / "arms" / arm, same=place == 0)
+        write_finished_run(folder / "arms" / arm, same=place == 0)
     files.write_text(folder / "config.yaml", f"name: {name}\n")
     return folder
 
 
-def test_arms_of_a_study(
-    write_run: Callable[..., Path], tmp_path: Path, worth: Callable[..., dict[str, Any]]
-) -> None:
+def test_arms_of_a_study(tmp_path: Path, worth: Callable[..., Any]) -> None:
     """Each arm as realism and worth tell it alone, beside the paper's figures; controls are left out."""
-    study = study_of(write_run, tmp_path / "study", "multi", "combo-1", "combo-2", "combo-2-placebo")
+    study = write_study(tmp_path / "study", "multi", "combo-1", "combo-2", "combo-2-placebo")
     placebo = study / "arms" / "combo-2-placebo" / "config.yaml"
     files.write_text(placebo, files.read_text(placebo).replace("method: si-fgsm", "method: placebo"))
     data = worth("--study", study, "--metrics", "psnr,ssim,perceptual", "--distance", "perceptual")
@@ -231,13 +183,10 @@ def test_arms_of_a_study(
 
 
 def test_what_a_study_retrained_gained(
-    write_run: Callable[..., Path],
-    tmp_path: Path,
-    worth: Callable[..., dict[str, Any]],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, worth: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each detector that was retrained, on the held-out counterexamples of the one before."""
-    study = study_of(write_run, tmp_path / "study", "retrain", "combo-2", "held-out", "held-out-ours")
+    study = write_study(tmp_path / "study", "retrain", "combo-2", "held-out", "held-out-ours")
     for name in ("ours", "benign"):
         files.write_text(study / "retrained" / name / WEIGHTS, "")
     monkeypatch.setattr(looking, "load_predictor", lambda name, *_: Sees(2 if "ours" in name else 0))
@@ -250,19 +199,6 @@ def test_what_a_study_retrained_gained(
     assert gains["benign"]["worth"] == pytest.approx(math.log(2))
     assert len(data["rows"]) == 3
     assert (study / "worth" / "gains.csv").is_file()
-
-
-def test_what_is_no_finished_study(
-    write_run: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
-) -> None:
-    run = write_run(tmp_path / "run")
-    assert "--study: expected the folder of a finished drivesem study" in refused("worth", "--study", str(run))
-    (tmp_path / "empty").rmdir()
-    study = study_of(write_run, tmp_path / "study", "multi", "combo-1")
-    (study / "arms" / "combo-1" / "metrics.json").unlink()
-    assert "--study: expected a finished run" in refused("worth", "--study", str(study))
-    (tmp_path / "empty").rmdir()
-    assert "--metrics: expected --study beside it" in refused("worth", str(run), "--metrics", "ssim")
 
 
 def test_a_table_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -291,32 +227,3 @@ def test_bad_tables(text: str, message: str, tmp_path: Path, refused: Callable[.
     path = tmp_path / "table.csv"
     path.write_text(text)
     assert message in refused("worth", "--table", str(path))
-
-
-def test_bad_input(write_run: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]) -> None:
-    run = write_run(tmp_path / "run")
-
-    def says(*words: object) -> str:
-        line = refused("worth", *map(str, words))
-        (tmp_path / "empty").rmdir()
-        return line
-
-    assert "RUN: expected folders of drivesem attack, or --table, or --study, found nothing" in says()
-    assert "found several of them" in says(run, "--table", "x.csv")
-    assert "--after: expected --table beside it" in says(run, "--after", "x.csv")
-    assert "--second: expected runs" in says("--table", "x.csv", "--second", "squeezedet")
-    assert "--base: expected e, or a number above 1, found '1'" in says(run, "--base", "1")
-    assert "--base" in says(run, "--base", "two")
-    assert "--bootstrap: expected --study beside it" in says(run, "--bootstrap", "20")
-    assert "--distance: expected none, perceptual" in says(run, "--distance", "psnr")
-    assert "--second: expected a detector" in says(run, "--distance", "none", "--second", "nobody")
-    assert "RUN: expected a folder of drivesem attack" in says(tmp_path)
-    (tmp_path / "table.csv").write_text(TABLE)
-    (tmp_path / "other.csv").write_text(TABLE.replace("bus,0.2", "bench,0.2"))
-    message = says("--table", tmp_path / "table.csv", "--after", tmp_path / "other.csv")
-    assert "--after: expected the classes and labels of table.csv" in message
-    other = write_run(tmp_path / "other")
-    files.write_text(
-        other / "config.yaml", files.read_text(run / "config.yaml").replace("squeezedet", "yolov3-slim")
-    )
-    assert "RUN: expected runs against one detector" in says(run, other)

@@ -1,4 +1,4 @@
-"""One fault a detector: bands for cars of all frames, searches in some of them, and rules of what all tell.
+"""One fault per detector: bands for cars of all frames, searches in some of them, and rules from all frames.
 
 A fault is drawn at random among those of its kind that hide few cars as photographed and some in Halton's draws.
 """
@@ -98,7 +98,7 @@ class SharedFaultSearch:
     """Of these, those that the detector without the fault sees in the same picture."""
     passes: int
     """Of the search."""
-    looked: tuple[NeighbourhoodSamples, ...]
+    neighbourhoods: tuple[NeighbourhoodSamples, ...]
     """Around each of the certain ones."""
 
 
@@ -107,7 +107,7 @@ class SharedFaultFrame:
     """What was found in one frame."""
 
     frame: str
-    asked: str
+    settings: str
     """See `SharedFaultBench`."""
     attempts: tuple[SharedFaultSearch, ...]
 
@@ -155,7 +155,9 @@ def _reached(
                     cars.append(1000 * number + car.index)
                     frames.append(number)
         still += [
-            [car.best[row] for row in rows] for car in pool.looks[0] if car.margin > 0 and car.best is not None
+            [car.best[row] for row in rows]
+            for car in pool.camera_samples[0]
+            if car.margin > 0 and car.best is not None
         ]
     return np.array(drawn), np.array(still).reshape(-1, len(rows)), np.array(cars), np.array(frames)
 
@@ -207,7 +209,7 @@ class SharedFaultBench:
     config: DetectorBenchConfig
     detector: Detector
     workers: dict[str, AttackWorker]
-    kept: Path | None
+    folder: Path | None
     """Folder of what is done."""
     faults: tuple[str, ...] = ()
     """In words."""
@@ -224,8 +226,8 @@ class SharedFaultBench:
             raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
         first = AttackWorker.from_config(attack_settings(config, methods[0]), detector)
         workers = {method: first.with_config(attack_settings(config, method)) for method in methods}
-        kept = None if config.out is None or config.out.endswith(".json") else Path(config.out)
-        return cls(config, detector, workers, kept, faults)
+        folder = None if config.out is None or config.out.endswith(".json") else Path(config.out)
+        return cls(config, detector, workers, folder, faults)
 
     @property
     def states(self) -> int:
@@ -240,13 +242,13 @@ class SharedFaultBench:
 
     def pool(self, name: str) -> FramePool:
         """A frame's states; what another call has made with the same settings is read. Raises NoVehicleError."""
-        asked = self._asked(("params", "budget", "detector", "across"))
-        path = None if self.kept is None else self.kept / "pools" / name / "pool.json"
+        settings = self._format_settings(("params", "budget", "detector", "across"))
+        path = None if self.folder is None else self.folder / "pools" / name / "pool.json"
         if (
             path is not None
             and self.config.resume
             and path.is_file()
-            and files.read_text(path.with_name("asked")) == asked
+            and files.read_text(path.with_name("settings")) == settings
         ):
             return load_record(path, FramePool, SCHEMA)
         scene = self._scene(name)
@@ -256,18 +258,18 @@ class SharedFaultBench:
         if path is not None:
             with files.atomic_folder(path.parent) as part:
                 files.write_text(part / path.name, dump_record(pool, SCHEMA))
-                files.write_text(part / "asked", asked)
+                files.write_text(part / "settings", settings)
         return pool
 
     def judge(self, numbered: tuple[int, str]) -> SharedFaultFrame:
-        """Searches of a frame, by its number and name, for the faults whose turn it is."""
+        """Search a frame, by its number and name, for the faults assigned to it."""
         number, name = numbered
         chosen = self.turn(number)
-        asked = self._asked(("params", "budget", "detector", "methods", "passes")) + repr(chosen)
-        path = None if self.kept is None else self.kept / "frames" / f"{name}.json"
+        settings = self._format_settings(("params", "budget", "detector", "methods", "passes")) + repr(chosen)
+        path = None if self.folder is None else self.folder / "frames" / f"{name}.json"
         if path is not None and self.config.resume and path.is_file():
             known = load_record(path, SharedFaultFrame, SCHEMA)
-            if known.asked == asked:
+            if known.settings == settings:
                 return known
         scene, shared_detector = self._scene(name), CachingDetector(self.detector)
         attempts = tuple(
@@ -275,7 +277,7 @@ class SharedFaultBench:
             for fault in chosen
             for method in self.workers
         )
-        judged = SharedFaultFrame(name, asked, attempts)
+        judged = SharedFaultFrame(name, settings, attempts)
         if path is not None:
             files.write_text(path, dump_record(judged, SCHEMA))
         return judged
@@ -296,20 +298,20 @@ class SharedFaultBench:
         )
         certain = certain_losses(attacked)
         seen = detected_without_fault(self.detector, attacked) if certain else ()
-        looked = tuple(
+        neighbourhoods = tuple(
             NeighbourhoodSamples(index, sample_neighbourhood(attacked, index, SAMPLES, self.config.seed))
             for index in certain
         )
         found = sum(index in seen for index in certain)
-        return SharedFaultSearch(name, fault, method, len(certain), found, attacked.passes, looked)
+        return SharedFaultSearch(name, fault, method, len(certain), found, attacked.passes, neighbourhoods)
 
     def _scene(self, name: str) -> SceneIR:
         scene = self.source.scene(name)
         if not len(scene.objects):
-            raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
+            raise NoVehicleError(f"frame {name}", "a vehicle that can be de-rendered", "none")
         return scene
 
-    def _asked(self, names: Sequence[str]) -> str:
+    def _format_settings(self, names: Sequence[str]) -> str:
         settings = shared_options(self.config, SceneOptions) | {name: getattr(self.config, name) for name in names}
         return repr(sorted((key, str(value)) for key, value in settings.items() if key != "limit"))
 

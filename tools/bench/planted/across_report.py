@@ -1,4 +1,4 @@
-"""What pooled rules say of detectors with one fault, with none, and with failures that follow nothing."""
+"""Tables of pooled rules for detectors with one fault, without a fault, and with random failures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from detectors.planted import PlantedFault
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.evaluation.resampling import wilson
 from drivesem.failures.rules import Flags, Floats, Intervals, fit_rule_list, format_rule
 from tools.bench.planted.across import SharedFault, SharedFaultFrame
@@ -17,11 +17,11 @@ from tools.bench.planted.pool import FramePool, bands_by_label, hidden
 from tools.bench.planted.yardstick import rule_names_fault
 
 CONTRAST = 4
-"""Halton's states of each frame beside samples around failures: they say where cars are not lost."""
+"""Halton states per frame in addition to samples around failures: they show where cars are detected."""
 SAME_PASSES, ALL = "halton's states, as many passes", "halton's states, all"
 CHANCE = "chance"
 CHANCE_DETECTORS = 40
-"""Detectors of each kind whose failures follow nothing."""
+"""Detectors of each kind with random failures."""
 SHARP = 0.3
 """Share of the cars in its bands by labels that a fault hides, from which it counts as sharp."""
 _SHARE = 0.05
@@ -60,7 +60,7 @@ SUMMARY_COLUMNS: Columns = {
     "low": ("from", "from"),
     "high": ("to", "to"),
     "in_part": ("in part", "part"),
-    "told": ("with a rule", "told"),
+    "with_rule": ("with a rule", "rule"),
     "further": ("further rules", "further"),
     "passes": ("passes a detector", "passes"),
 }
@@ -78,7 +78,7 @@ class PooledSamples:
     passes: int
 
     def rules(self) -> list[Intervals]:
-        """Pooled ones, the one that tells most first."""
+        """Pooled rules, the most informative first."""
         if not self.fails.any():
             return []
         return [rule.intervals for rule in fit_rule_list(self.columns, self.fails, self.objects)]
@@ -86,11 +86,9 @@ class PooledSamples:
 
 @dataclass(frozen=True, slots=True)
 class FaultRuleRow:
-    """What is said of one detector. failures, objects: lost samples, and of how many cars; passes: of the
-    detector; rules: in words; named, in_part: whether the first is the fault, or has one of its features; further:
-    those
-    after it, or all where there is no fault.
-    """
+    """Rules found for one detector. failures, objects: lost samples, and of how many cars; passes: of the detector;
+    rules: as text; named, in_part: whether the first rule is the fault, or has one of its features; further: rules
+    after it, or all rules without a fault."""
 
     fault: str
     by: str
@@ -141,7 +139,10 @@ def searched_evidence(
     contrast = drawn_evidence(fault, pools, CONTRAST)
     numbers = {pool.frame: number for number, pool in enumerate(pools)}
     parts = [
-        (_car(numbers[a.frame], one.index), one.around) for a in own for one in a.looked if one.around.margins
+        (_car(numbers[a.frame], one.index), one.around)
+        for a in own
+        for one in a.neighbourhoods
+        if one.around.margins
     ]
     columns = {
         name: np.concatenate([contrast.columns[name], *(part.columns()[name] for _, part in parts)])
@@ -173,11 +174,11 @@ def drawn_evidence(fault: PlantedFault | None, pools: Sequence[FramePool], state
 
 
 def chance_rows(pools: Sequence[FramePool], seed: int, shams: int) -> list[dict[str, Any]]:
-    """How often a rule is told of failures by lot."""
+    """How often random failures get a rule."""
     plain = drawn_evidence(None, pools, max(len(pool.states) for pool in pools))
     rows = []
     for kind in ("state by state", "car by car"):
-        told = 0
+        with_rule = 0
         for number in range(shams):
             rng = np.random.default_rng([seed, number])
             fails = rng.random(len(plain.fails)) < _SHARE
@@ -185,9 +186,9 @@ def chance_rows(pools: Sequence[FramePool], seed: int, shams: int) -> list[dict[
                 known = np.unique(plain.objects)
                 chosen = rng.choice(known, max(round(2 * _SHARE * len(known)), 1), replace=False)
                 fails = np.isin(plain.objects, chosen) & (rng.random(len(plain.fails)) < 0.5)
-            told += bool(PooledSamples(plain.columns, fails, plain.objects, plain.passes).rules())
-        low, high = wilson(told, shams)
-        rows.append({"by": f"{CHANCE}, {kind}", "faults": shams, "told": told, "low": low, "high": high})
+            with_rule += bool(PooledSamples(plain.columns, fails, plain.objects, plain.passes).rules())
+        low, high = wilson(with_rule, shams)
+        rows.append({"by": f"{CHANCE}, {kind}", "faults": shams, "with_rule": with_rule, "low": low, "high": high})
     return rows
 
 
@@ -213,7 +214,7 @@ def summary_rows(rows: Sequence[FaultRuleRow]) -> list[dict[str, Any]]:
                     "low": low,
                     "high": high,
                     "in_part": sum(row.in_part for row in own) if planted else None,
-                    "told": sum(bool(row.rules) for row in own),
+                    "with_rule": sum(bool(row.rules) for row in own),
                     "further": sum(row.further for row in own),
                     "passes": float(np.mean([row.passes for row in own])),
                 }

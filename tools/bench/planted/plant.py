@@ -1,7 +1,7 @@
-"""Faults planted for one frame: no car is in their bands as photographed, and theta can bring one into them.
+"""Plant faults in one frame: no car is in their bands as photographed, and theta can bring one into them.
 
-Bands lie between features that theta was seen to reach. Of many that are drawn, and that chance hits as rarely as
-was asked for, the one is kept inside of which theta can bring a car most surely.
+Bands lie between feature values that theta reaches. Of many random bands that samples hit as rarely as requested, the
+one into which theta brings a car most reliably is chosen.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ HITS: dict[Rarity, tuple[float, float]] = {"easy": (0.1, 0.4), "rare": (0.0, 0.0
 _TRIALS = 4000
 """Bands that are drawn for a fault."""
 _MAX_CHECKED = 200
-"""Of these, so many of the most promising are looked at closely."""
+"""Number of the most promising of these that are evaluated exactly."""
 _DIGITS = 4
 
 
@@ -83,7 +83,7 @@ def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> FaultPlacement | N
     for trial in range(_TRIALS):
         car = int(rng.choice(aims))
         bands = _bands(reached[:, :, car], mostly[:, car], rng)
-        # Roughly, by one box a car; what is kept is looked at closely below.
+        # Roughly, by one box a car; the best are evaluated exactly below.
         hit = _within(reached[:drawn], bands, 0 * mostly).any(1).mean()
         if not 0.5 * least <= hit <= most or (_within(benign[None], bands, farthest)[0] & judged).any():
             continue
@@ -94,7 +94,7 @@ def plant(survey: FrameSurvey, kind: FaultKind, seed: int) -> FaultPlacement | N
         named = zip(kind.features, bands.tolist(), strict=True)
         fault = PlantedFault(tuple(Band(name, low, high) for name, (low, high) in named))
         hit = survey.rarity(fault)
-        clear = not any(bool(look.lost(fault).any()) for look in survey.looks)
+        clear = not any(bool(sample.lost(fault).any()) for sample in survey.camera_samples)
         reachable = any(bool(s.lost(fault)[aims].any()) for s in (*survey.halton, *survey.corners))
         if clear and reachable and least <= hit <= most:
             sure = float(np.any(_within(reached[:drawn], bands, -mostly)[:, aims], axis=1).mean())

@@ -1,6 +1,6 @@
 """States of all frames, each shown once to the detector without a fault: what a fault does to it follows.
 
-Pictures, and what the detector says of them before a fault lowers scores, depend on no fault. So Halton's draws
+Pictures, and the detector's scores before a fault lowers them, depend on no fault. So Halton's draws
 are made once, and serve for where faults are planted, for how often chance hits them, and as samples of each.
 """
 
@@ -39,13 +39,13 @@ class CarObservation:
     """Its features as `FramePool.names` has them."""
     margin: float
     """In logits beyond t*, below 0 where the detector without a fault does not find it."""
-    told: tuple[tuple[float, ...], ...]
+    best_candidates: tuple[tuple[float, ...], ...]
     """Of each car that its predictions are about, as faults group them, the best score and that car's FEATURES."""
 
     @property
     def best(self) -> tuple[float, ...] | None:
         """FEATURES of the car that its best prediction is about; None where nothing meets it."""
-        return max(self.told)[1:] if self.told else None
+        return max(self.best_candidates)[1:] if self.best_candidates else None
 
     def lost(self, fault: PlantedFault, t_star: float) -> bool:
         """Whether the detector with a fault does not find it."""
@@ -58,13 +58,15 @@ class CarObservation:
 
 def hidden(cars: Sequence[CarObservation], fault: PlantedFault, t_star: float) -> list[bool]:
     """Which cars a fault hides, see `SeenCar.hidden`."""
-    counts = [len(car.told) if car.margin > 0 else 0 for car in cars]
-    rows = [row for car, count in zip(cars, counts, strict=True) if count for row in car.told]
+    counts = [len(car.best_candidates) if car.margin > 0 else 0 for car in cars]
+    rows = [row for car, count in zip(cars, counts, strict=True) if count for row in car.best_candidates]
     if not rows:
         return [False] * len(cars)
-    told = torch.tensor(rows, dtype=torch.float64)
-    by = fault.depth * fault.membership(told[:, [1 + FEATURES.index(name) for name in fault.feature_names]].T)
-    still = (lower_probability(told[:, 0], by) >= t_star).split(counts)
+    candidates = torch.tensor(rows, dtype=torch.float64)
+    by = fault.depth * fault.membership(
+        candidates[:, [1 + FEATURES.index(name) for name in fault.feature_names]].T
+    )
+    still = (lower_probability(candidates[:, 0], by) >= t_star).split(counts)
     return [count > 0 and not bool(seen.any()) for count, seen in zip(counts, still, strict=True)]
 
 
@@ -76,7 +78,7 @@ class FramePool:
     t_star: float
     """Of the detector."""
     names: tuple[str, ...]
-    looks: tuple[tuple[CarObservation, ...], ...]
+    camera_samples: tuple[tuple[CarObservation, ...], ...]
     """Its cars as photographed, in `CAMERA_DRAWS` draws of the camera."""
     states: tuple[tuple[CarObservation, ...], ...]
     """At Halton's draws over all of the bounds."""
@@ -84,30 +86,32 @@ class FramePool:
     @classmethod
     def make(cls, objective: Objective, name: str, seed: int, states: int) -> FramePool:
         """Of so many states; the same arguments give the same pool. name: the frame's. Raises RangeError where the
-        detector has no gradient, DetectorError where it does not tell its candidates.
+        detector has no gradient, DetectorError if it has no candidates.
         """
         everywhere = SceneSampler(objective, objective.feasible_set(), Nuisances(), f"planted:{name}:{seed}")
         cars = objective.benign.paper.category == CLASSES.index(BLIND_TO)
         still = objective.space.theta0
         # Numbers of looks lie beyond those of states: no draw of the camera is seen twice.
-        looked = [everywhere.sample_at(still, states + number) for number in range(CAMERA_DRAWS)]
+        jittered = [everywhere.sample_at(still, states + number) for number in range(CAMERA_DRAWS)]
         drawn = [everywhere.sample(number) for number in range(states)]
         seen = []
-        for samples in (*looked, *drawn):
+        for samples in (*jittered, *drawn):
             of_cars = {index: sample for index, sample in samples.items() if bool(cars[index])}
             seen.append(_seen(objective, of_cars, everywhere.margins(of_cars)))
-        names = next((tuple(sample.features) for samples in (*looked, *drawn) for sample in samples.values()), ())
+        names = next(
+            (tuple(sample.features) for samples in (*jittered, *drawn) for sample in samples.values()), ()
+        )
         return cls(name, objective.t_star, names, tuple(seen[:CAMERA_DRAWS]), tuple(seen[CAMERA_DRAWS:]))
 
     def hidden_as_photographed(self, fault: PlantedFault) -> set[int]:
-        """Cars that the fault hides in any look before a change."""
-        cars = [car for look in self.looks for car in look]
+        """Cars that the fault hides in any sample before a change."""
+        cars = [car for sample in self.camera_samples for car in sample]
         return {car.index for car, lost in zip(cars, hidden(cars, fault, self.t_star), strict=True) if lost}
 
     @property
     def found(self) -> set[int]:
         """Cars found in all looks."""
-        found = [{car.index for car in look if car.margin > 0} for look in self.looks]
+        found = [{car.index for car in sample if car.margin > 0} for sample in self.camera_samples]
         return set.intersection(*found) if found else set()
 
 
@@ -117,7 +121,7 @@ def bands_by_label(pools: Sequence[FramePool], fault: PlantedFault) -> tuple[Ban
     """
     rows: list[list[float]] = []
     for pool in pools:
-        cars = [car for state in (*pool.looks, *pool.states) for car in state]
+        cars = [car for state in (*pool.camera_samples, *pool.states) for car in state]
         for car, gone in zip(cars, hidden(cars, fault, pool.t_star), strict=True):
             if gone:
                 rows.append([car.described[pool.names.index(name)] for name in fault.feature_names])
@@ -154,8 +158,8 @@ def _seen(
     exposure = next(iter(samples.values())).image
     image, detector = exposure.image, objective.differentiable
     label = detector.classes.index(BLIND_TO)
-    told = detector.candidates(detector(image[None]))
-    placed, scores = told.boxes_for_class(label), told.log_scores[:, label].exp()
+    candidates = detector.candidates(detector(image[None]))
+    placed, scores = candidates.boxes_for_class(label), candidates.log_scores[:, label].exp()
     cars = group_cars(placed, scores)
     values = compute_features(image[None], cars.boxes_xyxy[None])[:, 0].T  # (K, F)
     found = []
@@ -172,25 +176,25 @@ def _seen(
 
 
 _MOST = 96
-"""Pictures whose predictions are kept, half a megabyte each: those that searches of one frame share."""
+"""Cached predictions, half a megabyte each: pictures that searches of one frame share."""
 
 
 class CachingDetector(DetectorWrapper):
-    """`inner`, which is asked once for each picture without a gradient. asked: how often it was."""
+    """Runs `inner` once per picture without a gradient. images_seen: pictures it ran on."""
 
     def __init__(self, inner: Detector) -> None:
         super().__init__(inner)
-        self.asked = 0
+        self.images_seen = 0
         self._known: OrderedDict[bytes, Any] = OrderedDict()
 
     def forward(self, images: Tensor) -> Any:
         """Inner's, of images (B, 3, H, W)."""
         if images.requires_grad or len(images) != 1:
-            self.asked += len(images)
+            self.images_seen += len(images)
             return self.inner(images)
         key = hashlib.blake2b(images.detach().cpu().contiguous().numpy().tobytes(), digest_size=16).digest()
         if key not in self._known:
-            self.asked += 1
+            self.images_seen += 1
             self._known[key] = self.inner(images)
             if len(self._known) > _MOST:
                 self._known.popitem(last=False)

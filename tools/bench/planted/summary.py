@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.bench.tables import Columns
+from drivesem.bench.session import Columns
 from drivesem.evaluation.resampling import DRAWS, bootstrap_intervals, ratio_metric
 from drivesem.failures.rules import format_rule
 from tools.bench.planted.yardstick import NO_FAULT, FrameSearches
@@ -16,10 +16,10 @@ METHOD = (
     "Each fault is planted into the detector for one frame: as photographed no car is inside of it, and theta "
     "can bring one in. Every method attacks each frame with each fault. Found: cars lost for certain that the "
     "detector without the fault sees in the same picture. Passes: of the detector, a gradient counted as 3; "
-    "certificates are not counted. Intervals: 95 %, by bootstrap over frames. Told: a rule of features tells the "
-    "failing states around the first car found from the others; named: its features are the fault's, each about "
-    "where its band is (half of both bands' hull); in part: at least one. Faults none: the detector as it is, "
-    "whose certain losses, and what is told of them, nobody planted."
+    "certificates are not counted. Intervals: 95 %, by bootstrap over frames. With a rule: a rule of features "
+    "separates the failing states around the first car found from the others; named: its features are the fault's, "
+    "each about where its band is (half of both bands' hull); in part: at least one. Faults none: the "
+    "detector as it is, with certain losses and rules that nobody planted."
 )
 TITLE = "planted faults found, by method"
 COLUMNS: Columns = {
@@ -34,7 +34,7 @@ COLUMNS: Columns = {
     "high": ("to", "to"),
     "inside_share": ("inside of the region", "inside"),
     "certain": ("all certain losses", "certain"),
-    "told": ("told by a rule", "told"),
+    "with_rule": ("with a rule", "rule"),
     "named": ("which is the fault", "named"),
     "in_part": ("in part", "in part"),
     "passes": ("passes a fault", "passes"),
@@ -44,11 +44,11 @@ KINDS_TITLE = "planted faults, by kind"
 
 
 def method_rows(judged: Sequence[FrameSearches], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
-    """A row for each rarity and method that was asked; None where nothing was planted."""
+    """One row per rarity and method; rarity None where nothing was planted."""
     attempts = [attempt for frame in judged for attempt in frame.attempts]
-    asked = {(attempt.rarity, attempt.method) for attempt in attempts}
+    measured = {(attempt.rarity, attempt.method) for attempt in attempts}
     rarities = dict.fromkeys(attempt.rarity for attempt in attempts)
-    pairs = [(method, rarity) for rarity in rarities for method in methods if (rarity, method) in asked]
+    pairs = [(method, rarity) for rarity in rarities for method in methods if (rarity, method) in measured]
     return [_row(judged, method, rarity, seed) for method, rarity in pairs]
 
 
@@ -110,8 +110,8 @@ def _row(judged: Sequence[FrameSearches], method: str, rarity: str, seed: int) -
         "high": interval.high,
         "inside_share": sum(attempt.inside for attempt in own) / found if found else None,
         "certain": sum(attempt.certain for attempt in own),
-        "asked": sum(attempt.rule is not None for attempt in own),
-        "told": sum(attempt.rule not in (None, format_rule({})) for attempt in own),
+        "explained": sum(attempt.rule is not None for attempt in own),
+        "with_rule": sum(attempt.rule not in (None, format_rule({})) for attempt in own),
         "named": sum(attempt.named for attempt in own),
         "in_part": sum(attempt.in_part for attempt in own),
         "naming": sum(attempt.naming for attempt in own),

@@ -22,11 +22,11 @@ from drivesem.failures.nuisances import Nuisances
 from scene_ir.types import SceneIR
 
 HALTON = 128
-"""Draws of a scrambled Halton sequence over all of the bounds: they say how rare a fault is."""
+"""Draws of a scrambled Halton sequence over all of the bounds: they measure how rare a fault is."""
 CORNERS = 48
-"""Corners of the bounds, each parameter at one of them or held: they say what can be reached beside."""
+"""Corners of the bounds, each parameter at one of them or held: they show what else can be reached."""
 CAMERA_DRAWS = 8
-"""Draws of the camera before any change: they say how far features differ from one picture to the next."""
+"""Draws of the camera before any change: they measure how features vary between pictures."""
 MOSTLY = 0.75
 """Of looks: as many draws must fail after a change for a failure to be certain."""
 _BY_FACTOR = ("height_px", "aspect")
@@ -35,7 +35,7 @@ _BY_FACTOR = ("height_px", "aspect")
 
 @dataclass(frozen=True, slots=True)
 class FeatureObservation:
-    """What a detector without a fault says of the cars in one picture, as faults take it."""
+    """Predictions of a detector without a fault for the cars in one picture, with the features that faults use."""
 
     values: Tensor
     """Of FEATURES, of the K cars that it sees, (F, K)."""
@@ -55,8 +55,8 @@ class FeatureObservation:
         """In an image (3, H, W) with labels (N, 4) px and ignore (N,) bool of the scene's objects."""
         detector = objective.differentiable
         label = detector.classes.index(BLIND_TO)
-        told = detector.candidates(detector(image[None]))
-        placed, scores = told.boxes_for_class(label), told.log_scores[:, label].exp()
+        candidates = detector.candidates(detector(image[None]))
+        placed, scores = candidates.boxes_for_class(label), candidates.log_scores[:, label].exp()
         cars = group_cars(placed, scores)
         own = scores[cars.rows]
         meets = boxes.iou_matrix(labels_xyxy.to(placed), placed[cars.rows]) >= MATCH_IOU
@@ -113,7 +113,7 @@ class ObservedFrame:
         scene = self.objective.space.apply(self.objective.space.scene, theta)
         return self._sighting(scene)
 
-    def looks(self, name: str, seed: int) -> Iterator[FeatureObservation]:
+    def camera_samples(self, name: str, seed: int) -> Iterator[FeatureObservation]:
         """What it sees in `CAMERA_DRAWS` draws of the scene before any change."""
         scene = self.objective.space.scene
         for number in range(CAMERA_DRAWS):
@@ -139,7 +139,7 @@ class FrameSurvey:
     """Sightings of a frame: in draws of the camera before any change, at Halton's draws, and at corners."""
 
     frame: ObservedFrame
-    looks: tuple[FeatureObservation, ...]
+    camera_samples: tuple[FeatureObservation, ...]
     halton: tuple[FeatureObservation, ...]
     corners: tuple[FeatureObservation, ...]
     benign: Tensor
@@ -159,10 +159,10 @@ class FrameSurvey:
     @classmethod
     def make(cls, objective: Objective, feasible: FeasibleSet, name: str, seed: int) -> FrameSurvey:
         """Of one frame; the same arguments give the same survey. name: the frame's. Raises RangeError where the
-        detector has no gradient, DetectorError where it does not tell its candidates.
+        detector has no gradient, DetectorError if it has no candidates.
         """
         frame = ObservedFrame(objective)
-        looks = tuple(frame.looks(name, seed))
+        camera_samples = tuple(frame.camera_samples(name, seed))
         photographed = frame.sighting(objective.space.theta0)
         labelled, benign = photographed.labelled, photographed.main
         seen = torch.isfinite(benign)
@@ -170,14 +170,14 @@ class FrameSurvey:
         factor = torch.where(by_factor & seen, benign / labelled, 1.0)
         shift = torch.where(~by_factor & seen, benign - labelled, 0.0)
         benign = benign.where(seen, labelled)
-        mains = torch.stack([look.main for look in looks])  # (LOOKS, F, N)
+        mains = torch.stack([sample.main for sample in camera_samples])  # (LOOKS, F, N)
         off = (mains - benign).abs().nan_to_num(0.0)
-        single = torch.stack([look.single for look in looks]).double().mean(0) >= MOSTLY
+        single = torch.stack([sample.single for sample in camera_samples]).double().mean(0) >= MOSTLY
         sure = frame.judged & seen.all(0) & torch.isfinite(mains).all(0).all(0) & single
-        some = bool(sure.any())  # without a car to plant a fault for nobody asks what can be reached
+        some = bool(sure.any())  # without such a car no fault is planted
         return cls(
             frame=frame,
-            looks=looks,
+            camera_samples=camera_samples,
             halton=tuple(map(frame.sighting, halton(feasible, HALTON, seed))) if some else (),
             corners=tuple(map(frame.sighting, corners(feasible, CORNERS, seed))) if some else (),
             benign=benign,
@@ -190,14 +190,14 @@ class FrameSurvey:
 
     def inside(self, fault: PlantedFault, theta: Tensor) -> Tensor:
         """Whether each object (N,) is a car inside of the fault's bands at a feasible theta (D,), by labels and
-        picture, and by how far the detector's boxes are off as photographed. No detector is asked.
+        picture, and by how far the detector's boxes are off as photographed. Runs no detector.
         """
         rows = [FEATURES.index(name) for name in fault.feature_names]
         values = self.factor[rows] * self.frame.labelled(theta, fault.feature_names) + self.shift[rows]
         return self.frame.judged & fault.contains(values)
 
     def blind(self, fault: PlantedFault, theta: Tensor) -> Tensor:
-        """Whether each object (N,) is a car that the fault hides at a feasible theta (D,). Asks the detector."""
+        """Whether each object (N,) is a car that the fault hides at a feasible theta (D,). Runs the detector."""
         return self.frame.sighting(theta).lost(fault)
 
     def bands_by_label(self, fault: PlantedFault) -> tuple[Band, ...]:

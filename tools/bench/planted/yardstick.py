@@ -38,7 +38,7 @@ from tools.bench.settings import DetectorBenchConfig
 METHODS = tuple(name for name in get_args(get_type_hints(AttackConfig)["method"]) if name != "placebo")
 """Attacks that can be judged: a placebo needs a run to be like."""
 NO_FAULT = "none"
-"""Kind and rarity of attempts on the detector as it is, beside which names are to be seen."""
+"""Kind and rarity of attempts on the unchanged detector, the control for rules."""
 SURE = (Grade.CERTAIN, Grade.CONFIRMED, Grade.SHARED)
 QUICK_KINDS = (KINDS[2], KINDS[-2])
 """One easy, one rare: those that could be planted wherever that was tried."""
@@ -68,7 +68,7 @@ class FaultSearch:
     seconds: float
     """Of the search and of certificates."""
     rule: str | None = None
-    """What samples around the first of those found say (`naming`), None where nobody asked."""
+    """Rule from samples around the first of those found (`naming`); None without --naming."""
     named: bool = False
     """Whether that is the fault, or a feature of it."""
     in_part: bool = False
@@ -101,7 +101,7 @@ def chosen_methods(config: DetectorBenchConfig) -> tuple[str, ...]:
 
 
 def rule_methods(config: DetectorBenchConfig) -> tuple[str, ...]:
-    """Those of its methods whose failures are to be told by rules. Raises UsageError for another one."""
+    """Methods with failures to explain by rules. Raises UsageError for another one."""
     return () if config.naming is None else _names_among(chosen_methods(config), "--naming", config.naming)
 
 
@@ -113,7 +113,7 @@ def _names_among(known: Sequence[str], setting: str, text: str) -> tuple[str, ..
 
 
 def attack_settings(config: DetectorBenchConfig, method: str) -> AttackConfig:
-    """The settings of a method: nobody is asked but the detector itself."""
+    """The settings of a method; only the detector itself is used."""
     settings = AttackConfig(
         **shared_options(config, SceneOptions),
         method=method,  # pyright: ignore[reportArgumentType]
@@ -140,8 +140,8 @@ class PlantedFaultBench:
     """By method."""
     kinds: tuple[FaultKind, ...]
     named: tuple[str, ...]
-    """Methods whose failures are to be told by rules."""
-    kept: Path | None
+    """Methods with failures to explain by rules."""
+    folder: Path | None
     """Folder of what is done, by frame."""
 
     @classmethod
@@ -155,29 +155,29 @@ class PlantedFaultBench:
             raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
         first = AttackWorker.from_config(attack_settings(config, methods[0]), detector)
         workers = {method: first.with_config(attack_settings(config, method)) for method in methods}
-        kept = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
-        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, rule_methods(config), kept)
+        folder = None if config.out is None or config.out.endswith(".json") else Path(config.out) / "frames"
+        return cls(config, detector, workers, QUICK_KINDS if config.quick else KINDS, rule_methods(config), folder)
 
     def judge(self, name: str) -> FrameSearches:
         """All methods on all faults of a frame; what another call has done with the same settings is read."""
-        asked = {field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)}
+        settings = {field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)}
         keys = ("methods", "passes", "params", "budget", "detector", "quick", "faults", "naming")
-        asked |= {key: getattr(self.config, key) for key in keys}
-        asked.pop("limit")
-        path = None if self.kept is None else self.kept / f"{name}.json"
+        settings |= {key: getattr(self.config, key) for key in keys}
+        settings.pop("limit")
+        path = None if self.folder is None else self.folder / f"{name}.json"
         if path is not None and self.config.resume and path.is_file():
             known = files.read_json(path)
-            if known["asked"] == asked:
+            if known["settings"] == settings:
                 return FrameSearches.of_json(known["judged"])
         judged = self._judge(name)
         if path is not None:
-            files.write_json(path, {"asked": asked, "judged": judged.to_json()})
+            files.write_json(path, {"settings": settings, "judged": judged.to_json()})
         return judged
 
     def _judge(self, name: str) -> FrameSearches:
         scene = next(iter(self.workers.values())).source.scene(name)
         if not len(scene.objects):
-            raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
+            raise NoVehicleError(f"frame {name}", "a vehicle that can be de-rendered", "none")
         space = ParameterSpace(scene, parse_params(self.config.params), parse_budget(self.config.budget))
         objective = Objective(Compositor(scene), space, self.detector)
         survey = FrameSurvey.make(objective, objective.feasible_set(), name, self.config.seed)

@@ -1,4 +1,4 @@
-"""Gradients of margins beside slopes over steps: rows of a table, by parameter, distance and width."""
+"""Agreement of margin gradients with slopes over steps: table rows by parameter, distance and width."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _RESAMPLES = 1000
 
 @dataclass(frozen=True, slots=True)
 class SlopeAgreement:
-    """How well one list of slopes tells another."""
+    """How well one list of slopes predicts another."""
 
     cosine: float
     """Of the two, with its 95 % interval by bootstrap over objects (None for fewer than 3)."""
@@ -28,9 +28,8 @@ class SlopeAgreement:
     high: float | None
     signs: float
     """Share of slopes of the same sign."""
-    kept: float
-    """The share of what the one says that the other does (its regression on the one, which noise of the other does
-    not lower)."""
+    realised: float
+    """Regression coefficient of the second slopes on the first, which noise of the second does not lower."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +45,11 @@ class ReachRow:
     slopes: int
     """How many there are."""
     point: SlopeAgreement
-    """What gradients tell of the slopes over that width."""
+    """Agreement of gradients with the slopes over that width."""
     smoothed: SlopeAgreement
-    """What gradients tell of the slopes over that width."""
+    """Agreement of gradients with the slopes over that width."""
     repeated: SlopeAgreement
-    """What the slopes of half the draws tell of those of the other half, which no gradient can be better than by
-    much."""
+    """Agreement between the slopes of both halves of the draws: about the best that a gradient can reach."""
 
 
 def reach_rows(frames: Sequence[Sequence[ProbeSlopes]], seed: int) -> tuple[ReachRow, ...]:
@@ -74,7 +72,7 @@ def reach_rows(frames: Sequence[Sequence[ProbeSlopes]], seed: int) -> tuple[Reac
 
 
 def compare_slopes(slopes: Array, by: Array, owner: NDArray[np.int64], seed: int) -> SlopeAgreement:
-    """What `by` (S,) says of slopes (S,). owner (S,): the object of each."""
+    """Agreement of predictions `by` (S,) with slopes (S,). owner (S,): the object of each."""
     count = int(owner.max()) + 1
     sums = np.stack([np.bincount(owner, part, count) for part in (slopes * by, slopes**2, by**2)])
     low = high = None
@@ -83,8 +81,10 @@ def compare_slopes(slopes: Array, by: Array, owner: NDArray[np.int64], seed: int
         weights = generator.multinomial(count, np.full(count, 1 / count), _RESAMPLES).astype(np.float64)
         low, high = (float(q) for q in np.quantile(_cosine(sums @ weights.T), (0.025, 0.975)))
     same = float((np.sign(slopes) == np.sign(by)).mean())
-    product, _, said = sums.sum(axis=1).tolist()
-    return SlopeAgreement(float(_cosine(sums.sum(axis=1))), low, high, same, product / max(said, 1e-30))
+    product, _, predicted_energy = sums.sum(axis=1).tolist()
+    return SlopeAgreement(
+        float(_cosine(sums.sum(axis=1))), low, high, same, product / max(predicted_energy, 1e-30)
+    )
 
 
 def _row(

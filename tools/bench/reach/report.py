@@ -36,10 +36,10 @@ _COLUMNS = (
     "steps",
     "point: cosine",
     "signs",
-    "kept",
+    "realised",
     "smoothed: cosine",
     "signs ",
-    "kept ",
+    "realised ",
     "repeated",
 )
 _NOTES = (
@@ -47,7 +47,7 @@ _NOTES = (
     "feasible allow, against its gradient; both are means over the same draws of a camera's small changes.",
     "Point: the gradient at the photographed scene. Smoothed: the mean of gradients at random places nearby, 4 "
     "steps apart. Cosine: of all objects' slopes and gradients, with 95 % by bootstrap over objects. Signs: % of "
-    "slopes of the gradient's sign; 50 is chance. Kept: how much of what the gradient promises the step does. "
+    "slopes of the gradient's sign; 50 is chance. Realised: share of the predicted change that the step makes. "
     "Repeated: the cosine of slopes in half of the draws and in the others; where low, slopes are mostly noise.",
 )
 
@@ -55,7 +55,7 @@ _NOTES = (
 def build_reach_report(
     out: Path, rows: Sequence[ReachRow], facts: Mapping[str, Any], failed: Mapping[str, str]
 ) -> AnalysisReport:
-    """What is said of all frames. facts: what stands before the rows in the JSON."""
+    """Build the report of all frames. facts: JSON entries before the rows."""
     everywhere = tuple(_line(row) for row in rows if row.distance == ALL)
     sheets = [ReportTable("Gradients and slopes of margins", _COLUMNS, everywhere), _by_distance(rows)]
     return AnalysisReport(
@@ -109,13 +109,13 @@ def write_reach(path: Path, rows: Sequence[ReachRow]) -> None:
 
 
 def _line(row: ReachRow) -> tuple[str, ...]:
-    said = [cell for one in (row.point, row.smoothed) for cell in _cells(one)]
-    return (row.row, str(row.objects), str(row.steps), *said, f"{row.repeated.cosine:.2f}")
+    cells = [cell for one in (row.point, row.smoothed) for cell in _cells(one)]
+    return (row.row, str(row.objects), str(row.steps), *cells, f"{row.repeated.cosine:.2f}")
 
 
 def _cells(one: SlopeAgreement) -> tuple[str, str, str]:
     bounds = "" if one.low is None or one.high is None else f" [{one.low:.2f}, {one.high:.2f}]"
-    return (f"{one.cosine:.2f}{bounds}", f"{100 * one.signs:.0f}", f"{one.kept:.2f}")
+    return (f"{one.cosine:.2f}{bounds}", f"{100 * one.signs:.0f}", f"{one.realised:.2f}")
 
 
 def _by_distance(rows: Sequence[ReachRow]) -> ReportTable:
@@ -148,7 +148,7 @@ class ReachWorker:
     config: GradcheckConfig
     source: SceneSource
     detector: Detector
-    kept: Path | None
+    folder: Path | None
     """Folder of what is done, by frame; None keeps nothing."""
 
     @classmethod
@@ -160,30 +160,30 @@ class ReachWorker:
         except DetectorError as error:
             raise UsageError.from_detector_error("--detector", "a detector with gradients", error) from error
         if type(detector).candidates is Detector.candidates:
-            raise UsageError("--detector", "one that tells its candidates", detector.name)
+            raise UsageError("--detector", "one with candidates", detector.name)
         return cls(config, source, detector, None if config.out is None else Path(config.out) / "frames")
 
     def measure(self, name: str) -> tuple[ProbeSlopes, ...]:
         """Of a frame; what another call has done with the same settings is read."""
-        asked: dict[str, Any] = {
+        settings: dict[str, Any] = {
             field.name: str(getattr(self.config, field.name)) for field in fields(SceneOptions)
         }
-        asked |= {"detector": self.config.detector, "draws": self.config.draws}
-        asked.pop("limit")
-        path = None if self.kept is None else self.kept / f"{name}.json"
+        settings |= {"detector": self.config.detector, "draws": self.config.draws}
+        settings.pop("limit")
+        path = None if self.folder is None else self.folder / f"{name}.json"
         if path is not None and self.config.resume and path.is_file():
             known = files.read_json(path)
-            if known["asked"] == asked:
+            if known["settings"] == settings:
                 return tuple(_of_json(row) for row in known["slopes"])
         found = self._measure(name)
         if path is not None:
-            files.write_json(path, {"asked": asked, "slopes": [asdict(one) for one in found]})
+            files.write_json(path, {"settings": settings, "slopes": [asdict(one) for one in found]})
         return found
 
     def _measure(self, name: str) -> tuple[ProbeSlopes, ...]:
         scene = self.source.scene(name)
         if not len(scene.objects):
-            raise NoVehicleError(f"frame {name}", "a vehicle that can be taken apart", "none")
+            raise NoVehicleError(f"frame {name}", "a vehicle that can be de-rendered", "none")
         space = ParameterSpace(scene, PAPER_PARAMETERS)
         objective = Objective(Compositor(scene), space, self.detector)
         views = NuisanceMarginOracle.for_objective(objective, Nuisances(), f"reach:{name}:{self.config.seed}")

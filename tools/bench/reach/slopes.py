@@ -1,4 +1,4 @@
-"""What the gradient of an object's margin says, and what the margin does over one step of an attack and over many.
+"""Gradient of each object's margin, and its slope over one attack step and over many.
 
 Both are seen in the same draws of a camera's small changes, both sides of a difference in the same one. All
 objects move at once, each to a side of its own that chance decides in each draw: what others do averages out.
@@ -37,7 +37,7 @@ class SlopeProbe:
     """Of the table that they belong to."""
     name: str
     """Of the direction."""
-    ways: Tensor
+    directions: Tensor
     """One a step long for each object (N, D), or one for the scene (1, D)."""
 
 
@@ -53,9 +53,9 @@ class ProbeSlopes:
     row: str
     name: str
     point: tuple[tuple[float | None, ...], ...]
-    """What gradients say of the same two sides, those at theta0 and those at places nearby."""
+    """Slopes predicted by gradients between the same two sides: at theta0 and at points nearby."""
     smoothed: tuple[tuple[float | None, ...], ...]
-    """What gradients say of the same two sides, those at theta0 and those at places nearby."""
+    """Slopes predicted by gradients between the same two sides: at theta0 and at points nearby."""
     wide: tuple[tuple[float | None, ...], ...]
     """By differences."""
 
@@ -80,7 +80,9 @@ def measure(
     gradients = []
     for draw in range(draws):
         apart = sum(
-            SMOOTHING * torch.randn(len(probe.ways), generator=generator).to(probe.ways) @ probe.ways
+            SMOOTHING
+            * torch.randn(len(probe.directions), generator=generator).to(probe.directions)
+            @ probe.directions
             for probe in noise
         )
         places = (space.theta0, feasible.project(space.theta0 + apart).theta)
@@ -117,9 +119,9 @@ def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator)
 def _probe(space: ParameterSpace, row: str, name: str, where: slice, direction: Tensor) -> SlopeProbe:
     """One direction (size,) of a block, for each object that the block holds."""
     count = (where.stop - where.start) // len(direction)
-    ways = space.theta0.new_zeros(count, space.dim)
-    ways[:, where] = torch.block_diag(*[direction[None].to(ways)] * count)
-    return SlopeProbe(row, name, ways)
+    directions = space.theta0.new_zeros(count, space.dim)
+    directions[:, where] = torch.block_diag(*[direction[None].to(directions)] * count)
+    return SlopeProbe(row, name, directions)
 
 
 def _gradients(views: MarginOracle, space: ParameterSpace, theta: Tensor, draw: int) -> Tensor:
@@ -147,20 +149,20 @@ def _slopes(
     """Slopes (draws, 3, N) along a probe: by two-sided differences, and by both gradients (2, N, D) of each draw;
     nan where there is none.
     """
-    space, ways = feasible.space, probe.ways
+    space, directions = feasible.space, probe.directions
     found = []
     for draw, gradient in enumerate(gradients):
-        signs = 2.0 * torch.randint(2, (len(ways),), generator=generator).to(ways) - 1
-        far = steps * (signs[:, None] * ways).sum(dim=0)
-        asked = [torch.minimum(torch.maximum(side * far, space.lower), space.upper) for side in (1, -1)]
-        sides = [feasible.project(theta).theta for theta in asked]
+        signs = 2.0 * torch.randint(2, (len(directions),), generator=generator).to(directions) - 1
+        far = steps * (signs[:, None] * directions).sum(dim=0)
+        wanted_ends = [torch.minimum(torch.maximum(side * far, space.lower), space.upper) for side in (1, -1)]
+        sides = [feasible.project(theta).theta for theta in wanted_ends]
         one, two = (views.margins(theta, draw) for theta in sides)
         # How far either went along each way, in steps: bounds and what is feasible may hold it back.
-        length = (ways * ways).sum(dim=1)
-        wanted, moved = (ways @ (ends[0] - ends[1]) / length for ends in (asked, sides))
-        # Rain brings clouds along, a kerb turns a way aside: gradients are asked about the way that was gone.
-        told = gradient @ (sides[0] - sides[1])
-        slopes = torch.cat([(one - two).to(told)[None], told]) / moved
+        length = (directions * directions).sum(dim=1)
+        wanted, moved = (directions @ (ends[0] - ends[1]) / length for ends in (wanted_ends, sides))
+        # Rain brings clouds along, a kerb turns a way aside: gradients are evaluated along the actual way.
+        predicted = gradient @ (sides[0] - sides[1])
+        slopes = torch.cat([(one - two).to(predicted)[None], predicted]) / moved
         there = (moved.abs() >= _LEAST_MOVE * wanted.abs()) & torch.isfinite(slopes[0])
         found.append(torch.where(there, slopes, torch.nan))
     return torch.stack(found)

@@ -10,13 +10,12 @@ from typing import Any
 
 from drivesem.classify.attack import Attacker
 from drivesem.classify.pictures import ObjectView
-from drivesem.classify.report import WRITTEN, load_picture_results
-from drivesem.classify.results import ClassifiedPicture
+from drivesem.classify.results import WRITTEN, ClassifiedPicture, load_picture_results
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.presets import find_presets
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import ARMS, FRAMES, SHARING, claim_folder
-from drivesem.run.frame import RESULT
+from drivesem.run.labels import RESULT
 from scene_ir import files
 from tools.experiments.settings import StudyConfig
 

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from drivesem.classify.networks.base import Classifier
+from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.training import compute_features
-from drivesem.report.terminal import Console, training_progress_bar
+from drivesem.report.tables import Console, training_progress_bar
 from drivesem.run.detection_cache import weights_digest
 from scene_ir import files
 from tools.experiments.realism.comparison import Measures

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.analysis.transfer.run import split_list
-from drivesem.classify.networks.base import Classifier
+from drivesem.analysis.transfer import split_list
+from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectSet, Split
 from drivesem.classify.pictures import ObjectRenderer, ObjectView, picture_path, render_pictures
-from drivesem.classify.report import write_run_report
+from drivesem.classify.results import write_run_report
 from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.training import compute_features, train_last_layer
 from drivesem.config.commands import ClassifyConfig

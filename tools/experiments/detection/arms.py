@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivesem.analysis.transfer.run import parse_detector_names, shorten_detector_names
+from drivesem.analysis.transfer import parse_detector_names, shorten_detector_names
 from drivesem.attack.methods.base import GRADIENT_PASSES
 from drivesem.attack.space import PAPER_PARAMETERS, Parameter
 from drivesem.attack.targets import EvaluatedClasses
@@ -20,9 +20,10 @@ from drivesem.config.options import GradingOptions, SceneAttackOptions, WorkerOp
 from drivesem.run.attack import WRITTEN, AttackWorker, attack_frames, select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, claim_folder
-from drivesem.run.frame import RESULT, write_frame
-from drivesem.run.protocol import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
+from drivesem.run.frame import write_frame
+from drivesem.run.labels import RESULT
 from drivesem.run.results import FrameResult, RunSummary, load_frame
+from drivesem.run.run_report import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -127,7 +128,8 @@ def base_attack(study: StudyConfig) -> AttackConfig:
     for block in (SceneAttackOptions, GradingOptions, WorkerOptions):
         common |= shared_options(study, block)
     # --confirm of a study re-tests whole arms; certain failures are confirmed in any case.
-    return AttackConfig(**common | {"limit": limit, "method": study.method, "confirm": AttackConfig.confirm})
+    common |= {"limit": limit, "method": study.method, "confirm": AttackConfig.confirm}
+    return AttackConfig(**common)
 
 
 def bootstrap_draws(study: StudyConfig) -> int:
@@ -136,7 +138,7 @@ def bootstrap_draws(study: StudyConfig) -> int:
 
 
 def build_arms(study: StudyConfig, out: Path) -> list[AttackArm]:
-    """The arms of a study that writes into `out`; a placebo follows the arm whose edits it matches in size."""
+    """The arms of a study that writes into `out`; a placebo follows the arm that it matches in size."""
     base = base_attack(study)
     combo = replace(base, combo=DEFAULT_COMBO)
     match study.name:

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivesem.analysis.transfer.report import format_interval
+from drivesem.analysis.transfer import format_interval
 from drivesem.attack.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.evaluation.resampling import Interval, NamedMetric, holm, paired_differences
 from drivesem.report.plots import PLOT_COLOURS
 from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
-from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, PROTOCOL
+from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS, PROTOCOL
 from tools.experiments.detection.arms import PAPER_PROTOCOL, AttackArm, base_attack, bootstrap_draws
 from tools.experiments.detection.comparison import ArmMetrics, feasible_fraction
 from tools.experiments.detection.counts import StudyCounts

@@ -20,7 +20,7 @@ from drivesem.evaluation.resampling import (
     paired_differences,
     wilson,
 )
-from drivesem.run.protocol import PAPER_BENIGN
+from drivesem.run.run_report import PAPER_BENIGN
 from tools.experiments.detection.arms import matching_control
 from tools.experiments.detection.counts import ArmCounts, FrameCounts
 from tools.experiments.tables import interval_columns

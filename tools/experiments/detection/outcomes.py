@@ -24,8 +24,7 @@ from drivesem.evaluation.resampling import (
 )
 from drivesem.failures.grades import Grade, Kind
 from drivesem.run.folder import ARMS, FRAMES
-from drivesem.run.frame import detections_from_records, targets_from_records
-from drivesem.run.summary import certain_losses, has_grade
+from drivesem.run.frame import certain_losses, detections_from_records, has_grade, targets_from_records
 from scene_ir.io import load_scene
 from tools.experiments.detection.arms import ArmRun
 from tools.experiments.detection.counts import ArmCounts, DetectedObject, FailureRecord, FrameCounts

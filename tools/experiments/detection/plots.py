@@ -18,8 +18,8 @@ from drivesem.report.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, paste, wri
 from drivesem.report.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
 from drivesem.report.tables import format_count
 from drivesem.run.folder import ARMS, FRAMES
-from drivesem.run.protocol import PAPER_BENIGN
 from drivesem.run.results import FrameResult
+from drivesem.run.run_report import PAPER_BENIGN
 from scene_ir import files
 from tools.experiments.detection.arms import ArmRun
 from tools.experiments.detection.comparison import ArmComparison

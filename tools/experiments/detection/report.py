@@ -7,14 +7,14 @@ from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from drivesem.analysis.confirm.report import Confirmation
-from drivesem.analysis.transfer.report import format_interval
+from drivesem.analysis.confirm import Confirmation
+from drivesem.analysis.transfer import format_interval
 from drivesem.attack.targets import HEADLINE
 from drivesem.evaluation.resampling import Interval, PairedDifference
 from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grades import Grade, Kind
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
-from drivesem.run.protocol import PAPER_BENIGN
+from drivesem.run.run_report import PAPER_BENIGN
 from tools.experiments.detection.arms import PLACEBO, RANDOM, bootstrap_draws
 from tools.experiments.detection.comparison import (
     METRIC_NAMES,
@@ -453,8 +453,8 @@ def build_notes(results: StudyResults) -> list[str]:
         )
     if results.label_sets:
         notes.append(
-            "Attacks use the benign labels unless the arm's name says otherwise. Paper only: counterexamples by the "
-            "benign labels and not by the moved ones, if a detection meets a label from that IoU on. The kept "
+            "Attacks use the benign labels unless the arm's name differs. Paper only: counterexamples by the "
+            "benign labels and not by the moved ones, if a detection meets a label from that IoU on. The chosen "
             "iterate fails most by moved labels at IoU 0.5; chosen by the benign labels there would be more."
         )
     if results.confirmed:

@@ -12,23 +12,21 @@ from pathlib import Path
 from detectors.base import Detector
 from detectors.registry import load_detector, read_weights, save_detector
 from detectors.types import CLASSES, Detections
-from drivesem.analysis.transfer.matrix import TransferCounts
-from drivesem.analysis.transfer.run import evaluate_pairs, load_target_detectors
+from drivesem.analysis.transfer import TransferCounts, evaluate_pairs, load_target_detectors
 from drivesem.attack.labels import Difficulty
 from drivesem.attack.targets import HEADLINE, resolve_t_star
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console
 from drivesem.run.attack import AttackWorker, select_frames
 from drivesem.run.detection_cache import weights_digest
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS, RETRAINED
 from drivesem.run.frame import detection_records, detections_from_records
 from drivesem.run.results import BoxRecord
-from drivesem.training.frames import FrameStore
+from drivesem.training.frames import AttackedFrame, FrameStore
 from drivesem.training.retrain import discard_stale_run, load_start
-from drivesem.training.samples import AttackedFrame
 from drivesem.training.validation import detect_in_store, score_detections
 from scene_ir import files
 from tools.experiments.detection.arms import ArmRun, AttackArm, AttackTotals, build_workers, run_arms

@@ -12,7 +12,7 @@ from rich.progress import track
 
 from detectors.registry import SHIPPED, save_detector
 from detectors.training import Sample
-from drivesem.analysis.transfer.run import split_list
+from drivesem.analysis.transfer import split_list
 from drivesem.config.commands import DEFAULT_COMBO, RetrainConfig
 from drivesem.config.constraints import parse_size_hw
 from drivesem.config.errors import UsageError
@@ -20,10 +20,10 @@ from drivesem.config.options import DEMO
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.data.subsets import open_selection
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.terminal import Console
+from drivesem.report.tables import Console
 from drivesem.run.attack import AttackWorker
 from drivesem.run.folder import ARMS, HELD_OUT, RETRAINED
-from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, follows_paper
+from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS, follows_paper
 from drivesem.run.workers import make_parallel_map
 from drivesem.scenes.sources import SceneSource
 from drivesem.training.failure_neighbourhoods import (
@@ -32,9 +32,15 @@ from drivesem.training.failure_neighbourhoods import (
     WorstCaseLoss,
     list_failures,
 )
-from drivesem.training.frames import FrameStore
+from drivesem.training.frames import (
+    AttackedFrame,
+    AttackedSamples,
+    FrameStore,
+    GeneratorSamples,
+    Stage,
+    TrainingMixture,
+)
 from drivesem.training.retrain import WEIGHTS, fine_tune, load_start, mixture_shares, select_counterexamples
-from drivesem.training.samples import AttackedFrame, AttackedSamples, GeneratorSamples, Stage, TrainingMixture
 from scene_ir.types import SceneIR
 from tools.experiments.detection.arms import PLACEBO, AttackArm, base_attack
 from tools.experiments.settings import StudyConfig
@@ -82,7 +88,7 @@ OURS = RetrainConfig(
     precision="bfloat16",
 )
 """Three benign frames for each counterexample, seen whole as at the end of the shipped detector's training, at a
-fifth of its rate, so that what it knows is kept. configs/retrain-mixed.yaml is the same."""
+fifth of its rate, so that it does not forget. configs/retrain-mixed.yaml is the same."""
 _QUICK = {"steps": 40, "window": "640x224", "warmup": 10}
 
 

@@ -7,8 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivesem.analysis.transfer.matrix import AP50, BROKEN, LOST
-from drivesem.analysis.transfer.report import format_interval
+from drivesem.analysis.transfer import AP50, BROKEN, LOST, format_interval
 from drivesem.attack.targets import HEADLINE
 from drivesem.evaluation.resampling import Interval
 from drivesem.report.plots import PLOT_COLOURS

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.analysis.transfer.matrix import (
+from drivesem.analysis.transfer import (
     AP50,
     BROKEN,
     TransferCounts,

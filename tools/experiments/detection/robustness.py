@@ -34,9 +34,9 @@ from drivesem.run.detection_cache import weights_digest
 from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames
 from drivesem.run.finished import AttackRun, rebuild_objective
 from drivesem.run.folder import FRAMES
-from drivesem.run.frame import RESULT
+from drivesem.run.frame import certain_losses
+from drivesem.run.labels import RESULT
 from drivesem.run.results import load_frame
-from drivesem.run.summary import certain_losses
 from scene_ir.errors import SceneError
 from scene_ir.io import load_scene
 from tools.experiments.settings import StudyConfig

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
-from drivesem.analysis.transfer.matrix import (
+from drivesem.analysis.confirm import Confirmation, SurvivalRate
+from drivesem.analysis.transfer import (
     EVALUATED_PICTURES,
     FrameLosses,
     SourceRun,

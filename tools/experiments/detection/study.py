@@ -6,13 +6,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from drivesem.analysis.confirm.report import Confirmation
-from drivesem.analysis.confirm.run import run_confirm
-from drivesem.analysis.transfer.run import DETECTIONS
+from drivesem.analysis.confirm import Confirmation, run_confirm
+from drivesem.analysis.transfer import DETECTIONS
 from drivesem.config.commands import ConfirmConfig
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.tables import AnalysisReport
-from drivesem.report.terminal import Console
+from drivesem.report.tables import AnalysisReport, Console
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
 from drivesem.training.card import warn_about_overlaps
 from tools.experiments.detection.arms import STUDY_JSON, StudyArms, build_arms, build_workers, run_arms

@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 
 from detectors.yolov3.yolov3 import YoloV3
-from drivesem.analysis.transfer.matrix import (
+from drivesem.analysis.transfer import (
     AP50,
     BROKEN,
     FRAMES,
     LOST,
     TRANSFER,
+    TargetDetector,
     TransferCounts,
     TransferRow,
+    build_transfer_tables,
     compute_transfer_row,
-)
-from drivesem.analysis.transfer.report import build_transfer_tables, format_interval, write_heatmap
-from drivesem.analysis.transfer.run import (
-    TargetDetector,
     evaluate_pairs,
+    format_interval,
     load_target_detectors,
     parse_detector_names,
+    write_heatmap,
 )
 from drivesem.attack.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
@@ -36,7 +36,7 @@ from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
 from drivesem.run.attack import AttackWorker
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS
-from drivesem.run.protocol import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER, follows_paper
+from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS, PAPER_TRANSFER, follows_paper
 from tools.experiments.detection.arms import AttackArm, AttackTotals, bootstrap_draws, feasible_share, run_arms
 from tools.experiments.detection.comparison import MODES
 from tools.experiments.detection.report import (

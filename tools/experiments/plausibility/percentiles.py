@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from drivesem.attack.feasible.weather import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
+from drivesem.attack.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
 from drivesem.attack.space import behind_camera
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
@@ -196,7 +196,7 @@ def run_plausibility(config: PlausibilityConfig) -> AnalysisReport:
     frames = [_load_frame(run, frame) for frame in run.frames]
     if not any(frame.kinds for frame in frames):
         raise UsageError("--run", "a run with vehicles", run.folder)
-    data = {"run": str(run.folder), **summarise_plausibility(frames)}
+    data: dict[str, Any] = {"run": str(run.folder), **summarise_plausibility(frames)}
     lowest = tuple((row["frame"], _format(row["before"]), _format(row["after"])) for row in data["by_frame"])
     tables = [_percentile_table(data), *_weather_table(frames)]
     report = AnalysisReport(
@@ -300,7 +300,7 @@ def _vehicle_rows(frames: Sequence[FramePlausibility]) -> list[dict[str, Any]]:
 
 
 def _weather_table(frames: Sequence[FramePlausibility]) -> list[ReportTable]:
-    """A line for each frame whose weather changed, the least likely first; no table without any."""
+    """One line per frame with changed weather, least likely first; no table without any."""
     known = [(frame.identifier, frame.weather) for frame in frames if frame.weather is not None]
     known.sort(key=lambda frame: -frame[1].share)
     rows = tuple(

@@ -64,7 +64,7 @@ def find_weights(name: str, folder: Path | None = None, fetch: bool = False) -> 
         fetch: Download it if it is nowhere.
 
     Raises:
-        FormatError: One line that says how to get it.
+        FormatError: The file is missing; the message names its source.
     """
     wanted = WEIGHT_FILES[name]
     places = [Path(torch.hub.get_dir()) / "checkpoints"]

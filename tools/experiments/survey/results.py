@@ -48,7 +48,7 @@ def run_survey_results(config: SurveyResultsConfig) -> AnalysisReport:
         raise UsageError("ANSWERS", "files with answers", "none in them")
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     summary = summarise_responses(items, answers, draws, config.seed)
-    data = {"survey": name, "bootstrap": draws, **summary, "paper": _PAPER}
+    data: dict[str, Any] = {"survey": name, "bootstrap": draws, **summary, "paper": _PAPER}
     metrics = _metric_table(data)
     report = AnalysisReport(
         out=resolve_output_folder(config.out, key.parent / "results"),

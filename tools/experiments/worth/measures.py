@@ -162,11 +162,11 @@ def points_from_detections(
         rho: Realism of each object; an empty place has their mean.
     """
     overlap = boxes.iou_matrix(found.boxes_xyxy, targets.boxes_xyxy)
-    kept = ~targets.ignore
+    counted = ~targets.ignore
     share = boxes.ioa_matrix(found.boxes_xyxy, targets.boxes_xyxy)
     same = found.labels[:, None] == targets.labels[None]
     excused = (same & targets.ignore & (share >= MATCH_IOU)).any(dim=1)
-    overlap, label = overlap[:, kept], targets.labels[kept].numpy().astype(np.int64)
+    overlap, label = overlap[:, counted], targets.labels[counted].numpy().astype(np.int64)
     count = len(label)
     scores = np.zeros((2 * count, len(CLASSES)))
     empty = count

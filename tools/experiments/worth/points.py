@@ -10,7 +10,7 @@ import torch
 
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections
-from drivesem.analysis.transfer.run import DETECTIONS
+from drivesem.analysis.transfer import DETECTIONS
 from drivesem.attack.targets import EvaluatedClasses, resolve_t_star
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
@@ -60,11 +60,11 @@ def object_distances(frame: RunFrame, parts: FrameRegions | None, name: str) -> 
         parts: Its measured regions; None gives zeros.
         name: Name of the metric.
     """
-    kept = _judged_objects(frame)
+    objects = _judged_objects(frame)
     if parts is None:
-        return np.zeros(len(kept))
+        return np.zeros(len(objects))
     by_index = {part.index: part.distances[name]["benign", "attacked"] for part in parts.select("boxes")}
-    return np.array([by_index.get(a.index, 0.0) for a, _ in kept], np.float64)
+    return np.array([by_index.get(a.index, 0.0) for a, _ in objects], np.float64)
 
 
 def realism_weights(distances: Sequence[Sequence[Floats]]) -> list[list[Floats]]:

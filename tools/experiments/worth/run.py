@@ -15,11 +15,10 @@ from rich.progress import track
 
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, Interval
-from drivesem.report.tables import AnalysisReport, ReportTable
-from drivesem.report.terminal import Console
+from drivesem.report.tables import AnalysisReport, Console, ReportTable
 from drivesem.run.finished import AttackRun, load_runs
 from drivesem.run.folder import ARMS, CONFIG, HELD_OUT, RETRAINED, resolve_output_folder
-from drivesem.run.protocol import PAPER_FID, PAPER_LPIPS
+from drivesem.run.run_report import PAPER_FID, PAPER_LPIPS
 from drivesem.training.retrain import WEIGHTS
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -253,11 +252,11 @@ def _worth_table(rows: Sequence[Mapping[str, Any]]) -> ReportTable:
     columns = ("set", "detector", "membership", "realism weight", "worth", "gain", "points")
     lines = []
     for row in rows:
-        shown = "-" if row["value"] is None else f"{row['value']:.4f}"
+        value = "-" if row["value"] is None else f"{row['value']:.4f}"
         if row["low"] is not None:
-            shown += f" ({row['low']:.4f} to {row['high']:.4f})"
+            value += f" ({row['low']:.4f} to {row['high']:.4f})"
         weight = "yes" if row["realism_weight"] else "no"
-        cells = (shown, "") if row["what"] == "worth" else ("", shown)
+        cells = (value, "") if row["what"] == "worth" else ("", value)
         lines.append((row["set"], row["detector"], row["membership"], weight, *cells, str(row["points"])))
     return ReportTable("information worth", columns, tuple(lines))
 
@@ -380,7 +379,7 @@ def _load_arm_runs(study: Path, limit: int | None) -> list[AttackRun]:
     settings = files.read_yaml(study / CONFIG) if (study / CONFIG).is_file() else None
     folders = sorted(path for path in (study / ARMS).glob("*") if (path / CONFIG).is_file())
     if not isinstance(settings, dict) or "name" not in settings or not folders:
-        raise UsageError("--study", "the folder of a finished drivesem study with arms", study)
+        raise UsageError("--study", "the folder of a finished study with arms", study)
     runs = [
         run for run in load_runs(list(map(str, folders)), limit, "--study") if run.method not in (RANDOM, PLACEBO)
     ]

@@ -9,9 +9,15 @@ from typing import Any
 import pytest
 
 from detectors.types import CLASSES
-from drivesem.analysis.confirm.comparison import ConfirmedFrame, ObjectComparison, RendererFailure
-from drivesem.analysis.confirm.report import SurvivalRate, build_confirm_report, summarise_confirmation
-from drivesem.analysis.confirm.run import ConfirmAnalyser
+from drivesem.analysis.confirm import (
+    ConfirmAnalyser,
+    ConfirmedFrame,
+    ObjectComparison,
+    RendererFailure,
+    SurvivalRate,
+    build_confirm_report,
+    summarise_confirmation,
+)
 from drivesem.evaluation.resampling import wilson
 from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import BoxRecord, FrameResult

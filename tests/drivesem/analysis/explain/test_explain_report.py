@@ -9,21 +9,21 @@ from pathlib import Path
 import cv2
 import pytest
 
-from drivesem.analysis.explain.attribution import ChangeSize
+from drivesem.analysis.explain.attribution import (
+    SCHEMA,
+    ChangeSize,
+    Contribution,
+    Explanation,
+    MinimalChange,
+    PartOutcome,
+    PixelSensitivity,
+)
 from drivesem.analysis.explain.report import (
     build_explain_report,
     build_explain_tables,
     build_frame_table,
     plot_waterfalls,
     summarise_parameters,
-)
-from drivesem.analysis.explain.results import (
-    SCHEMA,
-    Contribution,
-    Explanation,
-    MinimalChange,
-    PartOutcome,
-    PixelSensitivity,
 )
 from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import Coordinate, Failure

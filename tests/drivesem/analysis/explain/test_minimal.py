@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.analysis.explain.minimal import MinimalChangeSearch, ThetaBlock, find_minimal_change
+from drivesem.analysis.explain.attribution import MinimalChangeSearch, ThetaBlock, find_minimal_change
 from scene_ir.errors import RangeError
 
 RESOLUTION = 1 / (16 * 32)

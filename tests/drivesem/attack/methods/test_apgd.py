@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import Proposals
-from drivesem.attack.methods.gradient_ascent import SiFGSM
+from drivesem.attack.methods.gradient_ascent import APGD, SiFGSM
 from tests.drivesem.attack.methods.problems import START, Slope, make_problem, propose
 
 

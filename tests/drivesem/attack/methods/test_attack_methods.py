@@ -14,11 +14,11 @@ import yaml
 
 from detectors.base import AnchorPredictions, Detector
 from detectors.types import CLASSES, Detections
-from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run.finished import load_runs
 from drivesem.run.results import load_frame
 from drivesem.synth import demo
+from tests.drivesem.invoke import invoke
 
 WORDS = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--json", "--steps", "3"]
 
@@ -48,10 +48,8 @@ class Dazzled(Detector):
         return [Detections(raw.boxes_xyxy[0], torch.tensor([CLASSES.index("Car")]), score)]
 
 
-def attack(words: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    capsys.readouterr()
-    assert main([*WORDS, "--out", str(out), *words]) == 0
-    return json.loads(capsys.readouterr().out)
+def attack(words: list[str], out: Path) -> dict[str, Any]:
+    return json.loads(invoke(*WORDS, "--out", out, *words).out)
 
 
 _scene_once = functools.cache(demo.demo_scene)
@@ -72,10 +70,8 @@ def dazzled(monkeypatch: pytest.MonkeyPatch) -> None:
         (["--method", "scw", "--queries", "5", "--norm", "1"], 5),
     ],
 )
-def test_gradient_methods(
-    words: list[str], queries: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    metrics = attack(["--params", "weather,translate", *words], tmp_path, capsys)
+def test_gradient_methods(words: list[str], queries: int, tmp_path: Path) -> None:
+    metrics = attack(["--params", "weather,translate", *words], tmp_path)
     assert metrics["queries"] == queries
     assert metrics["feasible_fraction"] == 1.0
     assert metrics["attacked"]["moved"]["ap50"] is not None
@@ -100,20 +96,18 @@ def test_gradient_methods(
     ],
     ids=" ".join,
 )
-def test_no_method_exceeds_its_passes(
-    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    metrics = attack(["--params", "weather", "--passes", "40", *words], tmp_path, capsys)
+def test_no_method_exceeds_its_passes(words: list[str], tmp_path: Path) -> None:
+    metrics = attack(["--params", "weather", "--passes", "40", *words], tmp_path)
     assert 0 < metrics["passes"] <= 40
     if words in ([], ["--method", "halton"]):
         assert metrics["passes"] > 30
 
 
-def test_a_budget_from_a_file_is_recorded_in_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_budget_from_a_file_is_recorded_in_numbers(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
     own.write_text("translate: 0.02m\nweather: 0.125\n")
     out = tmp_path / "run"
-    attack(["--params", "weather,translate,rotate", "--budget", str(own)], out, capsys)
+    attack(["--params", "weather,translate,rotate", "--budget", str(own)], out)
     own.unlink()
     assert yaml.safe_load((out / "config.yaml").read_text())["budget"] == "weather=0.125,translate=0.02m"
     theta = json.loads((out / "frames" / "demo-000" / "theta.json").read_text())
@@ -128,7 +122,7 @@ def test_a_budget_from_a_file_is_recorded_in_numbers(tmp_path: Path, capsys: pyt
     # The same numbers, written out, are the same run: it is finished already.
     words = ["--params", "weather,translate,rotate", "--budget", "translate=0.02m,weather=0.125"]
     before = (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns
-    attack(words, out, capsys)
+    attack(words, out)
     assert (out / "frames" / "demo-000" / "result.json").stat().st_mtime_ns == before
 
 

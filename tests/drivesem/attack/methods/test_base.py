@@ -13,13 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from drivesem.attack.methods.apgd import APGD
 from drivesem.attack.methods.base import MAX_RESCORED, Attack, Problem, Proposals, Score
-from drivesem.attack.methods.climb import Climb
-from drivesem.attack.methods.gradient_ascent import FGSM, SGD, SiFGSM
-from drivesem.attack.methods.gradient_free import CMAES, Sampling
-from drivesem.attack.methods.margin_search import MIN_PASSES, Corners, MarginSearch
-from drivesem.attack.methods.placebo import Placebo
+from drivesem.attack.methods.gradient_ascent import APGD, FGSM, SGD, SiFGSM
+from drivesem.attack.methods.gradient_free import CMAES, Placebo, Sampling
+from drivesem.attack.methods.margin_search import MIN_PASSES, Climb, Corners, MarginSearch
 from drivesem.attack.methods.scw import SCW
 from drivesem.attack.theta import ProjectedTheta
 from drivesem.config import commands

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.methods.base import ParameterGroup
-from drivesem.attack.methods.climb import Climb
 from drivesem.attack.methods.gradient_free import Sampling
-from drivesem.attack.methods.margin_search import MIN_PASSES, Corners, MarginSearch, balanced_corners
+from drivesem.attack.methods.margin_search import MIN_PASSES, Climb, Corners, MarginSearch, balanced_corners
 from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import RangeError
 from tests.drivesem.attack.methods.problems import CARS, DIM, LOST_AT, PAINT, POSITION, WEATHER, Street

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from drivesem.attack.methods.base import ParameterGroup, Problem, Score
-from drivesem.attack.methods.placebo import FixedTheta, Placebo
+from drivesem.attack.methods.gradient_free import FixedTheta, Placebo
 from drivesem.attack.theta import ProjectedTheta
 from scene_ir.errors import ShapeError
 from tests.drivesem.attack.methods.problems import START, make_problem, score_of

@@ -13,16 +13,22 @@ from torch import nn
 
 from detectors.base import DetectorError
 from drivesem.classify.networks import architectures
-from drivesem.classify.networks.architectures import VGG16, PooledVGG16, ResNet50, SqueezeNet
-from drivesem.classify.networks.base import IMAGENET_MEAN, IMAGENET_STD
+from drivesem.classify.networks.architectures import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    VGG16,
+    PooledVGG16,
+    ResNet50,
+    SqueezeNet,
+)
 from drivesem.classify.networks.loading import (
     ARCHITECTURES,
+    OnnxClassifier,
     load_classifier,
     load_for_training,
     prepare_for_inference,
     save_classifier,
 )
-from drivesem.classify.networks.onnx import OnnxClassifier
 from scene_ir.errors import FormatError, RangeError
 from tools.onnx_graph import constant_graph
 

@@ -7,8 +7,16 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from drivesem.run.report.charts import SERIES, MetricDrop, curve_chart, drop_chart, legend_key, loss_trace_chart
-from drivesem.run.report.page import ChartLine, ReportChart
+from drivesem.run.report.page import (
+    SERIES,
+    ChartLine,
+    MetricDrop,
+    ReportChart,
+    curve_chart,
+    drop_chart,
+    legend_key,
+    loss_trace_chart,
+)
 
 
 def chart(lines: list[ChartLine], **of: object) -> ET.Element:

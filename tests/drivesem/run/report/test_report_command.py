@@ -14,21 +14,15 @@ import pytest
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.coco import ClassScores, CocoScores
-from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import build_cards
 from drivesem.run.results import SCHEMA
-from drivesem.run.run_report import load_reported_runs, query_curves, write_run_report
+from drivesem.run.run_report import PROTOCOL, load_reported_runs, query_curves, write_run_report
 from scene_ir import files
+from tests.drivesem.invoke import run_json
 
 
-def report(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    capsys.readouterr()
-    assert main(["report", *words, "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_one_run(some_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data = report([str(some_run)], capsys)
+def test_one_run(some_run: Path) -> None:
+    data = run_json("report", some_run)
     page = some_run / "report.html"
     assert data["out"] == str(page)
     assert data["bytes"] == page.stat().st_size
@@ -84,18 +78,14 @@ def test_an_attack_without_any_frame(some_run: Path) -> None:
 
 
 def test_runs_side_by_side(
-    tmp_path: Path,
-    frame: Callable[..., Any],
-    make_run: Callable[..., Path],
-    parse: Callable[[Path], Any],
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], parse: Callable[[Path], Any]
 ) -> None:
     """Frames are matched by name; figures are of those that both have."""
     frames = [frame("1", lost=True), frame("2", lost=True), frame("only a", phantom=True)]
     a = make_run(tmp_path / "a", frames, AttackConfig(**PROTOCOL))  # pyright: ignore[reportArgumentType]
     b = make_run(tmp_path / "b", [frame("2"), frame("1", phantom=True)], AttackConfig(method="placebo", like="x"))
     out = tmp_path / "both.html"
-    data = report([str(a), str(b), "--out", str(out)], capsys)
+    data = run_json("report", a, b, "--out", out)
     assert data["frames_left_out"] == 1
     assert [one["frame"] for one in data["frames"]] == ["1", "2"]
     assert data["frames"][0]["failures"] == {"a": ["lost"], "b": ["phantom"]}
@@ -122,23 +112,19 @@ def test_runs_side_by_side(
 
 
 def test_metrics_of_all_frames_equal_the_runs(
-    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path]
 ) -> None:
     """Counted again on the frames that are shared, they are as `drivesem attack` counts them."""
     names = ("1", "2")
     a = make_run(tmp_path / "a", [frame(name, lost=name == "1", phantom=True) for name in names])
     b = make_run(tmp_path / "b", [frame(name) for name in (*names, "3")])
-    alone = report([str(a)], capsys)["runs"][0]
-    compared = report([str(a), str(b), "--out", str(tmp_path / "page.html")], capsys)["runs"][0]
+    alone = run_json("report", a)["runs"][0]
+    compared = run_json("report", a, b, "--out", tmp_path / "page.html")["runs"][0]
     assert alone == compared
 
 
 def test_a_study_stands_for_its_arms(
-    tmp_path: Path,
-    frame: Callable[..., Any],
-    make_run: Callable[..., Path],
-    parse: Callable[[Path], Any],
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], parse: Callable[[Path], Any]
 ) -> None:
     study = tmp_path / "study"
     for name in ("random", "apgd"):
@@ -150,7 +136,7 @@ def test_a_study_stands_for_its_arms(
         for q in (1, 2)
     ]
     files.write_json(study / "study.json", {"curves": points})
-    data = report([str(study)], capsys)
+    data = run_json("report", study)
     assert [run["name"] for run in data["runs"]] == ["apgd", "random"]
     found = parse(study / "report.html")
     assert "Frames broken by number of queries" in found.text
@@ -177,16 +163,6 @@ def test_large_pictures_are_made_smaller(
     (card,) = build_cards(loaded, 1)
     assert (card.width, card.height) == (320, 96)  # boxes stay in the picture's own px
     assert len(card.layers[0].source) < 2000
-
-
-def test_no_folder(refused: Callable[..., str]) -> None:
-    assert refused("report") == "drivesem: RUN: expected folders of drivesem attack, found nothing"
-
-
-def test_no_run(refused: Callable[..., str]) -> None:
-    assert "RUN: expected a folder of drivesem attack or drivesem study, found nowhere" in refused(
-        "report", "nowhere"
-    )
 
 
 def test_no_run_in_the_folder(refused: Callable[..., str], tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from drivesem.run.report import page as grading
 from drivesem.run.report.frames import build_cards
 from drivesem.run.results import Failure, FrameResult
 from drivesem.run.run_report import load_reported_runs
+from tests.drivesem.invoke import run_json
 
 CERTAIN = Certificate(16, 16, 15, 16, 1.42, -0.61)
 CHANCE = Certificate(9, 16, 12, 16)
@@ -128,13 +128,10 @@ def test_runs_side_by_side_have_grades(
     frame: Callable[..., Any],
     make_run: Callable[..., Path],
     parse: Callable[[Path], Any],
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     other = make_run(tmp_path / "other", [graded(frame("a", lost=True), "threshold"), frame("b")])
     out = tmp_path / "both.html"
-    capsys.readouterr()
-    assert main(["report", str(run), str(other), "--out", str(out), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = run_json("report", run, other, "--out", out)
     assert data["runs"][0]["grades"] == {"threshold": 3, "certain": 1, "confirmed": 0, "shared": 0}
     assert data["frames"][1]["grades"] == {"run": ["certain"], "other": []}
     assert data["frames"][1]["kinds"] == {"run": ["placed"], "other": []}

@@ -19,10 +19,9 @@ from PIL import Image
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
 from drivesem.report.plots import PLOT_COLOURS
-from drivesem.run.protocol import PROTOCOL
 from drivesem.run.report.frames import build_cards
 from drivesem.run.results import load_frame
-from drivesem.run.run_report import load_reported_runs
+from drivesem.run.run_report import PROTOCOL, load_reported_runs
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -1,7 +1,5 @@
 """Whether a rule is the fault that was planted."""
 
-from __future__ import annotations
-
 import pytest
 
 from detectors.planted import Band, PlantedFault

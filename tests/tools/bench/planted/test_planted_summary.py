@@ -1,14 +1,12 @@
 """Figures of the yardstick, of attempts counted by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 
-from drivesem.bench.tables import BenchTable, build_terminal_table
+from drivesem.bench.session import BenchTable, build_terminal_table
 from tools.bench.planted.summary import kind_columns, kind_rows, method_rows
-from tools.bench.planted.yardstick import METHODS, NO_FAULT, FaultSearch, FrameSearches
+from tools.bench.planted.yardstick import NO_FAULT, FaultSearch, FrameSearches
 
 FIRST = FaultSearch("a", "aspect easy", "easy", "aspect=1:2", 0.2, 0.1, "halton", 3, 2, 1, 50, 4.0)
 
@@ -52,16 +50,17 @@ def test_names_are_counted_where_somebody_asked() -> None:
     none = replace(FIRST, kind=NO_FAULT, rarity=NO_FAULT, fault="", rule="moved_m 0 to 1", naming=90)
     judged = [FrameSearches("a", (told, none), ()), FrameSearches("b", (anywhere,), ())]
     easy, control = method_rows(judged, ("halton",), 0)
-    assert (easy["asked"], easy["told"], easy["named"], easy["in_part"], easy["naming"]) == (2, 1, 1, 1, 180)
-    assert (control["rarity"], control["told"], control["named"]) == (NO_FAULT, 1, 0)
+    assert (easy["explained"], easy["with_rule"], easy["named"], easy["in_part"], easy["naming"]) == (
+        2,
+        1,
+        1,
+        1,
+        180,
+    )
+    assert (control["rarity"], control["with_rule"], control["named"]) == (NO_FAULT, 1, 0)
     assert {row["kind"] for row in kind_rows(judged, ("halton",))} == {"aspect easy"}
 
 
 def test_what_was_judged_comes_back_from_json() -> None:
     for judged in frames():
         assert FrameSearches.of_json(judged.to_json()) == judged
-
-
-def test_methods_are_those_of_the_command() -> None:
-    assert {"si-fgsm", "halton", "cma-es", "corners", "climb"} <= set(METHODS)
-    assert "placebo" not in METHODS

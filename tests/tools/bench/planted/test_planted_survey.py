@@ -1,7 +1,5 @@
 """Features of a real frame's cars, as labels and pictures have them, and what is inside of a fault's region."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -27,15 +25,6 @@ def objective() -> Objective:
 @pytest.fixture(scope="module")
 def feasible(objective: Objective) -> FeasibleSet:
     return objective.feasible_set()
-
-
-def test_features_are_those_of_labels_and_picture(objective: Objective) -> None:
-    values = ObservedFrame(objective).labelled(objective.space.theta0)
-    label = objective.benign.paper.boxes_xyxy
-    assert values.shape == (len(FEATURES), len(label))
-    torch.testing.assert_close(values[0], label[:, 3] - label[:, 1])
-    (lightness,) = ObservedFrame(objective).labelled(objective.space.theta0, ("lightness",))
-    torch.testing.assert_close(lightness, values[FEATURES.index("lightness")])
 
 
 def test_turning_a_car_changes_its_aspect_and_painting_it_its_lightness(objective: Objective) -> None:
@@ -68,7 +57,7 @@ def test_a_survey_knows_what_is_inside(
     assert made.sure.any()
     assert not (made.sure & ~made.frame.judged).any()
     assert bool((made.mostly <= made.farthest).all())
-    assert (len(made.looks), len(made.halton), len(made.corners)) == (3, 4, 2)
+    assert (len(made.camera_samples), len(made.halton), len(made.corners)) == (3, 4, 2)
     # The detector's boxes are off the labels' by little, and so are features by it.
     assert float((made.factor[0, made.sure] - 1).abs().max()) < 0.3
     car, theta0 = int(made.sure.nonzero()[0]), objective.space.theta0

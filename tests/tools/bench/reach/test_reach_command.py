@@ -1,18 +1,14 @@
 """`drivesem gradcheck --reach`: options, what is printed and written, and that finished frames are kept."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from drivesem.config.parsing import parse
-from tools.bench.__main__ import BENCHMARKS, main
+from tools.bench.__main__ import main
 from tools.bench.reach.report import ReachWorker
 from tools.bench.reach.slopes import ProbeSlopes
-from tools.bench.settings import GradcheckConfig
 
 WORDS = ("gradcheck", "--reach", "--draws", "2", "--limit", "2", "--workers", "1")
 SLOPES = ProbeSlopes(
@@ -33,28 +29,6 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_options() -> None:
-    assert parse(list(WORDS), BENCHMARKS) == GradcheckConfig(reach=True, draws=2, limit=2, workers=1)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--draws", "3"], "--draws: expected --reach beside it"),
-        (["--reach", "--draws", "1"], "--draws: expected at least 2"),
-        (["--reach", "--directions", "4"], "--directions: expected no --reach beside it"),
-        (["--reach", "--max-error", "0.1"], "--max-error: expected no --reach beside it"),
-        (
-            ["--reach", "--detector", "nowhere.safetensors"],
-            "--detector: nowhere.safetensors: expected a weights file",
-        ),
-    ],
-)
-def test_what_does_not_go_together(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["gradcheck", *words]) == 2
-    assert capsys.readouterr().err.startswith(f"python -m tools.bench: {message}")
-
-
 def test_all_is_written_and_finished_frames_are_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], measured: list[str]
 ) -> None:
@@ -71,18 +45,6 @@ def test_all_is_written_and_finished_frames_are_kept(
     assert len(measured) == 2, "they were read"
     assert main([*words, "--seed", "5"]) == 0
     assert len(measured) == 4, "another seed is another question"
-
-
-@pytest.mark.usefixtures("measured")
-def test_a_table_without_a_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(list(WORDS)) == 0
-    told = capsys.readouterr().out
-    assert "Gradients and slopes of margins" in told
-    assert "Point gradients by distance" in told
-    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_that_the_detector_finds_is_one_line(

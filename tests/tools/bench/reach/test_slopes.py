@@ -1,7 +1,5 @@
 """Gradients and slopes of margins that are known in full."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -58,14 +56,14 @@ def test_a_probe_is_one_step_of_each_object_in_a_coordinate_of_its_own(space: Pa
     names = [probe.name for probe in tried(space)]
     assert len(names) == len(set(names)) == 5 + 4 + 2 + 1 + LATTICE_DIRECTIONS + len(ffd.low_order_modes())
     for probe in tried(space):
-        assert len(probe.ways) == (1 if probe.row == "weather" else 2)
-        steps = probe.ways.abs() / space.step
+        assert len(probe.directions) == (1 if probe.row == "weather" else 2)
+        steps = probe.directions.abs() / space.step
         assert float(steps.max(dim=1).values.min()) == pytest.approx(1)
         assert not bool((steps[:-1] * steps[1:]).any())  # no coordinate of two objects
-        owners = [{space.name(int(i)).split(".")[0] for i in way.nonzero()} for way in probe.ways]
+        owners = [{space.name(int(i)).split(".")[0] for i in way.nonzero()} for way in probe.directions]
         assert all(len(owner) == 1 for owner in owners)
     (yaw,) = [probe for probe in tried(space) if probe.name == "yaw"]
-    assert space.name(int(yaw.ways[1].nonzero()[0])) == "objects[1].yaw"
+    assert space.name(int(yaw.directions[1].nonzero()[0])) == "objects[1].yaw"
 
 
 def test_of_a_linear_margin_gradient_and_slopes_are_the_same(space: ParameterSpace) -> None:
@@ -89,20 +87,6 @@ def test_of_a_linear_margin_gradient_and_slopes_are_the_same(space: ParameterSpa
             for slope, *said in zip(wide, point, smoothed, strict=True):
                 assert (slope is None) == (said[0] is None), key
                 assert slope is None or said == pytest.approx([slope] * 2, rel=1e-2, abs=1e-4), key
-
-
-def test_ripples_are_in_the_gradient_and_not_in_wide_slopes(space: ParameterSpace) -> None:
-    where = space.blocks[Parameter.ROTATE]
-
-    def margins(theta: Tensor) -> Tensor:
-        return theta[where] + 0.05 * torch.sin(-100 * theta[where])
-
-    one = measured(space, margins)[0, "yaw"]
-    for point in one.point:
-        assert point == pytest.approx([0.01 * (1 - 5)] * 3, rel=1e-4)
-    for slope in one.wide[STEPS.index(16)]:
-        assert slope == pytest.approx(0.01, rel=0.4)
-    assert len(set(one.smoothed[0])) == 3
 
 
 def test_what_does_not_count_has_no_slope(space: ParameterSpace) -> None:

@@ -51,20 +51,6 @@ def test_pairs_are_compared_on_the_same_pictures():
     assert one.low >= 0
 
 
-def test_a_subset_keeps_shares_by_hand():
-    labels = [0] * 10 + [1] * 5 + [2]
-    stored = sample_stratified(labels, 8, np.random.default_rng(0))  # shares 5, 2.5, 0.5: the first loses as much
-    assert [sum(labels[i] == c for i in stored) for c in range(3)] == [5, 3, 0]
-    assert sample_stratified(labels, 16, np.random.default_rng(0)) == list(range(16))
-
-
-def test_232_of_the_papers_pictures():
-    sizes = [counts[0] for counts in paper_tables()["sizes"].values()]
-    labels = np.repeat(np.arange(12), sizes)
-    stored = labels[sample_stratified(list(labels), 232, np.random.default_rng(1))]
-    assert list(np.bincount(stored)) == [49, 29, 7, 8, 98, 4, 1, 5, 3, 2, 6, 20]
-
-
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=60), st.integers(1, 60), st.integers(0, 5))
 def test_a_subset_is_as_large_as_requested_and_no_class_is_off_by_one(labels, size, seed):
     stored = sample_stratified(labels, size, np.random.default_rng(seed))

@@ -1,7 +1,5 @@
 """What the study of classifiers keeps: read back it tells the same, and what is damaged is refused in one line."""
 
-from __future__ import annotations
-
 import gzip
 from itertools import product
 from pathlib import Path

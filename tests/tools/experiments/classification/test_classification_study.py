@@ -1,4 +1,4 @@
-"""`drivesem study classification` as it is typed, on objects that are known."""
+"""Experiment `classification` from the command line, on objects that are known."""
 
 import functools
 import json
@@ -11,15 +11,13 @@ from torch import nn
 
 from drivesem.classify import pictures, scenes
 from drivesem.classify.networks import loading
-from drivesem.classify.training import train_last_layer
-from drivesem.config.commands import ClassifyConfig
 from scene_ir import files
 from tests.drivesem.classify.conftest import KINDS, ColourClassifier, SolidObjects
 from tools.experiments.__main__ import main
 from tools.experiments.classification import study as study_module
 from tools.experiments.classification.arms import STRATEGIES
 from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT, attack_pixels, has_pixel_attacks
-from tools.experiments.classification.study import TABLES, classify_features, draw_half, retrain_last_layer
+from tools.experiments.classification.study import TABLES, classify_features, retrain_last_layer
 
 
 class Tints(ColourClassifier):
@@ -202,27 +200,6 @@ def test_attacks_on_pixels_keep_near():
         assert np.abs(found[name] / 255 - images).max() < 4.6 / 255
         output = network(torch.from_numpy(found[name]) / 255).argmax(1).numpy()
         assert not bool((output == labels).any())
-
-
-def test_training_on_begins_where_the_network_is():
-    network, generator = Tints(), torch.Generator().manual_seed(0)
-    features, labels = torch.rand(40, 3, generator=generator), torch.arange(40) % 3
-    with torch.no_grad():
-        before = network.last(features)
-    known, truth = dict.fromkeys(("train", "val"), features), dict.fromkeys(("train", "val"), labels)
-    config = ClassifyConfig(what="train", epochs=1, rate=1e-9)
-    train_last_layer(network, known, truth, config, generator, continued=True)
-    assert torch.allclose(network.last(features), before, atol=1e-4)
-    train_last_layer(network, known, truth, config, generator)
-    assert not torch.allclose(network.last(features), before, atol=1e-2)
-
-
-def test_half_of_the_pictures_are_replaced():
-    places = draw_half(9, 0)
-    assert len(places) == len(set(places)) == 4
-    assert places == sorted(places) == draw_half(9, 0)
-    assert places != draw_half(9, 1)
-    assert max(places) < 9
 
 
 def test_a_retrained_network_knows_what_it_was_given(tmp_path):

@@ -1,11 +1,7 @@
 """Arms of two classes on hand-made frames: no renderer, no detector."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-
-import pytest
 
 from detectors.types import CLASSES
 from drivesem.attack.targets import HEADLINE, EvaluatedClasses
@@ -22,7 +18,7 @@ def box(x: float, score: float | None = None, index: int | None = None) -> BoxRe
     return BoxRecord((x, 20.0, x + WIDTH_PX, 20.0 + HEIGHT_PX), HEADLINE, score=score, index=index)
 
 
-def _frame(
+def frame(
     name: str,
     moved_by: float = 0.0,
     found: bool = True,
@@ -58,35 +54,18 @@ def _frame(
     )
 
 
-def _run(arm: AttackArm, results: Sequence[FrameResult]) -> ArmRun:
+def arm_run(arm: AttackArm, results: Sequence[FrameResult]) -> ArmRun:
     judged = EvaluatedClasses(CLASSES, CLASSES)
     return ArmRun(arm, summary_of(arm.config, results), tuple(results), judged)
 
 
-@pytest.fixture
-def frame() -> Callable[..., FrameResult]:
-    return _frame
+def counted(arm: AttackArm, results: Sequence[FrameResult]) -> ArmCounts:
+    return ArmCounts.from_run(arm_run(arm, results))
 
 
-@pytest.fixture
-def arm_run() -> Callable[[AttackArm, Sequence[FrameResult]], ArmRun]:
-    return _run
-
-
-@pytest.fixture
-def counted() -> Callable[[AttackArm, Sequence[FrameResult]], ArmCounts]:
-    """The same as it is counted."""
-    return lambda arm, results: ArmCounts.from_run(_run(arm, results))
-
-
-@pytest.fixture
-def arm() -> Callable[..., AttackArm]:
+def arm(
+    name: str, reference: float | None = None, control: tuple[str, str] | None = None, **of: object
+) -> AttackArm:
     """An arm by name, with settings of its attack."""
-
-    def make(
-        name: str, reference: float | None = None, control: tuple[str, str] | None = None, **of: object
-    ) -> AttackArm:
-        kind, control_rows = control or (None, None)
-        return AttackArm(name, name, AttackConfig(**of), reference, kind, control_rows)  # pyright: ignore[reportArgumentType]
-
-    return make
+    kind, control_rows = control or (None, None)
+    return AttackArm(name, name, AttackConfig(**of), reference, kind, control_rows)  # pyright: ignore[reportArgumentType]

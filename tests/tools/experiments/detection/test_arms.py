@@ -1,7 +1,5 @@
 """Which attacks a study compares."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from drivesem.run.protocol import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
+from drivesem.run.run_report import PAPER_COMBOS, PAPER_SINGLE, PROTOCOL, follows_paper
 from scene_ir.errors import FormatError
 from tools.experiments.detection.arms import (
     PAPER_PROTOCOL,
@@ -101,14 +99,6 @@ def test_the_papers_metrics_stand_next_to_its_own_protocol_only() -> None:
         assert {arm.reference for arm in arms} == {None}
 
 
-def test_several_parameters_are_attacked_as_in_the_paper_and_by_shorter_steps() -> None:
-    arms = build_arms(StudyConfig(name="multi", steps=7, controls=False, paper_protocol=False), OUT)
-    assert [(arm.config.method, arm.config.steps) for arm in arms] == [("si-fgsm", 7)] * 4 + [("apgd", 28)]
-    assert arms[-1].config.combo == 2
-    alone = build_arms(StudyConfig(name="multi", method="apgd", controls=False, paper_protocol=False), OUT)
-    assert [(arm.config.method, arm.config.combo) for arm in alone] == [("apgd", k) for k in (1, 2, 3, 4)]
-
-
 def test_grades_compare_methods_at_the_same_cost() -> None:
     arms = {arm.name: arm for arm in build_arms(StudyConfig(name="grades", steps=7), OUT)}
     assert len(arms) == 15
@@ -154,16 +144,3 @@ def test_a_pace_without_seconds_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / STUDY_JSON).write_text(text)
     with pytest.raises(FormatError, match=r"study\.json: searches: expected"):
         build_arms(StudyConfig(name="searches", pace=str(tmp_path)), OUT)
-
-
-@pytest.mark.parametrize("name", ["samples", "steps", "grades", "searches"])
-def test_these_name_their_own_methods(name: str) -> None:
-    assert build_arms(StudyConfig(name=name), OUT) == build_arms(StudyConfig(name=name, method="apgd"), OUT)
-
-
-def test_samples_end_at_the_first_success() -> None:
-    arms = build_arms(StudyConfig(name="samples", queries=9), OUT)
-    assert all(arm.config.early_stop or arm.config.method == "fgsm" for arm in arms)
-    searches = [arm.config for arm in arms if arm.config.queries]
-    assert {config.queries for config in searches} == {9}
-    assert {config.range for config in searches} == {"steps", "bounds"}

@@ -1,9 +1,5 @@
 """Points of each factor of the protocol."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,7 +8,8 @@ import cv2
 import pytest
 
 from drivesem.config.commands import AttackConfig
-from drivesem.run.protocol import follows_paper
+from drivesem.run.run_report import follows_paper
+from tests.tools.experiments.detection.conftest import counted, frame
 from tools.experiments.detection.arms import PAPER_PROTOCOL
 from tools.experiments.detection.attribution import (
     COUNTED_LABELS,
@@ -63,7 +60,7 @@ def test_a_way_changes_one_factor_at_a_time_and_the_factors_start_as_ours() -> N
 
 
 @pytest.fixture
-def found(frame: Callable[..., Any], counted: Callable[..., Any]) -> Attribution:
+def found() -> Attribution:
     """Labels that are aimed at lose a car in two frames of six; what is not projected drives it away in all."""
     plan, runs = plan_of(limit=FRAMES), []
     for arm in plan.arms():
@@ -102,28 +99,6 @@ def test_points_are_of_the_factors_that_did_it(found: Attribution) -> None:
     assert 0 < shares["labels aimed at"].p <= 1
 
 
-def test_a_detector_counts_with_what_its_fall_begins_from(
-    frame: Callable[..., Any], counted: Callable[..., Any]
-) -> None:
-    """A detector that finds one car less before, and yet another less after, has fallen by the latter alone."""
-    plan, runs = plan_of(limit=FRAMES, other_detector="other"), []
-    for arm in plan.arms():
-        results = [frame(f"{i}") for i in range(FRAMES)]
-        if arm.config.detector == "other":
-            one = results[0].detections_benign[:1]
-            results[0] = replace(results[0], detections_benign=one, detections_attacked=one)
-            results[1] = replace(results[1], detections_attacked=one)
-        runs.append(counted(arm, results))
-    study = StudyConfig(name="attribution", bootstrap=DRAWS, other_detector="other")
-    found = attribute_drop(study, StudyCounts(tuple(runs), 0, {}))
-    *factors, detector, _, _ = found.shares
-    assert detector.name == "detector"
-    # 11 of 12 cars are found before, 10 after, nothing else: precision is 1 up to these recalls
-    assert (found.ours, found.papers) == (0, pytest.approx((92 - 84) / 101))
-    assert detector.points.value == pytest.approx(found.papers, abs=1e-12)
-    assert [share.points.value for share in factors] == [0] * 6
-
-
 def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:
     report = attribution_report(found, tmp_path)
     first = report.tables[0]
@@ -139,8 +114,3 @@ def test_text_json_and_picture(found: Attribution, tmp_path: Path) -> None:
     picture = cv2.imread(str(tmp_path / "a.png"))
     assert picture is not None
     assert picture.std() > 10
-
-
-def test_the_other_detector_is_of_this_study_alone(refused: Callable[..., str]) -> None:
-    assert "--other-detector: expected" in refused("multi", "--other-detector", "yolov3")
-    StudyConfig(name="attribution", other_detector="yolov3-slim").check()

@@ -1,18 +1,16 @@
 """Metrics of an arm: drops, by which labels, and beyond the controls."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.resampling import holm
-from drivesem.run.protocol import PAPER_BENIGN
+from drivesem.run.run_report import PAPER_BENIGN
+from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
 from tools.experiments.detection.arms import PLACEBO, RANDOM
-from tools.experiments.detection.comparison import compare_arms, relative_size
-from tools.experiments.detection.counts import ArmCounts, FrameCounts
+from tools.experiments.detection.comparison import compare_arms
+from tools.experiments.detection.counts import ArmCounts
 
 FRAMES = 8
 FAR = 40.0
@@ -20,7 +18,7 @@ FAR = 40.0
 
 
 @pytest.fixture
-def runs(frame, counted, arm):
+def runs():
     """An attack that makes the detector lose a car in half of the frames; a random control that moves the car in
     all of them and is followed; a placebo that does nothing.
     """
@@ -54,7 +52,7 @@ def test_a_row_for_each_arm_that_is_no_control(runs) -> None:
     assert flat["feasible_fraction"] == 1.0
 
 
-def test_metrics_are_those_of_pycocotools(frame, arm_run, arm) -> None:
+def test_metrics_are_those_of_pycocotools() -> None:
     """As the run itself tells them, of detections that are true at some overlaps and false at others."""
     run = arm_run(arm("a"), [frame(f"{i}", moved_by=4.0 * i, found=i != 3) for i in range(FRAMES)])
     (row,) = compare_arms([ArmCounts.from_run(run)], draws=0, seed=0)
@@ -95,23 +93,7 @@ def test_the_controls_stand_next_to(runs) -> None:
     assert flat["placebo_size"] == pytest.approx(0.5)
 
 
-def test_sizes_are_compared_frame_by_frame(frame) -> None:
-    attack = [FrameCounts.from_result(frame("a", yaw=yaw), ()) for yaw in (0.2, 0.1, 0.0)]
-    control = [FrameCounts.from_result(frame("a", yaw=yaw), ()) for yaw in (-0.2, 0.05, 0.3)]
-    assert relative_size(control, attack) == pytest.approx(np.mean([1.0, 0.5]))
-    assert relative_size([control[2]], [attack[2]]) is None
-
-
-def test_equal_arms_have_no_effect_and_no_spread(frame, counted, arm) -> None:
-    results = [frame(f"{i}", found=i % 2 == 0) for i in range(4)]
-    runs = [counted(arm("one"), results), counted(arm("two", control=(PLACEBO, "one")), results)]
-    (row,) = compare_arms(runs, draws=20, seed=3)
-    effect = row.effects[PLACEBO]["moved"]
-    assert (effect.difference, effect.low, effect.high, effect.p) == (0.0, 0.0, 0.0, 1.0)
-    assert row.drops["moved"]["ap50"].value == pytest.approx(25 / 101)
-
-
-def test_seeds_of_a_control_count_as_their_mean(runs, frame, counted, arm) -> None:
+def test_seeds_of_a_control_count_as_their_mean(runs) -> None:
     """Beside one that is followed in all frames, a second seed loses a car in all of them."""
     names = [f"{i:03d}" for i in range(FRAMES)]
     lost = counted(

@@ -1,9 +1,8 @@
 """Benign and moved labels of attacked frames."""
 
-from __future__ import annotations
-
 import pytest
 
+from tests.tools.experiments.detection.conftest import arm, arm_run, frame
 from tools.experiments.detection.labels import LabelComparison, compare_frame_labels, compare_labels
 
 
@@ -16,7 +15,7 @@ def sets_of(run) -> LabelComparison:
     return compare_labels(run.arm.name, compare_frame_labels(run))
 
 
-def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
+def test_overlap_and_failures_of_labels_alone() -> None:
     """The detector follows the car: any failure is the labels'. 10 px is an IoU of 0.67, 40 px one of 0.11."""
     shifts = [0.0, 10.0, 40.0, 40.0]
     found = sets_of(arm_run(arm("translate"), [frame(str(i), moved_by=s) for i, s in enumerate(shifts)]))
@@ -33,13 +32,7 @@ def test_overlap_and_failures_of_labels_alone(frame, arm_run, arm) -> None:
     assert flat["below_0.5"] == 0.25
 
 
-def test_a_car_that_is_really_lost_is_lost_by_both(frame, arm_run, arm) -> None:
+def test_a_car_that_is_really_lost_is_lost_by_both() -> None:
     one = sets_of(arm_run(arm("mesh"), [frame("0", moved_by=3.0, found=False)])).counts[0.5]
     assert (one.paper, one.moved, one.only_unmoved) == (1, 1, 0)
     assert (one.lost_paper, one.lost_only_unmoved) == (1, 0)
-
-
-def test_no_objects(arm_run, arm) -> None:
-    found = sets_of(arm_run(arm("mesh"), []))
-    assert found.objects == 0
-    assert set(found.iou.values()) == set(found.below.values()) == {None}

@@ -1,29 +1,24 @@
 """Grades, cost, success curves and withstanding objects, from hand-made frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from drivesem.failures.grades import Certificate, Grade, Kind, SecondOpinion
-from drivesem.run.results import Failure, FrameResult
+from drivesem.run.results import Failure
+from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
 from tools.experiments.detection.arms import PLACEBO, ArmRun
 from tools.experiments.detection.comparison import compare_arms
 from tools.experiments.detection.counts import ArmCounts, StudyCounts
 from tools.experiments.detection.outcomes import (
     ArmGrades,
-    WithstandingObjects,
     compare_success,
     count_grades,
     count_withstanding,
     find_detected_objects,
-    first_successes,
-    query_limit,
     search_costs,
     success_curve,
 )
@@ -40,7 +35,7 @@ def failure(grade: Grade, kind: Kind = Kind.MISSED, second: SecondOpinion | None
 
 
 @pytest.fixture
-def graded_runs(frame, counted, arm) -> list:
+def graded_runs() -> list:
     """Four frames of two cars, failures of each grade in the first three; a control fails by threshold."""
     of = [
         (failure(Grade.THRESHOLD), failure(Grade.CERTAIN, second=REQUIRED_KEYS)),
@@ -79,21 +74,6 @@ def test_what_survives_is_a_share_of_what_was_requested(grades: ArmGrades) -> No
     assert 0 <= low < 2 / 3 <= high == 1
 
 
-def test_ignored_objects_are_nothing_to_lose(frame, counted, arm) -> None:
-    result: FrameResult = frame("0")
-    first, second = result.targets_benign
-    ignored = replace(result, targets_benign=(replace(first, ignore=True), second))
-    assert count_grades(counted(arm("a"), [ignored]), 0, 0).objects == 1
-
-
-def test_bounds_are_those_of_drawing_frames(frame, counted, arm) -> None:
-    """Equal frames leave nothing to chance; without draws there are no bounds."""
-    alike = [replace(frame(str(i)), failures=(failure(Grade.CERTAIN),)) for i in range(5)]
-    one = count_grades(counted(arm("a"), alike), DRAWS, 0).rates[Grade.CERTAIN]
-    assert (one.value, one.low, one.high) == pytest.approx((0.5, 0.5, 0.5))
-    assert count_grades(counted(arm("a"), alike), 0, 0).rates[Grade.CERTAIN].low is None
-
-
 def test_grade_tables(graded_runs: list, tmp_path: Path) -> None:
     found = StudyResults(
         StudyConfig(name="grades"),
@@ -126,7 +106,7 @@ def lost(index: int, grade: Grade = Grade.CERTAIN) -> Failure:
 
 
 @pytest.fixture
-def search_runs(frame, arm_run, arm) -> list[ArmRun]:
+def search_runs() -> list[ArmRun]:
     """Four frames of two cars: the first arm loses three for certain, the second one, the placebo the far one."""
 
     def of(failures: Sequence[tuple[Failure, ...]], passes: int, seconds: float) -> list:
@@ -174,19 +154,6 @@ def test_what_stands_by_size_and_distance(counts: StudyCounts) -> None:
     assert classes["height from 80 px"].objects == 0
 
 
-def test_cars_that_the_detector_does_not_find_cannot_fall(search_runs: list[ArmRun]) -> None:
-    blind = [replace(result, detections_benign=()) for result in search_runs[0].results]
-    run = replace(search_runs[0], results=tuple(blind))
-    assert count_withstanding([ArmCounts.from_run(run)], find_detected_objects(run, DEPTHS))[0].objects == 0
-
-
-def test_share_with_wilson() -> None:
-    one = WithstandingObjects("all", 10, 1).share
-    assert one.value == pytest.approx(0.9)
-    assert (one.low, one.high) == pytest.approx((0.596, 0.982), abs=1e-3)
-    assert WithstandingObjects("none", 0, 0).share.value is None
-
-
 def test_search_tables(counts: StudyCounts) -> None:
     found = StudyResults(
         StudyConfig(name="searches"),
@@ -212,7 +179,7 @@ def test_search_tables(counts: StudyCounts) -> None:
 
 
 @pytest.fixture
-def success_runs(frame, counted, arm):
+def success_runs():
     """One arm that breaks frames after 1, 3, 3 queries and one never; one that needs 8 in two of them."""
     quick = [(1, True), (3, True), (3, True), (10, False)]
     slow = [(8, True), (8, True), (64, False), (64, False)]
@@ -245,20 +212,8 @@ def test_the_curve_is_the_distribution_of_first_successes(success_runs) -> None:
     }
 
 
-def test_queries_of_frames_that_were_never_broken_count_as_none(success_runs) -> None:
-    assert first_successes(success_runs[0].frames).tolist() == [1, 3, 3, np.inf]
-
-
 def test_one_arm_against_the_end_of_another(success_runs) -> None:
     one = compare_success(*(success_runs[0], 2, success_runs[1]), draws=60, seed=0)
     assert (one.first, one.second, one.difference) == (0.5, 0.25, -0.25)
     assert one.low <= -0.25 <= one.high
     assert compare_success(success_runs[0], 3, success_runs[1], 0, 0).difference == pytest.approx(0.25)
-
-
-def test_how_many_queries_an_arm_may_take(frame, counted, arm) -> None:
-    requested = {"si-fgsm": 7, "fgsm": 1, "halton": 32}
-    for method, most in requested.items():
-        queries = 32 if method == "halton" else None
-        run = counted(arm(method, method=method, steps=7, queries=queries), [frame("0")])
-        assert query_limit(run) == most

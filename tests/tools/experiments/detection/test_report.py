@@ -1,7 +1,5 @@
 """Tables, files and pictures of a study, from hand-made frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 from dataclasses import replace
@@ -10,14 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
 
-from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
-from drivesem.evaluation.resampling import Interval
-from drivesem.report.plots import PLOT_COLOURS
+from drivesem.analysis.confirm import Confirmation, SurvivalRate
 from drivesem.run.folder import ARMS
 from scene_ir import files
+from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
 from tools.experiments.detection.arms import PLACEBO, RANDOM
 from tools.experiments.detection.comparison import compare_arms
 from tools.experiments.detection.counts import ArmCounts, StudyCounts
@@ -26,7 +22,6 @@ from tools.experiments.detection.outcomes import compare_success, success_curve
 from tools.experiments.detection.plots import (
     MAX_CHANGES,
     PICTURE_WIDTH_PX,
-    draw_bars,
     find_largest_changes,
     write_largest_changes,
     write_plot,
@@ -38,7 +33,7 @@ DRAWS = 10
 
 
 @pytest.fixture
-def controlled(frame, counted, arm) -> StudyResults:
+def controlled() -> StudyResults:
     """Two parameters; one frame of four is broken by the attack, none by its controls."""
     runs = []
     for name, reference in (("rotate", 0.982), ("mesh", 0.987)):
@@ -51,7 +46,7 @@ def controlled(frame, counted, arm) -> StudyResults:
 
 
 @pytest.fixture
-def sampled(frame, counted, arm) -> StudyResults:
+def sampled() -> StudyResults:
     """An arm of 10 queries, one of 64, and one of a single query."""
     runs = [
         counted(arm("si-fgsm"), [frame("0", queries=2, success=True), frame("1", queries=5, success=True)]),
@@ -72,7 +67,7 @@ def sampled(frame, counted, arm) -> StudyResults:
 
 
 @pytest.fixture
-def labelled(frame, arm_run, arm) -> StudyResults:
+def labelled() -> StudyResults:
     run = arm_run(arm("translate"), [frame("0", moved_by=40.0), frame("1")])
     counts = StudyCounts((ArmCounts.from_run(run),), 0, {})
     sets = [compare_labels("translate", compare_frame_labels(run))]
@@ -119,12 +114,6 @@ def test_what_survives_the_second_renderer_stands_next_to(controlled: StudyResul
     assert "survive_share" not in controlled.to_json()["rows"][0]
 
 
-def test_json_has_what_others_read(controlled: StudyResults) -> None:
-    data = controlled.to_json()
-    assert (data["frames"], data["feasible_fraction"]) == (4, 1.0)
-    assert [row["name"] for row in data["rows"]] == ["rotate", "mesh"]
-
-
 def test_success_after_queries(sampled: StudyResults) -> None:
     first = cells(sampled, "Frames broken", "si-fgsm")
     assert [first[mark].split(" [")[0] for mark in ("1", "2", "5", "10", "20")] == [
@@ -165,7 +154,7 @@ def test_files(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
     assert found.rows[0].name in stream.getvalue()
 
 
-def test_nothing_to_attack(frame, counted, arm, tmp_path: Path) -> None:
+def test_nothing_to_attack(tmp_path: Path) -> None:
     """No frame has a vehicle: the tables have dashes, and nothing fails."""
     runs = [counted(arm("rotate", 0.982), []), counted(arm("rotate placebo", control=(PLACEBO, "rotate")), [])]
     runs.append(counted(arm("rotate random", control=(RANDOM, "rotate")), []))
@@ -178,15 +167,8 @@ def test_nothing_to_attack(frame, counted, arm, tmp_path: Path) -> None:
     write_plot(tmp_path / "study.png", found)
 
 
-def test_more_series_than_colours_are_reported_apart() -> None:
-    """Each has a look of its own, by colour or hatch."""
-    axes = Figure().add_subplot()
-    draw_bars(axes, {f"detector {i}": [Interval("ap50", 0.5, 0.4, 0.6)] for i in range(2 * len(PLOT_COLOURS) + 1)})
-    assert len({(bar.get_facecolor(), bar.get_hatch()) for bar in axes.patches}) == 2 * len(PLOT_COLOURS) + 1
-
-
 @pytest.fixture
-def runs(frame, arm_run, arm):
+def runs():
     """Two attacks, of which each changes other frames more, and a control that changes all frames most."""
     small = [frame(f"{i:03d}", yaw=0.01 * i) for i in range(MAX_CHANGES + 3)]
     turned = [frame(f"{i:03d}", yaw=-0.02 if i else 0.3) for i in range(MAX_CHANGES + 3)]
@@ -208,13 +190,6 @@ def test_each_frame_once_by_the_arm_that_changed_it_most(runs) -> None:
     assert len(found) == MAX_CHANGES
     assert found[0].size == pytest.approx(0.3 / 0.7)
     assert found[0].folder == Path("out", ARMS, "turned", "frames", "000")
-
-
-def test_what_was_not_changed_is_not_given(frame, arm_run, arm, tmp_path: Path) -> None:
-    still = arm_run(arm("still"), [frame("000", yaw=0.0)])
-    assert find_largest_changes([still], tmp_path) == []
-    write_largest_changes(tmp_path / "largest.png", [])
-    assert not (tmp_path / "largest.png").exists()
 
 
 def test_the_sheet_shows_photographs_next_to_counterexamples(runs, tmp_path: Path) -> None:

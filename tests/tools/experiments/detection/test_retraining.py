@@ -1,15 +1,12 @@
 """The study `retrain`: results, report, and the whole on embedded frames."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,51 +14,39 @@ import pytest
 import torch
 from rich.console import Console
 
-from detectors.registry import load_detector, save_detector
+from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.transfer.matrix import (
-    CERTAIN,
-    THRESHOLD,
-    TRANSFER,
+from drivesem.analysis.transfer import (
     SourceRun,
     TransferCounts,
     TransferTarget,
-    compute_transfer_row,
 )
-from drivesem.analysis.transfer.report import build_transfer_tables as transfer_sheets
 from drivesem.attack.methods.base import Attack
 from drivesem.evaluation.matched_class import ThresholdMatches
-from drivesem.evaluation.resampling import Interval
 from drivesem.run.frame import detections_from_records
-from drivesem.run.protocol import PROTOCOL
-from drivesem.run.results import Failure, FrameResult
-from scene_ir import files
+from drivesem.run.results import FrameResult
+from drivesem.run.run_report import PROTOCOL
+from tests.tools.experiments.conftest import REQUIRED_KEYS
+from tests.tools.experiments.detection.conftest import arm, arm_run, frame
 from tools.experiments.__main__ import main
 from tools.experiments.detection import retraining, retraining_arms
-from tools.experiments.detection import retraining_report as retraining_report_file
 from tools.experiments.detection.arms import AttackTotals
 from tools.experiments.detection.counts import ArmCounts
 from tools.experiments.detection.report import OWN_PROTOCOL
-from tools.experiments.detection.retraining import cached_detections, set_threshold
+from tools.experiments.detection.retraining import cached_detections
 from tools.experiments.detection.retraining_arms import BENIGN, build_retraining_arms, paper_reference
-from tools.experiments.detection.retraining_report import retraining_report, write_retraining_plot
+from tools.experiments.detection.retraining_report import retraining_report
 from tools.experiments.detection.retraining_results import (
     BenignMatches,
     RetrainingCounts,
     RetrainingResults,
     summarise_retraining,
 )
-from tools.experiments.detection.robustness import KINDS, RobustnessRow
 from tools.experiments.settings import StudyConfig
 
 FRAMES, DRAWS = 8, 40
 THEIRS = {name: value for name, value in PROTOCOL.items() if name != "early_stop"}
 """The paper's protocol, as a study is told it."""
-REQUIRED_KEYS = (
-    *("name", "benign_ap50", "paper_ap50", "moved_ap50", "drop_paper", "drop_moved", "recall_paper"),
-    *("recall_moved", "reference"),
-)
-"""What other programs read of a row."""
 CAR = torch.tensor([[10.0, 20.0, 60.0, 50.0]])
 
 
@@ -93,26 +78,8 @@ def known(name: str, results: Sequence[FrameResult], stored: int) -> TransferCou
     return TransferCounts.from_detections(source, target, results, found)
 
 
-def test_losses_that_are_certain_transfer_apart(frame: Callable[..., FrameResult]) -> None:
-    """Four frames whose first car is lost, in one of them for certain; the target loses it in that one alone."""
-    lost = Failure("lost", "Car", (0.0, 0.0, 1.0, 1.0), index=0, grade="threshold")
-    results = [
-        replace(frame(str(i), found=False, success=True), failures=(replace(lost, grade=grade),))
-        for i, grade in enumerate(("threshold", "threshold", "threshold", "confirmed"))
-    ]
-    row = compute_transfer_row(known("target", results, 3), DRAWS, 0)
-    assert row.counts[CERTAIN] == (1, 1)
-    assert row.counts[THRESHOLD] == (0, 3)
-    assert row.counts[TRANSFER] == (1, 4)
-    assert row.to_row()["certain_rate"] == 1.0
-    shares = transfer_sheets([row])[1]
-    assert [cell.split("\n")[-1] for cell in shares.rows[0][5:7]] == ["1 of 1", "0 of 3"]
-
-
 @pytest.fixture
-def found(
-    frame: Callable[..., FrameResult], arm_run: Callable[..., Any], arm: Callable[..., Any]
-) -> RetrainingResults:
+def found() -> RetrainingResults:
     """Four frames: the detector as it was loses a car in all of them; the retrained ones in half."""
     study = StudyConfig(name="retrain", quick=True, bootstrap=DRAWS, **THEIRS)  # pyright: ignore[reportArgumentType]
     plan = build_retraining_arms(study)
@@ -176,7 +143,7 @@ def test_the_papers_metrics_stand_next_to_its_protocol_only(found: RetrainingRes
 def test_what_is_reported(found: RetrainingResults, tmp_path: Path) -> None:
     data = found.to_json()
     json.dumps(data, allow_nan=False)
-    assert [set(REQUIRED_KEYS) - set(r) for r in data["rows"]] == [set()] * 3
+    assert [REQUIRED_KEYS - set(r) for r in data["rows"]] == [set()] * 3
     assert [(r["reference"], r["reference_benign"]) for r in data["rows"]] == [
         (0.659, 0.994),
         (0.659, 0.994),
@@ -204,28 +171,6 @@ def test_what_is_reported(found: RetrainingResults, tmp_path: Path) -> None:
     report.print(Console(file=stream, width=100))
     assert "retrained, ours" in stream.getvalue()
     assert min(cv2.imread(str(tmp_path / "study.png")).shape[:2]) > 400
-
-
-def test_the_picture_is_of_failures_where_states_were_given(
-    found: RetrainingResults, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Groups without any bar are left out; AP50 has no groups of states."""
-    drawn: list[dict[str, list[Interval | None]]] = []
-    draw = retraining_report_file.draw_bars
-    monkeypatch.setattr(
-        retraining_report_file, "draw_bars", lambda axes, series: (drawn.append(series), draw(axes, series))
-    )
-    monkeypatch.setattr(files, "write_bytes", lambda *_: None)
-    printed = Interval("", 0.2, 0.1, 0.3)
-    row = RobustnessRow(
-        "certain", "ours", dict.fromkeys(KINDS, printed), {}, replace(printed, value=0.5), None, None
-    )
-    write_retraining_plot(Path("a.png"), replace(found, robustness=[row]))
-    assert [one.value for one in drawn[0]["ours"] if one] == [0.2, 0.2, 0.2, 0.5]
-    write_retraining_plot(Path("a.png"), found)
-    once = replace(found, rows=[found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])])
-    write_retraining_plot(Path("a.png"), once)
-    assert [len(series[BENIGN]) for series in drawn[1:]] == [3, 2]
 
 
 def test_benign_frames_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,46 +203,6 @@ def test_benign_frames_are_evaluated_once(tmp_path: Path, monkeypatch: pytest.Mo
     store.digest = "of others"  # pyright: ignore[reportAttributeAccessIssue]
     cached_detections(detector, store, path, "cpu")  # pyright: ignore[reportArgumentType]
     assert looks == [2, 2, 1, 1], "other weights, other frames, other pictures"
-
-
-def test_the_threshold_lies_with_the_weights(tmp_path: Path) -> None:
-    weights = tmp_path / "w.safetensors"
-    detector = load_detector("squeezedet")
-    save_detector(detector, weights, {"retrained_from": "squeezedet", "steps": "2"})
-    set_threshold(detector, weights, 0.123456789)
-    assert load_detector(weights).t_star == detector.t_star == 0.123457
-    written = weights.stat().st_mtime_ns
-    set_threshold(load_detector(weights), weights, 0.123456789)
-    assert weights.stat().st_mtime_ns == written
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--train-steps", "0"], "--train-steps: expected at least 1, found 0"),
-        (["--fresh", "0"], "--fresh: expected at least 1, found 0"),
-        (["--benign-frames", "-3"], "--benign-frames: expected at least 1, found -3"),
-        (["--held-out", "x"], "--held-out, --benign-root: expected none with the embedded frames"),
-        (["--detector", "squeezdet"], "--detector: expected a detector that can be trained"),
-        (["--detector", "onnx:none.onnx"], "--detector: expected a detector"),
-        (["--mix", "half"], "half"),
-        (["--dataset", "kitti"], "--root: expected the folder of data set 'kitti'"),
-    ],
-)
-def test_bad_input_is_one_line(words: list[str], message: str, refused: Callable[..., str]) -> None:
-    assert message in refused("retrain", *words)
-
-
-def test_without_new_attacks_there_is_no_table_of_them(found: RetrainingResults) -> None:
-    rows = [found.rows[0], *(replace(row, fresh=None) for row in found.rows[1:])]
-    counts = replace(found.counts, left_out={"the same, consistently": "no failure"})
-    less = replace(found, rows=rows, counts=counts)
-    assert less.to_json()["left_out"] == {"the same, consistently": "no failure"}
-    assert less.rows[1].to_row()["fresh_moved_ap50"] is None
-    report = retraining_report(less, Path("out"))
-    assert not any("Fresh" in table.title for table in report.tables)
-    assert any("Fresh" in table.title for table in retraining_report(found, Path("out")).tables)
-    assert "Left out: the same, consistently: no failure." in report.notes
 
 
 @pytest.mark.slow

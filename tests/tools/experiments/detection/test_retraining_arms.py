@@ -1,10 +1,8 @@
 """Arms of the study `retrain`, their frames and pictures."""
 
-from __future__ import annotations
-
 import io
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,18 +20,18 @@ from drivesem.data import kitti
 from drivesem.data.kitti import KittiWriter
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.run.results import dump_frame
-from drivesem.training.samples import AttackedFrame, TrainingMixture
+from drivesem.training.frames import AttackedFrame, TrainingMixture
 from scene_ir import files
 from scene_ir.errors import SceneError
 from scene_ir.io import SCHEMA, VERSION
 from scene_ir.types import Labels
+from tests.tools.experiments.detection.conftest import frame
 from tools.experiments.detection import retraining_arms
 from tools.experiments.detection.retraining import prepare_retraining
 from tools.experiments.detection.retraining_arms import (
     OURS,
     RETRAINING_ARMS,
     FrameDivision,
-    FrameSubset,
     RetrainingArm,
     TrainingPictures,
     benign_samples,
@@ -70,7 +68,7 @@ def labelled(x: float, kind: str = "Car") -> Labels:
 
 
 @pytest.fixture
-def attacked(frame: Callable[..., object], tmp_path: Path) -> list[AttackedFrame]:
+def attacked(tmp_path: Path) -> list[AttackedFrame]:
     """Three frames: the first is not broken. Cars are at 10 by the benign labels, at 20 by moved ones."""
     found = []
     for i in range(3):
@@ -100,21 +98,6 @@ def test_ours_is_the_preset() -> None:
     )
     paper = build_retraining_arms(StudyConfig(name="retrain"))[-1]
     assert parse(["retrain", "--run", "", "--config", str(PRESETS / "retrain-paper.yaml")]) == paper.config
-
-
-def test_the_ablation_differs_in_its_pictures_alone() -> None:
-    for study in (
-        StudyConfig(name="retrain", quick=True),
-        StudyConfig(name="retrain", train_steps=7, mix="replace"),
-    ):
-        ablation, ours, *further = build_retraining_arms(study)
-        assert (ablation.pictures, ours.pictures) == ("rerender", "counterexample")
-        assert ablation.config == ours.config
-        assert len(further) == (not study.quick)
-        if study.train_steps is not None:
-            assert {lesson.config.steps for lesson in (ours, *further)} == {7}
-            assert (ours.config.mix, further[0].config.mix) == ("replace", "replace")
-    assert build_retraining_arms(StudyConfig(name="retrain"))[1].config.mix == "add"
 
 
 def test_arms_differ_in_their_pictures_alone() -> None:
@@ -151,14 +134,6 @@ def test_what_is_attacked_to_train_on() -> None:
     placebo = placebo_attack(arm, Path("out"))
     assert (placebo.config.method, placebo.config.like) == ("placebo", "out/arms/attacked")
     assert (placebo.config.params, placebo.config.passes, placebo.config.limit) == ("weather,rotate", None, 3)
-
-
-def test_weights_from_elsewhere_keep_their_loss() -> None:
-    losses = {
-        d: build_retraining_arms(StudyConfig(name="retrain", detector=d))[1].config.loss
-        for d in ("squeezedet", "own.safetensors")
-    }
-    assert losses == {"squeezedet": "quality", "own.safetensors": "published"}
 
 
 def test_held_out_frames_are_never_trained_on(tmp_path: Path) -> None:
@@ -220,14 +195,6 @@ def test_frames_without_vehicles_show_before_anything_is_done(tmp_path: Path) ->
     ready = prepare_retraining(replace(study, held_out=str(kitti_folder(tmp_path / "held_out", 1))), OUT)
     assert [arm.folder for arm in ready.attacks] == ["combo-2"]
     assert list(ready.workers[0].source.identifiers()) == ["000000", "000001"]
-
-
-def test_a_source_among_names() -> None:
-    class Source:
-        def identifiers(self) -> Sequence[str]:
-            return "c", "a", "b"
-
-    assert list(FrameSubset(Source(), frozenset(("a", "c"))).identifiers()) == ["c", "a"]  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture

@@ -1,12 +1,9 @@
 """How likely arms miss a car, from hand-made counts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from drivesem.run.finished import load_runs
@@ -21,7 +18,6 @@ from tools.experiments.detection.robustness import (
     StateEvaluator,
     compare_robustness,
     evaluate_states,
-    redrawn_count,
 )
 from tools.experiments.settings import StudyConfig
 
@@ -111,29 +107,6 @@ def test_seeds_count_together() -> None:
     assert row.title == "ours"
 
 
-def test_without_the_controls_no_goal_is_reported() -> None:
-    arms = [ARMS[0], ARMS[3]]
-    rows = by_arm((20, 8), arms)
-    assert rows["certain"].short_of is None
-    assert rows["certain"].to_row()["goal"] is None
-    assert rows["certain"].fewer == {}
-
-
-def test_what_nobody_loses_has_no_share_of_it() -> None:
-    none = by_arm((0, 0, 0, 0))["certain"]
-    assert none.failures[ANYWHERE].value == 0
-    assert none.fewer[ANYWHERE, "benign"].value is None
-    assert none.short_of == ("third", "benign", "random")
-
-
-def test_frames_without_a_second_renderer_are_left_out_of_its_share_alone() -> None:
-    both = frames({ANYWHERE: (4, 4, 4, 4), REDRAWN: (10, 10, 10, 10)})
-    some = [one if i < 6 else replace(one, counts={ANYWHERE: one.counts[ANYWHERE]}) for i, one in enumerate(both)]
-    rows = {row.arm: row for row in compare_robustness(some, ARMS, DROPS, DRAWS, 0)}
-    assert rows["certain"].failures[REDRAWN].value == pytest.approx(10.5 / CARS)
-    assert np.isfinite(rows["certain"].failures[REDRAWN].high or np.nan)
-
-
 @pytest.mark.slow
 def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> None:
     """The same detector twice loses the same cars; going on asks nothing again."""
@@ -154,7 +127,3 @@ def test_all_detectors_see_the_same_states(small_run: Path, tmp_path: Path) -> N
         assert evaluate_states(run, attack, requested, study, tmp_path)[0] == [one]
         with pytest.raises(TypeError):
             evaluate_states(run, attack, requested[:2], study, tmp_path)
-
-
-def test_as_many_are_drawn_again_as_grading_has_drawn() -> None:
-    assert [redrawn_count(n) for n in (16, 32, 4, 1)] == [4, 8, 1, 1]

@@ -1,10 +1,8 @@
 """Stored results: read back they give the same tables, and damaged ones are refused in one line."""
 
-from __future__ import annotations
-
 import gzip
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detectors.types import CLASSES
-from drivesem.analysis.confirm.report import Confirmation, SurvivalRate
-from drivesem.analysis.transfer.matrix import SourceRun, TransferCounts, TransferTarget
+from drivesem.analysis.confirm import Confirmation, SurvivalRate
+from drivesem.analysis.transfer import SourceRun, TransferCounts, TransferTarget
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.coco import IOU_THRESHOLDS
 from drivesem.evaluation.matched_class import FALSE, IGNORED, TRUE, ThresholdMatches
@@ -24,7 +22,8 @@ from drivesem.failures.grades import Grade, Kind, SecondOpinion
 from drivesem.run.frame import detections_from_records
 from drivesem.run.results import BoxRecord, Failure, FrameResult
 from scene_ir.errors import FormatError
-from tools.experiments.detection.arms import PLACEBO, RANDOM, ArmRun, AttackArm, AttackTotals
+from tests.tools.experiments.detection.conftest import arm, arm_run, counted, frame
+from tools.experiments.detection.arms import PLACEBO, RANDOM, AttackArm, AttackTotals
 from tools.experiments.detection.counts import ArmCounts, DetectedObject, FailureRecord, FrameCounts, StudyCounts
 from tools.experiments.detection.labels import compare_frame_labels, compare_labels
 from tools.experiments.detection.report import build_results
@@ -49,9 +48,7 @@ CYCLIST = BoxRecord((300.0, 20.0, 330.0, 60.0), "Cyclist", score=0.123456)
 
 
 @pytest.fixture
-def single(
-    frame: Callable[..., Any], counted: Callable[..., ArmCounts], arm: Callable[..., AttackArm]
-) -> tuple[StudyConfig, StudyCounts]:
+def single() -> tuple[StudyConfig, StudyCounts]:
     """A graded attack by which cars are lost; a control of another detector; one that does nothing."""
     names = [f"{i:03d}" for i in range(4)]
     drawn = replace(CERTAIN_LOSS, error=None, index=None, second=SecondOpinion("generator", 4, 1, 4))
@@ -68,9 +65,7 @@ def single(
 
 
 @pytest.fixture
-def labels(
-    frame: Callable[..., Any], arm_run: Callable[..., ArmRun], arm: Callable[..., AttackArm]
-) -> tuple[StudyConfig, StudyCounts]:
+def labels() -> tuple[StudyConfig, StudyCounts]:
     """Cars that move away from their labels; one is ignored, one is lost."""
     results = [frame(f"{i:03d}", moved_by=11.0 * i, found=i < 3) for i in range(4)]
     ignored = replace(results[1].targets_moved[1], ignore=True)
@@ -189,7 +184,7 @@ def with_cyclist(results: list[FrameResult]) -> list[FrameResult]:
 
 
 @pytest.fixture
-def attacked(frame: Callable[..., FrameResult]) -> list[FrameResult]:
+def attacked() -> list[FrameResult]:
     """Four frames: the car moves, and is lost in two of them, once with certainty; one has a phantom."""
     results = [frame(f"{i:03d}", moved_by=9.0 * i, found=i < 2, success=i >= 2) for i in range(4)]
     phantom = replace(results[3].detections_attacked[0], xyxy=(400.0, 20.0, 440.0, 60.0), score=0.5)
@@ -198,9 +193,7 @@ def attacked(frame: Callable[..., FrameResult]) -> list[FrameResult]:
 
 
 @pytest.fixture
-def transfer(
-    attacked: list[FrameResult], frame: Callable[..., FrameResult]
-) -> tuple[StudyConfig, TransferStudyCounts]:
+def transfer(attacked: list[FrameResult]) -> tuple[StudyConfig, TransferStudyCounts]:
     """A run and its placebo on two detectors, one of which knows fewer classes."""
     study = StudyConfig(name="transfer", bootstrap=DRAWS, seed=3, out="elsewhere")
     still = with_cyclist([frame(f"{i:03d}") for i in range(4)])
@@ -215,9 +208,7 @@ def transfer(
 
 
 @pytest.fixture
-def retrain(
-    attacked: list[FrameResult], counted: Callable[..., ArmCounts], arm: Callable[..., Any]
-) -> tuple[StudyConfig, RetrainingCounts]:
+def retrain(attacked: list[FrameResult]) -> tuple[StudyConfig, RetrainingCounts]:
     """A detector and three retrained ones; the second renderer drew one of three frames."""
     study = StudyConfig(name="retrain", quick=True, bootstrap=DRAWS, arms="benign,random,ours")
     retrained = [one.name for one in build_retraining_arms(study)]

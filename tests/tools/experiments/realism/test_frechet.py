@@ -1,7 +1,5 @@
 """The Fréchet distance against its closed form, and Inception against a second writing of it in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

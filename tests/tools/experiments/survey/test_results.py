@@ -1,7 +1,5 @@
 """Krippendorff's alpha: his own example, bounds, and what leaves it undefined."""
 
-from __future__ import annotations
-
 import pytest
 
 from tools.experiments.survey.results import interval_distance, krippendorff_alpha, nominal_distance

@@ -1,7 +1,5 @@
 """Information worth: cases worked out by hand, bounds, and detection's points."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -25,7 +23,6 @@ from tools.experiments.worth.measures import (
     one_hot,
     points_from_detections,
     points_from_probabilities,
-    realism,
     worth_interval,
 )
 
@@ -55,12 +52,6 @@ def test_fractional_by_hand() -> None:
     expected = 1.1 / 1.5 * entropy(0.9 / 1.1, 0.2 / 1.1) + 0.4 / 1.5 * entropy(0.1 / 0.4, 0.3 / 0.4)
     weighted = information_worth(mu, np.array([0, 1]), np.array([1.0, 0.5]))
     assert weighted.value == pytest.approx(expected)
-
-
-def test_a_point_that_is_not_real_does_not_count() -> None:
-    answers, label = np.array([0, 0, 0]), np.array([0, 0, 1])
-    assert information_worth(one_hot(answers, 2), label).value == pytest.approx(entropy(1 / 3, 2 / 3))
-    assert information_worth(one_hot(answers, 2), label, np.array([1.0, 0.4, 0.0])).value == 0
 
 
 def test_a_wrong_but_tidy_classifier_is_worth_nothing() -> None:
@@ -93,12 +84,6 @@ def test_bounds_and_what_makes_no_difference(drawn: tuple[list[list[float]], lis
     assert information_worth(mu[:, ::-1], labels, rho * 0.5).value == pytest.approx(found.value, abs=1e-9)
     twice = information_worth(np.tile(mu, (2, 1)), np.tile(labels, 2), np.tile(rho, 2))
     assert twice.value == pytest.approx(found.value, abs=1e-9)
-
-
-def test_realism() -> None:
-    np.testing.assert_allclose(realism(np.array([0.0, 0.1, 0.4])), [1, 0.75, 0])
-    np.testing.assert_allclose(realism(np.array([0.0, 0.1]), largest=0.5), [1, 0.8])
-    np.testing.assert_allclose(realism(np.zeros(3)), 1)
 
 
 def test_bad_input() -> None:
@@ -252,13 +237,6 @@ def test_ignored_objects_are_no_points_and_excuse_detections() -> None:
     points = points_from_detections(targets((False, True, False)), found((100, "Car", 0.9), (0, "Car", 0.8)), 0.5)
     assert points.label.tolist() == [CAR, CAR, NOTHING, NOTHING]
     np.testing.assert_allclose(points.fractional[:, CAR], [0.8, 0, 0, 0])
-
-
-def test_false_detections_beyond_the_empty_places_are_left_out() -> None:
-    seen = found(*((x, "Car", 0.9) for x in range(300, 1000, 100)))
-    points = points_from_detections(targets(), seen, 0.5)
-    assert len(points.label) == 6
-    assert worth_interval(points, WorthSettings("binary", weighted=False)).value == 0  # tidy, and all wrong
 
 
 def test_frames_without_objects_and_realism_of_empty_places() -> None:

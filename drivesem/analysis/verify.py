@@ -1,11 +1,13 @@
-"""Recomputes one frame of a run from its folder, and compares pictures, detections, labels, success and grades."""
+"""Recomputes every frame of a run from its files and compares pictures, labels, success, grades, theta and totals."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,19 +15,34 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.verify.checks import CheckLog, Mismatch, check_change, check_feasibility
-from drivesem.attack.budgets import change_limits
+from drivesem.attack.budgets import change_limits, parse_budget
+from drivesem.attack.feasibility_check import ChangeLimits, check_limits, check_scene
 from drivesem.attack.labels import Difficulty, Labeller, SceneLabels, to_kitti_labels
-from drivesem.attack.space import Budget, Parameter, Parametrisation
-from drivesem.attack.targets import EvaluatedClasses, TargetSelection
+from drivesem.attack.space import Budget, Parameter, ParameterSpace, Parametrisation
+from drivesem.attack.targets import EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.config.commands import VerifyConfig
+from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
 from drivesem.evaluation import failures
 from drivesem.failures.certificate import CertificateRule, CompositorRenderer
 from drivesem.failures.grades import Certificate, Grade
 from drivesem.failures.grading import Grader
+from drivesem.run.attack import build_grader, resolve_parameters, summarise_run
 from drivesem.run.detection_cache import detect_objects, image_to_tensor
+from drivesem.run.driver import ProgressSettings, run_frame_jobs
+from drivesem.run.finished import (
+    HASHED_FRAME_FIELDS,
+    HASHED_RUN_FIELDS,
+    MANIFEST,
+    METRICS,
+    AttackRun,
+    hash_fields,
+    hash_frame_files,
+    hash_json,
+    load_runs,
+)
+from drivesem.run.folder import CONFIG, FRAMES, load_run_detector, load_trusted_config, result_settings
 from drivesem.run.frame import (
-    RESULT,
     EvaluatedScene,
     build_failure_records,
     build_grading_input,
@@ -34,7 +51,8 @@ from drivesem.run.frame import (
     target_records,
     targets_from_records,
 )
-from drivesem.run.manifest import HASHED_FRAME_FIELDS, hash_fields, hash_frame_files
+from drivesem.run.labels import RESULT
+from drivesem.run.records import from_json
 from drivesem.run.results import BoxRecord, Failure, FrameResult, load_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -42,6 +60,168 @@ from scene_ir.io import load_scene, to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Labels, Render, SceneIR
+
+WHOLE_RUN = "(run)"
+"""Stands for the name of a frame in differences of the run as a whole."""
+_NOT_COMPUTED = ("schema", "out", "seconds", "frames_without_vehicles", "frames_failed")
+"""Keys of metrics.json that do not follow from the frames. The last two are part of its hash."""
+_ROUNDING = 1e-9
+
+
+def run_verify(config: VerifyConfig) -> tuple[dict[str, Any], Path]:
+    """Verify a run, and write the report. Returns its data and file. Raises UsageError or SceneError for bad
+    input.
+    """
+    (run,) = load_runs([config.run or ""])
+    make_verifier = partial(FrameVerifier, config, run)
+    verifier = make_verifier()
+    out = Path(config.out) if config.out else run.folder / "verify.json"
+    if out.is_dir():
+        raise UsageError("--out", "a file", f"the folder {out}")
+    names = [frame.result.identifier for frame in run.frames][: config.limit]
+    progress_settings = ProgressSettings("checking frames", keep=False)
+    jobs = run_frame_jobs(names, verifier, make_verifier, config, progress_settings)
+    checks = [jobs.results[name] for name in names if name in jobs.results]
+    data = _to_json(run, checks, _check_totals(run, verifier), jobs.failed)
+    files.write_json(out, data)
+    return data, out
+
+
+class FrameVerifier:
+    """Verifies frames of a run; made once per process."""
+
+    def __init__(self, config: VerifyConfig, run: AttackRun) -> None:
+        attack = load_trusted_config(run.folder, config.trust)
+        detector = load_run_detector(attack, config.device)
+        self.run, self.attack = run, attack
+        self.manifest = RunManifest.read(run.folder / MANIFEST)
+        self.settings = RecordedSettings(
+            detector=detector,
+            device=config.device,
+            backend=attack.backend,
+            params=resolve_parameters(attack),
+            budget=parse_budget(attack.budget),
+            parametrisation=attack.parametrisation,
+            aim=TargetSelection.from_options(attack.target_objects, attack.target_classes),
+            t_star=resolve_t_star(detector, attack.t_star),
+            hashes=self.manifest.frames,
+            field_hashes=self.manifest.frame_fields,
+            grader=build_grader(replace(attack, confirm=False), detector),
+        )
+
+    def __call__(self, name: str) -> FrameCheck:
+        """Verify one frame."""
+        return check_frame(name, self.run.folder / FRAMES / name, self.settings)
+
+
+@dataclass(frozen=True, slots=True)
+class RunManifest:
+    """Settings and hashes in a run's manifest.json."""
+
+    settings: Mapping[str, Any]
+    """The run's settings."""
+    metrics: str
+    """Hash of metrics.json."""
+    frames: Mapping[str, Mapping[str, str]]
+    """Hashes by frame and file."""
+    run_fields: Mapping[str, str]
+    """Hashes of values in metrics.json."""
+    frame_fields: Mapping[str, Mapping[str, str]]
+    """Hashes of values in result.json, by frame."""
+
+    @classmethod
+    def read(cls, path: Path) -> RunManifest:
+        """Read a manifest. Raises FormatError if it is damaged."""
+        data = files.read_json(path)
+        frames, settings = data.get("frames"), data.get("settings")
+        if not isinstance(frames, dict) or not all(isinstance(part, dict) for part in frames.values()):
+            raise FormatError(f"{path}: frames", "hashes by frame and file", "something else")
+        if not isinstance(settings, dict):
+            raise FormatError(f"{path}: settings", "settings by name", type(settings).__name__)
+        fields = from_json(_ManifestFields, data.get("fields", {}), f"{path}: fields")
+        return cls(settings, data.get("metrics"), frames, fields.run, fields.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class _ManifestFields:
+    run: dict[str, str] = field(default_factory=dict)
+    frames: dict[str, dict[str, str]] = field(default_factory=dict)
+
+
+def _check_totals(run: AttackRun, verifier: FrameVerifier) -> CheckLog:
+    """Compare config.yaml with the manifest, and metrics.json with the run's frames."""
+    log, metrics, manifest = CheckLog(), files.read_json(run.folder / METRICS), verifier.manifest
+    log.compare("files", METRICS, manifest.metrics, hash_json(metrics))
+    log.compare_values("files", METRICS, manifest.run_fields, hash_fields(metrics, HASHED_RUN_FIELDS))
+    settings, expected_settings = result_settings(verifier.attack), dict(manifest.settings)
+    for name in sorted(settings.keys() | expected_settings.keys()):
+        log.compare("settings", f"{CONFIG}: {name}", settings.get(name), expected_settings.get(name))
+    results = [frame.result for frame in run.frames]
+    params, detector = verifier.settings.params, verifier.settings.detector
+    computed = summarise_run(verifier.attack, params, detector, results).to_json()
+    for name in _NOT_COMPUTED:
+        del computed[name]
+    recorded = dict(_flatten("", metrics))
+    for name, value in _flatten("", computed):
+        expected = recorded.get(name)
+        log.record("totals", f"{METRICS}: {name}", expected, value, agrees=_is_equal(expected, value))
+    return log
+
+
+def _flatten(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the values of a nested object with their paths."""
+    if isinstance(value, dict) and value:
+        for key, part in value.items():
+            yield from _flatten(f"{name}.{key}" if name else key, part)
+    else:
+        yield name, value
+
+
+def _is_equal(expected: Any, value: Any) -> bool:
+    """Compare exactly, but floats up to rounding."""
+    numbers = isinstance(expected, int | float) and isinstance(value, float)
+    return math.isclose(expected, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING) if numbers else expected == value
+
+
+def _to_json(
+    run: AttackRun, checked: Sequence[FrameCheck], totals: CheckLog, failed: dict[str, str]
+) -> dict[str, Any]:
+    differences: list[tuple[str, Mismatch]] = [(c.identifier, d) for c in checked for d in c.differences]
+    differences += [(WHOLE_RUN, d) for d in totals.differences]
+    rows = []
+    for check, holds in CHECKS.items():
+        own = [name for name, d in differences if d.check == check]
+        rows.append(
+            {
+                "name": check,
+                "holds": holds,
+                "compared": sum(c.compared.get(check, 0) for c in (*checked, totals)),
+                "differing": len(own),
+                "frames_differing": list(dict.fromkeys(own)),
+            }
+        )
+    pictures = {name for c in checked for name in c.levels}
+    return {
+        "run": str(run.folder),
+        "detector": run.detector,
+        "params": run.params,
+        "frames": len(checked),
+        "frames_of_run": len(run.frames),
+        "agree": not differences and not failed,
+        "checks": rows,
+        "rendered_again": {
+            name: {
+                "largest_level": max(c.levels[name].largest for c in checked),
+                "largest_share": max(c.levels[name].share for c in checked),
+            }
+            for name in sorted(pictures)
+        },
+        "tolerances": {"levels": LEVELS, "box_px": BOX_PX, "score": SCORE, "label": LABEL, "draws": DRAWS},
+        "differences": [{"frame": name, **asdict(d)} for name, d in differences],
+        "frames_ungraded": sum(not frame.result.graded for frame in run.frames),
+        "frames_failed": failed,
+    }
+
 
 BENIGN, RERENDER, COUNTEREXAMPLE = "benign.png", "rerender.png", "counterexample.png"
 LEVELS = 1
@@ -155,10 +335,9 @@ def check_frame(identifier: str, folder: Path, settings: RecordedSettings) -> Fr
             for name, image in pictures.items()
         }
     names = EvaluatedClasses.from_detector(settings.detector).names
-    for name, field in _DETECTIONS.items():
-        _compare_boxes(
-            log, "detections", field, getattr(result, field), detection_records(detections[name], names)
-        )
+    for name, recorded in _DETECTIONS.items():
+        found_records = detection_records(detections[name], names)
+        _compare_boxes(log, "detections", recorded, getattr(result, recorded), found_records)
     _check_success(log, folder, result, rerender.labels, _SceneChange(base, perturbed), detections, settings)
     if result.graded:
         _check_grades(log, result, rerender, _SceneChange(base, perturbed), detections, settings)
@@ -390,8 +569,8 @@ def _compare_labels(log: CheckLog, name: str, written: Labels, own: Labels) -> b
     log.compare("labels", f"{name}: DontCare", *regions)
     if written.kind != own.kind or regions[0] != regions[1]:
         return False
-    for field in _LABEL_FIELDS:
-        _compare_rows(log, f"{name}: objects[{{}}].{field}", getattr(written, field), getattr(own, field))
+    for column in _LABEL_FIELDS:
+        _compare_rows(log, f"{name}: objects[{{}}].{column}", getattr(written, column), getattr(own, column))
     _compare_rows(log, f"{name}: DontCare[{{}}]", written.ignore_xyxy, own.ignore_xyxy)
     return True
 
@@ -414,3 +593,184 @@ def _targets_from_labels(written: Labels, own: SceneLabels, ignore: Tensor) -> T
     boxes_xyxy[own.in_view] = written.boxes_xyxy
     boxes = replace(own, boxes_xyxy=boxes_xyxy, regions_xyxy=written.ignore_xyxy).targets
     return Targets(boxes.boxes_xyxy, boxes.labels, ignore if len(ignore) == len(boxes) else boxes.ignore)
+
+
+CHECKS: Mapping[str, str] = {
+    "files": "all files of the frames, and metrics.json, have the hashes in manifest.json",
+    "settings": "config.yaml has the settings in manifest.json",
+    "pictures": "re-rendering the saved scene reproduces the three pictures",
+    "detections": "the detector's detections in the three pictures are the recorded ones",
+    "labels": "both label files and the recorded targets follow from the saved scene",
+    "success": "lost objects, phantoms, and success in both label modes follow from labels and detections",
+    "grades": "new draws reproduce each certificate; grades follow from their evidence",
+    "feasibility": "the independent check agrees on the saved scene, and the change is within the budget",
+    "theta": "theta.json, result.json and the saved scene hold the same change",
+    "totals": "metrics.json follows from the frames and config.yaml",
+}
+"""Checks in the order of the report, and what holds if nothing differs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mismatch:
+    """A difference between a run's result and its files."""
+
+    check: str
+    """Name of the check."""
+    field: str
+    """Such as `success_moved` or `objects[3].yaw`."""
+    expected: str
+    """Value in the run's result."""
+    found: str
+    """Value that follows from its files."""
+
+
+@dataclass(slots=True)
+class CheckLog:
+    """Counts comparisons, and collects the differences."""
+
+    compared: dict[str, int] = field(default_factory=dict)
+    """Number of comparisons by check."""
+    differences: list[Mismatch] = field(default_factory=list)
+    """Values that differ."""
+
+    def compare(self, check: str, name: str, expected: object, found: object) -> None:
+        """Compare two values exactly.
+
+        Args:
+            check: Name of the check.
+            name: Name of the value.
+            expected: Value in the run's result.
+            found: Value that follows from its files.
+        """
+        self.record(check, name, expected, found, agrees=expected == found)
+
+    def compare_values(self, check: str, file: str, expected: Mapping[str, str], found: Mapping[str, str]) -> None:
+        """Compare several values of a file exactly.
+
+        Args:
+            check: Name of the check.
+            file: The file.
+            expected: Values in the run's result, by name.
+            found: Values that follow from its files.
+        """
+        for name, value in expected.items():
+            self.compare(check, f"{file}: {name}", value, found.get(name))
+
+    def record(self, check: str, name: str, expected: object, found: object, agrees: bool) -> None:
+        """Record a comparison.
+
+        Args:
+            check: Name of the check.
+            name: Name of the value.
+            expected: Value in the run's result.
+            found: Value that follows from its files.
+            agrees: Whether they agree.
+        """
+        self.compared[check] = self.compared.get(check, 0) + 1
+        if not agrees:
+            self.differences.append(Mismatch(check, name, _format_value(expected), _format_value(found)))
+
+
+def _format_value(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "; ".join(_format_value(part) for part in value) or "none"
+    return str(value)
+
+
+THETA = "theta.json"
+BOUND = 1e-6
+"""Tolerance of theta's bounds, in its units: above float32 rounding, below a sign step."""
+SCENE = 1e-5
+"""Tolerance between the scene that theta gives and the saved one (m, rad, unit boxes, codes)."""
+_MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code")
+_CODES = ("weather", "foliage", "light")
+
+
+def check_change(
+    log: CheckLog,
+    folder: Path,
+    result: FrameResult,
+    base: SceneIR,
+    perturbed: SceneIR,
+    params: Sequence[Parameter],
+    budget: Budget,
+    parametrisation: Parametrisation,
+) -> None:
+    """Compare theta of result.json with theta.json, the run's bounds, and the saved scene.
+
+    Args:
+        log: Records the comparisons.
+        folder: The frame's folder.
+        result: The frame's result.
+        base: The scene before the change.
+        perturbed: The saved scene.
+        params: The run's parameters.
+        budget: The run's budget.
+        parametrisation: The run's parametrisation.
+
+    Raises:
+        FormatError: theta.json is damaged.
+    """
+    written = files.read_json(folder / THETA)
+    if not isinstance(written, dict):
+        raise FormatError(str(folder / THETA), "coordinates by name", type(written).__name__)
+    log.compare("theta", f"{THETA}, names", [c.name for c in result.theta], list(written))
+    for c in result.theta:
+        if c.name in written:
+            expected = {"value": c.value, "unit": c.unit, "bounds": [c.lower, c.upper], "display": c.display}
+            log.compare("theta", f"{THETA}: {c.name}", expected, written[c.name])
+    space = ParameterSpace(base, params, budget, parametrisation=parametrisation)
+    names = [space.name(i) for i in range(space.dim)]
+    log.compare("theta", "coordinates", [c.name for c in result.theta], names)
+    if len(result.theta) != space.dim:
+        return
+    for c, lower, upper in zip(result.theta, space.lower.tolist(), space.upper.tolist(), strict=True):
+        bounds, own = f"[{c.lower:g}, {c.upper:g}]", f"[{lower:g}, {upper:g}]"
+        same = abs(c.lower - lower) <= BOUND and abs(c.upper - upper) <= BOUND
+        log.record("theta", f"{c.name}, bounds", bounds, own, agrees=same)
+        log.record(
+            "feasibility",
+            f"{c.name}, budget",
+            f"a value in {own}",
+            c.value,
+            agrees=lower - BOUND <= c.value <= upper + BOUND,
+        )
+    theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
+    _compare_scenes(log, space.apply(base, theta), perturbed)
+
+
+def _compare_scenes(log: CheckLog, expected: SceneIR, found: SceneIR) -> None:
+    """Compare the scene that theta gives with the saved one."""
+    for name in _MOVED:
+        rows = zip(getattr(expected.objects, name), getattr(found.objects, name), strict=True)
+        for i, (one, other) in enumerate(rows):
+            _compare_tensors(log, f"scene: objects[{i}].{name}", one, other)
+    for name in _CODES:
+        one, other = (getattr(scene.environment, name) for scene in (expected, found))
+        _compare_tensors(log, f"scene: {name}", one, other)
+
+
+def _compare_tensors(log: CheckLog, name: str, expected: Tensor, found: Tensor) -> None:
+    differences = (expected - found).abs().reshape(-1)
+    worst = int(differences.argmax())
+    pair = [f"{float(side.reshape(-1)[worst]):.6g}" for side in (expected, found)]
+    log.record("theta", name, *pair, agrees=float(differences[worst]) <= SCENE)
+
+
+def check_feasibility(
+    log: CheckLog, result: FrameResult, base: SceneIR, perturbed: SceneIR, reach: ChangeLimits
+) -> None:
+    """Repeat the independent feasibility check, and check the saved poses against the run's budget.
+
+    Args:
+        log: Records the comparisons.
+        result: The frame's result.
+        base: The scene before the change.
+        perturbed: The saved scene.
+        reach: Limits of the change.
+    """
+    found = check_scene(base, perturbed, result.checked_by, result.joint_weather, reach)
+    log.compare("feasibility", "violations", list(result.violations), found)
+    log.compare("feasibility", "budget", [], check_limits(base, perturbed, reach))

@@ -1,27 +1,312 @@
-"""Reports which failures survive a second renderer: tables, Markdown, CSV, and a sheet of pictures per frame."""
+"""Tests counterexamples of a run again with a second renderer, and reports which failures survive."""
 
 from __future__ import annotations
 
+import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
-from detectors.types import CLASSES
-from drivesem.analysis.confirm.comparison import ConfirmedFrame, RendererFailure
+from detectors import boxes
+from detectors.types import CLASSES, Detections, Targets
 from drivesem.attack.targets import HEADLINE, EvaluatedClasses
-from drivesem.evaluation import coco
+from drivesem.config.commands import ConfirmConfig
+from drivesem.config.constraints import is_url
+from drivesem.config.errors import UsageError
+from drivesem.config.options import DEMO
+from drivesem.evaluation import coco, failures
 from drivesem.evaluation.resampling import wilson
+from drivesem.failures.second_renderer.base import SecondRender
+from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, measure_text, paste, write_text
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
-from drivesem.run.finished import RunFrame
-from drivesem.run.frame import detections_from_records, targets_from_records
+from drivesem.run.detection_cache import detect_objects, image_to_tensor
+from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames
+from drivesem.run.finished import METRICS, AttackRun, RunFrame, load_runs
+from drivesem.run.folder import FRAMES, PRESENTATION, claim_folder, load_run_detector, load_trusted_config
+from drivesem.run.frame import detection_records, detections_from_records, target_records, targets_from_records
 from drivesem.run.report.pictures import draw_overlay
 from drivesem.run.results import BoxRecord, Failure, FrameResult
 from scene_ir import files
+from scene_ir.io import load_scene, to_uint8
+
+
+@dataclass(frozen=True, slots=True)
+class RendererFailure:
+    """A failure in one of the two pictures."""
+
+    kind: str
+    """"lost" or "phantom"."""
+    label: str
+    """Class."""
+    xyxy: tuple[float, float, float, float]
+    """True box of a lost object, detected box of a phantom, px."""
+    index: int | None
+    """Number of the lost object; None for a phantom."""
+    score: float | None
+    """Score of a phantom, in [0, 1]."""
+    survives: bool
+    """Whether the other picture has it too: the same vehicle lost, or a phantom of the class at IoU >= 0.5."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectComparison:
+    """One of the scene's objects in both pictures."""
+
+    index: int
+    """Number of the object."""
+    judged: bool
+    """Whether it counts in the second renderer's picture of the change."""
+    iou_benign: float | None
+    """IoU of its two labels before the change; None if it is not visible."""
+    iou: float | None
+    """IoU of its two labels after the change; None if it is not visible."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConfirmedFrame:
+    """One frame, re-rendered with a second renderer."""
+
+    identifier: str
+    """The frame."""
+    source: str
+    """Digest of the run's result.json."""
+    renderer: str
+    """Name of the second renderer."""
+    compositor: tuple[RendererFailure, ...]
+    """Failures in the compositor's picture."""
+    second: tuple[RendererFailure, ...]
+    """Failures in the second renderer's picture."""
+    objects: tuple[ObjectComparison, ...]
+    """The scene's objects in both pictures."""
+    targets_benign: tuple[BoxRecord, ...]
+    """True boxes in the second renderer's picture before the change."""
+    targets_changed: tuple[BoxRecord, ...]
+    """True boxes in its picture after the change."""
+    detections_benign: tuple[BoxRecord, ...]
+    """Detections in its picture before the change."""
+    detections_changed: tuple[BoxRecord, ...]
+    """Detections in its picture after the change."""
+    not_carried: tuple[str, ...]
+    """Parts of the change that the second renderer cannot render."""
+    seconds: float
+    """Run time; the only field that may differ between two calls."""
+
+
+@dataclass(frozen=True, slots=True)
+class RendererTargets:
+    """A second renderer's labels before and after the change, row by row: objects, then regions of both pictures.
+    What is ignored in one picture is ignored in both.
+    """
+
+    benign: Targets
+    """Before the change."""
+    changed: Targets
+    """After the change."""
+
+
+def pair_targets(before: SecondRender, after: SecondRender, count: int) -> RendererTargets:
+    """Align the labels of two renders of a scene.
+
+    Args:
+        before: Render before the change.
+        after: Render after it.
+        count: Number of objects.
+    """
+    first, second = before.targets, after.targets
+    ignore = first.ignore[:count] | second.ignore[:count]
+    regions = [targets.boxes_xyxy[count:] for targets in (first, second)]
+    labels = [targets.labels[count:] for targets in (first, second)]
+
+    def append_regions(own: Targets) -> Targets:
+        all_regions = torch.cat(regions)
+        return Targets(
+            torch.cat([own.boxes_xyxy[:count], all_regions]),
+            torch.cat([own.labels[:count], *labels]),
+            torch.cat([ignore, torch.ones(len(all_regions), dtype=torch.bool)]),
+        )
+
+    return RendererTargets(append_regions(first), append_regions(second))
+
+
+def compare_failures(
+    result: FrameResult,
+    targets: RendererTargets,
+    detections: Sequence[Detections],
+    classes: EvaluatedClasses,
+    t_star: float,
+) -> tuple[tuple[RendererFailure, ...], tuple[RendererFailure, ...]]:
+    """Compare the failures in both renderers' pictures.
+
+    Args:
+        result: The run's result.
+        targets: Labels of the second renderer.
+        detections: Detections in its pictures, before and after the change.
+        classes: The detector's evaluated classes.
+        t_star: Score from which a detection counts.
+
+    Returns:
+        Failures in the compositor's picture, from the result, and in the second renderer's picture.
+    """
+    benign, changed = classes.map_targets(targets.benign), classes.map_targets(targets.changed)
+    before, after = detections
+    found = failures.find_failures(benign, before, changed, after, t_star)
+    second = []
+    for i in found.lost:
+        label = CLASSES[int(targets.changed.labels[i])]
+        second.append(RendererFailure("lost", label, _xyxy(changed.boxes_xyxy[i]), i, None, False))
+    for i in found.phantoms:
+        label, score = classes.names[int(after.labels[i])], float(after.scores[i])
+        second.append(RendererFailure("phantom", label, _xyxy(after.boxes_xyxy[i]), None, score, False))
+    compositor = [
+        RendererFailure(f.kind, f.label, f.xyxy, f.index if f.kind == "lost" else None, f.score, False)
+        for f in result.failures
+    ]
+    return _with_survival(compositor, second), _with_survival(second, compositor)
+
+
+def _with_survival(
+    own: Sequence[RendererFailure], others: Sequence[RendererFailure]
+) -> tuple[RendererFailure, ...]:
+    return tuple(
+        dataclasses.replace(one, survives=any(_is_same_failure(one, other) for other in others)) for one in own
+    )
+
+
+def _is_same_failure(one: RendererFailure, other: RendererFailure) -> bool:
+    if one.kind != other.kind:
+        return False
+    if one.kind == "lost":
+        return one.index is not None and one.index == other.index
+    return one.label == other.label and _iou(one.xyxy, other.xyxy) >= failures.MATCH_IOU
+
+
+def compare_objects(result: FrameResult, targets: RendererTargets, count: int) -> tuple[ObjectComparison, ...]:
+    """Compare the objects' boxes in both renderers' pictures.
+
+    Args:
+        result: The run's result.
+        targets: Labels of the second renderer.
+        count: Number of objects.
+    """
+    benign = {t.index: t.xyxy for t in result.targets_benign if t.index is not None}
+    moved = {t.index: t.xyxy for t in result.targets_moved if t.index is not None}
+
+    def label_iou(box: Sequence[float], others: Targets, i: int) -> float | None:
+        other = others.boxes_xyxy[i]
+        return _iou(box, _xyxy(other)) if float(boxes.area(other[None])) > 0 else None
+
+    return tuple(
+        ObjectComparison(
+            i,
+            not bool(targets.changed.ignore[i]),
+            label_iou(benign[i], targets.benign, i),
+            label_iou(moved[i], targets.changed, i),
+        )
+        for i in range(count)
+    )
+
+
+def _iou(one: Sequence[float], two: Sequence[float]) -> float:
+    return float(boxes.iou_matrix(torch.tensor([one]), torch.tensor([two]))[0, 0])
+
+
+def _xyxy(box: Tensor) -> tuple[float, float, float, float]:
+    x0, y0, x1, y1 = box.tolist()
+    return x0, y0, x1, y1
+
+
+_WRITTEN = ("confirm.json", "confirm.md", "confirm.csv", FRAMES)
+_FREE = (*PRESENTATION, "run", "root", "seed")
+
+
+def run_confirm(config: ConfirmConfig) -> tuple[Confirmation, AnalysisReport]:
+    """Re-test a run's frames, or resume, and write the report.
+
+    Raises UsageError or SceneError for bad input, NoSecondRendererError before anything is written.
+    """
+    (run,) = load_runs([config.run or ""], config.limit)
+    out = Path(config.out) if config.out else run.folder / "confirm"
+    make_analyser = partial(ConfirmAnalyser, config, run, out)
+    analyser = make_analyser()
+    claim_folder(out, config, _WRITTEN, _FREE)
+    names = [frame.result.identifier for frame in run.frames]
+    progress_settings = ProgressSettings("re-rendering frames", keep=False)
+    confirmed, failed = analyse_frames(names, analyser, make_analyser, config, progress_settings)
+    if not confirmed:
+        raise UsageError("--run", "a run with frames that can be used", run.folder)
+    results = [frame.result for frame in run.frames if frame.result.identifier not in failed]
+    classes = EvaluatedClasses.from_detector(analyser.detector).names
+    confirmation = summarise_confirmation(confirmed, results, classes, analyser.t_star)
+    facts = {
+        "run": str(run.folder),
+        "detector": run.detector,
+        "params": run.params,
+        "t_star": analyser.t_star,
+    }
+    report = build_confirm_report(out, confirmation, confirmed, facts, failed)
+    report.write()
+    return confirmation, report
+
+
+class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
+    """Re-renders frames of a run and compares the detector's failures."""
+
+    file, kind, schema = "confirmed.json", ConfirmedFrame, 2
+
+    def __init__(self, config: ConfirmConfig, run: AttackRun, out: Path) -> None:
+        super().__init__(run.folder, out)
+        attack = load_trusted_config(run.folder, config.trust)
+        self.frames = {frame.result.identifier: frame for frame in run.frames}
+        if attack.dataset == DEMO and config.root is not None:
+            raise UsageError("--root", "none for the embedded scenes", config.root)
+        if config.root is None and is_url(attack.root or ""):  # the local copy may be anywhere
+            raise UsageError("--root", "the run's data set, as the run read it from a URL", attack.root)
+        self.second = SecondRenderers(attack.dataset, config.root or attack.root)
+        self.second.check()
+        self.detector = load_run_detector(attack, config.device)
+        self.device, self.t_star = config.device, float(files.read_json(run.folder / METRICS)["t_star"])
+
+    def analyse(self, name: str, folder: Path) -> ConfirmedFrame:
+        """See `FrameAnalyser`. Raises SceneError if no second renderer reproduces the frame's photograph."""
+        start = time.perf_counter()
+        changed = load_scene(self.run_folder / FRAMES / name / "scene")
+        renderer = self.second.renderer_for(name, changed)
+        renders = [renderer.render(scene) for scene in (changed.as_photographed(), changed)]
+        count = len(changed.objects)
+        targets = pair_targets(renders[0], renders[1], count)
+        classes = EvaluatedClasses.from_detector(self.detector)
+        pictures = [to_uint8(render.image) for render in renders]
+        detections = [detect_objects(self.detector, image_to_tensor(p, self.device)) for p in pictures]
+        result = self.frames[name].result
+        compositor, second = compare_failures(result, targets, detections, classes, self.t_star)
+        confirmed = ConfirmedFrame(
+            identifier=name,
+            source=self.source_digest(name),
+            renderer=renderer.name,
+            compositor=compositor,
+            second=second,
+            objects=compare_objects(result, targets, count),
+            targets_benign=target_records(targets.benign, CLASSES, count),
+            targets_changed=target_records(targets.changed, CLASSES, count),
+            detections_benign=detection_records(detections[0], classes.names),
+            detections_changed=detection_records(detections[1], classes.names),
+            not_carried=renderer.unsupported_changes(changed),
+            seconds=round(time.perf_counter() - start, 3),
+        )
+        files.write_png(folder / f"{renderer.name}.png", pictures[1])
+        sheet = draw_confirm_sheet(self.frames[name], confirmed, pictures[1], self.t_star)
+        files.write_png(folder / "sheet.png", sheet)
+        return confirmed
+
 
 SURVIVE, SAME, LOST, PHANTOMS, NEW = (
     "frames",

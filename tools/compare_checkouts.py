@@ -1,7 +1,7 @@
 """What a command costs in this checkout and in another one, measured in turn.
 
     git worktree add --detach ../before 24a3e74
-    python -m tools.beside ../before -- attack --combo 2 --dataset kitti --root KITTI --limit 1 --out {out}
+    python -m tools.compare_checkouts ../before -- attack --combo 2 --dataset kitti --root KITTI --limit 1 --out {out}
 
 The words after -- are `drivesem`'s. {out} is a fresh folder each time; --keep DIR keeps the folders of the last
 round as DIR/before and DIR/now. Seconds are the processor's, of all threads and processes that the command starts:
@@ -43,10 +43,10 @@ def run(checkout: Path, words: Sequence[str], out: Path) -> RunTime:
     """One run of a checkout's `drivesem`. UsageError with its last line where it ends with another code than 0 or
     1, a check that failed.
     """
-    told = [word.replace(OUT, str(out)) for word in words]
+    command_words = [word.replace(OUT, str(out)) for word in words]
     before, start = os.times(), time.perf_counter()
     environment = os.environ | {"PYTHONPATH": str(checkout)}
-    whole = [sys.executable, "-c", _START, *told]
+    whole = [sys.executable, "-c", _START, *command_words]
     done = subprocess.run(whole, capture_output=True, text=True, check=False, env=environment, cwd=checkout)
     clock, after = time.perf_counter() - start, os.times()
     if done.returncode not in (0, 1):
@@ -62,7 +62,7 @@ def compare(before: Path, words: Sequence[str], rounds: int, keep: Path | None) 
     spent: dict[str, list[RunTime]] = {name: [] for name in checkouts}
     for number in range(rounds):
         for name in sorted(checkouts, reverse=bool(number % 2)):
-            with tempfile.TemporaryDirectory(prefix="drivesem-beside-") as folder:
+            with tempfile.TemporaryDirectory(prefix="drivesem-compare-") as folder:
                 out = Path(folder) / "out"
                 spent[name].append(run(checkouts[name], words, out))
                 if keep is not None and number == rounds - 1 and out.exists():
@@ -72,10 +72,12 @@ def compare(before: Path, words: Sequence[str], rounds: int, keep: Path | None) 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point: prints both medians and their ratio. Exit code 2 for a command that does not work."""
-    parser = argparse.ArgumentParser(prog="python -m tools.beside", description=(__doc__ or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.compare_checkouts", description=(__doc__ or "").partition("\n")[0]
+    )
     parser.add_argument("before", type=Path, help="another checkout")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--keep", type=Path, help="where {out} of the last round is kept")
+    parser.add_argument("--keep", type=Path, help="folder for {out} of the last round")
     parser.add_argument("words", nargs="+", help="a command of drivesem, after --")
     known = parser.parse_args(argv)
     try:

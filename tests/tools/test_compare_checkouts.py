@@ -1,12 +1,10 @@
-"""`python -m tools.beside`: two checkouts in turn, a folder each, and one line for what does not work."""
-
-from __future__ import annotations
+"""`python -m tools.compare_checkouts`: two checkouts in turn, a folder each, and one line for what does not work."""
 
 from pathlib import Path
 
 import pytest
 
-from tools import beside
+from tools import compare_checkouts
 
 _BUSY = """
 import sys, time
@@ -36,9 +34,11 @@ def test_both_are_measured_in_turn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = checkout(tmp_path / "a", 0.6)
-    monkeypatch.setattr(beside, "ROOT", checkout(tmp_path / "b", 0.1))
+    monkeypatch.setattr(compare_checkouts, "ROOT", checkout(tmp_path / "b", 0.1))
     keep = tmp_path / "kept"
-    assert beside.main([str(before), "--rounds", "2", "--keep", str(keep), "--", "attack", "{out}"]) == 0
+    assert (
+        compare_checkouts.main([str(before), "--rounds", "2", "--keep", str(keep), "--", "attack", "{out}"]) == 0
+    )
     said = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in said[:2]] == ["before", "now"]
     assert float(said[0].split()[1]) > float(said[1].split()[1]) + 0.3
@@ -50,10 +50,10 @@ def test_what_does_not_work_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = checkout(tmp_path / "a", 0)
-    monkeypatch.setattr(beside, "ROOT", before)
-    assert beside.main([str(before), "--", "attack", "--bad"]) == 2
-    assert beside.main([str(tmp_path), "--", "attack"]) == 2
-    assert beside.main([str(before), "--rounds", "0", "--", "attack"]) == 2
+    monkeypatch.setattr(compare_checkouts, "ROOT", before)
+    assert compare_checkouts.main([str(before), "--", "attack", "--bad"]) == 2
+    assert compare_checkouts.main([str(tmp_path), "--", "attack"]) == 2
+    assert compare_checkouts.main([str(before), "--rounds", "0", "--", "attack"]) == 2
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 3
     assert "--bad: expected nothing, found it" in said[0]

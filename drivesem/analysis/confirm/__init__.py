@@ -1,1 +1,0 @@
-"""Re-tests counterexamples with a second renderer."""

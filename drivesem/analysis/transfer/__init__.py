@@ -1,1 +1,0 @@
-"""Tests counterexamples on other detectors."""

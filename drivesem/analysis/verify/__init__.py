@@ -1,1 +1,0 @@
-"""Recomputes a run from its files and compares."""
