@@ -181,7 +181,7 @@ def test_json(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["convert", str(kitti), "--to", "yolo", "--out", str(tmp_path / "yolo"), "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["lost"]["3D box"] == 3
-    assert data["assumed"] == {}
+    assert data["assumed"] == {"val (same images as train)": 2}
 
 
 @pytest.mark.parametrize(
