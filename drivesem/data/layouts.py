@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from drivesem.data import coco_labels, kitti_labels
+from drivesem.data import coco_labels, kitti_labels, yolo_labels
 from drivesem.data.label_table import LabelTable
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
@@ -27,7 +27,8 @@ def detect_layout(path: Path) -> str | None:
         raise FormatError(str(path), "a .json or .yaml file, or a folder of labels", f"a {path.suffix or 'file'}")
     if not path.is_dir():
         raise FormatError(str(path), "a file or folder of labels", "nothing there")
-    if (path / "data.yaml").is_file():
+    has_kitti_labels = (path / "label_2").is_dir() or (path / "training" / "label_2").is_dir()
+    if not has_kitti_labels and yolo_labels.find_description(path) is not None:
         return "yolo"
     if coco_labels.find_annotation_files(path):
         return "coco"
@@ -36,13 +37,18 @@ def detect_layout(path: Path) -> str | None:
     with os.scandir(path) as entries:
         if any(_VKITTI2.match(entry.name) and entry.is_dir() for entry in entries):
             return "vkitti2"
-    folder = kitti_labels.find_label_folder(path)
-    if folder is None:
+    folder = kitti_labels.find_label_folder(path) or path / "labels"
+    if not folder.is_dir():
         return None
     # YOLO's lines begin with a class number, KITTI's with a name
-    starts = (files.read_text(folder / name).split(None, 1)[:1] for name in kitti_labels.list_text_files(folder))
-    first = next((words[0] for words in starts if words), "")
-    return "yolo" if first.isdecimal() else "kitti"
+    names = (
+        name for name in kitti_labels.list_text_files(folder) if yolo_labels.is_label_file(os.path.basename(name))
+    )
+    starts = (files.read_text(folder / name).split(None, 1)[:1] for name in names)
+    first = next((words[0] for words in starts if words), None)
+    if first is None and folder == path / "labels":
+        return None
+    return "yolo" if first is not None and first.replace(".", "", 1).isdecimal() else "kitti"
 
 
 def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:

@@ -1,7 +1,7 @@
 """YOLO's folders, `images/{train,val}`, `labels/{train,val}/000000.txt` and `data.yaml`: reader and writer.
 
-A label line is `class cx cy w h`: 0-based class, box centre and size as shares of the image's width and height
-(docs.ultralytics.com/datasets/detect). Its pixel column j spans [j, j + 1]; here it spans [j - 0.5, j + 0.5].
+`yolo_files` describes the folders that are read, `yolo_labels` the rows. In YOLO's pixels, column j spans [j, j + 1];
+here it spans [j - 0.5, j + 0.5].
 YOLO cannot hold masks, poses, truncation, occlusion, tracks, depth, semantic classes and regions to ignore: objects
 too small or too hidden to be labelled are background. The camera is written in KITTI's form to
 `calib/{train,val}/000000.txt`, which other readers of YOLO ignore.
@@ -10,25 +10,27 @@ too small or too hidden to be labelled are background. The camera is written in 
 from __future__ import annotations
 
 import math
+import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
 import yaml
 from numpy.typing import NDArray
 
+from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.coco import CATEGORIES, CATEGORY_IDS
 from drivesem.data.ground_truth import Exposure, FrameLocation
-from drivesem.data.kitti import finite_number, format_calibration, read_calibration
+from drivesem.data.kitti import format_calibration, read_calibration
 from drivesem.data.label_table import (
     REGION,
     LabelTable,
     WriteSummary,
     copy_images,
-    format_shortest,
     parse_camera_entry,
     xyxy_to_coco,
 )
@@ -36,12 +38,20 @@ from drivesem.data.photographs import (
     PNG_COMPRESSION,
     FrameIndex,
     check_focal,
-    list_images,
     pinhole_camera,
     read_focal_length,
     read_upright,
     read_upright_size,
 )
+from drivesem.data.yolo_files import (
+    SPLITS,
+    WITHOUT_IMAGE,
+    YoloDescription,
+    YoloFiles,
+    name_images,
+    replace_images_folder,
+)
+from drivesem.data.yolo_labels import EDGE, YoloRows, find_description, is_label_file, read_rows
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import to_tensor
@@ -51,12 +61,6 @@ DECIMALS = 8
 """Decimals of shares in generated data sets: 1e-8 of 4000 px is 4e-5 px."""
 TABLE_DECIMALS = 15
 """Decimals of shares in written tables, all that float64 has: 4e-12 px of 4000 px."""
-PARTS = ("train", "val", "test")
-"""Keys of `data.yaml` for folders of images."""
-_DIGITS = 18
-"""Limit of digits of a class number; Python refuses thousands."""
-EDGE = 1e-4
-"""How far a share may reach beyond the image, because of rounding."""
 
 
 class YoloWriter:
@@ -98,7 +102,7 @@ class YoloWriter:
         _write_yaml(self.root, parts, tuple(CATEGORIES))
 
 
-def _write_yaml(root: Path, parts: Mapping[str, str], kinds: Sequence[str]) -> None:
+def _write_yaml(root: Path, parts: Mapping[str, str | list[str]], kinds: Sequence[str]) -> None:
     content = {**parts, "nc": len(kinds), "names": dict(enumerate(kinds))}
     files.write_text(root / "data.yaml", yaml.safe_dump(content, sort_keys=False))
 
@@ -111,9 +115,10 @@ def _format_line(label: int, box_xywh: Sequence[float], size_wh: Sequence[int], 
 
 
 def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> WriteSummary:
-    """Write a table's objects with an area as parts "train" and "val" of a data set.
+    """Write a table's objects with an area, classes in its order, images and labels under the images' names.
 
-    Boxes are clipped to the image, since readers refuse shares above 1.
+    Each split is a folder of images and one of labels; without splits all frames are "train" and "val". Boxes are
+    clipped to the image, since readers refuse shares above 1.
 
     Args:
         table: Labels or detections.
@@ -121,39 +126,124 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
         images: Images to copy, by frame identifier.
 
     Returns:
-        Counts of files and lost values.
+        Counts of files, lost and assumed values.
 
     Raises:
-        FormatError: The size of an image is unknown.
+        FormatError: The size of an image is unknown, or a name leads out of the folder.
     """
-    table.require_sizes("yolo")
     table = table.with_box_format("xywh")
-    names, renamed = table.file_names()
+    table.require_sizes("yolo")
+    folders = _split_folders(table)
+    names = _file_names(table, folders)
     scored = table.scored
     objects, area = ~table.ignore & (table.kind != REGION), table.boxes[:, 2:].prod(axis=1)
     boxes, clipped = _clip_to_images(table)
     written = objects & (boxes[:, 2:] > 0).all(axis=1)
-    for name, rows, size_wh in zip(names, table.rows_by_frame(), table.sizes_wh.tolist(), strict=True):
+    paths = [f"{folder}/{name}" for folder, name in zip(folders, names, strict=True)]
+    for path, rows, size_wh in zip(paths, table.rows_by_frame(), table.sizes_wh.tolist(), strict=True):
         lines: list[str] = []
         for row in (row for row in rows if written[row]):
             line = _format_line(int(table.kind[row]), boxes[row].tolist(), size_wh, TABLE_DECIMALS)
-            lines.append(f"{line} {format_shortest(float(table.score[row]))}\n" if scored else f"{line}\n")
-        files.write_text(out / "labels" / "train" / f"{name}.txt", "".join(lines))
+            score = np.format_float_positional(table.score[row], trim="0")  # "1.0": whole numbers are track ids
+            lines.append(f"{line} {score}\n" if scored else f"{line}\n")
+        files.write_text(out / "labels" / f"{path}.txt", "".join(lines))
     for i, camera in table.cameras.items():
         calibration = format_calibration(torch.from_numpy(parse_camera_entry(camera)))
-        files.write_text(out / "calib" / "train" / f"{names[i]}.txt", calibration)
-    _write_yaml(out, {"train": "images/train", "val": "images/train"}, table.kinds)
-    folder = out / "images" / "train"
-    targets = {identifier: folder / name for identifier, name in zip(table.frames, names, strict=True)}
+        files.write_text(out / "calib" / f"{paths[i]}.txt", calibration)
+    targets = {identifier: out / "images" / path for identifier, path in zip(table.frames, paths, strict=True)}
+    splits, lists, lost = _describe_splits(table, folders)
+    for split, frames in lists.items():
+        lines = [f"./images/{paths[i]}{_suffix(table, i, images)}\n" for i in frames]
+        files.write_text(out / f"{split}.txt", "".join(lines))
+    first = next(iter(splits), "train")
+    parts: dict[str, str | list[str]] = dict.fromkeys(("train", "val"), "images/train")
+    parts |= {part: splits[first] for part in ("train", "val") if splits} | splits
+    _write_yaml(out, parts, table.kinds)
     masked = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-9) & written
     without = ~table.ignore & (table.boxes[:, 2:] <= 0).any(axis=1)
     more = {
         "box without area": int(without.sum()),
         "box beyond the image": int((clipped & objects & ~without).sum()),
         "area of the mask": int(masked.sum()),
+        "image file name": _count_renamed(table, names),
+        **lost,
     }
-    count = len(names) + 1 + copy_images(targets, images)
-    return WriteSummary.from_counts(count, table.count_lost(("score", "camera"), renamed | more))
+    count = len(names) + 1 + len(lists) + len(table.cameras) + copy_images(targets, images)
+    copied = [part for part in ("train", "val") if part not in (splits or ("train",))]
+    assumed = {f"{part} (same images as {first})": len(table.frames) for part in copied}
+    return WriteSummary.from_counts(count, table.count_lost(("score", "camera"), more), assumed)
+
+
+def _split_folders(table: LabelTable) -> list[str]:
+    """Return the folder of each frame: its first split, "rest" for frames of none, "train" without splits."""
+    splits = {name: rows for name, rows in table.splits.items() if len(rows)}
+    folder_of = {i: name.replace("/", "_") for name, rows in reversed([*splits.items()]) for i in rows}
+    return [folder_of.get(i, "rest" if splits else "train") for i in range(len(table.frames))]
+
+
+def _describe_splits(
+    table: LabelTable, folders: Sequence[str]
+) -> tuple[dict[str, str | list[str]], dict[str, list[int]], dict[str, int]]:
+    """Return the entries of `data.yaml` by split, frames of splits that must be lists, and lost values.
+
+    A split is a folder, or several, unless it shares only some of a folder's frames with another split.
+    """
+    members: dict[str, list[str]] = {}
+    for name, rows in table.splits.items():
+        if len(rows):
+            known = next((split for split in SPLITS if name.lower().startswith(split)), "train")
+            members.setdefault(known, []).append(name)
+    content, lists = dict[str, str | list[str]](), dict[str, list[int]]()
+    for split in sorted(members, key=SPLITS.index):
+        frames = sorted({i for name in members[split] for i in table.splits[name]})
+        used = list(dict.fromkeys(folders[i] for i in frames))
+        if sum(folder in used for folder in folders) == len(frames):
+            content[split] = f"images/{used[0]}" if len(used) == 1 else [f"images/{folder}" for folder in used]
+        else:
+            content[split], lists[split] = f"{split}.txt", frames
+    joined = [
+        name
+        for split, names in members.items()
+        for name in names
+        if len(names) > 1 or not name.lower().startswith(split)
+    ]
+    lost = {
+        "split": sum(len(table.splits[name]) for name in joined),
+        "frame of no split (not in data.yaml)": folders.count("rest") if content else 0,
+    }
+    return content, lists, lost
+
+
+def _file_names(table: LabelTable, folders: Sequence[str]) -> list[str]:
+    """Return the path of each image below its split's folder, without suffix: its own if it is named after its frame,
+    else the frame's identifier.
+    """
+    names: list[str] = []
+    for i, (identifier, folder) in enumerate(zip(table.frames, folders, strict=True)):
+        own = os.path.splitext(table.image_files.get(i, ""))[0]
+        flat_own, flat = own.replace("/", "_"), identifier.replace("/", "_")
+        name = own if flat_own.endswith(flat) and own.count("/") >= identifier.count("/") else identifier
+        name = name.removeprefix(f"{folder}/")
+        if name.startswith("/") or ".." in name.split("/") or "\0" in name:
+            raise FormatError(f"frame {identifier}", "a name below the folder of images", repr(name))
+        names.append(name)
+    count = Counter(zip(folders, names, strict=True))
+    unique = [count[key] == 1 for key in zip(folders, names, strict=True)]
+    return [name if good else frame for name, frame, good in zip(names, table.frames, unique, strict=True)]
+
+
+def _count_renamed(table: LabelTable, names: Sequence[str]) -> int:
+    stems = {i: os.path.splitext(file)[0] for i, file in table.image_files.items()}
+    own = {
+        i: stem for i, stem in stems.items() if stem.replace("/", "_").endswith(table.frames[i].replace("/", "_"))
+    }
+    return sum(PurePosixPath(stem).name != PurePosixPath(names[i]).name for i, stem in own.items())
+
+
+def _suffix(table: LabelTable, i: int, images: Mapping[str, Path]) -> str:
+    """Return the suffix of a frame's image, in the data set that is written."""
+    image = images.get(table.frames[i], Path(table.image_files.get(i, "")))
+    return image.suffix.lower() or ".png"
 
 
 def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -169,82 +259,11 @@ def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.
     return np.where(clipped[:, None], np.concatenate([corner, end - corner], axis=1), table.boxes), clipped
 
 
-class _YoloLabels(NamedTuple):
-    """Lines of a label file."""
-
-    kinds: list[int]
-    """Class numbers (N,)."""
-    boxes: list[list[float]]
-    """Left, top, width, height in COCO's pixels (N, 4)."""
-    scores: list[float]
-    """Scores (N,); empty for labels."""
-
-
-def _read_labels(path: Path, kinds: Mapping[int, str], size_wh: tuple[int, int], scored: bool) -> _YoloLabels:
-    """Read lines `class cx cy w h`, with a score if `scored`. Raises FormatError naming file, line and field."""
-    labels = _YoloLabels([], [], [])
-    for number, line in enumerate(files.read_text(path).splitlines(), start=1):
-        parts, where = line.split(), f"{path}:{number}"
-        if not parts:
-            continue
-        if len(parts) != 5 + scored:
-            expected = "6 fields: class cx cy w h score" if scored else "5 fields: class cx cy w h"
-            raise FormatError(where, expected, len(parts))
-        class_text = parts[0]
-        if not (class_text.isdecimal() and len(class_text) <= _DIGITS and int(class_text) in kinds):
-            raise FormatError(f"{where}: class", f"one of the {len(kinds)} in names", repr(class_text))
-        labels.kinds.append(int(class_text))
-        cx, cy, w, h = (
-            _parse_share(f"{where}: {name}", part) for name, part in zip(_SHARES, parts[1:5], strict=True)
-        )
-        width, height = size_wh
-        labels.boxes.append([(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height])
-        labels.scores.extend(finite_number(f"{where}: score", part) for part in parts[5:])
-    return labels
-
-
-_SHARES = ("cx", "cy", "w", "h")
-
-
-def _parse_share(where: str, text: str) -> float:
-    try:
-        share = float(text)
-    except ValueError:
-        share = math.nan
-    low = 0 if where.endswith((" w", " h")) else -EDGE
-    if not low <= share <= 1 + EDGE:
-        raise FormatError(where, "a share of the image in [0, 1]", repr(text))
-    return share
-
-
-def _to_table(
-    frames: Sequence[str],
-    kinds: Mapping[int, str],
-    texts: Sequence[_YoloLabels],
-    scored: bool,
-    sizes_wh: np.ndarray,
-) -> LabelTable:
-    """Convert label files, one for each frame, to a table."""
-    index = {number: i for i, number in enumerate(kinds)}
-    boxes = np.array([box for text in texts for box in text.boxes], np.float64).reshape(-1, 4)
-    table = LabelTable.from_columns(
-        frames,
-        list(kinds.values()),
-        np.repeat(np.arange(len(texts)), [len(text.boxes) for text in texts]),
-        [index[kind] for text in texts for kind in text.kinds],
-        boxes,
-        "xywh",
-        area=boxes[:, 2] * boxes[:, 3],
-        sizes_wh=sizes_wh,
-    )
-    return replace(table, score=np.array([s for text in texts for s in text.scores])) if scored else table
-
-
 def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable:
     """Read labels of a data set, or detections.
 
     Args:
-        path: Folder or YAML file of a data set, or folder of detections.
+        path: Folder or description of a data set, or folder of detections.
         scored: Read detections: text files with the classes and image sizes of `truth`.
         truth: Labels of the same frames, for detections.
 
@@ -255,32 +274,108 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
         FormatError: Names file, line and field.
     """
     if not scored:
-        dataset = YoloDataset(path)
-        return dataset.table(dataset.identifiers)
-    folder = path / "labels" if (path / "labels").is_dir() else path
-    paths = sorted(folder.rglob("[!.]*.txt"))
+        return YoloDataset(path).table()
     if truth is None or not truth.sizes_wh.all():
         raise FormatError(str(path), "labels with image sizes (YOLO's or COCO's)", "none")
-    kinds = dict(enumerate(truth.kinds))
+    if path.is_file():
+        raise FormatError(str(path), "a folder of detections", "a file")
+    return _read_detections(path, truth)
+
+
+def _read_detections(root: Path, truth: LabelTable) -> LabelTable:
+    """Read detections of labelled frames; a description in their folder names their classes, else `truth` does."""
+    folder = root / "labels" if (root / "labels").is_dir() else root
+    described = find_description(root)
+    lists = {described} if described is not None else set[Path]()
+    paths = sorted(path for path in folder.rglob("*.txt") if is_label_file(path.name) and path not in lists)
+    if folder == root:
+        paths = [path for path in paths if path.name not in ("train.txt", "val.txt", "test.txt")]
+    kinds, numbers = truth.kinds, np.arange(len(truth.kinds))
+    if described is not None:
+        names = YoloDescription(described).names
+        kinds = (*kinds, *(name for name in dict.fromkeys(names) if name not in kinds))
+        numbers = np.array([kinds.index(name) for name in names], np.int64)
+    frames = _match_frames(folder, paths, truth)
+    rows = read_rows([f"{path}" for path in paths], len(numbers), True)
+    if not len(rows.file):
+        raise FormatError(str(root), "at least one detection", f"{len(paths)} empty files")
     size = dict(zip(truth.frames, truth.sizes_wh.tolist(), strict=True))
-    for file in paths:
-        if file.stem not in size:
-            raise FormatError(str(file), f"a name of one of the {len(size)} labelled frames", repr(file.stem))
-    texts = [_read_labels(file, kinds, size[file.stem], True) for file in paths]
-    if not any(text.boxes for text in texts):
-        raise FormatError(str(path), "at least one detection", f"{len(paths)} empty files")
-    return _to_table([file.stem for file in paths], kinds, texts, True, np.zeros((len(paths), 2), np.int64))
+    sizes = np.array([size[frame] for frame in frames], np.int64).reshape(-1, 2)
+    table = _to_table(frames, kinds, numbers, rows, sizes)
+    count, skipped = account_for_files(root, [*paths, *lists])
+    account = DataAccount("yolo", len(paths), count, skipped, _count_classes(table), repairs=dict(rows.repairs))
+    return replace(table, score=rows.score, sizes_wh=np.zeros_like(sizes), account=account)
+
+
+def _match_frames(folder: Path, paths: Sequence[Path], truth: LabelTable) -> list[str]:
+    """Return the frame of each file of detections, by its path below the folder, else by its stem."""
+    known = set(truth.frames)
+    by_stem: dict[str, list[str]] = {}
+    for frame in truth.frames:
+        by_stem.setdefault(frame.rpartition("/")[2], []).append(frame)
+    file_of: dict[str, Path] = {}
+    for path in paths:
+        names = (path.relative_to(folder).with_suffix("").as_posix(), path.stem)
+        matches = [name for name in names if name in known] or by_stem.get(path.stem, [])
+        if not matches or (len(matches) > 1 and matches[0] not in names):
+            found = f"{path.stem!r}" if not matches else f"{path.stem!r}, the name of {len(matches)} frames"
+            raise FormatError(str(path), f"a name of one of the {len(known)} labelled frames", found)
+        if matches[0] in file_of:
+            raise FormatError(str(path), "one file of detections for a frame", f"also {file_of[matches[0]]}")
+        file_of[matches[0]] = path
+    return list(file_of)
+
+
+def _to_table(
+    frames: Sequence[str],
+    kinds: Sequence[str],
+    kind_of_number: NDArray[np.int64],
+    rows: YoloRows,
+    sizes_wh: NDArray[np.int64],
+) -> LabelTable:
+    """Convert rows to a table.
+
+    Args:
+        frames: Identifiers of the files' frames (F,).
+        kinds: Class names.
+        kind_of_number: Index in `kinds` of each class number.
+        rows: Rows of the files.
+        sizes_wh: Sizes of the images (F, 2) px.
+
+    Returns:
+        The table, in COCO's pixels, without scores.
+    """
+    scale = np.tile(sizes_wh[rows.file], 2).astype(np.float64)
+    low = (rows.shares[:, :2] - rows.shares[:, 2:] / 2) * scale[:, :2]
+    boxes = np.concatenate([low, rows.shares[:, 2:] * scale[:, 2:]], axis=1)
+    tracks = [None if math.isnan(track) else int(track) for track in rows.track.tolist()]
+    return LabelTable.from_columns(
+        frames,
+        kinds,
+        rows.file,
+        kind_of_number[rows.kind],
+        boxes,
+        "xywh",
+        area=boxes[:, 2] * boxes[:, 3],
+        sizes_wh=sizes_wh,
+        extra={"track": tracks} if any(track is not None for track in tracks) else {},
+    )
+
+
+def _count_classes(table: LabelTable) -> dict[str, int]:
+    """Count the boxes of the classes that occur."""
+    counts = np.bincount(table.kind, minlength=len(table.kinds)).tolist()
+    return {name: count for name, count in zip(table.kinds, counts, strict=True) if count}
 
 
 class YoloDataset(FrameIndex[Path]):
-    """The frames of a YOLO data set, all its parts together.
+    """The frames of a YOLO data set, all its splits together.
 
-    The labels of `.../images/NAME.png` are `.../labels/NAME.txt`; an image without such a file has no objects. A
-    frame's identifier is its file name without suffix. Images are turned upright by EXIF, as trainers read them.
+    An image without a label file has no objects. Images are turned upright by EXIF, as trainers read them.
     Truncation and 3D boxes are NaN, occlusion is 3, KITTI's values for unknown.
 
     Args:
-        root: Folder with `data.yaml`, or another YAML file of that form.
+        root: Folder with `data.yaml`, `obj.data` or `classes.txt`, or another YAML file of that form.
         focal_px: Focal length of images without a file in `calib`; by default EXIF's, or DEFAULT_FOCAL.
 
     Raises:
@@ -288,43 +383,94 @@ class YoloDataset(FrameIndex[Path]):
     """
 
     def __init__(self, root: Path, focal_px: float | None = None) -> None:
-        root = Path(root)
         check_focal(focal_px)
         self.focal_px = focal_px
-        path = root / "data.yaml" if root.is_dir() else root
-        content = _read_mapping(path)
-        self.class_names = _parse_names(path, content)
-        base = path.parent / _check_inside(path, "path", str(content.get("path") or "."))
-        folders = list(dict.fromkeys(folder for part in PARTS for folder in _image_folders(path, content, part)))
-        if not folders:
-            raise FormatError(f"{path}: train", "a folder of images", "none")
-        images: dict[str, Path] = {}
-        for image in (image for name in folders for image in list_images(base / name)):
-            if image.stem in images:
-                raise FormatError(str(image), "a unique name", f"the name of {images[image.stem]}")
-            images[image.stem] = image
-        if not images:
-            raise FormatError(str(base / folders[0]), "at least one .png or .jpg", "none")
-        super().__init__("the YOLO folder", dict(sorted(images.items())))
+        self._files = YoloFiles(Path(root))
+        self._files.check_pairs()
+        self.class_names = self._files.names
+        images = self._files.images
+        split_of = {
+            image: name for name, paths in reversed([*self._files.splits.items()]) for image in paths if name
+        }
+        identifiers, names = name_images(self._files.root, images, split_of)
+        self._file_names = dict(zip(identifiers, names, strict=True))
+        super().__init__("the YOLO folder", dict(sorted(zip(identifiers, images, strict=True))))
+
+    def splits(self) -> dict[str, tuple[str, ...]]:
+        """Identifiers by split; empty for a data set without splits."""
+        identifier_of = {image: identifier for identifier, image in self._entries.items()}
+        return {
+            name: tuple(sorted(identifier_of[image] for image in images if image in identifier_of))
+            for name, images in self._files.splits.items()
+            if name
+        }
+
+    def account(self) -> DataAccount:
+        """Account for all files and label rows; reads all labels, and no image."""
+        rows = self._read_rows(self.identifiers)
+        return self._account(rows, _to_kinds(self.class_names)[rows.kind])
+
+    def _account(self, rows: YoloRows, kind: NDArray[np.int64]) -> DataAccount:
+        images, found = self._entries.values(), self._files
+        labels = [found.label_path(image) for image in images if found.has_labels(image)]
+        cameras = [path for image in images if (path := self._calibration_path(image)) is not None]
+        unpaired = found.find_unpaired_labels()
+        read = [*map(str, images), *labels, *map(str, cameras), *map(str, found.described_by)]
+        reasons = found.reasons | dict.fromkeys(unpaired, WITHOUT_IMAGE)
+        count, skipped = account_for_files(found.root, read, reasons)
+        counts = np.bincount(kind, minlength=len(self.class_names)).tolist()
+        return DataAccount(
+            "yolo",
+            len(self),
+            count,
+            skipped,
+            {name: n for name, n in zip(self.class_names, counts, strict=True) if n},
+            unlabelled=len(self) - len(labels),
+            without_image=len(unpaired),
+            splits={name: len(identifiers) for name, identifiers in self.splits().items()},
+            unused_keys=tuple(found.unused_keys),
+            repairs=dict(found.repairs + rows.repairs),
+        )
+
+    def _read_rows(self, identifiers: Sequence[str]) -> YoloRows:
+        """Read the label files of frames; a row's file is the index of its frame."""
+        images = [self._entry(identifier) for identifier in identifiers]
+        labelled = [i for i, image in enumerate(images) if self._files.has_labels(image)]
+        paths = [self._files.label_path(images[i]) for i in labelled]
+        rows = read_rows(paths, len(self.class_names), False, self._files.keypoints)
+        return replace(rows, file=np.array(labelled, np.int64)[rows.file])
 
     def labels(self, identifier: str) -> Labels:
         """Read the labels of one frame and its image's header. Raises FormatError naming file, line and field."""
-        return self.table((identifier,)).to_labels()
+        return self._make_table((identifier,), self._read_rows((identifier,))).to_labels()
 
-    def table(self, identifiers: Sequence[str]) -> LabelTable:
-        """Read the labels of frames in columns, and their images' headers. Raises FormatError as `labels`."""
-        images = [self._entry(identifier) for identifier in identifiers]
-        sizes = [read_upright_size(image) for image in images]
-        texts = [
-            _read_labels(path, self.class_names, size, False) if path.exists() else _YoloLabels([], [], [])
-            for path, size in zip((_sibling_file(image, "labels") for image in images), sizes, strict=True)
-        ]
-        table = _to_table(identifiers, self.class_names, texts, False, np.array(sizes, np.int64).reshape(-1, 2))
-        return replace(table, image_files={i: image.name for i, image in enumerate(images)})
+    def table(self) -> LabelTable:
+        """Read the labels of all frames, and their images' headers. Raises FormatError as `labels`."""
+        rows = self._read_rows(self.identifiers)
+        table = self._make_table(self.identifiers, rows)
+        position = {identifier: i for i, identifier in enumerate(self.identifiers)}
+        return replace(
+            table,
+            image_files={i: self._file_names[identifier] for identifier, i in position.items()},
+            splits={name: [position[i] for i in identifiers] for name, identifiers in self.splits().items()},
+            account=self._account(rows, table.kind),
+        )
+
+    def _make_table(self, identifiers: Sequence[str], rows: YoloRows) -> LabelTable:
+        sizes = np.array([read_upright_size(self._entry(name)) for name in identifiers], np.int64).reshape(-1, 2)
+        return _to_table(identifiers, self.class_names, _to_kinds(self.class_names), rows, sizes)
 
     def image_path(self, identifier: str) -> Path:
         """Return a frame's image file. Raises RangeError for an unknown frame."""
         return self._entry(identifier)
+
+    def _calibration_path(self, image: Path) -> Path | None:
+        """Return the file with an image's camera, which only this project writes; None if there is none."""
+        parts = image.relative_to(self._files.root).parts
+        if "images" not in parts[:-1]:
+            return None
+        path = replace_images_folder(self._files.root, parts[:-1], "calib") / f"{image.stem}.txt"
+        return path if path.is_file() else None
 
     def frame(self, identifier: str) -> Frame:
         """Read one frame: photograph, camera, labels. Raises FormatError naming a damaged file."""
@@ -332,8 +478,8 @@ class YoloDataset(FrameIndex[Path]):
         image = read_upright(image_path)
         height, width = image.shape[:2]
         provenance = {"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name}
-        calib_path = _sibling_file(image_path, "calib")
-        if calib_path.exists():
+        calib_path = self._calibration_path(image_path)
+        if calib_path is not None:
             projection = read_calibration(calib_path).projection
             camera = Camera(projection[:, :3].clone(), height, width, projection)
         else:
@@ -343,40 +489,6 @@ class YoloDataset(FrameIndex[Path]):
         return Frame(identifier, to_tensor(image), camera, self.labels(identifier), provenance=provenance)
 
 
-def _read_mapping(path: Path) -> dict[str, Any]:
-    content = files.read_yaml(path)
-    if not isinstance(content, dict):
-        raise FormatError(str(path), "train, val and names", type(content).__name__)
-    return content
-
-
-def _parse_names(path: Path, content: Mapping[str, Any]) -> dict[int, str]:
-    names = content.get("names")
-    pairs = dict(enumerate(names)) if isinstance(names, list) else names
-    if not isinstance(pairs, dict) or not pairs or any(type(k) is not int or k < 0 for k in pairs):
-        raise FormatError(f"{path}: names", "a list of classes, or number: class", repr(names)[:60])
-    return {k: str(pairs[k]) for k in sorted(pairs)}
-
-
-def _image_folders(path: Path, content: Mapping[str, Any], part: str) -> list[str]:
-    value = content.get(part) or []
-    folders = [value] if isinstance(value, str) else value
-    if not isinstance(folders, list) or any(not isinstance(f, str) or f.endswith(".txt") for f in folders):
-        raise FormatError(f"{path}: {part}", "a folder of images, or a list of folders", repr(value)[:60])
-    return [_check_inside(path, part, folder) for folder in folders]
-
-
-def _check_inside(path: Path, key: str, folder: str) -> str:
-    """Return a folder that a YAML file names. Raises FormatError if it is not below that file's folder."""
-    if Path(folder).is_absolute() or ".." in Path(folder).parts or "\0" in folder:
-        raise FormatError(f"{path}: {key}", f"a folder in {path.parent}", repr(folder))
-    return folder
-
-
-def _sibling_file(image: Path, folder: str) -> Path:
-    """Return the text file of an image: the last "images" of its path becomes `folder`."""
-    parts = list(image.parts)
-    positions = [i for i, part in enumerate(parts[:-1]) if part == "images"]
-    if positions:
-        parts[positions[-1]] = folder
-    return Path(*parts).with_suffix(".txt")
+def _to_kinds(names: Sequence[str]) -> NDArray[np.int64]:
+    """Return the index of the first class with its name, for each class number (C,)."""
+    return np.array([names.index(name) for name in names], np.int64)

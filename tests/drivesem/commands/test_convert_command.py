@@ -173,7 +173,7 @@ def test_results_keep_their_scores(tmp_path: Path):
 def test_json(kitti: Path, tmp_path: Path):
     data = run_json("convert", kitti, "--to", "yolo", "--out", tmp_path / "yolo")
     assert data["lost"]["3D box"] == 3
-    assert data["assumed"] == {}
+    assert data["assumed"] == {"val (same images as train)": 2}
 
 
 @pytest.mark.parametrize(

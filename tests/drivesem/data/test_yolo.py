@@ -18,6 +18,7 @@ from drivesem.data.coco import CATEGORIES
 from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.label_table import LabelTable, xyxy_to_coco
 from drivesem.data.registry import WRITERS, open_dataset
+from drivesem.data.yolo_labels import read_rows
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.io import to_uint8
@@ -93,9 +94,10 @@ def test_boxes_round_trip(
     box = xyxy_to_coco(np.array([x0, y0, x1, y1]))
     path = tmp_path_factory.getbasetemp() / "box.txt"
     path.write_text(yolo._format_line(2, box.tolist(), size_wh, yolo.DECIMALS))
-    content = yolo._read_labels(path, {2: "Truck"}, size_wh, scored=False)
-    assert (content.kinds, content.scores) == ([2], [])
-    assert content.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
+    rows = read_rows([str(path)], 3, scored=False)
+    table = yolo._to_table(["box"], ["a", "b", "c"], np.arange(3), rows, np.array([size_wh]))
+    assert table.kind.tolist() == [2]
+    assert table.boxes[0] == pytest.approx(box.tolist(), abs=1e-4)
 
 
 def test_without_a_calibration_a_usual_focal_length_is_taken(folder: Path) -> None:
@@ -122,16 +124,19 @@ def test_lists_of_folders_and_of_names(folder: Path) -> None:
 
 GOOD = "0 0.5 0.5 0.25 0.25"
 BAD_LINES = [
-    ("0 0.5 0.5 0.25", "expected 5 fields: class cx cy w h, found 4"),
-    (f"{GOOD} 0.9", "expected 5 fields: class cx cy w h, found 6"),
+    ("0 0.5 0.5 0.25", "expected 5 fields: class cx cy w h, or a polygon, found 4"),
+    (f"{GOOD} 0.9 0.9 0.9", "expected 5 fields: class cx cy w h, or a polygon, found 8"),
+    (f"{GOOD} x", "score: expected a number, found 'x'"),
     ("8 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names, found '8'"),
-    ("0.0 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names, found '0.0'"),
+    ("0.5 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names, found '0.5'"),
     (f"{'1' * 5000} 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names"),
     ("-1 0.5 0.5 0.25 0.25", "class: expected one of the 8 in names"),
     ("0 1.5 0.5 0.25 0.25", r"cx: expected a share of the image in \[0, 1\], found '1.5'"),
     ("0 0.5 nan 0.25 0.25", "cy: expected a share"),
     ("0 0.5 0.5 -0.01 0.25", "w: expected a share"),
+    ("0 0.5 0.5 1.06 0.25", "w: expected a share"),
     ("0 0.5 0.5 0.25 x", "h: expected a share .*found 'x'"),
+    ("0 0.1 0.1 0.2 0.1 0.2 7", r"y3: expected a share of the image in \[0, 1\], found '7'"),
 ]
 
 
@@ -151,14 +156,21 @@ def test_a_bad_line_is_named(line: str, message: str, folder: Path) -> None:
         ("- a\n", r"data\.yaml: expected train, val and names, found list"),
         ("a: [\n", r"data\.yaml: expected YAML"),
         ("train: images/train\n", r"data\.yaml: names: expected a list of classes, .*found None"),
-        ("names: [a]\n", r"data\.yaml: train: expected a folder of images, found none"),
-        ("names: [a]\ntrain: a.txt\n", r"data\.yaml: train: expected a folder of images, or a list"),
-        (f"names: [a]\ntrain: {'t' * 400}\n", "tt: expected a folder of images, found File name too long"),
-        ("names: [a]\ntrain: no\n", "no: expected a folder of images, found no such folder"),
-        ("names: [a]\ntrain: calib/train\n", r"calib/train: expected at least one \.png or \.jpg, found none"),
-        ("names: [a]\ntrain: ../images\n", r"data\.yaml: train: expected a folder in .*, found '\.\./images'"),
-        ("names: [a]\ntrain: [/etc]\n", r"data\.yaml: train: expected a folder in .*, found '/etc'"),
-        ("names: [a]\npath: /etc\ntrain: a\n", r"data\.yaml: path: expected a folder in .*, found '/etc'"),
+        ("names: [a]\n", r"data\.yaml: train: expected a folder with at least one image .*, found none"),
+        ("names: [a]\ntrain: a.txt\n", r"data\.yaml: train: expected a list of images in .*, found 'a\.txt'"),
+        (f"names: [a]\ntrain: {'t' * 400}\n", "train: expected a folder of images in .*, found 'ttt"),
+        ("names: [a]\ntrain: no\n", "train: expected a folder of images in .*, found 'no'"),
+        ("names: [a]\ntrain: calib/train\n", r"train: expected a folder with at least one image .*, found none"),
+        ("names: [a]\ntrain: ../other\n", r"data\.yaml: train: expected a folder .*, found '\.\./other'"),
+        ("names: [a]\ntrain: [/etc]\n", r"data\.yaml: train: expected a folder of images in .*, found '/etc'"),
+        ("names: [a]\npath: /etc\ntrain: a\n", r"data\.yaml: train: expected a folder of images in .*, found 'a'"),
+        ("names: [a]\ntrain: [1]\n", r"data\.yaml: train: expected a folder of images, or a list of folders"),
+        (
+            "names: [a]\ntrain: images/train\nkpt_shape: 3\n",
+            r"data\.yaml: kpt_shape: expected number of keypoints",
+        ),
+        ("names: {0: a, 2: b}\ntrain: images/train\n", "names: expected .*, numbers from 0 to 1, found"),
+        ("names: no.txt\ntrain: images/train\n", "names: expected a list of classes, or a file of them"),
         ("names: {a: b}\ntrain: images/train\n", r"data\.yaml: names: expected .*found \{'a': 'b'\}"),
     ],
 )
@@ -181,9 +193,6 @@ def test_other_bad_requests(folder: Path) -> None:
     (folder / "images/train/000000.png").write_bytes(b"no image")
     with pytest.raises(FormatError, match=r"images/train/000000\.png: expected an image"):
         yolo.YoloDataset(folder).labels("000000")
-    files.write_png(folder / "images/train/000001.png", np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(FormatError, match=r"images/val/000001\.png: expected a unique name, found the"):
-        yolo.YoloDataset(folder)
 
 
 def test_a_part_without_frames_is_the_other_one(tmp_path: Path, make_exposure: Callable[..., Exposure]) -> None:
@@ -230,7 +239,8 @@ def test_boxes_beyond_the_image_are_clipped_and_counted(tmp_path: Path) -> None:
     )
     written = yolo.write_table(table, tmp_path, {})
     assert written.lost == {"box beyond the image": 4}
+    assert written.assumed == {"val (same images as train)": 1}
     files.write_png(tmp_path / "images/train/a.png", np.zeros((50, 100, 3), np.uint8))
-    again = yolo.YoloDataset(tmp_path).table(("a",))
+    again = yolo.YoloDataset(tmp_path).table()
     cut = [[0, 5, 20, 20], [70, 5, 30, 20], [0, 0, 100, 50], *boxes[4:]]
     assert np.allclose(again.boxes, cut, rtol=0, atol=1e-9)
