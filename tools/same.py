@@ -118,8 +118,8 @@ transfer: transfer --run {RUN} --detectors squeezedet,yolov3-slim --bootstrap 5 
 verify: verify --run {RUN} {WORKERS} --out @/verify.json
 plausibility: tools.experiments plausibility --run {RUN} --out @/plausibility
 realism: tools.experiments realism {RUN} --bootstrap 5 --out @/realism
-worth: tools.experiments worth {RUN} --second yolov3-slim --bootstrap 5 --out @/worth
-worth-table: tools.experiments worth --table @inputs/answers.csv --bootstrap 5 --base 2 --out @/worth
+worth: tools.experiments worth {RUN} --second yolov3-slim --out @/worth
+worth-table: tools.experiments worth --table @inputs/answers.csv --base 2 --out @/worth
 survey: tools.experiments survey {RUN} --items 2 --controls 1 --out @/survey
 survey-results: tools.experiments survey-results @answers/ann.csv @answers/bob.csv --survey @survey/survey\
  --bootstrap 5 --out @/results

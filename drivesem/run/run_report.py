@@ -112,7 +112,7 @@ def build_reports(config: ReportConfig) -> dict[str, Any]:
 def _find_runs(folder: Path) -> list[Path]:
     """Return a run, or the finished arms of a study. Raises UsageError if the folder is neither."""
     if not folder.is_dir():
-        raise UsageError("RUN", "a folder of drivesem attack or drivesem study", folder)
+        raise UsageError("RUN", "a folder of drivesem attack or of an experiment", folder)
     if not (folder / _ARMS).is_dir():
         return [folder]
     arms = [

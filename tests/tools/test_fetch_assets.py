@@ -1,5 +1,7 @@
 """The converter behind the optional pack of vehicles and skies, on made-up packages."""
 
+from __future__ import annotations
+
 import base64
 import io
 import sys
@@ -16,7 +18,9 @@ import yaml
 from drivesem.synth.assets import assets_from
 from scene_ir.errors import FormatError
 from scene_ir.types import Part
+from tests.tools.loading import tool
 
+TOOLS = Path(__file__).parents[2] / "tools"
 CATALOGUE = """# made up
 license=Creative Commons Attribution 3.0 Unported license  \xa9 nobody
 name#1=Seat
@@ -32,6 +36,11 @@ width#2=50
 depth#2=50
 height#2=90
 """
+
+
+@pytest.fixture(scope="module", name="tool")
+def script() -> ModuleType:
+    return tool("fetch_assets")
 
 
 def box_obj(
@@ -139,6 +148,29 @@ def test_what_is_there_is_not_made_again(tool: ModuleType, pack: Path) -> None:
     assert "Somebody" in tool.licences(tool.AssetPack(pack), ["park.npz"])
 
 
+def test_textures_are_cut_into_faces_only_where_they_vary(tool: ModuleType) -> None:
+    from PIL import Image
+
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:, 32:] = 255
+    visual = trimesh.visual.TextureVisuals(
+        uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]),
+        material=trimesh.visual.material.SimpleMaterial(image=Image.fromarray(picture)),
+    )
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1.0, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    corners, colours = tool._coloured(square, faces, visual, (0.1, 0.2))
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert area.sum() == pytest.approx(1)
+    assert len(corners) > 100
+    clear = np.abs(corners.mean(axis=1)[:, 0] - 0.5) > 0.05
+    assert (colours[clear, 0] == (corners.mean(axis=1)[clear, 0] > 0.5)).all()
+    visual.material.image = Image.fromarray(np.full((8, 8, 3), 128, np.uint8))
+    corners, colours = tool._coloured(square, faces, visual, (0.1, 0.2))
+    assert len(corners) == 2
+    assert colours == pytest.approx(0.5)
+
+
 def test_debian_packages_are_read_without_debians_tools(tool: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "made.deb"
     packed = library()  # once: a zip archive holds the time at which it was made
@@ -169,3 +201,13 @@ def test_skies_are_read_from_javascript(tool: ModuleType, tmp_path: Path) -> Non
     assert tool.equirectangular(module, "a") == pytest.approx(pixels.astype(np.float32))
     with pytest.raises(FormatError, match="nothing"):
         tool.equirectangular("export default 3", "nothing")
+
+
+def test_the_sky_is_drawn_down_over_its_skyline(tool: ModuleType) -> None:
+    elevation = 90 - (np.arange(180) + 0.5)
+    pixels = np.repeat(elevation[:, None, None], 3, axis=2).astype(np.float32) * np.ones((1, 360, 1), np.float32)
+    low = tool.without_skyline(pixels, 10.0)[:, 0, 0]
+    assert low[:39] == pytest.approx(elevation[:39], abs=1e-3)
+    assert low[elevation > 0].min() == pytest.approx(10.0, abs=1.0)
+    assert (np.diff(low[:90]) < 0).all()
+    assert low[90:] == pytest.approx(elevation[90:])

@@ -112,7 +112,7 @@ def test_a_run_with_other_settings_is_refused(finished: Path, tmp_path: Path) ->
     )
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_of_another_kind_stays_unchanged(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     assert "--out" in refusal(*WORDS, "--limit", "1", "--out", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]

@@ -160,7 +160,7 @@ def test_a_folder_of_another_layout_is_recognised(plain_coco: Path) -> None:
     )
 
 
-def test_nothing_to_attack_is_reported(plain_coco: Path, tmp_path: Path) -> None:
+def test_frames_without_vehicles_are_reported(plain_coco: Path, tmp_path: Path) -> None:
     root = shutil.copytree(plain_coco, tmp_path / "coco")
     (path,) = (root / "annotations").iterdir()
     files.write_json(path, files.read_json(path) | {"annotations": []})

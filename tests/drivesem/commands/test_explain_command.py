@@ -213,7 +213,7 @@ def test_files(explained: Path) -> None:
         assert f"({picture})" in page or picture.endswith("minimal.png")
 
 
-def test_a_second_call_explains_nothing_twice(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_call_explains_no_frame_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = explain("--run", run)
     assert json.loads((run / "explain" / "explain.json").read_text()) == first
     explained_frames: list[str] = []

@@ -294,7 +294,7 @@ class Blind:
         return [nothing] * len(raw)
 
 
-def test_a_detector_that_finds_nothing_is_not_attacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_detector_without_detections_is_not_attacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blind())
     words = ("attack", "--method", "random", "--queries", "1", "--workers", "1", "--params", "weather")
     line = refusal(*words, "--limit", "2", "--out", tmp_path / "run")

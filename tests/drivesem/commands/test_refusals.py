@@ -141,7 +141,7 @@ REFUSALS = [
     ("bench step --boxes none.tar.xz", "--boxes: expected a tar archive of KITTI's label_2 and calib, found"),
     ("bench render --boxes none.tar.xz", "--boxes: expected only with step, found render"),
     ("report", "RUN: expected folders of drivesem attack, found nothing"),
-    ("report nowhere", "RUN: expected a folder of drivesem attack or drivesem study, found nowhere"),
+    ("report nowhere", "RUN: expected a folder of drivesem attack or of an experiment, found nowhere"),
     ("runs merge a", "--out: expected the folder of the merged run, found nothing"),
     ("runs show a --out b", "--out: expected only with merge, found show"),
     ("runs merge a --out b\udcff", "--out: expected text that UTF-8 holds, found 'b\\udcff'"),

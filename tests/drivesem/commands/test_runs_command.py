@@ -95,7 +95,7 @@ def test_frames_that_are_there_are_compared_with_the_parts(parts: Path, tmp_path
 
 
 @pytest.mark.slow
-def test_parts_with_nothing_to_attack_merge_into_the_whole(tmp_path: Path) -> None:
+def test_parts_without_vehicles_merge_into_the_whole(tmp_path: Path) -> None:
     """Frames whose vehicles cannot be attacked count once, whichever part had them; a part may have no frame."""
     words = [*WORDS, "--no-grade", "--target-objects", "6"]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0

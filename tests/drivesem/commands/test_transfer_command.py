@@ -81,7 +81,7 @@ def test_files(run: Path) -> None:
     assert min(picture.shape[:2]) > 200
 
 
-def test_a_second_call_detects_nothing_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_call_detects_in_no_frame_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = transfer("--run", run, "--detectors", "squeezedet")
     cached = sorted((run / "transfer" / "detections").rglob("*.json"))
     assert len(cached) == 4

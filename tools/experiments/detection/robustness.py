@@ -96,6 +96,8 @@ class StateEvaluator(FrameAnalyser[FrameStateCounts]):
     Cars count that the original detector, the first, finds in the photograph.
     """
 
+    file, kind, schema = "robust.json", FrameStateCounts, 1
+
     def __init__(
         self, run: AttackRun, attack: AttackConfig, detectors: Sequence[str], states: int, out: Path
     ) -> None:

@@ -1,4 +1,4 @@
-"""`drivesem gradcheck --reach`: options, what is printed and written, and that finished frames are kept."""
+"""`python -m tools.bench gradcheck --reach`: options, output, and that finished frames stay."""
 
 import json
 from dataclasses import replace
