@@ -134,7 +134,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     changes: Annotated[str, OnlyWith("method", ("climb", "corners"))] | None = None
     """Changes of vehicles with --budget street: leave, park, swap, load, with commas (climb and corners)."""
     mesh: str | None = None
-    """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY, metres, y up (default: the templates)."""
+    """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY in metres (default: the templates)."""
     target_objects: str | None = None
     """Objects that count as failures when lost, such as 0,2; phantoms do not count then."""
     target_classes: str | None = None
