@@ -13,8 +13,9 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ from drivesem.data.yolo_files import (
     YoloDescription,
     YoloFiles,
     name_images,
-    replace_images_folder,
+    strip_split,
 )
 from drivesem.data.yolo_labels import EDGE, YoloRows, find_description, is_label_file, read_rows
 from scene_ir import files
@@ -157,7 +158,9 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
         files.write_text(out / f"{split}.txt", "".join(lines))
     first = next(iter(splits), "train")
     parts: dict[str, str | list[str]] = dict.fromkeys(("train", "val"), "images/train")
-    parts |= {part: splits[first] for part in ("train", "val") if splits} | splits
+    parts |= {
+        part: copy(splits[first]) for part in ("train", "val") if splits
+    } | splits  # one list would be an alias
     _write_yaml(out, parts, table.kinds)
     masked = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-9) & written
     without = ~table.ignore & (table.boxes[:, 2:] <= 0).any(axis=1)
@@ -219,11 +222,11 @@ def _file_names(table: LabelTable, folders: Sequence[str]) -> list[str]:
     else the frame's identifier.
     """
     names: list[str] = []
-    for i, (identifier, folder) in enumerate(zip(table.frames, folders, strict=True)):
+    for i, identifier in enumerate(table.frames):
         own = os.path.splitext(table.image_files.get(i, ""))[0]
         flat_own, flat = own.replace("/", "_"), identifier.replace("/", "_")
         name = own if flat_own.endswith(flat) and own.count("/") >= identifier.count("/") else identifier
-        name = name.removeprefix(f"{folder}/")
+        name = strip_split(name) if table.splits else name
         if name.startswith("/") or ".." in name.split("/") or "\0" in name:
             raise FormatError(f"frame {identifier}", "a name below the folder of images", repr(name))
         names.append(name)
@@ -233,11 +236,10 @@ def _file_names(table: LabelTable, folders: Sequence[str]) -> list[str]:
 
 
 def _count_renamed(table: LabelTable, names: Sequence[str]) -> int:
-    stems = {i: os.path.splitext(file)[0] for i, file in table.image_files.items()}
-    own = {
-        i: stem for i, stem in stems.items() if stem.replace("/", "_").endswith(table.frames[i].replace("/", "_"))
-    }
-    return sum(PurePosixPath(stem).name != PurePosixPath(names[i]).name for i, stem in own.items())
+    """Count the images, of those named after their frames, that have another stem in the written data set."""
+    own = {i: os.path.splitext(file)[0] for i, file in table.image_files.items()}
+    own = {i: n for i, n in own.items() if n.replace("/", "_").endswith(table.frames[i].replace("/", "_"))}
+    return sum(os.path.basename(name) != os.path.basename(names[i]) for i, name in own.items())
 
 
 def _suffix(table: LabelTable, i: int, images: Mapping[str, Path]) -> str:
@@ -368,7 +370,7 @@ def _count_classes(table: LabelTable) -> dict[str, int]:
     return {name: count for name, count in zip(table.kinds, counts, strict=True) if count}
 
 
-class YoloDataset(FrameIndex[Path]):
+class YoloDataset(FrameIndex[str]):
     """The frames of a YOLO data set, all its splits together.
 
     An image without a label file has no objects. Images are turned upright by EXIF, as trainers read them.
@@ -388,13 +390,9 @@ class YoloDataset(FrameIndex[Path]):
         self._files = YoloFiles(Path(root))
         self._files.check_pairs()
         self.class_names = self._files.names
-        images = self._files.images
-        split_of = {
-            image: name for name, paths in reversed([*self._files.splits.items()]) for image in paths if name
-        }
-        identifiers, names = name_images(self._files.root, images, split_of)
+        identifiers, names = name_images(self._files)
         self._file_names = dict(zip(identifiers, names, strict=True))
-        super().__init__("the YOLO folder", dict(sorted(zip(identifiers, images, strict=True))))
+        super().__init__("the YOLO folder", dict(sorted(zip(identifiers, self._files.images, strict=True))))
 
     def splits(self) -> dict[str, tuple[str, ...]]:
         """Identifiers by split; empty for a data set without splits."""
@@ -413,9 +411,9 @@ class YoloDataset(FrameIndex[Path]):
     def _account(self, rows: YoloRows, kind: NDArray[np.int64]) -> DataAccount:
         images, found = self._entries.values(), self._files
         labels = [found.label_path(image) for image in images if found.has_labels(image)]
-        cameras = [path for image in images if (path := self._calibration_path(image)) is not None]
+        cameras = [path for image in images if (path := found.calibration_path(image)) is not None]
         unpaired = found.find_unpaired_labels()
-        read = [*map(str, images), *labels, *map(str, cameras), *map(str, found.described_by)]
+        read = [*images, *labels, *cameras, *map(str, found.described_by)]
         reasons = found.reasons | dict.fromkeys(unpaired, WITHOUT_IMAGE)
         count, skipped = account_for_files(found.root, read, reasons)
         counts = np.bincount(kind, minlength=len(self.class_names)).tolist()
@@ -457,30 +455,24 @@ class YoloDataset(FrameIndex[Path]):
         )
 
     def _make_table(self, identifiers: Sequence[str], rows: YoloRows) -> LabelTable:
-        sizes = np.array([read_upright_size(self._entry(name)) for name in identifiers], np.int64).reshape(-1, 2)
+        sizes = np.array([read_upright_size(Path(self._entry(name))) for name in identifiers], np.int64).reshape(
+            -1, 2
+        )
         return _to_table(identifiers, self.class_names, _to_kinds(self.class_names), rows, sizes)
 
     def image_path(self, identifier: str) -> Path:
         """Return a frame's image file. Raises RangeError for an unknown frame."""
-        return self._entry(identifier)
-
-    def _calibration_path(self, image: Path) -> Path | None:
-        """Return the file with an image's camera, which only this project writes; None if there is none."""
-        parts = image.relative_to(self._files.root).parts
-        if "images" not in parts[:-1]:
-            return None
-        path = replace_images_folder(self._files.root, parts[:-1], "calib") / f"{image.stem}.txt"
-        return path if path.is_file() else None
+        return Path(self._entry(identifier))
 
     def frame(self, identifier: str) -> Frame:
         """Read one frame: photograph, camera, labels. Raises FormatError naming a damaged file."""
-        image_path = self._entry(identifier)
+        image_path = self.image_path(identifier)
         image = read_upright(image_path)
         height, width = image.shape[:2]
         provenance = {"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name}
-        calib_path = self._calibration_path(image_path)
+        calib_path = self._files.calibration_path(self._entry(identifier))
         if calib_path is not None:
-            projection = read_calibration(calib_path).projection
+            projection = read_calibration(Path(calib_path)).projection
             camera = Camera(projection[:, :3].clone(), height, width, projection)
         else:
             focal = read_focal_length(image_path, self.focal_px)
