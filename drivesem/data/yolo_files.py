@@ -57,11 +57,12 @@ class YoloDescription:
     """The description and the lists that it names."""
 
     def __init__(self, root: Path) -> None:
-        path = root if not root.is_dir() else find_description(root)
+        folder = Path(os.path.normpath(root if root.is_dir() else root.parent))
+        self.root = Path.cwd() if folder == Path() else folder  # so that paths begin with it
+        path = find_description(self.root) if root.is_dir() else self.root / root.name
         if path is None:
             raise FormatError(str(root), "data.yaml, obj.data or classes.txt", "none of them")
         self.path = path
-        self.root = Path(os.path.normpath(root if root.is_dir() else path.parent))
         self.repairs = Counter()
         self.described_by = [path]
         self._content = self._read_content()

@@ -459,6 +459,17 @@ def test_folders_of_other_tools(name: str, tmp_path: Path) -> None:
     assert yolo.YoloDataset(tmp_path).frame("x").provenance["focal"].endswith("default")
 
 
+@pytest.mark.parametrize("root", [".", "data.yaml", "images/..", "../{name}"])
+def test_relative_roots(root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    build(
+        tmp_path,
+        {"data.yaml": "train: images/train\n" + NAMES, "images/train/x.png": "", "labels/train/x.txt": ROW},
+    )
+    monkeypatch.chdir(tmp_path)
+    account = yolo.YoloDataset(Path(root.format(name=tmp_path.name))).account()
+    assert (account.files, dict(account.skipped), account.without_image) == (3, {}, 0)
+
+
 def test_stems_that_do_not_pair_are_refused(tmp_path: Path) -> None:
     build(tmp_path, {"data.yaml": TWO, "images/train/x.png": "", "labels/train/img_x.txt": ROW})
     with pytest.raises(FormatError, match=r"label files named after the images, such as x\.txt, found 1 others"):
