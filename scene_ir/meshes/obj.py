@@ -41,36 +41,42 @@ def read_obj(data: bytes, file: Path, resolver: Resolver) -> tuple[trimesh.Scene
     libraries: list[str] = []
     name = material = ""
     faces = short = 0
-    for line in re.sub(rb"\\\r?\n", b" ", data.removeprefix(b"\xef\xbb\xbf")).splitlines():
-        words = line.split(None, 1)
-        if len(words) < 2:
-            continue
-        key, rest = words
-        if key == b"v":
-            values = [float(word) for word in rest.partition(b"#")[0].split()]
-            if len(values) < 3:
-                raise FormatError(f"{file}: vertices", "three coordinates each", len(values))
-            points.extend(values[:3])
-            colours.extend(values[3:6] if len(values) >= 6 else ())
-        elif key == b"vt":
-            values = [float(word) for word in rest.partition(b"#")[0].split()]
-            texture.extend((*values, 0.0)[:2])
-        elif key == b"f":
-            faces += 1
-            corners = _resolve_face(rest.partition(b"#")[0].split(), len(points) // 3, len(texture) // 2)
-            if corners is None:
-                expected = f"vertices from 1, or from -1 to -{len(points) // 3:,}"
-                raise FormatError(f"{file}: face {faces:,}", expected, _decode(rest))
-            short += len(corners) < 3
-            group = groups[name, material]
-            for second, third in pairwise(corners[1:]):
-                group.extend((*corners[0], *second, *third))
-        elif key == b"usemtl":
-            material = _decode(rest)
-        elif key == b"o":
-            name = _decode(rest)
-        elif key == b"mtllib":
-            libraries.append(_decode(rest))
+    line = b""
+    try:
+        for line in re.sub(rb"\\\r?\n", b" ", data.removeprefix(b"\xef\xbb\xbf")).splitlines():
+            words = line.split(None, 1)
+            if len(words) < 2:
+                continue
+            key, rest = words
+            if key == b"v":
+                values = [float(word) for word in rest.partition(b"#")[0].split()]
+                if len(values) < 3:
+                    raise FormatError(f"{file}: vertices", "three coordinates each", len(values))
+                points.extend(values[:3])
+                colours.extend(values[3:6] if len(values) >= 6 else ())
+            elif key == b"vt":
+                values = [float(word) for word in rest.partition(b"#")[0].split()]
+                texture.extend((*values, 0.0)[:2])
+            elif key == b"f":
+                faces += 1
+                corners = _resolve_face(rest.partition(b"#")[0].split(), len(points) // 3, len(texture) // 2)
+                if corners is None:
+                    expected = f"vertices from 1, or from -1 to -{len(points) // 3:,}"
+                    raise FormatError(f"{file}: face {faces:,}", expected, _decode(rest))
+                short += len(corners) < 3
+                group = groups[name, material]
+                for second, third in pairwise(corners[1:]):
+                    group.extend((*corners[0], *second, *third))
+            elif key == b"usemtl":
+                material = _decode(rest)
+            elif key == b"o":
+                name = _decode(rest)
+            elif key == b"mtllib":
+                libraries.append(_decode(rest))
+    except FormatError:
+        raise
+    except ValueError:
+        raise FormatError(str(file), "a readable mesh, with numbers in lines v, vt and f", _decode(line)) from None
     notes = [f"{short:,} faces with fewer than three corners left out"] if short else []
     vertices = np.frombuffer(points, dtype=np.float64).reshape(-1, 3)
     rgb = np.frombuffer(colours, dtype=np.float64).reshape(-1, 3) if len(colours) == len(points) else None

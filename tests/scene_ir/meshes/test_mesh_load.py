@@ -484,7 +484,7 @@ def test_every_spelling_of_an_obj_is_read(tmp_path: Path, text: str, faces: int)
         ("0 1 2", "face 5: expected vertices from 1, or from -1 to -5, found 0 1 2"),
         ("-6 1 2", "face 5: expected vertices from 1, or from -1 to -5, found -6 1 2"),
         ("1 2 6", "faces: expected indices of 5 vertices, found vertex 6"),
-        ("1 2 x", "expected a readable mesh, found ValueError"),
+        ("1 2 x", "expected a readable mesh, with numbers in lines v, vt and f, found f 1 2 x"),
     ],
 )
 def test_faces_of_missing_vertices_are_refused(tmp_path: Path, face: str, found: str) -> None:
@@ -650,6 +650,30 @@ def test_what_gltf_does_not_draw_is_left_out(tmp_path: Path, kind: str, edit, no
 def test_quantized_positions_are_fractions(tmp_path: Path) -> None:
     path = box_gltf(tmp_path / "a.gltf", lambda h: _add(h, "extensionsRequired", "KHR_mesh_quantization"), "<i2")
     assert import_mesh(path).size_lhw == pytest.approx((4.0, 1.5, 1.8), abs=1e-3)
+
+
+def test_integer_texture_coordinates_are_fractions(tmp_path: Path) -> None:
+    """Core glTF allows normalized integers: (0.25, 0.75) from the upper left is the blue quarter."""
+    palette = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (9, 9, 9)]], np.uint8)
+    Image.fromarray(palette).save(tmp_path / "palette.png")
+    (tmp_path / "uv.bin").write_bytes(np.tile(np.array([16384, 49151], "<u2"), 8).tobytes())
+
+    def paint(header: dict) -> None:
+        header["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = 2
+        header["meshes"][0]["primitives"][0]["material"] = 0
+        header["materials"] = [{"name": "m", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+        header["textures"], header["images"] = [{"source": 0}], [{"uri": "palette.png"}]
+        values = {"bufferView": 2, "componentType": 5123, "count": 8, "type": "VEC2", "normalized": True}
+        _add(header, "accessors", values)
+        _add(header, "bufferViews", {"buffer": 1, "byteLength": 32})
+        _add(header, "buffers", {"uri": "uv.bin", "byteLength": 32})
+
+    imported = import_mesh(box_gltf(tmp_path / "a.gltf", paint))
+    assert imported.mesh.colours.unique(dim=0).tolist() == [[0.0, 0.0, 1.0]]
+    assert imported.notes == ()
+    (tmp_path / "palette.png").unlink()
+    missing = ("palette.png is missing", "the texture of material m is not read")
+    assert import_mesh(tmp_path / "a.gltf").notes == missing
 
 
 def test_unused_vertices_change_no_bounds(tmp_path: Path) -> None:
