@@ -6,6 +6,7 @@ checked before anything is allocated.
 
 from __future__ import annotations
 
+import codecs
 import filecmp
 import gzip
 import hashlib
@@ -42,6 +43,8 @@ _MAX_BYTES = 1 << 30
 """Size limit of a file that is read whole, and of all arrays of an NPZ."""
 _CHUNK_BYTES = 1 << 24
 """Bytes per read of a file that is longer than its reported size."""
+_MAX_LIST_BYTES = 1 << 33
+"""Size limit of a JSON list that is read item by item."""
 _MAX_PIXELS = 1 << 26
 """Size limit of an image: 8192 x 8192."""
 _MAX_YAML_BYTES = 1 << 18
@@ -336,6 +339,61 @@ def parse_json(text: str, where: str) -> Any:
     except RecursionError as error:
         raise FormatError(where, "JSON", "lists or objects that are nested too deep") from error
     return value
+
+
+def iterate_json_list(path: Path, start: re.Pattern[str]) -> Iterator[Any]:
+    """Yield the items of a JSON list in a file one by one, since all at once need several times its bytes.
+
+    Args:
+        path: The file, of at most 8 GiB.
+        start: Matches the text before the first item.
+
+    Raises:
+        FormatError: As `read_json`, naming the item; there is no such list.
+    """
+    check_regular_file(path, _MAX_LIST_BYTES)
+    decoder, scan = codecs.getincrementaldecoder("utf-8-sig")(), json.JSONDecoder().raw_decode
+    with path.open("rb") as stream:
+        text = _decode_chunk(decoder, stream.read(_CHUNK_BYTES), path)
+        match = start.match(text)
+        if match is None:
+            raise FormatError(str(path), "a list", repr(text[:40]))
+        place, number = match.end(), 0
+        while True:
+            try:
+                place = _skip_space(text, place)
+                if text[place] == "]":
+                    return
+                if number and text[place] != ",":
+                    raise FormatError(f"{path}[{number}]", "a comma or the end of the list", repr(text[place]))
+                begin = _skip_space(text, place + 1) if number else place
+                value, end = scan(text, begin)
+                _ = text[end]  # a number may continue in the next chunk
+            except (IndexError, json.JSONDecodeError, RecursionError) as error:
+                more = _decode_chunk(decoder, stream.read(max(_CHUNK_BYTES, len(text) - place)), path)
+                if not more:
+                    found = "the end of the file" if isinstance(error, IndexError) else error
+                    raise FormatError(f"{path}[{number}]", "JSON", found) from error
+                text, place = text[place:] + more, 0
+                continue
+            item = text[begin:end]
+            if _has_long_numbers(item) or _INVALID_ESCAPE.search(item):
+                value = parse_json(item, f"{path}[{number}]")
+            yield value
+            place, number = end, number + 1
+
+
+def _decode_chunk(decoder: codecs.IncrementalDecoder, data: bytes, path: Path) -> str:
+    try:
+        return decoder.decode(data, not data)
+    except UnicodeDecodeError as error:
+        raise FormatError(str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x}") from error
+
+
+def _skip_space(text: str, place: int) -> int:
+    while text[place] in " \t\r\n":
+        place += 1
+    return place
 
 
 def _has_long_numbers(text: str) -> bool:

@@ -302,8 +302,26 @@ def _quarter_turns(tags: Mapping[int, Any]) -> int:
 
 def read_photograph(path: Path, focal_px: float | None = None) -> Frame:
     """Read an upright photograph with its camera, without labels. Raises FormatError or RangeError."""
+    return read_labelled_photograph(path.stem, path, None, {"dataset": "photograph", "image": path.name}, focal_px)
+
+
+def read_labelled_photograph(
+    identifier: str, path: Path, labels: Labels | None, provenance: Mapping[str, str], focal_px: float | None
+) -> Frame:
+    """Read an upright photograph, with a camera that has a centred principal point.
+
+    Args:
+        identifier: Identifier of the frame.
+        path: The image.
+        labels: Labels in pixels of the upright image, if any.
+        provenance: Data set and files; the focal length and its source are added.
+        focal_px: Focal length; see `read_focal_length`.
+
+    Raises:
+        FormatError: A damaged image.
+        RangeError: Unless focal_px is positive.
+    """
     focal = read_focal_length(path, focal_px)
     image = to_tensor(read_upright(path))
-    provenance = {"dataset": "photograph", "image": path.name, "focal": str(focal)}
     camera = pinhole_camera(image.shape[1], image.shape[2], focal.length_px)
-    return Frame(path.stem, image, camera, provenance=provenance)
+    return Frame(identifier, image, camera, labels, provenance={**provenance, "focal": str(focal)})
