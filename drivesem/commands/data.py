@@ -107,9 +107,10 @@ def convert_command(config: ConvertConfig) -> int:
         copy_images=config.copy_images,
         mapping=parse_class_map("--map", config.map),
     )
-    written = convert_labels(source, out, conversion)
+    written, account = convert_labels(source, out, conversion)
+    data = write_account(account, roles=False)
     if config.json:
-        print_json({"out": config.out, **asdict(written)})
+        print_json({"out": config.out, **asdict(written), "data": data})
     sys.stderr.write(f"{summarise_losses(written)}\n")
     if layout == "run" and config.to_format == "coco" and not config.copy_images and not config.scores:
         sys.stderr.write(f"images are in {source / 'frames'} (--copy-images copies them)\n")

@@ -274,6 +274,7 @@ class BddFiles:
             occlusion=np.array(rows.occlusion, np.int64)[chosen],
             sizes_wh=sizes,
             image_files={i: image.name for i, image in images.items()},
+            image_paths=images,
             frame_attributes={i: rows.attributes[k] for i, k in enumerate(positions) if rows.attributes[k]},
             extra={"attributes": others} if any(others) else {},
         )

@@ -50,7 +50,6 @@ from drivesem.data.photographs import (
     PNG_COMPRESSION,
     FrameIndex,
     check_focal,
-    match_images,
     pinhole_camera,
     read_focal_length,
     read_upright,
@@ -246,13 +245,13 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     parts: dict[str, list[int]] = {name: [] for name in table.splits} if split_of else {}
     for i in range(len(table.frames)):
         parts.setdefault(split_of.get(i, "rest" if split_of else "all"), []).append(i)
-    flat, _ = table.file_names()
-    names = [_file_name(table, i, name, images) for i, name in enumerate(flat)]
+    paths, renamed = table.file_names([split_of.get(i, "") for i in range(len(table.frames))])
+    names = [_file_name(table, i, path, images) for i, path in enumerate(paths)]
     repeated = {
         key for key, n in Counter((split_of.get(i), name) for i, name in enumerate(names)).items() if n > 1
     }
     names = [
-        f"{flat[i]}{PurePosixPath(name).suffix}" if (split_of.get(i), name) in repeated else name
+        f"{paths[i]}{PurePosixPath(name).suffix}" if (split_of.get(i), name) in repeated else name
         for i, name in enumerate(names)
     ]
     count, targets = 0, dict[str, Path]()
@@ -263,22 +262,18 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
         count += 1
         place = folder / part if split_of else folder
         targets |= {table.frames[i]: place / PurePosixPath(names[i]).with_suffix("") for i in frames}
-    lost = {
-        "/ in frame names": sum("/" in f and "/" not in name for name, f in zip(names, table.frames, strict=True)),
-        "split": sum(map(len, table.splits.values())) if single else 0,
-    }
-    return WriteSummary.from_counts(count + copy_images(targets, images), lost)
+    lost = {**renamed, "split": sum(map(len, table.splits.values())) if single else 0}
+    named = {*table.image_files, *(i for i, frame in enumerate(table.frames) if frame in images)}
+    assumed = {"suffix of image files (.png)": len(table.frames) - len(named)}
+    return WriteSummary.from_counts(count + copy_images(targets, images), lost, assumed)
 
 
-def _file_name(table: LabelTable, i: int, name: str, images: Mapping[str, Path]) -> str:
-    """Return an image's file name: its own if it is named after its frame, or stays where it is; else `name`."""
-    identifier, own = table.frames[i], table.image_files.get(i, "")
-    if identifier not in images:
-        return own or f"{name}.png"
-    suffix = images[identifier].suffix.lower()
-    if own and PurePosixPath(own).stem in (name, identifier.rpartition("/")[2]):
-        return PurePosixPath(own).with_suffix(suffix).as_posix()
-    return f"{name}{suffix}"
+def _file_name(table: LabelTable, i: int, path: str, images: Mapping[str, Path]) -> str:
+    """Return an image's file name: its own if it stays where it is; else `path` with its suffix."""
+    image = images.get(table.frames[i])
+    if image is None:
+        return table.image_files.get(i) or f"{path}.png"
+    return f"{path}{image.suffix}"
 
 
 def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]) -> str:
@@ -350,16 +345,6 @@ def _row_annotation(table: LabelTable, row: int) -> dict[str, Any]:
         **{name: values[row] for name, values in table.extra.items()},
     }
     return {name: value for name, value in entry.items() if value is not None}
-
-
-def find_images(path: Path, frames: Sequence[str]) -> dict[str, Path]:
-    """Find the images that a data set's files name, or else those named after the frames, in its image folders."""
-    data = CocoFiles(path)
-    found = match_images([part.folder for part in data.parts], frames)
-    for part, names in zip(data.parts, data.names, strict=True):
-        paths = zip(names, part.paths, strict=True)
-        found |= {name: Path(image) for name, image in paths if image is not None and isfile(image)}
-    return {name: found[name] for name in frames if name in found}
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivesem.data import fiftyone
-from drivesem.data.account import DataAccount, account_for_files
-from drivesem.data.label_table import REGION, LabelTable
+from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
+from drivesem.data.label_table import REGION, LabelTable, join_tables
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -414,6 +414,15 @@ class AnnotationFile:
                 found = f"{path}, as {self.images.locate(first[path], 'file_name')}"
                 raise FormatError(self.images.locate(i, "file_name"), "another image", found)
 
+    def _existing_images(self, frames: Sequence[str]) -> dict[int, str]:
+        """Return the existing images: those that the file names, else those named after the frames, in their folder."""
+        existing = {i: path for i, path in enumerate(self.paths) if path is not None and isfile(path)}
+        if len(existing) < len(self.paths):
+            names = (name for name in os.listdir(self.folder) if name.lower().endswith(IMAGE_SUFFIXES))
+            by_stem = {os.path.splitext(name)[0]: os.path.join(self.folder, name) for name in names}
+            existing |= {i: by_stem[n] for i, n in enumerate(frames) if i not in existing and n in by_stem}
+        return existing
+
     def relative_names(self) -> list[str]:
         """Return the images' paths below their folder, with "/"; "" without a file name."""
         relative = [name or "" for name in self.images.values("file_name")]
@@ -453,6 +462,7 @@ class AnnotationFile:
             merged_kind_ids=self.merged_ids,
             cameras={i: row["camera"] for i, row in enumerate(images) if "camera" in row},
             image_files={i: name for i, name in enumerate(self.relative_names()) if name},
+            image_paths={i: Path(path) for i, path in self._existing_images(frames).items()},
             frame_attributes={i: a | exported.get(i, {}) for i, a in attributes.items() if a or i in exported},
         )
 
@@ -624,7 +634,7 @@ class CocoFiles:
     def to_table(self, scored: bool) -> LabelTable:
         """Convert all files to one table."""
         tables = [part.to_table(names, scored) for part, names in zip(self.parts, self.names, strict=True)]
-        table = tables[0] if len(tables) == 1 else _join_tables(tables)
+        table = tables[0] if len(tables) == 1 else join_tables(tables)
         position = {name: i for i, name in enumerate(table.frames)}
         splits = {name: [position[frame] for frame in frames] for name, frames in self.splits().items()}
         return replace(table, splits=splits, account=self.account())
@@ -636,50 +646,6 @@ def _read_content(path: Path) -> Any:
     if isinstance(content, dict) and isinstance(content.get("labels"), dict) and "annotations" not in content:
         return fiftyone.to_coco(path, content, read_upright_size)
     return content
-
-
-def _join_tables(tables: Sequence[LabelTable]) -> LabelTable:
-    """Join tables of different frames. Ids that are not unique, or differ between the tables, are dropped."""
-    kinds = list(dict.fromkeys(kind for table in tables for kind in table.kinds))
-    starts = np.cumsum([0, *(len(table.frames) for table in tables)]).tolist()
-    numbers: dict[str, set[int]] = {}
-    for table in tables:
-        for kind, number in zip(table.kinds, (table.kind_ids if table.kind_ids is not None else []), strict=True):
-            numbers.setdefault(kind, set()).add(int(number))
-    known = len(numbers) == len(kinds) and all(len(ids) == 1 for ids in numbers.values())
-    kind_ids = [next(iter(numbers[kind])) for kind in kinds] if known else []
-    names = sorted({name for table in tables for name in table.extra})
-    columns = ("boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area", "sizes_wh")
-    maps = ("cameras", "image_files", "frame_attributes")
-    parts = list(zip(tables, starts, strict=False))
-
-    def unique(values: Sequence[Any]) -> Any:
-        if any(value is None for value in values) or len({value.dtype.kind for value in values}) > 1:
-            return None
-        joined = np.concatenate(values)
-        return joined if len(np.unique(joined)) == len(joined) else None
-
-    return replace(
-        tables[0],
-        frames=tuple(name for table in tables for name in table.frames),
-        kinds=tuple(kinds),
-        frame=np.concatenate([table.frame + start for table, start in parts]),
-        kind=np.concatenate(
-            [np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind] for table in tables]
-        ),
-        **{name: np.concatenate([getattr(table, name) for table in tables]) for name in columns},
-        image_ids=unique([table.image_ids for table in tables]),
-        box_ids=unique([table.box_ids for table in tables]),
-        kind_ids=np.array(kind_ids, np.int64) if known and len(set(kind_ids)) == len(kinds) else None,
-        merged_kind_ids={},
-        extra={
-            name: [v for table in tables for v in table.extra.get(name, [None] * len(table))] for name in names
-        },
-        **{
-            name: {i + start: value for table, start in parts for i, value in getattr(table, name).items()}
-            for name in maps
-        },
-    )
 
 
 def read_orientation(path: str | Path) -> int:
@@ -744,23 +710,16 @@ def turn_boxes(boxes: NDArray[np.float64], orientation: int, size_wh: Sequence[i
     return np.concatenate([low, corners.max(axis=1) - low], axis=1)
 
 
-def turn_upright(table: LabelTable, images: Mapping[str, Path]) -> LabelTable:
+def turn_upright(table: LabelTable) -> LabelTable:
     """Turn the boxes, outlines and sizes of those frames that refer to the stored pixels of a turned image.
 
     Outlines that are run lengths, cameras and keypoints of turned frames are dropped.
-
-    Args:
-        table: Labels of a COCO data set.
-        images: Images by frame identifier.
-
-    Returns:
-        The table, of upright images.
     """
     boxes, sizes_wh, cameras = table.boxes.copy(), table.sizes_wh.copy(), dict(table.cameras)
     extra = {name: list(values) for name, values in table.extra.items()}
     for i, rows in enumerate(table.rows_by_frame()):
         size_wh = sizes_wh[i].tolist()
-        orientation = read_turn(images.get(table.frames[i]), size_wh)
+        orientation = read_turn(table.image_paths.get(i), size_wh)
         if orientation == 1:
             continue
         boxes[rows.start : rows.stop] = turn_boxes(boxes[rows.start : rows.stop], orientation, size_wh)

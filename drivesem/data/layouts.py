@@ -47,9 +47,7 @@ def detect_layout(path: Path) -> str | None:
     if not folder.is_dir():
         return None
     # YOLO's lines begin with a class number, KITTI's with a name
-    names = (
-        name for name in kitti_labels.list_text_files(folder) if yolo_labels.is_label_file(os.path.basename(name))
-    )
+    names = (name for name in kitti_labels.list_files(folder) if yolo_labels.is_label_file(os.path.basename(name)))
     starts = (files.read_text(folder / name).split(None, 1)[:1] for name in names)
     first = next((words[0] for words in starts if words), None)
     if first is None and folder == path / "labels":
@@ -57,7 +55,13 @@ def detect_layout(path: Path) -> str | None:
     return "yolo" if first is not None and first.replace(".", "", 1).isdecimal() else "kitti"
 
 
-def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable | None = None) -> LabelTable:
+def read_table(
+    path: Path,
+    layout: str,
+    scored: bool = False,
+    truth: LabelTable | None = None,
+    size_wh: tuple[int, int] | None = None,
+) -> LabelTable:
     """Read labels or detections.
 
     Args:
@@ -65,6 +69,7 @@ def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable 
         layout: One of LAYOUTS.
         scored: Read detections with scores.
         truth: Labels of the same frames, which give detections COCO's ids, YOLO's classes and image sizes.
+        size_wh: Size of all images, px; by default YOLO's images are opened, to scale its labels.
 
     Returns:
         The labels or detections.
@@ -82,7 +87,7 @@ def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable 
     if layout == "yolo":
         from drivesem.data import yolo
 
-        return yolo.read_table(path, scored, truth)
+        return yolo.read_table(path, scored, truth, size_wh)
     if layout not in LAYOUTS:
         raise RangeError("layout", f"one of {', '.join(LAYOUTS)}", layout)
     if scored:
@@ -92,4 +97,7 @@ def read_table(path: Path, layout: str, scored: bool = False, truth: LabelTable 
     from drivesem.data import vkitti1, vkitti2
 
     dataset = (vkitti1.Vkitti1Dataset if layout == "vkitti1" else vkitti2.Vkitti2Dataset)(path)
-    return replace(dataset.table(), account=dataset.account())
+    table = dataset.table()
+    images = {i: dataset.image_path(name) for i, name in enumerate(table.frames)}
+    names = {i: f"{table.frames[i]}{path.suffix}" for i, path in images.items()}
+    return replace(table, image_files=names, image_paths=images, account=dataset.account())

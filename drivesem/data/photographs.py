@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -13,6 +16,7 @@ import numpy as np
 import torch
 
 from drivesem.data.account import IMAGE_SUFFIXES
+from drivesem.data.coco_labels import read_orientation
 from drivesem.data.kitti_labels import NEAR_M
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, make_printable
@@ -41,6 +45,8 @@ _QUARTER_TURNS: dict[float, int] = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8:
 """Quarter turns to the left that make an image of each EXIF orientation upright."""
 _MIRRORED = (2, 4, 5, 7)
 """Orientations that are also mirrored left to right, after the turns."""
+_JPEG_QUALITY = 95
+"""JPEG quality of copies that are turned upright."""
 _CONVERTIBLE_MODES = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
 """Pillow's 8-bit modes that convert to RGB."""
 
@@ -110,12 +116,6 @@ def name_by_path(images: Sequence[Path], root: Path) -> dict[str, Path]:
     return named
 
 
-def read_image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header. FormatError."""
-    with files.open_image(path) as image:
-        return image.size
-
-
 def pinhole_camera(height: int, width: int, focal_px: float) -> Camera:
     """Make a camera with a centred principal point.
 
@@ -182,16 +182,14 @@ def is_in_front(z: float, length: float, width: float, yaw: float) -> bool:
     return z + 0.5 * (length * abs(math.sin(yaw)) + width * abs(math.cos(yaw))) > NEAR_M
 
 
-def match_images(folders: Sequence[Path], frames: Sequence[str]) -> dict[str, Path]:
-    """Find the image of each frame in one of the folders; frames without an image are left out."""
-    images = {p.stem: p for folder in reversed(folders) for p in list_images(folder)}
-    return {name: images[name] for name in frames if name in images}
-
-
-def match_images_below(folders: Sequence[Path], frames: Sequence[str]) -> dict[str, Path]:
-    """As `match_images`, in those folders that exist and in their direct subfolders."""
-    parents = [folder for folder in folders if folder.is_dir()]
-    return match_images([f for p in parents for f in (p, *sorted(c for c in p.iterdir() if c.is_dir()))], frames)
+def match_images(folder: Path, frames: Sequence[str]) -> dict[str, Path]:
+    """Find the image of each frame below a folder, by its identifier, or its last part; others are left out."""
+    paths = list_images(folder, recursive=True)
+    by_path = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(paths)}
+    count = Counter(path.stem for path in by_path.values())
+    by_stem = {path.stem: path for path in by_path.values() if count[path.stem] == 1}
+    found = {name: by_path.get(name) or by_stem.get(name.rpartition("/")[2]) for name in frames}
+    return {name: path for name, path in found.items() if path is not None}
 
 
 def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
@@ -233,6 +231,26 @@ def turn_pixels(pixels: np.ndarray, orientation: float) -> np.ndarray:
     """Turn a stored image or mask (H, W, ...) upright. orientation: EXIF's, 1 to 8; others change nothing."""
     pixels = np.rot90(pixels, _QUARTER_TURNS.get(orientation, 0))
     return np.ascontiguousarray(pixels[:, ::-1] if orientation in _MIRRORED else pixels)
+
+
+def copy_upright(source: Path, target: Path) -> None:
+    """Copy an image unchanged; with an EXIF orientation, turned upright, without that tag, in the same file format.
+
+    Raises FormatError for a damaged image.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if read_orientation(source) == 1:
+        shutil.copyfile(source, target)
+        return
+    from PIL import ImageOps
+
+    with files.open_image(source) as image:
+        upright = ImageOps.exif_transpose(image)  # without the tag
+        data = BytesIO()
+        options = {"quality": _JPEG_QUALITY, "subsampling": 0} if image.format == "JPEG" else {"lossless": True}
+        profile = image.info.get("icc_profile")
+        upright.save(data, image.format, exif=upright.getexif().tobytes(), icc_profile=profile, **options)
+    files.write_bytes(target, data.getvalue())
 
 
 def read_upright_size(path: Path) -> tuple[int, int]:

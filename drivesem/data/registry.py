@@ -10,9 +10,8 @@ from drivesem.data import bdd100k, coco, fiftyone, kitti, vkitti1, vkitti2, voc,
 from drivesem.data.account import DataAccount
 from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.label_table import LabelTable, WriteSummary
-from drivesem.data.layouts import LAYOUTS, detect_layout
+from drivesem.data.layouts import detect_layout
 from drivesem.data.photograph_dataset import PhotographDataset
-from drivesem.data.vkitti import VirtualKittiDataset
 from drivesem.store import local_copy
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
@@ -183,26 +182,3 @@ def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, 
         FormatError: The table lacks something that the layout requires.
     """
     return _TABLE_WRITERS[layout](table, out, images)
-
-
-def find_images(path: Path, layout: str, frames: Sequence[str]) -> dict[str, Path]:
-    """Find the images of labels in the place that their layout prescribes.
-
-    Args:
-        path: File or folder of labels.
-        layout: Layout of the labels; without a location for images, as of runs, nothing is found.
-        frames: Identifiers of the frames.
-
-    Returns:
-        Image files by identifier.
-    """
-    if layout not in LAYOUTS:
-        return {}
-    if layout in ("kitti", "coco"):
-        return (kitti if layout == "kitti" else coco).find_images(path, frames)
-    if layout in ("voc", "bdd100k"):
-        images = (voc.VocFiles if layout == "voc" else bdd100k.BddFiles)(path).images
-        return {name: images[name] for name in frames if name in images}
-    dataset = DATASETS[layout](path)
-    assert isinstance(dataset, (VirtualKittiDataset, yolo.YoloDataset))
-    return {name: dataset.image_path(name) for name in frames}

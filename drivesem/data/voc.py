@@ -297,6 +297,7 @@ class VocFiles:
             occlusion=np.array(occlusion, np.int64),
             sizes_wh=sizes,
             image_files={i: self._names[name] for i, name in enumerate(identifiers) if name in self._names},
+            image_paths={i: self.images[name] for i, name in enumerate(identifiers) if name in self.images},
         )
         return table, repairs, unused
 

@@ -162,7 +162,7 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
         part: copy(splits[first]) for part in ("train", "val") if splits
     } | splits  # one list would be an alias
     _write_yaml(out, parts, table.kinds)
-    masked = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-9) & written
+    masked = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-3, atol=0.01) & written
     without = ~table.ignore & (table.boxes[:, 2:] <= 0).any(axis=1)
     more = {
         "box without area": int(without.sum()),
@@ -245,7 +245,7 @@ def _count_renamed(table: LabelTable, names: Sequence[str]) -> int:
 def _suffix(table: LabelTable, i: int, images: Mapping[str, Path]) -> str:
     """Return the suffix of a frame's image, in the data set that is written."""
     image = images.get(table.frames[i], Path(table.image_files.get(i, "")))
-    return image.suffix.lower() or ".png"
+    return image.suffix or ".png"
 
 
 def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -261,13 +261,16 @@ def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.
     return np.where(clipped[:, None], np.concatenate([corner, end - corner], axis=1), table.boxes), clipped
 
 
-def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable:
+def read_table(
+    path: Path, scored: bool, truth: LabelTable | None, size_wh: tuple[int, int] | None = None
+) -> LabelTable:
     """Read labels of a data set, or detections.
 
     Args:
         path: Folder or description of a data set, or folder of detections.
         scored: Read detections: text files with the classes and image sizes of `truth`.
         truth: Labels of the same frames, for detections.
+        size_wh: Size of all images of labels, px; by default they are opened.
 
     Returns:
         The labels or detections.
@@ -276,7 +279,7 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
         FormatError: Names file, line and field.
     """
     if not scored:
-        return YoloDataset(path).table()
+        return YoloDataset(path).table(size_wh)
     if truth is None or not truth.sizes_wh.all():
         raise FormatError(str(path), "labels with image sizes (YOLO's or COCO's)", "none")
     if path.is_file():
@@ -350,7 +353,8 @@ def _to_table(
     scale = np.tile(sizes_wh[rows.file], 2).astype(np.float64)
     low = (rows.shares[:, :2] - rows.shares[:, 2:] / 2) * scale[:, :2]
     boxes = np.concatenate([low, rows.shares[:, 2:] * scale[:, 2:]], axis=1)
-    tracks = [None if math.isnan(track) else int(track) for track in rows.track.tolist()]
+    known = np.isfinite(rows.track).any()
+    tracks = [None if math.isnan(track) else int(track) for track in rows.track.tolist()] if known else []
     return LabelTable.from_columns(
         frames,
         kinds,
@@ -360,7 +364,7 @@ def _to_table(
         "xywh",
         area=boxes[:, 2] * boxes[:, 3],
         sizes_wh=sizes_wh,
-        extra={"track": tracks} if any(track is not None for track in tracks) else {},
+        extra={"track": tracks} if known else {},
     )
 
 
@@ -442,22 +446,27 @@ class YoloDataset(FrameIndex[str]):
         """Read the labels of one frame and its image's header. Raises FormatError naming file, line and field."""
         return self._make_table((identifier,), self._read_rows((identifier,))).to_labels()
 
-    def table(self) -> LabelTable:
-        """Read the labels of all frames, and their images' headers. Raises FormatError as `labels`."""
+    def table(self, size_wh: tuple[int, int] | None = None) -> LabelTable:
+        """Read the labels of all frames, and their images' headers, unless `size_wh` is the size of all, px.
+
+        Raises FormatError as `labels`.
+        """
         rows = self._read_rows(self.identifiers)
-        table = self._make_table(self.identifiers, rows)
+        table = self._make_table(self.identifiers, rows, size_wh)
         position = {identifier: i for i, identifier in enumerate(self.identifiers)}
         return replace(
             table,
             image_files={i: self._file_names[identifier] for identifier, i in position.items()},
+            image_paths={i: Path(self._entry(identifier)) for identifier, i in position.items()},
             splits={name: [position[i] for i in identifiers] for name, identifiers in self.splits().items()},
             account=self._account(rows, table.kind),
         )
 
-    def _make_table(self, identifiers: Sequence[str], rows: YoloRows) -> LabelTable:
-        sizes = np.array([read_upright_size(Path(self._entry(name))) for name in identifiers], np.int64).reshape(
-            -1, 2
-        )
+    def _make_table(
+        self, identifiers: Sequence[str], rows: YoloRows, size_wh: tuple[int, int] | None = None
+    ) -> LabelTable:
+        read = ([*(size_wh or read_upright_size(Path(self._entry(name))))] for name in identifiers)
+        sizes = np.array([*read], np.int64).reshape(-1, 2)
         return _to_table(identifiers, self.class_names, _to_kinds(self.class_names), rows, sizes)
 
     def image_path(self, identifier: str) -> Path:

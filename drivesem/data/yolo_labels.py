@@ -165,14 +165,14 @@ def read_rows(paths: Sequence[str], classes: int, scored: bool, keypoints: int =
         FormatError: Names file, line and field.
     """
     repairs: Counter[str] = Counter()
-    chunks = list(_read_chunks(paths, classes, scored, keypoints, repairs))
+    chunks: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    for places, rows in _read_chunks(paths, classes, scored, keypoints, repairs):
+        first = np.ones(len(rows), np.bool_) if scored else _first_of_equal_rows(places, rows)
+        repairs.update({"repeated rows (dropped)": repeated} if (repeated := int((~first).sum())) else {})
+        chunks.append((places[first], rows[first]))
     file = np.concatenate([np.zeros(0, np.int64), *(places for places, _ in chunks)])
     values = np.concatenate([np.zeros((0, 7)), *(rows for _, rows in chunks)])
     if not scored:
-        first = _first_of_equal_rows(file, values)
-        if not first.all():
-            repairs["repeated rows (dropped)"] += int((~first).sum())
-            file, values = file[first], values[first]
         sixth = values[:, 5].copy()
         known = np.isfinite(sixth)
         values[:, 5:] = np.nan

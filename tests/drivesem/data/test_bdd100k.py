@@ -10,7 +10,7 @@ from PIL import Image
 from drivesem.cli import main
 from drivesem.data import bdd100k
 from drivesem.data.layouts import detect_layout, read_table
-from drivesem.data.registry import find_images, open_dataset
+from drivesem.data.registry import open_dataset
 from drivesem.data.subsets import FrameFilter, open_selection
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -100,7 +100,7 @@ def test_forms(form: str, tmp_path: Path) -> None:
         "folder": "train",
         "focal": "70.0 px, given",
     }
-    assert find_images(tmp_path, "bdd100k", ["a1"]) == {"a1": tmp_path / "images/100k/train/a1.jpg"}
+    assert read_table(tmp_path, "bdd100k").image_paths[0] == tmp_path / "images/100k/train/a1.jpg"
     account = dataset.account()
     assert (account.frames, account.files, account.regions, account.unlabelled) == (2, 4, 1, 1)
     assert account.classes == {"car": 1, "rider": 1}

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from detectors.types import Targets
 from drivesem.data import layouts, registry
-from drivesem.data.classes import KITTI
+from drivesem.data.kitti import format_calibration
 from drivesem.data.label_table import LabelTable
+from drivesem.training.frames import make_targets
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.types import Labels
@@ -20,6 +21,9 @@ SIZE = (1242, 375)
 
 def _kitti(root: Path, right: float) -> None:
     files.write_png(root / "training/image_2/000000.png", np.zeros((*SIZE[::-1], 3), np.uint8))
+    files.write_text(
+        root / "training/calib/000000.txt", format_calibration(torch.eye(3, 4) + 99 * torch.eye(3, 4))
+    )
     files.write_text(root / "training/label_2/000000.txt", f"Car 0 0 -10 10 20 {right} 60 {POSE}\n")
 
 
@@ -73,8 +77,7 @@ def test_a_box_without_an_area_is_read_and_never_trained_on(layout: str, tmp_pat
     labels, table = _both(layout, tmp_path, 10)
     assert labels.boxes_xyxy.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
     assert table.with_box_format("xyxy").boxes.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
-    targets: Targets = KITTI.targets(labels)
-    assert targets.ignore.tolist() == [True]
+    assert make_targets(labels).ignore.tolist() == [True]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -84,7 +87,7 @@ def test_scenes_and_tables_read_alike(layout: str, tmp_path: Path) -> None:
     for name in Labels.__slots__:
         mine, other = getattr(labels, name), getattr(again, name)
         assert mine == other if name == "kind" else np.array_equal(mine, other, equal_nan=True), name
-    assert KITTI.targets(labels).ignore.tolist() == [False]
+    assert make_targets(labels).ignore.tolist() == [False]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

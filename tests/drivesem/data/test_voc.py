@@ -9,7 +9,7 @@ from PIL import Image
 
 from drivesem.cli import main
 from drivesem.data.layouts import detect_layout, read_table
-from drivesem.data.registry import find_images, open_dataset
+from drivesem.data.registry import open_dataset
 from scene_ir.errors import FormatError
 
 Box = tuple[float, float, float, float]
@@ -104,7 +104,7 @@ def test_tables_have_sizes_splits_and_file_names(folder: Path) -> None:
     assert table.image_files == {0: "a1.jpg", 1: "a2.jpg", 2: "b1.jpg"}
     assert table.account is not None
     assert table.account.frames == 3
-    assert find_images(folder, "voc", ["a2"]) == {"a2": folder / "JPEGImages/a2.jpg"}
+    assert table.image_paths[1] == folder / "JPEGImages/a2.jpg"
     with pytest.raises(FormatError, match="detections with scores, found voc,"):
         read_table(folder, "voc", scored=True)
 

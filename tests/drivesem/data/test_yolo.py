@@ -597,5 +597,5 @@ def test_splits_are_written(
     assert summary.lost == lost | rest
     again = layouts.read_table(tmp_path / "out", "yolo")
     assert again.kinds == ("Van", "Car")
-    names = {"a/drive/0.jpg", "b/drive/1.jpg"} if rest else {"drive/0.jpg", "drive/1.jpg", "x.png"}
-    assert {name.replace(".PNG", ".png") for name in again.image_files.values()} == names
+    names = {"a/drive/0.jpg", "b/drive/1.jpg"} if rest else {"drive/0.jpg", "drive/1.jpg", "x.PNG"}
+    assert set(again.image_files.values()) == names
