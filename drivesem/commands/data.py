@@ -22,8 +22,6 @@ from drivesem.report.drawing import write_picture
 from drivesem.report.tables import format_count, print_json
 from drivesem.report.terminal import Console
 from drivesem.run.conversion import ConversionSettings, convert_labels
-from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
-from drivesem.run.finished import load_runs
 from drivesem.run.labels import detect_labels_layout
 from drivesem.store import local_copy
 
@@ -139,6 +137,9 @@ def summarise_losses(written: WriteSummary) -> str:
 
 def export_command(config: ExportConfig) -> int:
     """`drivesem export`: export the counterexamples of a run."""
+    from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
+    from drivesem.run.finished import load_runs  # these double the memory that inspect and convert start with
+
     out = Path(config.out or "")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("--out", "a new or empty folder", out)

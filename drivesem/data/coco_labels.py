@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from drivesem.data import fiftyone
 from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
-from drivesem.data.label_table import REGION, LabelTable, join_tables
+from drivesem.data.json_columns import BoxRowColumns
+from drivesem.data.label_table import REGION, LabelTable, join_tables, repeat_value
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -74,6 +75,8 @@ class JsonRows:
     @classmethod
     def from_list(cls, where: str, rows: Any) -> JsonRows:
         """Wrap all entries of a list. Raises FormatError if it is not a list of objects."""
+        if isinstance(rows, BoxRowColumns):
+            return cls(where, rows, range(len(rows)))
         if not isinstance(rows, list):
             raise FormatError(where, "a list", "none" if rows is None else type(rows).__name__)
         if not set(map(type, rows)) <= {dict}:
@@ -94,10 +97,16 @@ class JsonRows:
 
     def values(self, key: str, missing: Any = None) -> list[Any]:
         """Return the values (N,) of a key."""
+        if isinstance(self.rows, BoxRowColumns):
+            return self.rows.column(key, missing)
         try:
             return list(map(itemgetter(key), self.rows))
         except KeyError:
             return [row.get(key, missing) for row in self.rows]
+
+    def key_names(self) -> set[str]:
+        """Return the keys that occur."""
+        return self.rows.key_names() if isinstance(self.rows, BoxRowColumns) else set().union(*self.rows)
 
     def integers(self, key: str) -> NDArray[np.int64]:
         """Return the integers (N,) of a key. Raises FormatError naming the first row without one."""
@@ -156,7 +165,7 @@ class JsonRows:
 
     def boxes(self) -> NDArray[np.float64]:
         """Return left, top, width, height (N, 4). Raises FormatError naming the first row without such a box."""
-        values = self.values("bbox")
+        values = self.rows.boxes() if isinstance(self.rows, BoxRowColumns) else self.values("bbox")
         try:
             array = np.array(values).reshape(len(values), 4)
             boxes = array.astype(np.float64)
@@ -164,6 +173,7 @@ class JsonRows:
                 return boxes
         except (ValueError, TypeError):
             pass  # the row is found below
+        values = self.values("bbox")
         for i, value in enumerate(values):
             if not (isinstance(value, list) and len(value) == 4 and all(type(v) in (int, float) for v in value)):
                 raise FormatError(self.locate(i, "bbox"), "x, y, width, height", json.dumps(value)[:60])
@@ -221,29 +231,32 @@ class JsonRows:
 
     def is_numeric(self, key: str) -> bool:
         """Whether a key has numbers only; it may be missing."""
-        return {type(row.get(key)) for row in self.rows} <= {int, float, type(None)}
+        return set(map(type, self.values(key))) <= {int, float, type(None)}
 
     def regions(self) -> NDArray[np.bool_]:
         """Return which rows (N,) are crowds or regions to ignore.
 
         pycocotools overwrites "ignore" by "iscrowd"; here both are regions.
         """
-        return np.array([bool(row.get("iscrowd") or row.get("ignore")) for row in self.rows], np.bool_)
+        flags = np.zeros(len(self), np.bool_)
+        for key in self.key_names() & {"iscrowd", "ignore"}:
+            flags |= np.array(list(map(bool, self.values(key))), np.bool_)
+        return flags
 
     def count_unusable(self) -> dict[str, int]:
         """Count the values that a scene cannot use, and which it takes for unknown."""
-        keys = set().union(*self.rows)
+        keys = self.key_names()
         counts: dict[str, int] = {}
         if "truncation" in keys:
-            bad = (row.get("truncation") for row in self.rows)
             counts["truncations outside [0, 1]"] = sum(
-                v not in (None, -1) and not (type(v) in (int, float) and 0 <= v <= 1) for v in bad
+                v not in (None, -1) and not (type(v) in (int, float) and 0 <= v <= 1)
+                for v in self.values("truncation")
             )
         if "occlusion" in keys:
-            bad = (row.get("occlusion") for row in self.rows)
-            counts["occlusions other than 0 to 3"] = sum(v not in (None, -1, 0, 1, 2, 3) for v in bad)
+            wrong = (value not in (None, -1, 0, 1, 2, 3) for value in self.values("occlusion"))
+            counts["occlusions other than 0 to 3"] = sum(wrong)
         if "pose" in keys:
-            given = (i for i, row in enumerate(self.rows) if row.get("pose") is not None)
+            given = (i for i, value in enumerate(self.values("pose")) if value is not None)
             counts["3D boxes that cannot be used"] = sum(math.isnan(self.pose(i)[0]) for i in given)
         return {name: count for name, count in counts.items() if count}
 
@@ -269,20 +282,20 @@ class JsonRows:
         Returns:
             The table.
         """
-        keys = set().union(*self.rows)
+        keys = self.key_names()
 
         def column(key: str, missing: float = math.nan) -> NDArray[np.float64]:
-            return self.column(key, missing) if key in keys else np.full(len(self), missing)
+            return self.column(key, missing) if key in keys else repeat_value(missing, len(self))
 
         boxes = self.boxes()
-        area = np.full(len(self), np.nan) if scored else column("area")
+        area = repeat_value(np.nan, len(self)) if scored else column("area")
         numbers = self.values("id") if "id" in keys else []
         texts = {key for key in ("truncation", "occlusion", "alpha") if not self.is_numeric(key)}
         names = [] if scored else sorted((keys - _TABLE_COLUMNS) | texts)
         keys -= texts
-        pose = np.full((len(self), 7), np.nan)
+        pose = repeat_value(math.nan, len(self), 7)
         if "pose" in keys:
-            pose[:] = [self.pose(i) for i in range(len(self))]
+            pose = np.array([self.pose(i) for i in range(len(self))], np.float64).reshape(-1, 7)
         return LabelTable.from_columns(
             frames,
             kinds,
@@ -291,9 +304,9 @@ class JsonRows:
             boxes,
             "xywh",
             ignore=self.regions() if keys & {"iscrowd", "ignore"} else np.zeros(len(self), np.bool_),
-            score=self.column("score", None) if scored else np.full(len(self), np.nan),
+            score=self.column("score", None) if scored else repeat_value(np.nan, len(self)),
             truncation=column("truncation", -1.0),
-            occlusion=self.flags("occlusion", -1) if "occlusion" in keys else np.full(len(self), -1),
+            occlusion=self.flags("occlusion", -1) if "occlusion" in keys else repeat_value(-1, len(self)),
             alpha=column("alpha"),
             pose=pose,
             area=np.where(np.isnan(area), boxes[:, 2] * boxes[:, 3], area),
@@ -350,7 +363,7 @@ class AnnotationFile:
 
     def _number_anew(self, rows: JsonRows) -> JsonRows:
         """Give annotations whole numbers that no other one has, where they repeat one."""
-        numbers = [row["id"] for row in rows.rows if type(row.get("id")) is int]
+        numbers = [number for number in rows.values("id") if type(number) is int]
         if len(set(numbers)) == len(numbers):
             return rows
         following, seen, renewed = max(numbers) + 1, set[int](), list(rows.rows)
@@ -455,8 +468,10 @@ class AnnotationFile:
         )
         exported = {i: {"drivesem": row["drivesem"]} for i, row in enumerate(images) if "drivesem" in row}
         attributes = {i: self.attributes(i) for i in range(len(images))}
+        if (np.diff(table.frame) < 0).any():
+            table = table.select(np.argsort(table.frame, kind="stable"))
         return replace(
-            _merge_regions(table.select(np.argsort(table.frame, kind="stable"))),
+            _merge_regions(table),
             sizes_wh=self.sizes_wh(),
             image_ids=self.image_ids,
             merged_kind_ids=self.merged_ids,
@@ -562,9 +577,6 @@ class CocoFiles:
         if not found:
             expected = "a COCO folder, with annotations/instances_*.json, or such a file (--root FILE.json)"
             raise FormatError(str(root), expected, "neither")
-        for path in found:
-            if not files.read_bytes(path).strip():
-                raise FormatError(str(path), "COCO annotations or results", "an empty file")
         self.parts = [AnnotationFile(path, _read_content(path), split) for path, split in found.items()]
         self.names = self._name_frames()
         """Identifiers of the images of each file."""
@@ -641,8 +653,15 @@ class CocoFiles:
 
 
 def _read_content(path: Path) -> Any:
-    """Read a data set's file; FiftyOne's own form is converted."""
-    content = files.read_json(path)
+    """Read a data set's file, its annotations by column; FiftyOne's own form is converted."""
+    text = files.read_text(path)
+    if not text or text.isspace():
+        raise FormatError(str(path), "COCO annotations or results", "an empty file")
+    columns = BoxRowColumns()
+    content = files.parse_json(text, str(path), columns.store)
+    if isinstance(content, dict) and columns.holds(content.get("annotations")):
+        return {**content, "annotations": columns}
+    content = files.parse_json(text, str(path))
     if isinstance(content, dict) and isinstance(content.get("labels"), dict) and "annotations" not in content:
         return fiftyone.to_coco(path, content, read_upright_size)
     return content

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -218,9 +218,7 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     root = out / "training" if images or table.cameras or any("/" in name for name in names) else out
     folder = root / "label_2" if root != out else out
     for name, rows in zip(names, table.rows_by_frame(), strict=True):
-        written = [row for row in rows if not (scored and table.kind[row] == REGION)]
-        text = "".join(f"{_format_row(table, row, kinds, scored)}\n" for row in written)
-        files.write_text(folder / f"{name}.txt", text)
+        files.write_text(folder / f"{name}.txt", "".join(_format_rows(table, rows, kinds, scored)))
     for i, camera in table.cameras.items():
         calibration = format_calibration(torch.from_numpy(parse_camera_entry(camera)))
         files.write_text(root / "calib" / f"{names[i]}.txt", calibration)
@@ -250,20 +248,39 @@ def _kitti_type(kind: str, boxes: int) -> str:
     return kind
 
 
-def _format_row(table: LabelTable, row: int, kinds: Sequence[str], scored: bool) -> str:
-    region = table.kind[row] == REGION or bool(table.ignore[row])
-    truncation, occlusion, alpha = float(table.truncation[row]), int(table.occlusion[row]), float(table.alpha[row])
-    pose = table.pose[row].tolist()
-    pose = pose if is_known_pose(pose) and not region else None
-    if pose is not None and not math.isfinite(alpha):
-        alpha = math.remainder(pose[6] - math.atan2(pose[3], pose[5]), 2 * math.pi)
-    if not region and not scored:
-        # KITTI has a code for unknown occlusion, but none for unknown truncation
-        occlusion = UNKNOWN_OCCLUSION if occlusion < 0 else occlusion
-        truncation = max(truncation, 0.0)
-    score = format_shortest(float(table.score[row])) if scored else None
-    kind = "DontCare" if region else kinds[int(table.kind[row])]
-    return _format_line(kind, truncation, occlusion, alpha, table.boxes[row].tolist(), pose, score)
+def _format_rows(table: LabelTable, rows: range, kinds: Sequence[str], scored: bool) -> Iterator[str]:
+    """Yield the lines of a frame's boxes.
+
+    Args:
+        table: Labels or detections.
+        rows: Rows of the frame.
+        kinds: KITTI's types of the table's classes.
+        scored: Write detections; regions are left out.
+    """
+    part = slice(rows.start, rows.stop)
+    columns = (table.kind, table.ignore, table.truncation, table.occlusion, table.alpha, table.boxes, table.pose)
+    values = zip(*(column[part].tolist() for column in columns), table.score[part].tolist(), strict=True)
+    for kind, ignore, truncation, occlusion, alpha, box, pose, score in values:
+        if scored and kind == REGION:
+            continue
+        region = kind == REGION or ignore
+        known = is_known_pose(pose) and not region
+        if known and not math.isfinite(alpha):
+            alpha = math.remainder(pose[6] - math.atan2(pose[3], pose[5]), 2 * math.pi)
+        if not region and not scored:
+            # KITTI has a code for unknown occlusion, but none for unknown truncation
+            occlusion = UNKNOWN_OCCLUSION if occlusion < 0 else occlusion
+            truncation = max(truncation, 0.0)
+        line = _format_line(
+            "DontCare" if region else kinds[kind],
+            truncation,
+            occlusion,
+            alpha,
+            box,
+            pose if known else None,
+            format_shortest(score) if scored else None,
+        )
+        yield f"{line}\n"
 
 
 def _write_splits(table: LabelTable, names: Sequence[str], out: Path) -> tuple[int, int]:

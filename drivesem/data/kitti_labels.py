@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
-from drivesem.data.label_table import REGION, LabelTable, join_tables
+from drivesem.data.label_table import REGION, LabelTable, join_tables, repeat_value
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -171,11 +171,13 @@ class KittiLabelLines:
             np.fromiter(map(index.__getitem__, self.kinds), np.int64, len(self.kinds)),
             values[:, 3:7].copy(),
             "xyxy",
-            score=values[:, 14].copy() if scored else np.full(len(values), np.nan),
+            score=values[:, 14].copy() if scored else repeat_value(np.nan, len(values)),
             truncation=values[:, 0].copy(),
             occlusion=values[:, 1].astype(np.int64),
             alpha=np.where(values[:, 2] == UNKNOWN_ANGLE, np.nan, values[:, 2]),
-            pose=np.where(known[:, None], np.concatenate([size, position], axis=1), np.nan),
+            pose=np.where(known[:, None], np.concatenate([size, position], axis=1), np.nan)
+            if known.any()
+            else repeat_value(np.nan, len(values), 7),
         )
 
 

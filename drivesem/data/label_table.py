@@ -142,12 +142,12 @@ class LabelTable:
         kind = np.asarray(kind, np.int64)
         unknown: dict[str, Any] = {
             "ignore": kind == REGION,
-            "score": np.full(n, np.nan),
-            "truncation": np.full(n, -1.0),
-            "occlusion": np.full(n, -1, np.int64),
-            "alpha": np.full(n, np.nan),
-            "pose": np.full((n, 7), np.nan),
-            "area": np.full(n, np.nan),
+            "score": repeat_value(np.nan, n),
+            "truncation": repeat_value(-1.0, n),
+            "occlusion": repeat_value(-1, n),
+            "alpha": repeat_value(np.nan, n),
+            "pose": repeat_value(np.nan, n, 7),
+            "area": repeat_value(np.nan, n),
             "sizes_wh": np.zeros((len(frames), 2), np.int64),
         }
         frame = np.asarray(frame, np.int64)
@@ -166,7 +166,7 @@ class LabelTable:
         index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
         return replace(
             self,
-            **{name: getattr(self, name)[index] for name in columns},
+            **{name: _select_rows(getattr(self, name), index) for name in columns},
             box_ids=None if self.box_ids is None else self.box_ids[index],
             extra={name: [values[i] for i in index.tolist()] for name, values in self.extra.items()},
         )
@@ -298,7 +298,7 @@ def join_tables(tables: Sequence[LabelTable]) -> LabelTable:
     starts = np.cumsum([0, *(len(table.frames) for table in tables)]).tolist()
     numbers: dict[str, set[int]] = {}
     for table in tables:
-        for kind, number in zip(table.kinds, (table.kind_ids if table.kind_ids is not None else []), strict=True):
+        for kind, number in zip(table.kinds, table.kind_ids, strict=True) if table.kind_ids is not None else ():
             numbers.setdefault(kind, set()).add(int(number))
     known = len(numbers) == len(kinds) and all(len(ids) == 1 for ids in numbers.values())
     kind_ids = [next(iter(numbers[kind])) for kind in kinds] if known else []
@@ -321,7 +321,7 @@ def join_tables(tables: Sequence[LabelTable]) -> LabelTable:
         kind=np.concatenate(
             [np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind] for table in tables]
         ),
-        **{name: np.concatenate([getattr(table, name) for table in tables]) for name in columns},
+        **{name: _concatenate([getattr(table, name) for table in tables]) for name in columns},
         image_ids=unique([table.image_ids for table in tables]),
         box_ids=unique([table.box_ids for table in tables]),
         kind_ids=np.array(kind_ids, np.int64) if known and len(set(kind_ids)) == len(kinds) else None,
@@ -334,6 +334,32 @@ def join_tables(tables: Sequence[LabelTable]) -> LabelTable:
             for name in maps
         },
     )
+
+
+def repeat_value(value: float, *shape: int) -> NDArray[Any]:
+    """Return a read-only array of one value, which takes no memory."""
+    return np.broadcast_to(np.array(value), shape)
+
+
+def _is_repeated(column: NDArray[Any]) -> bool:
+    return not any(column.strides)
+
+
+def _select_rows(column: NDArray[Any], index: NDArray[np.int64]) -> NDArray[Any]:
+    if len(column) and _is_repeated(column):
+        return np.broadcast_to(column[0], (len(index), *column.shape[1:]))
+    return column[index]
+
+
+def _concatenate(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    parts = [column for column in columns if len(column)] or [*columns[:1]]
+    first, length = parts[0], sum(map(len, columns))
+    alike = all(
+        _is_repeated(part) and np.array_equal(part[0], first[0], equal_nan=True) for part in parts if len(part)
+    )
+    if alike and len(first):
+        return np.broadcast_to(first[0], (length, *first.shape[1:]))
+    return np.concatenate(columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -407,7 +433,8 @@ def format_number(value: float) -> str:
 
 def format_shortest(value: float) -> str:
     """Format a number with the fewest decimals that read back unchanged, without an exponent."""
-    return np.format_float_positional(value, trim="-")
+    text = repr(float(value))
+    return np.format_float_positional(value, trim="-") if "e" in text else text.removesuffix(".0")
 
 
 def parse_camera_entry(camera: Any) -> NDArray[np.float64]:

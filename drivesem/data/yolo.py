@@ -142,11 +142,15 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     written = objects & (boxes[:, 2:] > 0).all(axis=1)
     paths = [f"{folder}/{name}" for folder, name in zip(folders, names, strict=True)]
     for path, rows, size_wh in zip(paths, table.rows_by_frame(), table.sizes_wh.tolist(), strict=True):
+        part = slice(rows.start, rows.stop)
+        columns = (written, table.kind, boxes, table.score)
         lines: list[str] = []
-        for row in (row for row in rows if written[row]):
-            line = _format_line(int(table.kind[row]), boxes[row].tolist(), size_wh, TABLE_DECIMALS)
-            score = np.format_float_positional(table.score[row], trim="0")  # "1.0": whole numbers are track ids
-            lines.append(f"{line} {score}\n" if scored else f"{line}\n")
+        for known, kind, box, score in zip(*(column[part].tolist() for column in columns), strict=True):
+            if known:
+                line = _format_line(kind, box, size_wh, TABLE_DECIMALS)
+                # "1.0": whole numbers are track ids
+                end = f" {np.format_float_positional(score, trim='0')}" if scored else ""
+                lines.append(f"{line}{end}\n")
         files.write_text(out / "labels" / f"{path}.txt", "".join(lines))
     for i, camera in table.cameras.items():
         calibration = format_calibration(torch.from_numpy(parse_camera_entry(camera)))
