@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 
 from drivesem.data.account import DataAccount, account_for_files
-from drivesem.data.coco_labels import read_turn, read_upright_size, turn_boxes
+from drivesem.data.coco_labels import read_turn, turn_boxes
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.image_index import SPLITS, FileIndex, IndexedFile, image_stem, name_uniquely
 from drivesem.data.label_table import LabelTable
 from scene_ir import files

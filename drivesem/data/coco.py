@@ -37,6 +37,7 @@ from drivesem.data.coco_labels import (
     turn_boxes,
 )
 from drivesem.data.ground_truth import Exposure, FrameLocation, TrackedObject
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.label_table import (
     REGION,
     LabelTable,
@@ -54,7 +55,6 @@ from drivesem.data.photographs import (
     pinhole_camera,
     read_focal_length,
     read_upright,
-    read_upright_size,
     turn_pixels,
 )
 from scene_ir import files

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from drivesem.data import fiftyone
 from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
+from drivesem.data.image_headers import read_orientation, read_stored_header, read_upright_size
 from drivesem.data.json_columns import BoxRowColumns
 from drivesem.data.label_table import REGION, LabelTable, join_tables, repeat_value
 from scene_ir import files
@@ -32,8 +33,6 @@ _OTHER_TASKS = ("person_keypoints_", "captions_", "stuff_", "panoptic_", "image_
 _HEAD_BYTES = 1 << 16
 _DATASET_START = re.compile(rb'"(images|annotations|categories)"\s*:\s*\[|"labels"\s*:\s*\{')
 """Matches the first keys of a data set's file; results are a list."""
-_ORIENTATION = 0x0112
-"""EXIF's tag of the orientation."""
 Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _MAX_VALUE = 2**31
 """Exclusive limit of occlusions, box coordinates and image sides."""
@@ -667,33 +666,6 @@ def _read_content(path: Path) -> Any:
     return content
 
 
-def read_orientation(path: str | Path) -> int:
-    """Read EXIF's orientation of an image, 1 to 8; 1 if there is none, or no file."""
-    if not isfile(path):
-        return 1
-    if str(path).lower().endswith((".jpg", ".jpeg", ".png")):  # faster than to parse the header
-        with open(path, "rb") as stream:
-            head = stream.read(_HEAD_BYTES)
-        if b"Exif\0\0" not in head and b"eXIf" not in head:
-            return 1
-    return _read_header(path)[0]
-
-
-def read_upright_size(path: str | Path) -> tuple[int, int]:
-    """Read width and height of the upright image from its header. Raises FormatError."""
-    orientation, width, height = _read_header(path)
-    return (height, width) if orientation > 4 else (width, height)
-
-
-def _read_header(path: str | Path) -> tuple[int, int, int]:
-    """Read an image's orientation, width and height, as stored. Raises FormatError."""
-    from PIL import Image
-
-    with files.open_image(Path(path)) as image:
-        orientation = Image.Image.getexif(image).get(_ORIENTATION)  # PNG's own method would decode all pixels
-        return (orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1, *image.size)
-
-
 def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:
     """Return the orientation by which an image's labels must be turned, 5 to 8; 1 if they are upright.
 
@@ -704,7 +676,7 @@ def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:
     """
     if path is None or size_wh[0] == size_wh[1] or read_orientation(path) < 5:
         return 1
-    orientation, width, height = _read_header(path)
+    orientation, width, height = read_stored_header(path)
     return orientation if (width, height) == tuple(size_wh) else 1
 
 

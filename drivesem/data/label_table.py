@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivesem.data.account import DataAccount
+from drivesem.data.image_headers import copy_upright
 from scene_ir.errors import FormatError
 
 if TYPE_CHECKING:  # torch takes a second to load; most readers of label files do not need it
@@ -163,7 +164,7 @@ class LabelTable:
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> LabelTable:
         """Select boxes by mask or indices, ascending by frame; the frames stay."""
         columns = ("frame", "kind", "boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area")
-        index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+        index: NDArray[np.int64] = np.arange(len(self))[chosen]
         return replace(
             self,
             **{name: _select_rows(getattr(self, name), index) for name in columns},
@@ -407,8 +408,6 @@ def copy_images(
     Raises:
         FormatError: An image has another suffix.
     """
-    from drivesem.data.photographs import copy_upright
-
     for identifier, source in images.items():
         target, suffix = targets[identifier], source.suffix
         if suffixes is not None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -16,7 +14,6 @@ import numpy as np
 import torch
 
 from drivesem.data.account import IMAGE_SUFFIXES
-from drivesem.data.coco_labels import read_orientation
 from drivesem.data.kitti_labels import NEAR_M
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, make_printable
@@ -45,8 +42,6 @@ _QUARTER_TURNS: dict[float, int] = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8:
 """Quarter turns to the left that make an image of each EXIF orientation upright."""
 _MIRRORED = (2, 4, 5, 7)
 """Orientations that are also mirrored left to right, after the turns."""
-_JPEG_QUALITY = 95
-"""JPEG quality of copies that are turned upright."""
 _CONVERTIBLE_MODES = ("1", "L", "LA", "P", "PA", "RGBA", "CMYK")
 """Pillow's 8-bit modes that convert to RGB."""
 
@@ -200,7 +195,7 @@ def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
     files.check_utf8(f"{path.parent}: name of a photograph", path.name)
     with files.open_image(path, files.read_bytes(path)) as image:
         width, height = image.size
-        if image.mode not in _CONVERTIBLE_MODES:
+        if image.mode not in _CONVERTIBLE_MODES and not (image.format == "TIFF" and image.mode == "RGB"):
             return files.read_image(path, size_hw)
         pixels = np.array(image.convert("RGB"))
     if size_hw is not None and (height, width) != size_hw:
@@ -231,31 +226,6 @@ def turn_pixels(pixels: np.ndarray, orientation: float) -> np.ndarray:
     """Turn a stored image or mask (H, W, ...) upright. orientation: EXIF's, 1 to 8; others change nothing."""
     pixels = np.rot90(pixels, _QUARTER_TURNS.get(orientation, 0))
     return np.ascontiguousarray(pixels[:, ::-1] if orientation in _MIRRORED else pixels)
-
-
-def copy_upright(source: Path, target: Path) -> None:
-    """Copy an image unchanged; with an EXIF orientation, turned upright, without that tag, in the same file format.
-
-    Raises FormatError for a damaged image.
-    """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if read_orientation(source) == 1:
-        shutil.copyfile(source, target)
-        return
-    from PIL import ImageOps
-
-    with files.open_image(source) as image:
-        upright = ImageOps.exif_transpose(image)  # without the tag
-        data = BytesIO()
-        options = {"quality": _JPEG_QUALITY, "subsampling": 0} if image.format == "JPEG" else {"lossless": True}
-        profile = image.info.get("icc_profile")
-        upright.save(data, image.format, exif=upright.getexif().tobytes(), icc_profile=profile, **options)
-    files.write_bytes(target, data.getvalue())
-
-
-def read_upright_size(path: Path) -> tuple[int, int]:
-    """Read width and height of the upright image from its header. Raises FormatError."""
-    return _read_header(path)[1:]
 
 
 def read_focal_length(image_path: Path, focal_px: float | None = None) -> FocalLength:
@@ -310,6 +280,8 @@ def _read_header(path: Path) -> tuple[dict[int, Any], int, int]:
     with files.open_image(path) as image:  # Pillow reads EXIF on demand and raises then
         exif = Image.Image.getexif(image)  # PngImageFile's method would decode all pixels first
         tags = {_ORIENTATION: exif.get(_ORIENTATION), **exif.get_ifd(_EXIF)}
+        if image.format == "TIFF":  # Pillow turns it
+            tags[_ORIENTATION] = 1
         width, height = image.size
     return (tags, height, width) if _quarter_turns(tags) % 2 else (tags, width, height)
 

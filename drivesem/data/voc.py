@@ -28,7 +28,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from drivesem.data.account import DataAccount, account_for_files
-from drivesem.data.coco_labels import read_turn, read_upright_size, turn_boxes
+from drivesem.data.coco_labels import read_turn, turn_boxes
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.image_index import FileIndex, IndexedFile, image_stem, name_uniquely
 from drivesem.data.kitti_labels import finite_number
 from drivesem.data.label_table import LabelTable, coco_to_xyxy, xyxy_to_coco

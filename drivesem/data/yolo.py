@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.coco import CATEGORIES, CATEGORY_IDS
 from drivesem.data.ground_truth import Exposure, FrameLocation
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.kitti import format_calibration, read_calibration
 from drivesem.data.label_table import (
     REGION,
@@ -42,7 +43,6 @@ from drivesem.data.photographs import (
     pinhole_camera,
     read_focal_length,
     read_upright,
-    read_upright_size,
 )
 from drivesem.data.yolo_files import (
     SPLITS,
@@ -261,8 +261,12 @@ def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.
     high = low + table.boxes[:, 2:]
     beyond = np.maximum(-low, high - sizes_wh)
     clipped = np.any(beyond > EDGE / 2 * sizes_wh, axis=1)  # half, so that readers accept the width in any case
-    corner, end = np.clip(low, 0, sizes_wh), np.clip(high, 0, sizes_wh)
-    return np.where(clipped[:, None], np.concatenate([corner, end - corner], axis=1), table.boxes), clipped
+    if not clipped.any():
+        return table.boxes, clipped
+    corner, end = (np.clip(place[clipped], 0, sizes_wh[clipped]) for place in (low, high))
+    boxes = table.boxes.copy()
+    boxes[clipped] = np.concatenate([corner, end - corner], axis=1)
+    return boxes, clipped
 
 
 def read_table(

@@ -13,10 +13,11 @@ import torch
 from drivesem.config.errors import UsageError
 from drivesem.data.account import DataAccount
 from drivesem.data.coco_labels import turn_upright
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.kitti import read_calibration
 from drivesem.data.kitti_labels import TYPES, find_label_folder, read_label_files
 from drivesem.data.label_table import REGION, LabelTable, WriteSummary, make_camera_entry, shortest_decimals
-from drivesem.data.photographs import match_images, read_upright_size
+from drivesem.data.photographs import match_images
 from drivesem.data.registry import write_table
 from drivesem.failures.grades import Grade
 from drivesem.run.labels import RESULT, detect_labels_layout, list_frames, read_labels
