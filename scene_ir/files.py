@@ -6,6 +6,7 @@ checked before anything is allocated.
 
 from __future__ import annotations
 
+import codecs
 import filecmp
 import gzip
 import hashlib
@@ -22,7 +23,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,8 @@ _MAX_BYTES = 1 << 30
 """Size limit of a file that is read whole, and of all arrays of an NPZ."""
 _CHUNK_BYTES = 1 << 24
 """Bytes per read of a file that is longer than its reported size."""
+_MAX_LIST_BYTES = 1 << 33
+"""Size limit of a JSON list that is read item by item."""
 _MAX_PIXELS = 1 << 26
 """Size limit of an image: 8192 x 8192."""
 _MAX_YAML_BYTES = 1 << 18
@@ -94,14 +97,29 @@ def name_write_errors(path: Path) -> Iterator[None]:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `data` to `path` atomically, and make its folder. Raises WriteError, as all writers here do."""
+    write_parts(path, (data,))
+
+
+def write_parts(path: Path, parts: Iterable[bytes]) -> None:
+    """Write parts of a file atomically, one by one, and make its folder.
+
+    Makes as few system calls as possible: tens of thousands of small files are written at once.
+    """
     temporary = _temporary_path(path)
     with name_write_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            temporary.write_bytes(data)
+            stream = temporary.open("wb")
+        except FileNotFoundError:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream = temporary.open("wb")
+        try:
+            with stream:
+                for part in parts:
+                    stream.write(part)
             os.replace(temporary, path)
-        finally:
+        except BaseException:
             temporary.unlink(missing_ok=True)
+            raise
 
 
 def hardlink_duplicates(folder: Path, other: Path) -> None:
@@ -319,12 +337,16 @@ def read_json(path: Path) -> Any:
     return parse_json(read_text(path), str(path))
 
 
-def parse_json(text: str, where: str) -> Any:
-    """The value of JSON text from the file `where`. Raises FormatError as `read_json`."""
+def parse_json(text: str, where: str, object_hook: Callable[[dict[str, Any]], Any] | None = None) -> Any:
+    """The value of JSON text from the file `where`. Raises FormatError as `read_json`.
+
+    `object_hook` replaces each object by what it returns.
+    """
     try:
-        value = json.loads(text, parse_int=_parse_integer if _has_long_numbers(text) else None)
+        parse_int = _parse_integer if _has_long_numbers(text) else None
+        value = json.loads(text, parse_int=parse_int, object_hook=object_hook)
         if _INVALID_ESCAPE.search(text):
-            _check_texts(value)
+            _check_texts(value if object_hook is None else json.loads(text))
     except json.JSONDecodeError as error:
         raise FormatError(f"{where}:{error.lineno}:{error.colno}", "JSON", error.msg) from error
     except UnicodeEncodeError as error:
@@ -338,18 +360,77 @@ def parse_json(text: str, where: str) -> Any:
     return value
 
 
+def iterate_json_list(path: Path, start: re.Pattern[str]) -> Iterator[Any]:
+    """Yield the items of a JSON list in a file one by one, since all at once need several times its bytes.
+
+    Args:
+        path: The file, of at most 8 GiB.
+        start: Matches the text before the first item.
+
+    Raises:
+        FormatError: As `read_json`, naming the item; there is no such list.
+    """
+    check_regular_file(path, _MAX_LIST_BYTES)
+    decoder, scan = codecs.getincrementaldecoder("utf-8-sig")(), json.JSONDecoder().raw_decode
+    with path.open("rb") as stream:
+        text = _decode_chunk(decoder, stream.read(_CHUNK_BYTES), path)
+        match = start.match(text)
+        if match is None:
+            raise FormatError(str(path), "a list", repr(text[:40]))
+        place, number = match.end(), 0
+        while True:
+            try:
+                place = _skip_space(text, place)
+                if text[place] == "]":
+                    return
+                if number and text[place] != ",":
+                    raise FormatError(f"{path}[{number}]", "a comma or the end of the list", repr(text[place]))
+                begin = _skip_space(text, place + 1) if number else place
+                value, end = scan(text, begin)
+                _ = text[end]  # a number may continue in the next chunk
+            except (IndexError, json.JSONDecodeError, RecursionError) as error:
+                more = _decode_chunk(decoder, stream.read(max(_CHUNK_BYTES, len(text) - place)), path)
+                if not more:
+                    found = "the end of the file" if isinstance(error, IndexError) else error
+                    raise FormatError(f"{path}[{number}]", "JSON", found) from error
+                text, place = text[place:] + more, 0
+                continue
+            item = text[begin:end]
+            if _has_long_numbers(item) or _INVALID_ESCAPE.search(item):
+                value = parse_json(item, f"{path}[{number}]")
+            yield value
+            place, number = end, number + 1
+
+
+def _decode_chunk(decoder: codecs.IncrementalDecoder, data: bytes, path: Path) -> str:
+    try:
+        return decoder.decode(data, not data)
+    except UnicodeDecodeError as error:
+        raise FormatError(str(path), "UTF-8 text", f"byte 0x{error.object[error.start]:02x}") from error
+
+
+def _skip_space(text: str, place: int) -> int:
+    while text[place] in " \t\r\n":
+        place += 1
+    return place
+
+
 def _has_long_numbers(text: str) -> bool:
     """Whether the text has as many digits in a row as an integer beyond 64 bits.
 
     Only then is each integer checked, which takes as long as the rest of the parsing.
     """
-    digits = np.frombuffer(text.encode("utf-8", "surrogatepass"), np.uint8) - np.uint8(ord("0")) < 10
-    run = 1
-    while run < _INTEGER_DIGITS and digits.size:
-        step = min(run, _INTEGER_DIGITS - run)
-        digits = digits[:-step] & digits[step:]
-        run += step
-    return bool(digits.any())
+    for start in range(0, len(text), _CHUNK_BYTES):
+        part = text[start : start + _CHUNK_BYTES + _INTEGER_DIGITS]
+        digits = np.frombuffer(part.encode("utf-8", "surrogatepass"), np.uint8) - np.uint8(ord("0")) < 10
+        run = 1
+        while run < _INTEGER_DIGITS and digits.size:
+            step = min(run, _INTEGER_DIGITS - run)
+            digits = digits[:-step] & digits[step:]
+            run += step
+        if digits.any():
+            return True
+    return False
 
 
 def _parse_integer(text: str) -> int:

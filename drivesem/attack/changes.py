@@ -22,7 +22,7 @@ from drivesem.attack.space import ground_axes
 from scene_ir import exchange
 from scene_ir.errors import FormatError
 from scene_ir.exchange import Vehicle
-from scene_ir.meshes.load import ImportedMesh, import_mesh
+from scene_ir.meshes.load import ImportedMesh
 from scene_ir.meshes.templates import ROOF_LOADS, make_roof_load, template, typical_size_lhw
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
@@ -90,11 +90,13 @@ def parse_vehicle_changes(text: str) -> tuple[VehicleChange, ...]:
 
 def load_vehicle_mesh(path: str) -> ImportedMesh:
     """A user's mesh in metres. Raises FormatError for a file that is no mesh, or not of a vehicle's size."""
-    imported = import_mesh(path)
-    for name, size_m, (low, high) in zip(("length", "height", "width"), imported.size_lhw, _SIZES_M, strict=True):
+    from drivesem.synth.assets import read_vehicle
+
+    vehicle = read_vehicle(path)
+    for name, size_m, (low, high) in zip(("length", "height", "width"), vehicle.stated_lhw, _SIZES_M, strict=True):
         if not low <= size_m <= high:
             raise FormatError(f"{path}: {name}", f"a vehicle's in metres, {low:g} to {high:g}", f"{size_m:.3g}")
-    return imported
+    return ImportedMesh(vehicle.mesh, vehicle.stated_lhw, vehicle.up, vehicle.notes)
 
 
 def count_affordable_proposals(passes: int) -> int:

@@ -21,8 +21,6 @@ from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.report.drawing import write_picture
 from drivesem.report.tables import Console, format_count, print_json
 from drivesem.run.conversion import ConversionSettings, convert_labels
-from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
-from drivesem.run.finished import load_runs
 from drivesem.run.labels import detect_labels_layout
 from drivesem.store import local_copy
 
@@ -106,9 +104,10 @@ def convert_command(config: ConvertConfig) -> int:
         copy_images=config.copy_images,
         mapping=parse_class_map("--map", config.map),
     )
-    written = convert_labels(source, out, conversion)
+    written, account = convert_labels(source, out, conversion)
+    data = write_account(account, roles=False)
     if config.json:
-        print_json({"out": config.out, **asdict(written)})
+        print_json({"out": config.out, **asdict(written), "data": data})
     sys.stderr.write(f"{summarise_losses(written)}\n")
     if layout == "run" and config.to_format == "coco" and not config.copy_images and not config.scores:
         sys.stderr.write(f"images are in {source / 'frames'} (--copy-images copies them)\n")
@@ -137,6 +136,9 @@ def summarise_losses(written: WriteSummary) -> str:
 
 def export_command(config: ExportConfig) -> int:
     """`drivesem export`: export the counterexamples of a run."""
+    from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
+    from drivesem.run.finished import load_runs  # these double the memory that inspect and convert start with
+
     out = Path(config.out or "")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("--out", "a new or empty folder", out)

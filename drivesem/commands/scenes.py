@@ -133,12 +133,12 @@ def derender_command(config: DerenderConfig) -> int:
 
 
 def _print_source(source: SceneSource, config: DerenderConfig, console: Console) -> None:
-    """Print the camera of a photograph, and meshes that cannot be read."""
+    """Print the camera of a photograph, and what is left out of the meshes."""
     if isinstance(source, PhotographSource) and config.photo is not None:
         focal = source.focal_length(next(source.identifiers()))
         console.print(f"camera: focal length {focal.length_px:.0f} px ({focal.source})", soft_wrap=True)
     if config.meshes is not None:
-        from drivesem.synth.assets import unreadable_in
+        from drivesem.synth.assets import notes_in
 
-        for name, fault in unreadable_in(config.meshes):
-            console.print(f"--meshes: {name} is left out: {fault}", soft_wrap=True, highlight=False, markup=False)
+        for note in notes_in(config.meshes):
+            console.print(f"--meshes: {note}", soft_wrap=True, highlight=False, markup=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from drivesem.report.tables import Console, format_count, print_json, progress_b
 from drivesem.run.folder import resolve_output_folder
 from drivesem.run.lock import acquire_folder_lock
 from drivesem.run.workers import make_parallel_map
+from drivesem.synth.assets import meshes_in, notes_in, of_split
 from drivesem.synth.variations import MIXED, parse_variations
 from drivesem.synth.write import Order, synthesise
 
@@ -49,6 +51,7 @@ def synth_command(config: SynthConfig) -> int:
     """`drivesem synth`: generate the frames that do not exist yet."""
     start = time.perf_counter()
     order = build_order(config)
+    _write_mesh_notes(order)
     total = len(order.places())
     acquire_folder_lock(order.out)
     done = synthesise(order, make_parallel_map(config))
@@ -68,6 +71,21 @@ def synth_command(config: SynthConfig) -> int:
             f"{format_count(total, 'frame')} in {order.out} ({result['seconds']:.0f} s)", soft_wrap=True
         )
     return 0
+
+
+def _write_mesh_notes(order: Order) -> None:
+    """Write to stderr what the meshes lack, and how many of them belong to the other split."""
+    assets = None if order.assets is None else order.assets / "vehicles"
+    option, folder = ("--assets", assets) if order.meshes is None else ("--meshes", order.meshes)
+    if folder is None or not folder.is_dir():
+        return
+    sys.stderr.writelines(f"{option}: {note}\n" for note in notes_in(folder))
+    vehicles = meshes_in(folder)
+    others = len(vehicles) - len(of_split(vehicles, order.split))
+    if others and not order.validation:
+        sys.stderr.write(
+            f"{option}: {others} of {len(vehicles)} meshes belong to the other split by their names\n"
+        )
 
 
 def _sheet(order: Order) -> Path:

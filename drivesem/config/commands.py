@@ -134,7 +134,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     changes: Annotated[str, OnlyWith("method", ("climb", "corners"))] | None = None
     """Changes of vehicles with --budget street: leave, park, swap, load, with commas (climb and corners)."""
     mesh: str | None = None
-    """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY, metres, y up (default: the templates)."""
+    """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY in metres (default: the templates)."""
     target_objects: str | None = None
     """Objects that count as failures when lost, such as 0,2; phantoms do not count then."""
     target_classes: str | None = None
@@ -512,7 +512,7 @@ class EvalConfig(FrameFilterOptions, TileOption, WorkerOptions, CommandConfig):
     """Second detections of the same frames, compared with the first by a paired test."""
     protocol: Literal["coco", "kitti", "voc"] = "coco"
     """Evaluation protocol."""
-    gt_format: Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"] = "auto"
+    gt_format: Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "voc", "bdd100k", "run"] = "auto"
     """Layout of --gt; auto detects it."""
     pred_format: Literal["auto", "kitti", "coco", "yolo", "run"] = "auto"
     """Layout of --pred and --pred-b; auto detects it."""
@@ -610,7 +610,8 @@ class ConvertConfig(CommandConfig):
     to_format: Annotated[LabelFormat, tyro.conf.arg(aliases=["--to"])]
     """Format to write."""
     from_format: Annotated[
-        Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "run"], tyro.conf.arg(aliases=["--from"])
+        Literal["auto", "kitti", "coco", "yolo", "vkitti1", "vkitti2", "voc", "bdd100k", "run"],
+        tyro.conf.arg(aliases=["--from"]),
     ] = "auto"
     """Format of SOURCE; auto detects it."""
     scores: Flag = False

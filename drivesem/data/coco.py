@@ -14,8 +14,9 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from os.path import isfile
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -36,6 +37,7 @@ from drivesem.data.coco_labels import (
     turn_boxes,
 )
 from drivesem.data.ground_truth import Exposure, FrameLocation, TrackedObject
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.label_table import (
     REGION,
     LabelTable,
@@ -50,11 +52,9 @@ from drivesem.data.photographs import (
     PNG_COMPRESSION,
     FrameIndex,
     check_focal,
-    match_images,
     pinhole_camera,
     read_focal_length,
     read_upright,
-    read_upright_size,
     turn_pixels,
 )
 from scene_ir import files
@@ -150,37 +150,46 @@ class CocoWriter:
                 )
             ]
             images = [entry["image"] for entry in part_entries]
-            text = _format_dataset(images, annotations, CATEGORY_IDS.items(), _HEAD, "")
-            files.write_text(self.root / "annotations" / f"instances_{part}.json", text)
+            parts = _format_dataset(images, annotations, CATEGORY_IDS.items(), _HEAD, "")
+            files.write_parts(self.root / "annotations" / f"instances_{part}.json", parts)
 
 
 _HEAD = '"info": {"description": "drivesem synth"},\n"licenses": [],\n'
 
 
 def _format_dataset(
-    images: Sequence[Any],
-    annotations: Sequence[Any],
+    images: Iterable[Any],
+    annotations: Iterable[Any],
     categories: Iterable[tuple[str, int]],
     start: str = "\n",
     end: str = "\n",
-) -> str:
-    """Format a data set's file, one image or annotation per line. `categories` are names and ids."""
+) -> Iterator[bytes]:
+    """Format a data set's file in parts, one image or annotation per line. `categories` are names and ids."""
     named = [
         {"id": number, "name": name, "supercategory": CATEGORIES.get(name, "object")}
         for name, number in categories
     ]
     tables = {"images": images, "annotations": annotations, "categories": named}
-    lines = {
-        name: ",\n".join(_format_entry(name, i, row) for i, row in enumerate(rows))
-        for name, rows in tables.items()
-    }
-    return "{" + start + ",\n".join(f'"{name}": [\n{text}\n]' for name, text in lines.items()) + end + "}\n"
+    yield f"{{{start}".encode()
+    for name, rows in tables.items():
+        yield f'"{name}": [\n'.encode()
+        lines = (_format_entry(name, i, row) for i, row in enumerate(rows))
+        separator = ""
+        while text := ",\n".join(islice(lines, _LINES_PER_PART)):
+            yield f"{separator}{text}".encode()
+            separator = ",\n"
+        yield b"\n]" if name == "categories" else b"\n],\n"
+    yield f"{end}}}\n".encode()
+
+
+_LINES_PER_PART = 1 << 14
+_ENCODER = json.JSONEncoder(allow_nan=False)
 
 
 def _format_entry(table: str, index: int, row: Any) -> str:
     """Format an entry as JSON. Raises FormatError for NaN and infinity in keys of another project."""
     try:
-        return json.dumps(row, allow_nan=False)
+        return _ENCODER.encode(row)
     except ValueError as error:
         raise FormatError(f"{table}[{index}]", "finite numbers", "NaN or infinity") from error
 
@@ -246,42 +255,38 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     parts: dict[str, list[int]] = {name: [] for name in table.splits} if split_of else {}
     for i in range(len(table.frames)):
         parts.setdefault(split_of.get(i, "rest" if split_of else "all"), []).append(i)
-    flat, _ = table.file_names()
-    names = [_file_name(table, i, name, images) for i, name in enumerate(flat)]
+    paths, renamed = table.file_names([split_of.get(i, "") for i in range(len(table.frames))])
+    names = [_file_name(table, i, path, images) for i, path in enumerate(paths)]
     repeated = {
         key for key, n in Counter((split_of.get(i), name) for i, name in enumerate(names)).items() if n > 1
     }
     names = [
-        f"{flat[i]}{PurePosixPath(name).suffix}" if (split_of.get(i), name) in repeated else name
+        f"{paths[i]}{PurePosixPath(name).suffix}" if (split_of.get(i), name) in repeated else name
         for i, name in enumerate(names)
     ]
     count, targets = 0, dict[str, Path]()
     folder = (out.parent if single else out) / "images"
     for part, frames in parts.items():
         path = out if single else out / "annotations" / f"instances_{part}.json"
-        files.write_text(path, _format_table(table, frames, names))
+        files.write_parts(path, _format_table(table, frames, names))
         count += 1
         place = folder / part if split_of else folder
         targets |= {table.frames[i]: place / PurePosixPath(names[i]).with_suffix("") for i in frames}
-    lost = {
-        "/ in frame names": sum("/" in f and "/" not in name for name, f in zip(names, table.frames, strict=True)),
-        "split": sum(map(len, table.splits.values())) if single else 0,
-    }
-    return WriteSummary.from_counts(count + copy_images(targets, images), lost)
+    lost = {**renamed, "split": sum(map(len, table.splits.values())) if single else 0}
+    named = {*table.image_files, *(i for i, frame in enumerate(table.frames) if frame in images)}
+    assumed = {"suffix of image files (.png)": len(table.frames) - len(named)}
+    return WriteSummary.from_counts(count + copy_images(targets, images), lost, assumed)
 
 
-def _file_name(table: LabelTable, i: int, name: str, images: Mapping[str, Path]) -> str:
-    """Return an image's file name: its own if it is named after its frame, or stays where it is; else `name`."""
-    identifier, own = table.frames[i], table.image_files.get(i, "")
-    if identifier not in images:
-        return own or f"{name}.png"
-    suffix = images[identifier].suffix.lower()
-    if own and PurePosixPath(own).stem in (name, identifier.rpartition("/")[2]):
-        return PurePosixPath(own).with_suffix(suffix).as_posix()
-    return f"{name}{suffix}"
+def _file_name(table: LabelTable, i: int, path: str, images: Mapping[str, Path]) -> str:
+    """Return an image's file name: its own if it stays where it is; else `path` with its suffix."""
+    image = images.get(table.frames[i])
+    if image is None:
+        return table.image_files.get(i) or f"{path}.png"
+    return f"{path}{image.suffix}"
 
 
-def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]) -> str:
+def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]) -> Iterator[bytes]:
     """Format the file of some frames.
 
     Args:
@@ -290,7 +295,7 @@ def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]
         names: File names of all images.
 
     Returns:
-        The file's text.
+        Parts of the file.
     """
     if table.kind_ids is not None:
         numbers: list[int] = table.kind_ids.tolist()
@@ -303,10 +308,6 @@ def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]
         numbers = [dict(categories)[kind] for kind in table.kinds]
     image_ids = (np.arange(1, len(names) + 1) if table.image_ids is None else table.image_ids).tolist()
     records: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    box_ids = [] if table.box_ids is None else table.box_ids.tolist()
-    next_id = max(box_ids, default=0) + 1
-    by_frame = table.rows_by_frame()
     for i in frames:
         width, height = table.sizes_wh[i].tolist()
         record = {"id": image_ids[i], "file_name": names[i], "width": width, "height": height}
@@ -315,51 +316,79 @@ def _format_table(table: LabelTable, frames: Sequence[int], names: Sequence[str]
         exported = attributes.pop("drivesem", None)
         record |= {"attributes": attributes} if attributes else {}
         records.append(record | ({} if exported is None else {"drivesem": exported}))
-        for row in by_frame[i]:
-            kind, entry = int(table.kind[row]), _row_annotation(table, row)
-            for label in [number for _, number in categories] if kind == REGION else [numbers[kind]]:
-                number = next_id
-                if box_ids and kind != REGION:
-                    number = box_ids[row]
-                else:
+    annotations = _iterate_annotations(table, frames, image_ids, numbers, [number for _, number in categories])
+    return _format_dataset(records, annotations, categories)
+
+
+def _iterate_annotations(
+    table: LabelTable,
+    frames: Sequence[int],
+    image_ids: Sequence[Any],
+    kind_numbers: Sequence[int],
+    all_numbers: Sequence[int],
+) -> Iterator[dict[str, Any]]:
+    """Yield the annotations of some frames.
+
+    Args:
+        table: All frames.
+        frames: Indices of the frames.
+        image_ids: Ids of all frames.
+        kind_numbers: Ids of the table's classes.
+        all_numbers: Ids of all categories, each of which gets the regions.
+    """
+    next_id = 1 + (0 if table.box_ids is None else int(table.box_ids.max(initial=0)))
+    by_frame, fields = table.rows_by_frame(), _known_fields(table)
+    for i in frames:
+        rows = by_frame[i]
+        part = slice(rows.start, rows.stop)
+        kinds = table.kind[part].tolist()
+        box_ids = [None] * len(kinds) if table.box_ids is None else table.box_ids[part].tolist()
+        for kind, box_id, entry in zip(kinds, box_ids, _row_entries(table, rows, fields), strict=True):
+            for label in all_numbers if kind == REGION else [kind_numbers[kind]]:
+                number = box_id
+                if box_id is None or kind == REGION:
+                    number = next_id
                     next_id += 1
                 annotation = {"id": number, "image_id": image_ids[i], "category_id": label, **entry}
-                annotations.append(annotation | ({"dontcare": True} if kind == REGION else {}))
-    return _format_dataset(records, annotations, categories)
+                yield annotation | {"dontcare": True} if kind == REGION else annotation
 
 
 _KITTI_LAYOUTS = ("kitti", "vkitti1", "vkitti2")
 """Layouts with KITTI's types; their ids, and those of runs, are CATEGORY_IDS."""
 
 
-def _row_annotation(table: LabelTable, row: int) -> dict[str, Any]:
-    """Make the annotation of a row without ids and unknown values."""
-    box, area, pose = table.boxes[row].tolist(), float(table.area[row]), table.pose[row].tolist()
-    area = area if math.isfinite(area) else box[2] * box[3]
-    score, alpha = float(table.score[row]), float(table.alpha[row])
-    truncation, occlusion = float(table.truncation[row]), int(table.occlusion[row])
-    entry = {
-        "bbox": box,
-        "area": int(area) if area.is_integer() else area,
-        "iscrowd": int(table.ignore[row]),
-        "score": score if math.isfinite(score) else None,
-        "truncation": truncation if truncation >= 0 else None,
-        "occlusion": occlusion if occlusion >= 0 else None,
-        "alpha": alpha if math.isfinite(alpha) else None,
-        "pose": _pose_entry(pose[:3], pose[3:6], pose[6]) if is_known_pose(pose) else None,
-        **{name: values[row] for name, values in table.extra.items()},
+def _known_fields(table: LabelTable) -> list[str]:
+    """Return the fields, other than box and area, with a value in any row."""
+    known = {
+        "score": np.isfinite(table.score),
+        "truncation": table.truncation >= 0,
+        "occlusion": table.occlusion >= 0,
+        "alpha": np.isfinite(table.alpha),
+        "pose": np.isfinite(table.pose).all(axis=1),
     }
-    return {name: value for name, value in entry.items() if value is not None}
+    return [name for name, rows in known.items() if rows.any()]
 
 
-def find_images(path: Path, frames: Sequence[str]) -> dict[str, Path]:
-    """Find the images that a data set's files name, or else those named after the frames, in its image folders."""
-    data = CocoFiles(path)
-    found = match_images([part.folder for part in data.parts], frames)
-    for part, names in zip(data.parts, data.names, strict=True):
-        paths = zip(names, part.paths, strict=True)
-        found |= {name: Path(image) for name, image in paths if image is not None and isfile(image)}
-    return {name: found[name] for name in frames if name in found}
+def _row_entries(table: LabelTable, rows: range, fields: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the annotations of a frame's rows, without ids and unknown values; see `_known_fields`."""
+    part = slice(rows.start, rows.stop)
+    columns = {name: getattr(table, name)[part].tolist() for name in fields}
+    boxes, areas, ignored = (column[part].tolist() for column in (table.boxes, table.area, table.ignore))
+    for place, (row, box, area, ignore) in enumerate(zip(rows, boxes, areas, ignored, strict=True)):
+        area = area if math.isfinite(area) else box[2] * box[3]
+        entry: dict[str, Any] = {
+            "bbox": box,
+            "area": int(area) if area.is_integer() else area,
+            "iscrowd": int(ignore),
+        }
+        for name, values in columns.items():
+            value = values[place]
+            if name == "pose":
+                entry |= {name: _pose_entry(value[:3], value[3:6], value[6])} if is_known_pose(value) else {}
+            elif math.isfinite(value) and (value >= 0 or name in ("score", "alpha")):
+                entry[name] = value
+        entry |= {name: values[row] for name, values in table.extra.items() if values[row] is not None}
+        yield entry
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,14 +450,14 @@ class CocoDataset(FrameIndex[_CocoImage]):
 
     def account(self) -> DataAccount:
         """Account for all files and annotations."""
-        sizes = {id(part): part.sizes_wh().tolist() for part in self._files.parts}
         broken = 0
-        for name in self.identifiers:
-            image = self._entry(name)
-            width, height = sizes[id(image.file)][image.index]
-            for row in image.rows:
-                segmentation = image.file.annotations.rows[row].get("segmentation")
-                broken += bool(segmentation) and height > 0 and _is_broken(segmentation, (height, width))
+        for part in self._files.parts:
+            if "segmentation" in part.annotations.key_names():
+                sizes_hw = part.sizes_wh()[part.annotation_image, ::-1].tolist()
+                outlines = zip(part.annotations.values("segmentation"), sizes_hw, strict=True)
+                broken += sum(
+                    bool(outline) and size[0] > 0 and _is_broken(outline, size) for outline, size in outlines
+                )
         return self._files.account(
             {"outlines that are broken (no masks of their frames)": broken} if broken else {}
         )

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivesem.data import fiftyone
-from drivesem.data.account import DataAccount, account_for_files
-from drivesem.data.label_table import REGION, LabelTable
+from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
+from drivesem.data.image_headers import read_orientation, read_stored_header, read_upright_size
+from drivesem.data.json_columns import BoxRowColumns
+from drivesem.data.label_table import REGION, LabelTable, join_tables, repeat_value
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -31,8 +33,6 @@ _OTHER_TASKS = ("person_keypoints_", "captions_", "stuff_", "panoptic_", "image_
 _HEAD_BYTES = 1 << 16
 _DATASET_START = re.compile(rb'"(images|annotations|categories)"\s*:\s*\[|"labels"\s*:\s*\{')
 """Matches the first keys of a data set's file; results are a list."""
-_ORIENTATION = 0x0112
-"""EXIF's tag of the orientation."""
 Ids: TypeAlias = "NDArray[np.int64] | NDArray[np.str_]"
 _MAX_VALUE = 2**31
 """Exclusive limit of occlusions, box coordinates and image sides."""
@@ -74,6 +74,8 @@ class JsonRows:
     @classmethod
     def from_list(cls, where: str, rows: Any) -> JsonRows:
         """Wrap all entries of a list. Raises FormatError if it is not a list of objects."""
+        if isinstance(rows, BoxRowColumns):
+            return cls(where, rows, range(len(rows)))
         if not isinstance(rows, list):
             raise FormatError(where, "a list", "none" if rows is None else type(rows).__name__)
         if not set(map(type, rows)) <= {dict}:
@@ -94,10 +96,16 @@ class JsonRows:
 
     def values(self, key: str, missing: Any = None) -> list[Any]:
         """Return the values (N,) of a key."""
+        if isinstance(self.rows, BoxRowColumns):
+            return self.rows.column(key, missing)
         try:
             return list(map(itemgetter(key), self.rows))
         except KeyError:
             return [row.get(key, missing) for row in self.rows]
+
+    def key_names(self) -> set[str]:
+        """Return the keys that occur."""
+        return self.rows.key_names() if isinstance(self.rows, BoxRowColumns) else set().union(*self.rows)
 
     def integers(self, key: str) -> NDArray[np.int64]:
         """Return the integers (N,) of a key. Raises FormatError naming the first row without one."""
@@ -156,7 +164,7 @@ class JsonRows:
 
     def boxes(self) -> NDArray[np.float64]:
         """Return left, top, width, height (N, 4). Raises FormatError naming the first row without such a box."""
-        values = self.values("bbox")
+        values = self.rows.boxes() if isinstance(self.rows, BoxRowColumns) else self.values("bbox")
         try:
             array = np.array(values).reshape(len(values), 4)
             boxes = array.astype(np.float64)
@@ -164,6 +172,7 @@ class JsonRows:
                 return boxes
         except (ValueError, TypeError):
             pass  # the row is found below
+        values = self.values("bbox")
         for i, value in enumerate(values):
             if not (isinstance(value, list) and len(value) == 4 and all(type(v) in (int, float) for v in value)):
                 raise FormatError(self.locate(i, "bbox"), "x, y, width, height", json.dumps(value)[:60])
@@ -221,29 +230,32 @@ class JsonRows:
 
     def is_numeric(self, key: str) -> bool:
         """Whether a key has numbers only; it may be missing."""
-        return {type(row.get(key)) for row in self.rows} <= {int, float, type(None)}
+        return set(map(type, self.values(key))) <= {int, float, type(None)}
 
     def regions(self) -> NDArray[np.bool_]:
         """Return which rows (N,) are crowds or regions to ignore.
 
         pycocotools overwrites "ignore" by "iscrowd"; here both are regions.
         """
-        return np.array([bool(row.get("iscrowd") or row.get("ignore")) for row in self.rows], np.bool_)
+        flags = np.zeros(len(self), np.bool_)
+        for key in self.key_names() & {"iscrowd", "ignore"}:
+            flags |= np.array(list(map(bool, self.values(key))), np.bool_)
+        return flags
 
     def count_unusable(self) -> dict[str, int]:
         """Count the values that a scene cannot use, and which it takes for unknown."""
-        keys = set().union(*self.rows)
+        keys = self.key_names()
         counts: dict[str, int] = {}
         if "truncation" in keys:
-            bad = (row.get("truncation") for row in self.rows)
             counts["truncations outside [0, 1]"] = sum(
-                v not in (None, -1) and not (type(v) in (int, float) and 0 <= v <= 1) for v in bad
+                v not in (None, -1) and not (type(v) in (int, float) and 0 <= v <= 1)
+                for v in self.values("truncation")
             )
         if "occlusion" in keys:
-            bad = (row.get("occlusion") for row in self.rows)
-            counts["occlusions other than 0 to 3"] = sum(v not in (None, -1, 0, 1, 2, 3) for v in bad)
+            wrong = (value not in (None, -1, 0, 1, 2, 3) for value in self.values("occlusion"))
+            counts["occlusions other than 0 to 3"] = sum(wrong)
         if "pose" in keys:
-            given = (i for i, row in enumerate(self.rows) if row.get("pose") is not None)
+            given = (i for i, value in enumerate(self.values("pose")) if value is not None)
             counts["3D boxes that cannot be used"] = sum(math.isnan(self.pose(i)[0]) for i in given)
         return {name: count for name, count in counts.items() if count}
 
@@ -269,20 +281,20 @@ class JsonRows:
         Returns:
             The table.
         """
-        keys = set().union(*self.rows)
+        keys = self.key_names()
 
         def column(key: str, missing: float = math.nan) -> NDArray[np.float64]:
-            return self.column(key, missing) if key in keys else np.full(len(self), missing)
+            return self.column(key, missing) if key in keys else repeat_value(missing, len(self))
 
         boxes = self.boxes()
-        area = np.full(len(self), np.nan) if scored else column("area")
+        area = repeat_value(np.nan, len(self)) if scored else column("area")
         numbers = self.values("id") if "id" in keys else []
         texts = {key for key in ("truncation", "occlusion", "alpha") if not self.is_numeric(key)}
         names = [] if scored else sorted((keys - _TABLE_COLUMNS) | texts)
         keys -= texts
-        pose = np.full((len(self), 7), np.nan)
+        pose = repeat_value(math.nan, len(self), 7)
         if "pose" in keys:
-            pose[:] = [self.pose(i) for i in range(len(self))]
+            pose = np.array([self.pose(i) for i in range(len(self))], np.float64).reshape(-1, 7)
         return LabelTable.from_columns(
             frames,
             kinds,
@@ -291,9 +303,9 @@ class JsonRows:
             boxes,
             "xywh",
             ignore=self.regions() if keys & {"iscrowd", "ignore"} else np.zeros(len(self), np.bool_),
-            score=self.column("score", None) if scored else np.full(len(self), np.nan),
+            score=self.column("score", None) if scored else repeat_value(np.nan, len(self)),
             truncation=column("truncation", -1.0),
-            occlusion=self.flags("occlusion", -1) if "occlusion" in keys else np.full(len(self), -1),
+            occlusion=self.flags("occlusion", -1) if "occlusion" in keys else repeat_value(-1, len(self)),
             alpha=column("alpha"),
             pose=pose,
             area=np.where(np.isnan(area), boxes[:, 2] * boxes[:, 3], area),
@@ -350,7 +362,7 @@ class AnnotationFile:
 
     def _number_anew(self, rows: JsonRows) -> JsonRows:
         """Give annotations whole numbers that no other one has, where they repeat one."""
-        numbers = [row["id"] for row in rows.rows if type(row.get("id")) is int]
+        numbers = [number for number in rows.values("id") if type(number) is int]
         if len(set(numbers)) == len(numbers):
             return rows
         following, seen, renewed = max(numbers) + 1, set[int](), list(rows.rows)
@@ -414,6 +426,15 @@ class AnnotationFile:
                 found = f"{path}, as {self.images.locate(first[path], 'file_name')}"
                 raise FormatError(self.images.locate(i, "file_name"), "another image", found)
 
+    def _existing_images(self, frames: Sequence[str]) -> dict[int, str]:
+        """Return the existing images: those that the file names, else those named after the frames, in their folder."""
+        existing = {i: path for i, path in enumerate(self.paths) if path is not None and isfile(path)}
+        if len(existing) < len(self.paths):
+            names = (name for name in os.listdir(self.folder) if name.lower().endswith(IMAGE_SUFFIXES))
+            by_stem = {os.path.splitext(name)[0]: os.path.join(self.folder, name) for name in names}
+            existing |= {i: by_stem[n] for i, n in enumerate(frames) if i not in existing and n in by_stem}
+        return existing
+
     def relative_names(self) -> list[str]:
         """Return the images' paths below their folder, with "/"; "" without a file name."""
         relative = [name or "" for name in self.images.values("file_name")]
@@ -446,13 +467,16 @@ class AnnotationFile:
         )
         exported = {i: {"drivesem": row["drivesem"]} for i, row in enumerate(images) if "drivesem" in row}
         attributes = {i: self.attributes(i) for i in range(len(images))}
+        if (np.diff(table.frame) < 0).any():
+            table = table.select(np.argsort(table.frame, kind="stable"))
         return replace(
-            _merge_regions(table.select(np.argsort(table.frame, kind="stable"))),
+            _merge_regions(table),
             sizes_wh=self.sizes_wh(),
             image_ids=self.image_ids,
             merged_kind_ids=self.merged_ids,
             cameras={i: row["camera"] for i, row in enumerate(images) if "camera" in row},
             image_files={i: name for i, name in enumerate(self.relative_names()) if name},
+            image_paths={i: Path(path) for i, path in self._existing_images(frames).items()},
             frame_attributes={i: a | exported.get(i, {}) for i, a in attributes.items() if a or i in exported},
         )
 
@@ -552,9 +576,6 @@ class CocoFiles:
         if not found:
             expected = "a COCO folder, with annotations/instances_*.json, or such a file (--root FILE.json)"
             raise FormatError(str(root), expected, "neither")
-        for path in found:
-            if not files.read_bytes(path).strip():
-                raise FormatError(str(path), "COCO annotations or results", "an empty file")
         self.parts = [AnnotationFile(path, _read_content(path), split) for path, split in found.items()]
         self.names = self._name_frames()
         """Identifiers of the images of each file."""
@@ -624,89 +645,25 @@ class CocoFiles:
     def to_table(self, scored: bool) -> LabelTable:
         """Convert all files to one table."""
         tables = [part.to_table(names, scored) for part, names in zip(self.parts, self.names, strict=True)]
-        table = tables[0] if len(tables) == 1 else _join_tables(tables)
+        table = tables[0] if len(tables) == 1 else join_tables(tables)
         position = {name: i for i, name in enumerate(table.frames)}
         splits = {name: [position[frame] for frame in frames] for name, frames in self.splits().items()}
         return replace(table, splits=splits, account=self.account())
 
 
 def _read_content(path: Path) -> Any:
-    """Read a data set's file; FiftyOne's own form is converted."""
-    content = files.read_json(path)
+    """Read a data set's file, its annotations by column; FiftyOne's own form is converted."""
+    text = files.read_text(path)
+    if not text or text.isspace():
+        raise FormatError(str(path), "COCO annotations or results", "an empty file")
+    columns = BoxRowColumns()
+    content = files.parse_json(text, str(path), columns.store)
+    if isinstance(content, dict) and columns.holds(content.get("annotations")):
+        return {**content, "annotations": columns}
+    content = files.parse_json(text, str(path))
     if isinstance(content, dict) and isinstance(content.get("labels"), dict) and "annotations" not in content:
         return fiftyone.to_coco(path, content, read_upright_size)
     return content
-
-
-def _join_tables(tables: Sequence[LabelTable]) -> LabelTable:
-    """Join tables of different frames. Ids that are not unique, or differ between the tables, are dropped."""
-    kinds = list(dict.fromkeys(kind for table in tables for kind in table.kinds))
-    starts = np.cumsum([0, *(len(table.frames) for table in tables)]).tolist()
-    numbers: dict[str, set[int]] = {}
-    for table in tables:
-        for kind, number in zip(table.kinds, (table.kind_ids if table.kind_ids is not None else []), strict=True):
-            numbers.setdefault(kind, set()).add(int(number))
-    known = len(numbers) == len(kinds) and all(len(ids) == 1 for ids in numbers.values())
-    kind_ids = [next(iter(numbers[kind])) for kind in kinds] if known else []
-    names = sorted({name for table in tables for name in table.extra})
-    columns = ("boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area", "sizes_wh")
-    maps = ("cameras", "image_files", "frame_attributes")
-    parts = list(zip(tables, starts, strict=False))
-
-    def unique(values: Sequence[Any]) -> Any:
-        if any(value is None for value in values) or len({value.dtype.kind for value in values}) > 1:
-            return None
-        joined = np.concatenate(values)
-        return joined if len(np.unique(joined)) == len(joined) else None
-
-    return replace(
-        tables[0],
-        frames=tuple(name for table in tables for name in table.frames),
-        kinds=tuple(kinds),
-        frame=np.concatenate([table.frame + start for table, start in parts]),
-        kind=np.concatenate(
-            [np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind] for table in tables]
-        ),
-        **{name: np.concatenate([getattr(table, name) for table in tables]) for name in columns},
-        image_ids=unique([table.image_ids for table in tables]),
-        box_ids=unique([table.box_ids for table in tables]),
-        kind_ids=np.array(kind_ids, np.int64) if known and len(set(kind_ids)) == len(kinds) else None,
-        merged_kind_ids={},
-        extra={
-            name: [v for table in tables for v in table.extra.get(name, [None] * len(table))] for name in names
-        },
-        **{
-            name: {i + start: value for table, start in parts for i, value in getattr(table, name).items()}
-            for name in maps
-        },
-    )
-
-
-def read_orientation(path: str | Path) -> int:
-    """Read EXIF's orientation of an image, 1 to 8; 1 if there is none, or no file."""
-    if not isfile(path):
-        return 1
-    if str(path).lower().endswith((".jpg", ".jpeg", ".png")):  # faster than to parse the header
-        with open(path, "rb") as stream:
-            head = stream.read(_HEAD_BYTES)
-        if b"Exif\0\0" not in head and b"eXIf" not in head:
-            return 1
-    return _read_header(path)[0]
-
-
-def read_upright_size(path: str | Path) -> tuple[int, int]:
-    """Read width and height of the upright image from its header. Raises FormatError."""
-    orientation, width, height = _read_header(path)
-    return (height, width) if orientation > 4 else (width, height)
-
-
-def _read_header(path: str | Path) -> tuple[int, int, int]:
-    """Read an image's orientation, width and height, as stored. Raises FormatError."""
-    from PIL import Image
-
-    with files.open_image(Path(path)) as image:
-        orientation = Image.Image.getexif(image).get(_ORIENTATION)  # PNG's own method would decode all pixels
-        return (orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1, *image.size)
 
 
 def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:
@@ -719,7 +676,7 @@ def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:
     """
     if path is None or size_wh[0] == size_wh[1] or read_orientation(path) < 5:
         return 1
-    orientation, width, height = _read_header(path)
+    orientation, width, height = read_stored_header(path)
     return orientation if (width, height) == tuple(size_wh) else 1
 
 
@@ -744,23 +701,16 @@ def turn_boxes(boxes: NDArray[np.float64], orientation: int, size_wh: Sequence[i
     return np.concatenate([low, corners.max(axis=1) - low], axis=1)
 
 
-def turn_upright(table: LabelTable, images: Mapping[str, Path]) -> LabelTable:
+def turn_upright(table: LabelTable) -> LabelTable:
     """Turn the boxes, outlines and sizes of those frames that refer to the stored pixels of a turned image.
 
     Outlines that are run lengths, cameras and keypoints of turned frames are dropped.
-
-    Args:
-        table: Labels of a COCO data set.
-        images: Images by frame identifier.
-
-    Returns:
-        The table, of upright images.
     """
     boxes, sizes_wh, cameras = table.boxes.copy(), table.sizes_wh.copy(), dict(table.cameras)
     extra = {name: list(values) for name, values in table.extra.items()}
     for i, rows in enumerate(table.rows_by_frame()):
         size_wh = sizes_wh[i].tolist()
-        orientation = read_turn(images.get(table.frames[i]), size_wh)
+        orientation = read_turn(table.image_paths.get(i), size_wh)
         if orientation == 1:
             continue
         boxes[rows.start : rows.stop] = turn_boxes(boxes[rows.start : rows.stop], orientation, size_wh)

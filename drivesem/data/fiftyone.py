@@ -46,7 +46,7 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     content = {"classes": list(table.kinds), "labels": labels}
     files.write_text(out / "labels.json", json.dumps(content, allow_nan=False, indent=1) + "\n")
     targets = {identifier: out / "data" / name for identifier, name in zip(table.frames, names, strict=True)}
-    supported = ("truncation", "occlusion", "alpha", "3D box", "score", *table.extra)
+    supported = ("truncation", "occlusion", "alpha", "3D box", "score", "attributes of frames", *table.extra)
     return WriteSummary.from_counts(1 + copy_images(targets, images), table.count_lost(supported, renamed))
 
 

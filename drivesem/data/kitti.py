@@ -13,7 +13,9 @@ a scene requires more, see `read_labels`. Errors name the file, the line or key,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,12 +26,16 @@ from torch import Tensor
 from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
 from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
 from drivesem.data.kitti_labels import (
+    SPLITS,
     TYPES,
     UNKNOWN_POSE,
     UNKNOWN_SIZE,
+    WITHOUT_LABELS,
     KittiLabelLines,
     finite_number,
-    list_text_files,
+    iterate_label_lines,
+    list_files,
+    read_splits,
 )
 from drivesem.data.label_table import (
     REGION,
@@ -48,7 +54,6 @@ from drivesem.data.photographs import (
     check_image_size,
     is_in_front,
     list_images,
-    match_images_below,
     pinhole_camera,
     read_focal_length,
     read_upright,
@@ -196,7 +201,8 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
 
     Args:
         table: Labels or detections.
-        out: Folder of the label files; with images or cameras, it gets a `training` folder with all of them.
+        out: Folder of the label files; with images, cameras or subfolders, it gets a `training` folder with all of
+            them, and `ImageSets` with the splits.
         images: Images to copy, by frame identifier.
 
     Returns:
@@ -209,12 +215,10 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     kinds = [_kitti_type(kind, int((table.kind == i).sum())) for i, kind in enumerate(table.kinds)]
     names, renamed = table.file_names()
     scored = table.scored
-    root = out / "training" if images or table.cameras else out
+    root = out / "training" if images or table.cameras or any("/" in name for name in names) else out
     folder = root / "label_2" if root != out else out
     for name, rows in zip(names, table.rows_by_frame(), strict=True):
-        written = [row for row in rows if not (scored and table.kind[row] == REGION)]
-        text = "".join(f"{_format_row(table, row, kinds, scored)}\n" for row in written)
-        files.write_text(folder / f"{name}.txt", text)
+        files.write_text(folder / f"{name}.txt", "".join(_format_rows(table, rows, kinds, scored)))
     for i, camera in table.cameras.items():
         calibration = format_calibration(torch.from_numpy(parse_camera_entry(camera)))
         files.write_text(root / "calib" / f"{names[i]}.txt", calibration)
@@ -222,7 +226,11 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     count = len(names) + copy_images(targets, images)
     known, objects = table.known_fields(), table.kind != REGION
     supported = ("truncation", "occlusion", "alpha", "3D box", "score", "region", "camera")
-    lost = table.count_lost(supported, renamed | ({"region": int((~objects).sum())} if scored else {}))
+    more = renamed | ({"region": int((~objects).sum())} if scored else {})
+    if root != out:
+        lists, more["split"] = _write_splits(table, names, out)
+        count += lists
+    lost = table.count_lost(supported, more)
     assumed = {
         "occlusion (3, unknown)": int((objects & ~known["occlusion"]).sum()),
         "truncation (0)": int((objects & ~known["truncation"]).sum()),
@@ -240,26 +248,62 @@ def _kitti_type(kind: str, boxes: int) -> str:
     return kind
 
 
-def _format_row(table: LabelTable, row: int, kinds: Sequence[str], scored: bool) -> str:
-    region = table.kind[row] == REGION or bool(table.ignore[row])
-    truncation, occlusion, alpha = float(table.truncation[row]), int(table.occlusion[row]), float(table.alpha[row])
-    pose = table.pose[row].tolist()
-    pose = pose if is_known_pose(pose) and not region else None
-    if pose is not None and not math.isfinite(alpha):
-        alpha = math.remainder(pose[6] - math.atan2(pose[3], pose[5]), 2 * math.pi)
-    if not region and not scored:
-        # KITTI has a code for unknown occlusion, but none for unknown truncation
-        occlusion = UNKNOWN_OCCLUSION if occlusion < 0 else occlusion
-        truncation = max(truncation, 0.0)
-    score = format_shortest(float(table.score[row])) if scored else None
-    kind = "DontCare" if region else kinds[int(table.kind[row])]
-    return _format_line(kind, truncation, occlusion, alpha, table.boxes[row].tolist(), pose, score)
+def _format_rows(table: LabelTable, rows: range, kinds: Sequence[str], scored: bool) -> Iterator[str]:
+    """Yield the lines of a frame's boxes.
+
+    Args:
+        table: Labels or detections.
+        rows: Rows of the frame.
+        kinds: KITTI's types of the table's classes.
+        scored: Write detections; regions are left out.
+    """
+    part = slice(rows.start, rows.stop)
+    columns = (table.kind, table.ignore, table.truncation, table.occlusion, table.alpha, table.boxes, table.pose)
+    values = zip(*(column[part].tolist() for column in columns), table.score[part].tolist(), strict=True)
+    for kind, ignore, truncation, occlusion, alpha, box, pose, score in values:
+        if scored and kind == REGION:
+            continue
+        region = kind == REGION or ignore
+        known = is_known_pose(pose) and not region
+        if known and not math.isfinite(alpha):
+            alpha = math.remainder(pose[6] - math.atan2(pose[3], pose[5]), 2 * math.pi)
+        if not region and not scored:
+            # KITTI has a code for unknown occlusion, but none for unknown truncation
+            occlusion = UNKNOWN_OCCLUSION if occlusion < 0 else occlusion
+            truncation = max(truncation, 0.0)
+        line = _format_line(
+            "DontCare" if region else kinds[kind],
+            truncation,
+            occlusion,
+            alpha,
+            box,
+            pose if known else None,
+            format_shortest(score) if scored else None,
+        )
+        yield f"{line}\n"
 
 
-def find_images(path: Path, frames: Sequence[str]) -> dict[str, Path]:
-    """Find the images of a folder of label files next to it, in KITTI's layout."""
-    folders = (path / "training" / "image_2", path / "image_2", path.parent / "image_2")
-    return match_images_below(folders, frames)
+def _write_splits(table: LabelTable, names: Sequence[str], out: Path) -> tuple[int, int]:
+    """Write the lists `ImageSets/{train,val,test}.txt`.
+
+    Args:
+        table: All frames and splits.
+        names: Names of the frames' files.
+        out: Folder above `ImageSets`.
+
+    Returns:
+        Number of lists, and of frames of splits with another name, or joined with another split.
+    """
+    lists: dict[str, list[int]] = {}
+    lost = 0
+    for name, rows in table.splits.items():
+        known = next((split for split in SPLITS if name.lower().startswith(split)), None)
+        lost += len(rows) if known is None or known in lists else 0
+        if known is not None:
+            lists.setdefault(known, []).extend(rows)
+    for name, rows in lists.items():
+        files.write_text(out / "ImageSets" / f"{name}.txt", "".join(f"{names[i]}\n" for i in sorted(set(rows))))
+    return len(lists), lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,27 +413,22 @@ class KittiDataset(FrameIndex[Path]):
         self._has_labels = (self.folder / "label_2").is_dir()
         self._unpaired: dict[str, str] = {}
         if self._has_labels:
-            labelled = {name.removesuffix(".txt") for name in list_text_files(self.folder / "label_2")}
-            self._unpaired = {f"{images[name]}": "image without a label file" for name in images.keys() - labelled}
-            paths = (self._label_path(name) for name in labelled - images.keys())
+            folder = self.folder / "label_2"
+            self._labels = {os.path.splitext(name)[0]: f"{folder}{os.sep}{name}" for name in list_files(folder)}
+            self._unpaired = {f"{images[name]}": WITHOUT_LABELS for name in images.keys() - self._labels.keys()}
+            paths = (self._labels[name] for name in self._labels.keys() - images.keys())
             self._unpaired |= {f"{path}": _WITHOUT_IMAGE for path in paths}
-            images = {name: path for name, path in images.items() if name in labelled}
+            images = {name: path for name, path in images.items() if name in self._labels}
             if not images:
                 raise FormatError(str(self.folder / "label_2"), "label files named after the images", "none")
         super().__init__(self.folder, dict(sorted(images.items())))
-
-    def _label_path(self, identifier: str) -> Path:
-        return self.folder / "label_2" / f"{identifier}.txt"
 
     def _calibration_path(self, identifier: str) -> Path:
         return self.folder / "calib" / f"{identifier}.txt"
 
     def splits(self) -> dict[str, tuple[str, ...]]:
         """Identifiers by split, of the lists `ImageSets/{train,val,test}.txt`."""
-        lists = {name: self._root / "ImageSets" / f"{name}.txt" for name in _SPLITS}
-        names = {name: set(files.read_text(path).split()) for name, path in lists.items() if path.is_file()}
-        splits = {name: tuple(i for i in self.identifiers if i in chosen) for name, chosen in names.items()}
-        return {name: identifiers for name, identifiers in splits.items() if identifiers}
+        return read_splits(self._root, self.identifiers)
 
     def account(self) -> DataAccount:
         """Account for all files and label rows; reads all labels."""
@@ -400,12 +439,15 @@ class KittiDataset(FrameIndex[Path]):
         for folder, suffix in (("depth_2", "png"), ("instance_2", "png"), ("velodyne", "bin")):
             if folder != "velodyne" or self.with_points:
                 read += [f"{self.folder / folder / name}.{suffix}" for name in names]
-        classes, regions, repairs = {}, 0, {}
+        classes, regions, repairs = Counter[str](), 0, Counter[str]()
         if self._has_labels:
-            paths = [f"{self._label_path(name)}" for name in names]
+            paths = [self._labels[name] for name in names]
             read += paths
-            lines = KittiLabelLines(paths, [files.read_text(path) for path in paths], scored=False)
-            repairs, (classes, regions) = lines.drop_unusable(), lines.count_rows()
+            for lines in iterate_label_lines(paths):
+                repairs.update(lines.drop_unusable())
+                of_chunk, regions_of_chunk = lines.count_rows()
+                classes.update(of_chunk)
+                regions += regions_of_chunk
         uncalibrated = sum(not self._calibration_path(name).exists() for name in names)
         if uncalibrated:
             repairs["frames without calibration (3D boxes not used)"] = uncalibrated
@@ -415,11 +457,11 @@ class KittiDataset(FrameIndex[Path]):
             len(names),
             count,
             skipped,
-            classes,
+            dict(classes),
             regions,
             without_image=sum(reason == _WITHOUT_IMAGE for reason in self._unpaired.values()),
             splits={name: len(chosen) for name, chosen in splits.items()},
-            repairs=repairs,
+            repairs=dict(repairs),
         )
 
     def labels(self, identifier: str) -> Labels | None:
@@ -427,8 +469,8 @@ class KittiDataset(FrameIndex[Path]):
         self._entry(identifier)
         if not self._has_labels:
             return None
-        path = self._label_path(identifier)
-        lines = KittiLabelLines([str(path)], [files.read_text(path)], scored=False)
+        path = self._labels[identifier]
+        lines = KittiLabelLines([path], [files.read_text(path)], scored=False)
         lines.drop_unusable()
         labels = lines.to_table([identifier], scored=False).to_labels()
         return labels if self._calibration_path(identifier).exists() else _drop_poses(labels)
@@ -473,7 +515,6 @@ class KittiDataset(FrameIndex[Path]):
         )
 
 
-_SPLITS = ("train", "val", "test")
 _WITHOUT_IMAGE = "label file without an image"
 
 

@@ -11,7 +11,7 @@ import math
 import os
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.data.account import DataAccount, account_for_files
-from drivesem.data.label_table import REGION, LabelTable
+from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
+from drivesem.data.label_table import REGION, LabelTable, join_tables, repeat_value
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -36,6 +36,10 @@ UNKNOWN_POSE = ["-1", "-1", "-1", "-1000", "-1000", "-1000", "-10"]
 _NUMBERS_BEFORE_POSE = FIELDS.index("height") - 1
 """Number of values of a line before its 3D box."""
 
+SPLITS = ("train", "val", "test")
+"""Splits of the lists in ImageSets."""
+WITHOUT_LABELS = "image without a label file"
+_FILES_PER_CHUNK = 4096
 _MAX_FLAG = 2**31
 MAX_YAW = 2 * math.pi + 0.01
 """Largest yaw, rad; more than a turn means another unit."""
@@ -167,11 +171,13 @@ class KittiLabelLines:
             np.fromiter(map(index.__getitem__, self.kinds), np.int64, len(self.kinds)),
             values[:, 3:7].copy(),
             "xyxy",
-            score=values[:, 14].copy() if scored else np.full(len(values), np.nan),
+            score=values[:, 14].copy() if scored else repeat_value(np.nan, len(values)),
             truncation=values[:, 0].copy(),
             occlusion=values[:, 1].astype(np.int64),
             alpha=np.where(values[:, 2] == UNKNOWN_ANGLE, np.nan, values[:, 2]),
-            pose=np.where(known[:, None], np.concatenate([size, position], axis=1), np.nan),
+            pose=np.where(known[:, None], np.concatenate([size, position], axis=1), np.nan)
+            if known.any()
+            else repeat_value(np.nan, len(values), 7),
         )
 
 
@@ -228,13 +234,14 @@ def _strip_unknown_poses(rests: Sequence[str]) -> list[str] | None:
 def find_label_folder(path: Path) -> Path | None:
     """Find the folder of label files: the path, or `label_2`, `training/label_2` or `data` below it."""
     for folder in (path / "training" / "label_2", path / "label_2", path / "data", path):
-        if folder.is_dir() and any(folder.glob("[!.]*.txt")):
+        pattern = "**/[!.]*.txt" if folder.name == "label_2" else "[!.]*.txt"
+        if folder.is_dir() and any(folder.glob(pattern)):
             return folder
     return None
 
 
-def list_text_files(folder: Path) -> list[str]:
-    """List a folder's text files, in subfolders too, by their paths below it, sorted.
+def list_files(folder: Path, suffixes: tuple[str, ...] = (".txt",)) -> list[str]:
+    """List a folder's files of some suffixes, in subfolders too, by their paths below it, sorted.
 
     Path objects of tens of thousands would take seconds.
     """
@@ -242,8 +249,16 @@ def list_text_files(folder: Path) -> list[str]:
     for place, folders, found in os.walk(folder):
         folders[:] = [name for name in folders if name[0] != "."]
         start = "" if place == str(folder) else f"{os.path.relpath(place, folder)}{os.sep}"
-        names += [f"{start}{name}" for name in found if name.endswith(".txt") and name[0] != "."]
+        names += [f"{start}{name}" for name in found if name.lower().endswith(suffixes) and name[0] != "."]
     return sorted(names)
+
+
+def read_splits(root: Path, identifiers: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return identifiers by split, of the lists `ImageSets/{train,val,test}.txt` below a folder."""
+    lists = {name: root / "ImageSets" / f"{name}.txt" for name in SPLITS}
+    names = {name: set(files.read_text(path).split()) for name, path in lists.items() if path.is_file()}
+    splits = {name: tuple(i for i in identifiers if i in chosen) for name, chosen in names.items()}
+    return {name: chosen for name, chosen in splits.items() if chosen}
 
 
 def read_table(path: Path, scored: bool) -> LabelTable:
@@ -251,20 +266,62 @@ def read_table(path: Path, scored: bool) -> LabelTable:
     folder = find_label_folder(path) if path.is_dir() else None
     if folder is None:
         raise FormatError(str(path), "a folder of KITTI label files (NNNNNN.txt)", "none")
-    paths = {name.removesuffix(".txt"): f"{folder}{os.sep}{name}" for name in list_text_files(folder)}
+    paths = {os.path.splitext(name)[0]: f"{folder}{os.sep}{name}" for name in list_files(folder)}
     table = read_label_files(paths, scored)
     if scored and not len(table):
         raise FormatError(str(folder), "at least one detection", f"{len(paths)} empty files")
-    count, skipped = account_for_files(folder, paths.values())
+    places = (parent / "image_2" for parent in (folder.parent, path.parent))
+    image_folder = next((place for place in places if place.is_dir()), None)
+    found = [] if image_folder is None else list_files(image_folder, IMAGE_SUFFIXES)
+    image_of = {os.path.splitext(name)[0]: name for name in found}
+    image_files = {i: image_of[name] for i, name in enumerate(table.frames) if name in image_of}
+    image_paths = {i: Path(f"{image_folder}{os.sep}{name}") for i, name in image_files.items()}
+    splits = read_splits(path, table.frames)
+    unlabelled = (f"{image_folder}{os.sep}{image_of[name]}" for name in image_of.keys() - paths.keys())
+    read = [*paths.values(), *map(str, image_paths.values()), *(f"{path / 'ImageSets' / s}.txt" for s in splits)]
+    if folder.name == "label_2":
+        read += [f"{folder.parent}{os.sep}calib{os.sep}{name}.txt" for name in paths]
+    count, skipped = account_for_files(path, read, dict.fromkeys(unlabelled, WITHOUT_LABELS))
     counts = np.bincount(table.kind[table.kind >= 0], minlength=len(table.kinds)).tolist()
-    regions = int((table.kind < 0).sum())
-    classes = dict(zip(table.kinds, counts, strict=True))
-    return replace(table, account=DataAccount("kitti", len(paths), count, skipped, classes, regions))
+    account = DataAccount(
+        "kitti",
+        len(paths),
+        count,
+        skipped,
+        dict(zip(table.kinds, counts, strict=True)),
+        int((table.kind < 0).sum()),
+        without_image=len(paths) - len(image_paths) if found else 0,
+        splits={name: len(chosen) for name, chosen in splits.items()},
+    )
+    position = {name: i for i, name in enumerate(table.frames)}
+    return replace(
+        table,
+        image_files=image_files,
+        image_paths=image_paths,
+        splits={name: [position[frame] for frame in chosen] for name, chosen in splits.items()},
+        account=account,
+    )
 
 
 def read_label_files(paths: Mapping[str, str], scored: bool = False) -> LabelTable:
     """Read the labels, or detections if `scored`, of files by frame. Raises FormatError as `KittiLabelLines`."""
-    lines = KittiLabelLines(list(paths.values()), [files.read_text(file) for file in paths.values()], scored)
-    if not scored:
-        lines.check_sizes()
-    return lines.to_table(list(paths), scored)
+    frames = list(paths)
+    tables: list[LabelTable] = []
+    for lines in iterate_label_lines(list(paths.values()), scored):
+        if not scored:
+            lines.check_sizes()
+        start = sum(len(table.frames) for table in tables)
+        tables.append(lines.to_table(frames[start : start + len(lines.counts)], scored))
+    if len(tables) == 1:
+        return tables[0]
+    table = join_tables(tables)
+    kinds = sorted(table.kinds)
+    places = np.array([*map(kinds.index, table.kinds), REGION], np.int64)
+    return replace(table, kinds=tuple(kinds), kind=places[table.kind])
+
+
+def iterate_label_lines(paths: Sequence[str], scored: bool = False) -> Iterator[KittiLabelLines]:
+    """Yield the lines of some files at a time, which bounds the memory of their text."""
+    for start in range(0, max(len(paths), 1), _FILES_PER_CHUNK):
+        chunk = paths[start : start + _FILES_PER_CHUNK]
+        yield KittiLabelLines(chunk, [files.read_text(path) for path in chunk], scored)

@@ -11,7 +11,7 @@ ignores them. A box that ends before it begins is an error.
 from __future__ import annotations
 
 import math
-import shutil
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivesem.data.account import DataAccount
+from drivesem.data.image_headers import copy_upright
 from scene_ir.errors import FormatError
 
 if TYPE_CHECKING:  # torch takes a second to load; most readers of label files do not need it
@@ -100,7 +101,9 @@ class LabelTable:
     cameras: Mapping[int, Any] = field(default_factory=dict)
     """COCO's "camera" entries by frame index."""
     image_files: Mapping[int, str] = field(default_factory=dict)
-    """Image files by frame index, where not named after the frame."""
+    """Names of image files, with folders and suffix, by frame index, where they are known."""
+    image_paths: Mapping[int, Path] = field(default_factory=dict)
+    """Existing image files by frame index."""
     frame_attributes: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     """Further attributes of frames as JSON, by frame index."""
     splits: Mapping[str, Sequence[int]] = field(default_factory=dict)
@@ -140,12 +143,12 @@ class LabelTable:
         kind = np.asarray(kind, np.int64)
         unknown: dict[str, Any] = {
             "ignore": kind == REGION,
-            "score": np.full(n, np.nan),
-            "truncation": np.full(n, -1.0),
-            "occlusion": np.full(n, -1, np.int64),
-            "alpha": np.full(n, np.nan),
-            "pose": np.full((n, 7), np.nan),
-            "area": np.full(n, np.nan),
+            "score": repeat_value(np.nan, n),
+            "truncation": repeat_value(-1.0, n),
+            "occlusion": repeat_value(-1, n),
+            "alpha": repeat_value(np.nan, n),
+            "pose": repeat_value(np.nan, n, 7),
+            "area": repeat_value(np.nan, n),
             "sizes_wh": np.zeros((len(frames), 2), np.int64),
         }
         frame = np.asarray(frame, np.int64)
@@ -161,10 +164,10 @@ class LabelTable:
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> LabelTable:
         """Select boxes by mask or indices, ascending by frame; the frames stay."""
         columns = ("frame", "kind", "boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area")
-        index = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+        index: NDArray[np.int64] = np.arange(len(self))[chosen]
         return replace(
             self,
-            **{name: getattr(self, name)[index] for name in columns},
+            **{name: _select_rows(getattr(self, name), index) for name in columns},
             box_ids=None if self.box_ids is None else self.box_ids[index],
             extra={name: [values[i] for i in index.tolist()] for name, values in self.extra.items()},
         )
@@ -191,6 +194,7 @@ class LabelTable:
             image_ids=ids,
             cameras={int(new[i]): camera for i, camera in self.cameras.items() if new[i] >= 0},
             image_files={int(new[i]): name for i, name in self.image_files.items() if new[i] >= 0},
+            image_paths={int(new[i]): path for i, path in self.image_paths.items() if new[i] >= 0},
             frame_attributes={int(new[i]): values for i, values in self.frame_attributes.items() if new[i] >= 0},
             splits={name: [int(new[i]) for i in rows if new[i] >= 0] for name, rows in self.splits.items()},
         )
@@ -250,16 +254,36 @@ class LabelTable:
         return known | {name: np.array([v is not None for v in values], np.bool_) for name, values in columns}
 
     def count_lost(self, supported: Sequence[str], more: Mapping[str, int]) -> dict[str, int]:
-        """Count boxes with a value, and cameras, by field that is not `supported`; add the counts `more`."""
+        """Count boxes and frames with a value, by field that is not `supported`; add the counts `more`."""
         counts = {name: int(rows.sum()) for name, rows in self.known_fields().items() if name not in supported}
-        return counts | ({} if "camera" in supported else {"camera": len(self.cameras)}) | dict(more)
+        of_frames = {
+            "camera": len(self.cameras),
+            "attributes of frames": sum(bool(v.keys() - {"drivesem"}) for v in self.frame_attributes.values()),
+            "split": sum(len(rows) for rows in self.splits.values() if len(rows) < len(self.frames)),
+        }
+        return counts | {name: n for name, n in of_frames.items() if name not in supported} | dict(more)
 
-    def file_names(self) -> tuple[list[str], dict[str, int]]:
-        """Return identifiers as file names, and the number of changed ones, as a loss."""
-        names = ["_".join(name.split("/")) for name in self.frames]
-        if len(set(names)) != len(names):
-            raise FormatError("frames", "names that differ when / becomes _", "two alike")
-        return names, {"/ in frame names": sum(a != b for a, b in zip(names, self.frames, strict=True))}
+    def file_names(self, folders: Sequence[str] = ()) -> tuple[list[str], dict[str, int]]:
+        """Return paths of the frames' files, without suffix, and the number of changed names, as a loss.
+
+        A frame's files are named as its image if that is named after the frame, with its folders. If some are alike,
+        all are named by identifiers.
+
+        Args:
+            folders: Folder of each frame (F,), in which names must differ; by default one for all.
+
+        Raises:
+            FormatError: A name leads out of its folder.
+        """
+        stems = ((i, self.frames[i], os.path.splitext(file)[0]) for i, file in self.image_files.items())
+        own = {i: name for i, frame, name in stems if _is_ending(frame, name) or _is_ending(name, frame)}
+        names = [own.get(i, identifier) for i, identifier in enumerate(self.frames)]
+        if len(set(zip(folders, names, strict=True) if folders else names)) < len(names):
+            names = list(self.frames)
+        for name in names:
+            if name.startswith("/") or "\0" in name or ".." in name.split("/"):
+                raise FormatError("frames", "names below a folder", repr(name))
+        return names, {"names of frames": sum(not _is_ending(own[i], names[i]) for i in own)}
 
     def require_sizes(self, layout: str) -> None:
         """Raise FormatError if the size of an image is unknown."""
@@ -267,6 +291,76 @@ class LabelTable:
         if missing:
             expected = "--images FOLDER or --image-size WIDTHxHEIGHT"
             raise FormatError(f"{layout}: image sizes", expected, f"none for {missing} frames")
+
+
+def join_tables(tables: Sequence[LabelTable]) -> LabelTable:
+    """Join tables of different frames. Ids that are not unique, or differ between the tables, are dropped."""
+    kinds = list(dict.fromkeys(kind for table in tables for kind in table.kinds))
+    starts = np.cumsum([0, *(len(table.frames) for table in tables)]).tolist()
+    numbers: dict[str, set[int]] = {}
+    for table in tables:
+        for kind, number in zip(table.kinds, table.kind_ids, strict=True) if table.kind_ids is not None else ():
+            numbers.setdefault(kind, set()).add(int(number))
+    known = len(numbers) == len(kinds) and all(len(ids) == 1 for ids in numbers.values())
+    kind_ids = [next(iter(numbers[kind])) for kind in kinds] if known else []
+    names = sorted({name for table in tables for name in table.extra})
+    columns = ("boxes", "ignore", "score", "truncation", "occlusion", "alpha", "pose", "area", "sizes_wh")
+    maps = ("cameras", "image_files", "image_paths", "frame_attributes")
+    parts = list(zip(tables, starts, strict=False))
+
+    def unique(values: Sequence[Any]) -> Any:
+        if any(value is None for value in values) or len({value.dtype.kind for value in values}) > 1:
+            return None
+        joined = np.concatenate(values)
+        return joined if len(np.unique(joined)) == len(joined) else None
+
+    return replace(
+        tables[0],
+        frames=tuple(name for table in tables for name in table.frames),
+        kinds=tuple(kinds),
+        frame=np.concatenate([table.frame + start for table, start in parts]),
+        kind=np.concatenate(
+            [np.array([*map(kinds.index, table.kinds), REGION], np.int64)[table.kind] for table in tables]
+        ),
+        **{name: _concatenate([getattr(table, name) for table in tables]) for name in columns},
+        image_ids=unique([table.image_ids for table in tables]),
+        box_ids=unique([table.box_ids for table in tables]),
+        kind_ids=np.array(kind_ids, np.int64) if known and len(set(kind_ids)) == len(kinds) else None,
+        merged_kind_ids={},
+        extra={
+            name: [v for table in tables for v in table.extra.get(name, [None] * len(table))] for name in names
+        },
+        **{
+            name: {i + start: value for table, start in parts for i, value in getattr(table, name).items()}
+            for name in maps
+        },
+    )
+
+
+def repeat_value(value: float, *shape: int) -> NDArray[Any]:
+    """Return a read-only array of one value, which takes no memory."""
+    return np.broadcast_to(np.array(value), shape)
+
+
+def _is_repeated(column: NDArray[Any]) -> bool:
+    return not any(column.strides)
+
+
+def _select_rows(column: NDArray[Any], index: NDArray[np.int64]) -> NDArray[Any]:
+    if len(column) and _is_repeated(column):
+        return np.broadcast_to(column[0], (len(index), *column.shape[1:]))
+    return column[index]
+
+
+def _concatenate(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    parts = [column for column in columns if len(column)] or [*columns[:1]]
+    first, length = parts[0], sum(map(len, columns))
+    alike = all(
+        _is_repeated(part) and np.array_equal(part[0], first[0], equal_nan=True) for part in parts if len(part)
+    )
+    if alike and len(first):
+        return np.broadcast_to(first[0], (length, *first.shape[1:]))
+    return np.concatenate(columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,26 +392,29 @@ class WriteSummary:
         return cls(files, *counts)
 
 
-def copy_images(targets: Mapping[str, Path], images: Mapping[str, Path], only: str | None = None) -> int:
-    """Copy images.
+def copy_images(
+    targets: Mapping[str, Path], images: Mapping[str, Path], suffixes: Sequence[str] | None = None
+) -> int:
+    """Copy images; those with an EXIF orientation are turned upright.
 
     Args:
         targets: Target without suffix, by frame identifier.
         images: Source, by frame identifier.
-        only: The only suffix that the layout can hold, if any.
+        suffixes: The suffixes that the layout can hold, in lower case; None for all, in any case.
 
     Returns:
         Number of copied images.
 
     Raises:
-        FormatError: An image has another suffix than `only`.
+        FormatError: An image has another suffix.
     """
     for identifier, source in images.items():
-        target, suffix = targets[identifier], source.suffix.lower()
-        if only not in (None, suffix):
-            raise FormatError(str(source), f"a {only} image", source.suffix or "none")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, target.with_name(target.name + suffix))
+        target, suffix = targets[identifier], source.suffix
+        if suffixes is not None:
+            suffix = suffix.lower()
+            if suffix not in suffixes:
+                raise FormatError(str(source), f"a {' or '.join(suffixes)} image", source.suffix or "none")
+        copy_upright(source, target.with_name(target.name + suffix))
     return len(images)
 
 
@@ -348,6 +445,11 @@ def select_by_attributes(
     return chosen
 
 
+def _is_ending(end: str, name: str) -> bool:
+    """Whether a path is the other one, or its last parts."""
+    return end == name or name.endswith(f"/{end}")
+
+
 def format_number(value: float) -> str:
     """Format a number with two decimals, as KITTI does, or with more if it needs them."""
     value += 0.0  # no "-0.00"
@@ -357,7 +459,8 @@ def format_number(value: float) -> str:
 
 def format_shortest(value: float) -> str:
     """Format a number with the fewest decimals that read back unchanged, without an exponent."""
-    return np.format_float_positional(value, trim="-")
+    text = repr(float(value))
+    return np.format_float_positional(value, trim="-") if "e" in text else text.removesuffix(".0")
 
 
 def parse_camera_entry(camera: Any) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,12 +111,6 @@ def name_by_path(images: Sequence[Path], root: Path) -> dict[str, Path]:
     return named
 
 
-def read_image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header. FormatError."""
-    with files.open_image(path) as image:
-        return image.size
-
-
 def pinhole_camera(height: int, width: int, focal_px: float) -> Camera:
     """Make a camera with a centred principal point.
 
@@ -182,16 +177,14 @@ def is_in_front(z: float, length: float, width: float, yaw: float) -> bool:
     return z + 0.5 * (length * abs(math.sin(yaw)) + width * abs(math.cos(yaw))) > NEAR_M
 
 
-def match_images(folders: Sequence[Path], frames: Sequence[str]) -> dict[str, Path]:
-    """Find the image of each frame in one of the folders; frames without an image are left out."""
-    images = {p.stem: p for folder in reversed(folders) for p in list_images(folder)}
-    return {name: images[name] for name in frames if name in images}
-
-
-def match_images_below(folders: Sequence[Path], frames: Sequence[str]) -> dict[str, Path]:
-    """As `match_images`, in those folders that exist and in their direct subfolders."""
-    parents = [folder for folder in folders if folder.is_dir()]
-    return match_images([f for p in parents for f in (p, *sorted(c for c in p.iterdir() if c.is_dir()))], frames)
+def match_images(folder: Path, frames: Sequence[str]) -> dict[str, Path]:
+    """Find the image of each frame below a folder, by its identifier, or its last part; others are left out."""
+    paths = list_images(folder, recursive=True)
+    by_path = {path.relative_to(folder).with_suffix("").as_posix(): path for path in reversed(paths)}
+    count = Counter(path.stem for path in by_path.values())
+    by_stem = {path.stem: path for path in by_path.values() if count[path.stem] == 1}
+    found = {name: by_path.get(name) or by_stem.get(name.rpartition("/")[2]) for name in frames}
+    return {name: path for name, path in found.items() if path is not None}
 
 
 def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarray:
@@ -202,7 +195,7 @@ def read_pixels(path: Path, size_hw: tuple[int, int] | None = None) -> np.ndarra
     files.check_utf8(f"{path.parent}: name of a photograph", path.name)
     with files.open_image(path, files.read_bytes(path)) as image:
         width, height = image.size
-        if image.mode not in _CONVERTIBLE_MODES:
+        if image.mode not in _CONVERTIBLE_MODES and not (image.format == "TIFF" and image.mode == "RGB"):
             return files.read_image(path, size_hw)
         pixels = np.array(image.convert("RGB"))
     if size_hw is not None and (height, width) != size_hw:
@@ -233,11 +226,6 @@ def turn_pixels(pixels: np.ndarray, orientation: float) -> np.ndarray:
     """Turn a stored image or mask (H, W, ...) upright. orientation: EXIF's, 1 to 8; others change nothing."""
     pixels = np.rot90(pixels, _QUARTER_TURNS.get(orientation, 0))
     return np.ascontiguousarray(pixels[:, ::-1] if orientation in _MIRRORED else pixels)
-
-
-def read_upright_size(path: Path) -> tuple[int, int]:
-    """Read width and height of the upright image from its header. Raises FormatError."""
-    return _read_header(path)[1:]
 
 
 def read_focal_length(image_path: Path, focal_px: float | None = None) -> FocalLength:
@@ -292,6 +280,8 @@ def _read_header(path: Path) -> tuple[dict[int, Any], int, int]:
     with files.open_image(path) as image:  # Pillow reads EXIF on demand and raises then
         exif = Image.Image.getexif(image)  # PngImageFile's method would decode all pixels first
         tags = {_ORIENTATION: exif.get(_ORIENTATION), **exif.get_ifd(_EXIF)}
+        if image.format == "TIFF":  # Pillow turns it
+            tags[_ORIENTATION] = 1
         width, height = image.size
     return (tags, height, width) if _quarter_turns(tags) % 2 else (tags, width, height)
 
@@ -302,8 +292,26 @@ def _quarter_turns(tags: Mapping[int, Any]) -> int:
 
 def read_photograph(path: Path, focal_px: float | None = None) -> Frame:
     """Read an upright photograph with its camera, without labels. Raises FormatError or RangeError."""
+    return read_labelled_photograph(path.stem, path, None, {"dataset": "photograph", "image": path.name}, focal_px)
+
+
+def read_labelled_photograph(
+    identifier: str, path: Path, labels: Labels | None, provenance: Mapping[str, str], focal_px: float | None
+) -> Frame:
+    """Read an upright photograph, with a camera that has a centred principal point.
+
+    Args:
+        identifier: Identifier of the frame.
+        path: The image.
+        labels: Labels in pixels of the upright image, if any.
+        provenance: Data set and files; the focal length and its source are added.
+        focal_px: Focal length; see `read_focal_length`.
+
+    Raises:
+        FormatError: A damaged image.
+        RangeError: Unless focal_px is positive.
+    """
     focal = read_focal_length(path, focal_px)
     image = to_tensor(read_upright(path))
-    provenance = {"dataset": "photograph", "image": path.name, "focal": str(focal)}
     camera = pinhole_camera(image.shape[1], image.shape[2], focal.length_px)
-    return Frame(path.stem, image, camera, provenance=provenance)
+    return Frame(identifier, image, camera, labels, provenance={**provenance, "focal": str(focal)})

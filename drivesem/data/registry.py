@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivesem.data import coco, fiftyone, kitti, vkitti1, vkitti2, yolo
+from drivesem.data import bdd100k, coco, fiftyone, kitti, vkitti1, vkitti2, voc, yolo
 from drivesem.data.account import DataAccount
 from drivesem.data.ground_truth import Exposure, FrameLocation
 from drivesem.data.label_table import LabelTable, WriteSummary
-from drivesem.data.layouts import LAYOUTS, detect_layout
-from drivesem.data.vkitti import VirtualKittiDataset
+from drivesem.data.layouts import detect_layout
+from drivesem.data.photograph_dataset import PhotographDataset
 from drivesem.store import local_copy
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.types import Frame, Labels
@@ -62,11 +62,28 @@ class DatasetWriter(Protocol):
         ...
 
 
+def _open_voc(root: Path, focal_px: float | None = None) -> Dataset:
+    return PhotographDataset(voc.VocFiles(root), focal_px)
+
+
+def _open_bdd100k(root: Path, focal_px: float | None = None) -> Dataset:
+    return PhotographDataset(bdd100k.BddFiles(root), focal_px)
+
+
+_PHOTOGRAPH_DATASETS: dict[str, Callable[[Path, float | None], Dataset]] = {
+    "bdd100k": _open_bdd100k,
+    "coco": coco.CocoDataset,
+    "voc": _open_voc,
+    "yolo": yolo.YoloDataset,
+}
+"""Readers of layouts without cameras."""
 DATASETS: dict[str, Callable[[Path], Dataset]] = {
+    "bdd100k": _open_bdd100k,
     "coco": coco.CocoDataset,
     "kitti": kitti.KittiDataset,
     "vkitti1": vkitti1.Vkitti1Dataset,
     "vkitti2": vkitti2.Vkitti2Dataset,
+    "voc": _open_voc,
     "yolo": yolo.YoloDataset,
 }
 """Readers by layout."""
@@ -97,7 +114,7 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_p
         name: Layout, a key of DATASETS.
         root: Folder or URL.
         with_points: Read laser points, which only KITTI has.
-        focal_px: Focal length of photographs without a camera, in COCO's and YOLO's layouts.
+        focal_px: Focal length of photographs without a camera, in layouts without cameras.
 
     Returns:
         The reader.
@@ -117,8 +134,8 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_p
     if not folder.exists():
         raise FormatError(str(root), f"the folder of a data set ({name}: {_CONTENTS[name]})", "nothing there")
     try:
-        if name in ("coco", "yolo"):
-            return (coco.CocoDataset if name == "coco" else yolo.YoloDataset)(folder, focal_px=focal_px)
+        if name in _PHOTOGRAPH_DATASETS:
+            return _PHOTOGRAPH_DATASETS[name](folder, focal_px)
         return DATASETS[name](folder)
     except FormatError as error:
         other = _guess_layout(folder)
@@ -129,10 +146,12 @@ def open_dataset(name: str, root: Path | str, with_points: bool = False, focal_p
 
 
 _CONTENTS = {
+    "bdd100k": "labels/det_20/det_*.json, bdd100k_labels_images_*.json or one JSON file per image, and images/100k",
     "coco": "annotations/instances_*.json, one JSON file with images or in each split's folder, or such a file itself",
     "kitti": "training/image_2, label_2 and calib",
     "vkitti1": "vkitti_1.3.1_rgb and similar folders",
     "vkitti2": "Scene01 and similar folders",
+    "voc": "Annotations/*.xml and JPEGImages, or XML files next to their images",
     "yolo": "data.yaml, or such a file itself",
 }
 """What the folder of a data set contains."""
@@ -163,23 +182,3 @@ def write_table(table: LabelTable, out: Path, layout: str, images: Mapping[str, 
         FormatError: The table lacks something that the layout requires.
     """
     return _TABLE_WRITERS[layout](table, out, images)
-
-
-def find_images(path: Path, layout: str, frames: Sequence[str]) -> dict[str, Path]:
-    """Find the images of labels in the place that their layout prescribes.
-
-    Args:
-        path: File or folder of labels.
-        layout: Layout of the labels; without a location for images, as of runs, nothing is found.
-        frames: Identifiers of the frames.
-
-    Returns:
-        Image files by identifier.
-    """
-    if layout not in LAYOUTS:
-        return {}
-    if layout in ("kitti", "coco"):
-        return (kitti if layout == "kitti" else coco).find_images(path, frames)
-    dataset = DATASETS[layout](path)
-    assert isinstance(dataset, (VirtualKittiDataset, yolo.YoloDataset))
-    return {name: dataset.image_path(name) for name in frames}

@@ -57,11 +57,16 @@ CACHED_TABLES = 16
 """Tables of four clips; a table of a thousand frames takes a few megabytes."""
 VISIBLE_BY_OCCLUSION = (1.0, 0.7, 0.3, 0.05)
 """Visible shares that Virtual KITTI 2's reader maps to KITTI's codes 0 to 3."""
-SUPPORTED_FIELDS = (
+_SUPPORTED_FIELDS = (
     *("truncation", "occlusion", "alpha", "3D box", "track", "visible", "model", "paint", "moving", "kind"),
     *("score", "region", "crowd"),  # lost ones are counted row by row
 )
-"""Fields of a table that both versions hold."""
+
+
+def supported_fields(table: LabelTable) -> tuple[str, ...]:
+    """Return the fields of a table that both versions hold; its own attributes of frames are in their names."""
+    own = table.account is not None and table.account.layout.startswith("vkitti")
+    return (*_SUPPORTED_FIELDS, "attributes of frames") if own else _SUPPORTED_FIELDS
 
 
 def written_category(name: str) -> str:
@@ -136,7 +141,7 @@ def locate_frames(table: LabelTable, scene: str) -> tuple[list[FrameLocation], i
     """Return the location of each frame and the number of changed names. `scene` is the default scene."""
     locations: list[FrameLocation] = []
     changed = 0
-    for i, name in enumerate(table.frames):
+    for i, name in enumerate(table.file_names()[0]):
         parts = name.replace("_", "/").split("/")
         world = parts[0].removeprefix("Scene")
         if len(parts) >= 3 and world.isdecimal() and parts[-1].isdecimal():

@@ -183,9 +183,9 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     targets = {table.frames[p.number]: writer.image_path(p, "rgb").with_suffix("") for p in locations}
     occluded = sum(tracked.occlusion > 2 for objects in frames for tracked in objects)
     more = {"occlusion 3 (2 is the most)": occluded, "frame names": changed}
-    copied = copy_images(targets, images, only=".png")
+    copied = copy_images(targets, images, (".png",))
     return WriteSummary.from_counts(
-        count + copied, lost | more | table.count_lost(vkitti.SUPPORTED_FIELDS, {}), assumed
+        count + copied, lost | more | table.count_lost(vkitti.supported_fields(table), {}), assumed
     )
 
 

@@ -250,10 +250,10 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     count = writer.write_tables(entries)
     targets = {table.frames[p.number]: writer.image_path(p, "rgb", 0, "jpg").with_suffix("") for p in locations}
     shifted = sum(bool(parse_camera_entry(camera)[:, 3].any()) for camera in table.cameras.values())
-    supported = (*vkitti.SUPPORTED_FIELDS, "pixels", "world", "world_yxz", "camera")
+    supported = (*vkitti.supported_fields(table), "pixels", "world", "world_yxz", "camera")
     more = {"frame names": changed, "camera's offset": shifted}
     without = {"camera": len(table.frames) - len(table.cameras)}
-    count += copy_images(targets, images)
+    count += copy_images(targets, images, (".jpg", ".png"))
     return WriteSummary.from_counts(count, lost | more | table.count_lost(supported, {}), assumed | without)
 
 

@@ -13,8 +13,9 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from drivesem.data.account import DataAccount, account_for_files
 from drivesem.data.coco import CATEGORIES, CATEGORY_IDS
 from drivesem.data.ground_truth import Exposure, FrameLocation
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.kitti import format_calibration, read_calibration
 from drivesem.data.label_table import (
     REGION,
@@ -41,7 +43,6 @@ from drivesem.data.photographs import (
     pinhole_camera,
     read_focal_length,
     read_upright,
-    read_upright_size,
 )
 from drivesem.data.yolo_files import (
     SPLITS,
@@ -49,7 +50,7 @@ from drivesem.data.yolo_files import (
     YoloDescription,
     YoloFiles,
     name_images,
-    replace_images_folder,
+    strip_split,
 )
 from drivesem.data.yolo_labels import EDGE, YoloRows, find_description, is_label_file, read_rows
 from scene_ir import files
@@ -141,11 +142,15 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
     written = objects & (boxes[:, 2:] > 0).all(axis=1)
     paths = [f"{folder}/{name}" for folder, name in zip(folders, names, strict=True)]
     for path, rows, size_wh in zip(paths, table.rows_by_frame(), table.sizes_wh.tolist(), strict=True):
+        part = slice(rows.start, rows.stop)
+        columns = (written, table.kind, boxes, table.score)
         lines: list[str] = []
-        for row in (row for row in rows if written[row]):
-            line = _format_line(int(table.kind[row]), boxes[row].tolist(), size_wh, TABLE_DECIMALS)
-            score = np.format_float_positional(table.score[row], trim="0")  # "1.0": whole numbers are track ids
-            lines.append(f"{line} {score}\n" if scored else f"{line}\n")
+        for known, kind, box, score in zip(*(column[part].tolist() for column in columns), strict=True):
+            if known:
+                line = _format_line(kind, box, size_wh, TABLE_DECIMALS)
+                # "1.0": whole numbers are track ids
+                end = f" {np.format_float_positional(score, trim='0')}" if scored else ""
+                lines.append(f"{line}{end}\n")
         files.write_text(out / "labels" / f"{path}.txt", "".join(lines))
     for i, camera in table.cameras.items():
         calibration = format_calibration(torch.from_numpy(parse_camera_entry(camera)))
@@ -157,9 +162,11 @@ def write_table(table: LabelTable, out: Path, images: Mapping[str, Path]) -> Wri
         files.write_text(out / f"{split}.txt", "".join(lines))
     first = next(iter(splits), "train")
     parts: dict[str, str | list[str]] = dict.fromkeys(("train", "val"), "images/train")
-    parts |= {part: splits[first] for part in ("train", "val") if splits} | splits
+    parts |= {
+        part: copy(splits[first]) for part in ("train", "val") if splits
+    } | splits  # one list would be an alias
     _write_yaml(out, parts, table.kinds)
-    masked = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-9) & written
+    masked = np.isfinite(table.area) & ~np.isclose(table.area, area, rtol=1e-3, atol=0.01) & written
     without = ~table.ignore & (table.boxes[:, 2:] <= 0).any(axis=1)
     more = {
         "box without area": int(without.sum()),
@@ -219,11 +226,11 @@ def _file_names(table: LabelTable, folders: Sequence[str]) -> list[str]:
     else the frame's identifier.
     """
     names: list[str] = []
-    for i, (identifier, folder) in enumerate(zip(table.frames, folders, strict=True)):
+    for i, identifier in enumerate(table.frames):
         own = os.path.splitext(table.image_files.get(i, ""))[0]
         flat_own, flat = own.replace("/", "_"), identifier.replace("/", "_")
         name = own if flat_own.endswith(flat) and own.count("/") >= identifier.count("/") else identifier
-        name = name.removeprefix(f"{folder}/")
+        name = strip_split(name) if table.splits else name
         if name.startswith("/") or ".." in name.split("/") or "\0" in name:
             raise FormatError(f"frame {identifier}", "a name below the folder of images", repr(name))
         names.append(name)
@@ -233,17 +240,16 @@ def _file_names(table: LabelTable, folders: Sequence[str]) -> list[str]:
 
 
 def _count_renamed(table: LabelTable, names: Sequence[str]) -> int:
-    stems = {i: os.path.splitext(file)[0] for i, file in table.image_files.items()}
-    own = {
-        i: stem for i, stem in stems.items() if stem.replace("/", "_").endswith(table.frames[i].replace("/", "_"))
-    }
-    return sum(PurePosixPath(stem).name != PurePosixPath(names[i]).name for i, stem in own.items())
+    """Count the images, of those named after their frames, that have another stem in the written data set."""
+    own = {i: os.path.splitext(file)[0] for i, file in table.image_files.items()}
+    own = {i: n for i, n in own.items() if n.replace("/", "_").endswith(table.frames[i].replace("/", "_"))}
+    return sum(os.path.basename(name) != os.path.basename(names[i]) for i, name in own.items())
 
 
 def _suffix(table: LabelTable, i: int, images: Mapping[str, Path]) -> str:
     """Return the suffix of a frame's image, in the data set that is written."""
     image = images.get(table.frames[i], Path(table.image_files.get(i, "")))
-    return image.suffix.lower() or ".png"
+    return image.suffix or ".png"
 
 
 def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -255,17 +261,24 @@ def _clip_to_images(table: LabelTable) -> tuple[NDArray[np.float64], NDArray[np.
     high = low + table.boxes[:, 2:]
     beyond = np.maximum(-low, high - sizes_wh)
     clipped = np.any(beyond > EDGE / 2 * sizes_wh, axis=1)  # half, so that readers accept the width in any case
-    corner, end = np.clip(low, 0, sizes_wh), np.clip(high, 0, sizes_wh)
-    return np.where(clipped[:, None], np.concatenate([corner, end - corner], axis=1), table.boxes), clipped
+    if not clipped.any():
+        return table.boxes, clipped
+    corner, end = (np.clip(place[clipped], 0, sizes_wh[clipped]) for place in (low, high))
+    boxes = table.boxes.copy()
+    boxes[clipped] = np.concatenate([corner, end - corner], axis=1)
+    return boxes, clipped
 
 
-def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable:
+def read_table(
+    path: Path, scored: bool, truth: LabelTable | None, size_wh: tuple[int, int] | None = None
+) -> LabelTable:
     """Read labels of a data set, or detections.
 
     Args:
         path: Folder or description of a data set, or folder of detections.
         scored: Read detections: text files with the classes and image sizes of `truth`.
         truth: Labels of the same frames, for detections.
+        size_wh: Size of all images of labels, px; by default they are opened.
 
     Returns:
         The labels or detections.
@@ -274,7 +287,7 @@ def read_table(path: Path, scored: bool, truth: LabelTable | None) -> LabelTable
         FormatError: Names file, line and field.
     """
     if not scored:
-        return YoloDataset(path).table()
+        return YoloDataset(path).table(size_wh)
     if truth is None or not truth.sizes_wh.all():
         raise FormatError(str(path), "labels with image sizes (YOLO's or COCO's)", "none")
     if path.is_file():
@@ -348,7 +361,8 @@ def _to_table(
     scale = np.tile(sizes_wh[rows.file], 2).astype(np.float64)
     low = (rows.shares[:, :2] - rows.shares[:, 2:] / 2) * scale[:, :2]
     boxes = np.concatenate([low, rows.shares[:, 2:] * scale[:, 2:]], axis=1)
-    tracks = [None if math.isnan(track) else int(track) for track in rows.track.tolist()]
+    known = np.isfinite(rows.track).any()
+    tracks = [None if math.isnan(track) else int(track) for track in rows.track.tolist()] if known else []
     return LabelTable.from_columns(
         frames,
         kinds,
@@ -358,7 +372,7 @@ def _to_table(
         "xywh",
         area=boxes[:, 2] * boxes[:, 3],
         sizes_wh=sizes_wh,
-        extra={"track": tracks} if any(track is not None for track in tracks) else {},
+        extra={"track": tracks} if known else {},
     )
 
 
@@ -368,7 +382,7 @@ def _count_classes(table: LabelTable) -> dict[str, int]:
     return {name: count for name, count in zip(table.kinds, counts, strict=True) if count}
 
 
-class YoloDataset(FrameIndex[Path]):
+class YoloDataset(FrameIndex[str]):
     """The frames of a YOLO data set, all its splits together.
 
     An image without a label file has no objects. Images are turned upright by EXIF, as trainers read them.
@@ -388,13 +402,9 @@ class YoloDataset(FrameIndex[Path]):
         self._files = YoloFiles(Path(root))
         self._files.check_pairs()
         self.class_names = self._files.names
-        images = self._files.images
-        split_of = {
-            image: name for name, paths in reversed([*self._files.splits.items()]) for image in paths if name
-        }
-        identifiers, names = name_images(self._files.root, images, split_of)
+        identifiers, names = name_images(self._files)
         self._file_names = dict(zip(identifiers, names, strict=True))
-        super().__init__("the YOLO folder", dict(sorted(zip(identifiers, images, strict=True))))
+        super().__init__("the YOLO folder", dict(sorted(zip(identifiers, self._files.images, strict=True))))
 
     def splits(self) -> dict[str, tuple[str, ...]]:
         """Identifiers by split; empty for a data set without splits."""
@@ -413,9 +423,9 @@ class YoloDataset(FrameIndex[Path]):
     def _account(self, rows: YoloRows, kind: NDArray[np.int64]) -> DataAccount:
         images, found = self._entries.values(), self._files
         labels = [found.label_path(image) for image in images if found.has_labels(image)]
-        cameras = [path for image in images if (path := self._calibration_path(image)) is not None]
+        cameras = [path for image in images if (path := found.calibration_path(image)) is not None]
         unpaired = found.find_unpaired_labels()
-        read = [*map(str, images), *labels, *map(str, cameras), *map(str, found.described_by)]
+        read = [*images, *labels, *cameras, *map(str, found.described_by)]
         reasons = found.reasons | dict.fromkeys(unpaired, WITHOUT_IMAGE)
         count, skipped = account_for_files(found.root, read, reasons)
         counts = np.bincount(kind, minlength=len(self.class_names)).tolist()
@@ -444,43 +454,42 @@ class YoloDataset(FrameIndex[Path]):
         """Read the labels of one frame and its image's header. Raises FormatError naming file, line and field."""
         return self._make_table((identifier,), self._read_rows((identifier,))).to_labels()
 
-    def table(self) -> LabelTable:
-        """Read the labels of all frames, and their images' headers. Raises FormatError as `labels`."""
+    def table(self, size_wh: tuple[int, int] | None = None) -> LabelTable:
+        """Read the labels of all frames, and their images' headers, unless `size_wh` is the size of all, px.
+
+        Raises FormatError as `labels`.
+        """
         rows = self._read_rows(self.identifiers)
-        table = self._make_table(self.identifiers, rows)
+        table = self._make_table(self.identifiers, rows, size_wh)
         position = {identifier: i for i, identifier in enumerate(self.identifiers)}
         return replace(
             table,
             image_files={i: self._file_names[identifier] for identifier, i in position.items()},
+            image_paths={i: Path(self._entry(identifier)) for identifier, i in position.items()},
             splits={name: [position[i] for i in identifiers] for name, identifiers in self.splits().items()},
             account=self._account(rows, table.kind),
         )
 
-    def _make_table(self, identifiers: Sequence[str], rows: YoloRows) -> LabelTable:
-        sizes = np.array([read_upright_size(self._entry(name)) for name in identifiers], np.int64).reshape(-1, 2)
+    def _make_table(
+        self, identifiers: Sequence[str], rows: YoloRows, size_wh: tuple[int, int] | None = None
+    ) -> LabelTable:
+        read = ([*(size_wh or read_upright_size(Path(self._entry(name))))] for name in identifiers)
+        sizes = np.array([*read], np.int64).reshape(-1, 2)
         return _to_table(identifiers, self.class_names, _to_kinds(self.class_names), rows, sizes)
 
     def image_path(self, identifier: str) -> Path:
         """Return a frame's image file. Raises RangeError for an unknown frame."""
-        return self._entry(identifier)
-
-    def _calibration_path(self, image: Path) -> Path | None:
-        """Return the file with an image's camera, which only this project writes; None if there is none."""
-        parts = image.relative_to(self._files.root).parts
-        if "images" not in parts[:-1]:
-            return None
-        path = replace_images_folder(self._files.root, parts[:-1], "calib") / f"{image.stem}.txt"
-        return path if path.is_file() else None
+        return Path(self._entry(identifier))
 
     def frame(self, identifier: str) -> Frame:
         """Read one frame: photograph, camera, labels. Raises FormatError naming a damaged file."""
-        image_path = self._entry(identifier)
+        image_path = self.image_path(identifier)
         image = read_upright(image_path)
         height, width = image.shape[:2]
         provenance = {"dataset": "yolo", "image": image_path.name, "folder": image_path.parent.name}
-        calib_path = self._calibration_path(image_path)
+        calib_path = self._files.calibration_path(self._entry(identifier))
         if calib_path is not None:
-            projection = read_calibration(calib_path).projection
+            projection = read_calibration(Path(calib_path)).projection
             camera = Camera(projection[:, :3].clone(), height, width, projection)
         else:
             focal = read_focal_length(image_path, self.focal_px)

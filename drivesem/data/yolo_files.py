@@ -9,6 +9,7 @@ folder, or next to the images. Paths that lead out of the data set are read by t
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -27,6 +28,7 @@ SPLITS = ("train", "val", "test")
 _ALIASES = {"valid": "val", "validation": "val"}
 _IMAGE_FOLDERS = ("images", "imgs", "JPEGImages", "obj_train_data")
 """Folders of images, where the description does not name them."""
+_SPLIT_FOLDER = re.compile(r"(?:train|val|valid|validation|test)[\d_-]*", re.IGNORECASE)
 DUPLICATE = "image with the name of another one"
 WITHOUT_IMAGE = "label file without an image"
 
@@ -55,11 +57,12 @@ class YoloDescription:
     """The description and the lists that it names."""
 
     def __init__(self, root: Path) -> None:
-        path = root if not root.is_dir() else find_description(root)
+        folder = Path(os.path.normpath(root if root.is_dir() else root.parent))
+        self.root = Path.cwd() if folder == Path() else folder  # so that paths begin with it
+        path = find_description(self.root) if root.is_dir() else self.root / root.name
         if path is None:
             raise FormatError(str(root), "data.yaml, obj.data or classes.txt", "none of them")
         self.path = path
-        self.root = Path(os.path.normpath(root if root.is_dir() else path.parent))
         self.repairs = Counter()
         self.described_by = [path]
         self._content = self._read_content()
@@ -153,9 +156,9 @@ class YoloDescription:
 class YoloFiles(YoloDescription):
     """Images of a data set, and their label files; see `YoloDescription`."""
 
-    splits: dict[str, list[Path]]
+    splits: dict[str, list[str]]
     """Images by split; those without a split by ""."""
-    images: list[Path]
+    images: list[str]
     """All images, without repetitions, sorted."""
     unused_keys: list[str]
     """Keys of the description that are not used."""
@@ -166,18 +169,19 @@ class YoloFiles(YoloDescription):
         super().__init__(root)
         self.unused_keys = []
         self.reasons = {}
-        self._label_folders: dict[Path, tuple[str, frozenset[str]]] = {}
+        self._label_folders: dict[str, tuple[str, frozenset[str]]] = {}
+        self._calibration_folders: dict[str, str | None] = {}
         self.splits = self._find_splits(self._content)
         self.images = self._drop_duplicates({image for images in self.splits.values() for image in images})
         if not self.images:
             where = str(self.path) if self.path.suffix == ".txt" else f"{self.path}: train"
             raise FormatError(where, f"a folder with at least one image ({', '.join(IMAGE_SUFFIXES)})", "none")
 
-    def _find_splits(self, content: Mapping[str, Any]) -> dict[str, list[Path]]:
+    def _find_splits(self, content: Mapping[str, Any]) -> dict[str, list[str]]:
         if self.path.suffix.lower() in (".txt", ".names"):
             return self._split_by_folder()
         known = {"names", "nc", "path", "kpt_shape"}
-        base, splits, missing = self._find_base(content.get("path")), dict[str, list[Path]](), list[FormatError]()
+        base, splits, missing = self._find_base(content.get("path")), dict[str, list[str]](), list[FormatError]()
         for key, value in content.items():
             split = _ALIASES.get(key, key)
             if split not in SPLITS or (split != key and split in content):
@@ -198,12 +202,13 @@ class YoloFiles(YoloDescription):
             raise missing[0]
         return {split: list(dict.fromkeys(images)) for split, images in splits.items() if images}
 
-    def _split_by_folder(self) -> dict[str, list[Path]]:
+    def _split_by_folder(self) -> dict[str, list[str]]:
         """Find the images of a data set without a description; splits are folders of their names."""
         folder = next((path for name in _IMAGE_FOLDERS if (path := self.root / name).is_dir()), self.root)
-        images = list_images(folder, recursive=True)
-        names = [image.relative_to(folder).parts[0] for image in images]
-        splits: dict[str, list[Path]] = {}
+        images = _list_paths(folder)
+        below = 0 if folder == self.root else len(folder.relative_to(self.root).parts)
+        names = [self.relative_parts(image)[below] for image in images]
+        splits: dict[str, list[str]] = {}
         by_folder = {_ALIASES.get(name.lower(), name.lower()) for name in names} <= set(SPLITS)
         for name, image in zip(names, images, strict=True):
             splits.setdefault(_ALIASES.get(name.lower(), name.lower()) if by_folder else "", []).append(image)
@@ -220,7 +225,7 @@ class YoloFiles(YoloDescription):
             self.repairs["path of another place (read in the data set's folder)"] = 1
         return base
 
-    def _list_entry(self, base: Path, key: str, entry: str) -> list[Path]:
+    def _list_entry(self, base: Path, key: str, entry: str) -> list[str]:
         """List the images of a folder, or of a text file with a path a line."""
         is_list = entry.lower().endswith(".txt")
         exists = Path.is_file if is_list else Path.is_dir
@@ -230,51 +235,68 @@ class YoloFiles(YoloDescription):
             raise FormatError(f"{self.path}: {key}", f"{expected} in {self.root}", repr(entry[:80]))
         if path not in (self._join(base, entry), self._join(self.root, entry)):
             self.repairs["folders and lists of another place (found in the data set's folder)"] += 1
-        return self._read_list(base, path) if is_list else list_images(path, recursive=True)
+        return self._read_list(base, path) if is_list else _list_paths(path)
 
-    def _read_list(self, base: Path, path: Path) -> list[Path]:
+    def _read_list(self, base: Path, path: Path) -> list[str]:
         self.described_by.append(path)
 
         @cache
-        def find_folder(name: str) -> tuple[Path, frozenset[str]] | None:
+        def find_folder(name: str) -> tuple[str, frozenset[str]] | None:
             for start in (path.parent, base):
                 folder = self._find_ending(start, name, Path.is_dir, ending=True) if name else start
                 if folder is not None:
-                    return folder, frozenset(os.listdir(folder))
+                    return "" if f"{folder}" == "." else f"{folder}", frozenset(os.listdir(folder))
             return None
 
-        images: list[Path] = []
+        images: list[str] = []
         for line in _read_lines(path):
             folder, _, name = line.replace("\\", "/").rpartition("/")
             found = find_folder(folder) if "\0" not in line else None
             if found is None or name not in found[1] or not name.lower().endswith(IMAGE_SUFFIXES):
                 self.repairs["entries of lists without a readable image"] += 1
             else:
-                images.append(found[0] / name)
+                images.append(os.path.join(found[0], name))
         repeated = len(images) - len(set(images))
         self.repairs.update({"images that a list repeats": repeated} if repeated else {})
         return images
 
-    def _drop_duplicates(self, images: Iterable[Path]) -> list[Path]:
+    def _drop_duplicates(self, images: Iterable[str]) -> list[str]:
         """Sort images, and drop those of one folder that differ from an earlier one in their suffix only."""
-        first: dict[str, Path] = {}
+        first: dict[str, str] = {}
         for image in sorted(images):
-            if first.setdefault(os.path.splitext(image)[0], image) is not image:
-                self.reasons[f"{image}"] = DUPLICATE
+            if first.setdefault(os.path.splitext(image)[0], image) != image:
+                self.reasons[image] = DUPLICATE
         return list(first.values())
 
-    def label_path(self, image: Path) -> str:
+    def relative_parts(self, path: str) -> tuple[str, ...]:
+        """Return the parts of a path below the data set's folder."""
+        return tuple(path.removeprefix(f"{self.root}{os.sep}").split(os.sep))
+
+    def label_path(self, image: str) -> str:
         """Return the path of an image's label file."""
-        return f"{self._label_folder(image.parent)[0]}{os.sep}{image.stem}.txt"
+        folder, name = os.path.split(image)
+        return f"{self._label_folder(folder)[0]}{os.sep}{os.path.splitext(name)[0]}.txt"
 
-    def has_labels(self, image: Path) -> bool:
+    def has_labels(self, image: str) -> bool:
         """Whether an image has a label file."""
-        return f"{image.stem}.txt" in self._label_folder(image.parent)[1]
+        folder, name = os.path.split(image)
+        return f"{os.path.splitext(name)[0]}.txt" in self._label_folder(folder)[1]
 
-    def _label_folder(self, folder: Path) -> tuple[str, frozenset[str]]:
+    def calibration_path(self, image: str) -> str | None:
+        """Return the file with an image's camera, which only this project writes; None if there is none."""
+        folder, name = os.path.split(image)
+        if folder not in self._calibration_folders:
+            parts = self.relative_parts(folder)
+            place = _replace_images_folder(self.root, parts, "calib") if "images" in parts else None
+            self._calibration_folders[folder] = f"{place}" if place is not None and place.is_dir() else None
+        place = self._calibration_folders[folder]
+        path = f"{place}{os.sep}{os.path.splitext(name)[0]}.txt"
+        return path if place is not None and os.path.isfile(path) else None
+
+    def _label_folder(self, folder: str) -> tuple[str, frozenset[str]]:
         """Return the folder with the labels of a folder of images, and the names of its label files."""
         if folder not in self._label_folders:
-            place = next((path for path in self._label_places(folder) if path.is_dir()), folder)
+            place = next((path for path in self._label_places(Path(folder)) if path.is_dir()), Path(folder))
             described = {path.name for path in self.described_by if path.parent == place}
             names = (name for name in os.listdir(place) if is_label_file(name) and name not in described)
             self._label_folders[folder] = f"{place}", frozenset(names)
@@ -283,7 +305,7 @@ class YoloFiles(YoloDescription):
     def _label_places(self, folder: Path) -> list[Path]:
         parts = folder.relative_to(self.root).parts
         if "images" in parts:
-            return [replace_images_folder(self.root, parts, "labels")]
+            return [_replace_images_folder(self.root, parts, "labels")]
         ends = ((parts[:i], rest) for i in range(len(parts), -1, -1) for rest in (parts[i:], parts[i + 1 :]))
         return [self.root.joinpath(*start, "labels", *rest) for start, rest in ends]
 
@@ -291,7 +313,9 @@ class YoloFiles(YoloDescription):
         """Raise FormatError if there are label files, and none has the name of an image."""
         unpaired = [] if any(map(self.has_labels, self.images)) else self.find_unpaired_labels()
         if unpaired:
-            expected = f"label files named after the images, such as {self.images[0].stem}.txt"
+            expected = (
+                f"label files named after the images, such as {os.path.basename(self.label_path(self.images[0]))}"
+            )
             raise FormatError(str(self.root), expected, f"{len(unpaired)} others, such as {unpaired[0]}")
 
     def find_unpaired_labels(self) -> list[str]:
@@ -311,30 +335,31 @@ def _read_lines(path: Path) -> list[str]:
     return [line.strip() for line in files.read_text(path).splitlines() if line.strip()]
 
 
-def replace_images_folder(root: Path, parts: Sequence[str], name: str) -> Path:
+def _replace_images_folder(root: Path, parts: Sequence[str], name: str) -> Path:
     """Return the path of folders below `root` with another name for the last folder "images"."""
     last = len(parts) - 1 - parts[::-1].index("images")
     return root.joinpath(*parts[:last], name, *parts[last + 1 :])
 
 
-def name_images(root: Path, images: Sequence[Path], split_of: Mapping[Path, str]) -> tuple[list[str], list[str]]:
-    """Return identifiers and file names of images.
+def _list_paths(folder: Path) -> list[str]:
+    return [f"{image}" for image in list_images(folder, recursive=True)]
 
-    Args:
-        root: Folder of the data set.
-        images: Images.
-        split_of: Split of each image that has one.
 
-    Returns:
-        Identifiers: stems if all differ, else paths below the folders of images without suffix; and file names, with
-        the folders below the split's folder if all differ, else with the split.
+def name_images(found: YoloFiles) -> tuple[list[str], list[str]]:
+    """Return identifiers and file names of a data set's images.
+
+    Identifiers are stems if all differ, else paths below the folders of images without suffix. File names have the
+    folders below the split's folder, if all differ, else with the split.
     """
-    relative = [image.relative_to(root).parts for image in images]
+    relative = [found.relative_parts(image) for image in found.images]
+    with_split = {image for name, images in found.splits.items() for image in images if name}
     places = [_drop_image_folder(parts) for parts in relative]
     long = ["/".join(place) for place in (places if len(set(places)) == len(places) else relative)]
-    short = [_strip_split(name, split_of.get(image, "")) for name, image in zip(long, images, strict=True)]
+    short = [
+        strip_split(name) if image in with_split else name for name, image in zip(long, found.images, strict=True)
+    ]
     file_names = short if len(set(short)) == len(short) else long
-    stems = [image.stem for image in images]
+    stems = [os.path.splitext(parts[-1])[0] for parts in relative]
     unique = len(set(stems)) == len(stems)
     return stems if unique else [os.path.splitext(name)[0] for name in file_names], file_names
 
@@ -345,7 +370,7 @@ def _drop_image_folder(parts: tuple[str, ...]) -> tuple[str, ...]:
     return parts[:index] + parts[index + 1 :]
 
 
-def _strip_split(name: str, split: str) -> str:
-    """Return a path without its first folder, if that is the folder of a split."""
+def strip_split(name: str) -> str:
+    """Return a path without its first folder, if that is named after a split."""
     first, _, rest = name.partition("/")
-    return rest if split and rest and first.lower().startswith(split) else name
+    return rest if rest and _SPLIT_FOLDER.fullmatch(first) else name

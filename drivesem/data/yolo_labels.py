@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -66,7 +67,7 @@ class YoloRows:
 
 
 class _RowParser:
-    """Parses the rows of a chunk of files to numbers, whose range is checked afterwards for all rows at once."""
+    """Parses the rows of a chunk of files to numbers; their range is checked afterwards for all rows at once."""
 
     def __init__(self, paths: Sequence[str], scored: bool, keypoints: int, repairs: Counter[str]) -> None:
         self._paths, self._scored, self._keypoints, self._repairs = paths, scored, keypoints, repairs
@@ -154,7 +155,7 @@ def read_rows(paths: Sequence[str], classes: int, scored: bool, keypoints: int =
     Args:
         paths: Files.
         classes: Number of classes.
-        scored: Read detections, whose rows have scores.
+        scored: Read detections; their rows have scores.
         keypoints: Numbers after a box that belong to its keypoints.
 
     Returns:
@@ -164,14 +165,14 @@ def read_rows(paths: Sequence[str], classes: int, scored: bool, keypoints: int =
         FormatError: Names file, line and field.
     """
     repairs: Counter[str] = Counter()
-    chunks = list(_read_chunks(paths, classes, scored, keypoints, repairs))
+    chunks: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    for places, rows in _read_chunks(paths, classes, scored, keypoints, repairs):
+        first = np.ones(len(rows), np.bool_) if scored else _first_of_equal_rows(places, rows)
+        repairs.update({"repeated rows (dropped)": repeated} if (repeated := int((~first).sum())) else {})
+        chunks.append((places[first], rows[first]))
     file = np.concatenate([np.zeros(0, np.int64), *(places for places, _ in chunks)])
     values = np.concatenate([np.zeros((0, 7)), *(rows for _, rows in chunks)])
     if not scored:
-        first = _first_of_equal_rows(file, values)
-        if not first.all():
-            repairs["repeated rows (dropped)"] += int((~first).sum())
-            file, values = file[first], values[first]
         sixth = values[:, 5].copy()
         known = np.isfinite(sixth)
         values[:, 5:] = np.nan
@@ -195,9 +196,14 @@ def _read_chunks(
     first = ""
     for start in range(0, len(paths), _FILES_PER_CHUNK):
         chunk = paths[start : start + _FILES_PER_CHUNK]
+        texts = [files.read_text(path) for path in chunk]
+        plain = None if scored or keypoints else _parse_plain(texts, classes)
+        if plain is not None:
+            yield plain[0] + start, plain[1]
+            continue
         parser = _RowParser(chunk, scored, keypoints, repairs)
-        for i, path in enumerate(chunk):
-            parser.parse(i, files.read_text(path))
+        for i, text in enumerate(texts):
+            parser.parse(i, text)
         values = np.array(parser.rows, np.float64).reshape(-1, 7)
         _check_values(parser, values, classes, scored)
         repairs.update({_CLIPPED: clipped} if (clipped := _clip_overhang(values)) else {})
@@ -206,6 +212,34 @@ def _read_chunks(
         yield np.array([file for file, _ in parser.places], np.int64) + start, values
     if scored and rows and whole_scores == rows:
         raise FormatError(first, "scores in [0, 1]", "whole numbers in all rows, such as track ids")
+
+
+def _parse_plain(texts: Sequence[str], classes: int) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Parse rows `class cx cy w h` that need no repair, many times as fast as `_RowParser`.
+
+    Returns file indices (n,) and values (n, 7); None if a row is anything else.
+    """
+    split = [text.splitlines() for text in texts]
+    lines = [line for rows in split for line in rows]
+    plain = all(line.count(" ") == 4 and line[: line.find(" ")].isdecimal() for line in lines)
+    text = " ".join(lines)
+    if not plain or "  " in text or "\t" in text:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # raised for text that is not a number
+            numbers = np.fromstring(text, np.float64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        return None
+    # spaces are single, so every row has five values if all together have as many
+    if numbers.size != 5 * len(lines):
+        return None
+    numbers = numbers.reshape(-1, 5)
+    if not (numbers[:, 0] < classes).all() or not ((numbers[:, 1:] >= 0) & (numbers[:, 1:] <= 1)).all():
+        return None
+    return np.repeat(np.arange(len(texts)), [*map(len, split)]), np.pad(
+        numbers, ((0, 0), (0, 2)), constant_values=np.nan
+    )
 
 
 def _check_values(parser: _RowParser, values: NDArray[np.float64], classes: int, scored: bool) -> None:

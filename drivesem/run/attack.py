@@ -97,6 +97,8 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
     out = Path(config.out) if config.out else Path("runs") / _run_name(config, worker.params)
     claim_folder(out, config, WRITTEN)
     account = write_account(worker.source.account())
+    own_mesh = None if worker.changes is None else worker.changes.mesh
+    sys.stderr.writelines(f"--mesh: {note}\n" for note in (own_mesh.notes if own_mesh else ()))
     names, without_vehicles, failed = select_frames(worker.source, config)
     _check_any_frame(config, names, without_vehicles, failed)
     names = _select_part(names, config.part)

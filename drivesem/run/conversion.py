@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,14 @@ import numpy as np
 import torch
 
 from drivesem.config.errors import UsageError
+from drivesem.data.account import DataAccount
 from drivesem.data.coco_labels import turn_upright
+from drivesem.data.image_headers import read_upright_size
 from drivesem.data.kitti import read_calibration
 from drivesem.data.kitti_labels import TYPES, find_label_folder, read_label_files
 from drivesem.data.label_table import REGION, LabelTable, WriteSummary, make_camera_entry, shortest_decimals
-from drivesem.data.photographs import match_images, read_image_size
-from drivesem.data.registry import find_images, write_table
+from drivesem.data.photographs import match_images
+from drivesem.data.registry import write_table
 from drivesem.failures.grades import Grade
 from drivesem.run.labels import RESULT, detect_labels_layout, list_frames, read_labels
 from drivesem.run.results import FrameResult, load_frame
@@ -52,13 +53,18 @@ class ConversionSettings:
     """Frames of a run; all if None."""
 
 
-def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> WriteSummary:
+def convert_labels(
+    source: Path, out: Path, settings: ConversionSettings
+) -> tuple[WriteSummary, DataAccount | None]:
     """Write the labels or detections of `source` to `out` in another layout.
 
     Args:
         source: A run, or labels in a known layout.
         out: Folder of the new layout.
         settings: Layouts, classes and images.
+
+    Returns:
+        What was written, lost and assumed, and the account of `source`, if it is no run.
 
     Raises:
         FormatError: `source` cannot be read, or lacks what the new layout needs.
@@ -68,7 +74,7 @@ def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> Wri
     if layout == "run" and not settings.scores:
         table = read_training_labels(source, settings.frames)
     else:
-        table = read_labels(source, layout, scored=settings.scores)
+        table = read_labels(source, layout, scored=settings.scores, size_wh=settings.size_wh)
     (odd,) = np.nonzero((table.truncation > 1) | ((table.truncation < 0) & (table.truncation != -1)))
     if len(odd):
         where = f"{source}: frame {table.frames[table.frame[odd[0]]]}: truncation"
@@ -77,30 +83,40 @@ def convert_labels(source: Path, out: Path, settings: ConversionSettings) -> Wri
         table = rename_classes(table, settings.mapping)
     if layout == "run":
         table = _turn_unsupported_into_regions(table, settings)
-    image_paths = match_images([settings.images], table.frames) if settings.images is not None else {}
-    if settings.images is None and (
-        layout == "coco" or settings.copy_images or (not table.sizes_wh.all() and settings.size_wh is None)
-    ):
-        find = find_counterexamples if layout == "run" else partial(find_images, layout=layout)
-        image_paths = find(source, frames=table.frames)
+    table = _with_images(table, source, layout, settings.images)
     if layout == "coco":
-        table = turn_upright(table, image_paths)
-    if settings.size_wh is not None:
-        table = replace(table, sizes_wh=np.tile(np.array(settings.size_wh, np.int64), (len(table.frames), 1)))
-    elif not table.sizes_wh.all() and settings.to_format in ("coco", "yolo", "fiftyone"):
-        sizes = table.sizes_wh.copy()
-        for i, name in enumerate(table.frames):
-            if not sizes[i].all() and name in image_paths:
-                sizes[i] = read_image_size(image_paths[name])
-        table = replace(table, sizes_wh=sizes)
-    names = {i: "_".join(name.split("/")) for i, name in enumerate(table.frames) if name in image_paths}
-    image_files = {i: f"{name}{image_paths[table.frames[i]].suffix}" for i, name in names.items()}
-    table = replace(table, image_files=image_files | dict(table.image_files))
+        table = turn_upright(table)
+    table = _with_sizes(table, settings)
     if layout == "kitti":
         table = replace(table, cameras=_read_cameras(source, table))
-    if settings.copy_images and len(image_paths) < len(table.frames):
-        raise UsageError("--copy-images", f"an image of each of {len(table.frames)} frames", len(image_paths))
-    return write_table(table, out, settings.to_format, image_paths if settings.copy_images else {})
+    images = {table.frames[i]: path for i, path in table.image_paths.items()} if settings.copy_images else {}
+    if settings.copy_images and len(images) < len(table.frames):
+        raise UsageError("--copy-images", f"an image of each of {len(table.frames)} frames", len(images))
+    return write_table(table, out, settings.to_format, images), table.account
+
+
+def _with_images(table: LabelTable, source: Path, layout: str, folder: Path | None) -> LabelTable:
+    """Return the table with the images of a folder, if there is one, and those of a run; others are known."""
+    if folder is None and layout != "run":
+        return table
+    find = find_counterexamples if folder is None else match_images
+    found = find(source if folder is None else folder, table.frames)
+    paths = {i: found[name] for i, name in enumerate(table.frames) if name in found}
+    names = {i: f"{table.frames[i]}{path.suffix}" for i, path in paths.items()}
+    return replace(table, image_paths=paths, image_files=names | dict(table.image_files))
+
+
+def _with_sizes(table: LabelTable, settings: ConversionSettings) -> LabelTable:
+    """Return the table with the size of all images that is given, or unknown ones read, if the layout needs them."""
+    if settings.size_wh is not None:
+        return replace(table, sizes_wh=np.tile(np.array(settings.size_wh, np.int64), (len(table.frames), 1)))
+    if settings.to_format not in ("coco", "yolo", "fiftyone"):
+        return table
+    sizes = table.sizes_wh.copy()
+    for i in np.flatnonzero((sizes <= 0).any(axis=1)).tolist():
+        if i in table.image_paths:
+            sizes[i] = read_upright_size(table.image_paths[i])
+    return replace(table, sizes_wh=sizes)
 
 
 def rename_classes(table: LabelTable, mapping: Mapping[str, str | None]) -> LabelTable:
@@ -170,7 +186,7 @@ def read_training_labels(run: Path, frames: Sequence[str] | None = None) -> Labe
     )
     table = _with_unchanged_objects(table, folders)
     results = [load_frame(folder / RESULT) for folder in folders]
-    sizes = [read_image_size(folder / COUNTEREXAMPLE) for folder in folders]
+    sizes = [read_upright_size(folder / COUNTEREXAMPLE) for folder in folders]
     failure: list[str | None] = [None] * len(table)
     for result, rows in zip(results, table.rows_by_frame(), strict=True):
         for lost in (one for one in result.failures if one.kind == "lost"):

@@ -65,7 +65,7 @@ def export_dataset(
     results = select_frames_by_grade(run, grade)
     names = [result.identifier for result in results]
     settings = ConversionSettings(layout, "run", copy_images=True, mapping=mapping or {}, frames=names)
-    written = convert_labels(run.folder, out, settings)
+    written, _ = convert_labels(run.folder, out, settings)
     frames = [
         {
             "number": i,

@@ -52,7 +52,12 @@ def detect_labels_layout(path: Path) -> str:
 
 
 def read_labels(
-    path: Path, layout: str, scored: bool = False, stage: str = STAGES[0], truth: LabelTable | None = None
+    path: Path,
+    layout: str,
+    scored: bool = False,
+    stage: str = STAGES[0],
+    truth: LabelTable | None = None,
+    size_wh: tuple[int, int] | None = None,
 ) -> LabelTable:
     """Read the labels or detections at a path.
 
@@ -62,11 +67,12 @@ def read_labels(
         scored: Read detections instead of labels.
         stage: One of `STAGES`, for a run.
         truth: Labels that the detections belong to.
+        size_wh: Size of all images, px, if known.
     """
     return (
         _read_run_table(path, scored, stage)
         if layout == "run"
-        else layouts.read_table(path, layout, scored, truth)
+        else layouts.read_table(path, layout, scored, truth, size_wh)
     )
 
 

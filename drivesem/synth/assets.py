@@ -32,7 +32,7 @@ import torch
 from drivesem.synth.light import Light, Panorama
 from drivesem.synth.soup import Material, Soup, creased_normals, make
 from scene_ir import files
-from scene_ir.errors import FormatError, RangeError
+from scene_ir.errors import FormatError, RangeError, SceneError, make_printable
 from scene_ir.meshes.load import ImportedMesh, import_mesh
 from scene_ir.meshes.lod import simplify
 from scene_ir.meshes.templates import KINDS
@@ -109,6 +109,10 @@ class VehicleMesh:
     path: Path
     up: str = "y"
     front: str = "auto"
+    stated_lhw: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Length, height, width in m as the file or the sidecar states them."""
+    notes: tuple[str, ...] = ()
+    """What is missing, or was left out of the file, one line each."""
 
     @property
     def mesh(self) -> Mesh:
@@ -148,6 +152,25 @@ def unreadable_in(folder: str | Path) -> tuple[tuple[str, str], ...]:
     return _folder(*_listing(folder))[1]
 
 
+def read_vehicle(path: str | Path) -> VehicleMesh:
+    """The vehicle in one file, read as `meshes_in` reads it: with its entry in its folder's `vehicles.yaml`.
+
+    Raises FormatError for an unreadable file or a faulty `vehicles.yaml`.
+    """
+    place = Path(path).resolve()
+    sidecar = place.parent / SIDECAR
+    entries = _sidecar(sidecar) if sidecar.is_file() else {}
+    return _vehicle(place, entries.get(place.name, _Entry()))
+
+
+def notes_in(folder: str | Path) -> tuple[str, ...]:
+    """What is left out of a folder's meshes, or missing, one line each: files that cannot be read, parts of others."""
+    vehicles, faults = _folder(*_listing(folder))
+    lines = [f"left out: {fault}" for _, fault in faults]
+    lines += [f"{vehicle.name}: {note}" for vehicle in vehicles for note in vehicle.notes]
+    return tuple(make_printable(line) for line in lines)
+
+
 _Stamp = tuple[str, int, int]
 
 
@@ -159,8 +182,11 @@ def _listing(folder: str | Path) -> tuple[Path, tuple[_Stamp, ...]]:
     found = []
     for path in sorted(place.iterdir()):
         if path.suffix.lower() in _SUFFIXES or path.name == SIDECAR:
-            status = path.stat()
-            found.append((path.name, status.st_size, status.st_mtime_ns))
+            try:
+                status = path.stat()
+                found.append((path.name, status.st_size, status.st_mtime_ns))
+            except OSError:  # a broken link is left out as any unreadable file
+                found.append((path.name, 0, 0))
     return place, tuple(found)
 
 
@@ -182,7 +208,7 @@ def _folder(
             continue
         try:
             vehicles.append(_vehicle(place / name, entry))
-        except FormatError as error:
+        except SceneError as error:
             faults.append((name, str(error)))
     if not vehicles:
         reason = f"{len(faults)} of {len(names)} unreadable" + (f", first {faults[0][1]}" if faults else "")
@@ -211,9 +237,6 @@ def _entry(field: str, raw: object) -> _Entry:
         raise FormatError(f"{field}: up", "auto, y, z or -y", up)
     if front != "auto" and not re.fullmatch(r"[+-][xyz]", front):
         raise FormatError(f"{field}: front", "auto or an axis such as +x", front)
-    if front != "auto" and up == "auto":
-        # What looks along y can only stand on z.
-        up = "z" if front[1] == "y" else "y"
     if front[1] == up[-1]:
         raise FormatError(f"{field}: front", f"an axis other than up, {up}", front)
     size = raw.get("size_lhw_m")
@@ -240,23 +263,12 @@ def _positive(value: object) -> bool:
 
 
 def _vehicle(path: Path, entry: _Entry) -> VehicleMesh:
-    up = entry.up if entry.up != "auto" else _up(path)
-    length, height, width = (e * entry.metres_per_unit for e in _read(path, up, entry.front).size_lhw)
+    imported = _read(path, entry.up, entry.front)
+    length, height, width = (e * entry.metres_per_unit for e in imported.size_lhw)
     kind = entry.kind or classify_vehicle(path.stem, (length, height, width))
     size = entry.size_lhw_m or usual_size(kind, (length, height, width))
-    return VehicleMesh(path.name, kind, size, path, up, entry.front)
-
-
-def _up(path: Path) -> str:
-    """Which of y and z points up in a file: the tyres lie low; without tyres, no vehicle is higher than long."""
-    for up in ("y", "z"):
-        imported = _read(path, up, "auto")
-        mesh, (length, height, _) = imported.mesh, imported.size_lhw
-        tyres = mesh.faces[mesh.part == Part.TYRE]
-        low = float(mesh.vertices[tyres][..., 1].mean()) > -0.4 if len(tyres) else height < 0.95 * length
-        if low and height < length:
-            return up
-    return "y"
+    own = entry.size_lhw_m or (length, height, width)
+    return VehicleMesh(path.name, kind, size, path, imported.up, entry.front, own, imported.notes)
 
 
 def classify_vehicle(name: str, size_lhw: tuple[float, float, float]) -> str:

@@ -98,7 +98,12 @@ class Order:
             raise RangeError("synth people", f"none in layout {self.layout}, which has no class for them", "some")
         parse_variations(",".join(self.variations))
         _read_edits(self.edits)
-        _pack(self.meshes, self.assets)
+        vehicles = _pack(self.meshes, self.assets).vehicles
+        for split in (self.split, *(("heldout",) if self.validation else ())):
+            if vehicles and not of_split(vehicles, split):
+                place = self.assets if self.meshes is None else self.meshes
+                found = ", ".join(vehicle.name for vehicle in vehicles)
+                raise FormatError(str(place), f"a vehicle of split {split} (by its file name)", found)
 
     def recipe(self) -> dict[str, object]:
         """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""

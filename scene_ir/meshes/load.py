@@ -19,9 +19,13 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
+from scene_ir.meshes.gltf import VERTEX_COLOURS, GltfContents, compare_counts, parse_header
+from scene_ir.meshes.obj import read_obj
 from scene_ir.types import Mesh, Part
 
 _Number = TypeVar("_Number", np.float32, np.float64)
+NOTES = "notes"
+"""Key in a scene's metadata of what was left out or is missing."""
 _VERSION = 1
 _KEY = "drivesem_mesh"
 """Key in the GLB mesh's `extras` that marks files of `save_mesh`."""
@@ -49,10 +53,6 @@ _AXES = {
     "-z": (0.0, 0.0, -1.0),
 }
 _UP = {"y": "+y", "z": "+z", "-y": "-y"}
-_VERTEX_COLOURS = "_COLOR0"
-"""Name of glTF's vertex colours under which trimesh leaves them unchanged."""
-_GLB_HEAD = 20
-"""Bytes before a GLB's JSON."""
 _GLTF_TRANSFORM = np.diag([1.0, -1.0, -1.0, 1.0])
 """Node transform of our GLBs: glTF's y points up, ours down."""
 _PART_PATTERNS = (
@@ -88,10 +88,14 @@ class ImportedMesh:
     """The mesh."""
     size_lhw: tuple[float, float, float]
     """Length, height, width, m."""
+    up: str = "y"
+    """The file's axis that points up."""
+    notes: tuple[str, ...] = ()
+    """What was left out of the file or is missing, one line each."""
 
 
 def import_mesh(
-    path: str | Path, *, up: str = "y", front: str = "auto", metres_per_unit: float = 1.0
+    path: str | Path, *, up: str = "auto", front: str = "auto", metres_per_unit: float = 1.0
 ) -> ImportedMesh:
     """Read a mesh file and transform it to the unit box: front along +x, y down, sides at z = -0.5 and 0.5.
 
@@ -101,7 +105,8 @@ def import_mesh(
 
     Args:
         path: An OBJ, GLB, GLTF or PLY file.
-        up: The file's axis that points up: "y", "z" or "-y".
+        up: The file's axis that points up: "y", "z", "-y", or "auto": y or z, whichever puts the tyres low, or makes a
+            file without tyres lower than long.
         front: The file's axis that the vehicle faces, "+x" ... "-z", or "auto": the longest horizontal axis, towards
             parts named front, else towards the end with all windows (lorries), else away from the roof's centre
             (bonnets are longer than boots).
@@ -115,9 +120,11 @@ def import_mesh(
         RangeError: An unknown axis.
     """
     file = Path(path)
-    if up not in _UP:
-        raise RangeError("up", " or ".join(_UP), up)
-    if front != "auto" and (front not in _AXES or front[1] == _UP[up][1]):
+    if up not in (*_UP, "auto"):
+        raise RangeError("up", " or ".join((*_UP, "auto")), up)
+    if up == "auto" and front[1:] == "y":
+        up = "z"  # what faces along y can only stand on z
+    if front != "auto" and (front not in _AXES or front[1] == up[-1]):
         raise RangeError("front", "auto or an axis at right angles to up, such as +x", front)
     if not metres_per_unit > 0:
         raise RangeError("metres_per_unit", "a positive number", metres_per_unit)
@@ -127,6 +134,8 @@ def import_mesh(
         extent = own.vertices.amax(dim=0) - own.vertices.amin(dim=0)
         return ImportedMesh(own, (float(extent[0]), float(extent[1]), float(extent[2])))
     soup = _flatten(scene, file)
+    if up == "auto":
+        up = _find_up(soup, front)
     turned = soup.vertices @ _file_rotation(soup, _AXES[_UP[up]], front).T
     low, high = turned.min(axis=0), turned.max(axis=0)
     extent = high - low
@@ -146,15 +155,15 @@ def import_mesh(
         uv=None if soup.uv is None else torch.from_numpy(soup.uv.astype(np.float32)),
     )
     length, height, width = (float(e) * metres_per_unit for e in extent)
-    return ImportedMesh(mesh, (length, height, width))
+    return ImportedMesh(mesh, (length, height, width), up, tuple(scene.metadata[NOTES]))
 
 
-def load_mesh(path: str | Path, *, up: str = "y", front: str = "auto") -> Mesh:
+def load_mesh(path: str | Path, *, up: str = "auto", front: str = "auto") -> Mesh:
     """The mesh of `import_mesh`.
 
     Args:
         path: An OBJ, GLB, GLTF or PLY file.
-        up: The file's axis that points up.
+        up: The file's axis that points up, or "auto".
         front: The file's axis that the vehicle faces, or "auto".
 
     Returns:
@@ -202,10 +211,10 @@ def read_scene(file: Path, root: Path | None = None, max_bytes: int = _MAX_BYTES
         max_bytes: Size limit of each file.
 
     Returns:
-        The scene.
+        The scene; its metadata has what was left out or is missing, one line each, under `NOTES`.
 
     Raises:
-        FormatError: The file is missing, too large, or no mesh.
+        FormatError: The file is missing, too large, no mesh, or its import differs from its own counts and bounds.
     """
     if file.suffix.lower() not in _SUFFIXES:
         raise FormatError(str(file), f"a mesh file ({', '.join(_SUFFIXES)})", file.suffix or "no suffix")
@@ -213,17 +222,36 @@ def read_scene(file: Path, root: Path | None = None, max_bytes: int = _MAX_BYTES
         raise FormatError(str(file), "a mesh file", "no such file")
     data, kind = files.read_bytes(file, max_bytes), file.suffix.lower().removeprefix(".")
     _check_declared_sizes(file, kind, data)
-    if kind in ("glb", "gltf"):
-        end = len(data) if kind == "gltf" else _GLB_HEAD + _glb_json_length(data)
-        data = data[:end].replace(b'"COLOR_0"', b'"%b"' % _VERTEX_COLOURS.encode()) + data[end:]
     resolver = _MeshFiles(file.parent, root or file.parent, max_bytes)
     try:
-        return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+        if kind == "obj":
+            scene, notes = read_obj(data, file, resolver)
+        elif kind == "ply":
+            scene, notes = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False), []
+            _check_ply(scene, file, data)
+        else:
+            contents = GltfContents.read(data, kind, file)
+            content, notes = io.BytesIO(contents.encode(data, kind)), contents.notes
+            scene = trimesh.load_scene(content, file_type=kind, resolver=resolver, process=False)
+            contents.check_scene(scene, file)
     except FormatError:
         raise
     except Exception as error:  # the parsers behind trimesh raise many types
         reason = next(iter(f"{type(error).__name__}: {error}".splitlines()))
         raise FormatError(str(file), "a readable mesh", reason) from None
+    scene.metadata[NOTES] = [*resolver.faults, *notes]
+    return scene
+
+
+def _check_ply(scene: trimesh.Scene, file: Path, data: bytes) -> None:
+    """Compare what was imported with a PLY's header; polygons may become several triangles."""
+    counts = _ply_counts(data)
+    shapes = [shape for shape in scene.geometry.values() if isinstance(shape, trimesh.Trimesh)]
+    if shapes:
+        compare_counts(f"{file}: vertices", counts.get("vertex", 0), sum(len(shape.vertices) for shape in shapes))
+        faces = sum(len(shape.faces) for shape in shapes)
+        if faces < counts.get("face", 0):
+            compare_counts(f"{file}: faces", counts["face"], faces)
 
 
 class _MeshFiles(Resolver):
@@ -235,10 +263,21 @@ class _MeshFiles(Resolver):
 
     def __init__(self, folder: Path, root: Path, most: int) -> None:
         self._folder, self._root, self._most = folder, root, most
+        self.faults: list[str] = []
+        """Files that are missing or cannot be read, one line each: trimesh goes on without them."""
 
     def get(self, key: str) -> bytes:
         """The content of a file. Raises FormatError, and FileNotFoundError if there is none."""
+        try:
+            return self._read(key)
+        except (FormatError, FileNotFoundError) as error:
+            missing = f"{key.strip()} is missing"
+            self.faults.append(str(error) if isinstance(error, FormatError) else missing)
+            raise
+
+    def _read(self, key: str) -> bytes:
         name = key.strip().replace("\\", "/")
+        name = name.split()[-1] if name.startswith("-") else name  # options of a texture precede its name
         for candidate in dict.fromkeys((name, unquote(name), name.rpartition("/")[2])):  # glTF's are quoted
             path = self._folder / candidate
             if path.resolve().is_relative_to(self._root.resolve()) and path.is_file():
@@ -261,23 +300,11 @@ class _MeshFiles(Resolver):
         raise FormatError(str(self._folder / name), "a mesh that is read", "one that is written")
 
 
-def _glb_json_length(data: bytes) -> int:
-    """Length of a GLB's JSON, bytes."""
-    return int.from_bytes(data[12:16], "little")
-
-
 def _check_declared_sizes(file: Path, kind: str, data: bytes) -> None:
     """Raise FormatError for a file that declares more elements than a vehicle has, before it is parsed."""
     counts: list[Any] = []
     if kind in ("glb", "gltf"):
-        if kind == "glb":
-            data = data[_GLB_HEAD : _GLB_HEAD + _glb_json_length(data)]
-        try:
-            header = files.parse_json(data.decode("utf-8"), str(file))
-        except (UnicodeDecodeError, FormatError) as error:
-            found = error.actual if isinstance(error, FormatError) else "bytes that are no text"
-            raise FormatError(str(file), "a readable mesh", found) from error
-        lists = header if isinstance(header, dict) else {}
+        lists = parse_header(data, kind, file)
         accessors, nodes = (
             lists[key] if isinstance(lists.get(key), list) else [] for key in ("accessors", "nodes")
         )
@@ -285,13 +312,18 @@ def _check_declared_sizes(file: Path, kind: str, data: bytes) -> None:
         if len(nodes) > _MAX_NODES:
             raise FormatError(f"{file}: nodes", f"at most {_MAX_NODES:,}", f"{len(nodes):,}")
     elif kind == "ply":
-        head = data[:_PLY_HEAD].partition(b"end_header")[0].decode("latin-1")
-        counts = [int(count[:_MAX_DIGITS]) for count in re.findall(r"element\s+\S+\s+(\d+)", head)]
+        counts = list(_ply_counts(data).values())
     whole = [count for count in counts if type(count) is int]
     if sum(whole) > _MAX_DECLARED:
         raise FormatError(
             str(file), f"at most {_MAX_DECLARED:,} vertices, faces and their values", f"{sum(whole):,}"
         )
+
+
+def _ply_counts(data: bytes) -> dict[str, int]:
+    """Number of elements by name in a PLY's header."""
+    head = data[:_PLY_HEAD].partition(b"end_header")[0].decode("latin-1")
+    return {name: int(count[:_MAX_DIGITS]) for name, count in re.findall(r"element\s+(\S+)\s+(\d+)", head)}
 
 
 def _saved_mesh(scene: trimesh.Scene, file: Path) -> Mesh | None:
@@ -335,7 +367,7 @@ class _Soup:
 def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
     vertices, faces, names, colours, uvs, sides = [], [], [], [], [], []
     start = total = 0
-    for node in sorted(scene.graph.nodes_geometry):
+    for (label, _), node in _sort_nodes(scene):
         transform, geometry_name = scene.graph[node]
         shape = scene.geometry[geometry_name]
         if not isinstance(shape, trimesh.Trimesh) or len(shape.faces) == 0:
@@ -352,16 +384,17 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
         if np.linalg.det(transform[:3, :3]) < 0:
             index = index[:, ::-1]
         material = getattr(shape.visual, "material", None)
-        names.append((f"{getattr(material, 'name', '') or ''}", f"{node} {geometry_name}", len(index)))
-        vertices.append(placed)
-        faces.append(index + start)
-        colours.append(_vertex_colours(shape, file))
+        names.append((f"{getattr(material, 'name', '') or ''}", f"{label} {geometry_name}", len(index)))
+        used, index = np.unique(index, return_inverse=True)  # others are part of no surface
         uv = getattr(shape.visual, "uv", None)
-        uvs.append(None if uv is None or len(uv) != len(placed) else np.asarray(uv)[:, :2])
-        label = node.lower()
-        if "front" in label:
+        uvs.append(None if uv is None or len(uv) != len(placed) else np.asarray(uv)[used, :2])
+        placed = placed[used]
+        vertices.append(placed)
+        faces.append(index.reshape(-1, 3) + start)
+        colours.append(_vertex_colours(shape, file)[used])
+        if "front" in label.lower():
             sides.append((1.0, placed.mean(axis=0)))
-        elif re.search(r"back|rear", label):
+        elif re.search(r"back|rear", label.lower()):
             sides.append((-1.0, placed.mean(axis=0)))
         start += len(placed)
     if not faces:
@@ -377,6 +410,20 @@ def _flatten(scene: trimesh.Scene, file: Path) -> _Soup:
             forward += sign * np.mean([centre for s, centre in sides if s == sign], axis=0)
     uv = np.concatenate([u for u in uvs if u is not None]) if all(u is not None for u in uvs) else None
     return _Soup(everything, np.concatenate(faces), _parts(names), np.concatenate(colours), uv, forward)
+
+
+def _sort_nodes(scene: trimesh.Scene) -> list[tuple[tuple[str, int], str]]:
+    """((label, position of the mesh), name) of the nodes with meshes, sorted.
+
+    The label is the name as in the file: trimesh adds random letters for meshes of several primitives.
+    """
+    position = {name: index for index, name in enumerate(scene.geometry)}
+    found = []
+    for node in scene.graph.nodes_geometry:
+        name = scene.graph[node][1]
+        several = scene.geometry[name].metadata.get("from_gltf_primitive", False)
+        found.append(((node.rpartition("_")[0] if several else node, position[name]), node))
+    return sorted(found)
 
 
 def _parts(names: list[tuple[str, str, int]]) -> NDArray[np.int64]:
@@ -404,7 +451,7 @@ def _vertex_colours(shape: trimesh.Trimesh, file: Path) -> NDArray[np.float64]:
 
 def painted(shape: trimesh.Trimesh) -> NDArray[np.float64] | None:
     """What glTF's vertex colours multiply a surface's with: linear RGB (V, 3) in [0, 1]; None without any."""
-    values = shape.vertex_attributes.get(_VERTEX_COLOURS)
+    values = shape.vertex_attributes.get(VERTEX_COLOURS)
     if values is None or len(values) != len(shape.vertices):
         return None
     share = np.asarray(values)[:, :3]
@@ -479,6 +526,25 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 def srgb_to_linear(srgb: NDArray[_Number]) -> NDArray[_Number]:
     """sRGB to linear light, in [0, 1] (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _find_up(soup: _Soup, front: str) -> str:
+    """Which of y and z points up: the tyres lie low; without tyres, no vehicle is higher than long."""
+    tyres = soup.vertices[soup.faces[soup.part == int(Part.TYRE)]].reshape(-1, 3)
+    for up in ("y", "z"):
+        if front[1:] == up:
+            continue
+        axes = _file_rotation(soup, _AXES[_UP[up]], front)
+        length, height, _ = np.ptp(soup.vertices @ axes.T, axis=0)
+        down = soup.vertices @ axes[1]
+        low = (
+            float((tyres @ axes[1]).mean()) > float(down.max()) - 0.4 * height
+            if len(tyres)
+            else height < 0.95 * length
+        )
+        if low and height < length:
+            return up
+    return "y"
 
 
 def _file_rotation(soup: _Soup, up: tuple[float, float, float], front: str) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 import errno
 import gzip
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -87,11 +87,24 @@ def _reads_only(*_: object, **__: object) -> NoReturn:
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
 
-@pytest.mark.parametrize("call", ["mkdir", "write_bytes"])
+@pytest.mark.parametrize("call", ["mkdir", "open"])
 def test_what_may_only_be_read_is_named(tmp_path: Path, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, call, _reads_only)
     with pytest.raises(WriteError, match=r"a\.txt: expected a place that can be written, found read-only file"):
-        files.write_text(tmp_path / "a.txt", "x")
+        files.write_text(tmp_path / "new/a.txt" if call == "mkdir" else tmp_path / "a.txt", "x")
+
+
+def test_a_file_in_parts_is_whole_or_absent(tmp_path: Path) -> None:
+    files.write_parts(tmp_path / "new/a.txt", (f"{i}\n".encode() for i in range(3)))
+    assert (tmp_path / "new/a.txt").read_text() == "0\n1\n2\n"
+
+    def fail() -> Iterator[bytes]:
+        yield b"3\n"
+        raise FormatError("a", "b", "c")
+
+    with pytest.raises(FormatError):
+        files.write_parts(tmp_path / "new/a.txt", fail())
+    assert [path.read_text() for path in (tmp_path / "new").iterdir()] == ["0\n1\n2\n"]
 
 
 def test_a_folder_in_what_may_only_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,8 @@ import torch
 from detectors.boxes import iou_matrix
 from detectors.registry import SHIPPED, load_detector
 from detectors.types import CLASSES
-from drivesem.data.classes import KITTI
 from drivesem.synth.frames import generate_frame
+from drivesem.training.frames import make_targets
 from scene_ir import files
 from tools.compare_checkouts import ROOT
 
@@ -20,7 +20,7 @@ SEED, INDEX = 2026, 13
 @pytest.mark.parametrize("name", SHIPPED)
 def test_near_cars_are_found(name: str) -> None:
     frame = generate_frame(SEED, INDEX, "heldout")
-    targets = KITTI.targets(frame.labels)
+    targets = make_targets(frame.labels)
     objects = len(frame.labels.kind)  # regions to ignore stand behind them
     boxes_xyxy = targets.boxes_xyxy[:objects]
     near = (targets.labels[:objects] == CLASSES.index("Car")) & (boxes_xyxy[:, 3] - boxes_xyxy[:, 1] >= 40)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 
 import drivesem as ds
 from drivesem.attack.budgets import PRESETS
@@ -21,6 +22,7 @@ from drivesem.attack.feasibility_check import check_exchange, check_scene
 from drivesem.attack.feasible.projection import FeasibleSet
 from drivesem.attack.labels import Labeller, to_kitti_labels
 from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.synth.assets import meshes_in
 from drivesem.synth.demo import demo_scene
 from scene_ir.errors import FormatError
 from scene_ir.exchange import CHANGE_KEY, Vehicle, add_roof_load, add_vehicle, remove_vehicle, replace_vehicle
@@ -230,3 +232,21 @@ def test_a_users_mesh_parks_and_must_have_a_vehicles_size(scene: SceneIR, tmp_pa
     made = propose_scenes(scene, VehicleChangeSettings((VehicleChange.PARK,), own), 1, 0)
     assert made[0].meshes[-1].name == "block"
     assert made[0].objects.size_lhw[-1].tolist() == pytest.approx([4.0, 1.5, 1.8])
+
+
+def test_a_z_up_mesh_is_upright_and_as_the_generator_has_it(scene: SceneIR, tmp_path: Path) -> None:
+    lines: list[str] = []
+    for low, high in (((-0.9, -2.1, 0.2), (0.9, 2.1, 1.0)), ((-0.75, -0.8, 1.0), (0.75, 1.2, 1.6))):
+        box = trimesh.creation.box(bounds=[low, high])
+        lines += [f"v {x} {y} {z}" for x, y, z in box.vertices]
+        lines += [f"f {' '.join(map(str, face - 8))}" for face in box.faces]
+    (tmp_path / "zup.obj").write_text("\n".join(lines))
+    own, (other,) = load_vehicle_mesh(str(tmp_path / "zup.obj")), meshes_in(tmp_path)
+    assert own.size_lhw == pytest.approx((4.2, 1.4, 1.8))
+    assert (own.up, other.up) == ("z", "z")
+    assert torch.equal(own.mesh.vertices, other.mesh.vertices)
+    assert torch.equal(own.mesh.faces, other.mesh.faces)
+    roof = own.mesh.vertices[own.mesh.vertices[:, 1] < -0.99]
+    assert roof[:, 0].unique().tolist() == pytest.approx([-1.2 / 4.2, 0.8 / 4.2])
+    made = propose_scenes(scene, VehicleChangeSettings((VehicleChange.PARK,), own), 1, 0)
+    assert made[0].objects.size_lhw[-1].tolist() == pytest.approx([4.2, 1.4, 1.8])

@@ -45,7 +45,10 @@ def kitti(tmp_path: Path) -> Path:
 
 
 def _labels(folder: Path) -> dict[str, list[list[str]]]:
-    return {p.name: [line.split() for line in p.read_text().splitlines()] for p in sorted(folder.glob("*.txt"))}
+    paths = sorted(folder.rglob("*.txt"))
+    return {
+        p.name: [line.split() for line in p.read_text().splitlines()] for p in paths if p.parent.name != "calib"
+    }
 
 
 def test_kitti_to_coco_and_back(kitti: Path, tmp_path: Path):
@@ -125,7 +128,8 @@ def test_kitti_to_virtual_kitti_and_back(kitti: Path, tmp_path: Path, layout: st
     rows = next(iter(_labels(tmp_path / "back").values()))
     assert [row[8:15] for row in rows] == [line.split()[8:15] for line in LABELS.splitlines()[:3]]
     assert "model of 3" in text
-    assert "/ in frame names of" in text
+    assert "lost: names" not in text
+    assert (tmp_path / "back/training/label_2" / f"{name}.txt").is_file()
     # and once more into its own layout: everything is there
     again = convert(tmp_path / "virtual", "--to", layout, "--out", tmp_path / "again", "--copy-images")
     assert "nothing lost" in again
@@ -173,6 +177,8 @@ def test_results_keep_their_scores(tmp_path: Path):
 def test_json(kitti: Path, tmp_path: Path):
     data = run_json("convert", kitti, "--to", "yolo", "--out", tmp_path / "yolo")
     assert data["lost"]["3D box"] == 3
+    assert data["data"]["rows"] == {"classes": {"Car": 1, "Pedestrian": 1, "Van": 1}, "regions": 1}
+    assert (data["data"]["files"], data["data"]["skipped"]) == (6, {})
     assert data["assumed"] == {"val (same images as train)": 2}
 
 
@@ -328,3 +334,111 @@ def test_images_of_kitti_labels_keep_their_suffix(kitti: Path, tmp_path: Path):
     convert(kitti, "--to", "coco", "--out", tmp_path / "a.json")
     content = json.loads((tmp_path / "a.json").read_text())
     assert [row["file_name"] for row in content["images"]] == ["000003.jpg", "000011.jpg"]
+
+
+@pytest.fixture
+def named_yolo(tmp_path: Path) -> Path:
+    """A YOLO folder with splits, a subfolder, suffixes in capitals, and KITTI's types in another order."""
+    root = tmp_path / "yolo"
+    for split, name, text in (
+        ("train", "day/a.JPG", "1 0.5 0.5 0.2 0.2\n0 0.2 0.3 0.1 0.4\n"),
+        ("val", "b.jpeg", "2 0.5 0.5 0.2 0.2\n"),
+    ):
+        image, labels = root / "images" / split / name, root / "labels" / split / f"{name.partition('.')[0]}.txt"
+        image.parent.mkdir(parents=True)
+        labels.parent.mkdir(parents=True)
+        Image.new("RGB", (100, 60)).save(image, "JPEG")
+        labels.write_text(text)
+    names = "names: [Pedestrian, Van, Car]\n"
+    (root / "data.yaml").write_text(f"train: images/train\nval: images/val\n{names}")
+    return root
+
+
+@pytest.mark.parametrize("layout", ["coco", "kitti"])
+def test_names_splits_and_class_numbers_go_there_and_back(named_yolo: Path, tmp_path: Path, layout: str):
+    text = convert(named_yolo, "--to", layout, "--copy-images", "--out", tmp_path / "there")
+    assert text.startswith("yolo: 2 images, 3 boxes in 3 classes; splits: train 1, val 1\n")
+    assert "nothing lost" in text
+    images = {"coco": ("images/train/day/a.JPG", "images/val/b.jpeg"), "kitti": ("day/a.JPG", "b.jpeg")}[layout]
+    folder = tmp_path / "there" / ("training/image_2" if layout == "kitti" else "")
+    assert all((folder / name).is_file() for name in images)
+    text = convert(tmp_path / "there", "--to", "yolo", "--copy-images", "--out", tmp_path / "back")
+    assert "splits: train 1, val 1" in text
+    assert (tmp_path / "back/images/train/day/a.JPG").is_file()
+    assert (tmp_path / "back/images/val/b.jpeg").is_file()
+    classes = YoloDataset(tmp_path / "back").class_names
+    assert classes == (("Pedestrian", "Van", "Car") if layout == "coco" else ("Car", "Pedestrian", "Van"))
+    rows = [line.split() for line in (tmp_path / "back/labels/train/day/a.txt").read_text().splitlines()]
+    assert [classes[int(row[0])] for row in rows] == ["Van", "Pedestrian"]
+    assert [float(value) for value in rows[0][1:]] == pytest.approx([0.5, 0.5, 0.2, 0.2])
+
+
+def test_predictions_for_the_source_fit_the_converted_file(named_yolo: Path, tmp_path: Path):
+    convert(named_yolo, "--to", "coco", "--out", tmp_path / "gt.json")
+    content = json.loads((tmp_path / "gt.json").read_text())
+    assert [row["file_name"] for row in content["images"]] == ["day/a.JPG", "b.jpeg"]
+    rows = [  # of a detector that counts the source's classes from 1
+        {"image_id": 1, "category_id": 2, "bbox": [40, 24, 20, 12], "score": 0.9},
+        {"image_id": 1, "category_id": 1, "bbox": [15, 6, 10, 24], "score": 0.8},
+        {"image_id": 2, "category_id": 3, "bbox": [40, 24, 20, 12], "score": 0.7},
+    ]
+    (tmp_path / "results.json").write_text(json.dumps(rows))
+    metrics = run_json("eval", "--gt", tmp_path / "gt.json", "--pred", tmp_path / "results.json")["metrics"]
+    assert metrics["AP"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("layout", "source_size"), [("coco", (100, 60)), ("yolo", (60, 100)), ("kitti", (60, 100))]
+)
+def test_copies_are_upright(tmp_path: Path, layout: str, source_size: tuple[int, int]):
+    """A quarter turn: the stored image is 100 x 60 px, the upright one 60 x 100."""
+    root, names = (
+        tmp_path / "in",
+        {"coco": "images/all/a.jpg", "yolo": "images/all/a.jpg", "kitti": "image_2/a.jpg"},
+    )
+    path = root / names[layout]
+    path.parent.mkdir(parents=True)
+    pixels = np.full((60, 100, 3), 128, np.uint8)
+    pixels[10:20, 30:60] = 255
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = 6, "maker"
+    Image.fromarray(pixels).save(path, exif=exif, quality=100)
+    box = (40, 30, 50, 60)  # of the upright image: left = 60 - 20
+    if layout == "coco":  # the file states the stored size, so its boxes are of stored pixels
+        content = {
+            "images": [{"id": 1, "file_name": "a.jpg", "width": source_size[0], "height": source_size[1]}],
+            "categories": [{"id": 1, "name": "Car"}],
+            "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "bbox": [30, 10, 30, 10]}],
+        }
+        (root / "annotations").mkdir()
+        (root / "annotations/instances_all.json").write_text(json.dumps(content))
+    elif layout == "yolo":
+        (root / "labels/all").mkdir(parents=True)
+        (root / "labels/all/a.txt").write_text(f"0 {45 / 60} 0.45 {10 / 60} 0.3\n")
+        (root / "data.yaml").write_text("train: images/all\nval: images/all\nnames: [Car]\n")
+    else:
+        (root / "label_2").mkdir()
+        (root / "label_2/a.txt").write_text("Car 0 0 -10 39.5 29.5 49.5 59.5 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    convert(root, "--to", "coco", "--copy-images", "--out", tmp_path / "out")
+    frame = CocoDataset(tmp_path / "out").frame("a")
+    assert frame.photograph.shape[1:] == (100, 60)
+    assert frame.labels is not None
+    assert frame.labels.boxes_xyxy.numpy() == pytest.approx(np.array([box]) - 0.5, abs=0.01)
+    (copy,) = (tmp_path / "out").rglob("a.jpg")
+    with Image.open(copy) as image:
+        assert (image.size, image.getexif().get(0x0112), image.getexif()[0x010F]) == ((60, 100), None, "maker")
+        inside = np.asarray(image)[box[1] + 2 : box[3] - 2, box[0] + 2 : box[2] - 2]
+    assert inside.min() > 240
+
+
+def test_splits_and_attributes_that_are_lost_are_counted(two_parts: Path, tmp_path: Path):
+    source = two_parts / "annotations/instances_val.json"
+    content = json.loads(source.read_text())
+    content["images"][0]["attributes"] = {"weather": "rainy"}
+    source.write_text(json.dumps(content))
+    text = convert(two_parts, "--to", "kitti", "--out", tmp_path / "out")
+    assert "lost: attributes of frames of 1" in text
+    assert sorted(path.name for path in (tmp_path / "out/training/label_2").rglob("*.txt")) == ["000001.txt"] * 2
+    assert (tmp_path / "out/ImageSets/val.txt").read_text() == "val/000001\n"
+    text = convert(source, "--to", "fiftyone", "--copy-images", "--out", tmp_path / "fiftyone")
+    assert "nothing lost" in text

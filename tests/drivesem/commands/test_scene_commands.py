@@ -217,12 +217,16 @@ def test_a_users_mesh_is_chosen_where_it_fits_best(tmp_path: Path) -> None:
     turned = metres * np.array([1.0, -1.0, -1.0])
     trimesh.Trimesh(turned, shape.faces.numpy(), process=False).export(tmp_path / "meshes" / "my-pickup.obj")
     (tmp_path / "meshes" / "vehicles.yaml").write_text("my-pickup.obj: {front: +x, kind: van}\n")
+    (tmp_path / "meshes" / "draco.gltf").write_text('{"extensionsRequired": ["KHR_draco_mesh_compression"]}')
     words = ["derender", "--dataset", "kitti", "--root", str(tmp_path / "D"), "--workers", "1", "--fast"]
-    chosen = {}
+    chosen, notes = {}, []
     for name, more in (("A", []), ("B", ["--meshes", str(tmp_path / "meshes")])):
-        assert main([*words, *more, "--out", str(tmp_path / name)]) == 0
+        err = invoke(*words, *more, "--out", tmp_path / name).err
+        notes += [line for line in err.splitlines() if line.startswith("--meshes: ")]
         chosen[name] = load_scene(tmp_path / name / "000000").provenance["objects[0].mesh"]
     assert chosen["A"] != chosen["B"] == "my-pickup"
+    assert len(notes) == 1
+    assert notes[0].startswith(f"--meshes: left out: {tmp_path / 'meshes' / 'draco.gltf'}: extensionsRequired: ")
     assert '"my-pickup"' in (tmp_path / "B" / "000000" / "scene.json").read_text()
     output = refusal(*words, "--out", tmp_path / "B")
     assert "other values of meshes" in output

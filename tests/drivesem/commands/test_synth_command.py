@@ -10,7 +10,10 @@ from drivesem.commands.synth import build_order
 from drivesem.config.commands import SynthConfig
 from drivesem.config.parsing import parse
 from drivesem.data.registry import open_dataset
+from drivesem.synth.assets import choose_split
 from scene_ir import files
+from scene_ir.meshes.load import save_mesh
+from scene_ir.meshes.templates import template
 from tests.drivesem.invoke import invoke, refusal
 
 
@@ -39,6 +42,33 @@ def test_it_writes_a_data_set_a_sheet_and_distributions(tmp_path: Path) -> None:
     before = (out / "manifest.json").read_bytes()
     assert main([*words, "--no-resume", "--json"]) == 0
     assert (out / "manifest.json").read_bytes() == before
+
+
+def test_suitable_meshes_are_used_and_others_are_named(tmp_path: Path) -> None:
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    meshes.mkdir()
+    words = ["synth", "--frames", "1", "--workers", "1", "--meshes", str(meshes), "--out", str(out)]
+    (meshes / "draco.gltf").write_text('{"extensionsRequired": ["KHR_draco_mesh_compression"]}')
+    left_out = (
+        "draco.gltf: extensionsRequired: expected none that cannot be read, found KHR_draco_mesh_compression"
+    )
+    line = refusal(*words)
+    assert f"{meshes}: expected at least one vehicle mesh" in line
+    assert left_out in line
+    save_mesh(template("sedan", 0), meshes / "a.glb")
+    assert (choose_split("a.glb"), choose_split("sedan.glb")) == ("heldout", "train")
+    assert f"{meshes}: expected a vehicle of split train (by its file name), found a.glb" in refusal(*words)
+    save_mesh(template("sedan", 0), meshes / "sedan.glb")
+    lines = [line for line in invoke(*words).err.splitlines() if line.startswith("--meshes: ")]
+    assert lines == [
+        f"--meshes: left out: {meshes}/{left_out}",
+        "--meshes: 1 of 2 meshes belong to the other split by their names",
+    ]
+    vehicles = {
+        name for frame in json.loads((out / "manifest.json").read_text())["frames"] for name in frame["vehicles"]
+    }
+    assert "mesh-sedan.glb" in vehicles
+    assert "mesh-a.glb" not in vehicles
 
 
 def test_another_recipe_is_one_line(tmp_path: Path) -> None:

@@ -461,9 +461,7 @@ def test_boxes_and_masks_turn_with_their_image(orientation: int, stored: bool, t
     assert frame.labels.boxes_xyxy[0].tolist() == coco_to_xyxy(np.array(corner, float)).tolist()
     assert np.array_equal(frame.masks[0].numpy() > 0, upright)
     assert np.array_equal(to_uint8(frame.photograph)[..., 0] > 0, upright)
-    table = coco_labels.turn_upright(
-        coco_labels.read_table(path, False, None), coco.find_images(path, ["000000000139"])
-    )
+    table = coco_labels.turn_upright(coco_labels.read_table(path, False, None))
     assert table.boxes.tolist() == [corner]
     assert table.sizes_wh.tolist() == [list(upright_wh)]
 
@@ -633,7 +631,8 @@ def test_images_outside_of_the_data_set_are_not_opened(name: str, tmp_path: Path
 def test_fiftyone_reads_back(tmp_path: Path) -> None:
     _write_layout(tmp_path / "in", LAYOUTS["one file"][0])
     table = coco_labels.read_table(tmp_path / "in", False, None)
-    fiftyone.write_table(table, tmp_path / "out", coco.find_images(tmp_path / "in", table.frames))
+    images = {table.frames[i]: path for i, path in table.image_paths.items()}
+    fiftyone.write_table(table, tmp_path / "out", images)
     assert detect_layout(tmp_path / "out") == "coco"
     again = coco_labels.read_table(tmp_path / "out", False, None)
     assert (again.frames, again.kinds) == (table.frames, table.kinds)

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from detectors.types import Targets
-from drivesem.data import layouts, registry
-from drivesem.data.classes import KITTI
+from drivesem.data import kitti_labels, layouts, registry
+from drivesem.data.kitti import format_calibration
 from drivesem.data.label_table import LabelTable
+from drivesem.training.frames import make_targets
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.types import Labels
@@ -20,6 +21,9 @@ SIZE = (1242, 375)
 
 def _kitti(root: Path, right: float) -> None:
     files.write_png(root / "training/image_2/000000.png", np.zeros((*SIZE[::-1], 3), np.uint8))
+    files.write_text(
+        root / "training/calib/000000.txt", format_calibration(torch.eye(3, 4) + 99 * torch.eye(3, 4))
+    )
     files.write_text(root / "training/label_2/000000.txt", f"Car 0 0 -10 10 20 {right} 60 {POSE}\n")
 
 
@@ -73,8 +77,7 @@ def test_a_box_without_an_area_is_read_and_never_trained_on(layout: str, tmp_pat
     labels, table = _both(layout, tmp_path, 10)
     assert labels.boxes_xyxy.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
     assert table.with_box_format("xyxy").boxes.tolist() == [[pytest.approx(v) for v in (10, 20, 10, 60)]]
-    targets: Targets = KITTI.targets(labels)
-    assert targets.ignore.tolist() == [True]
+    assert make_targets(labels).ignore.tolist() == [True]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -84,7 +87,7 @@ def test_scenes_and_tables_read_alike(layout: str, tmp_path: Path) -> None:
     for name in Labels.__slots__:
         mine, other = getattr(labels, name), getattr(again, name)
         assert mine == other if name == "kind" else np.array_equal(mine, other, equal_nan=True), name
-    assert KITTI.targets(labels).ignore.tolist() == [False]
+    assert make_targets(labels).ignore.tolist() == [False]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -101,3 +104,39 @@ def test_a_turned_box_is_refused_by_both(layout: str, tmp_path: Path) -> None:
 def test_a_layout_of_none() -> None:
     with pytest.raises(FormatError, match="expected a file or folder of labels, found nothing there"):
         layouts.detect_layout(Path("/nowhere"))
+
+
+@pytest.mark.parametrize(
+    ("frames", "images", "names", "changed"),
+    [
+        (["1", "2"], {}, ["1", "2"], 0),
+        (["1", "2"], {0: "day/1.jpg", 1: "night/2.PNG"}, ["day/1", "night/2"], 0),
+        (["train/1", "val/1"], {0: "1.jpg", 1: "1.jpg"}, ["train/1", "val/1"], 0),
+        (["a", "b"], {0: "a/counterexample.png", 1: "b/counterexample.png"}, ["a", "b"], 0),
+        (["1", "day/1"], {0: "day/1.jpg"}, ["1", "day/1"], 1),
+    ],
+)
+def test_files_are_named_as_images(
+    frames: list[str], images: dict[int, str], names: list[str], changed: int
+) -> None:
+    table = LabelTable.from_columns(frames, (), [], [], np.zeros((0, 4)), "xyxy", image_files=images)
+    assert table.file_names() == (names, {"names of frames": changed})
+
+
+@pytest.mark.parametrize("name", ["../1", "/1", "a/../1", "1\0"])
+def test_names_that_lead_out_are_refused(name: str) -> None:
+    table = LabelTable.from_columns([name], (), [], [], np.zeros((0, 4)), "xyxy")
+    with pytest.raises(FormatError, match="names below a folder"):
+        table.file_names()
+
+
+def test_labels_are_alike_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i, kind in enumerate(("Van", "Car", "DontCare", "Car")):
+        files.write_text(tmp_path / f"{i}.txt", f"{kind} 0 0 -10 {i} 20 30 60 {POSE}\n" * i)
+    tables = [layouts.read_table(tmp_path, "kitti")]
+    monkeypatch.setattr(kitti_labels, "_FILES_PER_CHUNK", 1)
+    tables.append(layouts.read_table(tmp_path, "kitti"))
+    assert tables[0].kinds == tables[1].kinds == ("Car",)
+    assert tables[0].account == tables[1].account
+    for name in ("frame", "kind", "boxes", "ignore", "pose"):
+        assert getattr(tables[0], name).tolist() == getattr(tables[1], name).tolist()

@@ -145,6 +145,46 @@ def test_what_cannot_be_read_is_listed_and_the_rest_used(tmp_path: Path) -> None
         assets.meshes_in(tmp_path)
 
 
+def test_each_unsuitable_file_is_noted_and_drops_no_other(tmp_path: Path) -> None:
+    write_template(tmp_path / "good.glb", "sedan", (4.5, 1.45, 1.8))
+    block = "mtllib none.mtl\n" + "".join(f"v {x} {y} {z}\n" for x in (0, 4) for y in (0, 1.5) for z in (0, 1.8))
+    (tmp_path / "block.obj").write_text(f"{block}f 1 2 4 3\nf 5 7 8 6\n")
+    (tmp_path / "cut.glb").write_bytes((tmp_path / "good.glb").read_bytes()[:3000])
+    (tmp_path / "folder.ply").mkdir()
+    (tmp_path / "gone.obj").symlink_to(tmp_path / "nowhere.obj")
+    (tmp_path / "zero.obj").write_text(f"{block}f 0 1 2\n")
+    assert [v.name for v in assets.meshes_in(tmp_path)] == ["block.obj", "good.glb"]
+    notes = assets.notes_in(tmp_path)
+    assert [note.split("/")[-1].split(":")[0] for note in notes[:4]] == [
+        "cut.glb",
+        "folder.ply",
+        "gone.obj",
+        "zero.obj",
+    ]
+    assert all(note.startswith("left out: ") and "expected" in note and "\n" not in note for note in notes[:4])
+    assert notes[4:] == ("block.obj: none.mtl is missing",)
+
+
+def test_one_file_is_read_as_in_its_folder(tmp_path: Path) -> None:
+    write_template(tmp_path / "a.glb", "sedan", (4.5, 1.45, 1.8), z_up=True)
+    assert assets.read_vehicle(tmp_path / "a.glb") == assets.meshes_in(tmp_path)[0]
+    assert assets.read_vehicle(tmp_path / "a.glb").stated_lhw == pytest.approx((4.5, 1.45, 1.8), abs=1e-3)
+    (tmp_path / "vehicles.yaml").write_text("a.glb: {front: +y, metres_per_unit: 2, kind: suv}\n")
+    vehicle = assets.read_vehicle(tmp_path / "a.glb")
+    assert vehicle == assets.meshes_in(tmp_path)[0]
+    assert (vehicle.kind, vehicle.up, vehicle.front) == ("suv", "z", "+y")
+    assert vehicle.stated_lhw == pytest.approx((9.0, 2.9, 3.6), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("front", "up"), [("+x", "z"), ("-x", "z"), ("auto", "z"), ("+z", "y")], ids=["right", "left", "found", "roof"]
+)
+def test_up_is_found_for_a_given_front(tmp_path: Path, front: str, up: str) -> None:
+    write_template(tmp_path / "a.glb", "sedan", (4.5, 1.45, 1.8), z_up=True)
+    (tmp_path / "vehicles.yaml").write_text(f"a.glb: {{front: {front}}}\n")
+    assert assets.meshes_in(tmp_path)[0].up == up
+
+
 def test_a_missing_or_empty_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="nowhere"):
         assets.meshes_in(tmp_path / "nowhere")

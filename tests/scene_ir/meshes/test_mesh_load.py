@@ -1,6 +1,7 @@
 """Mesh files: our GLB keeps every bit; foreign OBJ, GLB, PLY come into the unit box with colours and parts."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -324,7 +325,9 @@ def test_bad_files_are_named_in_one_line(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("options", [{"up": "x"}, {"front": "+q"}, {"front": "+y"}, {"metres_per_unit": 0.0}])
+@pytest.mark.parametrize(
+    "options", [{"up": "x"}, {"front": "+q"}, {"front": "+y", "up": "y"}, {"metres_per_unit": 0.0}]
+)
 def test_unknown_options_are_refused(tmp_path: Path, options: dict) -> None:
     with pytest.raises(RangeError):
         import_mesh(tmp_path / "any.obj", **options)
@@ -413,3 +416,312 @@ def test_many_places_of_one_mesh_and_faces_without_vertices(
     (tmp_path / "a.glb").write_bytes(data)
     with pytest.raises(FormatError, match=r"a\.glb: faces: expected indices of \d+ vertices, found 1048576"):
         load_mesh(tmp_path / "a.glb")
+
+
+def two_boxes(order: str) -> str:
+    """A car of two boxes as OBJ text, 4.2 m long, 1.4 m high, 1.8 m wide.
+
+    Args:
+        order: "absolute" indices, "relative" ones behind each box's vertices, "cabin first", or "at the end".
+    """
+    blocks = []
+    for low, high in (((-0.9, 0.2, -2.1), (0.9, 1.0, 2.1)), ((-0.75, 1.0, -1.2), (0.75, 1.6, 0.8))):
+        box = trimesh.creation.box(bounds=[low, high])
+        blocks.append((["v " + " ".join(map(str, point)) for point in box.vertices.tolist()], box.faces))
+    if order == "cabin first":
+        blocks.reverse()
+    if order in ("absolute", "at the end"):
+        shift = (1, 9) if order == "absolute" else (-16, -8)
+        faces = [f"f {' '.join(map(str, f + s))}" for (_, fs), s in zip(blocks, shift, strict=True) for f in fs]
+        return "\n".join([*blocks[0][0], *blocks[1][0], *faces])
+    lines = [[*points, *(f"f {' '.join(map(str, f - 8))}" for f in faces)] for points, faces in blocks]
+    return "\n".join(line for block in lines for line in block)
+
+
+@pytest.mark.parametrize("order", ["absolute", "relative", "cabin first", "at the end"])
+def test_relative_indices_count_from_their_line(tmp_path: Path, order: str) -> None:
+    (tmp_path / "car.obj").write_text(two_boxes(order))
+    imported = import_mesh(tmp_path / "car.obj")
+    assert imported.size_lhw == pytest.approx((4.2, 1.4, 1.8))
+    assert (len(imported.mesh.vertices), len(imported.mesh.faces)) == (16, 24)
+    roof = imported.mesh.vertices[imported.mesh.vertices[:, 1] < -0.99]
+    assert sorted(set(np.round(roof[:, 0].tolist(), 3))) == pytest.approx([-1.2 / 4.2, 0.8 / 4.2], abs=1e-3)
+    assert (imported.up, imported.notes) == ("y", ())
+
+
+SOLID = "v 0 0 0\nv 4 0 0\nv 4 1 0\nv 0 1 0\nv 2 0.5 2\n"
+SIDES = "f 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "faces"),
+    [
+        (SOLID + SIDES + "f 4 3 2 1\n", 6),
+        (SOLID + "f 4 3 2 1\nf 5 4 3 2 1\n", 5),
+        ((SOLID + SIDES).replace(" ", "\t"), 4),
+        ((SOLID + SIDES).replace("\n", "\n  "), 4),
+        ((SOLID + SIDES).replace("\n", "\r\n"), 4),
+        ((SOLID + SIDES).replace("\n", " # comment 1/2\n"), 4),
+        ((SOLID + SIDES).replace("2 5", "2 \\\n5"), 4),
+        ("\ufeff" + SOLID + SIDES, 4),
+        (SOLID + SIDES + "f 1 2\nl 1 2\np 3\n", 4),
+        (SOLID + "vn 0 0 1\n" + SIDES.replace("f 1 2 5", "f 1//1 2//1 5//1"), 4),
+    ],
+    ids=["quad", "pentagon", "tabs", "indented", "CRLF", "comments", "continued", "BOM", "lines", "normals"],
+)
+def test_every_spelling_of_an_obj_is_read(tmp_path: Path, text: str, faces: int) -> None:
+    (tmp_path / "a.obj").write_bytes(text.encode())
+    imported = import_mesh(tmp_path / "a.obj")
+    assert (len(imported.mesh.vertices), len(imported.mesh.faces)) == (5, faces)
+    assert imported.size_lhw == pytest.approx((4.0, 1.0, 2.0))
+    short = ("1 faces with fewer than three corners left out",) if "f 1 2\n" in text else ()
+    assert imported.notes == short
+
+
+@pytest.mark.parametrize(
+    ("face", "found"),
+    [
+        ("0 1 2", "face 5: expected vertices from 1, or from -1 to -5, found 0 1 2"),
+        ("-6 1 2", "face 5: expected vertices from 1, or from -1 to -5, found -6 1 2"),
+        ("1 2 6", "faces: expected indices of 5 vertices, found vertex 6"),
+        ("1 2 x", "expected a readable mesh, with numbers in lines v, vt and f, found f 1 2 x"),
+    ],
+)
+def test_faces_of_missing_vertices_are_refused(tmp_path: Path, face: str, found: str) -> None:
+    (tmp_path / "a.obj").write_text(f"{SOLID}{SIDES}f {face}\n")
+    with pytest.raises(FormatError, match=rf"a\.obj: {found}"):
+        load_mesh(tmp_path / "a.obj")
+
+
+def test_faces_with_and_without_texture_coordinates_share_a_material(tmp_path: Path) -> None:
+    Image.new("RGB", (2, 2), (0, 255, 0)).save(tmp_path / "green tint.png")
+    (tmp_path / "my car.mtl").write_text(
+        "newmtl body\nmap_Kd -s 1 1 1 green.png\nnewmtl glass\nmap_Kd green tint.png\n"
+    )
+    faces = "vt 0 0\nvt 1 1\nvn 0 0 1\nf 1/1 2/2 5/-1\nf 2//1 3//1 5//1\nf 3 4 5\n"
+    (tmp_path / "a.obj").write_text(f"mtllib my car.mtl\nusemtl glass\n{SOLID}{faces}")
+    imported = import_mesh(tmp_path / "a.obj")
+    assert imported.mesh.part.tolist() == [int(Part.GLASS)] * 3
+    assert imported.mesh.colours.unique(dim=0).tolist() == [[0.0, 1.0, 0.0]]
+    assert imported.notes == ("-s 1 1 1 green.png is missing",)
+
+
+@pytest.mark.parametrize(
+    ("head", "files", "notes"),
+    [
+        ("", {}, ()),
+        ("mtllib a.mtl\n", {"a.mtl": "newmtl blue\nKd 0 0 1\n"}, ()),
+        ("mtllib a.mtl\nusemtl tyre\n", {}, ("a.mtl is missing", "materials that no file defines: tyre")),
+        ("mtllib a.mtl\nusemtl tyre\n", {"a.mtl": "newmtl tyre\nmap_Kd x/t.png\n"}, ("x/t.png is missing",)),
+        ("mtllib a.mtl b.mtl\nusemtl tyre\n", {"a.mtl": "", "b.mtl": "newmtl tyre\nKd 0 0 1\n"}, ()),
+    ],
+    ids=["none", "not used", "no file", "no texture", "two files"],
+)
+def test_missing_materials_are_noted(tmp_path: Path, head: str, files: dict, notes: tuple) -> None:
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "a.obj").write_text(head + SOLID + SIDES)
+    imported = import_mesh(tmp_path / "a.obj")
+    assert imported.notes == notes
+    assert imported.mesh.part.tolist() == [int(Part.TYRE if "tyre" in head else Part.PAINT)] * 4
+    colour = [0.0, 0.0, 1.0] if "b.mtl" in files else None
+    assert colour is None or imported.mesh.colours.unique(dim=0).tolist() == [colour]
+
+
+def box_gltf(path: Path, edit: Callable[[dict], object] = lambda header: None, positions: str = "<f4") -> Path:
+    """Write a box of 4 x 1.5 x 1.8 as glTF: 8 vertices, 12 triangles.
+
+    Args:
+        path: The .gltf file.
+        edit: Changes the header.
+        positions: Type of the positions; integers are normalized.
+    """
+    box = trimesh.creation.box((4, 1.5, 1.8))
+    values = box.vertices if positions == "<f4" else np.round(box.vertices / 2 * 32767)
+    blobs = [values.astype(positions).tobytes(), box.faces.astype("<u4").tobytes()]
+    (path.parent / "box.bin").write_bytes(b"".join(blobs))
+    low, high = values.min(axis=0).tolist(), values.max(axis=0).tolist()
+    kind = {"<f4": 5126, "<i2": 5122}[positions]
+    header = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": kind, "count": 8, "type": "VEC3", "min": low, "max": high},
+            {"bufferView": 1, "componentType": 5125, "count": 36, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": len(blobs[0])},
+            {"buffer": 0, "byteOffset": len(blobs[0]), "byteLength": len(blobs[1])},
+        ],
+        "buffers": [{"uri": "box.bin", "byteLength": sum(map(len, blobs))}],
+    }
+    if positions != "<f4":
+        header["accessors"][0]["normalized"] = True
+        header["nodes"][0]["scale"] = [2, 2, 2]
+    edit(header)
+    path.write_text(json.dumps(header))
+    return path
+
+
+def _add(header: dict, key: str, *values: object) -> None:
+    header.setdefault(key, []).extend(values)
+
+
+@pytest.mark.parametrize(
+    ("edit", "found"),
+    [
+        (
+            lambda h: _add(h, "extensionsRequired", "KHR_draco_mesh_compression"),
+            "found KHR_draco_mesh_compression",
+        ),
+        (lambda h: _add(h, "extensionsRequired", "EXT_meshopt_compression"), "found EXT_meshopt_compression"),
+        (lambda h: h["accessors"][0].pop("bufferView"), "accessor 0: expected values in a buffer, found none"),
+        (
+            lambda h: h["accessors"][1].update(sparse={}),
+            "accessor 1: expected values in one buffer, found a sparse",
+        ),
+        (
+            lambda h: h["meshes"][0]["primitives"][0].update(mode=6),
+            r"mode: expected triangles or strips \(4 or 5\)",
+        ),
+        (
+            lambda h: h["accessors"][0].update(min=[-2, -0.75, -4]),
+            r"accessor 0: expected \(-2.0, -0.75, -4.0\) to \(2.0, 0.75, 0.9\) as .*, found \(-2.0, -0.75, -0.9\) to",
+        ),
+        (lambda h: h["nodes"].append({"children": [0, 0]}) or h["scenes"][0].update(nodes=[1]), "expected a tree"),
+    ],
+    ids=["Draco", "meshopt", "no data", "sparse", "fan", "bounds", "graph"],
+)
+def test_gltf_that_is_not_read_whole_is_refused(tmp_path: Path, edit, found: str) -> None:
+    with pytest.raises(FormatError, match=found) as caught:
+        load_mesh(box_gltf(tmp_path / "a.gltf", edit))
+    assert str(tmp_path / "a.gltf") in str(caught.value)
+
+
+def _with_hidden_primitives(header: dict) -> None:
+    """A mesh without positions at a node with a child, lines, and a camera at the drawn node."""
+    _add(header, "cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1, "aspectRatio": 1}})
+    _add(header, "meshes", {"primitives": [{"attributes": {}}, {"attributes": {"POSITION": 0}, "mode": 1}]})
+    header["nodes"] = [{"mesh": 1, "children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "camera": 0}]
+
+
+@pytest.mark.parametrize(
+    ("edit", "notes"),
+    [
+        (
+            _with_hidden_primitives,
+            ("primitives without positions, not drawn: 1", "primitives of points or lines, not drawn: 1"),
+        ),
+        (lambda h: h["nodes"].append({"mesh": 0, "scale": [1, 1, 1]}), ()),
+        (lambda h: h["accessors"][0].pop("min"), ()),
+        (lambda h: _add(h, "extensionsRequired", "KHR_materials_unlit"), ()),
+        (lambda h: _add(h, "extensionsUsed", "EXT_x"), ("glTF extensions that are not read: EXT_x",)),
+    ],
+    ids=["hidden", "outside of the scene", "no bounds", "material", "extension"],
+)
+@pytest.mark.parametrize("kind", ["gltf", "glb"])
+def test_what_gltf_does_not_draw_is_left_out(tmp_path: Path, kind: str, edit, notes: tuple[str, ...]) -> None:
+    path = box_gltf(tmp_path / "a.gltf", edit)
+    if kind == "glb":
+        header, blob = json.loads(path.read_text()), (tmp_path / "box.bin").read_bytes()
+        del header["buffers"][0]["uri"]
+        text = json.dumps(header).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = [
+            (len(text)).to_bytes(4, "little"),
+            b"JSON",
+            text,
+            len(blob).to_bytes(4, "little"),
+            b"BIN\0",
+            blob,
+        ]
+        content = b"".join(chunks)
+        path = tmp_path / "a.glb"
+        path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(content)).to_bytes(4, "little") + content)
+    imported = import_mesh(path)
+    assert imported.size_lhw == pytest.approx((4.0, 1.5, 1.8))
+    assert (len(imported.mesh.vertices), len(imported.mesh.faces)) == (8, 12)
+    assert imported.notes == notes
+
+
+def test_quantized_positions_are_fractions(tmp_path: Path) -> None:
+    path = box_gltf(tmp_path / "a.gltf", lambda h: _add(h, "extensionsRequired", "KHR_mesh_quantization"), "<i2")
+    assert import_mesh(path).size_lhw == pytest.approx((4.0, 1.5, 1.8), abs=1e-3)
+
+
+def test_integer_texture_coordinates_are_fractions(tmp_path: Path) -> None:
+    """Core glTF allows normalized integers: (0.25, 0.75) from the upper left is the blue quarter."""
+    palette = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (9, 9, 9)]], np.uint8)
+    Image.fromarray(palette).save(tmp_path / "palette.png")
+    (tmp_path / "uv.bin").write_bytes(np.tile(np.array([16384, 49151], "<u2"), 8).tobytes())
+
+    def paint(header: dict) -> None:
+        header["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = 2
+        header["meshes"][0]["primitives"][0]["material"] = 0
+        header["materials"] = [{"name": "m", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+        header["textures"], header["images"] = [{"source": 0}], [{"uri": "palette.png"}]
+        values = {"bufferView": 2, "componentType": 5123, "count": 8, "type": "VEC2", "normalized": True}
+        _add(header, "accessors", values)
+        _add(header, "bufferViews", {"buffer": 1, "byteLength": 32})
+        _add(header, "buffers", {"uri": "uv.bin", "byteLength": 32})
+
+    imported = import_mesh(box_gltf(tmp_path / "a.gltf", paint))
+    assert imported.mesh.colours.unique(dim=0).tolist() == [[0.0, 0.0, 1.0]]
+    assert imported.notes == ()
+    (tmp_path / "palette.png").unlink()
+    missing = ("palette.png is missing", "the texture of material m is not read")
+    assert import_mesh(tmp_path / "a.gltf").notes == missing
+
+
+def test_unused_vertices_change_no_bounds(tmp_path: Path) -> None:
+    text = "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
+    text += "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+    text += SOLID.replace("v ", "") + "9 9 9\n3 0 1 4\n4 1 2 3 4\n"
+    (tmp_path / "a.ply").write_text(text.format(2))
+    imported = import_mesh(tmp_path / "a.ply")
+    assert imported.size_lhw == pytest.approx((4.0, 1.0, 2.0))
+    assert (len(imported.mesh.vertices), len(imported.mesh.faces)) == (5, 3)
+    (tmp_path / "a.ply").write_text(text.format(4))
+    with pytest.raises(FormatError, match=r"a\.ply: faces: expected 4 as stated in the file, found 3 after"):
+        import_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("spoil", ["vertices", "faces", "graph"])
+def test_an_import_that_differs_from_the_file_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: str
+) -> None:
+    original = trimesh.load_scene
+
+    def load_wrongly(*args: object, **options: object) -> trimesh.Scene:
+        scene = original(*args, **options)
+        (shape,), (node,) = scene.geometry.values(), scene.graph.nodes_geometry
+        if spoil == "vertices":
+            shape.vertices = np.zeros((8, 3))
+        elif spoil == "faces":
+            shape.update_faces(np.arange(12) > 0)
+        else:
+            scene.graph.update(node, matrix=trimesh.transformations.translation_matrix((0, 0, 1)))
+        return scene
+
+    monkeypatch.setattr(trimesh, "load_scene", load_wrongly)
+    with pytest.raises(FormatError, match=r"as stated in the file, found .* after the import") as caught:
+        load_mesh(box_gltf(tmp_path / "a.gltf"))
+    assert ("expected 12" in str(caught.value)) == (spoil == "faces")
+
+
+def test_meshes_of_several_primitives_come_in_one_order(tmp_path: Path) -> None:
+    def split(header: dict) -> None:
+        primitives = header["meshes"][0]["primitives"] = [
+            dict(header["meshes"][0]["primitives"][0]) for _ in range(6)
+        ]
+        for index, primitive in enumerate(primitives):
+            header["accessors"].append(header["accessors"][1] | {"count": 3, "byteOffset": 12 * index})
+            primitive["indices"] = index + 2
+
+    path = box_gltf(tmp_path / "a.gltf", split)
+    first, second = (load_mesh(path) for _ in range(2))
+    assert_same(first, second)
+    assert len(first.faces) == 6

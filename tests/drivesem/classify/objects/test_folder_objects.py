@@ -116,7 +116,7 @@ HOSTILE = {
     "NaN": ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
     "infinity": ("v inf 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
     "too far apart": ("v 1e308 0 0\nv -1e308 0 0\nv 0 1 0\nf 1 2 3\n", "some extent"),
-    "out of range": ("v 0 0 0\nv 1 0 0\nf 1 2 9\n", "a readable mesh"),
+    "out of range": ("v 0 0 0\nv 1 0 0\nf 1 2 9\n", "indices of 2 vertices, found vertex 9"),
 }
 
 
