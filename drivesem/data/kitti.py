@@ -93,10 +93,14 @@ def read_labels(path: Path, scored: bool = False) -> Labels:
     return _parse_labels(str(path), files.read_text(path), scored)
 
 
-def _parse_labels(name: str, text: str, scored: bool) -> Labels:
+def _split_lines(name: str, text: str, scored: bool) -> KittiLabelLines:
     if text.count("\n") > _MAX_LINES:
         raise FormatError(name, f"at most {_MAX_LINES:,} lines", f"{text.count(chr(10)):,}")
-    lines = KittiLabelLines([name], [text], scored)
+    return KittiLabelLines([name], [text], scored)
+
+
+def _parse_labels(name: str, text: str, scored: bool) -> Labels:
+    lines = _split_lines(name, text, scored)
     check_scene(lines, scored)
     return lines.to_table([name], scored).to_labels()
 
@@ -470,7 +474,7 @@ class KittiDataset(FrameIndex[Path]):
         if not self._has_labels:
             return None
         path = self._labels[identifier]
-        lines = KittiLabelLines([path], [files.read_text(path)], scored=False)
+        lines = _split_lines(path, files.read_text(path), scored=False)
         lines.drop_unusable()
         labels = lines.to_table([identifier], scored=False).to_labels()
         return labels if self._calibration_path(identifier).exists() else _drop_poses(labels)
@@ -489,7 +493,7 @@ class KittiDataset(FrameIndex[Path]):
         size_hw = height, width = image.shape[:2]
         points = None
         calib_path = self._calibration_path(identifier)
-        if calib_path.exists():
+        if calib_path.exists() or self.with_points:  # points have no place without a calibration
             calibration = read_calibration(calib_path)
             camera = Camera(calibration.projection[:, :3].clone(), height, width, calibration.projection)
             points_path = self.folder / "velodyne" / f"{identifier}.bin"

@@ -157,7 +157,7 @@ def read_vehicle(path: str | Path) -> VehicleMesh:
 
     Raises FormatError for an unreadable file or a faulty `vehicles.yaml`.
     """
-    place = Path(path).resolve()
+    place = Path(path)
     sidecar = place.parent / SIDECAR
     entries = _sidecar(sidecar) if sidecar.is_file() else {}
     return _vehicle(place, entries.get(place.name, _Entry()))

@@ -513,7 +513,6 @@ def fit_dataset_anchors(config: TrainConfig, count: int) -> dict[str, Any]:
     """
     config = _resolve_splits(config)
     dataset = open_selection(config.dataset, config.root or "", FrameFilter.from_options(config))
-    account = write_account(dataset.account())
     frames = dataset.identifiers[: config.limit]
     sizes_wh = np.concatenate([np.zeros((0, 2)), *(_box_sizes(dataset, name) for name in frames)])
     if not len(sizes_wh):
@@ -524,7 +523,7 @@ def fit_dataset_anchors(config: TrainConfig, count: int) -> dict[str, Any]:
     anchors = fit_anchors(sizes_wh, count, config.seed)
     return {
         "dataset": config.dataset,
-        "data": account,
+        "data": write_account(dataset.account()),
         "frames": len(frames),
         "boxes": len(sizes_wh),
         "min_height": _MIN_HEIGHT_PX,

@@ -9,11 +9,17 @@ REFUSALS = [
     ("attak", "command: expected one of attack, drive, classify, ... found attak; did you mean attack?"),
     ("attack --dataset kitty --root .", "--dataset: expected one of demo, kitti, vkitti1, ... found 'kitty'"),
     ("attack --dataset scenes --root .", ".: expected a scene of drivesem derender ... found none"),
-    ("attack --dataset photographs --root .", ".: expected photographs (.png, .jpg), found none"),
+    (
+        "attack --dataset photographs --root .",
+        ".: expected photographs (.png, .jpg, ... found none",
+    ),
     ("attack --dataset photographs", "--root: expected the folder of data set 'photographs', found nothing"),
     ("attack --dataset coco --root .", ".: expected a COCO folder, with ... found neither"),
     ("attack --dataset coco --root none", "none: expected the folder of a data set (coco: annotations/"),
-    ("attack --focal 700", "--focal: expected --dataset coco, yolo, photographs, found --dataset demo"),
+    (
+        "attack --focal 700",
+        "--focal: expected --dataset coco, yolo, voc, bdd100k, photographs, found --dataset demo",
+    ),
     ("attack --finder yolov3-slim", "--finder: expected --dataset photographs, found --dataset demo"),
     (
         "attack --changes fly --method climb --budget street",

@@ -79,6 +79,7 @@ _NEEDED: dict[str, tuple[str, ...]] = {
     "gate": ("run", "--after", "new.safetensors"),
     **dict.fromkeys(("render", "edit", "view"), ("scene",)),
     "eval": ("--gt", "labels", "--pred", "results"),
+    "inspect": ("root",),
     "convert": ("labels", "--to", "coco", "--out", "out"),
     "export": ("--run", "run", "--to", "coco", "--out", "out"),
     "check": ("--detector", "squeezedet"),

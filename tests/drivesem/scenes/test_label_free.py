@@ -333,7 +333,7 @@ def test_derender_takes_a_photograph(
         (["none.png"], "none.png: expected a readable file"),
         (["a.txt"], "a.txt: expected an image"),
         (["none.png", "--dataset", "kitti", "--root", "."], "PHOTO: expected no --dataset, found"),
-        (["--focal", "700"], "--focal: expected --dataset coco, yolo, photographs"),
+        (["--focal", "700"], "--focal: expected --dataset coco, yolo, voc, bdd100k, photographs"),
         (["none.png", "--focal", "-1"], "--focal: expected positive px"),
     ],
 )

@@ -45,7 +45,7 @@ PHOTO = ("photo.png",)
         (["--meshes", "texts"], "texts: expected at least one vehicle mesh"),
         (["--meshes", "nowhere"], "--meshes: expected a folder, found nowhere"),
         (["--meshes", "wrong.onnx"], "--meshes: expected a folder, found wrong.onnx"),
-        (["--meshes", "bad"], "car.obj: expected a readable mesh"),
+        (["--meshes", "bad"], "bad: expected at least one vehicle mesh"),
         (["--meshes", "bad-glb"], "car.glb: expected a readable mesh"),
         (["--segmenter", "none.onnx"], "none.onnx: expected a readable file"),
         (["--segmenter", "wrong.onnx"], "wrong.onnx: expected an ONNX network"),
@@ -76,4 +76,4 @@ def test_meshes_that_are_left_out_are_named(
     assert main(["derender", "photo.png", "--meshes", "bad", "--workers", "1", "--out", "S"]) == 0
     output = [line for line in capsys.readouterr().err.splitlines() if line.startswith("--meshes")]
     assert len(output) == 1
-    assert output[0].startswith("--meshes: car.obj is left out: ")
+    assert output[0].startswith("--meshes: left out: ")

@@ -147,8 +147,9 @@ def test_bad_settings(
     monkeypatch.chdir(tmp_path)
     root = kitti_folder(tmp_path / "frames", 2)
     error = invoke("train", "--root", root, "--out", tmp_path / "run", *words, code=2).err
-    assert message in error
-    assert error.count("\n") == 1
+    lines = [line for line in error.splitlines() if not line.startswith("kitti: 2 images")]  # the account
+    assert len(lines) == 1
+    assert message in lines[0]
 
 
 def test_data_without_boxes_or_frames(tmp_path: Path, kitti_folder: Callable[..., Path]) -> None:
@@ -157,7 +158,7 @@ def test_data_without_boxes_or_frames(tmp_path: Path, kitti_folder: Callable[...
         "train", "--root", root, "--out", tmp_path / "run"
     )
     (tmp_path / "empty" / "training" / "image_2").mkdir(parents=True)
-    assert "expected at least one .png" in refusal(
+    assert "expected at least one image" in refusal(
         "train", "--root", tmp_path / "empty", "--out", tmp_path / "run2"
     )
 
