@@ -14,6 +14,8 @@ _FILE_WIDTH = 120
 def eval_command(config: EvalConfig) -> int:
     """`drivesem eval`: evaluate and print."""
     console = Console(stderr=True)
+    if not console.is_terminal:
+        console = Console(stderr=True, width=_FILE_WIDTH)
     if config.detector is not None:
         from drivesem.analysis.evaluate.detector import evaluate_detector, print_detector_metrics
         from drivesem.config.devices import check_device
@@ -27,5 +29,5 @@ def eval_command(config: EvalConfig) -> int:
     result = evaluate_files(config)
     if config.json:
         print_json(result.to_json())
-    print_evaluation(result, console if console.is_terminal else Console(stderr=True, width=_FILE_WIDTH))
+    print_evaluation(result, console)
     return 0

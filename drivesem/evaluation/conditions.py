@@ -109,7 +109,7 @@ def recall_by_condition(
         frames: Number of frames.
         groups: Indices of frames by condition.
         reference: Condition that gives the shares of box heights; it comes first.
-        draws: Number of bootstrap draws; 0 for no intervals.
+        draws: Number of bootstrap draws; 0 for no intervals. A single frame has no interval.
         generator: Source of random numbers.
     """
     bins = len(HEIGHT_BINS_PX) - 1
@@ -124,7 +124,9 @@ def recall_by_condition(
     for name in order:
         chosen = groups[name]
         own_counts, own_hits = counts[chosen], hits[chosen]
-        drawn = generator.multinomial(len(chosen), np.full(len(chosen), 1 / len(chosen)), size=draws)
+        # one frame cannot show how much frames differ
+        size = draws if len(chosen) > 1 else 0
+        drawn = generator.multinomial(len(chosen), np.full(len(chosen), 1 / len(chosen)), size=size)
         total = own_counts.sum(axis=0)
         plain, equal = _recalls(own_hits.sum(axis=0)[None], total[None], shares)
         plain_draws, equal_draws = _recalls(drawn @ own_hits, drawn @ own_counts, shares)

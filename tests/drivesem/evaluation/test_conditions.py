@@ -42,7 +42,7 @@ def test_heights_that_do_not_occur_are_left_out() -> None:
     objects = DetectedObjects(np.array([0, 0, 1]), np.array([20.0, 80.0, 80.0]), np.array([False, True, True]))
     groups = {"day": np.array([0]), "fog": np.array([1]), "empty": np.array([2])}
     _, fog, empty = recall_by_condition(objects, 3, groups, "day", 20, np.random.default_rng(0))
-    assert (fog.equal_recall, fog.covered) == (1.0, 0.5)
+    assert (fog.equal_recall, fog.covered, fog.low, fog.equal_low) == (1.0, 0.5, None, None)
     assert (empty.objects, empty.recall, empty.equal_recall, empty.covered) == (0, None, None, None)
 
 
