@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivesem.data import fiftyone
 from drivesem.data.account import IMAGE_SUFFIXES, DataAccount, account_for_files
-from drivesem.data.image_headers import read_orientation, read_stored_header, read_upright_size
+from drivesem.data.image_headers import read_header, read_upright_size
 from drivesem.data.json_columns import BoxRowColumns
 from drivesem.data.label_table import REGION, LabelTable, join_tables, repeat_value
 from scene_ir import files
@@ -670,14 +670,23 @@ def read_turn(path: str | Path | None, size_wh: Sequence[int]) -> int:
     """Return the orientation by which an image's labels must be turned, 5 to 8; 1 if they are upright.
 
     Args:
-        path: The image.
-        size_wh: Its size in the annotation file. Labels are of stored pixels where only the stored image has this
-            size; where both have it, they are of the upright image.
+        path: The image; None or no file: labels are upright.
+        size_wh: Its size in the annotation file; 0 where unknown. Labels are of stored pixels where only the stored
+            image has this size; where both have it, they are of the upright image.
+
+    Raises:
+        FormatError: Neither the stored nor the upright image has this size, or the file is no image.
     """
-    if path is None or size_wh[0] == size_wh[1] or read_orientation(path) < 5:
+    if path is None or not size_wh[0] or not isfile(path):
         return 1
-    orientation, width, height = read_stored_header(path)
-    return orientation if (width, height) == tuple(size_wh) else 1
+    orientation, width, height = read_header(path)
+    upright = (height, width) if orientation > 4 else (width, height)
+    if upright == tuple(size_wh):
+        return 1
+    if (width, height) != tuple(size_wh):
+        found = f"{upright[0]}x{upright[1]} px"
+        raise FormatError(str(path), f"{size_wh[0]}x{size_wh[1]} px, as its annotation states", found)
+    return orientation
 
 
 def turn_points(points: NDArray[np.float64], orientation: int, size_wh: Sequence[int]) -> NDArray[np.float64]:

@@ -400,7 +400,9 @@ def test_a_camera_without_projection(tmp_path: Path) -> None:
 
 def test_images_missing_or_of_another_size(tmp_path: Path) -> None:
     dataset = coco.CocoDataset(foreign(tmp_path, images=[IMAGE | {"width": 79}]), focal_px=70.0)
-    with pytest.raises(FormatError, match=r"000000000139\.png: expected 79x40 px, found 80x40 px"):
+    with pytest.raises(
+        FormatError, match=r"000000000139\.png: expected 79x40 px, as its annotation states, found 80x40 px"
+    ):
         dataset.frame("000000000139")
     (tmp_path / "val2017" / "000000000139.png").unlink()
     with pytest.raises(FormatError, match=r"000000000139\.png: expected a readable file"):

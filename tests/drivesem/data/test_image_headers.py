@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from drivesem.data.image_headers import copy_upright, read_orientation, read_stored_header, read_upright_size
+from drivesem.data.coco_labels import read_turn
+from drivesem.data.image_headers import (
+    copy_upright,
+    read_header,
+    read_orientation,
+    read_stored_header,
+    read_upright_size,
+)
 from drivesem.data.photographs import read_upright, turn_pixels
+from scene_ir.errors import FormatError
 
 PIXELS = np.kron(np.random.default_rng(0).integers(0, 255, (3, 5, 3)), np.ones((16, 16, 1))).astype(np.uint8)
 OPTIONS = {".webp": {"lossless": True}, ".jpg": {"quality": 100, "subsampling": 0}}
@@ -44,3 +52,21 @@ def test_copies_have_the_mode_of_their_source(tmp_path: Path, mode: str) -> None
     with Image.open(tmp_path / "b.png") as copy:
         assert copy.mode == mode
         assert np.array_equal(np.asarray(copy), np.rot90(np.asarray(image), -1))
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp", "webp", "tif"])
+@pytest.mark.parametrize("options", [{}, {"progressive": True, "quality": 30}, {"exif": Image.Exif()}])
+def test_sizes_agree_with_pillow(suffix: str, options: dict[str, object], tmp_path: Path) -> None:
+    path = tmp_path / f"a.{suffix}"
+    Image.new("RGB", (321, 123), (10, 200, 30)).save(path, **options)
+    assert read_header(path) == read_stored_header(path) == (1, 321, 123)
+
+
+def test_a_size_that_the_image_does_not_have_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (100, 60)).save(path)
+    assert read_turn(path, (100, 60)) == read_turn(path, (0, 0)) == read_turn(tmp_path / "b.jpg", (9, 9)) == 1
+    with pytest.raises(
+        FormatError, match=r"a\.jpg: expected 640x480 px, as its annotation states, found 100x60 px"
+    ):
+        read_turn(path, (640, 480))

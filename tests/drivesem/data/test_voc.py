@@ -202,7 +202,7 @@ def test_missing_images_and_other_sizes(tmp_path: Path) -> None:
     write_xml(tmp_path / "y.xml", box())
     write_image(tmp_path / "x.jpg")
     dataset = open_dataset("voc", tmp_path)
-    with pytest.raises(FormatError, match=r"x.jpg: expected 50x40 px, as x.xml states, found 60x40 px"):
+    with pytest.raises(FormatError, match=r"x.jpg: expected 50x40 px, as its annotation states, found 60x40 px"):
         dataset.frame("x")
     with pytest.raises(FormatError, match=r"y.xml: expected an image of frame 'y' in the data set, found none"):
         dataset.frame("y")
