@@ -90,11 +90,6 @@ class PhotographDataset(FrameIndex[Path]):
         source, path = self._entry(identifier), self._files.images.get(identifier)
         if path is None:
             raise FormatError(str(source), f"an image of frame {identifier!r} in the data set", "none")
-        table = self._files.table((identifier,))
+        table = self._files.table((identifier,))  # refuses an image of another size
         provenance = {"dataset": self._files.layout, "image": path.name, "folder": path.parent.name}
-        frame = read_labelled_photograph(identifier, path, table.to_labels(), provenance, self.focal_px)
-        width, height = table.sizes_wh[0].tolist()
-        if width and (frame.camera.height, frame.camera.width) != (height, width):
-            found = f"{frame.camera.width}x{frame.camera.height} px"
-            raise FormatError(str(path), f"{width}x{height} px, as {source.name} states", found)
-        return frame
+        return read_labelled_photograph(identifier, path, table.to_labels(), provenance, self.focal_px)

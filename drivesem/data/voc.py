@@ -243,7 +243,7 @@ class VocFiles:
 
     def account(self) -> DataAccount:
         """Account for all files and objects."""
-        return self._account(*self._read(tuple(self.sources)))
+        return self._account(*self._read(tuple(self.sources), strict=False))
 
     def read_table(self) -> LabelTable:
         """Read the labels of all frames, with the splits and the account."""
@@ -252,8 +252,11 @@ class VocFiles:
         splits = {split: [position[name] for name in names] for split, names in self._splits.items()}
         return replace(table, splits=splits, account=self._account(table, repairs, unused))
 
-    def _read(self, identifiers: Sequence[str]) -> tuple[LabelTable, Counter[str], set[str]]:
-        """Read frames: their labels, repairs by what was done, and elements of objects that are not used."""
+    def _read(self, identifiers: Sequence[str], strict: bool = True) -> tuple[LabelTable, Counter[str], set[str]]:
+        """Read frames: their labels, repairs by what was done, and elements of objects that are not used.
+
+        An image of another size than its XML file states is an error if `strict`, else it is counted.
+        """
         repairs: Counter[str] = Counter()
         unused: set[str] = set()
         sizes = np.zeros((len(identifiers), 2), np.int64)
@@ -269,11 +272,17 @@ class VocFiles:
             own = np.array(content.boxes, np.float64).reshape(-1, 4)
             repairs["boxes from pixel 0 or less (pixels count from 1)"] += int((own[:, :2] < 1).any(axis=1).sum())
             own -= 1
-            size_wh = content.size_wh
+            size_wh, orientation = content.size_wh, 1
+            try:
+                orientation = read_turn(image, size_wh)
+            except FormatError:
+                if strict:
+                    raise
+                repairs["images of another size than stated (refused where they are used)"] += 1
             if not size_wh[0] and image is not None:
                 size_wh = read_upright_size(image)
                 repairs["image sizes that are missing (read from the image)"] += 1
-            elif (orientation := read_turn(image, size_wh)) != 1:
+            elif orientation != 1:
                 own = coco_to_xyxy(turn_boxes(xyxy_to_coco(own), orientation, size_wh))
                 size_wh = (size_wh[1], size_wh[0])
                 repairs["images with boxes of stored pixels (turned upright)"] += 1

@@ -208,7 +208,10 @@ def test_missing_images_and_other_sizes(tmp_path: Path) -> None:
         dataset.frame("y")
     account = dataset.account()
     assert account.without_image == 1
-    assert account.repairs == {"boxes from pixel 0 or less (pixels count from 1)": 1}
+    assert account.repairs == {
+        "boxes from pixel 0 or less (pixels count from 1)": 1,
+        "images of another size than stated (refused where they are used)": 1,
+    }
     with pytest.raises(
         FormatError, match=r"expected Pascal VOC's XML files, such as Annotations/NAME.xml, found none"
     ):
