@@ -199,7 +199,7 @@ class _RenderedVehicle:
 
 
 def _object_row(vehicle_render: _RenderedVehicle, mesh: int, scene: SceneIR) -> Objects:
-    """A vehicle's row of objects. Its label (`drivesem.attack.labels`) is empty at first."""
+    """A vehicle's row of objects. Its label (`drivesem.attacks.labels`) is empty at first."""
     vehicle, like = vehicle_render.vehicle, scene.objects.translation
     return Objects(
         mesh_index=torch.tensor([mesh]),

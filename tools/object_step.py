@@ -14,7 +14,7 @@ import argparse
 
 import torch
 
-from drivesem.attack.methods.gradient_ascent import SiFGSM
+from drivesem.attacks.methods.gradient_ascent import SiFGSM
 from drivesem.bench.timing import CallTime, PairedTimer, Spread
 from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.networks.loading import ARCHITECTURES, prepare_for_inference

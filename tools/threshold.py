@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from detectors.registry import load_detector
-from drivesem.attack.labels import Difficulty
+from drivesem.attacks.labels import Difficulty
 from drivesem.data.registry import open_dataset
 from drivesem.report.tables import format_count
 from drivesem.training.frames import FrameStore

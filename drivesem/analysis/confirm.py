@@ -17,7 +17,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.targets import HEADLINE, EvaluatedClasses
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses
 from drivesem.config.commands import ConfirmConfig
 from drivesem.config.constraints import is_url
 from drivesem.config.errors import UsageError

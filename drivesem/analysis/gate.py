@@ -14,8 +14,8 @@ import numpy as np
 
 from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
-from drivesem.attack.space import parse_params
-from drivesem.attack.targets import EvaluatedClasses, resolve_t_star
+from drivesem.attacks.space import parse_params
+from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import GateConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, LEVEL, PairedDifference, holm, paired_differences, ratio_metric

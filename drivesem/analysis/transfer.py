@@ -15,7 +15,7 @@ import torch
 from detectors.base import DetectorError, Predictor
 from detectors.registry import SHIPPED
 from detectors.types import CLASSES, Detections
-from drivesem.attack.targets import DEFAULT_T_STAR, HEADLINE, EvaluatedClasses, resolve_t_star
+from drivesem.attacks.targets import DEFAULT_T_STAR, HEADLINE, EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import TransferConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DetectionOptions

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.budgets import change_limits, parse_budget
-from drivesem.attack.feasibility_check import ChangeLimits, check_limits, check_scene
-from drivesem.attack.labels import Difficulty, Labeller, SceneLabels, to_kitti_labels
-from drivesem.attack.space import Budget, Parameter, ParameterSpace, Parametrisation
-from drivesem.attack.targets import EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attacks.budgets import change_limits, parse_budget
+from drivesem.attacks.feasibility_check import ChangeLimits, check_limits, check_scene
+from drivesem.attacks.labels import Difficulty, Labeller, SceneLabels, to_kitti_labels
+from drivesem.attacks.space import Budget, Parameter, ParameterSpace, Parametrisation
+from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_t_star
 from drivesem.config.commands import VerifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels

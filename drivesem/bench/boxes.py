@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from detectors.base import Detector
-from drivesem.attack.space import combo_parameters
+from drivesem.attacks.space import combo_parameters
 from drivesem.bench.scenes import HEIGHT, WIDTH
 from drivesem.bench.session import Columns
 from drivesem.bench.step import AttackSteps, pair_medians, time_pair

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from detectors.base import Detector
 from detectors.types import Targets
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import Labeller
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import Parameter, ParameterSpace, combo_parameters
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.labels import Labeller
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import Parameter, ParameterSpace, combo_parameters
 from drivesem.bench.scenes import BenchScene, build_bench_scene
 from drivesem.bench.session import Columns
 from drivesem.bench.timing import CallTime, PairedTimer, Spread, TimeBudget, repetitions

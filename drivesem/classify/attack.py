@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import Attack
+from drivesem.attacks.methods.base import Attack
 from drivesem.classify.networks.architectures import ImageClassifier
 from drivesem.classify.networks.loading import open_network
 from drivesem.classify.objective import (

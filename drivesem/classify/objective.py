@@ -8,10 +8,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.methods.base import GRADIENT_PASSES, Attack, ParameterGroup, Problem, Score
-from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
-from drivesem.attack.methods.gradient_free import Sampling
-from drivesem.attack.methods.scw import SCW
+from drivesem.attacks.methods.base import GRADIENT_PASSES, Attack, ParameterGroup, Problem, Score
+from drivesem.attacks.methods.gradient_ascent import SGD, SiFGSM
+from drivesem.attacks.methods.gradient_free import Sampling
+from drivesem.attacks.methods.scw import SCW
 from drivesem.classify.networks.architectures import ImageClassifier
 from drivesem.classify.scenes import ObjectScene
 from drivesem.classify.space import (

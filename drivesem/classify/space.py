@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attack.theta import ParameterSpec, ProjectedTheta, ThetaSpace, lattice_names, select_parameters
+from drivesem.attacks.theta import ParameterSpec, ProjectedTheta, ThetaSpace, lattice_names, select_parameters
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.geometry import weld_vertices

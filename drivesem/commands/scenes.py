@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from drivesem.attack.scene_edits import REMOVED, apply_edit
+from drivesem.attacks.scene_edits import REMOVED, apply_edit
 from drivesem.config.commands import DerenderConfig, EditConfig, RenderConfig
 from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting, read_frame_edit
 from drivesem.config.errors import UsageError

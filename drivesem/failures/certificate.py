@@ -17,9 +17,9 @@ from torch import Tensor
 from detectors import boxes
 from detectors.base import Predictor, predict
 from detectors.types import Targets
-from drivesem.attack import losses
-from drivesem.attack.labels import Labeller, visible_boxes
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks import losses
+from drivesem.attacks.labels import Labeller, visible_boxes
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.options import MIN_DRAWS
 from drivesem.failures import margins as margin
 from drivesem.failures.grades import Certificate, Kind

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from detectors.base import Predictor, predict
-from drivesem.attack.targets import EvaluatedClasses, resolve_t_star
+from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.evaluation.failures import FrameFailures
 from drivesem.failures.certificate import (
     CertificateRule,

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from detectors.base import Candidates, Detector, predict
 from detectors.incremental.reference import ReferencePass
-from drivesem.attack import losses
-from drivesem.attack.labels import visible_boxes
-from drivesem.attack.methods.base import GRADIENT_PASSES
-from drivesem.attack.objective import Objective
+from drivesem.attacks import losses
+from drivesem.attacks.labels import visible_boxes
+from drivesem.attacks.methods.base import GRADIENT_PASSES
+from drivesem.attacks.objective import Objective
 from drivesem.failures import margins as margin
 from drivesem.failures.certificate import pad_visible_boxes
 from drivesem.failures.kinds import LabelledDetections, match_detections

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.base import Candidates
-from drivesem.attack.losses import log_score_logits, threshold_logit
+from drivesem.attacks.losses import log_score_logits, threshold_logit
 from drivesem.failures.kinds import BACKGROUND_IOU, MATCH_IOU, SAME_PLACE_IOU
 
 MIN_MARGIN = -8.0

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.planted import compute_features
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.margin_search import UnitBox
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import SPECS, Parameter
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.methods.margin_search import UnitBox
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import SPECS, Parameter
 from drivesem.failures.certificate import (
     CompositorRenderer,
     NuisanceCamera,

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from drivesem.attack.space import ground_axes
+from drivesem.attacks.space import ground_axes
 from drivesem.config.errors import UsageError
 from drivesem.failures.jpeg import DifferentiableJpeg, Matrix, SeparableMap
 from scene_ir.types import LATTICE, SceneIR

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from detectors.base import Detector, DetectorError, Predictor, detector_device
 from detectors.registry import load_detector, load_predictor
-from drivesem.attack.budgets import format_budget, parse_budget, resolve_parameters
-from drivesem.attack.changes import (
+from drivesem.attacks.budgets import format_budget, parse_budget, resolve_parameters
+from drivesem.attacks.changes import (
     SAMPLES,
     VehicleChangeSettings,
     count_affordable_proposals,
@@ -27,21 +27,21 @@ from drivesem.attack.changes import (
     proposal_passes,
     propose_scenes,
 )
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
-from drivesem.attack.methods.gradient_ascent import APGD, FGSM, SGD, SiFGSM
-from drivesem.attack.methods.gradient_free import CMAES, FixedTheta, Placebo, Sampling
-from drivesem.attack.methods.margin_search import (
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
+from drivesem.attacks.methods.gradient_ascent import APGD, FGSM, SGD, SiFGSM
+from drivesem.attacks.methods.gradient_free import CMAES, FixedTheta, Placebo, Sampling
+from drivesem.attacks.methods.margin_search import (
     FIRST_HELD_OUT_SAMPLE,
     Climb,
     Corners,
     MarginSearch,
     margin_objective,
 )
-from drivesem.attack.methods.scw import SCW
-from drivesem.attack.objective import GRADIENT_FREE_TERMS, Objective
-from drivesem.attack.space import Parameter, parse_params
-from drivesem.attack.targets import HEADLINE, EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attacks.methods.scw import SCW
+from drivesem.attacks.objective import GRADIENT_FREE_TERMS, Objective
+from drivesem.attacks.space import Parameter, parse_params
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses, TargetSelection, resolve_t_star
 from drivesem.config.commands import DEFAULT_QUERIES, GRADIENT_FREE_METHODS, AttackConfig
 from drivesem.config.constraints import parse_part
 from drivesem.config.devices import check_device

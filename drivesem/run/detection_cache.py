@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
 from detectors.types import Detections
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.options import WorkerOptions
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.run.frame import detection_records, detections_from_records

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from detectors.base import Predictor, detector_device
 from detectors.registry import ONNX
-from drivesem.attack.budgets import parse_budget
-from drivesem.attack.feasible.constraints import FeasibilityLimits
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import Difficulty
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.feasible.constraints import FeasibilityLimits
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.labels import Difficulty
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade

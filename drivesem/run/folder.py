@@ -11,7 +11,7 @@ from typing import Any
 
 from detectors.base import DetectorError, Predictor
 from detectors.registry import find_code_to_run, load_predictor
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import OutputOptions, to_yaml

@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.budgets import change_limits
-from drivesem.attack.feasibility_check import available_check_method, check_scene
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import SceneLabels, to_kitti_labels, visible_boxes
-from drivesem.attack.methods.base import AttackResult
-from drivesem.attack.methods.gradient_free import Placebo
-from drivesem.attack.objective import Objective, RenderEvaluation
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.budgets import change_limits
+from drivesem.attacks.feasibility_check import available_check_method, check_scene
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.labels import SceneLabels, to_kitti_labels, visible_boxes
+from drivesem.attacks.methods.base import AttackResult
+from drivesem.attacks.methods.gradient_free import Placebo
+from drivesem.attacks.objective import Objective, RenderEvaluation
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.data import kitti
 from drivesem.evaluation import coco
 from drivesem.evaluation.failures import FrameFailures

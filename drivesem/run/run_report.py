@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.attack.budgets import parse_budget
-from drivesem.attack.space import combo_parameters
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.space import combo_parameters
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import COMBO_NUMBERS, AttackConfig, ReportConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import format_command_line

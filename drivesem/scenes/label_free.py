@@ -19,7 +19,7 @@ from detectors.base import Predictor, predict
 from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES, Detections
-from drivesem.attack.targets import resolve_t_star
+from drivesem.attacks.targets import resolve_t_star
 from drivesem.data.classes import VEHICLES, rename_to_types
 from drivesem.data.ground_truth import occlusion_from_visible
 from drivesem.data.label_table import UNKNOWN_OCCLUSION

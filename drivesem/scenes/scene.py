@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.attack.scene_edits import apply_edit
+from drivesem.attacks.scene_edits import apply_edit
 from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.errors import UsageError
 from drivesem.data import kitti

@@ -17,7 +17,7 @@ import numpy as np
 
 from detectors.base import Detector
 from detectors.registry import SHIPPED
-from drivesem.attack.labels import Difficulty
+from drivesem.attacks.labels import Difficulty
 from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.report.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
 from drivesem.report.tables import Console

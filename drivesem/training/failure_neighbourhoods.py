@@ -16,8 +16,8 @@ from torch import Tensor
 from detectors.base import Candidates, Detector, Predictor
 from detectors.training import Sample
 from detectors.types import CLASSES, Targets
-from drivesem.attack.feasible.constraints import FeasibilityLimits
-from drivesem.attack.space import Parameter
+from drivesem.attacks.feasible.constraints import FeasibilityLimits
+from drivesem.attacks.space import Parameter
 from drivesem.config.commands import AttackConfig
 from drivesem.data import kitti
 from drivesem.failures.margin_oracle import SHARPNESS

@@ -19,10 +19,10 @@ from detectors.base import Predictor
 from detectors.squeezedet import ANCHOR_SIZES_WH
 from detectors.training import AugmentedDataset, Sample
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import Difficulty, Labeller, LabelMode, append_other_labels, to_kitti_labels
-from drivesem.attack.space import PAPER_PARAMETERS, Parameter, ParameterSpace
-from drivesem.attack.targets import HEADLINE, EvaluatedClasses
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.labels import Difficulty, Labeller, LabelMode, append_other_labels, to_kitti_labels
+from drivesem.attacks.space import PAPER_PARAMETERS, Parameter, ParameterSpace
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses
 from drivesem.data import kitti
 from drivesem.data.classes import CLASS_OF_TYPE, IGNORED_TYPES, select_road_users
 from drivesem.data.registry import Dataset

@@ -16,8 +16,8 @@ from detectors.registry import load_detector, save_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, AuxiliaryLoss, Sample, TrainingSettings, train
 from detectors.types import CLASSES, Detections
-from drivesem.attack.labels import LabelMode
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.labels import LabelMode
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import AttackConfig, RetrainConfig
 from drivesem.config.constraints import parse_interval, parse_size_hw
 from drivesem.config.errors import UsageError

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from detectors.base import Predictor
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.base import ParameterGroup, Problem, Score
-from drivesem.attack.objective import Objective, RenderEvaluation
-from drivesem.attack.space import SPECS, Budget, Parameter, ParameterSpace
-from drivesem.attack.theta import ParameterSpec, ProjectedTheta, ThetaSpace
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.methods.base import ParameterGroup, Problem, Score
+from drivesem.attacks.objective import Objective, RenderEvaluation
+from drivesem.attacks.space import SPECS, Budget, Parameter, ParameterSpace
+from drivesem.attacks.theta import ParameterSpec, ProjectedTheta, ThetaSpace
 from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.evaluation.failures import match_detections
 from drivesem.video.clips import DerenderedClip

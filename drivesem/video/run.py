@@ -13,10 +13,10 @@ from torch import Tensor
 
 from detectors.base import detector_device
 from detectors.types import CLASSES
-from drivesem.attack.budgets import change_limits, parse_budget
-from drivesem.attack.feasibility_check import ChangeLimits, check_scene
-from drivesem.attack.methods.gradient_free import Placebo
-from drivesem.attack.targets import resolve_t_star
+from drivesem.attacks.budgets import change_limits, parse_budget
+from drivesem.attacks.feasibility_check import ChangeLimits, check_scene
+from drivesem.attacks.methods.gradient_free import Placebo
+from drivesem.attacks.targets import resolve_t_star
 from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.config.devices import check_device
 from drivesem.failures.certificate import CompositorRenderer

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from detectors import boxes
 from detectors.base import Predictor, detector_device
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.objective import Objective, RenderEvaluation
-from drivesem.attack.space import Budget
+from drivesem.attacks.feasibility_check import check_places
+from drivesem.attacks.objective import Objective, RenderEvaluation
+from drivesem.attacks.space import Budget
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
 from drivesem.report.tables import format_count

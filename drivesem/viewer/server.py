@@ -25,9 +25,9 @@ from urllib.parse import parse_qsl, urlsplit
 
 from detectors.base import DetectorError, Predictor
 from detectors.registry import load_predictor
-from drivesem.attack.budgets import parse_budget
-from drivesem.attack.space import Budget
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.space import Budget
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import ViewConfig
 from drivesem.config.errors import UsageError
 from drivesem.report.tables import format_count

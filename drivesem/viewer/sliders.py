@@ -1,7 +1,7 @@
 """Sliders of a scene in physical units, the states that they set, and the command that renders each state.
 
-Names, units and bounds are those of theta (`drivesem.attack.space`). The 96 mesh offsets of a vehicle share one slider:
-the share of the shape that the scene holds.
+Names, units and bounds are those of theta (`drivesem.attacks.space`). The 96 mesh offsets of a vehicle share one
+slider: the share of the shape that the scene holds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from drivesem.attack.space import (
+from drivesem.attacks.space import (
     SPECS,
     Budget,
     Parameter,

@@ -57,26 +57,26 @@ class Rule:
 
 _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.errors")
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
-_SEARCH = tuple(f"drivesem.attack.{name}" for name in ("theta", "space", "feasible", "methods"))
-_BELOW_FAILURES = ("attack", "scenes", "data", "evaluation", "config", "store", "synth")
-_BELOW_RUN = ("attack", "failures", "scenes", "data", "evaluation", "report", "config", "store")
+_SEARCH = tuple(f"drivesem.attacks.{name}" for name in ("theta", "space", "feasible", "methods"))
+_BELOW_FAILURES = ("attacks", "scenes", "data", "evaluation", "config", "store", "synth")
+_BELOW_RUN = ("attacks", "failures", "scenes", "data", "evaluation", "report", "config", "store")
 _NOT_IN_REPORTS = ("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster")
 RULES = (
     Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "PIL", "trimesh", "warp", "yaml")),
     Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
     *(Rule(package, (*_LOGIC, *_SEARCH), (*_LOGIC_LIBRARIES, "cma")) for package in _SEARCH),
-    # checks, independently, what drivesem.attack.feasible lets through
+    # checks, independently, what drivesem.attacks.feasible lets through
     Rule(
-        "drivesem.attack.feasibility_check",
+        "drivesem.attacks.feasibility_check",
         _LOGIC,
         (*_LOGIC_LIBRARIES, "cv2", "open3d"),
-        never=("drivesem.attack.feasible",),
+        never=("drivesem.attacks.feasible",),
     ),
     Rule(
         "drivesem.evaluation",
         ("detectors.types", "detectors.boxes"),
         ("torch", "numpy", "pycocotools", "ultrafast_pycocotools"),
-        never=("scene_ir", "drivesem.attack"),
+        never=("scene_ir", "drivesem.attacks"),
     ),
     Rule("drivesem.failures", ("scene_ir", "detectors", *(f"drivesem.{part}" for part in _BELOW_FAILURES)), None),
     # the second renderer of photographs shares nothing with the first one but the scene
@@ -85,7 +85,7 @@ RULES = (
             f"drivesem.failures.second_renderer.{name}",
             (
                 *("scene_ir.types", "scene_ir.errors", "detectors.types", "drivesem.failures.second_renderer"),
-                *("drivesem.attack.visibility", "drivesem.attack.labels.Difficulty"),
+                *("drivesem.attacks.visibility", "drivesem.attacks.labels.Difficulty"),
             ),
             ("torch", "numpy", "scipy", "cv2", "pyrender", "OpenGL", "triton"),
             never=("drivesem.failures.second_renderer.generator", "drivesem.failures.second_renderer.selection"),
@@ -226,14 +226,14 @@ def test_packages_import_only_what_they_may(rule: Rule) -> None:
         ("detectors/boxes.py", "from scene_ir.types import Labels"),
         ("detectors/boxes.py", "import onnxruntime"),
         ("detectors/training.py", "from rich.progress import Progress"),
-        ("drivesem/attack/methods/base.py", "from drivesem.attack import objective"),
-        ("drivesem/attack/methods/base.py", "from detectors import types"),
-        ("drivesem/attack/feasible/vehicles.py", "from scene_ir.render import compositor"),
-        ("drivesem/attack/feasibility_check.py", "from drivesem.attack.feasible.projection import FeasibleSet"),
+        ("drivesem/attacks/methods/base.py", "from drivesem.attacks import objective"),
+        ("drivesem/attacks/methods/base.py", "from detectors import types"),
+        ("drivesem/attacks/feasible/vehicles.py", "from scene_ir.render import compositor"),
+        ("drivesem/attacks/feasibility_check.py", "from drivesem.attacks.feasible.projection import FeasibleSet"),
         ("drivesem/evaluation/coco.py", "from scene_ir.types import Labels"),
         (
             "drivesem/evaluation/coco.py",
-            "import importlib\nimportlib.import_module('drivesem.attack.labels')",
+            "import importlib\nimportlib.import_module('drivesem.attacks.labels')",
         ),
         ("drivesem/run/attack.py", "def f():\n    from drivesem.analysis import verify"),
         ("drivesem/analysis/verify.py", "from drivesem.commands import verify"),
@@ -252,8 +252,8 @@ def test_the_rules_catch_what_they_forbid(file: str, source: str) -> None:
         ("scene_ir/io.py", "import json\nimport torch\nfrom scene_ir.types import Mesh"),
         ("detectors/adapters/onnx.py", "import onnxruntime"),
         (
-            "drivesem/attack/methods/gradient_ascent.py",
-            "from drivesem.attack.methods import base\nfrom scene_ir import ffd",
+            "drivesem/attacks/methods/gradient_ascent.py",
+            "from drivesem.attacks.methods import base\nfrom scene_ir import ffd",
         ),
         ("drivesem/run/frame.py", "from scene_ir.render import compositor\nfrom detectors import registry"),
         ("drivesem/run/report/page.py", "import jinja2\nfrom drivesem.run.results import RunSummary"),

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from detectors.types import CLASSES
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import coco
 from drivesem.run.frame import count_grades, detections_from_records, targets_from_records

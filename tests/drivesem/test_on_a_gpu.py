@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
-from drivesem.attack.budgets import parse_budget
+from drivesem.attacks.budgets import parse_budget
 from drivesem.cli import main
 from drivesem.viewer.scene import InteractiveScene
 from scene_ir.raster import launch

@@ -108,9 +108,9 @@ def test_importing_is_quick_and_every_name_is_there() -> None:
 
 
 def test_run_attack_stands_next_to_the_package() -> None:
-    from drivesem.attack import space
+    from drivesem.attacks import space
 
-    assert importlib.import_module("drivesem.attack.space") is space
+    assert importlib.import_module("drivesem.attacks.space") is space
     assert callable(ds.run_attack)
     with pytest.raises(UsageError, match="attack: expected options among"):
         ds.run_attack(None, nothing=1)  # pyright: ignore[reportArgumentType, reportCallIssue]

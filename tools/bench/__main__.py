@@ -16,7 +16,7 @@ from typing import Any
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector, load_predictor
 from drivesem import __version__
-from drivesem.attack.space import parse_params
+from drivesem.attacks.space import parse_params
 from drivesem.bench import render
 from drivesem.bench.scenes import MAX_CARS
 from drivesem.bench.session import BenchResult, BenchTable, output_paths, run_benchmark, show_progress

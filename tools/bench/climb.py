@@ -10,8 +10,8 @@ from functools import partial
 import torch
 
 from detectors.base import Detector
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.session import Columns
 from drivesem.bench.timing import Spread

@@ -15,9 +15,9 @@ from detectors import boxes
 from detectors.base import Detector
 from detectors.registry import load_detector
 from detectors.types import Detections
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.bench.session import Columns
 from drivesem.bench.timing import PairedTimer, Spread
 from drivesem.synth import frames as generated

@@ -23,9 +23,9 @@ from detectors.base import Predictor
 from detectors.boxes import iou_matrix
 from detectors.registry import load_predictor
 from detectors.types import Detections
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.labels import Labeller, SceneLabels
-from drivesem.attack.scene_edits import apply_changes
+from drivesem.attacks.feasibility_check import check_places
+from drivesem.attacks.labels import Labeller, SceneLabels
+from drivesem.attacks.scene_edits import apply_changes
 from drivesem.bench.session import Columns
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.options import SceneOptions

@@ -36,9 +36,9 @@ from torch import Tensor
 from detectors.base import AnchorPredictions, DetectorError
 from detectors.registry import load_detector
 from detectors.squeezedet import AnchorAssignment, SqueezeDet
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.labels import Labeller
-from drivesem.attack.space import COMBOS, PAPER_PARAMETERS, Parameter, ParameterSpace, StepSizes
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.labels import Labeller
+from drivesem.attacks.space import COMBOS, PAPER_PARAMETERS, Parameter, ParameterSpace, StepSizes
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.report.tables import Console, format_count, print_json

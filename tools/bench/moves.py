@@ -18,7 +18,7 @@ import torch
 
 from detectors.boxes import iou_matrix
 from detectors.registry import load_predictor
-from drivesem.attack.budgets import PAPER, PRESETS, STREET
+from drivesem.attacks.budgets import PAPER, PRESETS, STREET
 from drivesem.bench.session import Columns
 from drivesem.run.workers import run_jobs
 from drivesem.synth.edits import apply_edit

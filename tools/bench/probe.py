@@ -103,9 +103,9 @@ def _attack(order: ProbeOrder) -> ResidentMemory:
     import torch
 
     from detectors.registry import load_detector
-    from drivesem.attack.feasible.projection import FeasibleSet
-    from drivesem.attack.objective import Objective, compute_gradients
-    from drivesem.attack.space import ParameterSpace, combo_parameters
+    from drivesem.attacks.feasible.projection import FeasibleSet
+    from drivesem.attacks.objective import Objective, compute_gradients
+    from drivesem.attacks.space import ParameterSpace, combo_parameters
     from scene_ir.io import load_scene
     from scene_ir.render.compositor import Compositor
 

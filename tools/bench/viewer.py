@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from detectors.base import Predictor
-from drivesem.attack.budgets import PRESETS, STREET
+from drivesem.attacks.budgets import PRESETS, STREET
 from drivesem.bench.session import Columns
 from drivesem.bench.timing import Spread
 from drivesem.scenes.scene import demo_scene

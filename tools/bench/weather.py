@@ -20,8 +20,8 @@ from torch import Tensor
 
 from detectors.base import Predictor, predict
 from detectors.registry import load_predictor
-from drivesem.attack.losses import candidates_from_detections
-from drivesem.attack.targets import resolve_t_star
+from drivesem.attacks.losses import candidates_from_detections
+from drivesem.attacks.targets import resolve_t_star
 from drivesem.bench.session import Columns
 from drivesem.config.edits import FrameEdit
 from drivesem.failures.margins import object_margins

@@ -28,9 +28,9 @@ from drivesem.analysis.transfer import (
     TransferTarget,
 )
 from drivesem.analysis.verify import THETA, CheckLog, check_change
-from drivesem.attack.budgets import parse_budget
-from drivesem.attack.space import Parameter, ParameterSpace, parse_params
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.space import Parameter, ParameterSpace, parse_params
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import AttackConfig, ReportConfig
 from drivesem.config.edits import read_edits, read_frame_edit
 from drivesem.config.options import to_yaml

@@ -24,8 +24,8 @@ from drivesem.analysis.evaluate.conditions import (
     write_conditions,
 )
 from drivesem.analysis.evaluate.files import MANY_FRAMES
-from drivesem.attack.labels import Difficulty
-from drivesem.attack.targets import HEADLINE, EvaluatedClasses, resolve_t_star
+from drivesem.attacks.labels import Difficulty
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError
 from drivesem.data.account import write_account

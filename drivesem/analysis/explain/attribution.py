@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import RangeError
 

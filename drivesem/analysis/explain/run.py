@@ -44,11 +44,11 @@ from drivesem.analysis.explain.report import (
     plot_waterfalls,
     summarise_parameters,
 )
-from drivesem.attack.budgets import change_limits
-from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.methods.base import Problem, Score
-from drivesem.attack.objective import Objective, RenderEvaluation
-from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.attacks.budgets import change_limits
+from drivesem.attacks.feasibility_check import check_scene
+from drivesem.attacks.methods.base import Problem, Score
+from drivesem.attacks.objective import Objective, RenderEvaluation
+from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.config.commands import ExplainConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS

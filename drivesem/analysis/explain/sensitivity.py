@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from drivesem.attack.objective import Objective, RenderEvaluation
+from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.report.drawing import (
     MARGIN_PX,
     PAPER_COLOUR,

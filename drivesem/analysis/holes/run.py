@@ -29,7 +29,7 @@ from drivesem.analysis.holes.rules import (
     join_samples,
     merge_holes,
 )
-from drivesem.attack.space import parse_params
+from drivesem.attacks.space import parse_params
 from drivesem.config.commands import HolesConfig
 from drivesem.failures.failure_probability import UnitCubePoint, estimate_failure_probability
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood, ObjectSample, SceneSampler

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from detectors.types import CLASSES, Targets
-from drivesem.attack.labels import Difficulty
+from drivesem.attacks.labels import Difficulty
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.errors import UsageError
 from drivesem.failures.second_renderer.base import SecondRender

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from detectors.types import CLASSES, Targets
-from drivesem.attack.labels import Difficulty
-from drivesem.attack.visibility import compute_contrasts
+from drivesem.attacks.labels import Difficulty
+from drivesem.attacks.visibility import compute_contrasts
 from drivesem.failures.second_renderer import shading
 from drivesem.failures.second_renderer.baking import BakedAppearance, TextureAtlas, bake_atlas
 from drivesem.failures.second_renderer.base import SecondRender

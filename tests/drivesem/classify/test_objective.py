@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import nn
 
-from drivesem.attack.methods.base import Score
-from drivesem.attack.methods.gradient_ascent import SGD, SiFGSM
-from drivesem.attack.methods.gradient_free import Sampling
-from drivesem.attack.methods.scw import SCW
+from drivesem.attacks.methods.base import Score
+from drivesem.attacks.methods.gradient_ascent import SGD, SiFGSM
+from drivesem.attacks.methods.gradient_free import Sampling
+from drivesem.attacks.methods.scw import SCW
 from drivesem.classify.objective import ClassifierObjective, ClassLogits, class_margin, compute_attack_loss
 from drivesem.classify.scenes import DRAWN_PX, ObjectScene
 from drivesem.classify.space import ObjectSpace, ParameterAmounts, parse_parameters

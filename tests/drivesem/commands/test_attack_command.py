@@ -13,7 +13,7 @@ import torch
 
 from detectors.incremental import reference
 from detectors.types import CLASSES, Detections
-from drivesem.attack.feasibility_check import check_scene
+from drivesem.attacks.feasibility_check import check_scene
 from drivesem.cli import main
 from drivesem.config.commands import GRADIENT_FREE_METHODS, AttackConfig
 from drivesem.run import attack as run_attack
@@ -378,7 +378,7 @@ def test_a_gradient_that_is_no_number_names_frame_and_coordinate(
             gradients[0][0] = torch.nan
         return gradients
 
-    monkeypatch.setattr("drivesem.attack.objective.torch.autograd.grad", broken)
+    monkeypatch.setattr("drivesem.attacks.objective.torch.autograd.grad", broken)
     words = ["attack", "--params", "rotate", "--steps", "1", "--limit", "2", "--workers", "1"]
     (line,) = [
         ln

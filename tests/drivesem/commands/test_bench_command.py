@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from drivesem.attack.space import combo_parameters
+from drivesem.attacks.space import combo_parameters
 from drivesem.bench import render, step
 from drivesem.bench.scenes import build_bench_scene
 from drivesem.bench.timing import CallTime

@@ -19,9 +19,9 @@ from detectors.base import Detector
 from detectors.types import CLASSES, Detections
 from drivesem.analysis.explain import run as explaining
 from drivesem.analysis.explain.attribution import SCHEMA, Explanation
-from drivesem.attack.feasibility_check import check_scene
-from drivesem.attack.methods.gradient_free import FixedTheta
-from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.attacks.feasibility_check import check_scene
+from drivesem.attacks.methods.gradient_free import FixedTheta
+from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
 from drivesem.run import attack as run_attack

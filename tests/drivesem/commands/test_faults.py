@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from drivesem.attack.objective import Objective
+from drivesem.attacks.objective import Objective
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run.frame import AttackedScene

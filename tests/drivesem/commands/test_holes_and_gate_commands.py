@@ -20,7 +20,7 @@ from detectors.planted import compute_features
 from detectors.types import Detections
 from drivesem.analysis import gate as gate_analysis
 from drivesem.analysis.holes.rules import FrameHoles, FrameRuleSamples
-from drivesem.attack.labels import Labeller
+from drivesem.attacks.labels import Labeller
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder

@@ -16,9 +16,9 @@ import yaml
 
 from detectors.types import CLASSES, Detections
 from drivesem.analysis.verify import CHECKS
-from drivesem.attack.budgets import PRESETS
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.attacks.budgets import PRESETS
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.cli import main
 from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.scene_edits import apply_changes, apply_edit
-from drivesem.attack.space import ParameterSpace, Perturbation
+from drivesem.attacks.feasibility_check import check_places
+from drivesem.attacks.scene_edits import apply_changes, apply_edit
+from drivesem.attacks.space import ParameterSpace, Perturbation
 from drivesem.config.edits import (
     ALL,
     WEATHER_CODES,

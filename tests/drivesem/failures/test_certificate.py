@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from detectors.types import Detections, Targets
-from drivesem.attack.labels import Labeller
+from drivesem.attacks.labels import Labeller
 from drivesem.evaluation.resampling import wilson
 from drivesem.failures.certificate import (
     CertificateRule,

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from detectors.types import Detections
-from drivesem.attack.labels import Labeller
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.labels import Labeller
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.evaluation import failures
 from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.grades import Grade

@@ -7,8 +7,8 @@ import torch
 
 from detectors.incremental.reference import LIMIT_MB
 from detectors.registry import load_detector
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import ParameterSpace
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import ParameterSpace
 from drivesem.config.commands import AttackConfig
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances

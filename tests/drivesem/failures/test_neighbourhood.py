@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from detectors.registry import load_detector
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import Budget, ParameterSpace
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import Budget, ParameterSpace
 from drivesem.failures.neighbourhood import Neighbourhood, SceneSampler
 from drivesem.failures.nuisances import Nuisances
 from drivesem.synth.demo import demo_scene

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drivesem.attack.budgets import format_budget, parse_budget
+from drivesem.attacks.budgets import format_budget, parse_budget
 from drivesem.config.commands import AttackConfig
 from drivesem.config.parsing import parse
 from drivesem.run.run_report import PROTOCOL, follows_paper

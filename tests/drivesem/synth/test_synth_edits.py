@@ -73,7 +73,7 @@ def test_the_sun_moves_about_the_vertical_and_shines_stronger(plan):
 
 
 def test_it_moves_as_the_compositor_moves_it(plan):
-    from drivesem.attack.space import ground_axes
+    from drivesem.attacks.space import ground_axes
 
     actor = plan.actors[1]
     view = plan.setting.view

@@ -14,7 +14,7 @@ from torch import Tensor
 from detectors.base import Candidates
 from detectors.registry import load_detector
 from detectors.types import CLASSES
-from drivesem.attack.space import parse_params
+from drivesem.attacks.space import parse_params
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.run.folder import load_attack_config
 from drivesem.run.results import Failure

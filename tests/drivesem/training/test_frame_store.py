@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from detectors.types import CLASSES
-from drivesem.attack.labels import Difficulty
+from drivesem.attacks.labels import Difficulty
 from drivesem.data.kitti import KittiDataset
 from drivesem.training.frames import (
     PIXELS,

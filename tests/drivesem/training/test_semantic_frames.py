@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from detectors.types import CLASSES
-from drivesem.attack.labels import Labeller, append_other_labels, to_kitti_labels
-from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
+from drivesem.attacks.labels import Labeller, append_other_labels, to_kitti_labels
+from drivesem.attacks.space import PAPER_PARAMETERS, ParameterSpace
 from drivesem.data import kitti
 from drivesem.data.kitti import KittiDataset
 from drivesem.training.frames import (

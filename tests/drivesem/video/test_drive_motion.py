@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.space import ParameterSpace
+from drivesem.attacks.space import ParameterSpace
 from drivesem.synth.demo import make_drive
 from drivesem.video.clips import DerenderedClip, object_tracks
 from drivesem.video.objective import ClipSpace

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import Budget, Parameter, ParameterSpace
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.space import Budget, Parameter, ParameterSpace
 from drivesem.video.clips import DerenderedClip
 from drivesem.video.objective import ClipSpace, project_clip
 from drivesem.video.report import CarResult, MissedInterval

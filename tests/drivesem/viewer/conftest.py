@@ -12,7 +12,7 @@ import pytest
 from torch import Tensor
 
 from detectors.types import CLASSES, Detections
-from drivesem.attack.budgets import PRESETS
+from drivesem.attacks.budgets import PRESETS
 from drivesem.viewer.server import Server, Viewer, ViewerFrame
 from scene_ir.io import load_scene, save_scene
 from scene_ir.types import SceneIR

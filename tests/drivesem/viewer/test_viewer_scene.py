@@ -11,9 +11,9 @@ import torch
 
 from detectors.registry import load_detector
 from detectors.types import Detections, Targets
-from drivesem.attack.budgets import PRESETS
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.objective import Objective, RenderEvaluation
+from drivesem.attacks.budgets import PRESETS
+from drivesem.attacks.feasibility_check import check_places
+from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.viewer.scene import InteractiveScene, best_score
 from scene_ir.io import load_scene, to_uint8
 from scene_ir.types import Render, SceneIR

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivesem.attack.budgets import PRESETS
+from drivesem.attacks.budgets import PRESETS
 from drivesem.viewer.scene import InteractiveScene
 from drivesem.viewer.server import HOST, POLICY, Server, Viewer, ViewerFrame
 from tests.drivesem.viewer.conftest import GRID, Stubborn

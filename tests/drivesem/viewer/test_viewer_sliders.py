@@ -12,9 +12,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivesem.attack.budgets import PRESETS, parse_budget
-from drivesem.attack.scene_edits import apply_changes
-from drivesem.attack.space import Parameter
+from drivesem.attacks.budgets import PRESETS, parse_budget
+from drivesem.attacks.scene_edits import apply_changes
+from drivesem.attacks.space import Parameter
 from drivesem.config.commands import EditConfig, RenderConfig
 from drivesem.config.edits import merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.parsing import parse

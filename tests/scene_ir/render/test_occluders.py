@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.labels import hidden_shares
+from drivesem.attacks.labels import hidden_shares
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.files import read_json, write_json
 from scene_ir.io import load_scene, save_scene

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from detectors.types import Detections
-from drivesem.attack.feasibility_check import check_places
-from drivesem.attack.labels import Labeller
+from drivesem.attacks.feasibility_check import check_places
+from drivesem.attacks.labels import Labeller
 from drivesem.evaluation.resampling import wilson
 from scene_ir.errors import FormatError
 from scene_ir.io import save_scene

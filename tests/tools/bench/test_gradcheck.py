@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.attack.space import PAPER_PARAMETERS, Parameter
+from drivesem.attacks.space import PAPER_PARAMETERS, Parameter
 from scene_ir.types import Camera, Mesh, SceneIR
 from tools.bench import gradcheck
 from tools.bench import gradcheck as gradcheck_command

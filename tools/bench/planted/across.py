@@ -15,9 +15,9 @@ from detectors.base import Detector, DetectorError
 from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
 from drivesem.analysis.holes.rules import FeatureSamples
-from drivesem.attack.budgets import parse_budget
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions, shared_options
 from drivesem.run.attack import AttackWorker, build_grader

@@ -19,7 +19,7 @@ from detectors import boxes
 from detectors.base import Detector, DetectorWrapper, lower_probability
 from detectors.planted import BLIND_TO, FEATURES, Band, PlantedFault, compute_features, group_cars
 from detectors.types import CLASSES
-from drivesem.attack.objective import Objective
+from drivesem.attacks.objective import Objective
 from drivesem.evaluation.failures import MATCH_IOU
 from drivesem.failures.neighbourhood import ObjectSample, SceneSampler
 from drivesem.failures.nuisances import Nuisances

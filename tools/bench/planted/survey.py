@@ -14,8 +14,8 @@ from detectors import boxes
 from detectors.base import lower_probability
 from detectors.planted import BLIND_TO, FEATURES, PIXEL_FEATURES, Band, PlantedFault, compute_features, group_cars
 from detectors.types import CLASSES
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.objective import Objective
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.objective import Objective
 from drivesem.evaluation.failures import MATCH_IOU
 from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.nuisances import Nuisances

@@ -15,9 +15,9 @@ from detectors.planted import Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
 from drivesem.analysis.holes.rules import FeatureSamples
 from drivesem.analysis.holes.run import draw_samples_around
-from drivesem.attack.budgets import parse_budget
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import ParameterSpace, parse_params
+from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.config.commands import AttackConfig, HolesConfig
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions, shared_options

@@ -13,8 +13,8 @@ import torch
 
 from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import PAPER_PARAMETERS, ParameterSpace
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import PAPER_PARAMETERS, ParameterSpace
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions
 from drivesem.failures.margin_oracle import NuisanceMarginOracle

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.methods.base import MarginOracle
-from drivesem.attack.space import SPECS, Parameter, ParameterSpace
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.methods.base import MarginOracle
+from drivesem.attacks.space import SPECS, Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 

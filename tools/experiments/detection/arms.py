@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from drivesem.analysis.transfer import parse_detector_names, shorten_detector_names
-from drivesem.attack.methods.base import GRADIENT_PASSES
-from drivesem.attack.space import PAPER_PARAMETERS, Parameter
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.methods.base import GRADIENT_PASSES
+from drivesem.attacks.space import PAPER_PARAMETERS, Parameter
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import COMBO_NUMBERS, DEFAULT_COMBO, AttackConfig
 from drivesem.config.options import GradingOptions, SceneAttackOptions, WorkerOptions, shared_options
 from drivesem.run.attack import WRITTEN, AttackWorker, attack_frames, select_frames

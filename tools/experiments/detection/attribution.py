@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivesem.analysis.transfer import format_interval
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.evaluation.resampling import Interval, NamedMetric, holm, paired_differences
 from drivesem.report.plots import PLOT_COLOURS

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from detectors.types import CLASSES
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult

@@ -11,7 +11,7 @@ import torch
 
 from detectors import boxes
 from detectors.types import CLASSES
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.evaluation import failures
 from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult

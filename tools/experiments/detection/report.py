@@ -9,7 +9,7 @@ from typing import Any
 
 from drivesem.analysis.confirm import Confirmation
 from drivesem.analysis.transfer import format_interval
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.evaluation.resampling import Interval, PairedDifference
 from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grades import Grade, Kind

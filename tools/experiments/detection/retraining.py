@@ -13,8 +13,8 @@ from detectors.base import Detector
 from detectors.registry import load_detector, read_weights, save_detector
 from detectors.types import CLASSES, Detections
 from drivesem.analysis.transfer import TransferCounts, evaluate_pairs, load_target_detectors
-from drivesem.attack.labels import Difficulty
-from drivesem.attack.targets import HEADLINE, resolve_t_star
+from drivesem.attacks.labels import Difficulty
+from drivesem.attacks.targets import HEADLINE, resolve_t_star
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.failures.second_renderer.selection import SecondRenderers

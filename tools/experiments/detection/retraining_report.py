@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivesem.analysis.transfer import AP50, BROKEN, LOST, format_interval
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.evaluation.resampling import Interval
 from drivesem.report.plots import PLOT_COLOURS
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent

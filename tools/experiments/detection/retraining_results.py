@@ -17,7 +17,7 @@ from drivesem.analysis.transfer import (
     compute_transfer_row,
     headline_metrics,
 )
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.evaluation.coco import ClassScores
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.evaluation.resampling import Interval, NamedMetric, bootstrap_intervals, paired_differences

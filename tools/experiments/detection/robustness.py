@@ -18,9 +18,9 @@ import numpy as np
 
 from detectors.base import Predictor
 from detectors.registry import load_detector
-from drivesem.attack.feasible.constraints import FeasibilityLimits
-from drivesem.attack.space import Parameter
-from drivesem.attack.targets import resolve_t_star
+from drivesem.attacks.feasible.constraints import FeasibilityLimits
+from drivesem.attacks.space import Parameter
+from drivesem.attacks.targets import resolve_t_star
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import LEVEL, Interval

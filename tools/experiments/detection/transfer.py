@@ -28,7 +28,7 @@ from drivesem.analysis.transfer import (
     parse_detector_names,
     write_heatmap,
 )
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.config.options import DetectionOptions
 from drivesem.evaluation.resampling import Interval, paired_differences

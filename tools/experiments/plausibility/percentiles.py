@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from drivesem.attack.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
-from drivesem.attack.space import behind_camera
+from drivesem.attacks.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
+from drivesem.attacks.space import behind_camera
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count

@@ -11,7 +11,7 @@ import torch
 from detectors.base import DetectorError
 from detectors.types import CLASSES, Detections
 from drivesem.analysis.transfer import DETECTIONS
-from drivesem.attack.targets import EvaluatedClasses, resolve_t_star
+from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.config.errors import UsageError
 from drivesem.config.options import WorkerOptions
 from drivesem.run.detection_cache import DetectionCache, DetectorSpec, cache_detections

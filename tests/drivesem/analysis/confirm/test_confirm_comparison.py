@@ -9,7 +9,7 @@ import torch
 
 from detectors.types import CLASSES, Detections, Targets
 from drivesem.analysis.confirm import compare_failures, compare_objects, pair_targets
-from drivesem.attack.targets import EvaluatedClasses
+from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.run.results import BoxRecord, Failure
 

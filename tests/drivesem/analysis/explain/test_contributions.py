@@ -8,8 +8,8 @@ import torch
 
 from drivesem.analysis.explain.attribution import ThetaPart
 from drivesem.analysis.explain.run import PartialChangeEvaluator, compute_contributions
-from drivesem.attack.methods.base import ParameterGroup, Problem, Score
-from drivesem.attack.theta import ProjectedTheta
+from drivesem.attacks.methods.base import ParameterGroup, Problem, Score
+from drivesem.attacks.theta import ProjectedTheta
 
 THETA = torch.tensor([0.2, 0.4, 0.1, 0.3])
 

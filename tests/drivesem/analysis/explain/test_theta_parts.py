@@ -13,7 +13,7 @@ from drivesem.analysis.explain.attribution import (
     split_by_object,
     split_by_parameter,
 )
-from drivesem.attack.space import Budget, ParameterSpace
+from drivesem.attacks.space import Budget, ParameterSpace
 
 TWO = ((-2.5, 9.0), (2.5, 12.0))
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.labels import Labeller
+from drivesem.attacks.labels import Labeller
 from drivesem.failures.second_renderer.opengl import OpenGLContext
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.synth.demo import demo_scene

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivesem.attack.targets import HEADLINE
+from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import AttackConfig
 from drivesem.config.options import to_yaml
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame

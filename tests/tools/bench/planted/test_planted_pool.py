@@ -8,8 +8,8 @@ import torch
 from detectors.base import predict
 from detectors.planted import PlantedDetector, PlantedFault
 from detectors.registry import load_detector
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import ParameterSpace
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import ParameterSpace
 from drivesem.failures.neighbourhood import SceneSampler
 from drivesem.failures.nuisances import Nuisances
 from drivesem.run.records import dump_record, load_record

@@ -5,9 +5,9 @@ import torch
 
 from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.objective import Objective
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.objective import Objective
+from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.evaluation import failures
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor

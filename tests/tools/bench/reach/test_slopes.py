@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attack.feasible.projection import FeasibleSet
-from drivesem.attack.space import Parameter, ParameterSpace
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.space import Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.types import SceneIR

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from detectors.types import CLASSES
-from drivesem.attack.targets import HEADLINE, EvaluatedClasses
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses
 from drivesem.config.commands import AttackConfig
 from drivesem.run.results import BoxRecord, Coordinate, FrameResult
 from tests.drivesem.counting import summary_of

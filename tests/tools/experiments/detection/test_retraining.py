@@ -21,7 +21,7 @@ from drivesem.analysis.transfer import (
     TransferCounts,
     TransferTarget,
 )
-from drivesem.attack.methods.base import Attack
+from drivesem.attacks.methods.base import Attack
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.run.frame import detections_from_records
 from drivesem.run.results import FrameResult

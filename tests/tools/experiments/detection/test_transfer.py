@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from detectors.types import Detections
-from drivesem.attack.methods.base import Attack
+from drivesem.attacks.methods.base import Attack
 from drivesem.run import detection_cache as looking
 from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS
 from tests.tools.experiments.conftest import REQUIRED_KEYS

@@ -1,0 +1,411 @@
+"""The loss of theta: an attack's objective on one scene, from renderer, labels and detector."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from detectors.base import AnchorPredictions, Detector, Predictor, predict, run_in_halves
+from detectors.incremental.reference import LIMIT_MB, ReferencePass
+from detectors.incremental.regions import Rect
+from detectors.types import Detections, Targets
+from drivesem.attacks import losses
+from drivesem.attacks.budgets import parse_budget, resolve_parameters
+from drivesem.attacks.feasible.constraints import FeasibilityLimits
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.labels import Difficulty, Labeller, LabelMode, SceneLabels
+from drivesem.attacks.methods.base import GRADIENT_PASSES, MarginOracle, ParameterGroup, Problem, Score
+from drivesem.attacks.space import Parameter, ParameterSpace
+from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attacks.visibility import VisibilityUnderWeather
+from drivesem.config.commands import AttackConfig
+from drivesem.evaluation import failures
+from scene_ir import ffd
+from scene_ir.errors import RangeError, ShapeError
+from scene_ir.io import round_to_8bit
+from scene_ir.render.compositor import Compositor, render_batch
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.types import Render, SceneIR
+
+GRADIENT_FREE_TERMS = ("objectness", *losses.GOALS)
+"""Terms that need detections only."""
+_RECENT = 3
+"""Number of cached evaluations: an attack's last scores, so that its result need not be rendered again."""
+
+
+@dataclass(frozen=True, slots=True)
+class RenderEvaluation:
+    """One state of the scene, rendered, detected and labelled, without gradients."""
+
+    scene: SceneIR
+    """The scene at theta."""
+    render: Render
+    """Its render, rounded to 8 bits."""
+    detections: Detections
+    """Detections; labels are indices into the evaluated classes."""
+    paper: SceneLabels
+    """The benign labels."""
+    moved: SceneLabels
+    """Labels that follow the vehicles."""
+    loss: float
+    """The objective."""
+
+
+class Objective:
+    """The loss that an attack raises, as a function of theta (D,).
+
+    `passes` counts detector passes so far, a gradient as GRADIENT_PASSES; the benign picture's is the first.
+    """
+
+    def __init__(
+        self,
+        compositor: Compositor,
+        space: ParameterSpace,
+        detector: Predictor,
+        config: AttackConfig | None = None,
+        difficulty: Difficulty | None = None,
+    ) -> None:
+        """Render and evaluate the benign scene.
+
+        Args:
+            compositor: renders the scene.
+            space: the parameter space of the scene.
+            detector: the detector under attack; one without a gradient has GRADIENT_FREE_TERMS only.
+            config: settings of the loss, the targets and the detector's passes; None: the defaults.
+            difficulty: which objects are evaluated.
+
+        Raises:
+            DetectorError: the detector knows no cars, or does not provide the candidates that a goal needs.
+            RangeError: the detector does not provide the term.
+        """
+        config = config or AttackConfig()
+        self.compositor = compositor
+        self.space = space
+        self.detector = detector
+        self.label_mode: LabelMode = config.objective_labels
+        self.term: str = config.objective
+        self.t_star = resolve_t_star(detector, config.t_star)
+        self.classes = EvaluatedClasses.from_detector(detector)
+        self.aim = TargetSelection.from_options(config.target_objects, config.target_classes)
+        self.difficulty = difficulty or Difficulty()
+        with torch.no_grad():
+            base_render = compositor.render(space.apply(space.scene, space.theta0).origin)
+        base = space.scene.origin
+        self.labeller = Labeller(base, base_render, self.difficulty)
+        """Labels states of the scene."""
+        self.keep_mb = config.keep_mb
+        self.whole = True  # the reference comes first
+        """Whether the detector always evaluates whole pictures."""
+        self._reference: ReferencePass | None = None
+        self.benign = self.evaluate_render(base, base_render)
+        """The scene at theta = 0, re-rendered; the one before, where vehicles were exchanged, added or removed."""
+        self.whole = config.whole
+        self.passes = 1
+        self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
+        self._scores: dict[bytes, Score] = {}
+        self.previews: dict[bytes, Score] = {}
+
+    @classmethod
+    def from_config(
+        cls, scene: SceneIR, detector: Predictor, config: AttackConfig, difficulty: Difficulty | None = None
+    ) -> Objective:
+        """The objective of an attack's settings on one scene.
+
+        Args:
+            scene: on the detector's device.
+            detector: the detector under attack.
+            config: the settings.
+            difficulty: which objects are evaluated.
+        """
+        budget, params = parse_budget(config.budget), resolve_parameters(config)
+        space = ParameterSpace(scene, params, budget, parametrisation=config.parametrisation)
+        return cls(Compositor(scene, RenderSettings(backend=config.backend)), space, detector, config, difficulty)
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
+        return _compute_losses([self], [theta])[0]
+
+    def loss_and_grad(self, theta: Tensor, feasible: FeasibleSet | None = None) -> tuple[float, Tensor]:
+        """Loss and its gradient (D,) at theta (D,), for the coordinates that `feasible` leaves free. Raises
+        RangeError naming the coordinate where either is not finite.
+        """
+        leaf = theta.detach().clone().requires_grad_(True)
+        (loss,) = _compute_losses([self], [leaf])
+        (gradient,) = torch.autograd.grad(loss, leaf)
+        self.passes += GRADIENT_PASSES
+        self.space.check_gradient(gradient)
+        return float(loss.detach()), gradient if feasible is None else feasible.project_gradient(theta, gradient)
+
+    @torch.no_grad()
+    def evaluate(self, theta: Tensor) -> RenderEvaluation:
+        """Render, detect and label at theta (D,), without gradients."""
+        if self.space.scene.before is None and torch.equal(theta, self.space.theta0):
+            return self.benign
+        for recent_theta, evaluation in self._recent:
+            if torch.equal(theta, recent_theta):
+                return evaluation
+        scene = self.space.apply(self.space.scene, theta)
+        self.passes += 1
+        evaluation = self.evaluate_render(scene, self.compositor.render(scene))
+        self._recent.append((theta.clone(), evaluation))
+        return evaluation
+
+    def failures(self, evaluation: RenderEvaluation, mode: LabelMode) -> failures.FrameFailures:
+        """Failures in `evaluation` that the benign re-render does not have, by the labels of one mode."""
+        labels = evaluation.moved if mode == "moved" else evaluation.paper
+        return self._failures(labels, evaluation.detections)
+
+    def _failures(self, labels: SceneLabels, detections: Detections) -> failures.FrameFailures:
+        all_failures = failures.find_failures(
+            self.classes.map_targets(self.benign.paper.targets),
+            self.benign.detections,
+            self.classes.map_targets(labels.targets),
+            detections,
+            self.t_star,
+        )
+        return self.aim.failures(all_failures, labels.targets, detections, self.classes.names)
+
+    def score(self, theta: Tensor) -> Score:
+        """The score of theta (D,), from a render of its own, under both label modes.
+
+        Scores are cached, so that a gradient-free search pays for each theta once.
+        """
+        key = _key(theta)
+        if key not in self._scores:
+            rendered = self.evaluate(theta)
+            self._scores[key] = self.score_image(rendered.loss, rendered.moved, rendered.detections)
+        return self._scores[key]
+
+    def preview(self, theta: Tensor) -> Score | None:
+        """The score seen by the gradient pass at theta (D,), None without one: of an image that is not rounded to
+        8 bits, in the precision of gradients.
+        """
+        return self.previews.get(_key(theta))
+
+    def score_image(self, loss: float, moved: SceneLabels, detections: Detections) -> Score:
+        failed = self._failures(moved, detections)
+        # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
+        hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
+        return Score(
+            loss=loss,
+            lost=len(failed.lost),
+            phantoms=len(failed.phantoms),
+            success=failed.success and not hidden,
+            success_paper=self._failures(self.labeller.paper(), detections).success and not hidden,
+            violations=tuple(f"objects[{i}]: visibility" for i in hidden),
+        )
+
+    def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:
+        """The feasible set of the scene; weather keeps objects visible as far as `difficulty` requires."""
+        find_invisible, min_contrast = None, self.difficulty.min_contrast
+        if min_contrast > 0 and Parameter.WEATHER in self.space.params:
+            visible = ~self.labeller.paper().ignore.cpu().numpy()
+            environment = self.space.scene.environment
+            air = self.compositor.air
+            find_invisible = VisibilityUnderWeather(self.benign.render, environment, air, visible, min_contrast)
+        return FeasibleSet(self.space, limits, only_bounds, find_invisible)
+
+    def problem(
+        self, feasible: FeasibleSet, keep_last: bool = False, margin_oracle: MarginOracle | None = None
+    ) -> Problem:
+        """The problem that attacks solve.
+
+        Args:
+            feasible: the feasible set.
+            keep_last: see `Problem`.
+            margin_oracle: see `Problem`.
+        """
+        return Problem(
+            loss_and_grad=partial(self.loss_and_grad, feasible=feasible),
+            project=feasible.project,
+            score=self.score,
+            step=self.space.step,
+            lower=self.space.lower,
+            upper=self.space.upper,
+            groups=tuple(self._group(parameter, where) for parameter, where in self.space.blocks.items()),
+            preview=self.preview,
+            keep_last=keep_last,
+            margin_oracle=margin_oracle,
+        )
+
+    def _group(self, parameter: Parameter, where: slice) -> ParameterGroup:
+        owners = self.space.owner_count(parameter)
+        modes = ffd.low_order_modes() if parameter is Parameter.MESH else None
+        smooth = parameter not in (Parameter.TRANSLATE, Parameter.ROTATE, Parameter.SIZE)
+        return ParameterGroup(parameter.value, where, owners, modes, smooth)
+
+    def predict(self, render: Render) -> AnchorPredictions:
+        """Raw predictions for a render of the scene, with a gradient wherever vehicles are drawn. Raises
+        RangeError for a detector without one.
+        """
+        predictions = self.predict_regions(render)
+        return self.differentiable(render.image[None]) if predictions is None else predictions
+
+    def predict_regions(self, render: Render) -> AnchorPredictions | None:
+        """Predictions from the regions that differ from the benign picture; None where pictures are evaluated whole."""
+        if render.vehicle_regions is None or (reference := self._reference_layers()) is None:
+            return None
+        regions = [Rect(y0, y1, x0, x1) for x0, y0, x1, y1 in render.vehicle_regions.tolist()]
+        return reference(render.image[None], regions)
+
+    @property
+    def layer_limit_mb(self) -> float:
+        """Limit on the cached layers of one picture, in MB."""
+        return min(LIMIT_MB, self.keep_mb)
+
+    @property
+    def reference_mb(self) -> float:
+        """Size of the benign picture's cached layers, in MB."""
+        return 0.0 if self._reference is None else self._reference.bytes / 1e6
+
+    def release_layers(self) -> None:
+        """Release the benign picture's layers, which are computed again when needed."""
+        self._reference = None
+
+    def _reference_layers(self) -> ReferencePass | None:
+        """The benign picture's layers; None where pictures are evaluated whole."""
+        if self._reference is None and not self.whole:
+            self._reference = ReferencePass.run(
+                self.differentiable, self.benign.render.image[None], self.layer_limit_mb
+            )
+            self.whole = self._reference is None
+        return self._reference
+
+    @property
+    def differentiable(self) -> Detector:
+        """The detector. Raises RangeError where it has no gradient."""
+        if not isinstance(self.detector, Detector):
+            raise RangeError("detector", "one with a gradient", self.detector.name)
+        return self.detector
+
+    @torch.no_grad()
+    def detect(self, image: Tensor) -> Detections:
+        """Detections of the evaluated classes in an image (3, H, W)."""
+        return self.classes.map_detections(predict(self.detector, image[None])[0])
+
+    def loss_from_predictions(self, raw: AnchorPredictions, scene: SceneIR, render: Render) -> Tensor:
+        """The loss () of one image's predictions.
+
+        Args:
+            raw: predictions of one image.
+            scene: the state that the image shows.
+            render: its render.
+        """
+        labels = self.labeller.labels(self.label_mode, scene, render)
+        return self.compute_loss(self.differentiable, raw, labels.targets)
+
+    @torch.no_grad()
+    def evaluate_render(self, scene: SceneIR, render: Render) -> RenderEvaluation:
+        """Detect and label a rendered state of the scene."""
+        # Evaluate what is written: a file holds 8 bits, and so does a camera's picture.
+        render = replace(render, image=round_to_8bit(render.image))
+        paper, moved = self.labeller.paper(), self.labeller.moved(scene, render)
+        labels = (moved if self.label_mode == "moved" else paper).targets
+        if isinstance(self.detector, Detector):
+            raw = self.predict(render)
+            loss = float(self.compute_loss(self.detector, raw, labels))
+            detections = self.classes.map_detections(self.detector.decode(raw)[0])
+        else:
+            detections = self.detect(render.image)
+            loss = self._loss_without_gradient(detections, labels)
+        return RenderEvaluation(scene, render, detections, paper, moved, loss)
+
+    def compute_loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> Tensor:
+        targets = self.classes.to_detector_targets(self.classes.map_targets(self.aim.targets(labels)))
+        if self.term in losses.GOALS:
+            columns = [detector.classes.index(name) for name in self.aim.classes_of(self.classes.names)]
+            loss = losses.goal_loss(self.term, detector.candidates(raw), targets, self.t_star, columns)
+        else:
+            terms = detector.loss(raw, [targets])
+            self._check_term((*terms, *losses.GOALS))
+            loss = terms[self.term]
+        if not bool(torch.isfinite(loss)):
+            raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
+        return loss
+
+    def _loss_without_gradient(self, detections: Detections, labels: Targets) -> float:
+        self._check_term(GRADIENT_FREE_TERMS)
+        names, targets = self.classes.names, self.classes.map_targets(self.aim.targets(labels))
+        if self.term not in losses.GOALS:
+            return losses.detection_objectness(targets, detections)
+        columns = [names.index(name) for name in self.aim.classes_of(names)]
+        candidates = losses.candidates_from_detections(detections, len(names))
+        return float(losses.goal_loss(self.term, candidates, targets, self.t_star, columns))
+
+    def _check_term(self, terms: Collection[str]) -> None:
+        if self.term not in terms:
+            raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
+
+
+def compute_gradients(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """Losses and gradients at several thetas in one step, of one scene or of several.
+
+    Args:
+        objectives: one for each theta, all of one detector.
+        thetas: (D,) each.
+
+    Returns:
+        Loss () and gradient (D,) at each theta. Split in halves where the device's memory cannot hold all at once.
+
+    Raises:
+        RangeError: there is no objective, they have several detectors, or a loss or gradient is not finite.
+        ShapeError: the numbers of thetas and objectives differ.
+    """
+    detectors = {id(objective.detector) for objective in objectives}
+    if len(detectors) != 1:
+        raise RangeError("objectives", "one detector for all", f"{len(detectors)} detectors")
+    if len(thetas) != len(objectives):
+        raise ShapeError("thetas", f"{len(objectives)}, one for each objective", len(thetas))
+    return run_in_halves(_compute_batch, list(zip(objectives, thetas, strict=True)), "thetas")
+
+
+def _compute_batch(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, Tensor]]:
+    objectives, thetas = zip(*pairs, strict=True)
+    leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
+    batch_losses = _compute_losses(objectives, leaves)
+    gradients = torch.autograd.grad(batch_losses, leaves)
+    for objective, gradient in zip(objectives, gradients, strict=True):
+        objective.passes += GRADIENT_PASSES
+        objective.space.check_gradient(gradient)
+    return [(loss.detach(), gradient) for loss, gradient in zip(batch_losses, gradients, strict=True)]
+
+
+def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[Tensor]:
+    """The loss () of each objective at its theta (D,), differentiable; all share one detector. Scores seen on the
+    way are cached for `Objective.preview`.
+    """
+    scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
+    renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
+    predictions: dict[int, AnchorPredictions] = {}
+    whole_images: dict[torch.Size, list[int]] = {}
+    for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
+        region_predictions = objective.predict_regions(render)
+        if region_predictions is None:
+            whole_images.setdefault(render.image.shape, []).append(i)
+        else:
+            predictions[i] = region_predictions
+    for rows in whole_images.values():
+        images = [renders[i].image for i in rows]
+        raw = objectives[rows[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
+        # One by one: the loss of a batch is a mean over its images, weighted by their objects.
+        predictions |= {i: raw.select(row) for row, i in enumerate(rows)}
+    batch_losses = []
+    for i, (objective, theta) in enumerate(zip(objectives, thetas, strict=True)):
+        detector, raw = objective.differentiable, predictions[i]
+        moved = objective.labeller.moved(scenes[i], renders[i])
+        labels = moved if objective.label_mode == "moved" else objective.labeller.paper()
+        loss = objective.compute_loss(detector, raw, labels.targets)
+        with torch.no_grad():
+            detections = objective.classes.map_detections(detector.decode(raw)[0])
+        objective.previews[_key(theta)] = objective.score_image(float(loss.detach()), moved, detections)
+        batch_losses.append(loss)
+    return batch_losses
+
+
+def _key(theta: Tensor) -> bytes:
+    return theta.detach().cpu().numpy().tobytes()
