@@ -172,15 +172,15 @@ def write_png(path: Path, image: np.ndarray, compression: int | None = None) -> 
     write_bytes(path, encoded.tobytes())
 
 
-def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays as a compressed NPZ, atomically; equal arrays give equal bytes."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=_NPZ_LEVEL) as archive:
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray], compressed: bool = True) -> None:
+    """Write named arrays as an NPZ, atomically; equal arrays give equal bytes."""
+    buffer, method = io.BytesIO(), zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(buffer, "w", method, compresslevel=_NPZ_LEVEL) as archive:
         for name, array in arrays.items():
             member = io.BytesIO()
             np.lib.format.write_array(member, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False)
             entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, so that bytes do not depend on the clock
-            archive.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED, _NPZ_LEVEL)
+            archive.writestr(entry, member.getvalue(), method, _NPZ_LEVEL)
     write_bytes(path, buffer.getvalue())
 
 

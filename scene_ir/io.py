@@ -7,6 +7,10 @@
     meshes/0.glb      see `scene_ir.meshes.load`: opens in any viewer, keeps every bit of float32
     before/           `SceneIR.before`, if there is one, in the same form
 
+With `lossy=True` a scene takes a tenth of that: both images are JPEG, the background only where it differs, and
+`arrays.npz` holds codes of 8 bits, and of 16 bits for depth, without compression: whoever packs the folder compresses
+better.
+
 A folder of another schema version is rejected.
 """
 
@@ -87,16 +91,35 @@ _MESH_DTYPES = {
     "uv": torch.float32,
 }
 _INTEGERS = ("mesh_index", "category", "occlusion")
+_JPEG_QUALITY = 95
+_SAME = "background_same"
+"""Array of a lossy scene: pixels in which the background equals the photograph."""
+_BLOCK_PX = 8
+"""JPEG's block."""
+_LEVELS = 31
+"""Levels of a lossy map, from 0 to 1."""
+_NEAREST_M, _STEPS = 0.01, 250
+"""Lossy depth: distance of code 0, and codes per factor e, so one step is 0.4 %."""
+_INFINITE = 65535
+"""Code of an infinite depth."""
 
 
-def save_scene(scene: SceneIR, folder: Path) -> None:
-    """Write `scene` as `folder`, atomically, in place of an older one. Gradients are lost."""
+def save_scene(scene: SceneIR, folder: Path, lossy: bool = False) -> None:
+    """Write `scene` as `folder`, atomically, in place of an older one. Gradients are lost.
+
+    Args:
+        scene: The scene.
+        folder: The folder.
+        lossy: Write a smaller folder that holds images, depth and maps approximately.
+    """
     with files.atomic_folder(Path(folder)) as temporary:
         arrays = {"depth": _array(scene.depth)}
         arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
         in_png = {}
         for name in _IMAGES:
             image = getattr(scene, name).detach().cpu()
+            if lossy:
+                continue
             in_png[name] = _as_bytes(image)
             if in_png[name] is None:
                 arrays[name] = _array(image)
@@ -112,7 +135,7 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
                 "intrinsics": _numbers(scene.camera.intrinsics),
                 "projection": None if scene.camera.projection is None else _numbers(scene.camera.projection),
             },
-            "images": {name: "npz" if in_png[name] is None else "png" for name in _IMAGES},
+            "images": {name: "jpg" if lossy else "npz" if in_png[name] is None else "png" for name in _IMAGES},
             "meshes": len(scene.meshes),
             "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
             "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
@@ -123,13 +146,16 @@ def save_scene(scene: SceneIR, folder: Path) -> None:
             "before": scene.before is not None,
         }
         files.write_json(temporary / "scene.json", record)
-        files.write_npz(temporary / "arrays.npz", arrays)
+        if lossy:
+            arrays = {name: _to_codes(name, array) for name, array in arrays.items()}
+            arrays[_SAME] = _write_lossy_images(scene, temporary)
+        files.write_npz(temporary / "arrays.npz", arrays, compressed=not lossy)
         (temporary / "meshes").mkdir()
         for i, mesh in enumerate(scene.meshes):
             _check_mesh(i, mesh)
             save_mesh(mesh, temporary / "meshes" / f"{i}.glb")
         if scene.before is not None:
-            save_scene(scene.before, temporary / "before")
+            save_scene(scene.before, temporary / "before", lossy)
 
 
 def load_scene(folder: Path) -> SceneIR:
@@ -247,6 +273,41 @@ def _record(folder: Path) -> _JsonNode:
         found = f"version {root['version'].value!r}, of another drivesem"
         raise FormatError(f"{root.where}: version", f"version {VERSION}", found)
     return root
+
+
+def _write_lossy_images(scene: SceneIR, folder: Path) -> np.ndarray:
+    """Write both images as JPEG. Returns the pixels (H, W) uint8 in which they are equal."""
+    import cv2
+
+    photograph, background = (to_uint8(getattr(scene, name)) for name in _IMAGES)
+    same = (photograph == background).all(axis=-1)
+    # Blocks without a change are flat; those with one are whole, as ringing ends at their border.
+    near = cv2.dilate((~same).astype(np.uint8), np.ones((2 * _BLOCK_PX - 1, 2 * _BLOCK_PX - 1), np.uint8))
+    background = np.where(near[..., None] > 0, background, np.uint8(128))
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    for name, image in zip(_IMAGES, (photograph, background), strict=True):
+        files.write_bytes(folder / f"{name}.jpg", cv2.imencode(".jpg", image[..., ::-1], options)[1].tobytes())
+    return same.astype(np.uint8) * 255
+
+
+def _to_codes(name: str, array: np.ndarray) -> np.ndarray:
+    """Lossy codes of an array: 8 bits for values from 0 to 1, or 16 bits for depth."""
+    if name == "depth":
+        known = np.isfinite(array)
+        code = _STEPS * np.log(np.maximum(np.where(known, array, 1), _NEAREST_M) / _NEAREST_M)
+        return np.where(known, code.round().clip(0, _INFINITE - 1), _INFINITE).astype(np.uint16)
+    steps = _LEVELS if name in _MAPS else 255
+    return ((array.clip(0, 1) * steps).round() / steps * 255).round().astype(np.uint8)
+
+
+def _from_codes(array: np.ndarray) -> np.ndarray:
+    """The values of an array, which may hold the codes of `_to_codes`."""
+    if array.dtype == np.uint8:
+        return (array / np.float32(255)).astype(np.float32)
+    if array.dtype == np.uint16:
+        return np.where(array == _INFINITE, np.inf, _NEAREST_M * np.exp(array / _STEPS)).astype(np.float32)
+    return array
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -427,7 +488,7 @@ class _NpzArrays:
         where = f"{self.path}: {name}"
         if name not in self:
             raise FormatError(where, "an array", f"no such key (has {', '.join(self._arrays)})")
-        array = self._arrays[name]
+        array = _from_codes(self._arrays[name])
         if array.dtype.name not in _DTYPES:
             raise FormatError(where, f"one of {', '.join(_DTYPES)}", array.dtype.name)
         tensor = torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
@@ -441,9 +502,13 @@ class _NpzArrays:
 def _load_image(folder: Path, node: _JsonNode, arrays: _NpzArrays, size_hw: tuple[int, int], name: str) -> Tensor:
     if node.text() == "npz":
         return arrays.tensor(name, 3, *size_hw)
-    if node.text() != "png":
-        raise FormatError(node.where, "'png' or 'npz'", repr(node.value))
-    return to_tensor(files.read_image(folder / f"{name}.png", size_hw))
+    if node.text() not in ("png", "jpg"):
+        raise FormatError(node.where, "'png', 'jpg' or 'npz'", repr(node.value))
+    image = to_tensor(files.read_image(folder / f"{name}.{node.text()}", size_hw))
+    if node.text() == "png" or name != "background":
+        return image
+    photograph = to_tensor(files.read_image(folder / "photograph.jpg", size_hw))
+    return torch.where(arrays.tensor(_SAME, *size_hw) > 0, photograph, image)
 
 
 def _load_source(index: int, node: _JsonNode, arrays: _NpzArrays) -> Source:

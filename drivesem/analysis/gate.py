@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from torch import Tensor
 
-from detectors.base import DetectorError, Predictor
+from detectors.base import DetectorError, Predictor, predict
 from detectors.registry import load_predictor
+from detectors.types import Detections
 from drivesem.attacks.space import parse_params
 from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import GateConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, LEVEL, PairedDifference, holm, paired_differences, ratio_metric
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood
+from drivesem.report.drawing import (
+    DETECTED_COLOUR,
+    TRUE_COLOUR,
+    LabelLayout,
+    TextLabel,
+    encode_jpeg_data_url,
+    write_picture,
+)
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.report.web import render_page
 from drivesem.run.driver import FrameAnalyser, analyse_runs
+from drivesem.run.export import PACKAGE, GateSource, open_gate_package, write_lossy_frame
 from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
 from drivesem.run.folder import (
     FRAMES,
@@ -34,9 +49,10 @@ from drivesem.run.folder import (
 from drivesem.run.frame import certain_losses
 from drivesem.run.results import Failure
 from scene_ir import files
+from scene_ir.io import to_uint8
 
-_WRITTEN = ("gate.json", "gate.md", "gate.csv", "gate.xml", "runs")
-_FREE = (*PRESENTATION, "runs", "tolerance", "bootstrap")
+_WRITTEN = ("gate.json", "gate.md", "gate.csv", "gate.xml", "gate.html", "runs")
+_FREE = (*PRESENTATION, "runs", "tolerance", "bootstrap", "allow_empty")
 HOLE, KIND, ALL, PHANTOMS = "hole", "kind", "all", "phantoms"
 _MAX_PRINTED = 12
 """Holes in the table on a terminal; the files have all."""
@@ -47,8 +63,14 @@ _NOTE = (
     "phantoms. p: exact sign test of the samples in which only one detector fails, with Holm's correction over "
     "all rows. A row grew if the difference exceeds the tolerance, its interval lies above 0, and p is below 0.05."
 )
-_NO_FAILURES = "These runs have no certain failure of an object: nothing to compare, so the gate is passed."
-_NO_SAMPLES = "No sample counts around any certain failure: nothing was compared, so the gate is not passed."
+_NO_SAMPLES = "no sample counts around any certain failure"
+_SIDES = ("unchanged", "changed")
+"""Pictures of a certain failure."""
+_NEW_COLOUR = (86, 180, 233)
+_PICTURE_PX = 480
+"""Width of such a picture."""
+_MAX_PICTURED = 100
+"""Failures with pictures on the page: each has two of some 30 KB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,28 +146,91 @@ def run_gate(config: GateConfig) -> AnalysisReport:
 
     Raises UsageError or SceneError for bad input.
     """
-    runs = load_runs(config.runs, config.limit, "RUN")
+    with ExitStack() as stack:
+        return _run_gate(config, _open_sources(config, stack))
+
+
+def _run_gate(config: GateConfig, sources: Sequence[GateSource]) -> AnalysisReport:
+    runs = [source.run for source in sources]
     if config.before is None:
         config = replace(config, before=_attacked_detector(runs, config.trust))
     load_detector_pair(config)
-    out = resolve_output_folder(config.out, runs[0].folder / "gate")
+    out = resolve_output_folder(config.out, Path(config.runs[0]) / "gate")
     claim_folder(out, config, _WRITTEN, _FREE, renews=True)
     frames = [(run, [f.result.identifier for f in run.frames if certain_losses(f.result)]) for run in runs]
     results, failed = analyse_runs(
         frames, partial(GateAnalyser, config), out / "runs", config, "comparing detectors in"
     )
-    pairs = {name: result.pairs for name, result in results.items()}
     draws = DRAWS if config.bootstrap is None else config.bootstrap
-    facts = {
-        "runs": [str(run.folder) for run in runs],
-        "before": config.before,
-        "after": config.after,
-        "tolerance": config.tolerance,
+    pairs = {name: result.pairs for name, result in results.items()}
+    counts = {
+        "frames": sum(source.frames for source in sources),
+        "frames_attacked": sum(source.frames_attacked for source in sources),
+        "frames_ungraded": sum(not frame.result.graded for run in runs for frame in run.frames),
+        "frames_compared": len(pairs),
+        "failures": sum(map(len, pairs.values())),
     }
-    rows = compute_gate_rows(pairs, config.tolerance, draws, config.seed)
-    report = build_gate_report(out, rows, sum(map(len, pairs.values())), facts, failed)
+    report = build_gate_report(
+        out,
+        compute_gate_rows(pairs, config.tolerance, draws, config.seed),
+        GateFacts(
+            about={
+                "runs": list(config.runs),
+                "before": config.before,
+                "after": config.after,
+                "tolerance": config.tolerance,
+                **counts,
+            },
+            scope=_describe_scope(counts),
+            failures=counts["failures"],
+            failed=failed,
+            allow_empty=config.allow_empty,
+            pictures=_find_pictures(out, runs, pairs),
+        ),
+    )
     report.write()
     return report
+
+
+def _open_sources(config: GateConfig, stack: ExitStack) -> list[GateSource]:
+    """Load runs and unpack packages. Raises UsageError or FormatError if one cannot be used."""
+    packages = [folder for folder in config.runs if (Path(folder) / PACKAGE).is_file()]
+    folders = [folder for folder in config.runs if folder not in packages]
+    if len({Path(folder).resolve() for folder in packages}) < len(packages):
+        raise UsageError("RUN", "each package once", packages[0])
+    sources = [GateSource.from_run(run) for run in load_runs(folders, config.limit, "RUN")]
+    sources += [stack.enter_context(open_gate_package(Path(folder), config.limit)) for folder in packages]
+    names = [source.run.name for source in sources]
+    given = [*folders, *packages]
+    return [
+        source if names.count(name) == 1 else replace(source, run=replace(source.run, name=folder))
+        for source, name, folder in zip(sources, names, given, strict=True)
+    ]
+
+
+def _describe_scope(counts: Mapping[str, int]) -> str:
+    frames, attacked, ungraded = counts["frames"], counts["frames_attacked"], counts["frames_ungraded"]
+    failures = format_count(counts["failures"], "certain failure") + " of objects" if counts["failures"] else ""
+    text = f"{failures or 'no certain failure of an object'} in {format_count(attacked, 'attacked frame')}"
+    text += f" ({frames - attacked} of {frames} had nothing to attack)" if attacked < frames else ""
+    if ungraded:
+        text += f"; the failures of {format_count(ungraded, 'frame')} have no grade: attack without --no-grade"
+    return text
+
+
+def _find_pictures(
+    out: Path, runs: Sequence[AttackRun], pairs: Mapping[str, Sequence[PairedSamples]]
+) -> dict[str, list[Path]]:
+    """Return the pictures by hole of the analysed frames, in the order of `_SIDES`."""
+    pictures = {}
+    for number, run in enumerate(runs):
+        prefix = f"{run.name}/" if len(runs) > 1 else ""
+        for frame in run.frames:
+            name = frame.result.identifier
+            folder = out / "runs" / str(number) / FRAMES / name
+            for pair in pairs.get(prefix + name, ()):
+                pictures[_hole_name(prefix + name, pair)] = [folder / f"{pair.index}-{s}.jpg" for s in _SIDES]
+    return pictures
 
 
 def _attacked_detector(runs: Sequence[AttackRun], trust: bool) -> str:
@@ -179,7 +264,7 @@ def load_detector_pair(config: GateConfig) -> tuple[Predictor, Predictor]:
 class GateAnalyser(FrameAnalyser[FrameGateResult]):
     """Evaluates both detectors on samples around the certain failures of a run's frames."""
 
-    file, kind, schema = "gate.json", FrameGateResult, 2
+    file, kind, schema = "gate.json", FrameGateResult, 3
 
     def __init__(self, config: GateConfig, run: AttackRun, out: Path) -> None:
         super().__init__(run.folder, out)
@@ -191,12 +276,74 @@ class GateAnalyser(FrameAnalyser[FrameGateResult]):
         """See `FrameAnalyser`."""
         start = time.perf_counter()
         before, after = self.detectors
-        frame = RebuiltFrame.load(self.run_folder / FRAMES / name, self.attack, self.params, before)
-        pairs = tuple(
-            _draw_paired_samples(failure, neighbourhood, after, self.config.samples)
-            for failure, neighbourhood in frame.neighbourhoods(str(self.config.seed))
+        with tempfile.TemporaryDirectory(prefix="drivesem-gate-") as temporary:
+            # what a package holds, so that a run and its package give the same numbers
+            packed = write_lossy_frame(self.run_folder / FRAMES / name, Path(temporary))
+            frame = RebuiltFrame.load(packed, self.attack, self.params, before)
+        pairs = []
+        for failure, neighbourhood in frame.neighbourhoods(str(self.config.seed)):
+            pairs.append(_draw_paired_samples(failure, neighbourhood, after, self.config.samples))
+            _write_case_pictures(folder, frame, neighbourhood.index, after)
+        return FrameGateResult(name, self.source_digest(name), tuple(pairs), round(time.perf_counter() - start, 3))
+
+
+def _write_case_pictures(folder: Path, frame: RebuiltFrame, index: int, after: Predictor) -> None:
+    """Write the object before and after the change, without nuisances, with the detections of both detectors."""
+    objective = frame.objective
+    classes, changed = EvaluatedClasses.from_detector(after), objective.evaluate(frame.theta)
+    boxes = (objective.benign.paper.targets.boxes_xyxy[index], changed.moved.targets.boxes_xyxy[index])
+    for side, state, box in zip(_SIDES, (objective.benign, changed), boxes, strict=True):
+        new = classes.map_detections(predict(after, state.render.image[None])[0])
+        detections = (
+            (state.detections, objective.t_star, "current", DETECTED_COLOUR),
+            (new, resolve_t_star(after), "new", _NEW_COLOUR),
         )
-        return FrameGateResult(name, self.source_digest(name), pairs, round(time.perf_counter() - start, 3))
+        picture = _draw_close_up(to_uint8(state.render.image), boxes, box, detections)
+        write_picture(folder / f"{index}-{side}.jpg", picture)
+
+
+def _draw_close_up(
+    image: np.ndarray,
+    places_xyxy: Sequence[Tensor],
+    true_xyxy: Tensor,
+    detections: Sequence[tuple[Detections, float, str, tuple[int, int, int]]],
+) -> np.ndarray:
+    """Draw a part of a picture, enlarged, with boxes.
+
+    Args:
+        image: (H, W, 3) uint8.
+        places_xyxy: Boxes (4,) px that the part surrounds.
+        true_xyxy: True box (4,) px.
+        detections: Detections with threshold, name and colour.
+    """
+    height, width = image.shape[:2]
+    corners = np.array([place.tolist() for place in places_xyxy])
+    x0, y0, x1, y1 = (*corners[:, :2].min(0), *corners[:, 2:].max(0))
+    half = min(max(0.9 * (x1 - x0), 1.2 * (y1 - y0), 40.0), width / 2, 2 * height / 3)
+    x, y = np.clip((x0 + x1) / 2, half, width - half), np.clip((y0 + y1) / 2, 0.75 * half, height - 0.75 * half)
+    left, top, right, bottom = (round(float(v)) for v in (x - half, y - 0.75 * half, x + half, y + 0.75 * half))
+    zoom = _PICTURE_PX / (right - left)
+    size = (_PICTURE_PX, round((bottom - top) * zoom))
+    canvas = cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_CUBIC)
+    labels = LabelLayout((canvas.shape[1], canvas.shape[0]))
+
+    def draw(xyxy: Tensor, colour: tuple[int, int, int], outset: int, text: str = "") -> None:
+        a, b, c, d = ((xyxy.detach().cpu().numpy() - (left, top, left, top)) * zoom).tolist()
+        if c < 0 or d < 0 or a > canvas.shape[1] or b > canvas.shape[0]:
+            return
+        box = (a - outset, b - outset, c + outset, d + outset)
+        first, second = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
+        cv2.rectangle(canvas, first, second, colour, 2, cv2.LINE_AA)
+        if text:
+            labels.add(box, TextLabel(text, colour))
+
+    draw(true_xyxy, TRUE_COLOUR, 0)
+    for number, (found, threshold, name, colour) in enumerate(detections, start=1):
+        for box, score in zip(found.boxes_xyxy, found.scores.tolist(), strict=True):
+            if score >= threshold:
+                draw(box, colour, 3 * number, f"{name} {score:.2f}")
+    labels.draw(canvas)
+    return canvas
 
 
 def _draw_paired_samples(
@@ -236,12 +383,7 @@ def compute_gate_rows(
     Returns:
         Rows of holes, those that grew most first; then of kinds, of all holes, and of phantoms.
     """
-    named = [
-        (frame if p.index is None else f"{frame}: objects[{p.index}]", p)
-        for frame, pairs in pairs_by_frame.items()
-        for p in pairs
-        if p.before
-    ]
+    named = [(_hole_name(frame, p), p) for frame, pairs in pairs_by_frame.items() for p in pairs if p.before]
     hole_rows = [_compute_row(HOLE, name, [pair], tolerance, draws, seed) for name, pair in named]
     hole_rows.sort(key=lambda row: (-row.difference, row.hole))
     kinds = sorted({pair.error for _, pair in named})
@@ -262,6 +404,10 @@ def compute_gate_rows(
     ]
     adjusted = {p: corrected for p, corrected in zip(tested, holm(tested), strict=True) if corrected is not None}
     return [replace(row, p=adjusted[row.p], grew=row.grew and adjusted[row.p] < 1 - LEVEL) for row in rows]
+
+
+def _hole_name(frame: str, pair: PairedSamples) -> str:
+    return frame if pair.index is None else f"{frame}: objects[{pair.index}]"
 
 
 def _compute_row(
@@ -316,70 +462,140 @@ def _sign_test(pairs: Sequence[PairedSamples]) -> float:
     return float(binomtest(sum(discordant), len(discordant), alternative="greater").pvalue)
 
 
-def build_gate_report(
-    out: Path,
-    rows: Sequence[GateRow],
-    holes: int,
-    facts: Mapping[str, Any],
-    failed: Mapping[str, str],
-    verb: str = "lost",
-    note: str = _NOTE,
-) -> AnalysisReport:
-    """Decide whether the gate is passed, and write gate.xml.
+@dataclass(frozen=True, slots=True)
+class GateFacts:
+    """What a gate's report states besides its rows."""
+
+    about: Mapping[str, Any]
+    """First entries of the JSON; has before and after."""
+    scope: str
+    """Number of certain failures, and of frames, in words."""
+    failures: int
+    """Number of certain failures, with samples or not."""
+    failed: Mapping[str, str]
+    """Reasons by frame that could not be compared; if there are any, the gate is not passed."""
+    allow_empty: bool = False
+    """Whether a gate without certain failures is passed."""
+    pictures: Mapping[str, Sequence[Path]] = field(default_factory=dict)
+    """Pictures by hole, before and after the change."""
+    verb: str = "lost"
+    """Past participle that names a failure."""
+    note: str = _NOTE
+    """Explanation of the columns."""
+
+    def why_empty(self, rows: Sequence[GateRow]) -> str:
+        """Why nothing was compared; empty if something was, or if all frames failed."""
+        if rows or (self.failed and not self.failures):
+            return ""
+        return f"nothing was compared: {_NO_SAMPLES if self.failures else self.scope}"
+
+
+def build_gate_report(out: Path, rows: Sequence[GateRow], facts: GateFacts) -> AnalysisReport:
+    """Decide whether the gate is passed, and write gate.xml and gate.html.
 
     Args:
         out: Output folder.
         rows: The comparison.
-        holes: Number of certain failures, with samples or not.
-        facts: First entries of the JSON.
-        failed: Reasons by frame that could not be compared; if there are any, the gate is not passed.
-        verb: Past participle that names a failure.
-        note: Explanation of the columns.
+        facts: The rest.
     """
-    files.write_text(out / "gate.xml", format_junit(rows, failed, verb))
-    no_samples = holes > 0 and not rows
-    passed = not failed and not no_samples and not any(row.grew for row in rows)
-    hole_rows = [row for row in rows if row.level == HOLE]
-    other_rows = [row for row in rows if row.level != HOLE]
-    title = f"Gate {'passed' if passed else 'not passed'}: {facts['after']} after {facts['before']}"
-    notes = [note] if rows else [_NO_SAMPLES] if no_samples else [] if failed else [_NO_FAILURES]
+    why_empty, failed, verb = facts.why_empty(rows), facts.failed, facts.verb
+    allowed = bool(why_empty) and facts.allow_empty and not facts.failures
+    passed = not failed and (allowed or not why_empty) and not any(row.grew for row in rows)
+    verdict = "passed" if passed else "not passed"
+    title = f"Gate {verdict}: {facts.about['after']} after {facts.about['before']}"
+    notes = [f"Compared: {facts.scope}.", facts.note] if rows else []
+    if why_empty:
+        option = "" if facts.failures else " (--allow-empty)" if allowed else "; --allow-empty passes such a gate"
+        notes.append(f"Gate {verdict}: {why_empty}{option}.")
     if failed:
         notes.append(f"{format_count(len(failed), 'frame')} could not be compared, so the gate is not passed.")
-    data = {"passed": passed, **facts, "out": str(out), "rows": [row.to_json() for row in rows]}
+    hole_rows = [row for row in rows if row.level == HOLE]
+    other_rows = [row for row in rows if row.level != HOLE]
+    ordered = [*other_rows, *hole_rows]
+    files.write_text(out / "gate.xml", format_junit(rows, failed, verb, "" if allowed else why_empty, why_empty))
+    cases = [_describe_case(row, verb, facts.pictures.get(row.hole, ())) for row in ordered[:_MAX_PICTURED]]
+    page = render_page(
+        "drivesem.analysis:gate.html", title=title, passed=passed, facts=facts, cases=cases, notes=notes,
+        left_out=len(ordered) - len(cases),
+    )  # fmt: skip
+    files.write_text(out / "gate.html", page)
+    data = {"passed": passed, **facts.about, "out": str(out), "rows": [row.to_json() for row in rows]}
     return AnalysisReport(
         out=out,
         name="gate",
         heading=title,
         data={**data, "frames_failed": {**failed}},
         csv_tables={"gate": [_csv_row(row) for row in rows]} if rows else {},
-        tables=[_build_table(title, [*other_rows, *hole_rows], verb)],
-        printed_tables=[_build_table(title, [*other_rows, *hole_rows[:_MAX_PRINTED]], verb)],
+        tables=[_build_table(title, ordered, verb)],
+        printed_tables=[_build_table(title, [*other_rows, *hole_rows[:_MAX_PRINTED]], verb)] if rows else [],
         notes=notes,
         failed=failed,
         failure_text="could not be compared",
     )
 
 
-def format_junit(rows: Sequence[GateRow], failed: Mapping[str, str], verb: str = "lost") -> str:
-    """Format rows as JUnit XML, which CI servers show.
+def _describe_case(row: GateRow, verb: str, pictures: Sequence[Path]) -> dict[str, Any]:
+    """Values of a case on the page."""
+    images = [path for path in pictures if path.is_file()]
+    return {
+        "row": row,
+        "name": _row_name(row),
+        "text": _describe_row(row, verb),
+        "images": [encode_jpeg_data_url(files.read_image(path)) for path in images],
+    }
+
+
+def _row_name(row: GateRow) -> str:
+    names = {ALL: "all holes", PHANTOMS: "phantoms", KIND: f"all {row.hole}"}
+    return names.get(row.level, row.hole)
+
+
+def _describe_row(row: GateRow, verb: str) -> str:
+    """The result of a row in one line: counts of samples, difference with its interval, p."""
+    verb = "phantoms in" if row.level == PHANTOMS else verb
+    before, after = (f"{round(share * row.samples)} of {row.samples}" for share in (row.before, row.after))
+    text = f"{verb} {before} samples before, {after} after"
+    text += f"; difference {_format_difference(row)} points; p {row.p:.3g}"
+    return text if row.holes == 1 else f"{text}; {row.holes} holes"
+
+
+def format_junit(
+    rows: Sequence[GateRow],
+    failed: Mapping[str, str],
+    verb: str = "lost",
+    empty: str = "",
+    skipped: str = "",
+) -> str:
+    """Format rows as JUnit XML, which CI servers show. Each case has its numbers, passed or not.
 
     Args:
         rows: A test case each, which fails if the row grew.
         failed: Reasons by frame that could not be compared; a test case with an error each.
         verb: Past participle that names a failure.
+        empty: Why nothing was compared; a test case that fails.
+        skipped: Why nothing was compared; without `empty`, a test case that is skipped.
     """
-    counts = {"tests": len(rows) + len(failed), "failures": sum(r.grew for r in rows), "errors": len(failed)}
-    suite = ET.Element("testsuite", {"name": "drivesem gate"} | {name: str(n) for name, n in counts.items()})
+    suite = ET.Element("testsuite", {"name": "drivesem gate"})
     for row in rows:
         case = ET.SubElement(suite, "testcase", classname=f"drivesem.gate.{row.level}", name=row.hole)
         if row.grew:
             row_verb = "phantoms in" if row.level == PHANTOMS else verb
             message = f"{row_verb} {100 * row.before:.1f} % before, {100 * row.after:.1f} % after"
-            failure = ET.SubElement(case, "failure", message=message, type="grew")
-            failure.text = f"{message}; difference {_format_difference(row)}; p {row.p:.3g}"
+            ET.SubElement(case, "failure", message=message, type="grew").text = _describe_row(row, verb)
+        ET.SubElement(case, "system-out").text = _describe_row(row, verb)
     for name, reason in failed.items():
         case = ET.SubElement(suite, "testcase", classname="drivesem.gate.frame", name=name)
         ET.SubElement(case, "error", message=reason, type="failed")
+    if empty or skipped:
+        case = ET.SubElement(suite, "testcase", classname="drivesem.gate", name="certain failures")
+        if empty:
+            ET.SubElement(case, "failure", message=empty, type="empty")
+        else:
+            ET.SubElement(case, "skipped", message=skipped)
+    counts = {"tests": len(suite)}
+    counts |= {f"{tag}s": len(suite.findall(f"testcase/{tag}")) for tag in ("failure", "error")}
+    counts["skipped"] = len(suite.findall("testcase/skipped"))
+    suite.attrib |= {name: str(number) for name, number in counts.items()}
     ET.indent(suite)
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -387,7 +603,7 @@ def format_junit(rows: Sequence[GateRow], failed: Mapping[str, str], verb: str =
 def _build_table(title: str, rows: Sequence[GateRow], verb: str) -> ReportTable:
     lines = tuple(
         (
-            "all holes" if row.level == ALL else row.hole,
+            _row_name(row),
             f"{100 * row.before:.0f}",
             f"{100 * row.after:.0f}",
             _format_difference(row),

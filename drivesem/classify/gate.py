@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivesem.analysis.gate import PairedSamples, build_gate_report, compute_gate_rows
+from drivesem.analysis.gate import GateFacts, PairedSamples, build_gate_report, compute_gate_rows
 from drivesem.classify.analysis import ClassifyRun, FailureAnalyser, analyse_failures
 from drivesem.classify.holes import PoseSampler
 from drivesem.classify.networks.loading import open_network
@@ -41,7 +41,7 @@ class NetworkGateAnalyser(FailureAnalyser[PairedPoseSamples]):
     """Classifies poses around certain failures with both networks."""
 
     command, file, kind = "gate", "pair.json", PairedPoseSamples
-    grades, needs_failures, free = (Grade.CERTAIN, Grade.CONFIRMED), False, ("tolerance",)
+    grades, needs_failures, free = (Grade.CERTAIN, Grade.CONFIRMED), False, ("tolerance", "allow_empty")
     renews = True
 
     def __init__(self, config: ClassifyConfig, run: ClassifyRun, out: Path) -> None:
@@ -69,8 +69,10 @@ def compare_networks(config: ClassifyConfig) -> AnalysisReport:
     analysis = analyse_failures(config, NetworkGateAnalyser, "comparing networks")
     pairs = {one.identifier: [one.pair] for one in analysis.results}
     rows = compute_gate_rows(pairs, config.tolerance, DRAWS, config.seed)
-    facts = {"run": str(analysis.run.folder), "before": analysis.run.config.network, "after": config.network}
-    facts |= {"tolerance": config.tolerance}
-    report = build_gate_report(analysis.out, rows, len(pairs), facts, analysis.failed, _VERB, _NOTE)
+    about = {"run": str(analysis.run.folder), "before": analysis.run.config.network, "after": config.network}
+    about |= {"tolerance": config.tolerance, "failures": len(pairs)}
+    scope = f"{len(pairs) or 'no'} certain {'failure' if len(pairs) < 2 else 'failures'}"
+    facts = GateFacts(about, scope, len(pairs), analysis.failed, config.allow_empty, verb=_VERB, note=_NOTE)
+    report = build_gate_report(analysis.out, rows, facts)
     report.write()
     return report

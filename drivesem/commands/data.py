@@ -136,8 +136,15 @@ def summarise_losses(written: WriteSummary) -> str:
 
 def export_command(config: ExportConfig) -> int:
     """`drivesem export`: export the counterexamples of a run."""
-    from drivesem.run.export import build_tables, export_dataset, select_frames_by_grade, write_tables
-    from drivesem.run.finished import load_runs  # these double the memory that inspect and convert start with
+    # these double the memory that inspect and convert start with
+    from drivesem.run.export import (
+        build_tables,
+        export_dataset,
+        export_gate_package,
+        select_frames_by_grade,
+        write_tables,
+    )
+    from drivesem.run.finished import load_runs
 
     out = Path(config.out or "")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -145,6 +152,18 @@ def export_command(config: ExportConfig) -> int:
     if config.to_format == "gltf":
         return _gltf(config, out)
     (attack_run,) = load_runs([config.run or ""])
+    if config.to_format == "gate":
+        package = export_gate_package(attack_run, out)
+        if config.json:
+            print_json(package)
+        failures = format_count(package["failures"], "certain failure")
+        frames, size = format_count(package["frames"], "frame"), package["bytes"] / 1e6 / package["frames"]
+        sys.stderr.write(
+            f"{failures} in {frames}, {size:.2f} MB a frame, in {out}\n"
+            f"SHA-256 of {out / 'package.json'}: {package['sha256']}\n"
+            f"next: drivesem gate {out} --after NEW_DETECTOR\n"
+        )
+        return 0
     if config.to_format == "tables":
         written = write_tables(build_tables(attack_run, select_frames_by_grade(attack_run, config.grade)), out)
         if config.json:

@@ -264,8 +264,6 @@ class ExplainConfig(TrustOption, InferenceOptions, BootstrapOption, RunOption, F
 
     frame: str | None = None
     """Frames of the run, by name with commas (default: all that fail)."""
-    least: Literal["fails", "lost"] = "fails"
-    """Effect that the smallest change must keep: any failure, or a lost object where one was lost."""
     points: Count = 16
     """Scales of the change to evaluate before the smallest failing one is bisected."""
     permutations: int = 32
@@ -310,7 +308,7 @@ class GateConfig(TrustOption, BootstrapOption, TileOption, FrameCommandConfig):
     """Compare two detectors on a run's failure regions; for CI."""
 
     runs: RunFolders = ()
-    """Folders of runs of drivesem attack."""
+    """Folders of runs of drivesem attack, or packages of drivesem export RUN --to gate."""
     before: str | None = None
     """Current detector: shipped, a weights file, or another project's (default: the runs' own)."""
     after: Annotated[str | None, Required("the detector that replaces --before")] = None
@@ -319,6 +317,8 @@ class GateConfig(TrustOption, BootstrapOption, TileOption, FrameCommandConfig):
     """Accepted increase of the rate of lost objects: per region, per kind of failure, and overall."""
     samples: Count = 32
     """Samples around each failure, the same for both detectors."""
+    allow_empty: Flag = False
+    """Pass (exit code 0) if the runs have no certain failure; without it, an empty gate is not passed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -634,12 +634,18 @@ class ExportConfig(CommandConfig):
     """Folder of a run of drivesem attack; for gltf also a scene, or a folder of scenes."""
     out: NewFolder = None
     """Folder to write, new or empty."""
-    to_format: Annotated[Literal[LabelFormat, "tables", "gltf"], tyro.conf.arg(aliases=["--to"])]
-    """Format: a labelled data set; tables (CSV, and Parquet with pyarrow); gltf (textured 3D scenes)."""
+    to_format: Annotated[Literal[LabelFormat, "tables", "gltf", "gate"], tyro.conf.arg(aliases=["--to"])]
+    """Format: a labelled data set; tables (CSV, and Parquet with pyarrow); gltf (textured 3D scenes); gate: a small
+    package that drivesem gate takes instead of the run."""
     grade: Literal["all", "threshold", "certain", "confirmed", "shared"] = "threshold"
     """Lowest grade of the failures to export; all also exports frames without failures."""
     map: ClassMap | None = None
     """Class names, such as Car=car,Truck=truck; Truck=- leaves a class out."""
+
+    def check(self) -> None:
+        super().check()
+        whole = self.to_format == "gate" and (self.grade, self.map) != (ExportConfig.grade, None)
+        refuse(whole, "--grade, --map", "none with --to gate, which takes all certain failures", "one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -806,6 +812,8 @@ class ClassifyConfig(FrameCommandConfig):
     """Range of pitch, yaw and roll around a failure for holes and gate, rad either way."""
     tolerance: FractionOrEnds = 0.05
     """Accepted increase of the misclassification rate for gate: per failure, per class, and overall."""
+    allow_empty: Annotated[Flag, OnlyWith("what", ("gate",))] = False
+    """Pass gate (exit code 0) if the run has no certain failure."""
     objects: str | None = None
     """Folder of ShapeNetCore v2, or of meshes by class (default: 12 generated classes)."""
     split: Literal["train", "val", "test"] = "test"

@@ -1,12 +1,18 @@
-"""Exports counterexamples of a run as data sets with provenance, as tables, and as glTF scenes.
+"""Exports counterexamples of a run as data sets with provenance, as tables, as glTF scenes, and as a gate's package.
 
 Axes of a glTF scene are glTF's: x right, y up, looking along -z from the camera at the origin; metres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+import io
+import lzma
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,14 +26,19 @@ from drivesem.data.label_table import WriteSummary, xyxy_to_coco
 from drivesem.failures.grades import Grade
 from drivesem.failures.second_renderer.geometry import PictureCamera
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
-from drivesem.report.tables import rows_to_csv
+from drivesem.report.drawing import write_picture
+from drivesem.report.tables import Console, progress_bar, rows_to_csv
 from drivesem.run.conversion import ConversionSettings, convert_labels, provenance
-from drivesem.run.finished import AttackRun
-from drivesem.run.frame import has_grade
-from drivesem.run.results import FrameResult
+from drivesem.run.finished import METRICS, AttackRun, RunFrame
+from drivesem.run.folder import CONFIG, FRAMES, REFERENCED_FILES
+from drivesem.run.frame import certain_losses, has_grade
+from drivesem.run.labels import RESULT
+from drivesem.run.records import from_json
+from drivesem.run.results import FrameResult, load_frame
 from drivesem.scenes.sources import find_scene_folders
 from scene_ir import files
-from scene_ir.io import load_scene, to_uint8
+from scene_ir.errors import FormatError
+from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.types import SceneIR
 
 PROVENANCE = "provenance.json"
@@ -135,6 +146,148 @@ def _rows_to_parquet(rows: Sequence[Mapping[str, Any]]) -> bytes:
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.Table.from_pylist([dict(row) for row in rows]), sink)
     return sink.getvalue().to_pybytes()
+
+
+PACKAGE = "package.json"
+"""File of a gate's package with its failures and the SHA-256 of every other file."""
+_PACKAGE_SCHEMA = 1
+_SCENE, _ARCHIVE, _PHOTOGRAPH, _AFTER = "scene", "frame.tar.xz", "photograph.jpg", "counterexample.jpg"
+"""Folder of a frame's scene; files of a frame of a package. The archive holds the scene without its photograph."""
+_MAX_UNPACKED_BYTES = 1 << 28
+"""Size limit of an unpacked frame: 1280x720 has 8 MB."""
+
+
+@dataclass(frozen=True, slots=True)
+class GateSource:
+    """A run, or what a package holds of one."""
+
+    run: AttackRun
+    """The run; of a package, with its failing frames only."""
+    frames: int
+    """Number of frames of the whole run."""
+    frames_attacked: int
+    """Number of those that had something to attack."""
+
+    @classmethod
+    def from_run(cls, run: AttackRun) -> GateSource:
+        """Count the frames of a run."""
+        return cls(run, len(run.frames), sum(frame.result.attacked for frame in run.frames))
+
+
+def export_gate_package(run: AttackRun, out: Path) -> dict[str, Any]:
+    """Write what `drivesem gate` needs of a run: its frames with certain failures of objects, as lossy scenes.
+
+    Returns its failures, frames, bytes, and SHA-256 of `PACKAGE`. Raises UsageError if there is no such failure.
+    """
+    failing = [frame for frame in run.frames if certain_losses(frame.result)]
+    if not failing:
+        expected = "a run with a certain failure of an object, which a gate compares detectors at"
+        raise UsageError("--to gate", expected, f"none in {len(run.frames)} frames of {run.folder}")
+    with files.atomic_folder(out) as folder:
+        for name in (CONFIG, REFERENCED_FILES, METRICS):
+            if (run.folder / name).is_file():
+                shutil.copy(run.folder / name, folder)
+        with progress_bar(Console(stderr=True), keep=False) as bar:
+            task = bar.add_task("packing frames", total=len(failing))
+            for frame in failing:
+                _pack_frame(frame, folder / FRAMES / frame.result.identifier)
+                bar.advance(task)
+        paths = sorted(path for path in folder.rglob("*") if path.is_file())
+        failures = [
+            {"frame": frame.result.identifier, **failure.to_row()}
+            for frame in failing
+            for failure in certain_losses(frame.result)
+        ]
+        source = GateSource.from_run(run)
+        package = {
+            "schema": _PACKAGE_SCHEMA,
+            "run": run.name,
+            "frames": source.frames,
+            "frames_attacked": source.frames_attacked,
+            "failures": failures,
+            "files": {path.relative_to(folder).as_posix(): files.sha256_digest(path) for path in paths},
+        }
+        files.write_json(folder / PACKAGE, package)
+        size = sum(path.stat().st_size for path in (*paths, folder / PACKAGE))
+    digest = files.sha256_digest(out / PACKAGE)
+    return {"out": str(out), "failures": len(failures), "frames": len(failing), "bytes": size, "sha256": digest}
+
+
+def _pack_frame(frame: RunFrame, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    write_picture(folder / _AFTER, files.read_image(frame.pictures["attacked"]))
+    with tempfile.TemporaryDirectory(prefix="drivesem-pack-") as temporary:
+        packed = Path(temporary)
+        write_lossy_frame(frame.folder, packed)
+        shutil.move(packed / _SCENE / _PHOTOGRAPH, folder / _PHOTOGRAPH)
+        buffer = io.BytesIO()
+        with tarfile.open(fileobj=buffer, mode="w:xz") as archive:
+            for path in sorted(path for path in packed.rglob("*") if path.is_file()):
+                entry = tarfile.TarInfo(path.relative_to(packed).as_posix())  # without owner and date
+                entry.size = path.stat().st_size
+                with path.open("rb") as stream:
+                    archive.addfile(entry, stream)
+        files.write_bytes(folder / _ARCHIVE, buffer.getvalue())
+
+
+def write_lossy_frame(frame: Path, folder: Path) -> Path:
+    """Write a frame of a run, its result and lossy scene, to `folder`. Returns the folder that holds them: `frame`
+    itself if its scene is lossy.
+    """
+    if (frame / _SCENE / _PHOTOGRAPH).is_file():
+        return frame
+    save_scene(load_scene(frame / _SCENE), folder / _SCENE, lossy=True)
+    shutil.copy(frame / RESULT, folder)
+    return folder
+
+
+@contextmanager
+def open_gate_package(source: Path, limit: int | None = None) -> Iterator[GateSource]:
+    """Unpack a gate's package to a temporary folder, as a run with the frames that it holds, or the first `limit`.
+
+    Raises FormatError naming the first file that is damaged, missing or too many.
+    """
+    record = files.read_json(source / PACKAGE)
+    if not isinstance(record, dict) or record.get("schema") != _PACKAGE_SCHEMA:
+        raise FormatError(str(source / PACKAGE), f"a package of schema {_PACKAGE_SCHEMA}", "another")
+    digests = from_json(dict[str, str], record.get("files"), f"{source / PACKAGE}: files")
+    run_name = from_json(str, record.get("run"), f"{source / PACKAGE}: run")
+    counts = [from_json(int, record.get(n), f"{source / PACKAGE}: {n}") for n in ("frames", "frames_attacked")]
+    files.check_links(source)
+    for name, digest in digests.items():
+        path = files.resolve_inside(source, name)
+        if (found := files.sha256_digest(path)) != digest:
+            raise FormatError(str(path), f"the SHA-256 of {PACKAGE}, {digest[:16]}", found[:16])
+    names = sorted({Path(name).parts[1] for name in digests if Path(name).parts[0] == FRAMES})
+    with tempfile.TemporaryDirectory(prefix="drivesem-gate-") as temporary:
+        folder = Path(temporary)
+        for name in digests:
+            if Path(name).parts[0] != FRAMES:
+                files.write_bytes(folder / name, files.read_bytes(source / name))
+        frames = [_unpack_frame(source / FRAMES / name, folder / FRAMES / name) for name in names[:limit]]
+        config, metrics = files.read_yaml(folder / CONFIG), files.read_json(folder / METRICS)
+        try:
+            settings = (config["detector"], config["method"], ",".join(metrics["params"]))
+        except (KeyError, TypeError) as error:
+            raise FormatError(str(source / CONFIG), "settings of a run", error) from error
+        detector, method, params = (from_json(str, value, str(source / CONFIG)) for value in settings)
+        yield GateSource(AttackRun(run_name, folder, detector, method, params, tuple(frames)), *counts)
+
+
+def _unpack_frame(source: Path, folder: Path) -> RunFrame:
+    path, size = source / _ARCHIVE, 0
+    try:
+        with tarfile.open(fileobj=io.BytesIO(files.read_bytes(path)), mode="r:xz") as archive:
+            for entry in archive:
+                size += entry.size
+                stream = archive.extractfile(entry)
+                if stream is None or size > _MAX_UNPACKED_BYTES:
+                    raise FormatError(str(path), f"files of at most {_MAX_UNPACKED_BYTES:,} bytes", entry.name)
+                files.write_bytes(files.resolve_inside(folder, entry.name), stream.read())
+    except (tarfile.TarError, lzma.LZMAError, EOFError) as error:
+        raise FormatError(str(path), "an archive of a frame", error) from error
+    files.write_bytes(folder / _SCENE / _PHOTOGRAPH, files.read_bytes(source / _PHOTOGRAPH))
+    return RunFrame(folder, load_frame(folder / RESULT), {})
 
 
 STEP_PX = 4

@@ -13,6 +13,7 @@ from drivesem.analysis.gate import (
     HOLE,
     KIND,
     PHANTOMS,
+    GateFacts,
     PairedSamples,
     build_gate_report,
     compute_gate_rows,
@@ -156,40 +157,61 @@ def test_a_blind_one_does_not_pass_in_one_hole_of_24_samples() -> None:
     assert rows({"a": [pair(18, 24, of=24)]})[0].grew
 
 
-NONE = "nothing to compare"
+EMPTY = {"a": [PairedSamples(0, "Car", "missed", (), ())]}
 
 
 @pytest.mark.parametrize(
-    ("found", "failed", "passed", "without_rows"),
+    ("found", "failed", "allow_empty", "passed", "reason"),
     [
-        pytest.param({}, {}, True, True, id="no certain failure"),
-        pytest.param({}, {"a": "no scene"}, False, False, id="all frames failed"),
-        pytest.param({"b": [pair(5, 5)]}, {"a": "no scene"}, False, False, id="one of two frames failed"),
-        pytest.param({"a": [PairedSamples(0, "Car", "missed", (), ())]}, {}, False, False, id="no sample counts"),
-        pytest.param({"b": [pair(5, 5)]}, {}, True, False, id="nothing grew"),
-        pytest.param({"b": [pair(4, 14)]}, {}, False, False, id="a row grew"),
+        pytest.param({}, {}, False, False, "none in 3 frames", id="no certain failure"),
+        pytest.param({}, {}, True, True, "none in 3 frames", id="no certain failure, allowed"),
+        pytest.param({}, {"a": "no scene"}, True, False, "", id="all frames failed"),
+        pytest.param({"b": [pair(5, 5)]}, {"a": "no scene"}, False, False, "", id="one of two frames failed"),
+        pytest.param(EMPTY, {}, False, False, "no sample counts", id="no sample counts"),
+        pytest.param(EMPTY, {}, True, False, "no sample counts", id="no sample counts, allowed"),
+        pytest.param({"b": [pair(5, 5)]}, {}, False, True, "", id="nothing grew"),
+        pytest.param({"b": [pair(4, 14)]}, {}, False, False, "", id="a row grew"),
     ],
 )
-def test_the_verdict(found, failed, passed, without_rows, tmp_path: Path) -> None:
-    """A gate is passed where all that should be compared was compared, and no row grew."""
-    answer = build_gate_report(
-        tmp_path, rows(found), sum(map(len, found.values())), {"before": "x", "after": "y"}, failed
-    )
-    assert answer.data["passed"] == passed
-    assert answer.data["frames_failed"] == failed
-    assert any(NONE in note for note in answer.notes) == without_rows
-    assert any("could not be compared" in note for note in answer.notes) == bool(failed)
+def test_the_verdict(found, failed, allow_empty, passed, reason, tmp_path: Path) -> None:
+    """A gate is passed where all that should be compared was compared, and no row grew: notes, JUnit and page agree."""
+    about = {"before": "x", "after": "y", "tolerance": 0.05}
+    facts = GateFacts(about, "none in 3 frames", sum(map(len, found.values())), failed, allow_empty)
+    report = build_gate_report(tmp_path, rows(found), facts)
+    assert report.data["passed"] == passed
+    assert report.data["frames_failed"] == failed
+    assert any(f"nothing was compared: {reason}" in note for note in report.notes) == bool(reason)
+    assert any("could not be compared" in note for note in report.notes) == bool(failed)
     suite = ET.fromstring((tmp_path / "gate.xml").read_text())
-    assert int(suite.attrib["tests"]) == len(list(suite))
+    assert int(suite.attrib["tests"]) == len(list(suite)) > 0
     assert int(suite.attrib["errors"]) == len(failed)
+    assert (suite.attrib["failures"], suite.attrib["errors"]) == ("0", "0") if passed else True
+    assert passed or int(suite.attrib["failures"]) + int(suite.attrib["errors"]) > 0
+    assert suite.attrib["skipped"] == str(int(passed and bool(reason)))
     errors = {case.attrib["name"]: case.find("error") for case in suite}
     assert {name: one.attrib["message"] for name, one in errors.items() if one is not None} == failed
+    page = (tmp_path / "gate.html").read_text()
+    assert ("Gate passed" in page, "Gate not passed" in page) == (passed, not passed)
+
+
+def test_each_case_has_its_numbers_passed_or_not(tmp_path: Path) -> None:
+    compared = rows({"a": [pair(4, 14)], "c": [pair(5, 5)]})
+    build_gate_report(tmp_path, compared, GateFacts({"before": "x", "after": "y", "tolerance": 0.05}, "two", 2, {}))
+    page = (tmp_path / "gate.html").read_text()
+    cases = {case.attrib["name"]: case for case in ET.fromstring((tmp_path / "gate.xml").read_text())}
+    assert len(cases) == len(compared)
+    expected = {
+        "a: objects[0]": "lost 4 of 20 samples before, 14 of 20 after; difference +50.0 [",
+        "c: objects[0]": "lost 5 of 20 samples before, 5 of 20 after; difference +0.0 [",
+    }
+    for name, text in expected.items():
+        assert (cases[name].findtext("system-out") or "").startswith(text)
+        assert text in page
 
 
 def test_without_failures_there_are_no_rows() -> None:
     assert rows({}) == []
     assert rows({"a": [PairedSamples(0, "Car", "missed", (), (), (), ())]}) == []
-    assert ET.fromstring(format_junit([], {})).attrib["tests"] == "0"
 
 
 def test_junit() -> None:
