@@ -7,7 +7,7 @@ labels, the input of `scene_ir.derender.derender`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -159,12 +159,12 @@ def label_from_detections(
         ignore_xyxy=torch.zeros(0, 4),
     )
     row = {i: n for n, i in enumerate(vehicles)}
-    provenance = {"labels": "estimated"}
+    provenance = {"labels": "estimated"} | _record_uncertainty(
+        poses, {row[i]: n for n, i in enumerate(selected) if i in row}
+    )
     for n, i in enumerate(selected):
         if i in row:
             provenance[f"labels[{n}].score"] = f"{float(detections.scores[i]):.3f}"
-            provenance[f"labels[{n}].depth_sigma"] = f"{float(poses.log_depth_sigma[row[i]]):.3f}"
-            provenance[f"labels[{n}].facing"] = f"{float(poses.facing[row[i]]):.3f}"
     return replace(frame, labels=labels, provenance={**frame.provenance, **provenance})
 
 
@@ -199,7 +199,18 @@ def estimate_label_poses(frame: Frame) -> Frame:
         occlusion=torch.where(unknown & ~dropped, _estimate_occlusion(boxes, depth), labels.occlusion),
         truncation=torch.where(~known & ~dropped, estimated, labels.truncation),
     )
-    return replace(frame, labels=labels, provenance={**frame.provenance, "places": "estimated"})
+    uncertainty = _record_uncertainty(placed.poses, dict(enumerate(placed.vehicles)))
+    provenance = {**frame.provenance, "places": "estimated", **uncertainty}
+    return replace(frame, labels=labels, provenance=provenance)
+
+
+def _record_uncertainty(poses: VehiclePoses, rows: Mapping[int, int]) -> dict[str, str]:
+    """Provenance of the uncertainty of poses, by their labels. rows: label of each pose."""
+    provenance = {}
+    for pose, label in rows.items():
+        provenance[f"labels[{label}].depth_sigma"] = f"{float(poses.log_depth_sigma[pose]):.3f}"
+        provenance[f"labels[{label}].facing"] = f"{float(poses.facing[pose]):.3f}"
+    return provenance
 
 
 @dataclass(frozen=True, slots=True)

@@ -248,18 +248,9 @@ def _shade_photographed(
     uv = rows.xy + move
     texels = prepared.texels.sample(uv, rows.counts, prepared.backend, "clamp")
     rgb, rest = texels.split([channels.ALPHA, channels.TEXEL - channels.ALPHA], dim=1)
-    alpha, hidden, inset, z_seen, support = rest.unbind(1)
+    alpha, _, inset, _, support = rest.unbind(1)
     rgb = texture.relight(rgb, brighter)
-    clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
-    inside = texture.inside_weight(uv, *prepared.frame_hw)
-    visible = inside * clear
-    facing = texture.facing_weight(turned, cos_then, paint)
-    weight = facing * visible
-    if bool((inside.detach() < 1.0).any()):
-        near = texture.inside_weight(uv, *prepared.frame_hw, model.EXTENDED_PX)
-        near = near * smoothstep(alpha, *model.SOLID_ALPHA)
-        weight = weight + facing * (1.0 - inside) * near * clear
-    weight = weight * (1.0 - smoothstep(z_then - z_seen, *model.DEPTH_TOLERANCE_M))
+    weight, visible = photograph_weight(uv, texels, prepared.frame_hw, (z_then, turned, cos_then, paint))
     halo_weight = smoothstep(texture.outline_share(inset[m:]), 0.0, 1.0) * texture.outline_weight(turned[m:])
     halo_weight = halo_weight * (1.0 - smoothstep(inset[rows.anchor], *model.OUTER_OUTLINE_PX))
     weight = torch.cat([weight[:m], weight[m:] * halo_weight])
@@ -284,6 +275,60 @@ def _shade_photographed(
         region = prepared.regions.texels.sample_mesh_and_halo(uv, rows.counts, prepared.backend)[:, 0]
         paint = texture.paint_share(paint, region, unseen, prepared.regions.known[rows.owner])
     return _ShadedRows(colour, opacity, z_now, paint, height)
+
+
+def photograph_weight(
+    uv: Tensor, texels: Tensor, frame_hw: tuple[int, int], surface: tuple[Tensor, Tensor, Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """How far rows of meshes have the photograph's colours, not completed ones.
+
+    Args:
+        uv: (R, 2) px, where the photograph shows them.
+        texels: (R, `channels.TEXEL`) of the photograph there.
+        frame_hw: Size of the photograph, px.
+        surface: Of the mesh there, (R,) each: depth then, m; cosine towards the camera now minus then, and then;
+            share of paint.
+
+    Returns:
+        (R,) weight of the photograph in [0, 1], and whether it shows the place at all, in [0, 1].
+    """
+    alpha, hidden, _, z_seen, _ = texels[:, channels.ALPHA :].unbind(1)
+    z_then, turned, cos_then, paint = surface
+    clear = 1.0 - smoothstep(hidden, 0.0, 1.0)
+    inside = texture.inside_weight(uv, *frame_hw)
+    visible = inside * clear
+    facing = texture.facing_weight(turned, cos_then, paint)
+    weight = facing * visible
+    if bool((inside.detach() < 1.0).any()):
+        near = texture.inside_weight(uv, *frame_hw, model.EXTENDED_PX)
+        near = near * smoothstep(alpha, *model.SOLID_ALPHA)
+        weight = weight + facing * (1.0 - inside) * near * clear
+    return weight * (1.0 - smoothstep(z_then - z_seen, *model.DEPTH_TOLERANCE_M)), visible
+
+
+def measure_completion(prepared: PreparedScene, drawn: VisibleSurfaces) -> tuple[Tensor, Tensor]:
+    """For each packed pixel of the meshes (T,): the share that is drawn at all, and that with colours which the
+    photograph does not show; 0 beyond the meshes. Objects must have sources.
+    """
+    geometry, base, meshes = drawn.geometry, prepared.base_geometry, prepared.surfaces
+    turn = torch.stack([geometry.facing_cos - base.facing_cos, base.facing_cos, meshes.paint], dim=1)
+    attributes = torch.cat([base.clip - geometry.clip, base.clip[:, 2:], turn], dim=1)
+    dense = verbs.interpolate(drawn.mesh, geometry.clip, meshes.faces, attributes, prepared.backend)
+    hit = (drawn.mesh.face >= 0).nonzero()[:, 0]
+    xy = drawn.mesh.layout.pixel_xy()[hit].to(prepared.like)
+    lookup = _photograph_lookup(dense.index_select(0, hit), xy)
+    counts = torch.bincount(drawn.mesh.layout.draw_index()[hit], minlength=drawn.mesh.layout.rects.shape[0])
+    assert prepared.texels is not None
+    uv = xy + lookup[:, :2]
+    texels = prepared.texels.sample(uv, torch.cat([counts, 0 * counts]), prepared.backend, "clamp")
+    surface = (lookup[:, 2], lookup[:, 4], lookup[:, 5], lookup[:, 6])
+    weight, visible = photograph_weight(uv, texels, prepared.frame_hw, surface)
+    shown = 1.0 - visible * (1.0 - smoothstep(texels[:, channels.SUPPORT], *model.SUPPORTED))
+    drawn_share = prepared.like.new_zeros(drawn.mesh.layout.size)
+    return (
+        drawn_share.index_copy(0, hit, shown),
+        drawn_share.index_copy(0, hit, (1.0 - weight).clamp(0.0, 1.0) * shown),
+    )
 
 
 def _complete_unseen(
