@@ -14,22 +14,22 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
+from detectors import boxes
 from detectors.base import DetectorError, Predictor, predict
 from detectors.registry import load_predictor
-from detectors.types import Detections
 from drivesem.attacks.space import parse_params
 from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import GateConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, LEVEL, PairedDifference, holm, paired_differences, ratio_metric
+from drivesem.failures.kinds import BACKGROUND_IOU, MATCH_IOU
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood
 from drivesem.report.drawing import (
     DETECTED_COLOUR,
     TRUE_COLOUR,
-    LabelLayout,
-    TextLabel,
     encode_jpeg_data_url,
     write_picture,
 )
@@ -58,10 +58,11 @@ _MAX_PRINTED = 12
 """Holes in the table on a terminal; the files have all."""
 _NOTE = (
     "Lost: share of samples around a certain failure in which a detector misses the object; both detectors get "
-    "the same pictures. Phantoms: share of these samples with a detection on nothing, anywhere in the picture. In "
-    "brackets: 95 % paired bootstrap interval, over samples for a hole, and over holes for kinds, all, and "
-    "phantoms. p: exact sign test of the samples in which only one detector fails, with Holm's correction over "
-    "all rows. A row grew if the difference exceeds the tolerance, its interval lies above 0, and p is below 0.05."
+    "the same pictures, and samples in which the object is hidden, too small or faint do not count. Phantoms: share "
+    "of these samples with a detection on nothing, anywhere in the picture. In brackets: 95 % paired bootstrap "
+    "interval, over samples for a hole, and over holes for kinds, all, and phantoms. p: exact sign test of the "
+    "samples in which only one detector fails, with Holm's correction over all rows. A row grew if the difference "
+    "exceeds the tolerance, its interval lies above 0, and p is below 0.05."
 )
 _NO_SAMPLES = "no sample counts around any certain failure"
 _SIDES = ("unchanged", "changed")
@@ -91,6 +92,9 @@ class PairedSamples:
     """Whether the old detector reports something where nothing is, per sample."""
     phantoms_after: tuple[bool, ...] = ()
     """Whether the new detector does."""
+    scores: tuple[tuple[float | None, ...], ...] = ()
+    """Best score on the object before and after the change, without nuisances, by the old and by the new detector;
+    None if it is missed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +189,7 @@ def _run_gate(config: GateConfig, sources: Sequence[GateSource]) -> AnalysisRepo
             failures=counts["failures"],
             failed=failed,
             allow_empty=config.allow_empty,
-            pictures=_find_pictures(out, runs, pairs),
+            close_ups=_find_close_ups(out, runs, pairs),
         ),
     )
     report.write()
@@ -218,19 +222,20 @@ def _describe_scope(counts: Mapping[str, int]) -> str:
     return text
 
 
-def _find_pictures(
+def _find_close_ups(
     out: Path, runs: Sequence[AttackRun], pairs: Mapping[str, Sequence[PairedSamples]]
-) -> dict[str, list[Path]]:
-    """Return the pictures by hole of the analysed frames, in the order of `_SIDES`."""
-    pictures = {}
+) -> dict[str, CloseUp]:
+    """Return the close-ups by hole of the analysed frames."""
+    close_ups = {}
     for number, run in enumerate(runs):
         prefix = f"{run.name}/" if len(runs) > 1 else ""
         for frame in run.frames:
             name = frame.result.identifier
             folder = out / "runs" / str(number) / FRAMES / name
             for pair in pairs.get(prefix + name, ()):
-                pictures[_hole_name(prefix + name, pair)] = [folder / f"{pair.index}-{s}.jpg" for s in _SIDES]
-    return pictures
+                paths = tuple(folder / f"{pair.index}-{side}.jpg" for side in _SIDES)
+                close_ups[_hole_name(prefix + name, pair)] = CloseUp(pair, paths)
+    return close_ups
 
 
 def _attacked_detector(runs: Sequence[AttackRun], trust: bool) -> str:
@@ -282,67 +287,67 @@ class GateAnalyser(FrameAnalyser[FrameGateResult]):
             frame = RebuiltFrame.load(packed, self.attack, self.params, before)
         pairs = []
         for failure, neighbourhood in frame.neighbourhoods(str(self.config.seed)):
-            pairs.append(_draw_paired_samples(failure, neighbourhood, after, self.config.samples))
-            _write_case_pictures(folder, frame, neighbourhood.index, after)
+            pair = _draw_paired_samples(failure, neighbourhood, after, self.config.samples)
+            pairs.append(replace(pair, scores=_write_close_ups(folder, frame, neighbourhood.index, after)))
         return FrameGateResult(name, self.source_digest(name), tuple(pairs), round(time.perf_counter() - start, 3))
 
 
-def _write_case_pictures(folder: Path, frame: RebuiltFrame, index: int, after: Predictor) -> None:
-    """Write the object before and after the change, without nuisances, with the detections of both detectors."""
-    objective = frame.objective
+def _write_close_ups(
+    folder: Path, frame: RebuiltFrame, index: int, after: Predictor
+) -> tuple[tuple[float | None, ...], ...]:
+    """Write the object before and after the change, with the detections of both detectors on it. Returns
+    `PairedSamples.scores`.
+    """
+    objective, scores = frame.objective, []
     classes, changed = EvaluatedClasses.from_detector(after), objective.evaluate(frame.theta)
-    boxes = (objective.benign.paper.targets.boxes_xyxy[index], changed.moved.targets.boxes_xyxy[index])
-    for side, state, box in zip(_SIDES, (objective.benign, changed), boxes, strict=True):
+    states = ((objective.benign, objective.benign.paper), (changed, changed.moved))
+    places = [labels.targets.boxes_xyxy[index] for _, labels in states]
+    for side, (state, labels), place in zip(_SIDES, states, places, strict=True):
         new = classes.map_detections(predict(after, state.render.image[None])[0])
-        detections = (
-            (state.detections, objective.t_star, "current", DETECTED_COLOUR),
-            (new, resolve_t_star(after), "new", _NEW_COLOUR),
-        )
-        picture = _draw_close_up(to_uint8(state.render.image), boxes, box, detections)
+        label = objective.classes.map_targets(labels.targets).labels[index]
+        found = []
+        for detections, t_star in ((state.detections, objective.t_star), (new, resolve_t_star(after))):
+            ious = boxes.iou_matrix(detections.boxes_xyxy, place[None].to(detections.boxes_xyxy))[:, 0]
+            hits = (detections.scores >= t_star) & (detections.labels == label) & (ious >= MATCH_IOU)
+            near = (detections.scores >= t_star) & (ious >= BACKGROUND_IOU)
+            found.append(
+                (float(detections.scores[hits].max()) if hits.any() else None, detections.boxes_xyxy[near])
+            )
+        scores.append([score for score, _ in found])
+        coloured = [(place[None], TRUE_COLOUR), (found[0][1], DETECTED_COLOUR), (found[1][1], _NEW_COLOUR)]
+        picture = _draw_close_up(to_uint8(state.render.image), torch.stack(places), coloured)
         write_picture(folder / f"{index}-{side}.jpg", picture)
+    return tuple(zip(*scores, strict=True))
 
 
 def _draw_close_up(
-    image: np.ndarray,
-    places_xyxy: Sequence[Tensor],
-    true_xyxy: Tensor,
-    detections: Sequence[tuple[Detections, float, str, tuple[int, int, int]]],
+    image: np.ndarray, places_xyxy: Tensor, coloured: Sequence[tuple[Tensor, tuple[int, int, int]]]
 ) -> np.ndarray:
     """Draw a part of a picture, enlarged, with boxes.
 
     Args:
         image: (H, W, 3) uint8.
-        places_xyxy: Boxes (4,) px that the part surrounds.
-        true_xyxy: True box (4,) px.
-        detections: Detections with threshold, name and colour.
+        places_xyxy: (P, 4) px, boxes that the part surrounds.
+        coloured: Boxes (B, 4) px, with a colour; each colour a little farther out.
+
+    Returns:
+        (h, `_PICTURE_PX`, 3) uint8.
     """
     height, width = image.shape[:2]
-    corners = np.array([place.tolist() for place in places_xyxy])
-    x0, y0, x1, y1 = (*corners[:, :2].min(0), *corners[:, 2:].max(0))
+    (x0, y0), (x1, y1) = places_xyxy[:, :2].amin(0).tolist(), places_xyxy[:, 2:].amax(0).tolist()
     half = min(max(0.9 * (x1 - x0), 1.2 * (y1 - y0), 40.0), width / 2, 2 * height / 3)
     x, y = np.clip((x0 + x1) / 2, half, width - half), np.clip((y0 + y1) / 2, 0.75 * half, height - 0.75 * half)
     left, top, right, bottom = (round(float(v)) for v in (x - half, y - 0.75 * half, x + half, y + 0.75 * half))
     zoom = _PICTURE_PX / (right - left)
     size = (_PICTURE_PX, round((bottom - top) * zoom))
     canvas = cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_CUBIC)
-    labels = LabelLayout((canvas.shape[1], canvas.shape[0]))
-
-    def draw(xyxy: Tensor, colour: tuple[int, int, int], outset: int, text: str = "") -> None:
-        a, b, c, d = ((xyxy.detach().cpu().numpy() - (left, top, left, top)) * zoom).tolist()
-        if c < 0 or d < 0 or a > canvas.shape[1] or b > canvas.shape[0]:
-            return
-        box = (a - outset, b - outset, c + outset, d + outset)
-        first, second = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
-        cv2.rectangle(canvas, first, second, colour, 2, cv2.LINE_AA)
-        if text:
-            labels.add(box, TextLabel(text, colour))
-
-    draw(true_xyxy, TRUE_COLOUR, 0)
-    for number, (found, threshold, name, colour) in enumerate(detections, start=1):
-        for box, score in zip(found.boxes_xyxy, found.scores.tolist(), strict=True):
-            if score >= threshold:
-                draw(box, colour, 3 * number, f"{name} {score:.2f}")
-    labels.draw(canvas)
+    for outset, (rows, colour) in enumerate(coloured):
+        for box in rows.tolist():
+            a, b, c, d = (round(zoom * (v - start)) for v, start in zip(box, (left, top, left, top), strict=True))
+            margin = 3 * outset
+            corners = (a - margin, b - margin), (c + margin, d + margin)
+            cv2.rectangle(canvas, *corners, (0, 0, 0), 5, cv2.LINE_AA)
+            cv2.rectangle(canvas, *corners, colour, 3, cv2.LINE_AA)
     return canvas
 
 
@@ -463,6 +468,16 @@ def _sign_test(pairs: Sequence[PairedSamples]) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class CloseUp:
+    """Pictures of one certain failure."""
+
+    pair: PairedSamples
+    """Its samples."""
+    paths: tuple[Path, ...]
+    """JPEG files: before the change, and after it."""
+
+
+@dataclass(frozen=True, slots=True)
 class GateFacts:
     """What a gate's report states besides its rows."""
 
@@ -476,8 +491,8 @@ class GateFacts:
     """Reasons by frame that could not be compared; if there are any, the gate is not passed."""
     allow_empty: bool = False
     """Whether a gate without certain failures is passed."""
-    pictures: Mapping[str, Sequence[Path]] = field(default_factory=dict)
-    """Pictures by hole, before and after the change."""
+    close_ups: Mapping[str, CloseUp] = field(default_factory=dict)
+    """Pictures by hole."""
     verb: str = "lost"
     """Past participle that names a failure."""
     note: str = _NOTE
@@ -513,11 +528,20 @@ def build_gate_report(out: Path, rows: Sequence[GateRow], facts: GateFacts) -> A
     other_rows = [row for row in rows if row.level != HOLE]
     ordered = [*other_rows, *hole_rows]
     files.write_text(out / "gate.xml", format_junit(rows, failed, verb, "" if allowed else why_empty, why_empty))
-    cases = [_describe_case(row, verb, facts.pictures.get(row.hole, ())) for row in ordered[:_MAX_PICTURED]]
+    kinds = sum(row.level == KIND for row in rows)
+    distinct = [
+        r for r in ordered if not (r.level == KIND and kinds == 1) and not (r.level == ALL and r.holes == 1)
+    ]
+    cases = [_describe_case(row, verb, facts.close_ups.get(row.hole)) for row in distinct[:_MAX_PICTURED]]
     page = render_page(
-        "drivesem.analysis:gate.html", title=title, passed=passed, facts=facts, cases=cases, notes=notes,
-        left_out=len(ordered) - len(cases),
-    )  # fmt: skip
+        "drivesem.analysis:gate.html",
+        title=title,
+        passed=passed,
+        facts=facts,
+        cases=cases,
+        notes=notes,
+        left_out=len(distinct) - len(cases),
+    )
     files.write_text(out / "gate.html", page)
     data = {"passed": passed, **facts.about, "out": str(out), "rows": [row.to_json() for row in rows]}
     return AnalysisReport(
@@ -534,28 +558,31 @@ def build_gate_report(out: Path, rows: Sequence[GateRow], facts: GateFacts) -> A
     )
 
 
-def _describe_case(row: GateRow, verb: str, pictures: Sequence[Path]) -> dict[str, Any]:
+def _describe_case(row: GateRow, verb: str, close_up: CloseUp | None) -> dict[str, Any]:
     """Values of a case on the page."""
-    images = [path for path in pictures if path.is_file()]
-    return {
-        "row": row,
-        "name": _row_name(row),
-        "text": _describe_row(row, verb),
-        "images": [encode_jpeg_data_url(files.read_image(path)) for path in images],
-    }
+    case = {"row": row, "name": _row_name(row), "text": _describe_row(row, verb), "images": []}
+    if close_up is None or not all(path.is_file() for path in close_up.paths):
+        return case
+    urls = [encode_jpeg_data_url(files.read_image(path)) for path in close_up.paths]
+    scores = [
+        ["missed" if score is None else f"{score:.2f}" for score in by_detector]
+        for by_detector in zip(*close_up.pair.scores, strict=True)
+    ]
+    name = f"{case['name']} ({close_up.pair.label}, {close_up.pair.error})"
+    return {**case, "name": name, "images": list(zip(("before", "after"), urls, scores, strict=True))}
 
 
 def _row_name(row: GateRow) -> str:
-    names = {ALL: "all holes", PHANTOMS: "phantoms", KIND: f"all {row.hole}"}
+    names = {ALL: "all failures", PHANTOMS: "phantoms", KIND: f"all {row.hole}"}
     return names.get(row.level, row.hole)
 
 
 def _describe_row(row: GateRow, verb: str) -> str:
     """The result of a row in one line: counts of samples, difference with its interval, p."""
-    verb = "phantoms in" if row.level == PHANTOMS else verb
-    before, after = (f"{round(share * row.samples)} of {row.samples}" for share in (row.before, row.after))
-    text = f"{verb} {before} samples before, {after} after"
-    text += f"; difference {_format_difference(row)} points; p {row.p:.3g}"
+    verb = "phantoms" if row.level == PHANTOMS else verb
+    before, after = round(row.before * row.samples), round(row.after * row.samples)
+    text = f"{verb} in {before} of {row.samples} samples by the current detector, in {after} by the new one"
+    text += f"; difference {_format_difference(row)} points; p {row.p:.2g}"
     return text if row.holes == 1 else f"{text}; {row.holes} holes"
 
 

@@ -26,6 +26,7 @@ from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run
 from drivesem.run.records import load_record
+from scene_ir import files
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import solve_sources
 from scene_ir.types import SceneIR
@@ -350,6 +351,75 @@ def test_frames_that_cannot_be_compared_do_not_pass(
     page = (out / "gate.md").read_text()
     assert "1 frame could not be compared, so the gate is not passed." in page
     assert "no certain failure" not in page
+
+
+def test_a_package_gives_the_numbers_of_its_run(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], attacked: Path, tmp_path: Path
+) -> None:
+    package = tmp_path / "package"
+    exported = run_json("export", attacked, "--to", "gate", "--out", package)
+    assert (exported["frames"], exported["sha256"]) == (1, files.sha256_digest(package / "package.json"))
+    assert exported["bytes"] == sum(path.stat().st_size for path in package.rglob("*") if path.is_file()) < 1e6
+    (frame,) = load_run(attacked).frames
+    certain = [f.index for f in frame.result.failures if f.grade != "threshold"]
+    assert [row["object"] for row in files.read_json(package / "package.json")["failures"]] == certain
+    words = ["--before", "any", "--samples", "20", "--workers", "1"]
+    for after in ("worse", "any"):
+        code, data = gate(after)
+        of_package = run_json(
+            "gate", package, *words, "--after", after, "--out", tmp_path / f"p-{after}", code=code
+        )
+        assert of_package["rows"] == data["rows"]
+        assert of_package["failures"] == data["failures"] == len(certain)
+    page = (tmp_path / "p-worse" / "gate.html").read_text()
+    assert page.count("<img ") == 2 * len(certain)
+    assert not (package / "gate").exists()
+    assert "--to gate, which takes all certain failures" in refusal(
+        "export", attacked, "--to", "gate", "--grade", "shared", "--out", tmp_path / "none"
+    )
+
+
+@pytest.mark.usefixtures("gate")
+def test_a_damaged_package_is_refused_in_one_line(attacked: Path, tmp_path: Path) -> None:
+    package = tmp_path / "package"
+    invoke("export", attacked, "--to", "gate", "--out", package)
+    archive = package / "frames" / "demo-000" / "frame.tar.xz"
+    whole = archive.read_bytes()
+    for damaged in (whole[:-40], whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:], None):
+        archive.unlink() if damaged is None else archive.write_bytes(damaged)
+        reason = refusal("gate", package, "--after", "worse", "--out", tmp_path / "out")
+        assert reason.startswith(str(archive))
+    digests = files.read_json(package / "package.json")
+    archive.write_bytes(whole[:-40])
+    digests["files"]["frames/demo-000/frame.tar.xz"] = files.sha256_digest(archive)
+    files.write_json(package / "package.json", digests)
+    assert f"{archive}: expected an archive of a frame" in refusal("gate", package, "--after", "worse")
+    files.write_json(package / "package.json", {"schema": 9})
+    assert "package.json: expected a package of schema 1" in refusal("gate", package, "--after", "worse")
+
+
+def test_a_run_without_certain_failures_is_no_gate(
+    gate: Callable[[str], tuple[int, dict[str, Any]]], attacked: Path, tmp_path: Path
+) -> None:
+    run = shutil.copytree(attacked, tmp_path / "run")
+    path = run / "frames" / "demo-000" / "result.json"
+    result = json.loads(path.read_text())
+    words = ["gate", run, "--before", "any", "--after", "any", "--workers", "1"]
+    for number, (grade, reason) in enumerate((("threshold", "no certain failure of an object in 1 attacked frame"),
+                                              (None, "the failures of 1 frame have no grade"))):  # fmt: skip
+        failures = [failure | {"grade": grade} for failure in result["failures"]]
+        path.write_text(json.dumps(result | {"failures": failures}))
+        data = run_json(*words, "--out", tmp_path / f"{number}", code=1)
+        assert (data["passed"], data["failures"], data["rows"]) == (False, 0, [])
+        suite = ET.parse(tmp_path / f"{number}" / "gate.xml").getroot()
+        assert (suite.attrib["tests"], suite.attrib["failures"]) == ("1", "1")
+        printed = invoke(*words, "--allow-empty", "--out", tmp_path / f"{number}").out
+        (line,) = (line for line in printed.splitlines() if line.startswith("Gate passed: nothing was compared"))
+        assert reason in line
+        assert ET.parse(tmp_path / f"{number}" / "gate.xml").getroot().attrib["skipped"] == "1"
+    assert "expected a run with a certain failure" in refusal(
+        "export", run, "--to", "gate", "--out", tmp_path / "package"
+    )
 
 
 @pytest.mark.usefixtures("gate")

@@ -196,13 +196,15 @@ def test_the_verdict(found, failed, allow_empty, passed, reason, tmp_path: Path)
 
 def test_each_case_has_its_numbers_passed_or_not(tmp_path: Path) -> None:
     compared = rows({"a": [pair(4, 14)], "c": [pair(5, 5)]})
-    build_gate_report(tmp_path, compared, GateFacts({"before": "x", "after": "y", "tolerance": 0.05}, "two", 2, {}))
+    build_gate_report(
+        tmp_path, compared, GateFacts({"before": "x", "after": "y", "tolerance": 0.05}, "two", 2, {})
+    )
     page = (tmp_path / "gate.html").read_text()
     cases = {case.attrib["name"]: case for case in ET.fromstring((tmp_path / "gate.xml").read_text())}
     assert len(cases) == len(compared)
     expected = {
-        "a: objects[0]": "lost 4 of 20 samples before, 14 of 20 after; difference +50.0 [",
-        "c: objects[0]": "lost 5 of 20 samples before, 5 of 20 after; difference +0.0 [",
+        "a: objects[0]": "lost in 4 of 20 samples by the current detector, in 14 by the new one; difference +50.0 [",
+        "c: objects[0]": "lost in 5 of 20 samples by the current detector, in 5 by the new one; difference +0.0 [",
     }
     for name, text in expected.items():
         assert (cases[name].findtext("system-out") or "").startswith(text)
