@@ -1,10 +1,10 @@
-"""Tests counterexamples of a run again with a second renderer, and reports which failures survive."""
+"""Counts failures of a run again in a second renderer's images, and reports which survive."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.types import CLASSES, Detections, Targets
+from drivesem.attacks.space import parse_params
 from drivesem.attacks.targets import HEADLINE, EvaluatedClasses
 from drivesem.config.commands import ConfirmConfig
 from drivesem.config.constraints import is_url
@@ -24,15 +25,24 @@ from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO
 from drivesem.evaluation import coco, failures
 from drivesem.evaluation.resampling import wilson
+from drivesem.failures.grades import AGREEMENT_RULE, Grade, SecondOpinion
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, measure_text, paste, write_text
 from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
+from drivesem.run.attack import build_grader
 from drivesem.run.detection_cache import detect_objects, image_to_tensor
 from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames
-from drivesem.run.finished import METRICS, AttackRun, RunFrame, load_runs
+from drivesem.run.finished import METRICS, AttackRun, RebuiltFrame, RunFrame, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, claim_folder, load_run_detector, load_trusted_config
-from drivesem.run.frame import detection_records, detections_from_records, target_records, targets_from_records
+from drivesem.run.frame import (
+    detection_records,
+    detections_from_records,
+    has_grade,
+    target_records,
+    targets_from_records,
+)
+from drivesem.run.report.page import format_second_opinion, name_failure
 from drivesem.run.report.pictures import draw_overlay
 from drivesem.run.results import BoxRecord, Failure, FrameResult
 from scene_ir import files
@@ -41,7 +51,7 @@ from scene_ir.io import load_scene, to_uint8
 
 @dataclass(frozen=True, slots=True)
 class RendererFailure:
-    """A failure in one of the two pictures."""
+    """A failure in the second renderer's picture."""
 
     kind: str
     """"lost" or "phantom"."""
@@ -53,8 +63,35 @@ class RendererFailure:
     """Number of the lost object; None for a phantom."""
     score: float | None
     """Score of a phantom, in [0, 1]."""
-    survives: bool
-    """Whether the other picture has it too: the same vehicle lost, or a phantom of the class at IoU >= 0.5."""
+
+
+@dataclass(frozen=True, slots=True)
+class RetestedFailure:
+    """A failure of the run, counted again in a second renderer's images."""
+
+    failure: Failure
+    """The failure, as the run graded it."""
+    opinion: SecondOpinion | None
+    """Draws of the second renderer, the same ones as the grade's; None for a failure of no kind."""
+
+    @property
+    def survives(self) -> bool:
+        """Whether the second renderer agrees, by the rule of the grade *confirmed*."""
+        return self.opinion is not None and self.opinion.agrees
+
+    def to_json(self, frame: str) -> dict[str, Any]:
+        """Return a JSON object. frame: its frame."""
+        failure = self.failure
+        return {
+            "frame": frame,
+            "object": failure.index,
+            "kind": failure.error,
+            "by_threshold": failure.kind,
+            "grade": failure.grade,
+            "survives": None if self.opinion is None else self.survives,
+            "second": None if self.opinion is None else dataclasses.asdict(self.opinion),
+            "second_in_run": None if failure.second is None else dataclasses.asdict(failure.second),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +118,10 @@ class ConfirmedFrame:
     """Digest of the run's result.json."""
     renderer: str
     """Name of the second renderer."""
-    compositor: tuple[RendererFailure, ...]
-    """Failures in the compositor's picture."""
+    failures: tuple[RetestedFailure, ...]
+    """The run's failures, in the compositor's picture."""
     second: tuple[RendererFailure, ...]
-    """Failures in the second renderer's picture."""
+    """Failures in the second renderer's picture, without nuisances."""
     objects: tuple[ObjectComparison, ...]
     """The scene's objects in both pictures."""
     targets_benign: tuple[BoxRecord, ...]
@@ -137,56 +174,35 @@ def pair_targets(before: SecondRender, after: SecondRender, count: int) -> Rende
     return RendererTargets(append_regions(first), append_regions(second))
 
 
-def compare_failures(
-    result: FrameResult,
-    targets: RendererTargets,
-    detections: Sequence[Detections],
-    classes: EvaluatedClasses,
-    t_star: float,
-) -> tuple[tuple[RendererFailure, ...], tuple[RendererFailure, ...]]:
-    """Compare the failures in both renderers' pictures.
+def find_second_failures(
+    targets: RendererTargets, detections: Sequence[Detections], classes: EvaluatedClasses, t_star: float
+) -> tuple[RendererFailure, ...]:
+    """Find the failures in the second renderer's picture.
 
     Args:
-        result: The run's result.
-        targets: Labels of the second renderer.
+        targets: Its labels.
         detections: Detections in its pictures, before and after the change.
         classes: The detector's evaluated classes.
         t_star: Score from which a detection counts.
-
-    Returns:
-        Failures in the compositor's picture, from the result, and in the second renderer's picture.
     """
     benign, changed = classes.map_targets(targets.benign), classes.map_targets(targets.changed)
     before, after = detections
     found = failures.find_failures(benign, before, changed, after, t_star)
-    second = []
-    for i in found.lost:
-        label = CLASSES[int(targets.changed.labels[i])]
-        second.append(RendererFailure("lost", label, _xyxy(changed.boxes_xyxy[i]), i, None, False))
-    for i in found.phantoms:
-        label, score = classes.names[int(after.labels[i])], float(after.scores[i])
-        second.append(RendererFailure("phantom", label, _xyxy(after.boxes_xyxy[i]), None, score, False))
-    compositor = [
-        RendererFailure(f.kind, f.label, f.xyxy, f.index if f.kind == "lost" else None, f.score, False)
-        for f in result.failures
+    lost = [
+        RendererFailure("lost", CLASSES[int(targets.changed.labels[i])], _xyxy(changed.boxes_xyxy[i]), i, None)
+        for i in found.lost
     ]
-    return _with_survival(compositor, second), _with_survival(second, compositor)
-
-
-def _with_survival(
-    own: Sequence[RendererFailure], others: Sequence[RendererFailure]
-) -> tuple[RendererFailure, ...]:
-    return tuple(
-        dataclasses.replace(one, survives=any(_is_same_failure(one, other) for other in others)) for one in own
-    )
-
-
-def _is_same_failure(one: RendererFailure, other: RendererFailure) -> bool:
-    if one.kind != other.kind:
-        return False
-    if one.kind == "lost":
-        return one.index is not None and one.index == other.index
-    return one.label == other.label and _iou(one.xyxy, other.xyxy) >= failures.MATCH_IOU
+    phantoms = [
+        RendererFailure(
+            "phantom",
+            classes.names[int(after.labels[i])],
+            _xyxy(after.boxes_xyxy[i]),
+            None,
+            float(after.scores[i]),
+        )
+        for i in found.phantoms
+    ]
+    return (*lost, *phantoms)
 
 
 def compare_objects(result: FrameResult, targets: RendererTargets, count: int) -> tuple[ObjectComparison, ...]:
@@ -260,7 +276,7 @@ def run_confirm(config: ConfirmConfig) -> tuple[Confirmation, AnalysisReport]:
 class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
     """Re-renders frames of a run and compares the detector's failures."""
 
-    file, kind, schema = "confirmed.json", ConfirmedFrame, 2
+    file, kind, schema = "confirmed.json", ConfirmedFrame, 3
 
     def __init__(self, config: ConfirmConfig, run: AttackRun, out: Path) -> None:
         super().__init__(run.folder, out)
@@ -274,6 +290,9 @@ class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
         self.second.check()
         self.detector = load_run_detector(attack, config.device)
         self.device, self.t_star = config.device, float(files.read_json(run.folder / METRICS)["t_star"])
+        self.attack, self.params = attack, parse_params(run.params)
+        grader = build_grader(dataclasses.replace(attack, confirm=False), self.detector)
+        self.grader = dataclasses.replace(grader, make_second_renderer=self.second.renderer_for)
 
     def analyse(self, name: str, folder: Path) -> ConfirmedFrame:
         """See `FrameAnalyser`. Raises SceneError if no second renderer reproduces the frame's photograph."""
@@ -287,13 +306,12 @@ class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
         pictures = [to_uint8(render.image) for render in renders]
         detections = [detect_objects(self.detector, image_to_tensor(p, self.device)) for p in pictures]
         result = self.frames[name].result
-        compositor, second = compare_failures(result, targets, detections, classes, self.t_star)
         confirmed = ConfirmedFrame(
             identifier=name,
             source=self.source_digest(name),
             renderer=renderer.name,
-            compositor=compositor,
-            second=second,
+            failures=self._count_again(name),
+            second=find_second_failures(targets, detections, classes, self.t_star),
             objects=compare_objects(result, targets, count),
             targets_benign=target_records(targets.benign, CLASSES, count),
             targets_changed=target_records(targets.changed, CLASSES, count),
@@ -307,17 +325,24 @@ class ConfirmAnalyser(FrameAnalyser[ConfirmedFrame]):
         files.write_png(folder / "sheet.png", sheet)
         return confirmed
 
+    def _count_again(self, name: str) -> tuple[RetestedFailure, ...]:
+        """Count the draws of the second renderer in which a frame's failures occur, as its grades do."""
+        frame = RebuiltFrame.load(self.run_folder / FRAMES / name, self.attack, self.params, self.detector)
+        state = frame.evaluate_state(self.grader, frame.theta)
+        faults = {failure: state.find_recorded_fault(failure) for failure in frame.result.failures}
+        opinions = self.grader.second_opinions(
+            state.case, [fault for fault in faults.values() if fault is not None]
+        )
+        return tuple(
+            RetestedFailure(failure, None if fault is None else opinions[fault])
+            for failure, fault in faults.items()
+        )
 
-SURVIVE, SAME, LOST, PHANTOMS, NEW = (
-    "frames",
-    "frames, same failure",
-    "lost",
-    "phantoms",
-    "frames, second only",
-)
-"""Names of the survival rates: of frames that fail in the compositor's picture, those that fail in the second
-renderer's, by any failure or by the same one; of lost vehicles and of phantoms, those that do; of frames that do
-not fail in the compositor's picture, those that fail in the second renderer's."""
+
+SURVIVE, CERTAIN, LOST, PHANTOMS, NEW = ("frames", "certain", "lost", "phantoms", "frames, second only")
+"""Names of the survival rates. Of frames with failures of a kind: those in which one survives; of the failures that are
+graded at least certain, of lost vehicles, and of phantoms: those that survive; of frames that do not fail in the
+compositor's picture, those that fail in the second renderer's."""
 
 _OVERLAP = ("mean", "least", "boxes")
 _MAX_ENLARGED = 3
@@ -360,6 +385,10 @@ class Confirmation:
     """Number of these frames."""
     not_carried: dict[str, list[str]]
     """Parts of the change that the second renderer lacks, by frame that is left out."""
+    failures: tuple[tuple[str, RetestedFailure], ...]
+    """Failures that were counted again, each with its frame."""
+    not_tested: int
+    """Number of failures of no kind, which are not tested."""
     shares: tuple[SurvivalRate, ...]
     """Survival rates."""
     scores: dict[str, coco.CocoScores]
@@ -373,6 +402,8 @@ class Confirmation:
             "frames": self.frames,
             "not_carried": self.not_carried,
             "survive": self.shares[0].share,
+            "failures": [one.to_json(frame) for frame, one in self.failures],
+            "not_tested": self.not_tested,
             "rows": [
                 {name: getattr(share, name) for name in ("name", "failures", "survive", "share", "low", "high")}
                 for share in self.shares
@@ -395,21 +426,25 @@ def summarise_confirmation(
     """
     pairs = [(one, result) for one, result in zip(confirmed, results, strict=True) if not one.not_carried]
     whole = [one for one, _ in pairs]
-    failed = [one for one in whole if one.compositor]
+    every = [(one.identifier, failure) for one in whole for failure in one.failures]
+    tested = [(frame, failure) for frame, failure in every if failure.opinion is not None]
+    by_frame = {frame: [one for name, one in tested if name == frame] for frame, _ in tested}
 
-    def outcomes(kind: str) -> list[bool]:
-        return [f.survives for one in failed for f in one.compositor if f.kind == kind]
+    def rate(name: str, chosen: Callable[[Failure], bool]) -> SurvivalRate:
+        return SurvivalRate.from_outcomes(name, [one.survives for _, one in tested if chosen(one.failure)])
 
     shares = (
-        SurvivalRate.from_outcomes(SURVIVE, [bool(one.second) for one in failed]),
-        SurvivalRate.from_outcomes(SAME, [any(f.survives for f in one.compositor) for one in failed]),
-        SurvivalRate.from_outcomes(LOST, outcomes("lost")),
-        SurvivalRate.from_outcomes(PHANTOMS, outcomes("phantom")),
-        SurvivalRate.from_outcomes(NEW, [bool(one.second) for one in whole if not one.compositor]),
+        SurvivalRate.from_outcomes(SURVIVE, [any(f.survives for f in ones) for ones in by_frame.values()]),
+        rate(CERTAIN, has_grade(Grade.CERTAIN)),
+        rate(LOST, lambda failure: failure.kind == "lost"),
+        rate(PHANTOMS, lambda failure: failure.kind == "phantom"),
+        SurvivalRate.from_outcomes(NEW, [bool(one.second) for one in whole if not one.failures]),
     )
     ious = [s.iou for one in whole for s in one.objects if s.judged and s.iou is not None]
     return Confirmation(
         frames=len(whole),
+        failures=tuple(tested),
+        not_tested=len(every) - len(tested),
         not_carried={one.identifier: list(one.not_carried) for one in confirmed if one.not_carried},
         shares=shares,
         scores=_compute_scores(pairs, classes, t_star),
@@ -443,31 +478,50 @@ def _compute_scores(
 
 def build_confirm_tables(report: Confirmation) -> list[ReportTable]:
     """Build the tables of survival rates, and of precision and recall by picture."""
+    by_failure = tuple(
+        (
+            frame,
+            name_failure(one.failure),
+            one.failure.grade or "not graded",
+            format_second_opinion(one.failure, one.opinion),
+            "yes" if one.survives else "no",
+        )
+        for frame, one in report.failures
+    )
     shares = tuple(
         (
             s.name,
-            str(s.failures),
-            str(s.survive),
+            f"{s.survive} of {s.failures}",
             format_percent(s.share),
-            f"{format_percent(s.low)} to {format_percent(s.high)}",
+            f"{format_percent(s.low)} to {format_percent(s.high)}" if s.failures else "-",
         )
         for s in report.shares
     )
     scores = [(name, *map(format_percent, scores.headline.columns)) for name, scores in report.scores.items()]
     return [
-        ReportTable("failures that survive, %", ("figure", "failures", "survive", "share", "95 %"), shares),
+        ReportTable("failures", ("frame", "failure", "grade", "second renderer, draws", "survives"), by_failure),
+        ReportTable("failures that survive", ("of", "survive", "share, %", "95 %"), shares),
         ReportTable(f"{HEADLINE}, %", ("picture", *coco.SCORE_TITLES), tuple(scores)),
     ]
 
 
 def build_confirm_notes(report: Confirmation) -> list[str]:
     """Explain the rates, and list what they leave out."""
+    needed, of = AGREEMENT_RULE
     notes = [
-        "Survive: the detector also fails in the second renderer's picture of the same change, by that picture's "
-        "labels. Frames: by any failure, or by the same one; lost: the same vehicle; phantoms: one of the same "
-        "class at an IoU of at least 0.5. Second only: of the frames that do not fail in the compositor's "
-        "picture, those that fail in the second renderer's. Intervals: Wilson, 95 %.",
+        f"Survives: the second renderer agrees, by the rule and in the draws of the grade confirmed: right in {needed} "
+        f"of {of} draws before the change, wrong in {needed} of {of} after it. A failure that is certain and survives "
+        "is confirmed. Frames: those in which a failure survives. Second only: of the frames without a failure, "
+        "those that fail in the second renderer's one picture without nuisances. Intervals: Wilson, 95 %.",
     ]
+    if report.not_tested:
+        count = format_count(report.not_tested, "failure")
+        notes.append(f"{count} by threshold, none of a kind: not tested.")
+    for frame, one in report.failures:
+        earlier = one.failure.second
+        if earlier is not None and earlier != one.opinion:
+            before = format_second_opinion(one.failure, earlier)
+            notes.append(f"Frame {frame}, {name_failure(one.failure)}: the run counted otherwise: {before}.")
     if report.overlap is not None:
         mean, least, count = report.overlap
         notes.append(f"IoU of the boxes of {count} vehicles in both pictures: mean {mean:.3f}, least {least:.3f}.")
@@ -499,25 +553,22 @@ def build_confirm_report(
         csv_tables={"confirm": [_csv_row(frame) for frame in confirmed]},
         tables=build_confirm_tables(report),
         notes=build_confirm_notes(report),
+        text_columns=("frame", "failure", "grade", "second renderer, draws", "survives", "of", "picture"),
         failed={f"frame {name}": reason for name, reason in failed.items()},
     )
 
 
 def _csv_row(one: ConfirmedFrame) -> dict[str, Any]:
+    tested = [failure for failure in one.failures if failure.opinion is not None]
     row: dict[str, Any] = {
         "frame": one.identifier,
         "second": one.renderer,
-        "fails_compositor": bool(one.compositor),
-        "fails_second": bool(one.second),
-        "survives": bool(one.compositor and one.second),
+        "failures": len(tested),
+        "survive": sum(failure.survives for failure in tested),
+        "not_tested": len(one.failures) - len(tested),
+        "lost_second": sum(f.kind == "lost" for f in one.second),
+        "phantoms_second": sum(f.kind == "phantom" for f in one.second),
     }
-    for kind, title in (("lost", "lost"), ("phantom", "phantoms")):
-        ours = [f for f in one.compositor if f.kind == kind]
-        row |= {
-            f"{title}_compositor": len(ours),
-            f"{title}_second": sum(f.kind == kind for f in one.second),
-            f"{title}_both": sum(f.survives for f in ours),
-        }
     ious = [s.iou for s in one.objects if s.judged and s.iou is not None]
     return row | {
         "vehicles": len(one.objects),
@@ -543,14 +594,15 @@ def draw_confirm_sheet(frame: RunFrame, confirmed: ConfirmedFrame, image: np.nda
     composed = files.read_image(frame.pictures["attacked"])
     result = frame.result
     composed_overlay = _draw_failures(
-        composed, result.targets_moved, result.detections_attacked, confirmed.compositor, t_star
+        composed, result.targets_moved, result.detections_attacked, [f.failure for f in confirmed.failures], t_star
     )
     second_overlay = _draw_failures(
         image, confirmed.targets_changed, confirmed.detections_changed, confirmed.second, t_star
     )
+    survive = sum(failure.survives for failure in confirmed.failures)
     titles = (
-        f"{confirmed.identifier}, compositor: {_describe_failures(confirmed.compositor)}",
-        f"{confirmed.identifier}, {confirmed.renderer}: {_describe_failures(confirmed.second)}",
+        f"{confirmed.identifier}, compositor: {_describe_failures(result.failures)}; {survive} survive in draws",
+        f"{confirmed.identifier}, {confirmed.renderer}, without nuisances: {_describe_failures(confirmed.second)}",
     )
     names = ("compositor", confirmed.renderer)
     strip = _draw_enlarged(
@@ -574,7 +626,7 @@ def _draw_failures(
     image: np.ndarray,
     targets: Sequence[BoxRecord],
     detections: Sequence[BoxRecord],
-    failures: Sequence[RendererFailure],
+    failures: Sequence[RendererFailure | Failure],
     t_star: float,
 ) -> np.ndarray:
     # ignored regions, which the targets hold once per class, are left out
@@ -583,17 +635,17 @@ def _draw_failures(
     return draw_overlay(image, objects, tuple(detections), failed, t_star)
 
 
-def _describe_failures(failures: Sequence[RendererFailure]) -> str:
+def _describe_failures(failures: Sequence[RendererFailure | Failure]) -> str:
     if not failures:
         return "no failure"
     lost = sum(f.kind == "lost" for f in failures)
-    phantoms = format_count(len(failures) - lost, "phantom")
-    return f"{lost} lost, {phantoms}; {sum(f.survives for f in failures)} in both pictures"
+    return f"{lost} lost, {format_count(len(failures) - lost, 'phantom')}"
 
 
 def _choose_boxes(confirmed: ConfirmedFrame, moved: Sequence[BoxRecord]) -> list[tuple[float, ...]]:
     """Choose the boxes to enlarge: failures, then the largest vehicles that count."""
-    boxes: list[tuple[float, ...]] = [f.xyxy for f in (*confirmed.compositor, *confirmed.second)]
+    boxes: list[tuple[float, ...]] = [f.failure.xyxy for f in confirmed.failures]
+    boxes += [f.xyxy for f in confirmed.second]
     cars = sorted((t for t in moved if t.index is not None and not t.ignore), key=lambda t: t.xyxy[1] - t.xyxy[3])
     for box in (t.xyxy for t in cars):
         if all(abs(box[0] - p[0]) + abs(box[1] - p[1]) > 8 for p in boxes):

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 AGREEMENT_RULE = 3, 4
-"""Samples in which a second renderer or detector must agree, and of how many."""
+"""Samples, of either state, in which a second renderer or detector must agree, and of how many. The only rule by which
+a failure is *confirmed*, *shared*, or survives.
+"""
 
 
 class Kind(StrEnum):
@@ -58,13 +60,36 @@ class SecondOpinion:
     by: str
     """Name of the renderer or detector."""
     before: int
-    """Samples, of `draws`, that are right before the change."""
+    """Samples, of `draws`, of the unchanged scene that are right."""
     after: int
     """Samples, of `draws`, that are wrong after the change."""
     draws: int
     """Samples of either state."""
+    placebo: int | None = None
+    """Samples, of `draws`, that are right after a random edit of the same size; None where it was not needed."""
 
     @property
     def agrees(self) -> bool:
-        """Whether enough samples of either state agree with the failure."""
-        return min(self.before, self.after) >= AGREEMENT_RULE[0]
+        """Whether enough samples of every state agree with the failure."""
+        right = self.before if self.placebo is None else min(self.before, self.placebo)
+        return min(right, self.after) >= AGREEMENT_RULE[0]
+
+    def describe(self, kind: str | None) -> str:
+        """Describe the opinion on a failure of a kind: `generator agrees: found in 4/4 → 0/4`."""
+        verb, counts_right = draw_verb(kind)
+        if counts_right and not self.before:
+            return f"{self.by} never {verb.removesuffix(' in')} it: 0/{self.draws} without the change"
+
+        def share(right: int) -> str:
+            return f"{right if counts_right else self.draws - right}/{self.draws}"
+
+        verdict = "agrees" if self.agrees else "does not agree"
+        text = f"{self.by} {verdict}: {verb} {share(self.before)} → {share(self.draws - self.after)}"
+        return text if self.placebo is None else f"{text}; {share(self.placebo)} after a placebo"
+
+
+def draw_verb(kind: str | None) -> tuple[str, bool]:
+    """Return the verb that draws of a kind of failure are counted by, and whether it describes what is right."""
+    if kind == Kind.BACKGROUND:
+        return "there in", False
+    return ("reported twice in", False) if kind == Kind.TWICE else ("found in", True)

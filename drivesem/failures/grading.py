@@ -1,15 +1,15 @@
 """Grades: how certain a failure is. Each grade includes the requirements of the previous one.
 
-threshold: right in one image and wrong in another (`evaluation.failures`). certain: one of the kinds in `kinds`,
-    with
-a certificate. confirmed: it also occurs in a second renderer's images of the same samples. shared: it also occurs
-with a detector of another architecture, which is right under a placebo, a random edit of the same size.
+threshold: right in one image and wrong in another (`evaluation.failures`). certain: one of the kinds in `kinds`, with
+a certificate, in a picture that is trusted (`fidelity`). confirmed: it also occurs in a second renderer's images of other samples (`SecondOpinion.agrees`).
+shared: it also occurs with a detector of another architecture, which is right without the change and under a placebo,
+a random edit of the same size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -19,12 +19,14 @@ from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.evaluation.failures import FrameFailures
 from drivesem.failures.certificate import (
     CertificateRule,
+    CompositorRenderer,
     NuisanceCamera,
     SampleOutcome,
     certify,
     is_correct,
     shows_fault,
 )
+from drivesem.failures.fidelity import ObjectFidelity, lowest_fidelity, measure_fidelity
 from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, Kind, SecondOpinion
 from drivesem.failures.kinds import OBJECT_KINDS, Fault, LabelledDetections, find_faults
 from drivesem.failures.nuisances import Nuisances
@@ -50,6 +52,8 @@ class GradedFault:
     """Opinion of a second renderer; None where there was none."""
     peer: SecondOpinion | None = None
     """Opinion of a second detector; None where there was none."""
+    fidelity: ObjectFidelity | None = None
+    """Lowest fidelity of the edited objects in its place; None where there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +66,8 @@ class GradingInput:
     """Scene before the change."""
     changed: SceneIR
     """Scene after it."""
-    renderer: SecondRenderer
-    """The compositor, as a `CompositorRenderer`."""
+    renderer: CompositorRenderer
+    """The compositor of the scene."""
     benign: LabelledDetections
     """Labels and detections before the change."""
     now: LabelledDetections
@@ -141,6 +145,52 @@ class Grader:
             self.rule,
         )
 
+    def count_wrong(self, case: GradingInput, fault: Fault, draws: int, enough: int = 0) -> int:
+        """Count the samples that show a fault after the change: the first of its certificate's, by the same rule.
+
+        Args:
+            case: The scene before and after the change.
+            fault: The fault.
+            draws: Number of samples.
+            enough: Stop as soon as this many can no longer be reached.
+        """
+        camera = self._make_camera(case, case.renderer, self.detector, self.t_star)
+        (place,) = _fault_boxes(case, (fault,))
+        wrong = 0
+        for number in range(draws):
+            if wrong + draws - number < enough:
+                break
+            wrong += shows_fault(fault, place, _evaluate_state(case.changed, case.now, camera, number))
+        return wrong
+
+    def second_opinions(self, case: GradingInput, faults: Sequence[Fault]) -> dict[Fault, SecondOpinion]:
+        """Count how often faults occur in a second renderer's images: what makes a failure confirmed.
+
+        Raises SceneError where there is no second renderer of the scene.
+        """
+        if not faults or self.make_second_renderer is None:
+            return {}
+        renderer = self.make_second_renderer(case.identifier, case.changed)
+        camera = self._make_camera(case, renderer, self.detector, self.t_star, "second")
+        before = [self._evaluate_unchanged(case, camera, number) for number in _OPINION_SAMPLES]
+        return _second_opinions(case, camera, faults, before, renderer.name)
+
+    def _peer_opinions(self, case: GradingInput, faults: Sequence[Fault]) -> dict[Fault, SecondOpinion]:
+        """Count how often faults occur with the second detector; under a placebo only where that decides."""
+        if not faults or self.load_second_detector is None or case.placebo is None:
+            return {}
+        peer = self.load_second_detector()
+        camera = self._make_camera(case, case.renderer, peer, resolve_t_star(peer), "peer")
+        before = [_evaluate_state(case.base, case.benign, camera, number) for number in _OPINION_SAMPLES]
+        opinions = _second_opinions(case, camera, faults, before, peer.name)
+        agreeing = [fault for fault in faults if opinions[fault].agrees]
+        if agreeing:
+            edited = case.placebo()
+            samples = [_evaluate_state(edited, case.benign, camera, number) for number in _OPINION_SAMPLES]
+            for fault in agreeing:
+                opinions[fault] = replace(opinions[fault], placebo=_count_right(case, fault, samples))
+        return opinions
+
     def _evaluate_unchanged(self, case: GradingInput, camera: NuisanceCamera, number: int) -> SampleOutcome:
         """Evaluate a sample of the scene before the change; cached while the frame stays the same, as attacks on
         it differ only in what comes after.
@@ -158,36 +208,28 @@ class Grader:
     ) -> tuple[list[GradedFault], tuple[str, ...]]:
         certificates = self.certificates(case, faults)
         graded = [
-            GradedFault(fault, Grade.CERTAIN if self.rule.holds(certificate) else Grade.THRESHOLD, certificate)
-            for fault, certificate in zip(faults, certificates, strict=True)
+            GradedFault(fault, self._grade_without_opinions(certificate, fidelity), certificate, fidelity=fidelity)
+            for fault, certificate, fidelity in zip(faults, certificates, _fidelities(case, faults), strict=True)
         ]
         certain = [one.fault for one in graded if one.grade is Grade.CERTAIN]
-        if not certain or self.make_second_renderer is None:
-            return graded, ()
         try:
-            renderer = self.make_second_renderer(case.identifier, case.changed)
-            camera = self._make_camera(case, renderer, self.detector, self.t_star, "second")
-            before = [self._evaluate_unchanged(case, camera, number) for number in _OPINION_SAMPLES]
-            second = _second_opinions(case, camera, certain, before, renderer.name)
+            second = self.second_opinions(case, certain)
         except SceneError as error:
             return graded, (f"no second renderer: expected {error.expected}, found {error.actual}",)
-        confirmed = [fault for fault, opinion in second.items() if opinion.agrees]
-        peers: Mapping[Fault, SecondOpinion] = {}
-        if confirmed and self.load_second_detector is not None and case.placebo is not None:
-            peer = self.load_second_detector()
-            camera = self._make_camera(case, case.renderer, peer, resolve_t_star(peer), "peer")
-            placebo = case.placebo()
-            before = [_evaluate_state(placebo, case.benign, camera, number) for number in _OPINION_SAMPLES]
-            peers = _second_opinions(case, camera, confirmed, before, peer.name)
+        peers = self._peer_opinions(case, [fault for fault, opinion in second.items() if opinion.agrees])
 
         def add_opinions(one: GradedFault) -> GradedFault:
             by_renderer, by_detector = second.get(one.fault), peers.get(one.fault)
             grade = one.grade
             if by_renderer is not None and by_renderer.agrees:
                 grade = Grade.SHARED if by_detector is not None and by_detector.agrees else Grade.CONFIRMED
-            return GradedFault(one.fault, grade, one.count, by_renderer, by_detector)
+            return replace(one, grade=grade, second=by_renderer, peer=by_detector)
 
         return [add_opinions(one) for one in graded], ()
+
+    def _grade_without_opinions(self, certificate: Certificate, fidelity: ObjectFidelity | None) -> Grade:
+        is_trusted = fidelity is None or fidelity.is_trusted
+        return Grade.CERTAIN if is_trusted and self.rule.holds(certificate) else Grade.THRESHOLD
 
     def _make_camera(
         self,
@@ -209,20 +251,34 @@ def _evaluate_state(
 
 
 def _second_opinions(
-    case: GradingInput, camera: NuisanceCamera, faults: list[Fault], before: list[SampleOutcome], name: str
+    case: GradingInput, camera: NuisanceCamera, faults: Sequence[Fault], before: list[SampleOutcome], name: str
 ) -> dict[Fault, SecondOpinion]:
-    """Count how often faults occur with a camera. before: samples of the state that should be right."""
+    """Count how often faults occur with a camera. before: samples of the unchanged scene."""
     places = _fault_boxes(case, tuple(faults))
     after = [_evaluate_state(case.changed, case.now, camera, number) for number in _OPINION_SAMPLES]
     return {
         fault: SecondOpinion(
             name,
-            sum(is_correct(fault, place, outcome) for outcome in before),
+            _count_right(case, fault, before),
             sum(shows_fault(fault, place, outcome) for outcome in after),
             len(after),
         )
         for fault, place in zip(faults, places, strict=True)
     }
+
+
+def _count_right(case: GradingInput, fault: Fault, samples: Sequence[SampleOutcome]) -> int:
+    """Count the samples that are right where a fault may occur."""
+    (place,) = _fault_boxes(case, (fault,))
+    return sum(is_correct(fault, place, outcome) for outcome in samples)
+
+
+def _fidelities(case: GradingInput, faults: tuple[Fault, ...]) -> list[ObjectFidelity | None]:
+    """The lowest fidelity of the edited objects in the place of each fault."""
+    if not faults:
+        return []
+    regions = measure_fidelity(case.renderer.compositor, case.changed)
+    return [lowest_fidelity(regions, place) for place in _fault_boxes(case, faults).tolist()]
 
 
 def _fault_boxes(case: GradingInput, faults: tuple[Fault, ...]) -> Tensor:

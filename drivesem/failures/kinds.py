@@ -8,7 +8,7 @@ not after it is one failure, even if something else is reported in its place. A 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -166,6 +166,28 @@ def find_faults(
     is_new = ~(boxes.iou_matrix(changed.detections.boxes_xyxy, known) >= SAME_PLACE_IOU).any(dim=1)
     faults += [Fault(Kind.BACKGROUND, -1, d) for d in after.background if bool(is_new[d])]
     return tuple(faults)
+
+
+def find_same_fault(
+    faults: Sequence[Fault], fault: Fault, place_xyxy: Tensor, detections: Detections
+) -> Fault | None:
+    """Find the fault of the same object and kind; on background, of the same place.
+
+    Args:
+        faults: Faults of another image.
+        fault: The fault to look for.
+        place_xyxy: (4,) px, its place; used on background.
+        detections: Detections of the other image.
+    """
+    for other in faults:
+        if (other.kind, other.target) != (fault.kind, fault.target):
+            continue
+        box = detections.boxes_xyxy[other.detection]
+        if fault.kind is not Kind.BACKGROUND or float(boxes.iou_matrix(place_xyxy[None].to(box), box[None])) >= (
+            SAME_PLACE_IOU
+        ):
+            return other
+    return None
 
 
 def _lies_on_ignored(labelled: LabelledDetections, ious: Tensor, counts: Tensor) -> list[bool]:

@@ -11,8 +11,9 @@ from drivesem.attacks.labels import Labeller
 from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.evaluation import failures
 from drivesem.failures.certificate import CompositorRenderer
-from drivesem.failures.grades import Grade
+from drivesem.failures.grades import Grade, Kind, SecondOpinion
 from drivesem.failures.grading import FrameGrades, Grader, GradingInput
+from drivesem.failures.kinds import Fault
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.second_renderer.base import NoSecondRendererError, SecondRender, SecondRenderer
 from drivesem.run.frame import EvaluatedScene, build_grading_input
@@ -141,7 +142,36 @@ def test_shared_where_the_peer_loses_it_too(case: GradingInput) -> None:
     fault = graded(case, position_renderer(case), Oracle(blind=False)).lost[CAR]
     assert fault.grade is Grade.CONFIRMED
     assert fault.peer is not None
-    assert (fault.peer.before, fault.peer.after) == (4, 0)
+    assert (fault.peer.before, fault.peer.after, fault.peer.placebo) == (4, 0, None)
+
+
+def test_the_peer_is_counted_without_the_change_and_after_a_placebo_where_that_decides(case: GradingInput) -> None:
+    """A placebo that makes the peer fail too leaves the failure unshared, and the numbers show it."""
+    under_placebo = dataclasses.replace(case, placebo=lambda: case.changed)
+    for one, placebo, grade in ((case, 4, Grade.SHARED), (under_placebo, 0, Grade.CONFIRMED)):
+        fault = graded(one, position_renderer(one), Oracle()).lost[CAR]
+        assert fault.peer is not None
+        assert (fault.peer.before, fault.peer.after, fault.peer.placebo) == (4, 4, placebo)
+        assert fault.grade is grade
+
+
+@pytest.mark.parametrize(
+    ("opinion", "kind", "text"),
+    [
+        (SecondOpinion("a", 4, 4, 4), "missed", "a agrees: found in 4/4 → 0/4"),
+        (SecondOpinion("a", 4, 3, 4, 1), "missed", "a does not agree: found in 4/4 → 1/4; 1/4 after a placebo"),
+        (SecondOpinion("a", 0, 4, 4), "missed", "a never found it: 0/4 without the change"),
+        (SecondOpinion("a", 0, 4, 4), "background", "a does not agree: there in 4/4 → 4/4"),
+    ],
+)
+def test_an_opinion_as_text(opinion: SecondOpinion, kind: str, text: str) -> None:
+    assert opinion.describe(kind) == text
+
+
+def test_counting_stops_where_enough_cannot_be_reached(case: GradingInput) -> None:
+    grader, fault = Grader(Oracle(), 0.5, OFF), Fault(Kind.MISSED, CAR, -1)
+    assert grader.count_wrong(case, fault, 4) == 4
+    assert grader.count_wrong(dataclasses.replace(case, changed=case.base), fault, 4, 3) == 0
 
 
 def test_a_missing_second_renderer_is_noted(case: GradingInput) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import torch
 
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.analysis.confirm import compare_failures, compare_objects, pair_targets
+from drivesem.analysis.confirm import RetestedFailure, compare_objects, find_second_failures, pair_targets
 from drivesem.attacks.targets import EvaluatedClasses
+from drivesem.failures.grades import SecondOpinion
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.run.results import BoxRecord, Failure
 
@@ -57,50 +59,46 @@ def test_rows_are_objects_then_regions_of_both_pictures() -> None:
     assert rows.changed.boxes_xyxy[1].tolist() == list(shifted_box(310))
 
 
-def found(failures: list[Failure], after: Detections, *moved: tuple[float, ...]) -> Any:
-    """Findings of two cars, both found before; `moved`: their boxes after the change."""
+def found(after: Detections, *moved: tuple[float, ...]) -> Any:
+    """Failures of two cars, both found before; `moved`: their boxes after the change."""
     before = drawn(BOX, shifted_box(300))
     rows = pair_targets(before, drawn(*moved) if moved else before, 2)
-    result: Any = SimpleNamespace(failures=failures)
     seen = [detections(BOX, shifted_box(300)), after]
-    return compare_failures(result, rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR)
+    return find_second_failures(rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR)
 
 
-def test_the_same_vehicle_is_lost_in_both() -> None:
-    ours, theirs = found([Failure("lost", "Car", shifted_box(300), index=1)], detections(BOX))
-    assert [(f.kind, f.index, f.survives) for f in ours] == [("lost", 1, True)]
-    assert [(f.kind, f.index, f.survives, f.xyxy) for f in theirs] == [("lost", 1, True, shifted_box(300))]
-
-
-def test_another_vehicle_is_another_failure() -> None:
-    ours, theirs = found([Failure("lost", "Car", BOX, index=0)], detections(BOX))
-    assert [(f.index, f.survives) for f in ours] == [(0, False)]
-    assert [(f.index, f.survives) for f in theirs] == [(1, False)]
+def test_a_lost_vehicle() -> None:
+    (one,) = found(detections(BOX))
+    assert (one.kind, one.index, one.xyxy) == ("lost", 1, shifted_box(300))
 
 
 def test_what_is_ignored_is_not_lost() -> None:
     rows = pair_targets(drawn(BOX), drawn(NOTHING, ignored=(0,)), 1)
-    result: Any = SimpleNamespace(failures=[Failure("lost", "Car", BOX, index=0)])
     seen = [detections(BOX), detections()]
-    ours, theirs = compare_failures(result, rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR)
-    assert [f.survives for f in ours] == [False]
-    assert theirs == ()
+    assert find_second_failures(rows, seen, EvaluatedClasses(CLASSES, CLASSES), T_STAR) == ()
 
 
-def test_phantoms_of_a_class_and_place_are_the_same() -> None:
-    phantoms = [
-        Failure("phantom", "Car", shifted_box(505), score=0.8),
-        Failure("phantom", "Car", shifted_box(700), score=0.8),
-        Failure("phantom", "Truck", shifted_box(500), score=0.8),
-    ]
-    ours, theirs = found(phantoms, detections(BOX, shifted_box(300), shifted_box(500)))
-    assert [f.survives for f in ours] == [True, False, False]
-    assert [(f.kind, f.label, f.survives) for f in theirs] == [("phantom", "Car", True)]
+def test_a_phantom() -> None:
+    (one,) = found(detections(BOX, shifted_box(300), shifted_box(500)))
+    assert (one.kind, one.label, one.index, one.score) == ("phantom", "Car", None, pytest.approx(0.9))
 
 
 def test_found_where_it_went_is_no_failure() -> None:
-    ours, theirs = found([], detections(BOX, shifted_box(330)), BOX, shifted_box(330))
-    assert ours == theirs == ()
+    assert found(detections(BOX, shifted_box(330)), BOX, shifted_box(330)) == ()
+
+
+def opinion(before: int, after: int) -> SecondOpinion:
+    return SecondOpinion("generator", before, after, 4)
+
+
+@pytest.mark.parametrize(
+    ("seen", "survives"), [(opinion(3, 3), True), (opinion(4, 2), False), (opinion(2, 4), False), (None, False)]
+)
+def test_survival_is_the_rule_of_the_grade_confirmed(seen: SecondOpinion | None, survives: bool) -> None:
+    one = RetestedFailure(Failure("lost", "Car", BOX, index=1, error="missed", grade="certain"), seen)
+    assert one.survives is survives
+    assert one.to_json("a")["survives"] is (None if seen is None else survives)
+    assert seen is None or seen.agrees is survives
 
 
 def test_where_vehicles_stand() -> None:
