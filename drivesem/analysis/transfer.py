@@ -430,7 +430,9 @@ def evaluate_pairs(
         failed |= cache_detections(target.spec, target.predictor, pictures, config, target.name)
     pairs: list[TransferCounts] = []
     for run in runs:
-        frames = [f for f in run.frames if not any(str(p) in failed for p in f.pictures.values())]
+        frames = [
+            f for f in run.frames if f.result.attacked and not any(str(p) in failed for p in f.pictures.values())
+        ]
         if not frames:
             raise UsageError("--run", "a run with frames that can be read", run.folder)
         pairs += [_evaluate_pair(run, target, frames, config) for target in detectors]

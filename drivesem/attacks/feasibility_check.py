@@ -205,16 +205,19 @@ def check_exchange(scene: SceneIR, method: CheckMethod | None = None) -> list[st
     return [f"exchange: {line}" for line in violations]
 
 
-def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list[str]:
+def check_places(
+    base: SceneIR, perturbed: SceneIR, rows: Iterable[int], limits: ChangeLimits | None = None
+) -> list[str]:
     """Check that objects stay on the ground and the road, and apart from one another.
 
-    The limits of an attack do not apply. Always measured by outlines, so that results are equal on all machines and
-    no library is loaded.
+    With limits, also that they stay in the picture and on ground that it shows, and move no further. Always
+    measured by outlines, so that results are equal on all machines and no library is loaded.
 
     Args:
         base: the photographed scene.
         perturbed: the changed scene.
         rows: the objects to check.
+        limits: limits of moves; None: no such check.
 
     Returns:
         Lines like those of `check_scene`.
@@ -226,6 +229,7 @@ def check_places(base: SceneIR, perturbed: SceneIR, rows: Iterable[int]) -> list
     violations = []
     for i, old in before.items():
         lines = _height_violations(base, old, after[i]) + _road_violations(base, road, old, after[i])
+        lines += [] if limits is None else _place_violations(base, road, old, after[i], limits)
         violations += [f"objects[{i}]: {line}" for line in lines]
     return violations + _collisions(before, after, _OutlineCheck())
 
@@ -259,7 +263,7 @@ class _MeasuredCar(_MeasuredPose):
         self.vertices = local @ self.axes + self.position
         matrix = scene.camera.matrix.double().numpy()
         clip = self.vertices @ matrix[:, :3].T + matrix[:, 3]
-        self.near = float(clip[:, 2].min())
+        self.near, self.far = float(clip[:, 2].min()), float(clip[:, 2].max())
         front = clip[clip[:, 2] > 0.1]
         pixels = front[:, :2] / front[:, 2:] if len(front) else np.zeros((1, 2))
         self.box = (*pixels.min(axis=0).tolist(), *pixels.max(axis=0).tolist())
@@ -553,6 +557,25 @@ def _frame_violations(base: SceneIR, old: _MeasuredCar, new: _MeasuredCar) -> li
             violations.append(f"{length:.1f} px {name} ({length0:.1f} before)")
     if d1 - d0 < (MIN_HEIGHT_SHARE - VISIBLE_TOLERANCE) * (b1 - b0):
         violations.append(f"{d1 - d0:.1f} px high ({b1 - b0:.1f} before)")
+    return violations
+
+
+def _place_violations(
+    base: SceneIR, road: Array, old: _MeasuredCar, new: _MeasuredCar, limits: ChangeLimits
+) -> list[str]:
+    """Whether a car gets behind the camera, out of the picture or onto ground outside of it, or moves too far."""
+    violations = []
+    if _move_violations(old, new, limits):
+        along, _, across = np.abs(old.axes @ (new.position - old.position))
+        which = "" if old.whole else " for a partly visible vehicle"
+        violations.append(
+            f"moved by {along:.2f} m along, {across:.2f} m across: more than any budget allows{which}"
+        )
+    if new.near <= 0.1 < old.near:
+        return [*violations, "behind the camera" if new.far <= 0.1 else "reaches behind the camera"]
+    violations += _frame_violations(base, old, new)[:1]
+    if _road_share(base, road, old) is not None and _road_share(base, road, new) is None:
+        violations.append("on ground that the picture does not show")
     return violations
 
 

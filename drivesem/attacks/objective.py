@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from detectors.base import AnchorPredictions, Detector, Predictor, predict, run_in_halves
+from detectors.base import AnchorPredictions, Candidates, Detector, Predictor, predict, run_in_halves
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
 from detectors.types import Detections, Targets
@@ -25,6 +25,7 @@ from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_
 from drivesem.attacks.visibility import VisibilityUnderWeather
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
+from drivesem.failures.fidelity import find_untrusted
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.io import round_to_8bit
@@ -34,6 +35,10 @@ from scene_ir.types import Render, SceneIR
 
 GRADIENT_FREE_TERMS = ("objectness", *losses.GOALS)
 """Terms that need detections only."""
+CustomLoss = Callable[[Candidates, Targets, float], Tensor]
+"""A loss of a user's: from the detector's candidates, the targets, and t* to a differentiable loss () that an attack
+raises. Labels of the targets are indices into the detector's classes, which are the columns of the candidates' scores.
+"""
 _RECENT = 3
 """Number of cached evaluations: an attack's last scores, so that its result need not be rendered again."""
 
@@ -88,7 +93,8 @@ class Objective:
         self.space = space
         self.detector = detector
         self.label_mode: LabelMode = config.objective_labels
-        self.term: str = config.objective
+        self.term: str | CustomLoss = config.objective
+        """Name of the loss, or a function, which `drivesem.run.counterexample.attack` takes."""
         self.t_star = resolve_t_star(detector, config.t_star)
         self.classes = EvaluatedClasses.from_detector(detector)
         self.aim = TargetSelection.from_options(config.target_objects, config.target_classes)
@@ -104,6 +110,8 @@ class Objective:
         self._reference: ReferencePass | None = None
         self.benign = self.evaluate_render(base, base_render)
         """The scene at theta = 0, re-rendered; the one before, where vehicles were exchanged, added or removed."""
+        self.judged, self.found_before = self._count_vehicles()
+        """Rows of the vehicles that are targeted and not ignored, and of those that are detected at theta = 0."""
         self.whole = config.whole
         self.passes = 1
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
@@ -160,6 +168,15 @@ class Objective:
         labels = evaluation.moved if mode == "moved" else evaluation.paper
         return self._failures(labels, evaluation.detections)
 
+    def _count_vehicles(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """See `judged` and `found_before`."""
+        targets, classes, count = self.benign.paper.targets, self.classes, len(self.benign.scene.objects)
+        matches = failures.match_detections(classes.map_targets(targets), self.benign.detections, self.t_star)
+        judged = ~classes.map_targets(self.aim.targets(targets)).ignore.cpu()
+        rows = (judged[:count], (judged & matches.detected)[:count])
+        judged_rows, found_rows = (tuple(row.nonzero()[:, 0].tolist()) for row in rows)
+        return judged_rows, found_rows
+
     def _failures(self, labels: SceneLabels, detections: Detections) -> failures.FrameFailures:
         all_failures = failures.find_failures(
             self.classes.map_targets(self.benign.paper.targets),
@@ -201,14 +218,17 @@ class Objective:
         )
 
     def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:
-        """The feasible set of the scene; weather keeps objects visible as far as `difficulty` requires."""
+        """The feasible set of the scene. Weather keeps objects visible as far as `difficulty` requires, and vehicles
+        that no edit would leave with a trusted picture stay as photographed, except with `only_bounds`.
+        """
         find_invisible, min_contrast = None, self.difficulty.min_contrast
         if min_contrast > 0 and Parameter.WEATHER in self.space.params:
             visible = ~self.labeller.paper().ignore.cpu().numpy()
             environment = self.space.scene.environment
             air = self.compositor.air
             find_invisible = VisibilityUnderWeather(self.benign.render, environment, air, visible, min_contrast)
-        return FeasibleSet(self.space, limits, only_bounds, find_invisible)
+        held = () if only_bounds else find_untrusted(self.compositor)
+        return FeasibleSet(self.space, limits, only_bounds, find_invisible, held)
 
     def problem(
         self, feasible: FeasibleSet, keep_last: bool = False, margin_oracle: MarginOracle | None = None
@@ -317,7 +337,13 @@ class Objective:
 
     def compute_loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> Tensor:
         targets = self.classes.to_detector_targets(self.classes.map_targets(self.aim.targets(labels)))
-        if self.term in losses.GOALS:
+        if callable(self.term):
+            loss = self.term(detector.candidates(raw), targets, self.t_star)
+            if not isinstance(loss, Tensor) or loss.shape != ():
+                raise RangeError(
+                    "objective", "a function that returns a tensor ()", getattr(loss, "shape", type(loss))
+                )
+        elif self.term in losses.GOALS:
             columns = [detector.classes.index(name) for name in self.aim.classes_of(self.classes.names)]
             loss = losses.goal_loss(self.term, detector.candidates(raw), targets, self.t_star, columns)
         else:
@@ -329,6 +355,9 @@ class Objective:
         return loss
 
     def _loss_without_gradient(self, detections: Detections, labels: Targets) -> float:
+        if callable(self.term):
+            candidates = losses.candidates_from_detections(detections, len(self.classes.names))
+            return float(self.term(candidates, self.classes.map_targets(self.aim.targets(labels)), self.t_star))
         self._check_term(GRADIENT_FREE_TERMS)
         names, targets = self.classes.names, self.classes.map_targets(self.aim.targets(labels))
         if self.term not in losses.GOALS:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from drivesem.attacks.budgets import PRESETS, STREET, change_limits
 from drivesem.attacks.feasibility_check import check_places
 from drivesem.attacks.space import Budget, ground_axes
 from drivesem.config.edits import ALL, FrameEdit, ObjectEdit
@@ -31,7 +32,7 @@ class EditedScene:
     removed: tuple[int, ...]
     """Rows of the removed vehicles in the scene before."""
     notes: tuple[str, ...]
-    """Violations that `check_places` found."""
+    """Violations that `check_places` found, with the limits of the widest budget."""
 
 
 def apply_edit(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> EditedScene:
@@ -47,7 +48,9 @@ def apply_edit(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> 
     """
     removed = [row for row, changes in enumerate(_by_row(scene, edit)) if any(c.remove for c in changes)]
     changed = apply_changes(scene, edit, bent)
-    notes = check_places(scene, changed, (row for row in range(len(scene.objects)) if row not in removed))
+    rows = (row for row in range(len(scene.objects)) if row not in removed)
+    photographed = scene.unperturbed() if scene.objects.source else scene  # moves of several edits add up
+    notes = check_places(photographed, changed, rows, change_limits(PRESETS[STREET]))
     remaining = remove_objects(changed, removed)
     if removed:
         remaining = replace(remaining, provenance={**remaining.provenance, REMOVED: "vehicles, by an edit"})

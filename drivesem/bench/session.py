@@ -24,8 +24,6 @@ from scene_ir.errors import FormatError
 
 T = TypeVar("T")
 
-_LOG_WIDTH = 120
-"""Width of tables written to a file, columns."""
 _NOT_MEASURED = ("what", "json", "out", "markdown")
 """Settings that do not affect measurements."""
 
@@ -76,7 +74,7 @@ def run_benchmark(config: S, program: str, measure: Callable[[S, Console], Bench
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     check_device(config.device)
-    console = Console(stderr=True, width=None if sys.stderr.isatty() else _LOG_WIDTH)
+    console = Console(stderr=True)
     measured = measure(config, console)
     result = {
         "what": config.what,

@@ -11,9 +11,10 @@ from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.failures.grades import Grade, Kind
 from drivesem.report.tables import Console, format_count, print_json
 from drivesem.run.attack import attack_dataset
-from drivesem.run.report.page import KINDS, NO_KIND
+from drivesem.run.folder import load_attack_config
+from drivesem.run.report.page import KINDS, NO_KIND, describe_frames, describe_objects
 from drivesem.run.results import RunSummary
-from drivesem.run.run_report import build_reports
+from drivesem.run.run_report import build_reports, describe_next_step
 
 
 def attack_command(config: AttackConfig) -> int:
@@ -31,7 +32,7 @@ def _print(summary: RunSummary, console: Console) -> None:
         title=f"{summary.detector} on {summary.dataset}: {' + '.join(summary.params)}", title_justify="left"
     )
     table.add_column(f"{summary.headline}, %")
-    for title in SCORE_TITLES:
+    for title in (*SCORE_TITLES, "objects"):
         table.add_column(title, justify="right")
     rows = {
         "benign": summary.benign,
@@ -41,16 +42,22 @@ def _print(summary: RunSummary, console: Console) -> None:
     }
     for name, scores in rows.items():
         metrics = scores.headline.columns
-        table.add_row(name, *("-" if metric is None else f"{100 * metric:.1f}" for metric in metrics))
+        cells = ("-" if metric is None else f"{100 * metric:.1f}" for metric in metrics)
+        table.add_row(name, *cells, str(scores.headline.objects))
     console.print(table)
     feasible = "-" if summary.feasible_fraction is None else f"{100 * summary.feasible_fraction:.1f} %"
-    console.print(
-        f"{format_count(summary.frames, 'frame')}, {format_count(summary.objects, 'vehicle')}: "
-        f"{sum(summary.lost_objects.values())} lost, {format_count(sum(summary.phantoms.values()), 'phantom')} by "
-        f"threshold, {format_count(summary.successes_moved, 'frame')} broken; "
-        f"feasible {feasible}; {format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s"
+    lost = summary.lost_by_grade
+    lines = (
+        f"{describe_frames(summary)}; {describe_objects(summary)}",
+        f"missed before the attack: {summary.missed_before.format('judged vehicles')}",
+        f"lost by threshold: {lost[Grade.THRESHOLD].format('vehicles found before')}; certainly lost: "
+        f"{lost[Grade.CERTAIN].format()}; {format_count(sum(summary.phantoms.values()), 'phantom')} by threshold",
+        f"frames broken by threshold: {summary.broken.format('attacked frames')}; feasible {feasible}; "
+        f"{format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s",
+        summarise_grades(summary),
     )
-    console.print(summarise_grades(summary), soft_wrap=True)
+    for line in lines:
+        console.print(line, soft_wrap=True)
     for note, frames in summary.grade_notes.items():
         console.print(f"{format_count(frames, 'frame')}: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:
@@ -58,6 +65,8 @@ def _print(summary: RunSummary, console: Console) -> None:
     for name, reason in summary.frames_failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)
+    config = load_attack_config(Path(summary.out))
+    console.print(describe_next_step(config, summary), soft_wrap=True)
 
 
 def summarise_grades(summary: RunSummary) -> str:
@@ -73,6 +82,8 @@ def summarise_grades(summary: RunSummary) -> str:
     )
     kinds |= {NO_KIND: without} if without and not unknown else {}
     by_kind = f" ({', '.join(f'{count} {name}' for name, count in kinds.items())})" if kinds else ""
+    if summary.fidelity["not_trusted"]:
+        by_kind += f", {summary.fidelity['not_trusted']} in pictures that are not trusted"
     if not certain:
         return f"no certain failure: {failures} by threshold, which chance may explain{by_kind}{unknown}"
     by_grade = f"{certain} certain, {grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared"

@@ -218,7 +218,7 @@ def describe_machine() -> dict[str, str]:
 def doctor_command(config: DoctorConfig) -> int:
     """`drivesem doctor`: exit code 1 if a feature that everything needs does not work."""
     errors = Console(stderr=True)
-    with progress_bar(errors, keep=False, show_elapsed=False, hidden=not errors.is_terminal) as bar:
+    with progress_bar(errors, keep=False, show_elapsed=False) as bar:
         task = bar.add_task("checking features", total=len(FEATURES))
         results = check_features(FEATURES, lambda: bar.advance(task))
     fit = all(result.status == "works" for result in results if result.feature.needed)

@@ -7,15 +7,10 @@ from drivesem.analysis.evaluate.report import print_evaluation
 from drivesem.config.commands import EvalConfig
 from drivesem.report.tables import Console, print_json
 
-_FILE_WIDTH = 120
-"""Characters per line of tables that go to a file."""
-
 
 def eval_command(config: EvalConfig) -> int:
     """`drivesem eval`: evaluate and print."""
     console = Console(stderr=True)
-    if not console.is_terminal:
-        console = Console(stderr=True, width=_FILE_WIDTH)
     if config.detector is not None:
         from drivesem.analysis.evaluate.detector import evaluate_detector, print_detector_metrics
         from drivesem.config.devices import check_device

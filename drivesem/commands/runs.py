@@ -16,9 +16,10 @@ from drivesem.failures.grades import Grade
 from drivesem.report.tables import Console, format_count, print_json
 from drivesem.run.attack import merge_runs
 from drivesem.run.finished import METRICS
-from drivesem.run.folder import CONFIG, FRAMES, is_attack_run, load_attack_config, result_settings
+from drivesem.run.folder import CONFIG, FRAMES, PLAN, is_attack_run, load_attack_config, result_settings
 from drivesem.run.labels import list_frames
 from drivesem.run.lock import acquire_folder_lock, is_locked_elsewhere
+from drivesem.run.records import from_json
 from drivesem.store import local_copy
 from scene_ir import files
 
@@ -54,8 +55,9 @@ def _format_run(row: Mapping[str, Any]) -> str:
     grades, frames = row["grades"], format_count(row["frames"], "frame")
     attack = f"{row['params']} by {row['method']} on {row['detector']}, {row['mb']:.0f} MB"
     if grades is None:
-        state = "running" if row["running"] else "unfinished (the same command resumes)"
-        return f"{row['run']}: {frames}, {state}; {attack}"
+        frames = frames if row["frames_planned"] is None else f"{row['frames']} of {row['frames_planned']} frames"
+        state = f"running, {frames}" if row["running"] else f"interrupted, {frames} (the same command resumes)"
+        return f"{row['run']}: {state}; {attack}"
     sure = [f"{grades[grade]} {grade}" for grade in (Grade.CERTAIN, Grade.CONFIRMED) if grade in grades]
     failures = f"{', '.join(sure)} of {format_count(grades.get(Grade.THRESHOLD, 0), 'failure')} by threshold"
     return f"{row['run']}: {frames}, {failures}; {attack}"
@@ -66,8 +68,10 @@ def _runs_in(folder: Path) -> list[Path]:
         raise UsageError(_ARGUMENT, "a folder with runs of drivesem attack", folder)
     if (folder / CONFIG).is_file():
         return [folder]
-    runs = (path.parent for path in folder.glob(f"*/{CONFIG}") if (path.parent / FRAMES).is_dir())
-    return sorted(run for run in runs if is_attack_run(run))
+    runs = (path.parent for path in folder.glob(f"*/{CONFIG}"))
+    return sorted(
+        run for run in runs if any((run / name).exists() for name in (FRAMES, PLAN)) and is_attack_run(run)
+    )
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:
@@ -82,6 +86,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         "params": ",".join(metrics.get("params", ())) or attack.params or f"combo {attack.combo or DEFAULT_COMBO}",
         "method": attack.method,
         "frames": len(list_frames(folder)),
+        "frames_planned": _read_planned(folder),
         "grades": metrics.get("grades"),
         "mb": round(size / 1e6, 1),
     }
@@ -91,6 +96,12 @@ def _read_metrics(folder: Path) -> dict[str, Any]:
     """The content of metrics.json; empty for an unfinished run."""
     metrics = files.read_json(folder / METRICS) if (folder / METRICS).is_file() else {}
     return metrics if isinstance(metrics, dict) else {}
+
+
+def _read_planned(folder: Path) -> int | None:
+    """The number of frames that the run will have, if known."""
+    plan = files.read_json(folder / PLAN) if (folder / PLAN).is_file() else None
+    return None if plan is None else from_json(dict[str, int], plan, str(folder / PLAN)).get("frames")
 
 
 def _show(config: RunsConfig, console: Console) -> dict[str, Any]:

@@ -238,8 +238,10 @@ def _minus(a: float | None, b: float | None) -> float | None:
 
 
 def _draws(frames: int, draws: int, generator: np.random.Generator) -> list[Floats]:
-    """Draw `frames` frames with replacement, `draws` times: how often each is drawn (F,)."""
-    if not frames:
+    """Draw `frames` frames with replacement, `draws` times: how often each is drawn (F,). One frame varies in
+    nothing, and has no interval.
+    """
+    if frames < 2:
         return []
     shares = np.full(frames, 1 / frames)
     return [generator.multinomial(frames, shares).astype(np.float64) for _ in range(draws)]
@@ -272,6 +274,37 @@ def wilson(found: int, count: int) -> tuple[float, float]:
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = _Z_95 / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
     return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Proportion:
+    """A count out of a number, with the 95 % Wilson interval of the share."""
+
+    count: int
+    """How many."""
+    of: int
+    """Out of how many."""
+    low: float | None
+    """Lower end of the interval, in [0, 1]; None out of none."""
+    high: float | None
+    """Upper end."""
+
+    @classmethod
+    def from_counts(cls, count: int, of: int) -> Proportion:
+        """Add the interval."""
+        return cls(count, of, *(wilson(count, of) if of else (None, None)))
+
+    @property
+    def percent(self) -> str:
+        """The share and its interval, such as `38 % [14, 69]`; "" out of none."""
+        if self.low is None or self.high is None:
+            return ""
+        return f"{100 * self.count / self.of:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]"
+
+    def format(self, noun: str = "") -> str:
+        """Such as `3 of 8 cars (38 % [14, 69])`."""
+        text = f"{self.count} of {self.of}{noun and f' {noun}'}"
+        return f"{text} ({self.percent})" if self.of else text
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import sys
+import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,8 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    Task,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -257,6 +262,10 @@ def format_percent(value: float | None) -> str:
 
 
 _MAX_CHARACTERS = 100_000
+_LOG_WIDTH = 120
+"""Characters per line of output that is not a terminal, unless COLUMNS is set."""
+_LINE_SECONDS = 10.0
+"""Time between two lines of `ProgressLines`."""
 
 
 class Console(rich.console.Console):
@@ -264,6 +273,9 @@ class Console(rich.console.Console):
 
     def __init__(self, **rich_options: Any) -> None:
         super().__init__(markup=False, **rich_options)
+        chosen = "width" in rich_options or "COLUMNS" in os.environ
+        if not (chosen or self.is_terminal or self.is_jupyter):
+            self.width = _LOG_WIDTH
 
     def render_str(self, text: str, **rich_options: Any) -> Text:
         """Render a string after escaping what would control the terminal."""
@@ -278,7 +290,7 @@ def progress_bar(
     show_remaining: bool = False,
     hidden: bool = False,
 ) -> Progress:
-    """Return a progress bar with a description and a count.
+    """Return a progress bar with a description and a count, or plain lines (`ProgressLines`) without a terminal.
 
     Args:
         console: Where it is drawn.
@@ -287,6 +299,8 @@ def progress_bar(
         show_remaining: Show an estimate of the time left.
         hidden: Draw nothing.
     """
+    if not (hidden or console.is_terminal or console.is_jupyter):
+        return ProgressLines(console, keep)
     columns: list[ProgressColumn] = [
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -298,7 +312,64 @@ def progress_bar(
 
 
 def training_progress_bar(console: Console) -> Progress:
-    """Return a bar of training steps with the time left; hidden if the console is not a terminal."""
-    return progress_bar(
-        console, keep=False, show_elapsed=False, show_remaining=True, hidden=not console.is_terminal
-    )
+    """Return a bar of training steps with the time left."""
+    return progress_bar(console, keep=False, show_elapsed=False, show_remaining=True)
+
+
+class ProgressLines(Progress):
+    """Progress for logs: a plain line for each running task every `_LINE_SECONDS`, with its count, pace and time left.
+
+    Args:
+        console: Where lines are printed.
+        keep: Print a last line for each task at the end.
+    """
+
+    def __init__(self, console: Console, keep: bool = True) -> None:
+        super().__init__(console=console, disable=True)
+        self._keep = keep
+        self._ended = threading.Event()
+        self._first: dict[TaskID, float] = {}
+        """Count at the start, by task; a resumed one has more than 0."""
+        self._thread = threading.Thread(target=self._print_running, daemon=True)
+
+    def add_task(self, *arguments: Any, **options: Any) -> TaskID:
+        """Add a task, as `Progress.add_task`."""
+        task = super().add_task(*arguments, **options)
+        self._first[task] = self._tasks[task].completed
+        return task
+
+    def start(self) -> None:
+        """Start printing."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End printing."""
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self._keep:
+            self._print_lines(self.tasks)
+
+    def _print_running(self) -> None:
+        while not self._ended.wait(_LINE_SECONDS):
+            self._print_lines([task for task in self.tasks if not task.finished])
+
+    def _print_lines(self, tasks: Iterable[Task]) -> None:
+        for task in tasks:
+            self.console.print(self._format_line(task), soft_wrap=True, highlight=False)
+
+    def _format_line(self, task: Task) -> str:
+        elapsed, done = task.elapsed or 0.0, task.completed - self._first[task.id]
+        parts = [f"{task.completed:g}" if task.total is None else f"{task.completed:g} of {task.total:g}"]
+        parts = parts if task.completed or task.total is not None else []
+        parts.append(_format_duration(elapsed))
+        if done and elapsed:
+            pace = elapsed / done
+            parts.append(f"{pace:.1f} s each" if pace >= 1 else f"{1 / pace:.1f} a second")
+            parts += [f"{_format_duration(pace * task.remaining)} left"] if task.remaining else []
+        return f"{task.description}: {', '.join(parts)}"
+
+
+def _format_duration(seconds: float) -> str:
+    """Format a duration as h:mm:ss."""
+    return str(timedelta(seconds=round(seconds)))

@@ -56,7 +56,7 @@ from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.report.tables import format_count
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS, AttackRun, build_manifest, hash_json, load_runs
-from drivesem.run.folder import FRAMES, claim_folder, load_run_detector, load_trusted_config, result_settings
+from drivesem.run.folder import FRAMES, PLAN, claim_folder, load_run_detector, load_trusted_config, result_settings
 from drivesem.run.frame import AttackedScene, grade_failures, summarise_frames, write_frame
 from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json
@@ -75,7 +75,7 @@ GRADIENT_FREE_FALLBACK = "climb"
 _METHODS_WITHOUT_GRADIENT = (*GRADIENT_FREE_METHODS, "corners", GRADIENT_FREE_FALLBACK)
 _FIXED_PASSES = 3
 """Detector passes of a frame that no method controls."""
-WRITTEN = (METRICS, MANIFEST, "report.html", FRAMES)
+WRITTEN = (PLAN, METRICS, MANIFEST, "report.html", FRAMES)
 
 
 def attack_dataset(config: AttackConfig) -> RunSummary:
@@ -123,6 +123,7 @@ def attack_frames(worker: AttackWorker, names: Sequence[str], out: Path) -> RunS
 def _prepare_jobs(worker: AttackWorker, names: Sequence[str], out: Path) -> tuple[Any, ...]:
     """The arguments of `run_frame_jobs`, for frames that are not finished."""
     config = worker.config
+    files.write_json(out / PLAN, {"frames": len(names)})
     pending = [name for name in names if not (out / FRAMES / name / RESULT).is_file()]
     if pending and config.backend == "warp" and config.device == "cpu":
         compile_source_kernels(config)
@@ -345,8 +346,11 @@ class AttackWorker:
         method = self.method if config.like is None else _load_placebo(Path(config.like), identifier)
         try:
             instance, other_passes = self._pose(identifier, scene), 0
-            if self.changes is None:
-                result = method(instance.problem, instance.objective.space.theta0, config.seed)
+            theta0 = instance.objective.space.theta0
+            if not instance.objective.found_before and config.objective != "phantom":
+                result = FixedTheta(theta0)(instance.problem, theta0, config.seed)  # nothing can be lost
+            elif self.changes is None:
+                result = method(instance.problem, theta0, config.seed)
             else:
                 instance, result, other_passes = self._search_with_changes(
                     identifier, scene, instance, self.changes

@@ -14,21 +14,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from detectors import boxes
 from detectors.base import Predictor, detector_device
 from detectors.registry import ONNX
 from drivesem.attacks.budgets import parse_budget
 from drivesem.attacks.feasible.constraints import FeasibilityLimits
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.labels import Difficulty
-from drivesem.attacks.objective import Objective
+from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
+from drivesem.evaluation.failures import MATCH_IOU, FrameFailures
 from drivesem.failures.grades import Grade
+from drivesem.failures.grading import Grader, GradingInput
+from drivesem.failures.kinds import OBJECT_KINDS, Fault
 from drivesem.failures.neighbourhood import Neighbourhood
 from drivesem.failures.nuisances import Nuisances
 from drivesem.run.folder import CONFIG, FRAMES, result_settings
-from drivesem.run.frame import certain_losses, count_grades
+from drivesem.run.frame import certain_losses, count_grades, objective_grading_input
 from drivesem.run.labels import MANIFEST, RESULT, list_manifest_frames
 from drivesem.run.lock import is_locked_elsewhere
 from drivesem.run.records import from_json
@@ -102,8 +106,11 @@ def _frame_row(frame: RunFrame) -> dict[str, Any]:
     return {
         "frame": result.identifier,
         "objects": result.objects,
-        "success_moved": result.success_moved,
-        "success_paper": result.success_paper,
+        "judged": len(result.judged),
+        "found_before": len(result.found_before),
+        "attacked": result.attacked,
+        "success_moved": result.success_moved if result.attacked else None,
+        "success_paper": result.success_paper if result.attacked else None,
         "lost": kinds.count("lost"),
         "phantoms": kinds.count("phantom"),
         **_count_frame_grades(result),
@@ -243,6 +250,42 @@ def rebuild_objective(
     return Objective(compositor, space, detector, attack, Difficulty(min_contrast=result.min_contrast)), theta
 
 
+@dataclass(frozen=True, slots=True)
+class ChangedState:
+    """A state of a frame's scene, and what the detector gets wrong there."""
+
+    evaluation: RenderEvaluation
+    """The rendered state."""
+    case: GradingInput
+    """The input of a grader."""
+    failures: FrameFailures
+    """Failures by threshold."""
+    faults: tuple[Fault, ...]
+    """Those of a kind."""
+    hidden: bool
+    """Whether the change hides an object, which makes it no counterexample."""
+
+    def find_recorded_fault(self, record: Failure) -> Fault | None:
+        """Find the fault of the run's counterexample that a record describes."""
+        for fault in self.faults:
+            is_lost = fault.kind in OBJECT_KINDS
+            if record.error not in (None, fault.kind) or is_lost != (record.kind == "lost"):
+                continue
+            if fault.target == record.index if is_lost else self._is_detection(fault.detection, record):
+                return fault
+        return None
+
+    def shows_by_threshold(self, record: Failure) -> bool:
+        """Whether a failure of no kind occurs."""
+        if record.kind == "lost":
+            return record.index in self.failures.lost
+        return any(self._is_detection(row, record) for row in self.failures.phantoms)
+
+    def _is_detection(self, row: int, record: Failure) -> bool:
+        box = self.evaluation.detections.boxes_xyxy[row : row + 1]
+        return float(boxes.iou_matrix(box, torch.tensor([record.xyxy]).to(box))[0, 0]) >= MATCH_IOU
+
+
 @dataclass(frozen=True)
 class RebuiltFrame:
     """A frame of a finished run, ready to be rendered and evaluated in other states."""
@@ -279,6 +322,15 @@ class RebuiltFrame:
         feasible = objective.feasible_set(limits, attack.project == "bounds")
         return cls(result, objective, feasible, theta, Nuisances.parse(attack.nuisances))
 
+    def evaluate_state(self, grader: Grader, theta: Tensor) -> ChangedState:
+        """Evaluate the detector at a feasible theta (D,). grader: finds the faults."""
+        objective = self.objective
+        evaluation = objective.evaluate(theta)
+        case = objective_grading_input(self.result.identifier, objective, evaluation)
+        failures = objective.failures(evaluation, "moved")
+        hidden = bool(evaluation.moved.out_of_sight.any())
+        return ChangedState(evaluation, case, failures, grader.faults(case, failures), hidden)
+
     def neighbourhoods(self, stream: str, reach: float = 1.0) -> Iterator[tuple[Failure, Neighbourhood]]:
         """Yield each certain failure of an object, and its neighbourhood. `stream` selects the random draws."""
         for failure in certain_losses(self.result):
@@ -297,7 +349,7 @@ VOLATILE_KEYS = ("out", "seconds")
 HASHED_RUN_FIELDS = ("frames_without_vehicles", "frames_failed")
 HASHED_FRAME_FIELDS = (
     *("loss_trace", "queries", "passes", "active_constraints", "violated_at_start", "became_ignored"),
-    *("failures", "grade_notes", "checked_by", "change"),
+    *("judged", "found_before", "failures", "grade_notes", "checked_by", "change"),
 )
 """Values of metrics.json and result.json that do not follow from other files. Each has its own hash, so that a change
 can be named."""

@@ -23,6 +23,8 @@ CONFIG = "config.yaml"
 """File of the resolved settings."""
 REFERENCED_FILES = "files.json"
 """File of the digests of files that the settings name."""
+PLAN = "plan.json"
+"""File of the number of frames that a run of `drivesem attack` will have."""
 FRAMES = "frames"
 """Folder of the frames of a run or an analysis."""
 SHARING = ("workers", "engine", "address", "keep_going")

@@ -25,13 +25,14 @@ from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.data import kitti
 from drivesem.evaluation import coco
 from drivesem.evaluation.failures import FrameFailures
+from drivesem.evaluation.resampling import Proportion
 from drivesem.failures.certificate import CompositorRenderer, pad_visible_boxes
 from drivesem.failures.grades import Grade, Kind
 from drivesem.failures.grading import FrameGrades, GradedFault, Grader, GradingInput
 from drivesem.failures.kinds import OBJECT_KINDS, LabelledDetections
 from drivesem.run.labels import RESULT
 from drivesem.run.report import pictures
-from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, dump_frame
+from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, VehicleCounts, dump_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.exchange import CHANGE_KEY
@@ -110,6 +111,8 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         detections_attacked=detection_records(rendered.detections, names),
         failures=attacked.failures,
         became_ignored=tuple(rendered.moved.became_ignored.nonzero()[:, 0].tolist()),
+        judged=objective.judged,
+        found_before=objective.found_before,
         success_paper=search.success_paper,
         success_moved=search.success_moved,
         identity_psnr_db=psnr_in_boxes(objective.benign.scene, objective.benign.render.image),
@@ -179,16 +182,7 @@ def grade_failures(
         edit = Placebo(tuple(search.theta.tolist()))(objective.problem(feasible), objective.space.theta0, seed)
         return objective.space.apply(objective.space.scene, edit.theta)
 
-    benign = objective.benign
-    grading_input = build_grading_input(
-        identifier,
-        CompositorRenderer(objective.compositor, objective.labeller),
-        objective.classes,
-        EvaluatedScene(benign.scene, benign.render, benign.paper, benign.detections),
-        EvaluatedScene(evaluation.scene, evaluation.render, evaluation.moved, evaluation.detections),
-        placebo,
-    )
-    grades = grader.grade(grading_input, failures)
+    grades = grader.grade(objective_grading_input(identifier, objective, evaluation, placebo), failures)
     records = build_failure_records(objective.classes, moved, evaluation.detections, failures, grades)
     return records, grades.notes
 
@@ -233,6 +227,31 @@ def build_grading_input(
 
     before, after = label_detections(benign), label_detections(attacked)
     return GradingInput(identifier, benign.scene, attacked.scene, renderer, before, after, placebo)
+
+
+def objective_grading_input(
+    identifier: str,
+    objective: Objective,
+    evaluation: RenderEvaluation,
+    placebo: Callable[[], SceneIR] | None = None,
+) -> GradingInput:
+    """The input of a grader for a state of an objective's scene.
+
+    Args:
+        identifier: name of the frame.
+        objective: the objective of the scene.
+        evaluation: the state after the change.
+        placebo: makes a random change of the same size; see `GradingInput`.
+    """
+    benign = objective.benign
+    return build_grading_input(
+        identifier,
+        CompositorRenderer(objective.compositor, objective.labeller),
+        objective.classes,
+        EvaluatedScene(benign.scene, benign.render, benign.paper, benign.detections),
+        EvaluatedScene(evaluation.scene, evaluation.render, evaluation.moved, evaluation.detections),
+        placebo,
+    )
 
 
 def build_failure_records(
@@ -281,8 +300,10 @@ def _grade_fields(grades: FrameGrades | None, which: Literal["lost", "phantoms"]
     graded: GradedFault | None = getattr(grades, which).get(index)
     if graded is None:
         return {"grade": str(Grade.THRESHOLD)}
-    fields = {"error": str(graded.fault.kind), "grade": str(graded.grade), "count": graded.count}
-    return fields | {"second": graded.second, "peer": graded.peer}
+    fields: dict[str, Any] = {"error": str(graded.fault.kind), "grade": str(graded.grade), "count": graded.count}
+    if graded.fault.kind is Kind.TWICE:
+        fields["index"] = graded.fault.target
+    return fields | {"second": graded.second, "peer": graded.peer, "fidelity": graded.fidelity}
 
 
 def target_records(targets: Targets, names: tuple[str, ...], objects: int) -> tuple[BoxRecord, ...]:
@@ -406,8 +427,29 @@ def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
         "passes": sum(r.passes or 0 for r in results),
         "grades": {str(grade): sum(map(has_grade(grade), failures)) for grade in Grade},
         "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
+        "fidelity": {
+            "trusted": sum(failure.count is not None and failure.is_trusted for failure in failures),
+            "not_trusted": sum(not failure.is_trusted for failure in failures),
+        },
         "frames_ungraded": sum(not r.graded for r in results),
         "grade_notes": dict(Counter(note for r in results for note in r.grade_notes)),
+    }
+
+
+def count_objects(results: Sequence[FrameResult]) -> dict[str, Any]:
+    """Count vehicles: those that are judged, found before, missed before, and lost."""
+    judged, found = sum(len(r.judged) for r in results), sum(len(r.found_before) for r in results)
+
+    def lost(grade: Grade) -> int:
+        reaches = has_grade(grade)
+        return sum(
+            f.kind == "lost" and f.index in r.found_before and reaches(f) for r in results for f in r.failures
+        )
+
+    return {
+        "objects": VehicleCounts(sum(r.objects for r in results), judged, found),
+        "missed_before": Proportion.from_counts(judged - found, judged),
+        "lost_by_grade": {str(grade): Proportion.from_counts(lost(grade), found) for grade in Grade},
     }
 
 
@@ -423,9 +465,11 @@ def summarise_frames(
         headline: Class of the headline.
     """
 
+    attacked = [r for r in results if r.attacked]
+
     def scores(labels: str, picture: str) -> coco.CocoScores:
         return coco.evaluate(
-            *targets_and_detections(results, classes, labels, picture), classes.names, t_star, headline
+            *targets_and_detections(attacked, classes, labels, picture), classes.names, t_star, headline
         )
 
     def count(kind: str) -> dict[str, int]:
@@ -434,7 +478,8 @@ def summarise_frames(
 
     return {
         "frames": len(results),
-        "objects": sum(r.objects for r in results),
+        "frames_not_attacked": {r.identifier: r.reason_not_attacked for r in results if not r.attacked},
+        **count_objects(results),
         "benign": scores("benign", "benign"),
         "rerendered": scores("benign", "rerendered"),
         "attacked_paper": scores("benign", "attacked"),
@@ -443,7 +488,7 @@ def summarise_frames(
         "phantoms": count("phantom"),
         "successes_paper": sum(r.success_paper for r in results),
         "successes_moved": sum(r.success_moved for r in results),
-        "feasible_fraction": sum(r.feasible for r in results) / len(results) if results else None,
+        "feasible_fraction": sum(r.feasible for r in attacked) / len(attacked) if attacked else None,
         "queries": sum(r.queries for r in results),
         **count_grades(results),
     }

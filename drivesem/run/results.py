@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drivesem.evaluation.coco import CocoScores
+from drivesem.evaluation.resampling import Proportion
+from drivesem.failures.fidelity import ObjectFidelity
 from drivesem.failures.grades import Certificate, SecondOpinion
+from drivesem.report.tables import format_count
 from drivesem.run.records import dump_record, load_record
 from scene_ir.errors import FormatError
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of result.json and metrics.json."""
 
 
@@ -77,9 +80,16 @@ class Failure:
     """Opinion of a second renderer."""
     peer: SecondOpinion | None = None
     """Opinion of a second detector."""
+    fidelity: ObjectFidelity | None = None
+    """Lowest fidelity of the edited objects in its box; None if there is none, or the failure is not graded."""
+
+    @property
+    def is_trusted(self) -> bool:
+        """Whether the picture is trusted."""
+        return self.fidelity is None or self.fidelity.is_trusted
 
     def to_row(self) -> dict[str, Any]:
-        """Return a flat row: kind, grade, draws, second opinions, and box in px; None if unknown.
+        """Return a flat row: kind, grade, draws, second opinions, fidelity, and box in px; None if unknown.
 
         by_threshold is lost or phantom; right_before and wrong_after count draws, of draws_before and draws_after.
         """
@@ -91,6 +101,7 @@ class Failure:
         row |= {"margin_before": count.margin_before, "margin_after": count.margin_after}
         for name, agreement in (("second", self.second), ("peer", self.peer)):
             row |= {name: agreement and agreement.by, f"{name}_agrees": agreement and agreement.agrees}
+        row |= {"fidelity": self.fidelity and self.fidelity.score}
         return row | {"x0": x0, "y0": y0, "x1": x1, "y1": y1}
 
 
@@ -126,6 +137,10 @@ class FrameResult:
     """Lost objects and phantoms."""
     became_ignored: tuple[int, ...]
     """Objects that the change makes ignored."""
+    judged: tuple[int, ...]
+    """Objects that count, before the change: targeted, of a class of the detector, and not ignored."""
+    found_before: tuple[int, ...]
+    """Judged objects that are detected in the re-rendered photograph at IoU 0.5 and t*; others cannot be lost."""
     success_paper: bool
     """Whether the detector fails with benign labels."""
     success_moved: bool
@@ -155,9 +170,34 @@ class FrameResult:
         return not self.violations
 
     @property
+    def attacked(self) -> bool:
+        """Whether there was anything to attack: an object found before, or a search for phantoms alone."""
+        return bool(self.found_before) or self.queries > 0
+
+    @property
+    def reason_not_attacked(self) -> str:
+        """Why the frame was not attacked."""
+        if self.judged:
+            return f"none of {format_count(len(self.judged), 'judged vehicle')} is found before"
+        reason = "under 25 px high, hidden, cut off, faint, not targeted, or of a class that the detector lacks"
+        return f"none of {format_count(self.objects, 'vehicle')} is judged: {reason}"
+
+    @property
     def graded(self) -> bool:
         """Whether all failures have a grade."""
         return all(failure.grade is not None for failure in self.failures)
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleCounts:
+    """Numbers of vehicles, each a part of the one before."""
+
+    all: int
+    """In the frames."""
+    judged: int
+    """That count (`FrameResult.judged`)."""
+    found_before: int
+    """That the detector finds before the attack."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,12 +218,18 @@ class RunSummary:
     """Score from which detections count."""
     frames: int
     """Number of frames."""
+    frames_not_attacked: dict[str, str]
+    """Reasons by frame that had nothing to attack; scores and shares leave these frames out."""
     frames_without_vehicles: int
     """Frames skipped because they have no vehicle."""
     frames_failed: dict[str, str]
     """Reasons by frame that could not be used."""
-    objects: int
-    """Number of objects."""
+    objects: VehicleCounts
+    """Vehicles of all frames."""
+    missed_before: Proportion
+    """Judged vehicles that the detector misses before the attack."""
+    lost_by_grade: dict[str, Proportion]
+    """Vehicles found before that are lost, by at least each grade."""
     benign: CocoScores
     """Scores on the photographs."""
     rerendered: CocoScores
@@ -210,6 +256,8 @@ class RunSummary:
     """Failures of at least each grade."""
     kinds: dict[str, int]
     """Failures by kind."""
+    fidelity: dict[str, int]
+    """Graded failures of a kind, by whether their pictures are `trusted` or `not_trusted`."""
     frames_ungraded: int
     """Frames with ungraded failures."""
     grade_notes: dict[str, int]
@@ -219,6 +267,16 @@ class RunSummary:
     data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Files and label rows of the data set, and what became of them; empty for generated scenes."""
 
+    @property
+    def frames_attacked(self) -> int:
+        """Number of frames that had something to attack."""
+        return self.frames - len(self.frames_not_attacked)
+
+    @property
+    def broken(self) -> Proportion:
+        """Attacked frames that fail with moved labels."""
+        return Proportion.from_counts(self.successes_moved, self.frames_attacked)
+
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object with totals, followed by counts by class."""
         data = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -227,6 +285,11 @@ class RunSummary:
             "schema": SCHEMA,
             **data,
             "params": list(self.params),
+            "frames_attacked": self.frames_attacked,
+            "broken": dataclasses.asdict(self.broken),
+            "objects": dataclasses.asdict(self.objects),
+            "missed_before": dataclasses.asdict(self.missed_before),
+            "lost_by_grade": {grade: dataclasses.asdict(share) for grade, share in self.lost_by_grade.items()},
             "benign": self.benign.to_json(),
             "rerendered": self.rerendered.to_json(),
             "attacked": {"paper": paper.to_json(), "moved": moved.to_json()},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.budgets import STREET, format_budget, parse_budget
+from drivesem.attacks.methods.margin_search import Climb
 from drivesem.attacks.space import combo_parameters
 from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import COMBO_NUMBERS, AttackConfig, ReportConfig
@@ -19,6 +22,8 @@ from drivesem.data.label_table import WEATHER_VARIATIONS
 from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.matched_class import MatchedClass
 from drivesem.failures.certificate import CertificateRule
+from drivesem.failures.grades import Grade
+from drivesem.report.tables import format_count
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, load_attack_config
 from drivesem.run.frame import summarise_frames, targets_and_detections
@@ -83,11 +88,14 @@ PAGE = "report.html"
 _STUDY, _ARMS = "study.json", "arms"
 PICTURES = 200
 """Default number of pictures on a page: 100 frames of one run, 14 to 21 MB for KITTI."""
+_OMITTED_NEXT = ("json", "resume", "workers")
+"""Settings omitted from the command of the next step."""
 _OMITTED_SETTINGS = ("out", "json", "resume", "workers")
 """Settings that do not affect the result, omitted from the command line in the report."""
 _MAX_LINES = 7
 """Largest number of lines in a chart, as there are that many colours."""
-_GRADE_FIELDS = ("passes", "grades", "kinds", "frames_ungraded", "grade_notes")
+_OBJECT_FIELDS = ("objects", "missed_before", "lost_by_grade")
+_GRADE_FIELDS = ("passes", "grades", "kinds", "fidelity", "frames_ungraded", "grade_notes")
 
 
 def build_reports(config: ReportConfig) -> dict[str, Any]:
@@ -141,6 +149,7 @@ def _to_json(out: Path, size: int, runs: Sequence[ReportedRun], left_out: int) -
     frames = [
         {
             "frame": results[0].identifier,
+            "attacked": {one.name: result.attacked for one, result in zip(runs, results, strict=True)},
             "failures": {
                 one.name: [f.kind for f in result.failures] for one, result in zip(runs, results, strict=True)
             },
@@ -311,8 +320,51 @@ def _make_reported_run(
         command=format_command_line("attack", config, _OMITTED_SETTINGS),
         weathers=tuple(_find_weather(r.identifier) for r in sorted(results, key=lambda r: r.identifier)),
         grade_requirements=_grade_requirements(config),
+        next_step=describe_next_step(config, replace(summary, out=str(folder))),
         paper=_paper_figure(summary.params) if follows_paper(config) else None,
     )
+
+
+def describe_next_step(config: AttackConfig, summary: RunSummary) -> str:
+    """Describe what to do next after a run: one line with the command.
+
+    Args:
+        config: The run's settings.
+        summary: Its summary, with its folder.
+    """
+    out, objects = shlex.quote(summary.out), summary.objects
+    if not summary.frames_attacked:
+        more = "a detector that finds them, lower --t-star" if objects.judged else "frames with closer vehicles"
+        frames = "other frames" if config.limit is None else f"more frames than --limit {config.limit}"
+        found = f"{objects.judged} judged, {objects.found_before} found by {summary.detector}"
+        return (
+            f"nothing to attack: {found}, of {format_count(objects.all, 'vehicle')} ({_first_reason(summary)}); "
+            f"next: {more}, or {frames}"
+        )
+    if summary.grades[Grade.CERTAIN]:
+        return (
+            f"next: drivesem explain {out} (which change causes each failure), drivesem holes {out} "
+            f"(where else it fails), drivesem view {out} (look at it)"
+        )
+    budget = format_budget(parse_budget(config.budget))
+    if summary.frames_ungraded:
+        changed, name = replace(config, grade=True), "graded"
+    elif "weather" not in summary.params and config.parametrisation == "ground":
+        params = ",".join((*summary.params, "weather"))
+        changed, name = replace(config, combo=None, params=params, budget=budget), "weather"
+    elif budget != STREET and config.parametrisation == "ground":
+        changed, name = replace(config, budget=STREET), STREET
+    else:
+        changed, name = replace(config, method="climb", passes=2 * (config.passes or Climb().passes)), "climb"
+    command = format_command_line("attack", replace(changed, out=f"{summary.out}-{name}"), _OMITTED_NEXT)
+    why = {"graded": "grade the failures", "weather": "add weather", STREET: "widen the budget"}
+    return f"next, {why.get(name, 'search longer for failures that hold')}: {command}"
+
+
+def _first_reason(summary: RunSummary) -> str:
+    """Return the reason that most frames have for not being attacked."""
+    reasons = Counter(summary.frames_not_attacked.values())
+    return next((f"{format_count(n, 'frame')}: {reason}" for reason, n in reasons.most_common(1)), "no frame")
 
 
 def _grade_requirements(config: AttackConfig) -> GradeRequirements:
@@ -341,7 +393,8 @@ def _precision_recall_line(run: ReportedRun, labels: str, seen: str, name: str) 
     classes = _evaluated_classes(summary)
     if summary.headline not in classes.names or not run.frames:
         return None
-    targets, found = targets_and_detections(run.frames, classes, labels, seen)
+    attacked = [result for result in run.frames if result.attacked]
+    targets, found = targets_and_detections(attacked, classes, labels, seen)
     outcome = MatchedClass.from_frames(targets, found, classes.names.index(summary.headline))
     samples = sampled_curve(outcome.candidates.class_matches(outcome.match, 0))
     if not samples:
@@ -372,7 +425,8 @@ def _load_summary(path: Path) -> RunSummary:
             name: data[name]
             for name in ("out", "dataset", "detector", "headline", "t_star", "frames", "frames_without_vehicles")
         }
-        plain |= {name: data[name] for name in ("frames_failed", "objects", "successes_paper", "successes_moved")}
+        plain |= {name: data[name] for name in ("frames_failed", "frames_not_attacked", *_OBJECT_FIELDS)}
+        plain |= {name: data[name] for name in ("successes_paper", "successes_moved")}
         plain |= {name: data[name] for name in ("feasible_fraction", "queries", "seconds")}
         plain |= {"params": data["params"]} | {name: data[name] for name in _GRADE_FIELDS}
         plain |= {name: _parse_scores(data[name]) for name in ("benign", "rerendered")}

@@ -25,8 +25,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from drivesem.attacks.labels import Labeller
 from drivesem.attacks.scene_edits import apply_edit
-from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting
+from drivesem.attacks.space import Budget, Parameter, ParameterSpace, Perturbation
+from drivesem.config.edits import ALL, WEATHER_CODES, merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.errors import UsageError
 from drivesem.data import kitti
 from drivesem.data.photographs import check_image_size, default_camera, read_photograph, read_pixels
@@ -46,7 +48,11 @@ Calib: TypeAlias = "str | Path | Camera | NDArray[np.floating[Any]] | Tensor"
 """A calibration file of KITTI, a camera, intrinsics (3, 3) or a projection (3, 4), px."""
 
 
-@dataclass(frozen=True, slots=True)
+_NO_CHANGE = 1e-6
+"""Changes up to this are rounding."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Scene:
     """A de-rendered photograph: vehicles, their shadows, the background behind them, weather and foliage.
 
@@ -58,7 +64,7 @@ class Scene:
     name: str = "scene"
     """Name, for example of the photograph."""
     notes: tuple[str, ...] = ()
-    """Infeasible parts of the last edit, such as `objects[2]: left the road, ...`."""
+    """Infeasible places after the last edit, such as `objects[2]: left the road, ...`."""
 
     def __len__(self) -> int:
         """Number of movable vehicles."""
@@ -68,6 +74,31 @@ class Scene:
     def photograph(self) -> NDArray[np.uint8]:
         """The original photograph (H, W, 3) RGB."""
         return to_uint8(self.ir.photograph)
+
+    @torch.no_grad()
+    def boxes(self) -> NDArray[np.float32]:
+        """The labels' boxes (N, 4) px, xyxy, which move with the vehicles."""
+        photographed = self.ir.unperturbed()
+        labeller = Labeller(photographed, render([photographed])[0])
+        return labeller.moved(self.ir, render([self.ir])[0]).boxes_xyxy.cpu().numpy()
+
+    @property
+    def weather(self) -> dict[str, float]:
+        """The weather codes: fog, rain, time, overcast; in [0, 1]."""
+        return dict(zip(WEATHER_CODES, self.ir.environment.weather.tolist(), strict=True))
+
+    @property
+    def theta(self) -> dict[str, float]:
+        """All changes from the photograph, by name, such as objects[3].yaw; empty where nothing is changed."""
+        photographed = self.ir.unperturbed()
+        space = ParameterSpace(photographed, tuple(Parameter), Budget(size=1.0, sun=1.0))
+        theta = space.flatten(Perturbation.between(photographed, self.ir)).tolist()
+        return {space.name(i): value for i, value in enumerate(theta) if abs(value) > _NO_CHANGE}
+
+    def __repr__(self) -> str:
+        _, height, width = self.ir.photograph.shape
+        changes = f", {len(self.theta)} changes" if self.theta else ""
+        return f"Scene({self.name!r}, {width}x{height} px, {len(self)} vehicles{changes})"
 
     def render(self) -> NDArray[np.uint8]:
         """Render the scene, (H, W, 3) RGB."""

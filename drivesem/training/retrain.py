@@ -202,8 +202,9 @@ def _fresh(
         ("moved", summary.attacked_moved, summary.successes_moved),
         ("paper", summary.attacked_paper, summary.successes_paper),
     ):
-        share = won / summary.frames if summary.frames else None
-        rows.append(RetrainRow("fresh counterexamples", mode, "after", summary.frames, scores.headline, share))
+        frames = summary.frames_attacked
+        share = won / frames if frames else None
+        rows.append(RetrainRow("fresh counterexamples", mode, "after", frames, scores.headline, share))
     return rows
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from detectors import boxes
 from detectors.base import Predictor, detector_device
 from detectors.types import CLASSES, Detections, Targets
+from drivesem.attacks.budgets import PRESETS, STREET, change_limits
 from drivesem.attacks.feasibility_check import check_places
 from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.attacks.space import Budget
@@ -134,10 +135,10 @@ class InteractiveScene:
         return result
 
     def notes(self, rendered: RenderedState) -> list[str]:
-        """Violated constraints: vehicles off the ground or the road, or inside one another."""
-        count = len(self.sliders.rest.objects)
-        there = (row for row in range(count) if float(rendered.scene.objects.translation[row, 2]) > 0)
-        return check_places(self.sliders.rest, rendered.scene, there)
+        """Violated constraints: vehicles off the ground or the road, out of the picture, or inside one another."""
+        rest = self.sliders.rest
+        there = (row for row in range(len(rest.objects)) if float(rest.objects.translation[row, 2]) > 0)
+        return check_places(rest, rendered.scene, there, change_limits(PRESETS[STREET]))
 
     def encode_picture(self, rendered: RenderedState) -> bytes:
         """JPEG of a rendered state."""

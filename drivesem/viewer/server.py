@@ -511,4 +511,4 @@ def _summarize_frame(result: FrameResult) -> str:
     lost, phantoms = kinds.count("lost"), kinds.count("phantom")
     parts = [f"{lost} lost"] if lost else []
     parts += [format_count(phantoms, "phantom")] if phantoms else []
-    return ", ".join(parts) or "withstood"
+    return ", ".join(parts) or ("withstood" if result.attacked else "not attacked")

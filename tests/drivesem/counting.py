@@ -6,7 +6,7 @@ from detectors.types import CLASSES
 from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import coco
-from drivesem.run.frame import count_grades, detections_from_records, targets_from_records
+from drivesem.run.frame import count_grades, count_objects, detections_from_records, targets_from_records
 from drivesem.run.results import FrameResult, RunSummary
 
 T_STAR = 0.5
@@ -35,7 +35,8 @@ def summary_of(config: AttackConfig, results: Sequence[FrameResult]) -> RunSumma
         frames=len(results),
         frames_without_vehicles=0,
         frames_failed={},
-        objects=2 * len(results),
+        frames_not_attacked={r.identifier: r.reason_not_attacked for r in results if not r.attacked},
+        **count_objects(results),
         benign=scores("benign", "benign"),
         rerendered=scores("benign", "rerendered"),
         attacked_paper=scores("benign", "attacked"),

@@ -248,6 +248,8 @@ def _run(root: Path) -> None:
         detections_attacked=(),
         failures=(Failure("lost", "Car", moved, 0, 0.9, "missed", "threshold"),),
         became_ignored=(),
+        judged=(0,),
+        found_before=(0,),
         success_paper=True,
         success_moved=True,
         identity_psnr_db=None,

@@ -253,6 +253,11 @@ class FrameCard:
         return max(min(round(min(failed, default=100.0)) - _CUT_BEFORE, 50), _CUT_LEAST)
 
     @property
+    def attacked(self) -> bool:
+        """Whether any run attacked the frame."""
+        return any(one.result.attacked for one in self.outcomes)
+
+    @property
     def failures(self) -> int:
         """Number of failures in all runs."""
         return sum(one.failures for one in self.outcomes)
@@ -296,7 +301,8 @@ class FrameCard:
 def build_cards(runs: Sequence[ReportedRun], gallery: int) -> list[FrameCard]:
     """Prepare all frames, worst first, with pictures for the first `gallery`.
 
-    Frames are ordered by highest grade, number of failures of that grade, number of failures, and smallest change.
+    Attacked frames come first, by highest grade, number of failures of that grade, number of failures, and smallest
+    change.
     Raises FormatError if a picture is missing.
     """
     plain = [
@@ -308,7 +314,9 @@ def build_cards(runs: Sequence[ReportedRun], gallery: int) -> list[FrameCard]:
         )
         for place, results in enumerate(zip(*(run.frames for run in runs), strict=True))
     ]
-    plain.sort(key=lambda card: (-card.rank, -card.surest, -card.failures, card.size, card.identifier))
+    plain.sort(
+        key=lambda card: (not card.attacked, -card.rank, -card.surest, -card.failures, card.size, card.identifier)
+    )
     # decoding and encoding run outside the interpreter's lock
     with ThreadPoolExecutor(_THREADS) as pool:
         return [*pool.map(_with_pictures, plain[:gallery]), *plain[gallery:]]
@@ -339,18 +347,14 @@ def _by_grade(failures: Sequence[Failure]) -> list[Failure]:
 
 def _failure_row(result: FrameResult, failure: Failure) -> FailureRow:
     return FailureRow(
-        text=_describe_with_object(failure),
+        text=grading.name_failure(failure),
         grade=failure.grade or "",
-        draws=grading.format_draws(failure),
+        draws=grading.format_evidence(failure),
         margin=grading.format_margins(failure.count),
         second=grading.format_second_opinion(failure, failure.second),
         peer=grading.format_second_opinion(failure, failure.peer),
         score=_scores(result, failure, _before_it_moved(result, failure)),
     )
-
-
-def _describe_with_object(failure: Failure) -> str:
-    return grading.describe_failure(failure) + ("" if failure.index is None else f", object {failure.index}")
 
 
 def _parameter(coordinate: Coordinate) -> str:
@@ -459,6 +463,8 @@ def describe_outcome(one: FrameOutcome) -> str:
     parts = [f"{one.lost} lost"] if one.lost else []
     if one.phantoms:
         parts.append(format_count(one.phantoms, "phantom"))
+    if not one.result.attacked:
+        return f"not attacked: {one.result.reason_not_attacked}"
     if not parts:
         return "withstood"
     sure = f"{one.surest} {one.grade} of " if one.sure else ""
@@ -466,7 +472,9 @@ def describe_outcome(one: FrameOutcome) -> str:
 
 
 def _describe_vehicles(one: FrameOutcome) -> str:
-    return format_count(one.result.objects, "vehicle")
+    result = one.result
+    counts = f"{len(result.judged)} judged, {len(result.found_before)} found before"
+    return f"{format_count(result.objects, 'vehicle')}, {counts}"
 
 
 def _shared(sets: Sequence[tuple[BoxMark, ...]]) -> tuple[tuple[tuple[int, ...], tuple[BoxMark, ...]], ...]:

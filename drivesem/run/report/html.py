@@ -81,7 +81,7 @@ def render_report(page: ReportPage, at: Path) -> str:
         lead=_lead(runs),
         tiles=[] if several else _tiles(first),
         rows=[_run_row(run, any(r.paper for r in runs)) for run in runs] if several else _figure_rows(first),
-        columns=tuple(_COLUMNS),
+        columns=(*_COLUMNS, "objects"),
         frames=len(cards),
         left_out=page.left_out,
         paper_before=next((f"{100 * run.paper.before:.1f}" for run in runs if run.paper), ""),
@@ -134,19 +134,22 @@ def _totals(summary: RunSummary) -> tuple[int, int]:
 def _verdict(run: ReportedRun) -> str:
     summary = run.summary
     lost, phantoms = _totals(summary)
+    attacked = format_count(summary.frames_attacked, "attacked frame")
+    if not summary.frames_attacked:
+        return f"Nothing to attack: {grading.describe_objects(summary)}"
     if not lost and not phantoms:
-        return f"{summary.detector} withstood in all of {format_count(summary.frames, 'frame')}"
+        return f"{summary.detector} withstood in all of {attacked}"
     if grading.is_known(summary, run.frames):
         grade = grading.highest_grade(summary)
         if grade is None:
             return f"No certain failure: {format_count(lost + phantoms, 'failure')} by threshold, {grading.CHANCE}"
         frames = sum(any(f.grade == grade for f in r.failures) for r in run.frames)
         failures = format_count(summary.grades[str(grade)], f"{grade} failure")
-        return f"{failures} of {summary.detector}, in {frames} of {format_count(summary.frames, 'frame')}"
+        return f"{failures} of {summary.detector}, in {frames} of {attacked}"
     parts = [f"loses {format_count(lost, 'object')}"] if lost else []
     if phantoms:
         parts.append(f"reports {phantoms if lost else format_count(phantoms, 'object')}")
-    frames = f"{summary.successes_moved} of {format_count(summary.frames, 'frame')}"
+    frames = f"{summary.successes_moved} of {attacked}"
     return f"{summary.detector} {' and '.join(parts)}, in {frames}"
 
 
@@ -215,10 +218,10 @@ def _notes(runs: Sequence[ReportedRun]) -> list[str]:
 
 def _lead(runs: Sequence[ReportedRun]) -> str:
     summary = runs[0].summary
-    vehicles = format_count(summary.objects, "vehicle")
-    data = f"{format_count(summary.frames, 'frame')} of {summary.dataset} with {vehicles}"
+    frames = format_count(summary.frames, "frame")
     if len(runs) > 1:
-        return f"The same {data}, run by run."
+        return f"The same {frames} of {summary.dataset}, with {format_count(summary.objects.all, 'vehicle')}."
+    data = f"{summary.dataset} ({grading.describe_frames(summary)}; {grading.describe_objects(summary)})"
     changed = " + ".join(summary.params)
     return (
         f"{changed} changed by {runs[0].method} within feasible limits, on {data}. Each failure was correct "
@@ -232,19 +235,38 @@ def _tiles(run: ReportedRun) -> list[_SummaryTile]:
     before, moved, stay = (
         s.headline.ap50 for s in (summary.benign, summary.attacked_moved, summary.attacked_paper)
     )
-    lost, phantoms = _totals(summary)
+    _, phantoms = _totals(summary)
     paper = f"paper's mAP: {_percent(run.paper.before)} → {_percent(run.paper.after)}" if run.paper else ""
     by_labels = f"with benign labels {_percent(stay)}"
-    share = f"{100 * summary.successes_moved / summary.frames:.0f} % of the frames" if summary.frames else ""
+    left = len(summary.frames_not_attacked)
+    objects, missed = summary.objects, summary.missed_before
+    lost_share = summary.lost_by_grade[str(Grade.THRESHOLD)]
     return [
+        _SummaryTile(
+            "missed before the attack",
+            f"{missed.count} of {missed.of}",
+            f"{missed.percent} of judged vehicles; {objects.all} vehicles in all"
+            if missed.of
+            else "none is judged",
+        ),
         *_graded_tile(run),
         _SummaryTile(
             f"AP50 of {summary.headline}, %",
             f"{_percent(before)} → {_percent(moved)}",
-            f"{_points(before, moved)} points lower; {by_labels}" + (f"; {paper}" if paper else ""),
+            f"on {format_count(summary.benign.headline.objects, summary.headline)}: {_points(before, moved)} points "
+            f"lower; {by_labels}" + (f"; {paper}" if paper else ""),
         ),
-        _SummaryTile("frames broken, by threshold", f"{summary.successes_moved} of {summary.frames}", share),
-        _SummaryTile("lost + phantoms, by threshold", f"{lost} + {phantoms}", _by_class(summary)),
+        _SummaryTile(
+            "frames broken, by threshold",
+            f"{summary.successes_moved} of {summary.frames_attacked}",
+            f"{summary.broken.percent} of attacked frames" + (f"; {left} not attacked" if left else ""),
+        ),
+        _SummaryTile(
+            "lost, by threshold",
+            f"{lost_share.count} of {lost_share.of}",
+            f"{lost_share.percent} of vehicles found before; {format_count(phantoms, 'phantom')}; "
+            f"{_by_class(summary)}",
+        ),
         _SummaryTile(
             "feasible, %",
             _percent(summary.feasible_fraction),
@@ -259,7 +281,8 @@ def _graded_tile(run: ReportedRun) -> list[_SummaryTile]:
         return []
     if not grading.is_known(run.summary, run.frames):
         return [_SummaryTile("certain failures", "unknown", "the failures of this run are not graded")]
-    more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only"
+    more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only. "
+    more += f"Certainly lost: {run.summary.lost_by_grade[str(Grade.CERTAIN)].format('vehicles found before')}"
     return [_SummaryTile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
 
 
@@ -280,11 +303,17 @@ def _figure_rows(run: ReportedRun) -> list[_MetricRow]:
         ("after, benign labels (as in the paper)", summary.attacked_paper),
     ]
     found = [
-        _MetricRow(name, tuple(_percent(getattr(scores.headline, key)) for key in _COLUMNS.values()))
+        _MetricRow(
+            name,
+            (
+                *(_percent(getattr(scores.headline, key)) for key in _COLUMNS.values()),
+                str(scores.headline.objects),
+            ),
+        )
         for name, scores in rows
     ]
     if run.paper is not None:
-        empty = (_NONE,) * (len(_COLUMNS) - 1)
+        empty = (_NONE,) * len(_COLUMNS)
         found += [
             _MetricRow("the paper's mAP, before", (_percent(run.paper.before), *empty), from_paper=True),
             _MetricRow("the paper's mAP, after", (_percent(run.paper.after), *empty), from_paper=True),
@@ -301,14 +330,15 @@ def _run_row(run: ReportedRun, papers: bool) -> _MetricRow:
         run.name,
         (
             *_graded_cells(run),
+            str(before.objects),
             _percent(before.ap50),
             _percent(moved.ap50),
             _points(before.ap50, moved.ap50),
             _percent(summary.attacked_paper.headline.ap50),
             *((_percent(run.paper.after if run.paper else None),) if papers else ()),
             _percent(moved.recall_at_t_star),
-            str(summary.successes_moved),
-            str(lost),
+            f"{summary.successes_moved} of {summary.frames_attacked}",
+            f"{lost} of {summary.objects.found_before}",
             str(phantoms),
             _percent(summary.feasible_fraction),
             str(summary.queries),

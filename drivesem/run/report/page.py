@@ -12,7 +12,8 @@ from pathlib import Path
 
 from markupsafe import Markup, escape
 
-from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, Kind, SecondOpinion
+from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, Kind, SecondOpinion, draw_verb
+from drivesem.report.tables import format_count
 from drivesem.run.results import Failure, FrameResult, RunSummary
 
 SERIES = 7
@@ -245,6 +246,8 @@ class ReportedRun:
     """Weather of each frame, if known."""
     grade_requirements: GradeRequirements
     """Requirements of the grades."""
+    next_step: str
+    """What to do next, with the command."""
     paper: PaperFigure | None = None
     """The paper's mAP, if the run follows its protocol."""
 
@@ -402,12 +405,30 @@ def describe_failure(failure: Failure) -> str:
     return f"{failure.kind} {failure.label}{excuse}"
 
 
+def name_failure(failure: Failure) -> str:
+    """Name a failure and its object: `Car missed, object 6`."""
+    return describe_failure(failure) + ("" if failure.index is None else f", object {failure.index}")
+
+
+def format_grade(failure: Failure) -> str:
+    """Format the grade: `certain`, `threshold, picture not trusted`, or `not graded`."""
+    grade = failure.grade or "not graded"
+    return grade if failure.is_trusted else f"{grade}, picture not trusted"
+
+
+def format_evidence(failure: Failure) -> str:
+    """Format draws and, where it is too low, the fidelity of the picture; "" without a certificate."""
+    fidelity = failure.fidelity
+    parts = (format_draws(failure), "" if fidelity is None or fidelity.is_trusted else fidelity.describe())
+    return "; ".join(filter(None, parts))
+
+
 def format_draws(failure: Failure) -> str:
     """Format draws: `found in 16/16 draws before → 1/16 after`; "" without a certificate."""
     count = failure.count
     if count is None or not count.after_draws:
         return ""
-    word, right = _draw_verb(failure.error)
+    word, right = draw_verb(failure.error)
     after = count.after_draws - count.after if right else count.after
     after_text = f"{after}/{count.after_draws}"
     if not count.before_draws:  # too few after the change for draws before it
@@ -424,22 +445,8 @@ def format_margins(count: Certificate | None) -> str:
 
 
 def format_second_opinion(failure: Failure, agreement: SecondOpinion | None) -> str:
-    """Format a second opinion: `generator agrees: found in 4/4 → 0/4`; "" without one."""
-    if agreement is None:
-        return ""
-    word, right = _draw_verb(failure.error)
-    before, after, of = agreement.before, agreement.draws - agreement.after, agreement.draws
-    if not right:
-        before, after = agreement.draws - agreement.before, agreement.after
-    verdict = "agrees" if agreement.agrees else "does not agree"
-    return f"{agreement.by} {verdict}: {word} {before}/{of} → {after}/{of}"
-
-
-def _draw_verb(error: str | None) -> tuple[str, bool]:
-    """Return the verb that draws are counted by, and whether it describes a correct detection."""
-    if error == Kind.BACKGROUND:
-        return "there in", False
-    return ("reported twice in", False) if error == Kind.TWICE else ("found in", True)
+    """Format a second opinion (`SecondOpinion.describe`); "" without one."""
+    return "" if agreement is None else agreement.describe(failure.error)
 
 
 def tabulate_kinds(frames: Sequence[FrameResult]) -> list[FailureKindRow]:
@@ -485,9 +492,24 @@ def build_grade_rules(requirements: GradeRequirements) -> list[GradeRule]:
         GradeRule(
             Grade.THRESHOLD,
             "Right in one picture, wrong in another. Chance may explain it: a shift of a few pixels can have the "
-            "same effect.",
+            "same effect. A failure in a picture that is not trusted gets no higher grade.",
         ),
     ]
+
+
+def describe_frames(summary: RunSummary) -> str:
+    """Describe frames: `3 frames: 2 attacked, 1 not attacked (no vehicle judged and found before)`."""
+    text, left = format_count(summary.frames, "frame"), len(summary.frames_not_attacked)
+    if not left:
+        return f"{text} attacked"
+    return f"{text}: {summary.frames_attacked} attacked, {left} not attacked (no vehicle judged and found before)"
+
+
+def describe_objects(summary: RunSummary) -> str:
+    """Describe vehicles: `26 vehicles: 13 judged, 8 found before the attack`."""
+    objects = summary.objects
+    text = f"{format_count(objects.all, 'vehicle')}: {objects.judged} judged, {objects.found_before} found before"
+    return f"{text} the attack"
 
 
 def summarise_kinds(failures: Sequence[Failure]) -> str:

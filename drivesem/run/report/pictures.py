@@ -50,7 +50,7 @@ def draw_overlay(
     labels = labels or LabelLayout((image.shape[1], image.shape[0]))
     labels.protected_boxes = [box.xyxy for box in (*failures, *targets)]
     for failure in failures:
-        grade = f": {failure.grade}" if failure.grade else ""
+        grade = f": {grading.format_grade(failure)}" if failure.grade else ""
         labels.add(
             failure.xyxy, TextLabel(f"{grading.describe_failure(failure)}{grade}", _failure_colour(failure))
         )

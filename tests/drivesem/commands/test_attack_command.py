@@ -62,7 +62,14 @@ def test_metrics(finished: Path) -> None:
     assert metrics["out"] == str(finished)
     assert metrics["frames"] == 2
     assert metrics["frames_without_vehicles"] == 0
-    assert metrics["objects"] >= 8
+    assert metrics["frames_attacked"] == 2
+    objects = metrics["objects"]
+    assert objects["all"] >= objects["judged"] >= objects["found_before"] >= 8
+    missed = {"count": objects["judged"] - objects["found_before"], "of": objects["judged"]}
+    assert missed.items() <= metrics["missed_before"].items()
+    lost = metrics["lost_by_grade"]["threshold"]
+    assert (lost["count"], lost["of"]) == (metrics["lost_objects"], objects["found_before"])
+    assert lost["low"] <= lost["count"] / lost["of"] <= lost["high"]
     assert metrics["queries"] == 4
     assert metrics["feasible_fraction"] == 1.0
     assert metrics["rerendered"]["ap50"] == pytest.approx(metrics["benign"]["ap50"], abs=0.01)
@@ -144,18 +151,36 @@ def test_kitti_folder(kitti_folder: Path, tmp_path: Path) -> None:
     assert "000002" in (tmp_path / "run" / "report.html").read_text()
 
 
+def test_a_frame_in_which_nothing_is_found_before_is_not_attacked(tmp_path: Path) -> None:
+    words = [*WORDS, "--limit", "1", "--out", tmp_path / "run", "--t-star", "0.9999"]
+    metrics = run_json(*words)
+    assert metrics["frames_not_attacked"] == {"demo-000": "none of 6 judged vehicles is found before"}
+    assert (metrics["frames"], metrics["frames_attacked"], metrics["queries"]) == (1, 0, 0)
+    assert metrics["objects"] == {"all": 6, "judged": 6, "found_before": 0}
+    assert metrics["broken"] == {"count": 0, "of": 0, "low": None, "high": None}
+    assert metrics["feasible_fraction"] is None
+    assert metrics["benign"]["objects"] == 0
+    output = invoke(*words).out
+    assert "1 frame: 0 attacked, 1 not attacked (no vehicle judged and found before)" in output
+    assert "missed before the attack: 6 of 6 judged vehicles (100 % [61, 100])" in output
+    last = output.splitlines()[-1]
+    assert last.startswith("nothing to attack: 6 judged, 0 found by squeezedet, of 6 vehicles")
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "not attacked: none of 6 judged vehicles is found before" in page
+    assert "withstood" not in page
+    assert last[1:] in page
+
+
 class Blinking:
-    """A detector without gradient: a car in the middle of the picture, surer the brighter that is."""
+    """A detector without gradient: the first car of the first embedded frame, surer the brighter the picture is."""
 
     name, classes = "blinking", ("bus", "Car")
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        self.size_hw = images.shape[2:]
         return images.mean(dim=(1, 2, 3))
 
     def decode(self, raw: torch.Tensor) -> list[Detections]:
-        h, w = self.size_hw
-        box = torch.tensor([[w / 4, h / 4, 3 * w / 4, 3 * h / 4]])
+        box = demo_scene(0, 0).objects.box2d[:1]
         return [Detections(box, torch.tensor([1]), mean[None].clamp(0, 1)) for mean in raw]
 
 

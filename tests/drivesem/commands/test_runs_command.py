@@ -131,7 +131,12 @@ def test_list_and_show(parts: Path) -> None:
 def test_a_run_that_stopped_early_is_listed(parts: Path, tmp_path: Path) -> None:
     shutil.copytree(parts / "part2", tmp_path / "run")
     (tmp_path / "run" / "metrics.json").unlink()
-    assert "run: 1 frame, unfinished (the same command resumes)" in invoke("runs", "list", tmp_path).out
+    (tmp_path / "run" / "plan.json").write_text('{"frames": 40}')
+    assert "run: interrupted, 1 of 40 frames (the same command resumes)" in invoke("runs", "list", tmp_path).out
+    shutil.rmtree(tmp_path / "run" / "frames")
+    output = invoke("runs", "list", tmp_path).out
+    assert "run: interrupted, 0 of 40 frames" in output
+    assert "1 in total" in output
 
 
 def test_runs_of_other_commands_are_passed_over(parts: Path, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from drivesem.config.edits import (
     parse_setting,
     read_frame_edit,
 )
+from drivesem.synth.demo import demo_scene
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
 from scene_ir.types import SceneIR
@@ -264,3 +265,29 @@ def test_places_that_vehicles_should_not_have(street: Street) -> None:
     assert check_places(scene, raised, rows)[0] == "objects[0]: off the ground by 0.300 m"
     far = apply_changes(scene, edit_of("objects[1].translate=2m,0m"))
     assert check_places(scene, far, rows) == []
+
+
+@pytest.mark.parametrize(
+    ("move", "expected"),
+    [
+        ("3m,0m", []),
+        ("6m,0m", ["moved by 6.00 m along, 0.00 m across: more than any budget allows"]),
+        ("50m,0m", ["moved by", "8.9 px high"]),
+        ("0m,3m", ["moved by 0.00 m along, 3.00 m across: more than any budget allows"]),
+        ("0m,50m", ["moved by", "left the picture", "on ground that the picture does not show"]),
+        ("-50m,0m", ["moved by", "behind the camera"]),
+        ("-12m,0m", ["moved by", "reaches behind the camera"]),
+    ],
+)
+def test_moves_off_the_map_have_notes(street: Street, move: str, expected: list[str]) -> None:
+    scene = street(positions_xz=((0.0, 12.0),), yaw=-math.pi / 2, road_edge_x_m=60.0)
+    notes = apply_edit(scene, edit_of(f"objects[0].translate={move}")).notes
+    assert all(note.startswith(f"objects[0]: {words}") for note, words in zip(notes, expected, strict=True)), notes
+
+
+def test_moves_of_several_edits_add_up() -> None:
+    scene = demo_scene(0, 0)
+    once = apply_edit(scene, edit_of("objects[5].translate=3m,0m"))
+    twice = apply_edit(once.scene, edit_of("objects[5].translate=3m,0m"))
+    assert once.notes == ()
+    assert twice.notes == ("objects[5]: moved by 6.00 m along, 0.00 m across: more than any budget allows",)

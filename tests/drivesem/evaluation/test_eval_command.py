@@ -427,8 +427,8 @@ def test_a_run_of_the_attack(run: Run, tmp_path: Path):
     result = FrameResult(
         identifier="demo-000", objects=3, queries=1, loss_trace=(), theta=(), active_constraints=(), violations=(),
         targets_benign=truth, targets_moved=truth, detections_benign=found, detections_rerendered=found,
-        detections_attacked=found[:1], failures=(), became_ignored=(), success_paper=True, success_moved=True,
-        identity_psnr_db=None, seconds=0.0,
+        detections_attacked=found[:1], failures=(), became_ignored=(), judged=(0, 1), found_before=(0, 1),
+        success_paper=True, success_moved=True, identity_psnr_db=None, seconds=0.0,
     )  # fmt: skip
     (tmp_path / "run/frames/demo-000").mkdir(parents=True)
     (tmp_path / "run/frames/demo-000/result.json").write_text(dump_frame(result))

@@ -31,6 +31,8 @@ def frame_result(identifier: str = "000001", lost: bool = True) -> FrameResult:
         detections_attacked=(BoxRecord((100.0, 20.0, 120.0, 55.0), "Pedestrian", score=0.8),),
         failures=(Failure("lost", "Car", (11.0, 20.0, 61.0, 55.0), index=0),) if lost else (),
         became_ignored=(),
+        judged=(0,),
+        found_before=(0,),
         success_paper=lost,
         success_moved=lost,
         identity_psnr_db=None,

@@ -11,7 +11,7 @@ import torch
 
 from detectors.registry import load_detector
 from detectors.types import Detections, Targets
-from drivesem.attacks.budgets import PRESETS
+from drivesem.attacks.budgets import PRESETS, STREET, change_limits
 from drivesem.attacks.feasibility_check import check_places
 from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.viewer.scene import InteractiveScene, best_score
@@ -146,7 +146,8 @@ def test_infeasible_states_have_notes(stage: InteractiveScene) -> None:
     for state in ({k.name: k.high for k in sliders_of_position}, {k.name: k.low for k in sliders_of_position}):
         drawn = stage.render_state(state)
         rows = range(len(stage.sliders.rest.objects))
-        assert stage.notes(drawn) == check_places(stage.sliders.rest, drawn.scene, rows)
+        limits = change_limits(PRESETS[STREET])
+        assert stage.notes(drawn) == check_places(stage.sliders.rest, drawn.scene, rows, limits)
 
 
 def test_the_street_is_as_wide_as_its_vehicles(stage: InteractiveScene) -> None:

@@ -64,6 +64,8 @@ def _frame(
         detections_attacked=tuple(after),
         failures=tuple(failures),
         became_ignored=(),
+        judged=(0, 1),
+        found_before=(0, 1),
         success_paper=bool(failures),
         success_moved=bool(failures),
         identity_psnr_db=None,

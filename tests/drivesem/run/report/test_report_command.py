@@ -150,7 +150,7 @@ def test_frames_without_failure(tmp_path: Path, frame: Callable[..., Any], make_
     run = make_run(tmp_path / "run", [frame("1"), frame("2")])
     assert main(["report", str(run)]) == 0
     text = (run / "report.html").read_text(encoding="utf-8")
-    assert "withstood in all of 2 frames" in text
+    assert "withstood in all of 2 attacked frames" in text
     assert "What went wrong" not in text
 
 

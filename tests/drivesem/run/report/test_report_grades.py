@@ -59,7 +59,7 @@ def page_of(run: Path, parse: Callable[[Path], Any]) -> tuple[Any, str]:
 
 def test_the_page_begins_with_the_highest_grade(run: Path, parse: Callable[[Path], Any]) -> None:
     found, text = page_of(run, parse)
-    assert "1 confirmed failure of squeezedet, in 1 of 5 frames" in text
+    assert "1 confirmed failure of squeezedet, in 1 of 5 attacked frames" in text
     assert (
         "Confirmed: 1 on nothing. Only certain: 1 missed, 1 badly placed, 1 on nothing. "
         "More by threshold only: 1 missed, 1 on nothing, 1 none of a kind." in text

@@ -148,7 +148,7 @@ def test_the_page_shows_the_metrics(page: Path, parse: Callable[[Path], Any]) ->
     metrics = json.loads((page.parent / "metrics.json").read_text())
     text = " ".join(found.text.split())
     assert f"{100 * metrics['benign']['ap50']:.1f} → {100 * metrics['attacked']['moved']['ap50']:.1f}" in text
-    assert "squeezedet loses 2 objects and reports 2, in 3 of 4 frames" in text
+    assert "squeezedet loses 2 objects and reports 2, in 3 of 4 attacked frames" in text
     for what in ("+0.21 m", "−0.08 m", "+17.2°", "1 offsets, up to 0.04 m", "drivesem attack"):
         assert what in text
 

@@ -47,6 +47,8 @@ def frame(
         detections_attacked=after,
         failures=(),
         became_ignored=(),
+        judged=(0,),
+        found_before=(0,),
         success_paper=success,
         success_moved=success,
         identity_psnr_db=None,
