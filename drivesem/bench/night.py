@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -17,10 +18,11 @@ import torch
 from drivesem.bench.session import Columns
 from drivesem.config.commands import AttackConfig, BenchConfig
 from drivesem.config.errors import UsageError
-from drivesem.config.options import SceneOptions, shared_options
+from drivesem.config.options import SceneOptions, format_command_line, shared_options
 from drivesem.config.parsing import parse
 from drivesem.evaluation.resampling import DRAWS, bootstrap_intervals, ratio_metric
 from drivesem.run.attack import AttackWorker
+from drivesem.run.folder import CONFIG, PRESENTATION
 from drivesem.run.frame import write_frame
 from drivesem.scenes.sources import NoVehicleError, open_source
 
@@ -41,15 +43,15 @@ NIGHTS_COLUMNS: Columns = {
     "by": ("by", "by"),
     "frames": ("frames", "frames"),
     "processes": ("processes", "processes"),
-    "hours": ("hours", "hours"),
-    "low": ("from", "from"),
-    "high": ("to", "to"),
+    "time": ("time", "time"),
+    "time_low": ("from", "from"),
+    "time_high": ("to", "to"),
 }
 METHOD = (
     "Frames spread evenly over the data set are attacked as drivesem attack would, in as many processes, and "
     "each part is timed: derender turns the photograph into a scene; search is the attack with what it "
     "prepares; certify grades its failures, with the second renderer and the other detector; write is the "
-    "frame's folder and the independent check. Frames without labelled vehicles are skipped. Hours: "
+    "frame's folder and the independent check. Frames without labelled vehicles are skipped. Time: "
     "the mean of all parts for each frame, shared by the processes; intervals 95 %, by bootstrap over frames. "
     "Start-up, some seconds a process, is left out. Measured: the same frames with other settings; estimated: from "
     "the parts, or, for no other work, from the processor's seconds, where a process has one thread."
@@ -85,15 +87,40 @@ def build_attack_config(config: BenchConfig) -> AttackConfig:
     Raises:
         UsageError: The preset cannot be used.
     """
-    preset = parse(["attack", *([] if config.attack is None else ["--config", config.attack])])
+    preset = parse(["attack", *_attack_words(config.attack)])
     assert isinstance(preset, AttackConfig)
-    overrides = shared_options(config, SceneOptions)
+    # the attack's own frames, unless this command names others
+    options = shared_options(config, SceneOptions)
+    overrides = {name: value for name, value in options.items() if value != getattr(BenchConfig, name)}
     overrides |= {"workers": config.workers, "device": config.device, "limit": None}
     settings = replace(preset, **overrides, keep_going=config.keep_going, out=None)
     if config.detector != BenchConfig.detector:
         settings = replace(settings, detector=config.detector)
     settings.check()
     return settings
+
+
+def _attack_words(attack: str | None) -> list[str]:
+    """Options of `drivesem attack` from --attack: the options themselves, a run's folder, a preset or a YAML file."""
+    if attack is None:
+        return []
+    if " " in attack.strip() and not Path(attack).exists():
+        words = shlex.split(attack)
+        return words[next((i for i, word in enumerate(words) if word.startswith("-")), len(words)) :]
+    return ["--config", str(Path(attack) / CONFIG) if Path(attack).is_dir() else attack]
+
+
+def format_attack(settings: AttackConfig) -> str:
+    """The command line of an attack, without where it writes and how its work is shared."""
+    return format_command_line("attack", settings, PRESENTATION)
+
+
+def format_duration(seconds: float) -> str:
+    """A duration in the unit that suits it: s, min, h or days."""
+    limits = ((90.0, 1.0, "s"), (90 * 60.0, 60.0, "min"), (48 * 3600.0, 3600.0, "h"))
+    unit, name = next(((unit, name) for limit, unit, name in limits if seconds < limit), (86400.0, "days"))
+    value = seconds / unit
+    return f"{value:.0f} {name}" if value >= 9.95 else f"{value:.1f} {name}"
 
 
 def pick_evenly(names: Sequence[str], count: int) -> list[str]:
@@ -181,14 +208,14 @@ def _estimate_hours(
     figure = ratio_metric(how, np.array(seconds), np.ones(len(seconds)))
     (mean,) = bootstrap_intervals([figure], len(seconds), DRAWS, np.random.default_rng(seed))
     hours = [None if v is None else v * frames / processes / 3600 for v in (mean.value, mean.low, mean.high)]
+    times = (None if value is None else format_duration(3600 * value) for value in hours)
     return {
         "how": how,
         "by": by,
         "frames": frames,
         "processes": processes,
-        "hours": hours[0],
-        "low": hours[1],
-        "high": hours[2],
+        **dict(zip(("hours", "low", "high"), hours, strict=True)),
+        **dict(zip(("time", "time_low", "time_high"), times, strict=True)),
     }
 
 

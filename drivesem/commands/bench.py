@@ -92,9 +92,10 @@ def _night(config: BenchConfig, console: Console) -> BenchResult:
     names, skipped, failed = select_frames(open_source(settings), settings)
     count = config.count or len(names)
     chosen = night.pick_evenly(names, config.limit or night.FRAMES)
+    attack = night.format_attack(settings)
+    console.print(f"timing: {attack}", soft_wrap=True)
     console.print(
-        f"measuring {len(chosen)} of {format_count(len(names), 'frame')} with vehicles; "
-        f"{skipped} without vehicles skipped"
+        f"on {len(chosen)} of {format_count(len(names), 'frame')} with vehicles; {skipped} without vehicles skipped"
     )
     build = partial(night.build_frame_timer, settings)
     timed = run_frame_jobs(chosen, time_frame, build, config, ProgressSettings("frames", show_remaining=True))
@@ -103,13 +104,14 @@ def _night(config: BenchConfig, console: Console) -> BenchResult:
     processes = min(config.processes, len(chosen))
     parts, nights = night.part_rows(times), night.night_rows(times, count, processes, config.seed)
     fields = {
+        "attack": attack,
         "parts": parts,
         "nights": nights,
         "measured": [asdict(one) for one in times],
         "failed": failed | timed.failed,
     }
     return BenchResult(
-        fields | {"method": night.METHOD},
+        fields | {"method": f"Attack: {attack}. {night.METHOD}"},
         [
             BenchTable(night.PARTS_TITLE, night.PARTS_COLUMNS, parts),
             BenchTable(night.NIGHTS_TITLE, night.NIGHTS_COLUMNS, nights),

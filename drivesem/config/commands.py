@@ -482,7 +482,7 @@ class BenchConfig(BenchOptions):
     )
 
     what: tyro.conf.Positional[Literal["step", "render", "night"]] = "step"
-    """step: an attack step and the detector alone; render: both renderers; night: hours for all of --root."""
+    """step: an attack step and the detector alone; render: both renderers; night: run time for all of --root."""
     boxes: Annotated[str, OnlyWith("what", ("step",))] | None = None
     """Tar archive of KITTI's label_2 and calib with the vehicles that step measures."""
     frames: Count = 40
@@ -492,7 +492,7 @@ class BenchConfig(BenchOptions):
     count: Count | None = None
     """Frames that night estimates for (default: all with vehicles)."""
     attack: str | None = None
-    """Preset or YAML file of the attack that night measures (default: the default attack)."""
+    """Attack that night times: its options in quotes, a run's folder, a preset or a YAML file (default: no options)."""
 
     def check(self) -> None:
         super().check()

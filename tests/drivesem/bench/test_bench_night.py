@@ -11,6 +11,7 @@ from drivesem.bench import night
 from drivesem.bench.night import FrameTime
 from drivesem.config.commands import BenchConfig
 from drivesem.config.errors import UsageError
+from drivesem.config.options import to_yaml
 
 FRAMES = [FrameTime(2.0, 4.0, 3.0, 1.0, 1.0), FrameTime(4.0, 8.0, 1.0, 1.0, 1.0)]
 
@@ -71,6 +72,36 @@ def test_frames_lie_evenly() -> None:
 def test_no_frame_with_a_vehicle() -> None:
     with pytest.raises(UsageError, match="frames with vehicles"):
         night.require_frames([])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.4, "0.4 s"), (58.32, "58 s"), (91, "1.5 min"), (3000, "50 min"), (5400, "1.5 h"), (234000, "2.7 days")],
+)
+def test_durations_have_the_unit_that_suits_them(seconds: float, text: str) -> None:
+    assert night.format_duration(seconds) == text
+
+
+@pytest.mark.parametrize("program", ["", "drivesem attack ", "attack "])
+def test_the_attack_is_given_as_its_command(program: str, tmp_path: Path) -> None:
+    words = "--method climb --params color,weather --no-confirm"
+    settings = night.build_attack_config(BenchConfig(what="night", attack=program + words))
+    assert (settings.method, settings.params, settings.confirm) == ("climb", "color,weather", False)
+    command = night.format_attack(settings)
+    assert command == "drivesem attack --no-confirm --params color,weather --method climb"
+    assert night.build_attack_config(BenchConfig(what="night", attack=command)) == settings
+    (tmp_path / "config.yaml").write_text(to_yaml(settings))
+    assert (
+        night.format_attack(night.build_attack_config(BenchConfig(what="night", attack=str(tmp_path)))) == command
+    )
+
+
+def test_the_attacks_own_frames_are_timed_unless_others_are_named(tmp_path: Path) -> None:
+    attack = f"drivesem attack --dataset kitti --root {tmp_path} --limit 20"
+    settings = night.build_attack_config(BenchConfig(what="night", attack=attack))
+    assert (settings.dataset, settings.root, settings.limit) == ("kitti", str(tmp_path), None)
+    settings = night.build_attack_config(BenchConfig(what="night", attack=attack, dataset="yolo"))
+    assert settings.dataset == "yolo"
 
 
 def test_the_attack_is_the_presets_on_this_commands_frames(tmp_path: Path) -> None:

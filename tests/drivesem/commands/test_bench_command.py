@@ -116,10 +116,14 @@ def test_out_must_be_a_folder_or_a_new_file(tmp_path: Path) -> None:
 def test_night() -> None:
     """Two embedded frames tell of a thousand."""
     words = ["bench", "night", "--limit", "2", "--count", "1000", "--workers", "1", "--json"]
-    result = json.loads(invoke(*words).out)
+    printed = invoke(*words, "--attack", "--steps 2 --no-confirm")
+    result = json.loads(printed.out)
+    assert result["attack"] == "drivesem attack --steps 2 --no-confirm"
+    assert "timing: drivesem attack --steps 2 --no-confirm" in printed.err
     assert len(result["measured"]) == 2
     assert [row["part"] for row in result["parts"]] == ["derender", "search", "certify", "write"]
     night = result["nights"][0]
+    assert night["time"].endswith((" min", " h"))
     whole = sum(row["mean_s"] for row in result["parts"])
     assert night["hours"] == pytest.approx(whole * 1000 / 3600)
     assert 0 < whole < 300
