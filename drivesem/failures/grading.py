@@ -1,9 +1,9 @@
 """Grades: how certain a failure is. Each grade includes the requirements of the previous one.
 
 threshold: right in one image and wrong in another (`evaluation.failures`). certain: one of the kinds in `kinds`, with
-a certificate, in a picture that is trusted (`fidelity`). confirmed: it also occurs in a second renderer's images of other samples (`SecondOpinion.agrees`).
-shared: it also occurs with a detector of another architecture, which is right without the change and under a placebo,
-a random edit of the same size.
+a certificate, in a picture that is trusted (`fidelity`). confirmed: it also occurs in a second renderer's images of
+other samples (`SecondOpinion.agrees`). shared: it also occurs with a detector of another architecture, which is right
+without the change and under a placebo, a random edit of the same size.
 """
 
 from __future__ import annotations

@@ -323,11 +323,11 @@ def measure_completion(prepared: PreparedScene, drawn: VisibleSurfaces) -> tuple
     texels = prepared.texels.sample(uv, torch.cat([counts, 0 * counts]), prepared.backend, "clamp")
     surface = (lookup[:, 2], lookup[:, 4], lookup[:, 5], lookup[:, 6])
     weight, visible = photograph_weight(uv, texels, prepared.frame_hw, surface)
-    shown = 1.0 - visible * (1.0 - smoothstep(texels[:, channels.SUPPORT], *model.SUPPORTED))
+    share = 1.0 - visible * (1.0 - smoothstep(texels[:, channels.SUPPORT], *model.SUPPORTED))
     drawn_share = prepared.like.new_zeros(drawn.mesh.layout.size)
     return (
-        drawn_share.index_copy(0, hit, shown),
-        drawn_share.index_copy(0, hit, (1.0 - weight).clamp(0.0, 1.0) * shown),
+        drawn_share.index_copy(0, hit, share),
+        drawn_share.index_copy(0, hit, (1.0 - weight).clamp(0.0, 1.0) * share),
     )
 
 

@@ -12,7 +12,7 @@ are image offsets (`attack.roi`), the vertical offset follows the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -57,6 +57,7 @@ class FeasibleSet:
         limits: FeasibilityLimits | None = None,
         only_bounds: bool = False,
         find_invisible: FindInvisible | None = None,
+        held: Sequence[int] = (),
     ) -> None:
         """Prepare the constraints of the scene.
 
@@ -65,6 +66,7 @@ class FeasibleSet:
             limits: what counts as feasible.
             only_bounds: project onto the bounds alone, as the paper does.
             find_invisible: which objects are no longer visible in which weather; None: all stay visible.
+            held: vehicles that stay as photographed.
         """
         self.space = space
         self.only_bounds = only_bounds
@@ -76,6 +78,11 @@ class FeasibleSet:
         objects = space.scene.objects
         self._lower = to_float64_array(space.lower)
         self._upper = to_float64_array(space.upper)
+        self._held = tuple(held)
+        for parameter, where in space.blocks.items():
+            if space.specs[parameter].per_object:
+                for bound in (self._lower, self._upper):
+                    bound[where].reshape(space.count, -1)[list(self._held)] = 0
         if space.count == 0:
             return
         self._translation = to_float64_array(objects.translation)
@@ -94,14 +101,15 @@ class FeasibleSet:
     @property
     def violated_at_start(self) -> tuple[str, ...]:
         """Violations at theta = 0, such as `objects[3]: collision`: labels that overlap or leave less than the
-        clearance; vehicles off the road, out of the picture, too small or hidden; strained fits. These may stay,
-        but not get worse.
+        clearance; vehicles off the road, out of the picture, too small or hidden; strained fits; pictures that are
+        not trusted. These may stay, but not get worse.
         """
         if self.space.count == 0:
             return ()
+        held = [f"objects[{i}]: fidelity" for i in self._held]
         strained = [f"objects[{i}]: strain" for i in np.flatnonzero(self._strain.violated_at_start)]
         limits = ConstraintBounds.absolute(self.space.count, self.limits)
-        names = (*strained, *self._find_violations(self._at_rest(), limits).names())
+        names = (*held, *strained, *self._find_violations(self._at_rest(), limits).names())
         absent = tuple(f"objects[{i}]:" for i in behind_camera(self.space.scene).nonzero()[:, 0].tolist())
         return tuple(name for name in names if not name.startswith(absent))
 
