@@ -1,4 +1,4 @@
-"""Smallest failing part of a change theta, and the Shapley values of its parts (parameters, objects).
+"""Smallest part of a change theta that keeps a failure, and the Shapley values of its parts (parameters, objects).
 
 A part's Shapley value is what it adds on average over all orders in which the parts may be applied. A game gives
 values (K,) of any subset of its P players, several games at once if they share their cost. Contributions add up to
@@ -26,7 +26,7 @@ from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import RangeError
 
-SCHEMA = 1
+SCHEMA = 2
 EXPLANATION = "explain.json"
 """File of a frame's explanation."""
 
@@ -45,6 +45,8 @@ class PartOutcome:
     """Whether the detector fails."""
     held_back: bool
     """Whether the projection onto the feasible set changed theta."""
+    occurs: tuple[bool, ...] = ()
+    """Whether each explained failure of the frame occurs: of the same object, in the same kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +61,10 @@ class Contribution:
     """Shapley value of the loss."""
     loss_error: float | None
     """Its standard error, if orders were sampled."""
-    fails: float
-    """Shapley value of failing (1) or not (0)."""
-    fails_error: float | None
-    """Its standard error, if orders were sampled."""
+    fails: tuple[float, ...]
+    """Shapley value of each explained failure: whether it occurs (1) or not (0)."""
+    fails_error: tuple[float, ...] | None
+    """Their standard errors, if orders were sampled."""
     gradient: float | None
     """Sum of gradient at theta0 times theta; None without a gradient."""
     gradient_share: float | None
@@ -75,16 +77,24 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True)
 class MinimalChange:
-    """The smallest change found that still fails."""
+    """The smallest change found that keeps one failure: the same object in the same kind."""
 
+    draws: int
+    """Draws, of `of`, that show the failure after this change, by the rule of its certificate."""
+    of: int
+    """Draws evaluated: the first of the certificate's; 0 for a failure of no kind."""
+    holds: bool
+    """Whether enough draws show it for a certificate. The search requires it of failures from certain on, and of
+    others only that they occur in the picture.
+    """
     scan: tuple[bool, ...]
-    """Whether the whole change fails at each scale of the grid, 0 and 1 included."""
+    """Whether the failure occurs in the picture at each scale of the whole change, 0 and 1 included."""
     sign_changes: int
     """Changes between failing and not failing along the grid."""
     scale_whole: float
-    """Smallest failing scale of the whole change, in [0, 1]."""
+    """Smallest scale of the whole change that keeps the failure, in [0, 1]."""
     scale: float
-    """Smallest failing scale after dropping parts, in [0, 1]."""
+    """Smallest such scale after dropping parts, in [0, 1]."""
     dropped: tuple[str, ...]
     """Names of the dropped parts, in order."""
     norm_found: float
@@ -110,6 +120,11 @@ class MinimalChange:
         return self.norm / self.norm_found
 
     @property
+    def is_whole(self) -> bool:
+        """Whether no part and no smaller amount of the change keeps the failure."""
+        return not self.dropped and self.scale == 1
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Parameters of the minimal change."""
         return tuple(dict.fromkeys(size.parameter for size in self.sizes))
@@ -128,6 +143,18 @@ class PixelSensitivity:
     """Share on each object, in [0, 1]."""
     background: float
     """Share on the background, in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureExplanation:
+    """One graded failure of the run, and the smallest change that keeps it."""
+
+    failure: Failure
+    """The failure, as the run graded it."""
+    least: MinimalChange | None
+    """The minimal change; None with a `reason`."""
+    reason: str = ""
+    """Why there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,21 +177,14 @@ class Explanation:
     """Kinds of parts with exact Shapley values."""
     sizes: tuple[ChangeSize, ...]
     """Size of each parameter of each object."""
-    least: MinimalChange
-    """The minimal change."""
+    failures: tuple[FailureExplanation, ...]
+    """Its failures, highest grade first."""
     sensitivity: dict[str, PixelSensitivity]
     """Pixel gradients of `benign` and `counterexample`; empty without a gradient."""
     renders: int
     """Number of thetas evaluated."""
     seconds: float
     """Run time; the only field that may differ between two calls."""
-
-    @property
-    def by_exchange(self) -> bool:
-        """Whether the scene fails at theta0 already, by the exchange of vehicles alone; there are no contributions
-        then, and the minimal change is empty.
-        """
-        return self.least.scan[0]
 
     def of_kind(self, kind: str) -> tuple[Contribution, ...]:
         """Return the contributions of one kind, `parameter` or `object`."""
@@ -405,8 +425,10 @@ class MinimalChangeSearch:
 
     project: Callable[[Tensor], Tensor]
     """Projects onto the feasible set."""
+    occurs: Callable[[Tensor], bool]
+    """Whether the failure occurs in the picture of a feasible theta: necessary, and cheap."""
     fails: Callable[[Tensor], bool]
-    """Whether the detector fails at a feasible theta."""
+    """Whether the failure is kept at a feasible theta."""
     size: Callable[[Tensor], float]
     """The norm to minimise."""
     points: int
@@ -422,7 +444,7 @@ class ShortenedChange:
     scale: float
     """Its scale relative to the remaining blocks, in [0, 1]."""
     scan: tuple[bool, ...]
-    """Whether the whole change fails at each scale of the grid, 0 and 1 included."""
+    """Whether the failure occurs at each scale of the whole change, 0 and 1 included."""
     shortened: Tensor
     """The whole change (D,) after the first bisection."""
     shortened_scale: float
@@ -452,11 +474,11 @@ def find_minimal_change(
     Raises:
         RangeError: The change does not fail, or no change is needed.
     """
-    scan = tuple(_fails_at(theta, k / search.points, search) for k in range(search.points + 1))
+    scan = tuple(search.occurs(search.project(theta * (k / search.points))) for k in range(search.points + 1))
     if not scan[-1] or scan[0]:
         actual = "one that does not" if not scan[-1] else "a failure without any change"
         raise RangeError("theta", "a change that fails", actual)
-    first = scan.index(True)
+    first = next(k for k, occurs in enumerate(scan) if occurs and _fails_at(theta, k / search.points, search))
     scale = _bisect(theta, (first - 1) / search.points, first / search.points, search)
     shortened, shortened_scale = search.project(theta * scale), scale
     direction, dropped = theta, []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -10,18 +10,41 @@ from statistics import fmean, median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich import box
 
-from drivesem.analysis.explain.attribution import ChangeSize, Contribution, Explanation, PartOutcome
-from drivesem.evaluation.curves import ClassMatches
-from drivesem.evaluation.resampling import Interval, NamedMetric, WeightedRecall, bootstrap_intervals
+from drivesem.analysis.explain.attribution import (
+    ChangeSize,
+    Contribution,
+    Explanation,
+    FailureExplanation,
+    MinimalChange,
+    PartOutcome,
+)
+from drivesem.evaluation.resampling import Interval, NamedMetric, bootstrap_intervals, ratio_metric
 from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
-from drivesem.report.tables import AnalysisReport, ReportTable
+from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.run.report.page import format_grade, grade_rank, name_failure
+from drivesem.run.results import Failure
 
 _NEEDED = "needs"
-_TEXT_COLUMNS = ("parameter", "frame", _NEEDED)
+_TEXT_COLUMNS = ("parameter", "frame", "failure", "grade", _NEEDED, "changes", "holds")
 """Columns of text; the others hold numbers."""
-_RICH_OPTIONS: dict[str, Any] = {"unbroken": _TEXT_COLUMNS, "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
+_RICH_OPTIONS: dict[str, Any] = {
+    "unbroken": ("parameter", "frame"),
+    "box": box.SIMPLE_HEAD,
+    "padding": (0, 1, 0, 0),
+}
+
+
+def minimal_picture(number: int) -> str:
+    """Name the picture of the minimal change of a frame's failure of that number, from 0."""
+    return f"minimal_{number + 1}"
+
+
+def sort_failures(failures: Sequence[Failure]) -> list[Failure]:
+    """Sort failures, the highest grade first."""
+    return sorted(failures, key=lambda failure: -grade_rank(failure))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +56,17 @@ class ParameterSummary:
     loss: Interval
     """Mean Shapley value of the loss, with a bootstrap interval over frames."""
     fails: Interval
-    """Mean Shapley value of failing, with a bootstrap interval over frames."""
+    """Mean Shapley value over failures of whether they occur, with a bootstrap interval over frames."""
     gradient_share: float | None
     """Mean share of the gradient; None without a gradient."""
+    failures: int
+    """Number of failures."""
     alone: int
-    """Frames that fail by this parameter alone."""
+    """Those that this parameter alone causes."""
     without: int
-    """Frames that fail without it."""
+    """Those that occur without it."""
     needed: int
-    """Frames in which the minimal change contains it."""
+    """Those with a minimal change that contains it."""
     found: float
     """Median over frames of the largest change of an object, in `unit`."""
     least: float | None
@@ -68,47 +93,50 @@ def summarise_parameters(explanations: Sequence[Explanation], draws: int, seed: 
     """
     names = list(dict.fromkeys(c.name for e in explanations for c in e.of_kind("parameter")))
     tables = [{c.name: c for c in e.of_kind("parameter")} for e in explanations]
-    loss = _mean_intervals(names, [[_shapley_value(t, n, "loss") for t in tables] for n in names], draws, seed)
-    fails = _mean_intervals(names, [[_shapley_value(t, n, "fails") for t in tables] for n in names], draws, seed)
+    ones, failures = np.ones(len(tables)), np.array([len(e.failures) for e in explanations], np.float64)
+
+    def metric(name: str, value: Callable[[Contribution], float], totals: NDArray[np.float64]) -> NamedMetric:
+        return ratio_metric(name, np.array([value(t[name]) if name in t else 0.0 for t in tables]), totals)
+
+    metrics = [metric(name, lambda c: c.loss, ones) for name in names]
+    metrics += [metric(name, lambda c: sum(c.fails), failures) for name in names]
+    intervals = bootstrap_intervals(metrics, len(tables), draws, np.random.default_rng(seed))
+    loss, fails = intervals[: len(names)], intervals[len(names) :]
     return [_summarise_parameter(name, loss[i], fails[i], tables, explanations) for i, name in enumerate(names)]
 
 
 def build_explain_tables(
     explanations: Sequence[Explanation], rows: Sequence[ParameterSummary]
 ) -> list[ReportTable]:
-    """Build the table of parameters over all frames, and that of minimal changes by frame."""
+    """Build the table of failures and their minimal changes, and that of parameters over all frames."""
     by_parameter = tuple(
         (
             row.name,
             _format_interval(row.loss, 1, 2),
             _format_interval(row.fails, 100, 0),
             "-" if row.gradient_share is None else f"{100 * row.gradient_share:.0f}",
-            str(row.alone),
-            str(row.without),
-            str(row.needed),
+            *(f"{count} of {row.failures}" for count in (row.alone, row.without, row.needed)),
             _format_size(row.found, row.unit),
             "-" if row.least is None else _format_size(row.least, row.unit),
         )
         for row in rows
     )
-    by_frame = tuple(_frame_row(e) for e in explanations)
+    by_failure = tuple(_failure_row(e, one) for e in explanations for one in e.failures)
+    failures = format_count(sum(len(e.failures) for e in explanations), "failure")
     return [
         ReportTable(
-            f"by parameter, frames: {len(explanations)}",
-            (
-                *("parameter", "adds to loss", "of failing, %", "of gradient, %", "fail by it alone"),
-                *("fail without it", "need it", "largest change", "sufficient"),
-            ),
-            by_parameter,
+            "smallest change that keeps each failure",
+            ("frame", "failure", "grade", _NEEDED, "changes", "size, %", "holds"),
+            by_failure,
             _RICH_OPTIONS,
         ),
         ReportTable(
-            "minimal change",
+            f"by parameter: {failures} in {format_count(len(explanations), 'frame')}",
             (
-                *("frame", "loss", "failures", "flips", "size, steps", "minimal, steps", "minimal, %"),
-                *(_NEEDED, "objects", "failures left", "most loss by"),
+                *("parameter", "adds to loss", "of failing, %", "of gradient, %", "alone suffices"),
+                *("occurs without it", "need it", "largest change", "sufficient"),
             ),
-            by_frame,
+            by_parameter,
             _RICH_OPTIONS,
         ),
     ]
@@ -121,9 +149,9 @@ def build_frame_table(explanation: Explanation) -> ReportTable:
         ("whole change", "", "", "", *_format_outcome(explanation.found), "", ""),
     ]
     for one in explanation.contributions:
-        loss, fails = f"{one.loss:+.2f}", f"{100 * one.fails:+.0f}"
-        if one.loss_error is not None and one.fails_error is not None:
-            loss, fails = f"{loss} ± {one.loss_error:.2f}", f"{fails} ± {100 * one.fails_error:.0f}"
+        loss, fails = f"{one.loss:+.2f}", _format_fails(one)
+        if one.loss_error is not None:
+            loss = f"{loss} ± {one.loss_error:.2f}"
         share = "-" if one.gradient_share is None else f"{100 * one.gradient_share:.0f}"
         rows.append((one.name, loss, fails, share, *_format_outcome(one.alone), *_format_outcome(one.without)))
     columns = (
@@ -135,20 +163,20 @@ def build_frame_table(explanation: Explanation) -> ReportTable:
 
 def build_explain_notes(draws: int) -> list[str]:
     """Explain the columns. draws: bootstrap draws."""
-    interval = f"; in brackets: 95 % interval of {draws} bootstrap draws of frames" if draws else ""
+    interval = (
+        f"; in brackets, from two frames on: 95 % interval of {draws} bootstrap draws of frames" if draws else ""
+    )
     return [
-        f"Adds to loss, of failing: mean Shapley values, which add up to the rise of the loss and to 100 "
-        f"%{interval}. "
-        "Of gradient: share of |gradient x change| at the photograph. Fail by it alone, without it: frames that "
-        "fail by this parameter's part of the change only, and by all other parts. Need it: frames in which the "
-        "minimal change contains it. Largest change, sufficient: largest change of an object in the "
-        "counterexample, and in the minimal change if it contains the parameter; medians over frames.",
-        "Failures: lost objects + phantoms. Flips: how often failing starts or stops between photograph and "
-        "counterexample. Size: of the change, in sign steps; minimal: of the smallest change found that still "
-        "fails, "
-        f"and its share; {_NEEDED}, objects: what it changes; failures left: its failures. Most loss by: the "
-        f"object "
-        "with the largest contribution to the loss.",
+        f"{_NEEDED.capitalize()}, changes: the parameters and objects of the smallest change found that keeps the "
+        "same object failing in the same kind. Size: relative to the whole change, in sign steps. Holds: draws "
+        "that show the failure after it, the first of those of its certificate; from certain on, as large a share "
+        "as a certificate needs. A failure by threshold is kept in the picture only.",
+        f"Adds to loss: mean Shapley value over frames; of failing: the same of whether a failure occurs, over "
+        f"failures{interval}. A part with a negative share works against the failure at its full size. Of "
+        "gradient: share of |gradient x change| at the photograph. Alone suffices, occurs without it: failures "
+        "that occur after this parameter's part of the change only, and after all other parts. Largest change, "
+        "sufficient: largest change of an object in the counterexample, and in the smallest changes that contain "
+        "the parameter; medians.",
     ]
 
 
@@ -177,16 +205,29 @@ def build_explain_report(
     for e in explanations:
         table = build_frame_table(e)
         appendix += [*table.to_markdown(table.columns), ""]
-        pictures = ("shapley", *(("sensitivity",) if e.sensitivity else ()), "minimal_overlay")
-        appendix += [f"![](frames/{e.identifier}/{name}.png)\n" for name in pictures]
+        pictures = {"shapley": "", **({"sensitivity": ""} if e.sensitivity else {})}
+        pictures |= {
+            f"{minimal_picture(number)}_overlay": f"Smallest change that keeps: {name_failure(one.failure)}"
+            for number, one in enumerate(e.failures)
+            if one.least is not None
+        }
+        appendix += [f"![{text}](frames/{e.identifier}/{name}.png)\n" for name, text in pictures.items()]
     tables = build_explain_tables(explanations, rows)
     left_out: Sequence[str] = facts["frames_by_exchange"]
     return AnalysisReport(
         out=out,
         name="explain",
         heading="Explanations",
-        data={**facts, "rows": [row.to_json() for row in rows], "explained": [_json_row(e) for e in explanations]},
-        csv_tables={"explain": [line for e in explanations for line in _csv_rows(e)]},
+        data={
+            **facts,
+            "rows": [_json_row(e, one) for e in explanations for one in e.failures],
+            "parameters": [row.to_json() for row in rows],
+            "explained": [_json_frame(e) for e in explanations],
+        },
+        csv_tables={
+            "explain": [line for e in explanations for line in _csv_rows(e)],
+            "explain_failures": [_flat_row(e, one) for e in explanations for one in e.failures],
+        },
         tables=tables,
         notes=[
             *build_explain_notes(draws),
@@ -206,20 +247,50 @@ def build_explain_report(
     )
 
 
-def _json_row(explanation: Explanation) -> dict[str, Any]:
-    """Summarise a frame; its own folder has the rest."""
-    least = explanation.least
-    return {
+def _json_row(explanation: Explanation, one: FailureExplanation) -> dict[str, Any]:
+    """Summarise a failure."""
+    failure, least = one.failure, one.least
+    row: dict[str, Any] = {
         "frame": explanation.identifier,
-        "loss_benign": explanation.benign.loss,
-        "loss_found": explanation.found.loss,
-        "sign_changes": least.sign_changes,
+        "object": failure.index,
+        "kind": failure.error,
+        "by_threshold": failure.kind,
+        "label": failure.label,
+        "grade": failure.grade,
+        "fidelity": failure.fidelity and failure.fidelity.score,
+        "box": list(failure.xyxy),
+        "reason": one.reason or None,
+    }
+    if least is None:
+        return {**row, "least": {"holds": False, "draws": 0, "of": 0}}
+    row["least"] = {
+        **{name: getattr(least, name) for name in ("holds", "draws", "of", "is_whole", "left", "sign_changes")},
+        "size": least.norm,
         "size_found": least.norm_found,
-        "size_least": least.norm,
-        "left": least.left,
         "parameters": list(least.parameters),
         "objects": list(least.objects),
         "feasible": not least.violations,
+    }
+    return row
+
+
+def _flat_row(explanation: Explanation, one: FailureExplanation) -> dict[str, Any]:
+    """Summarise a failure for CSV."""
+    row = _json_row(explanation, one)
+    least, box_xyxy = row.pop("least"), row.pop("box")
+    row |= dict(zip(("x0", "y0", "x1", "y1"), box_xyxy, strict=True))
+    for name, value in least.items():
+        row[name] = "; ".join(map(str, value)) if isinstance(value, list) else value
+    return row
+
+
+def _json_frame(explanation: Explanation) -> dict[str, Any]:
+    """Summarise a frame; its own folder has the rest."""
+    return {
+        "frame": explanation.identifier,
+        "failures": len(explanation.failures),
+        "loss_benign": explanation.benign.loss,
+        "loss_found": explanation.found.loss,
         "renders": explanation.renders,
     }
 
@@ -228,7 +299,7 @@ def _csv_rows(explanation: Explanation) -> list[dict[str, Any]]:
     """Return a row per parameter and per object."""
     rows: list[dict[str, Any]] = []
     for one in explanation.contributions:
-        before, after = _part_sizes(one, explanation.sizes), _part_sizes(one, explanation.least.sizes)
+        before = _part_sizes(one, explanation.sizes)
         # an object's change has no single unit: metres and degrees do not add up
         physical = one.kind == "parameter"
         rows.append(
@@ -237,19 +308,23 @@ def _csv_rows(explanation: Explanation) -> list[dict[str, Any]]:
                 "kind": one.kind,
                 "name": one.name,
                 "exact": one.kind in explanation.exact,
-                **{name: getattr(one, name) for name in ("loss", "loss_error", "fails", "fails_error")},
+                **{name: getattr(one, name) for name in ("loss", "loss_error")},
+                "fails": fmean(one.fails),
                 "gradient": one.gradient,
                 "gradient_share": one.gradient_share,
-                **{f"alone_{key}": value for key, value in asdict(one.alone).items()},
-                **{f"without_{key}": value for key, value in asdict(one.without).items()},
+                **{f"alone_{key}": value for key, value in _outcome_row(one.alone).items()},
+                **{f"without_{key}": value for key, value in _outcome_row(one.without).items()},
                 "unit": before[0].unit if physical else None,
                 "found": max(s.value for s in before) if physical else None,
-                "least": max((s.value for s in after), default=0.0) if physical else None,
                 "found_steps": max(s.steps for s in before),
-                "least_steps": max((s.steps for s in after), default=0.0),
             }
         )
     return rows
+
+
+def _outcome_row(outcome: PartOutcome) -> dict[str, Any]:
+    """Return an outcome with the number of explained failures that occur."""
+    return {**asdict(outcome), "occurs": sum(outcome.occurs)}
 
 
 def _part_sizes(one: Contribution, sizes: Sequence[ChangeSize]) -> list[ChangeSize]:
@@ -267,16 +342,18 @@ def _summarise_parameter(
     known = [table[name] for table in tables if name in table]
     shares = [c.gradient_share for c in known if c.gradient_share is not None]
     found = [_largest_size(name, e.sizes) for e in explanations]
-    least = [_largest_size(name, e.least.sizes) for e in explanations]
+    least = [_largest_size(name, one.least.sizes) for e in explanations for one in e.failures if one.least]
     moved, needed = [s for s in found if s is not None], [s for s in least if s is not None]
+    # a frame that does not change it fails without it
+    unchanged = sum(len(e.failures) for e, table in zip(explanations, tables, strict=True) if name not in table)
     return ParameterSummary(
         name=name,
         loss=loss,
         fails=fails,
         gradient_share=fmean(shares) if shares else None,
-        alone=sum(c.alone.success for c in known),
-        # a frame that does not change it fails without it
-        without=sum(c.without.success for c in known) + len(tables) - len(known),
+        failures=sum(len(e.failures) for e in explanations),
+        alone=sum(sum(c.alone.occurs) for c in known),
+        without=sum(sum(c.without.occurs) for c in known) + unchanged,
         needed=len(needed),
         found=median(s.value for s in moved),
         least=median(s.value for s in needed) if needed else None,
@@ -289,41 +366,33 @@ def _largest_size(name: str, sizes: Sequence[ChangeSize]) -> ChangeSize | None:
     return max(own, key=lambda size: size.value) if own else None
 
 
-def _shapley_value(table: dict[str, Contribution], name: str, field: str) -> float:
-    return float(getattr(table[name], field)) if name in table else 0.0
-
-
-def _mean_intervals(
-    names: Sequence[str], values: Sequence[Sequence[float]], draws: int, seed: int
-) -> list[Interval]:
-    """Return means over frames with bootstrap intervals. values: per name and frame."""
-    frames = len(values[0])
-    ones, order = np.ones(frames), np.arange(frames)
-    metrics = [
-        NamedMetric(name, (WeightedRecall(ClassMatches(ones, order, np.asarray(row), np.zeros(frames), ones)),))
-        for name, row in zip(names, values, strict=True)
-    ]
-    return bootstrap_intervals(metrics, frames, draws, np.random.default_rng(seed))
-
-
-def _frame_row(explanation: Explanation) -> tuple[str, ...]:
-    least = explanation.least
-    most = max(explanation.of_kind("object"), key=lambda c: c.loss)
-    benign_loss, _ = _format_outcome(explanation.benign)
-    found_loss, fails = _format_outcome(explanation.found)
+def _failure_row(explanation: Explanation, one: FailureExplanation) -> tuple[str, ...]:
+    least, head = one.least, (explanation.identifier, name_failure(one.failure), format_grade(one.failure))
+    if least is None:
+        return (*head, "-", "-", "-", one.reason)
+    changed = [f"object {index}" for index in least.objects]
+    changed += ["scene"] if any(size.object is None for size in least.sizes) else []
     return (
-        explanation.identifier,
-        f"{benign_loss} to {found_loss}",
-        fails,
-        str(least.sign_changes),
-        f"{least.norm_found:.2f}",
-        f"{least.norm:.2f}",
-        f"{100 * least.left:.1f}",
+        *head,
         ", ".join(least.parameters),
-        f"{', '.join(map(str, least.objects)) or 'none'} of {explanation.objects}",
-        _format_outcome(least.outcome)[1],
-        f"{most.name.removeprefix('objects')} {most.loss:+.2f}",
+        ", ".join(changed),
+        f"{100 * least.left:.0f}",
+        _format_holds(one, least),
     )
+
+
+def _format_holds(one: FailureExplanation, least: MinimalChange) -> str:
+    """Format whether the failure holds after its minimal change."""
+    text = f"{least.draws} of {least.of} draws" if least.of else "in the picture, no kind to test in draws"
+    if least.of and not least.holds:
+        text = f"no: {text}, in the picture only"
+    return f"{text}; no smaller change keeps it" if least.is_whole else text
+
+
+def _format_fails(one: Contribution) -> str:
+    """Format the Shapley value of failing, averaged over failures, percent."""
+    text = f"{100 * fmean(one.fails):+.0f}"
+    return text if one.fails_error is None else f"{text} ± {100 * fmean(one.fails_error):.0f}"
 
 
 def _format_outcome(outcome: PartOutcome) -> tuple[str, str]:
@@ -422,7 +491,7 @@ def _plot_waterfall(axes: Axes, explanation: Explanation, contributions: Sequenc
 
 
 def _format_contribution(one: Contribution) -> str:
-    return f"{one.loss:+.2f}   (failing {100 * one.fails:+.0f} %)"
+    return f"{one.loss:+.2f}   (failing {_format_fails(one)} %)"
 
 
 def _plot_bars(axes: Axes, intervals: Sequence[Interval], factor: float, label: str) -> None:

@@ -1,10 +1,11 @@
-"""Explains counterexamples of a run: which parameters and objects cause the failure, and how little suffices."""
+"""Explains failures of a run: which parameters and objects cause each, and how little of the change keeps it."""
 
 from __future__ import annotations
 
+import math
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from drivesem.analysis.explain.attribution import (
     SCHEMA,
     Contribution,
     Explanation,
+    FailureExplanation,
     Flags,
     Floats,
     MinimalChange,
@@ -41,29 +43,40 @@ from drivesem.analysis.explain.attribution import (
 from drivesem.analysis.explain.report import (
     build_explain_report,
     exchange_note,
+    minimal_picture,
     plot_waterfalls,
+    sort_failures,
     summarise_parameters,
 )
 from drivesem.attacks.budgets import change_limits
 from drivesem.attacks.feasibility_check import check_scene
-from drivesem.attacks.methods.base import Problem, Score
+from drivesem.attacks.methods.base import Problem
 from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.config.commands import ExplainConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS
+from drivesem.failures.grades import AGREEMENT_RULE, Grade
+from drivesem.failures.grading import Grader
+from drivesem.failures.kinds import Fault, find_same_fault
 from drivesem.report.tables import AnalysisReport, format_count
+from drivesem.run.attack import build_grader
 from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames
-from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
+from drivesem.run.finished import AttackRun, ChangedState, RebuiltFrame, load_runs
 from drivesem.run.folder import FRAMES, PRESENTATION, claim_folder, load_run_detector, load_trusted_config
-from drivesem.run.frame import build_failure_records, detection_records, target_records
+from drivesem.run.frame import (
+    build_failure_records,
+    detection_records,
+    has_grade,
+    target_records,
+)
 from drivesem.run.report import pictures
-from drivesem.run.results import Coordinate
+from drivesem.run.results import Coordinate, Failure
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import to_uint8
 
-_WRITTEN = ("explain.json", "explain.md", "explain.csv", "explain.png", FRAMES)
+_WRITTEN = ("explain.json", "explain.md", "explain.csv", "explain_failures.csv", "explain.png", FRAMES)
 _FREE = (*PRESENTATION, "run", "frame", "bootstrap")
 """Settings that do not affect a frame's explanation."""
 
@@ -80,8 +93,8 @@ def run_explain(config: ExplainConfig) -> AnalysisReport:
     analyser = make_analyser()
     claim_folder(out, config, _WRITTEN, _FREE)
     results, failed = analyse_frames(names, analyser, make_analyser, config, ProgressSettings("explaining frames"))
-    explanations = [one for one in results if not one.by_exchange]
-    by_exchange = [one.identifier for one in results if one.by_exchange]
+    explanations = [one for one in results if one.contributions]
+    by_exchange = [one.identifier for one in results if not one.contributions]
     if not explanations:
         reasons = "; ".join([*failed.values(), *([exchange_note(by_exchange)] if by_exchange else [])])
         raise UsageError("--run", "a run with frames that can be explained", reasons)
@@ -130,28 +143,109 @@ class ExplainBudget:
     """Sampled orders of more than MOST_EXACT parts; an even number."""
     seed: int
     """Seed of the orders."""
-    keep_lost: bool = False
-    """The minimal change of a counterexample that loses objects must lose one, too."""
+
+
+MIN_CHECK_DRAWS = AGREEMENT_RULE[1]
+"""Draws that test a change in the search, doubled up to those of the certificate until the whole change holds."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedFailure:
+    """A failure of the run, to be found again after other changes of its frame."""
+
+    record: Failure
+    """As the run graded it."""
+    fault: Fault | None
+    """The same as a fault; None for a failure of no kind."""
+
+    @classmethod
+    def list_occurring(cls, records: Sequence[Failure], state: ChangedState) -> list[TrackedFailure]:
+        """List the failures of a kind, or all if there are none, that occur at the counterexample."""
+        of_kind = [record for record in records if record.error is not None]
+        return [
+            tracked
+            for record in of_kind or records
+            if (tracked := cls(record, state.find_recorded_fault(record))).occurs(state)
+        ]
+
+    @property
+    def certain(self) -> bool:
+        """Whether the run graded it certain or higher."""
+        return has_grade(Grade.CERTAIN)(self.record)
+
+    def occurs(self, state: ChangedState) -> bool:
+        """Whether it occurs in a picture: the same object fails in the same kind."""
+        if state.hidden:
+            return False
+        return (
+            self.fault_in(state) is not None if self.fault is not None else state.shows_by_threshold(self.record)
+        )
+
+    def fault_in(self, state: ChangedState) -> Fault | None:
+        """Find it among the faults of a state."""
+        assert self.fault is not None
+        place, detections = torch.tensor(self.record.xyxy), state.evaluation.detections
+        return find_same_fault(state.faults, self.fault, place, detections)
 
 
 class PartialChangeEvaluator:
-    """Evaluates the detector on parts of a change."""
+    """Evaluates the detector on parts of a change, and follows failures through them."""
 
-    def __init__(self, problem: Problem) -> None:
-        self._problem = problem
-        self._evaluated: set[bytes] = set()
+    def __init__(self, problem: Problem, evaluate_state: Callable[[Tensor], ChangedState], grader: Grader) -> None:
+        self._problem, self._evaluate_state, self._grader = problem, evaluate_state, grader
+        self._occurs: dict[bytes, tuple[bool, ...]] = {}
+        self.tracked: Sequence[TrackedFailure] = ()
+        """Failures that `outcome` looks for."""
 
     @property
     def renders(self) -> int:
         """Number of different thetas evaluated."""
-        return len(self._evaluated)
+        return len(self._occurs)
 
     def outcome(self, theta: Tensor, mask: Tensor) -> PartOutcome:
         """Evaluate theta (D,) with the coordinates outside `mask` (D,) bool reset and the rest projected."""
         masked = torch.where(mask, theta, 0)
         part = self.project(masked)
-        score = self._score(part)
-        return PartOutcome(score.loss, score.lost, score.phantoms, score.success, not torch.equal(part, masked))
+        occurs, score = self.occurs(part), self._problem.score(part)
+        held_back = not torch.equal(part, masked)
+        return PartOutcome(score.loss, score.lost, score.phantoms, score.success, held_back, occurs)
+
+    def occurs(self, theta: Tensor) -> tuple[bool, ...]:
+        """Whether each failure occurs in the picture of a feasible theta (D,)."""
+        key = theta.cpu().numpy().tobytes()
+        if key not in self._occurs:
+            state = self._evaluate_state(theta)
+            self._occurs[key] = tuple(tracked.occurs(state) for tracked in self.tracked)
+        return self._occurs[key]
+
+    def count_draws(self, theta: Tensor, row: int, draws: int, enough: int = 0) -> int:
+        """Count the draws that show a failure at a feasible theta (D,).
+
+        Args:
+            theta: The state.
+            row: Number of the failure.
+            draws: Number of draws.
+            enough: Stop as soon as this many can no longer be reached.
+        """
+        state, tracked = self._evaluate_state(theta), self.tracked[row]
+        fault = None if tracked.fault is None else tracked.fault_in(state)
+        return 0 if fault is None else self._grader.count_wrong(state.case, fault, draws, enough)
+
+    def choose_draws(self, theta: Tensor, row: int) -> int:
+        """Choose the fewest draws in which a certain failure holds at its counterexample theta (D,)."""
+        draws = MIN_CHECK_DRAWS
+        while draws < self._grader.rule.draws and not self.holds(theta, row, draws):
+            draws *= 2
+        return min(draws, self._grader.rule.draws)
+
+    def enough(self, draws: int) -> int:
+        """Return how many of that many draws must show a failure, by the share that a certificate needs."""
+        return math.ceil(self._grader.rule.wrong_after * draws)
+
+    def holds(self, theta: Tensor, row: int, draws: int) -> bool:
+        """Whether a failure occurs in the picture and in enough draws."""
+        enough = self.enough(draws)
+        return self.occurs(theta)[row] and self.count_draws(theta, row, draws, enough) >= enough
 
     def project(self, theta: Tensor) -> Tensor:
         """Project theta (D,) onto the feasible set."""
@@ -161,18 +255,19 @@ class PartialChangeEvaluator:
         """Return the size of theta (D,) in steps (`Problem.size`)."""
         return float(self._problem.size(theta))
 
-    def make_search(self, points: int, keep_lost: bool) -> MinimalChangeSearch:
-        """Make the search for the smallest change that fails or, with `keep_lost`, that loses an object."""
+    def make_search(self, points: int, row: int, draws: int) -> MinimalChangeSearch:
+        """Make the search for the smallest change that keeps a failure.
 
-        def fails(theta: Tensor) -> bool:
-            score = self._score(theta)
-            return score.lost > 0 if keep_lost else score.success
+        Args:
+            points: Points of the grid of scales.
+            row: Number of the failure.
+            draws: Draws in which it must hold; 0 if the picture decides.
+        """
 
-        return MinimalChangeSearch(self.project, fails, self.size, points)
+        def keeps(theta: Tensor) -> bool:
+            return self.holds(theta, row, draws) if draws else self.occurs(theta)[row]
 
-    def _score(self, theta: Tensor) -> Score:
-        self._evaluated.add(theta.cpu().numpy().tobytes())
-        return self._problem.score(theta)
+        return MinimalChangeSearch(self.project, lambda theta: self.occurs(theta)[row], keeps, self.size, points)
 
 
 class ExplainAnalyser(FrameAnalyser[Explanation]):
@@ -186,58 +281,94 @@ class ExplainAnalyser(FrameAnalyser[Explanation]):
         whole = config.resolve_whole(attack.whole)
         self.attack = replace(attack, whole=whole, incremental=False, keep_mb=config.keep_mb)
         self.params, self.detector = parse_params(run.params), load_run_detector(attack, config.device)
-        keep_lost = config.least == "lost"
-        self.budget = ExplainBudget(config.points, config.permutations, config.seed, keep_lost)
+        self.budget = ExplainBudget(config.points, config.permutations, config.seed)
+        self.grader = build_grader(replace(attack, confirm=False), self.detector)
 
     def analyse(self, name: str, folder: Path) -> Explanation:
-        """See `FrameAnalyser`. A scene that fails by the exchange of its vehicles alone has no contributions.
+        """See `FrameAnalyser`. Failures by the exchange of vehicles alone have no contributions.
 
-        Raises FormatError if the detector does not fail on this machine, RangeError for a gradient that is not
+        Raises FormatError if none of the failures occurs on this machine, RangeError for a gradient that is not
         finite.
         """
         start = time.perf_counter()
         frame_folder, budget = self.run_folder / FRAMES / name, self.budget
         frame = RebuiltFrame.load(frame_folder, self.attack, self.params, self.detector)
         objective, theta, space = frame.objective, frame.theta, frame.objective.space
-        evaluator = PartialChangeEvaluator(objective.problem(frame.feasible))
-        everything = torch.ones_like(theta, dtype=torch.bool)
-        found = evaluator.outcome(theta, everything)
-        if not found.success:
+        evaluate_state = partial(frame.evaluate_state, self.grader)
+        evaluator = PartialChangeEvaluator(objective.problem(frame.feasible), evaluate_state, self.grader)
+        records = sort_failures(frame.result.failures)
+        evaluator.tracked = TrackedFailure.list_occurring(records, evaluate_state(evaluator.project(theta)))
+        if not evaluator.tracked:
             raise FormatError(
                 str(frame_folder), "a counterexample that fails", "one that the detector gets right here"
             )
+        everything = torch.ones_like(theta, dtype=torch.bool)
+        found, benign = evaluator.outcome(theta, everything), evaluator.outcome(theta, ~everything)
         parts = {"parameter": split_by_parameter(space, theta), "object": split_by_object(space, theta)}
         slope = objective.loss_and_grad(space.theta0)[1] * theta if isinstance(self.detector, Detector) else None
         generator = np.random.default_rng([budget.seed, zlib.crc32(name.encode())])
-        search = evaluator.make_search(budget.points, budget.keep_lost and found.lost > 0)
         contributions: list[Contribution] = []
-        if search.fails(space.theta0):
-            shortened = ShortenedChange(space.theta0, 0.0, (True, True), space.theta0, 0.0, ())
-        else:
+        if not all(benign.occurs):
             for own in parts.values():
                 contributions += compute_contributions(
                     own, theta, evaluator, slope, budget.permutations, generator
                 )
-            blocks = _order_blocks(space, theta, [*parts["parameter"], *parts["object"]], contributions, evaluator)
-            shortened = find_minimal_change(theta, blocks, search)
-        minimal = objective.evaluate(shortened.theta)
+        blocks = _order_blocks(space, theta, [*parts["parameter"], *parts["object"]], contributions, evaluator)
+        explained = [
+            _explain_failure(frame, evaluator, row, blocks, budget.points) for row in range(len(evaluator.tracked))
+        ]
         gradients = _pixel_gradients(objective, theta)
         explanation = Explanation(
             identifier=name,
             source=self.source_digest(name),
             objects=frame.result.objects,
-            benign=evaluator.outcome(theta, ~everything),
+            benign=benign,
             found=found,
             contributions=tuple(contributions),
             exact=tuple(kind for kind, own in parts.items() if len(own) <= MOST_EXACT),
             sizes=tuple(measure_change(space, theta)),
-            least=_describe_minimal_change(frame, evaluator, shortened, minimal),
+            failures=tuple(one for one, _ in explained),
             sensitivity={view: _sensitivity_shares(*pair) for view, pair in gradients.items()},
             renders=evaluator.renders,
             seconds=round(time.perf_counter() - start, 3),
         )
-        _write_pictures(folder, explanation, objective, minimal, gradients)
+        _write_pictures(folder, explanation, objective, [rendered for _, rendered in explained], gradients)
         return explanation
+
+
+def _explain_failure(
+    frame: RebuiltFrame, evaluator: PartialChangeEvaluator, row: int, blocks: Sequence[ThetaBlock], points: int
+) -> tuple[FailureExplanation, RenderEvaluation | None]:
+    """Find the smallest change that keeps a failure, and render it.
+
+    Args:
+        frame: The frame.
+        evaluator: Evaluates the detector.
+        row: Number of the failure.
+        blocks: Blocks to drop, in this order.
+        points: Points of the grid of scales.
+    """
+    theta, tracked, theta0 = frame.theta, evaluator.tracked[row], frame.objective.space.theta0
+    if evaluator.occurs(evaluator.project(theta0))[row]:
+        return FailureExplanation(tracked.record, None, "the exchange of vehicles alone causes it"), None
+    whole = evaluator.project(theta)
+    draws = evaluator.choose_draws(whole, row) if tracked.certain else MIN_CHECK_DRAWS
+    must_hold = tracked.certain and evaluator.holds(whole, row, draws)
+    others = torch.zeros_like(theta, dtype=torch.bool)
+    for cell in list_object_parameters(frame.objective.space):
+        others[cell.where] = cell.object not in (None, tracked.record.index)
+    first = [] if tracked.record.index is None else [ThetaBlock("other objects", others)]
+    search = evaluator.make_search(points, row, draws if must_hold else 0)
+    shortened = find_minimal_change(theta, [*first, *blocks], search)
+    rendered = frame.objective.evaluate(shortened.theta)
+    wrong = evaluator.count_draws(shortened.theta, row, draws)
+    least = replace(
+        _describe_minimal_change(frame, evaluator, shortened, rendered),
+        draws=wrong,
+        of=draws if tracked.fault is not None else 0,
+        holds=wrong >= evaluator.enough(draws),
+    )
+    return FailureExplanation(tracked.record, least), rendered
 
 
 def compute_contributions(
@@ -269,24 +400,25 @@ def compute_contributions(
 
     def game(members: Flags) -> Floats:
         one = outcome(members)
-        return np.array([one.loss, one.success], dtype=np.float64)
+        return np.array([one.loss, *one.occurs], dtype=np.float64)
 
     values = shapley_values(game, len(parts), permutations, generator)
     total_slope = None if slope is None else float(slope.abs().sum())
     contributions: list[Contribution] = []
     for i, part in enumerate(parts):
         alone = np.arange(len(parts)) == i
-        errors = (None, None) if values.errors is None else tuple(values.errors[i].tolist())
+        loss, *fails = values.contributions[i].tolist()
+        errors = None if values.errors is None else values.errors[i].tolist()
         own_slope = None if slope is None else slope[part.mask]
         share = float(own_slope.abs().sum()) / total_slope if own_slope is not None and total_slope else None
         contributions.append(
             Contribution(
                 kind=part.kind,
                 name=part.name,
-                loss=float(values.contributions[i, 0]),
-                loss_error=errors[0],
-                fails=float(values.contributions[i, 1]),
-                fails_error=errors[1],
+                loss=loss,
+                loss_error=None if errors is None else errors[0],
+                fails=tuple(fails),
+                fails_error=None if errors is None else tuple(errors[1:]),
                 gradient=None if own_slope is None else float(own_slope.sum()),
                 gradient_share=share,
                 alone=outcome(alone),
@@ -307,7 +439,9 @@ def _order_blocks(
     single parameters of single objects, the smallest first.
     """
     loss = {c.name: c.loss for c in contributions}
-    blocks = [ThetaBlock(part.name, part.mask) for part in sorted(parts, key=lambda part: loss[part.name])]
+    blocks = [
+        ThetaBlock(part.name, part.mask) for part in sorted(parts, key=lambda part: loss.get(part.name, 0.0))
+    ]
     single: list[tuple[float, ThetaBlock]] = []
     for cell in list_object_parameters(space):
         mask = torch.zeros_like(theta, dtype=torch.bool)
@@ -327,6 +461,9 @@ def _describe_minimal_change(
         limits=change_limits(space.budget, space.parametrisation),
     )
     return MinimalChange(
+        draws=0,
+        of=0,
+        holds=False,
         scan=shortened.scan,
         sign_changes=shortened.sign_changes,
         scale_whole=shortened.shortened_scale,
@@ -371,20 +508,24 @@ def _write_pictures(
     folder: Path,
     explanation: Explanation,
     objective: Objective,
-    minimal: RenderEvaluation,
+    rendered: Sequence[RenderEvaluation | None],
     gradients: Mapping[str, tuple[RenderEvaluation, sensitivity.Floats]],
 ) -> None:
-    image = to_uint8(minimal.render.image)
-    files.write_png(folder / "minimal.png", image)
-    overlay = pictures.draw_overlay(
-        image,
-        target_records(minimal.moved.targets, CLASSES, explanation.objects),
-        detection_records(minimal.detections, objective.classes.names),
-        explanation.least.failures,
-        objective.t_star,
-        sensitivity.place_object_numbers((image.shape[1], image.shape[0]), _object_boxes(minimal)),
-    )
-    files.write_png(folder / "minimal_overlay.png", overlay)
+    """Write a frame's pictures. rendered: the minimal change of each failure."""
+    for number, (explained, minimal) in enumerate(zip(explanation.failures, rendered, strict=True)):
+        if minimal is None or explained.least is None:
+            continue
+        image = to_uint8(minimal.render.image)
+        files.write_png(folder / f"{minimal_picture(number)}.png", image)
+        overlay = pictures.draw_overlay(
+            image,
+            target_records(minimal.moved.targets, CLASSES, explanation.objects),
+            detection_records(minimal.detections, objective.classes.names),
+            explained.least.failures,
+            objective.t_star,
+            sensitivity.place_object_numbers((image.shape[1], image.shape[0]), _object_boxes(minimal)),
+        )
+        files.write_png(folder / f"{minimal_picture(number)}_overlay.png", overlay)
     if gradients:
         rows = [
             (name, to_uint8(one.render.image), _object_boxes(one), gradient)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -14,6 +15,7 @@ from drivesem.analysis.explain.attribution import (
     ChangeSize,
     Contribution,
     Explanation,
+    FailureExplanation,
     MinimalChange,
     PartOutcome,
     PixelSensitivity,
@@ -29,12 +31,14 @@ from drivesem.run.records import dump_record, load_record
 from drivesem.run.results import Coordinate, Failure
 from scene_ir.errors import FormatError
 
-GOOD, BAD = PartOutcome(1.0, 0, 0, False, False), PartOutcome(3.0, 1, 2, True, False)
+GOOD, BAD = PartOutcome(1.0, 0, 0, False, False, (False,)), PartOutcome(3.0, 1, 2, True, False, (True,))
+LOST = Failure("lost", "Car", (1.0, 2.0, 3.0, 4.0), index=2, error="missed", grade="certain")
 
 
 def contribution(kind: str, name: str, loss: float, fails: float, error: float | None = None) -> Contribution:
     bad, good = (BAD, GOOD) if fails > 0.5 else (GOOD, BAD)
-    return Contribution(kind, name, loss, error, fails, error, 2 * loss, abs(loss) / 2, bad, good)
+    errors = None if error is None else (error,)
+    return Contribution(kind, name, loss, error, (fails,), errors, 2 * loss, abs(loss) / 2, bad, good)
 
 
 def explanation(name: str, rotate: float = 0.5) -> Explanation:
@@ -44,6 +48,9 @@ def explanation(name: str, rotate: float = 0.5) -> Explanation:
         ChangeSize("mesh", 2, 0.1, "m", 1.0),
     )
     least = MinimalChange(
+        draws=3,
+        of=4,
+        holds=True,
         scan=(False, True, False, True),
         sign_changes=3,
         scale_whole=0.3,
@@ -72,7 +79,7 @@ def explanation(name: str, rotate: float = 0.5) -> Explanation:
         ),
         exact=("parameter",),
         sizes=sizes,
-        least=least,
+        failures=(FailureExplanation(LOST, least),),
         sensitivity={"benign": PixelSensitivity((0.1, 0.2, 0.3), 0.4)},
         renders=99,
         seconds=1.5,
@@ -83,17 +90,18 @@ def test_back_from_json(tmp_path: Path) -> None:
     path, record = tmp_path / "explain.json", explanation("a")
     path.write_text(dump_record(record, SCHEMA))
     assert load_record(path, Explanation, SCHEMA) == record
-    for broken in ("[]", "{}", '{"schema": 1}', path.read_text().replace('"sign_changes"', '"signs"')):
+    for broken in ("[]", "{}", '{"schema": 2}', path.read_text().replace('"sign_changes"', '"signs"')):
         (tmp_path / "broken.json").write_text(broken)
-        with pytest.raises(FormatError, match=r"broken\.json: (schema|identifier|least)"):
+        with pytest.raises(FormatError, match=r"broken\.json: (schema|identifier|failures)"):
             load_record(tmp_path / "broken.json", Explanation, SCHEMA)
     (tmp_path / "old.json").write_text('{"schema": 0}')
-    with pytest.raises(FormatError, match="schema: expected 1"):
+    with pytest.raises(FormatError, match="schema: expected 2"):
         load_record(tmp_path / "old.json", Explanation, SCHEMA)
 
 
 def test_the_least_change_in_words() -> None:
-    least = explanation("a").least
+    least = explanation("a").failures[0].least
+    assert least is not None
     assert least.left == 0.25
     assert least.parameters == ("rotate",)
     assert least.objects == (2,)
@@ -129,12 +137,13 @@ def test_a_parameter_that_some_frames_leave_alone() -> None:
 
 def test_tables() -> None:
     frames = [explanation("a"), explanation("b")]
-    by_parameter, by_frame = build_explain_tables(frames, summarise_parameters(frames, 0, 0))
-    assert by_parameter.rows[0] == ("rotate", "+1.50", "+75", "75", "2", "0", "2", "5 deg", "2.5 deg")
-    row = dict(zip(by_frame.columns, by_frame.rows[0], strict=True))
-    assert (row["loss"], row["failures"], row["failures left"]) == ("1.00 to 3.00", "1 + 2", "1 + 0")
-    assert (row["minimal, %"], row["needs"], row["objects"]) == ("25.0", "rotate", "2 of 3")
-    assert row["most loss by"] == "[2] +2.50"
+    by_failure, by_parameter = build_explain_tables(frames, summarise_parameters(frames, 0, 0))
+    assert by_parameter.rows[0] == (
+        *("rotate", "+1.50", "+75", "75", "2 of 2", "0 of 2", "2 of 2", "5 deg", "2.5 deg"),
+    )
+    assert by_failure.rows[0] == (
+        *("a", "Car missed, object 2", "certain", "rotate", "object 2", "25", "3 of 4 draws"),
+    )
     parts = {row[0]: row for row in build_frame_table(frames[0]).rows}
     assert parts["whole change"][4:6] == ("3.00", "1 + 2")
     assert parts["rotate"][1:4] == ("+1.50", "+75", "75")
@@ -142,18 +151,49 @@ def test_tables() -> None:
     assert parts["objects[0]"][4:] == ("1.00", "0 + 0", "3.00", "1 + 2")
 
 
+def held(**changes: Any) -> str:
+    one = explanation("a")
+    (failure,) = one.failures
+    assert failure.least is not None
+    least = replace(failure.least, **changes)
+    tables = build_explain_tables([replace(one, failures=(replace(failure, least=least),))], [])
+    return tables[0].rows[0][-1]
+
+
+def test_whether_the_smallest_change_holds_in_words() -> None:
+    assert held(draws=1, holds=False) == "no: 1 of 4 draws, in the picture only"
+    assert held(dropped=(), scale=1.0) == "3 of 4 draws; no smaller change keeps it"
+    assert held(draws=0, of=0, holds=False) == "in the picture, no kind to test in draws"
+    one = explanation("a")
+    exchanged = replace(one, failures=(FailureExplanation(LOST, None, "the exchange causes it"),))
+    assert build_explain_tables([exchanged], [])[0].rows[0][-1] == "the exchange causes it"
+
+
+def test_one_frame_has_no_interval() -> None:
+    (lone, _) = summarise_parameters([explanation("a")], 100, 0)
+    assert (lone.loss.value, lone.loss.low, lone.fails.low) == (1.5, None, None)
+
+
 def test_files(tmp_path: Path) -> None:
     frames = [explanation("a"), explanation("b", 1.5)]
-    build_explain_report(
+    report = build_explain_report(
         tmp_path, frames, summarise_parameters(frames, 20, 0), 20, {"frames_failed": {}, "frames_by_exchange": []}
-    ).write()
+    )
+    report.write()
+    row = report.data["rows"][0]
+    assert (row["frame"], row["object"], row["grade"]) == ("a", 2, "certain")
+    assert {name: row["least"][name] for name in ("holds", "draws", "of")} == {"holds": True, "draws": 3, "of": 4}
     rows = list(csv.DictReader((tmp_path / "explain.csv").read_text().splitlines()))
     assert [row["frame"] for row in rows] == ["a"] * 4 + ["b"] * 4
-    assert (rows[0]["found"], rows[0]["least"], rows[0]["unit"]) == ("5.0", "2.5", "deg")
-    assert (rows[2]["name"], rows[2]["found"], rows[2]["least_steps"]) == ("objects[0]", "", "0.0")
-    assert rows[3]["least_steps"] == "4.3"
+    assert (rows[0]["found"], rows[0]["unit"]) == ("5.0", "deg")
+    assert (rows[2]["name"], rows[2]["found"]) == ("objects[0]", "")
+    failures = list(csv.DictReader((tmp_path / "explain_failures.csv").read_text().splitlines()))
+    assert [(f["frame"], f["object"], f["holds"], f["draws"], f["parameters"]) for f in failures] == [
+        (name, "2", "True", "3", "rotate") for name in ("a", "b")
+    ]
     page = (tmp_path / "explain.md").read_text()
     assert page.count("\n## ") == 4
+    assert "![Smallest change that keeps: Car missed, object 2](frames/a/minimal_1_overlay.png)" in page
     assert all(len(line.split("|")) > 5 for line in page.splitlines() if line.startswith("|"))
     assert min(cv2.imread(str(tmp_path / "explain.png")).shape[:2]) > 150
 

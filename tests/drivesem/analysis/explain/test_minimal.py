@@ -26,7 +26,7 @@ PAIRS = blocks(("a", (0, 1)), ("b", (2, 3)))
 
 
 def search(fails, project=lambda theta: theta, points=16):
-    return MinimalChangeSearch(project, fails, lambda theta: float(theta.norm()), points)
+    return MinimalChangeSearch(project, fails, fails, lambda theta: float(theta.norm()), points)
 
 
 def test_what_is_not_needed_goes_and_the_rest_is_shortened():
@@ -129,3 +129,13 @@ def test_what_does_not_fail_is_refused():
         find_minimal_change(torch.ones(4), PAIRS, search(lambda _: False))
     with pytest.raises(RangeError, match="found a failure without any change"):
         find_minimal_change(torch.ones(4), PAIRS, search(lambda _: True))
+
+
+def test_what_only_occurs_in_the_picture_is_not_enough():
+    """The scan follows the picture; the scale is the first from which the failure holds."""
+    occurs, holds = (lambda theta: bool(theta[0] > 0.2)), (lambda theta: bool(theta[0] > 0.6))
+    found = find_minimal_change(
+        torch.tensor([1.0, 0, 0, 0]), [], MinimalChangeSearch(lambda t: t, occurs, holds, lambda t: float(t.norm()), 16)
+    )
+    assert found.scan.index(True) == 4
+    assert 0.6 < found.scale < 0.6 + RESOLUTION
