@@ -8,6 +8,7 @@ from drivesem.evaluation.curves import ClassMatches
 from drivesem.evaluation.kitti import evaluate
 from drivesem.evaluation.resampling import (
     NamedMetric,
+    Proportion,
     WeightedAveragePrecision,
     WeightedKittiPrecision,
     WeightedRecall,
@@ -160,3 +161,11 @@ def test_a_difference_without_its_test_is_the_same() -> None:
     )
     assert without.interval == with_p.interval
     assert (without.p, with_p.p is None) == (None, False)
+
+
+@pytest.mark.parametrize(
+    ("count", "of", "text"),
+    [(3, 8, "3 of 8 cars (38 % [14, 69])"), (0, 13, "0 of 13 cars (0 % [0, 23])"), (0, 0, "0 of 0 cars")],
+)
+def test_a_proportion_has_its_interval(count: int, of: int, text: str) -> None:
+    assert Proportion.from_counts(count, of).format("cars") == text

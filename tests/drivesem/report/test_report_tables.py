@@ -1,11 +1,15 @@
 """Numbers and their nouns, and tables on terminals of any width."""
 
 import io
+import re
+import time
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report.tables import Console, ReportTable, format_count, rows_to_csv
+from drivesem.report import tables
+from drivesem.report.tables import Console, ReportTable, format_count, progress_bar, rows_to_csv
 
 COLUMNS = ("arm", "where", "PSNR, dB", "perceptual distance", "FID")
 ROWS = (
@@ -83,3 +87,45 @@ def test_no_word_and_no_number_is_broken(
     assert max(map(len, text.splitlines())) <= width
     assert all(number in text for _, number in numbers)
     assert all(word in text for word in " ".join([*columns, sentence]).split())
+
+
+@pytest.mark.parametrize(("columns", "width"), [(None, 120), ("90", 90)])
+def test_a_log_is_120_wide_unless_columns_says_otherwise(
+    columns: str | None, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    assert Console(file=io.StringIO()).width == width
+    assert Console(file=io.StringIO(), width=70).width == 70
+
+
+def test_progress_in_a_log_is_a_plain_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "_LINE_SECONDS", 0.05)
+    stream = io.StringIO()
+    with progress_bar(Console(file=stream)) as progress:
+        task = progress.add_task("attacking frames", total=40, completed=10)
+        time.sleep(0.12)
+        progress.advance(task, 2)
+        time.sleep(0.12)
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "attacking frames: 10 of 40, 0:00:00"
+    assert re.fullmatch(r"attacking frames: 12 of 40, 0:00:00, [\d.]+ a second, 0:00:0\d left", lines[-1]), lines
+    assert 3 <= len(lines) <= 6
+
+
+def test_progress_on_a_terminal_has_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "_LINE_SECONDS", 0.01)
+    stream = io.StringIO()
+    with progress_bar(Console(file=stream, force_terminal=True, width=80), keep=False) as progress:
+        progress.add_task("frames", total=2)
+        time.sleep(0.05)
+    assert "frames: " not in stream.getvalue()
+
+
+@pytest.mark.parametrize("options", [{"keep": False}, {"hidden": True}])
+def test_a_short_job_leaves_no_line(options: dict[str, bool]) -> None:
+    stream = io.StringIO()
+    with progress_bar(Console(file=stream), **options) as progress:
+        progress.add_task("frames", total=2)
+    assert stream.getvalue().strip() == ""

@@ -16,8 +16,15 @@ from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.run.report.frames import build_cards
 from drivesem.run.results import SCHEMA
-from drivesem.run.run_report import PROTOCOL, load_reported_runs, query_curves, write_run_report
+from drivesem.run.run_report import (
+    PROTOCOL,
+    describe_next_step,
+    load_reported_runs,
+    query_curves,
+    write_run_report,
+)
 from scene_ir import files
+from tests.drivesem.counting import summary_of
 from tests.drivesem.invoke import run_json
 
 
@@ -217,3 +224,72 @@ def test_damaged_curves(refused: Callable[..., str], some_run: Path, tmp_path: P
     shutil.copytree(some_run, tmp_path / "study" / "arms" / "a")
     files.write_json(tmp_path / "study" / "study.json", {"curves": [{"name": "a"}]})
     assert "expected curves of a study" in refused("report", str(tmp_path / "study"))
+
+
+def test_frames_that_were_not_attacked_are_in_no_denominator(
+    tmp_path: Path, frame: Callable[..., Any], make_run: Callable[..., Path], parse: Callable[[Path], Any]
+) -> None:
+    missed = replace(frame("3", queries=0), found_before=(), detections_benign=(), detections_rerendered=())
+    hidden = replace(frame("4", queries=0), judged=(), found_before=())
+    run = make_run(tmp_path / "run", [frame("1", lost=True), frame("2"), missed, hidden])
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["objects"] == {"all": 8, "judged": 6, "found_before": 4}
+    assert (metrics["frames"], metrics["frames_attacked"]) == (4, 2)
+    assert metrics["broken"] == {"count": 1, "of": 2} | {key: metrics["broken"][key] for key in ("low", "high")}
+    assert (metrics["lost_by_grade"]["threshold"]["count"], metrics["missed_before"]["count"]) == (1, 2)
+    assert main(["report", str(run)]) == 0
+    text = " ".join(parse(run / "report.html").text.split())
+    assert "4 frames: 2 attacked, 2 not attacked (no vehicle judged and found before)" in text
+    assert "8 vehicles: 6 judged, 4 found before the attack" in text
+    assert "not attacked: none of 2 judged vehicles is found before" in text
+    assert "not attacked: none of 2 vehicles is judged: under 25 px high" in text
+    assert "25 % [5, 70] of vehicles found before" in text
+    assert "33 % [10, 70] of judged vehicles" in text
+    assert text.count("withstood") == 2  # frame 2, in the gallery and in the table
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "expected"),
+    [
+        (
+            {"combo": 2},
+            {},
+            "next, add weather: drivesem attack --out a/run-weather --params translate,rotate,mesh,weather",
+        ),
+        (
+            {"combo": 2, "dataset": "coco", "root": "data/b dd", "limit": 3},
+            {},
+            "next, add weather: drivesem attack --out a/run-weather --limit 3 --dataset coco --root 'data/b dd' "
+            "--params translate,rotate,mesh,weather",
+        ),
+        (
+            {"params": "weather"},
+            {"params": ("weather",)},
+            "next, widen the budget: drivesem attack --out a/run-street --budget street --params weather",
+        ),
+        (
+            {"params": "weather", "budget": "street"},
+            {"params": ("weather",)},
+            "next, search longer for failures that hold: drivesem attack --out a/run-climb --budget street "
+            "--params weather --method climb --passes 180",
+        ),
+        (
+            {"combo": 2},
+            {"grades": {"certain": 1}},
+            "next: drivesem explain a/run (which change causes each failure), drivesem holes a/run (where else it "
+            "fails), drivesem view a/run (look at it)",
+        ),
+        (
+            {"combo": 2},
+            {"frames_not_attacked": {"1": "none of 2 vehicles is judged: too small"}},
+            "nothing to attack: 2 judged, 2 found by squeezedet, of 2 vehicles (1 frame: none of 2 vehicles is judged: "
+            "too small); next: a detector that finds them, lower --t-star, or other frames",
+        ),
+    ],
+)
+def test_the_next_step_fits_the_run(
+    config: dict[str, Any], change: dict[str, Any], expected: str, frame: Callable[..., Any]
+) -> None:
+    attack = AttackConfig(**config)
+    summary = replace(summary_of(attack, [frame("1")]), out="a/run")
+    assert describe_next_step(attack, replace(summary, **change)) == expected
