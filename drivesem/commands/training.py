@@ -10,7 +10,7 @@ from rich.table import Table
 from drivesem.config.commands import RetrainConfig, TrainConfig
 from drivesem.config.devices import check_device
 from drivesem.report.tables import Console, format_count, format_percent, print_json
-from drivesem.training.retrain import RetrainRow, retrain_detector
+from drivesem.training.retrain import NOTE, RetrainRow, build_verdict_table, retrain_detector
 from drivesem.training.train import fit_dataset_anchors, run_training
 
 
@@ -53,11 +53,14 @@ def retrain_command(config: RetrainConfig) -> int:
     """`drivesem retrain`: fine-tune or resume, then attack again."""
     console = Console(stderr=True)
     check_device(config.device)
-    data, rows = retrain_detector(config, console)
+    result = retrain_detector(config, console)
     if config.json:
-        print_json(data)
-    _print_retraining(rows, console)
-    console.print(f"weights: {data['weights']}", soft_wrap=True)
+        print_json(result.data)
+    _print_retraining(result.rows, console)
+    table = build_verdict_table(result.verdicts)
+    console.print(*table.fit_to_console(console, ("frames", "metric", "of", "verdict")), sep="\n")
+    for line in (result.thresholds, NOTE, f"weights: {result.data['weights']}"):
+        console.print(line, soft_wrap=True)
     return 0
 
 

@@ -15,19 +15,36 @@ from detectors.base import Detector, DetectorError
 from detectors.registry import load_detector, save_detector
 from detectors.squeezedet import SqueezeDet
 from detectors.training import CHECKPOINT, LOG, AuxiliaryLoss, Sample, TrainingSettings, train
-from detectors.types import CLASSES, Detections
+from detectors.types import CLASSES, Detections, Targets
 from drivesem.attacks.labels import LabelMode
-from drivesem.attacks.targets import EvaluatedClasses
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses
 from drivesem.config.commands import AttackConfig, RetrainConfig
 from drivesem.config.constraints import parse_interval, parse_size_hw
 from drivesem.config.errors import UsageError
 from drivesem.data.account import write_account
 from drivesem.data.subsets import open_selection
 from drivesem.evaluation.coco import SCORE_TITLES, ClassScores
-from drivesem.report.tables import Console, ReportTable, format_percent, rows_to_csv, training_progress_bar
+from drivesem.evaluation.matched_class import MatchedClass
+from drivesem.evaluation.resampling import (
+    DRAWS,
+    LEVEL,
+    NamedMetric,
+    PairedDifference,
+    WeightedAveragePrecision,
+    WeightedRecall,
+    paired_differences,
+)
+from drivesem.report.tables import (
+    Console,
+    ReportTable,
+    format_count,
+    format_percent,
+    rows_to_csv,
+    training_progress_bar,
+)
 from drivesem.run.attack import AttackWorker, attack_frames
 from drivesem.run.folder import SHARING, claim_folder, load_trusted_config
-from drivesem.run.frame import targets_from_records
+from drivesem.run.frame import detections_from_records, targets_from_records
 from drivesem.training.card import plot_curves, warn_about_overlaps
 from drivesem.training.frames import (
     AttackedFrame,
@@ -77,8 +94,73 @@ class RetrainRow:
         return row | asdict(self.scores) | {"broken": self.broken}
 
 
-def retrain_detector(config: RetrainConfig, console: Console) -> tuple[dict[str, Any], list[RetrainRow]]:
-    """Fine-tune or resume: the data of `--json`, and its rows. Raises UsageError or SceneError for bad input."""
+@dataclass(frozen=True, slots=True)
+class RetrainVerdict:
+    """Whether the fine-tuned detector is better in one metric on one set of frames."""
+
+    frames: str
+    """Set of frames."""
+    count: int
+    """Number of frames, the same for both detectors."""
+    objects: int
+    """Number of objects of the headline's class."""
+    compared: PairedDifference
+    """The metric before and after, with a paired bootstrap over frames and a permutation test."""
+
+    @property
+    def verdict(self) -> str:
+        """better or worse if the interval leaves out 0 and p is below 0.05, as six frames at least allow."""
+        difference, (low, high, p) = (
+            self.compared.difference,
+            (self.compared.low, self.compared.high, self.compared.p),
+        )
+        if difference is None or low is None or high is None or p is None or low <= 0 <= high or p >= 1 - LEVEL:
+            return "too few to tell"
+        return "better" if difference > 0 else "worse"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON object."""
+        one = self.compared
+        values = {"before": one.first, "after": one.second, "difference": one.difference}
+        row = {"set": self.frames, "metric": one.name, "verdict": self.verdict, "frames": self.count}
+        return row | {"objects": self.objects, **values, "interval": [one.low, one.high], "p": one.p}
+
+    def cells(self) -> tuple[str, ...]:
+        """Texts of a table row, see `VERDICT_COLUMNS`."""
+        one = self.compared
+        change = "" if one.difference is None else f"{100 * one.difference:+.1f}"
+        if one.low is not None and one.high is not None:
+            change += f" [{100 * one.low:+.1f}, {100 * one.high:+.1f}]"
+        counts = f"{format_count(self.count, 'frame')}, {format_count(self.objects, 'object')}"
+        return (
+            *(self.frames, one.name, format_percent(one.first), format_percent(one.second)),
+            *(change, counts, self.verdict),
+        )
+
+
+NOTE = (
+    "better, worse: the 95 % interval of the change (paired bootstrap over frames) leaves out 0, and a permutation "
+    "test gives p < 0.05, for which six frames are the least; otherwise too few to tell."
+)
+VERDICT_COLUMNS = ("frames", "metric", "before", "after", "change, points", "of", "verdict")
+
+
+@dataclass(frozen=True, slots=True)
+class RetrainResult:
+    """What `drivesem retrain` reports."""
+
+    data: dict[str, Any]
+    """The data of `--json`."""
+    rows: list[RetrainRow]
+    """Metrics of both detectors."""
+    verdicts: list[RetrainVerdict]
+    """Comparisons of both."""
+    thresholds: str
+    """Both detectors' t*, and how it was chosen."""
+
+
+def retrain_detector(config: RetrainConfig, console: Console) -> RetrainResult:
+    """Fine-tune or resume, evaluate and attack again. Raises UsageError or SceneError for bad input."""
     attack = load_trusted_config(Path(config.run), config.trust)
     frames = load_attacked_frames(Path(config.run))
     held_out, training = _split_frames(frames, config)
@@ -90,11 +172,19 @@ def retrain_detector(config: RetrainConfig, console: Console) -> tuple[dict[str,
     claim_folder(out, config, _WRITTEN, _FREE)
     mixture = _mixture(config, attack, training, {frame.name for frame in held_out}, out, after)
     fine_tune(config, after, mixture, out, console)
-    found = detect_in_frames(after, held_out, "benign", config.device)
-    after.t_star = _t_star(after, held_out, found)
+    own_t_star = before.t_star
+    for detector in (before, after):
+        detector.t_star = _t_star(
+            detector, held_out, detect_in_frames(detector, held_out, "benign", config.device)
+        )
     save_detector(after, out / WEIGHTS, {"retrained_from": Path(start).name, "steps": str(config.steps)})
     rows = _known(before, "before", held_out, config.device) + _known(after, "after", held_out, config.device)
     rows += _fresh(config, attack, held_out, out)
+    verdicts = _verdicts(config, (before, after), held_out, out / FRESH)
+    thresholds = (
+        f"t*: {before.t_star:.3f} before, {after.t_star:.3f} after, each with the best F1 on the "
+        f"{format_count(len(held_out), 'validation photograph')} (the detector's own: {own_t_star:.3f})"
+    )
     data = {
         "out": str(out),
         "weights": str(out / WEIGHTS),
@@ -103,13 +193,86 @@ def retrain_detector(config: RetrainConfig, console: Console) -> tuple[dict[str,
         "frames": len(mixture),
         "counterexamples": len(mixture.drawn_counterexamples),
         "held_out": len(held_out),
-        "t_star": {"before": before.t_star, "after": after.t_star},
+        "t_star": {"before": before.t_star, "after": after.t_star, "own": own_t_star},
+        "verdicts": [one.to_json() for one in verdicts],
         "rows": [row.to_json() for row in rows],
     }
     files.write_json(out / RESULT, data)
-    _write(out, rows)
+    _write(out, rows, verdicts, thresholds)
     plot_curves(out / LOG, out / "evaluations.csv", out / CURVES, f"{before.name}, retrained")
-    return data, rows
+    return RetrainResult(data, rows, verdicts, thresholds)
+
+
+def _verdicts(
+    config: RetrainConfig, detectors: tuple[Detector, Detector], held_out: Sequence[AttackedFrame], fresh: Path
+) -> list[RetrainVerdict]:
+    """Compare both detectors on photographs, on the run's counterexamples, and on those against either."""
+
+    def judge(name: str, frames: Sequence[AttackedFrame], stage: Stage) -> list[RetrainVerdict]:
+        truths = [_true_targets(detector, frames, stage) for detector in detectors]
+        found = [detect_in_frames(detector, frames, stage, config.device) for detector in detectors]
+        return compare_retrained(name, detectors, truths, found, config.seed)
+
+    attacked = [frame for frame in held_out if frame.result.attacked]
+    verdicts = judge("photographs", held_out, "benign")
+    if attacked:
+        verdicts += judge("counterexamples of the run", attacked, "counterexample")
+    if not fresh.is_dir():
+        return verdicts
+    again = {frame.name: frame for frame in load_attacked_frames(fresh) if frame.result.attacked}
+    pairs = [(frame, again[frame.name]) for frame in attacked if frame.name in again]
+    if pairs and config.attack_steps is None:  # the same attack on either
+        sides = list(zip(*pairs, strict=True))
+        truths, found = [], []
+        for detector, frames in zip(detectors, sides, strict=True):
+            names = EvaluatedClasses.from_detector(detector).names
+            truths.append(_true_targets(detector, frames, "counterexample"))
+            found.append([detections_from_records(f.result.detections_attacked, names) for f in frames])
+        verdicts += compare_retrained("counterexamples against each", detectors, truths, found, config.seed)
+    return verdicts
+
+
+def _true_targets(detector: Detector, frames: Sequence[AttackedFrame], stage: Stage) -> list[Targets]:
+    """True boxes of a stage's pictures; those of counterexamples have moved with the vehicles."""
+    judged = EvaluatedClasses.from_detector(detector)
+    results = [frame.result for frame in frames]
+    records = [r.targets_benign if stage == "benign" else r.targets_moved for r in results]
+    return [judged.map_targets(targets_from_records(record, CLASSES)) for record in records]
+
+
+def compare_retrained(
+    name: str,
+    detectors: Sequence[Detector],
+    truths: Sequence[Sequence[Targets]],
+    found: Sequence[Sequence[Detections]],
+    seed: int,
+) -> list[RetrainVerdict]:
+    """Compare AP50 and recall at t* of the headline's class before and after.
+
+    Args:
+        name: Set of frames.
+        detectors: Before and after, each with its t*.
+        truths: Labels of each frame, by detector.
+        found: Detections in each frame, by detector.
+        seed: Seed of the bootstrap.
+    """
+    metrics, objects, frames = [], 0, len(truths[0])
+    for detector, targets, detections in zip(detectors, truths, found, strict=True):
+        label = EvaluatedClasses.from_detector(detector).names.index(HEADLINE)
+        keep = [one.scores >= detector.t_star for one in detections]
+        sure = [
+            Detections(one.boxes_xyxy[k], one.labels[k], one.scores[k])
+            for one, k in zip(detections, keep, strict=True)
+        ]
+        at_any_score, at_t_star = (
+            matched.candidates.class_matches(matched.match, 0)
+            for matched in (MatchedClass.from_frames(targets, some, label) for some in (detections, sure))
+        )
+        objects = int(at_any_score.objects.sum())
+        ap50 = NamedMetric("AP50", (WeightedAveragePrecision(at_any_score, "coco"),))
+        metrics.append((ap50, NamedMetric("recall at t*", (WeightedRecall(at_t_star),))))
+    compared = paired_differences(*metrics, frames, DRAWS, np.random.default_rng(seed))
+    return [RetrainVerdict(name, frames, objects, one) for one in compared]
 
 
 def _split_frames(
@@ -165,6 +328,10 @@ def _known(detector: Detector, name: str, frames: Sequence[AttackedFrame], devic
         ("counterexample", ("moved", "paper")),
     )
     for stage, modes in stages:
+        if stage == "counterexample":
+            frames = [frame for frame in frames if frame.result.attacked]
+            if not frames:
+                continue
         found = detect_in_frames(detector, frames, stage, device)
         for mode in modes:
             scores = headline_scores(detector, detector.t_star, frames, found, mode)
@@ -208,13 +375,27 @@ def _fresh(
     return rows
 
 
-def _write(out: Path, rows: Sequence[RetrainRow]) -> None:
-    """Write the table as CSV and Markdown."""
+def _write(out: Path, rows: Sequence[RetrainRow], verdicts: Sequence[RetrainVerdict], thresholds: str) -> None:
+    """Write the metrics as CSV, and all as Markdown."""
     words = ("frames", "labels", "detector")
     sheet = ReportTable("", (*words, *SCORE_TITLES, "objects", "frames broken"), tuple(map(_cells, rows)))
     csv_name, markdown_name = TABLES
     files.write_text(out / csv_name, rows_to_csv([row.to_json() for row in rows], line_end="\r\n"))
-    files.write_text(out / markdown_name, "\n".join(sheet.to_markdown(words)[2:]) + "\n")  # without the heading
+    lines = [
+        *build_verdict_table(verdicts).to_markdown(("frames", "metric", "verdict")),
+        "",
+        thresholds,
+        "",
+        NOTE,
+        "",
+    ]
+    files.write_text(out / markdown_name, "\n".join([*lines, *sheet.to_markdown(words)[2:]]) + "\n")
+
+
+def build_verdict_table(verdicts: Sequence[RetrainVerdict]) -> ReportTable:
+    """The verdicts as a table."""
+    title = f"{HEADLINE}, %: is the retrained detector better?"
+    return ReportTable(title, VERDICT_COLUMNS, tuple(one.cells() for one in verdicts))
 
 
 def _cells(row: RetrainRow) -> tuple[str, ...]:
