@@ -109,14 +109,13 @@ class RetrainVerdict:
 
     @property
     def verdict(self) -> str:
-        """better or worse if the interval leaves out 0 and p is below 0.05, as six frames at least allow."""
-        difference, (low, high, p) = (
-            self.compared.difference,
-            (self.compared.low, self.compared.high, self.compared.p),
-        )
-        if difference is None or low is None or high is None or p is None or low <= 0 <= high or p >= 1 - LEVEL:
+        """better or worse if the interval leaves out 0 and p is below 0.05, with `_LEAST_FRAMES` at least."""
+        one = self.compared
+        if self.count < _LEAST_FRAMES or one.difference is None or one.low is None or one.high is None:
             return "too few to tell"
-        return "better" if difference > 0 else "worse"
+        if one.p is None or one.p >= 1 - LEVEL or one.low <= 0 <= one.high:
+            return "too few to tell"
+        return "better" if one.difference > 0 else "worse"
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object."""
@@ -138,9 +137,11 @@ class RetrainVerdict:
         )
 
 
+_LEAST_FRAMES = 6
+"""Fewest frames of which a permutation test can give p < 0.05."""
 NOTE = (
     "better, worse: the 95 % interval of the change (paired bootstrap over frames) leaves out 0, and a permutation "
-    "test gives p < 0.05, for which six frames are the least; otherwise too few to tell."
+    f"test gives p < 0.05, for which {_LEAST_FRAMES} frames are the least; otherwise too few to tell."
 )
 VERDICT_COLUMNS = ("frames", "metric", "before", "after", "change, points", "of", "verdict")
 
