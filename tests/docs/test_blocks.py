@@ -5,22 +5,29 @@ A Python block that cannot run here follows a comment, `<!-- not run: needs ... 
 
 import ast
 import json
+import os
 import pkgutil
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from detectors.registry import load_detector, save_detector
 from drivesem.cli import main
 from drivesem.config.commands import COMMANDS
 from drivesem.config.parsing import Commands, parse
+from drivesem.run.results import Failure, dump_frame, load_frame
 from tools.bench.__main__ import BENCHMARKS
 from tools.experiments.__main__ import EXPERIMENTS
+from tools.noisy_weights import with_noise
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -157,6 +164,62 @@ def test_python_runs(page: Path, workplace: Path) -> None:
         if block.language == "python" and block.runs:
             padded = "\n" * (block.line - 1) + block.text  # so that a traceback names the page's line
             exec(compile(padded, str(page), "exec"), names)
+
+
+GATE_PAGE = ROOT / "docs" / "guide" / "gate.md"
+
+
+def workflow_steps() -> list[dict[str, Any]]:
+    """Steps of the workflow on the gate's page."""
+    (block,) = (block for block in iterate_blocks(GATE_PAGE) if block.language == "yaml")
+    return yaml.safe_load(block.text)["jobs"]["gate"]["steps"]
+
+
+def test_the_workflow_installs_drivesem_from_its_own_checkout() -> None:
+    steps = workflow_steps()
+    (source,) = (
+        step["with"]["path"] for step in steps if step.get("with", {}).get("repository", "").endswith("/drivesem")
+    )
+    (install,) = (step["run"] for step in steps if step.get("run", "").startswith("pip install"))
+    assert shlex.split(install)[2:] == ["-c", f"{source}/constraints.txt", f"./{source}"]
+    assert (ROOT / "constraints.txt").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_the_workflow_runs_as_written(noise: float, small_run: Path, tmp_path: Path) -> None:
+    """All its commands but pip's, in bash, on a package of one frame: its car is lost for certain, it says."""
+    run, weights = tmp_path / "run", tmp_path / "weights"
+    shutil.copytree(small_run, run)
+    (path,) = run.glob("frames/*/result.json")
+    result = load_frame(path)
+    car = result.found_before[0]
+    box = result.targets_moved[car]
+    lost = Failure("lost", box.label, box.xyxy, index=car, error="missed", grade="certain")
+    path.write_text(dump_frame(replace(result, failures=(lost,))))
+    assert main(["export", str(run), "--to", "gate", "--out", str(tmp_path / "tests" / "gate")]) == 0
+    detector = load_detector("squeezedet")
+    save_detector(detector, weights / "current.safetensors")
+    save_detector(with_noise(detector, noise), weights / "new.safetensors")
+    shim = tmp_path / "bin" / "drivesem"
+    shim.parent.mkdir()
+    shim.write_text(f'#!/bin/sh\nexec {sys.executable} -m drivesem "$@"\n')
+    shim.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{shim.parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    environment["GITHUB_STEP_SUMMARY"] = str(tmp_path / "summary.md")
+    codes = [
+        subprocess.run(["bash", "-e", "-c", step["run"]], cwd=tmp_path, env=environment, check=False).returncode
+        for step in workflow_steps()
+        if "run" in step and not step["run"].startswith("pip ")
+    ]
+    assert codes == [int(noise > 0), 0]
+    verdict = "not passed" if noise else "passed"
+    assert (tmp_path / "summary.md").read_text().startswith(f"# Gate {verdict}: weights/new.safetensors after")
+    assert {path.name for path in (tmp_path / "build" / "gate").iterdir()} >= {
+        "gate.html",
+        "gate.xml",
+        "gate.json",
+    }
 
 
 @pytest.mark.slow
