@@ -19,7 +19,6 @@ from drivesem.attacks.targets import EvaluatedClasses, resolve_t_star
 from drivesem.evaluation.failures import FrameFailures
 from drivesem.failures.certificate import (
     CertificateRule,
-    CompositorRenderer,
     NuisanceCamera,
     SampleOutcome,
     certify,
@@ -32,6 +31,7 @@ from drivesem.failures.kinds import OBJECT_KINDS, Fault, LabelledDetections, fin
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.second_renderer.base import SecondRenderer
 from scene_ir.errors import SceneError
+from scene_ir.render.compositor import Compositor
 from scene_ir.types import SceneIR
 
 _OPINION_SAMPLES = range(AGREEMENT_RULE[1])
@@ -66,12 +66,14 @@ class GradingInput:
     """Scene before the change."""
     changed: SceneIR
     """Scene after it."""
-    renderer: CompositorRenderer
-    """The compositor of the scene."""
+    renderer: SecondRenderer
+    """The compositor, as a `CompositorRenderer`."""
     benign: LabelledDetections
     """Labels and detections before the change."""
     now: LabelledDetections
     """Labels and detections after it."""
+    compositor: Compositor
+    """The compositor of the scene."""
     placebo: Callable[[], SceneIR] | None = None
     """Makes the scene after a random edit of the same size as the change."""
 
@@ -277,7 +279,7 @@ def _fidelities(case: GradingInput, faults: tuple[Fault, ...]) -> list[ObjectFid
     """The lowest fidelity of the edited objects in the place of each fault."""
     if not faults:
         return []
-    regions = measure_fidelity(case.renderer.compositor, case.changed)
+    regions = measure_fidelity(case.compositor, case.changed)
     return [lowest_fidelity(regions, place) for place in _fault_boxes(case, faults).tolist()]
 
 

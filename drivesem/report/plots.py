@@ -124,6 +124,26 @@ def _add_legend(axes: Axes, entries: int) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=min(entries, 3), fontsize=9)
 
 
+def write_scatter(
+    path: Path, title: str, x: Sequence[float], y: Sequence[float], axis_labels: tuple[str, str]
+) -> None:
+    """Plot points of two measures in the same unit, and where they are equal.
+
+    Args:
+        path: PNG file.
+        title: Title of the plot.
+        x: First measure.
+        y: Second measure of the same points.
+        axis_labels: Labels of both axes.
+    """
+    figure, axes = _create_axes(title)
+    end = 1.05 * max([*x, *y, 1e-9])
+    axes.plot([0, end], [0, end], "--", color="#888888", linewidth=1)
+    axes.plot(x, y, "o", color=PLOT_COLOURS[0], markersize=3.5, alpha=0.5)
+    axes.set(xlabel=axis_labels[0], ylabel=axis_labels[1], xlim=(0, end), ylim=(0, end))
+    write_figure(path, figure)
+
+
 def _create_axes(title: str) -> tuple[Figure, Axes]:
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -226,7 +226,9 @@ def build_grading_input(
         return LabelledDetections(targets, boxes, state.detections)
 
     before, after = label_detections(benign), label_detections(attacked)
-    return GradingInput(identifier, benign.scene, attacked.scene, renderer, before, after, placebo)
+    return GradingInput(
+        identifier, benign.scene, attacked.scene, renderer, before, after, renderer.compositor, placebo
+    )
 
 
 def objective_grading_input(

@@ -11,6 +11,7 @@ from drivesem import __version__
 from drivesem.config.options import CommandConfig
 from drivesem.program import Program
 from tools.experiments.settings import (
+    FidelityConfig,
     PlausibilityConfig,
     RealismConfig,
     StudyConfig,
@@ -27,6 +28,7 @@ EXPERIMENTS: dict[str, type[CommandConfig]] = {
     **dict.fromkeys(STUDIES, StudyConfig),
     "plausibility": PlausibilityConfig,
     "realism": RealismConfig,
+    "fidelity": FidelityConfig,
     "worth": WorthConfig,
     "survey": SurveyConfig,
     "survey-results": SurveyResultsConfig,
@@ -37,6 +39,7 @@ _RUNNERS = {
     "classification": "classification.study:run_classification_study",
     "plausibility": "plausibility.percentiles:run_plausibility",
     "realism": "realism.report:run_realism",
+    "fidelity": "fidelity:run_fidelity",
     "worth": "worth.run:run_worth",
     "survey": "survey.page:run_survey",
     "survey-results": "survey.results:run_survey_results",

@@ -178,6 +178,16 @@ class RealismConfig(SeededBootstrapOptions, CommandConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FidelityConfig(SeededBootstrapOptions, CommandConfig):
+    """Fit the fidelity of edited objects to generated streets, and test it on others (docs/research/realism.md)."""
+
+    out: str
+    """Folder of the results; the same command resumes what it finds there."""
+    streets: Annotated[int, at_least(2, "one to fit, one to test")] = 60
+    """Number of generated streets; every other one is held out."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class WorthConfig(SeededBootstrapOptions, CommandConfig):
     """Measure the information worth of counterexamples and the gain of a second or retrained detector (section 3)."""
 

@@ -1,6 +1,7 @@
 """Grades of failures of a scene whose detector is made to fail."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -121,6 +122,20 @@ def test_certain_without_second_opinions(case: GradingInput) -> None:
     grades = graded(case)
     assert grades.lost[CAR].grade is Grade.CERTAIN
     assert grades.lost[CAR].count.after == grades.lost[CAR].count.before == 16
+
+
+def test_no_grade_above_threshold_in_a_picture_that_is_not_trusted(case: GradingInput) -> None:
+    yaw = case.changed.objects.yaw.clone()
+    yaw[CAR] += math.pi
+    turned = dataclasses.replace(case, changed=case.changed.with_objects(yaw=yaw))
+    (one,) = graded(turned, position_renderer(case)).lost.values()
+    assert one.grade is Grade.THRESHOLD
+    assert one.count.after == one.count.before == 16
+    assert one.second is None
+    assert one.fidelity is not None
+    assert one.fidelity.index == CAR
+    assert one.fidelity.completed > 0.5
+    assert not one.fidelity.is_trusted
 
 
 def test_confirmed_where_the_second_renderer_fails_too(case: GradingInput) -> None:
