@@ -88,6 +88,8 @@ PAGE = "report.html"
 _STUDY, _ARMS = "study.json", "arms"
 PICTURES = 200
 """Default number of pictures on a page: 100 frames of one run, 14 to 21 MB for KITTI."""
+_STEP_FIELDS = ("steps", "rate", "momentum", "early_stop")
+"""Settings of the default method that climb does not have."""
 _OMITTED_NEXT = ("json", "resume", "workers")
 """Settings omitted from the command of the next step."""
 _OMITTED_SETTINGS = ("out", "json", "resume", "workers")
@@ -346,19 +348,19 @@ def describe_next_step(config: AttackConfig, summary: RunSummary) -> str:
             f"next: drivesem explain {out} (which change causes each failure), drivesem holes {out} "
             f"(where else it fails), drivesem view {out} (look at it)"
         )
-    budget = format_budget(parse_budget(config.budget))
-    if summary.frames_ungraded:
-        changed, name = replace(config, grade=True), "graded"
-    elif "weather" not in summary.params and config.parametrisation == "ground":
+    default = AttackConfig()
+    step = replace(config, budget=format_budget(parse_budget(config.budget)), grade=True)
+    if config.method == default.method:  # climb looks for failures that hold
+        step = replace(step, method="climb", **{name: getattr(default, name) for name in _STEP_FIELDS})
+    if "weather" not in summary.params and config.parametrisation == "ground":
         params = ",".join((*summary.params, "weather"))
-        changed, name = replace(config, combo=None, params=params, budget=budget), "weather"
-    elif budget != STREET and config.parametrisation == "ground":
-        changed, name = replace(config, budget=STREET), STREET
+        why, name, step = "add weather", "weather", replace(step, combo=None, params=params)
+    elif step.budget != STREET and config.parametrisation == "ground":
+        why, name, step = "widen the budget", STREET, replace(step, budget=STREET)
     else:
-        changed, name = replace(config, method="climb", passes=2 * (config.passes or Climb().passes)), "climb"
-    command = format_command_line("attack", replace(changed, out=f"{summary.out}-{name}"), _OMITTED_NEXT)
-    why = {"graded": "grade the failures", "weather": "add weather", STREET: "widen the budget"}
-    return f"next, {why.get(name, 'search longer for failures that hold')}: {command}"
+        why, name, step = "search longer", "longer", replace(step, passes=2 * (config.passes or Climb().passes))
+    command = format_command_line("attack", replace(step, out=f"{summary.out}-{name}"), _OMITTED_NEXT)
+    return f"next, {why}: {command}"
 
 
 def _first_reason(summary: RunSummary) -> str:

@@ -235,7 +235,6 @@ def _tiles(run: ReportedRun) -> list[_SummaryTile]:
     before, moved, stay = (
         s.headline.ap50 for s in (summary.benign, summary.attacked_moved, summary.attacked_paper)
     )
-    _, phantoms = _totals(summary)
     paper = f"paper's mAP: {_percent(run.paper.before)} → {_percent(run.paper.after)}" if run.paper else ""
     by_labels = f"with benign labels {_percent(stay)}"
     left = len(summary.frames_not_attacked)
@@ -249,6 +248,13 @@ def _tiles(run: ReportedRun) -> list[_SummaryTile]:
             if missed.of
             else "none is judged",
         ),
+        _SummaryTile(
+            "lost, by threshold",
+            f"{lost_share.count} of {lost_share.of}",
+            f"{lost_share.percent} of vehicles found before; {_by_class(summary)}"
+            if lost_share.of
+            else "none is found before",
+        ),
         *_graded_tile(run),
         _SummaryTile(
             f"AP50 of {summary.headline}, %",
@@ -260,12 +266,6 @@ def _tiles(run: ReportedRun) -> list[_SummaryTile]:
             "frames broken, by threshold",
             f"{summary.successes_moved} of {summary.frames_attacked}",
             f"{summary.broken.percent} of attacked frames" + (f"; {left} not attacked" if left else ""),
-        ),
-        _SummaryTile(
-            "lost, by threshold",
-            f"{lost_share.count} of {lost_share.of}",
-            f"{lost_share.percent} of vehicles found before; {format_count(phantoms, 'phantom')}; "
-            f"{_by_class(summary)}",
         ),
         _SummaryTile(
             "feasible, %",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +14,7 @@ import pytest
 
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
+from drivesem.config.parsing import parse
 from drivesem.evaluation.coco import ClassScores, CocoScores
 from drivesem.run.report.frames import build_cards
 from drivesem.run.results import SCHEMA
@@ -248,30 +250,35 @@ def test_frames_that_were_not_attacked_are_in_no_denominator(
     assert text.count("withstood") == 2  # frame 2, in the gallery and in the table
 
 
+_WEATHER = {"params": ("weather",)}
+
+
 @pytest.mark.parametrize(
     ("config", "change", "expected"),
     [
         (
-            {"combo": 2},
+            {"combo": 2, "steps": 2, "momentum": 1.0, "grade": False},
             {},
-            "next, add weather: drivesem attack --out a/run-weather --params translate,rotate,mesh,weather",
+            "next, add weather: drivesem attack --out a/run-weather --params translate,rotate,mesh,weather "
+            "--method climb",
         ),
         (
-            {"combo": 2, "dataset": "coco", "root": "data/b dd", "limit": 3},
+            {"combo": 2, "dataset": "coco", "root": "data/b dd", "limit": 3, "method": "random"},
             {},
             "next, add weather: drivesem attack --out a/run-weather --limit 3 --dataset coco --root 'data/b dd' "
-            "--params translate,rotate,mesh,weather",
+            "--params translate,rotate,mesh,weather --method random",
         ),
         (
             {"params": "weather"},
-            {"params": ("weather",)},
-            "next, widen the budget: drivesem attack --out a/run-street --budget street --params weather",
+            _WEATHER,
+            "next, widen the budget: drivesem attack --out a/run-street --budget street --params weather "
+            "--method climb",
         ),
         (
-            {"params": "weather", "budget": "street"},
-            {"params": ("weather",)},
-            "next, search longer for failures that hold: drivesem attack --out a/run-climb --budget street "
-            "--params weather --method climb --passes 180",
+            {"params": "weather", "budget": "street", "method": "climb", "passes": 100},
+            _WEATHER,
+            "next, search longer: drivesem attack --out a/run-longer --budget street --params weather "
+            "--method climb --passes 200",
         ),
         (
             {"combo": 2},
@@ -292,4 +299,7 @@ def test_the_next_step_fits_the_run(
 ) -> None:
     attack = AttackConfig(**config)
     summary = replace(summary_of(attack, [frame("1")]), out="a/run")
-    assert describe_next_step(attack, replace(summary, **change)) == expected
+    text = describe_next_step(attack, replace(summary, **change))
+    assert text == expected
+    if ": drivesem attack" in text:
+        parse(shlex.split(text.partition("drivesem ")[2])).check()  # a command that is accepted
