@@ -56,11 +56,11 @@ RETIRED_IN_NAMES = frozenset(
 LIBRARY_NAMES = frozenset({("gradient_free.py", "ask"), ("gradient_free.py", "tell")})
 """Names of libraries, by file: pycma's."""
 RETIRED_IN_TEXT = re.compile(
-    r"\b(told|tells?|telling|says?|said|kept|beside|asked|asks?|whose|whatever|things?|taken apart|looked at"
+    r"\b(told|(?<!too few to )tells?|telling|says?|said|kept|beside|asked|asks?|whose|whatever|things?|taken apart|looked at"
     r"|looks? at|is all well|by law|at hand)\b",
     re.IGNORECASE,
 )
-"""Words and phrases of docstrings, comments, messages and pages."""
+"""Words and phrases of docstrings, comments, messages and pages; "too few to tell" is a verdict."""
 PATHS = re.compile(r"`[^`\n]*`|```.*?```|https?://\S+|\]\([^)]*\)|<[^>\n]*>", re.DOTALL)
 """Parts of a page that are not prose: code, links and tags."""
 WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
