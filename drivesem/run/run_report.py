@@ -346,7 +346,7 @@ def describe_next_step(config: AttackConfig, summary: RunSummary) -> str:
     if summary.grades[Grade.CERTAIN]:
         return (
             f"next: drivesem explain {out} (which change causes each failure), drivesem holes {out} "
-            f"(where else it fails), drivesem view {out} (look at it)"
+            f"(where else it fails), drivesem view {out} (in the browser)"
         )
     default = AttackConfig()
     step = replace(config, budget=format_budget(parse_budget(config.budget)), grade=True)

@@ -90,7 +90,7 @@ def test_no_word_and_no_number_is_broken(
 
 
 @pytest.mark.parametrize(("columns", "width"), [(None, 120), ("90", 90)])
-def test_a_log_is_120_wide_unless_columns_says_otherwise(
+def test_a_log_is_as_wide_as_columns_or_120(
     columns: str | None, width: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)

@@ -284,7 +284,7 @@ _WEATHER = {"params": ("weather",)}
             {"combo": 2},
             {"grades": {"certain": 1}},
             "next: drivesem explain a/run (which change causes each failure), drivesem holes a/run (where else it "
-            "fails), drivesem view a/run (look at it)",
+            "fails), drivesem view a/run (in the browser)",
         ),
         (
             {"combo": 2},
