@@ -42,7 +42,7 @@ from drivesem.run.frame import (
     target_records,
     targets_from_records,
 )
-from drivesem.run.report.page import format_second_opinion, name_failure
+from drivesem.run.report.page import format_grade, format_second_opinion, name_failure
 from drivesem.run.report.pictures import draw_overlay
 from drivesem.run.results import BoxRecord, Failure, FrameResult
 from scene_ir import files
@@ -88,6 +88,7 @@ class RetestedFailure:
             "kind": failure.error,
             "by_threshold": failure.kind,
             "grade": failure.grade,
+            "fidelity": failure.fidelity and failure.fidelity.score,
             "survives": None if self.opinion is None else self.survives,
             "second": None if self.opinion is None else dataclasses.asdict(self.opinion),
             "second_in_run": None if failure.second is None else dataclasses.asdict(failure.second),
@@ -385,16 +386,16 @@ class Confirmation:
     """Number of these frames."""
     not_carried: dict[str, list[str]]
     """Parts of the change that the second renderer lacks, by frame that is left out."""
-    failures: tuple[tuple[str, RetestedFailure], ...]
-    """Failures that were counted again, each with its frame."""
-    not_tested: int
-    """Number of failures of no kind, which are not tested."""
     shares: tuple[SurvivalRate, ...]
     """Survival rates."""
     scores: dict[str, coco.CocoScores]
     """Scores by picture, each by its own labels."""
     overlap: tuple[float, float, int] | None
     """Mean and least IoU of vehicles' boxes in both pictures, and their number; None without any."""
+    failures: tuple[tuple[str, RetestedFailure], ...] = ()
+    """Failures that were counted again, each with its frame."""
+    not_tested: int = 0
+    """Number of failures of no kind, which are not tested."""
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object; rates are fractions."""
@@ -482,7 +483,7 @@ def build_confirm_tables(report: Confirmation) -> list[ReportTable]:
         (
             frame,
             name_failure(one.failure),
-            one.failure.grade or "not graded",
+            format_grade(one.failure),
             format_second_opinion(one.failure, one.opinion),
             "yes" if one.survives else "no",
         )

@@ -39,7 +39,8 @@ from drivesem.run.detection_cache import DetectionCache, DetectorSpec, cache_det
 from drivesem.run.finished import PICTURES, AttackRun, RunFrame, load_runs
 from drivesem.run.folder import claim_folder
 from drivesem.run.frame import has_grade, targets_from_records
-from drivesem.run.results import FrameResult
+from drivesem.run.report.page import format_grade, name_failure
+from drivesem.run.results import Failure, FrameResult
 
 AP50, RECALL = "AP50", "recall"
 EVALUATED_PICTURES = {"benign": "benign", "rerendered": "rerendered", "paper": "attacked", "moved": "attacked"}
@@ -76,6 +77,25 @@ class TransferTarget:
 
 
 @dataclass(frozen=True, slots=True)
+class LossTransfer:
+    """An object that the source lost, before the target: in the run's own pictures, without draws."""
+
+    failure: Failure
+    """The failure, as the run graded it."""
+    found: bool
+    """Whether the target detects the object in the photograph."""
+    lost: bool
+    """Whether the target loses it, too."""
+
+    @property
+    def text(self) -> str:
+        """What the target does."""
+        if not self.found:
+            return "never found it"
+        return "loses it, too" if self.lost else "still finds it"
+
+
+@dataclass(frozen=True, slots=True)
 class FrameLosses:
     """Losses of one frame before a target, with moved labels."""
 
@@ -99,6 +119,8 @@ class FrameLosses:
     """Whether the picture fails the target."""
     phantoms: int
     """Phantoms of the target."""
+    losses: tuple[LossTransfer, ...] = ()
+    """Objects that the source lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +178,7 @@ class TransferCounts:
                     source_broken=result.success_moved,
                     broken=failed.success,
                     phantoms=len(failed.phantoms),
+                    losses=tuple(LossTransfer(f, f.index in found, f.index in lost) for f in losses),
                 )
             )
         matches = {
@@ -212,6 +235,8 @@ class TransferRow:
     """Numerator and denominator of each share."""
     phantoms: int
     """Phantoms with moved labels."""
+    losses: tuple[tuple[str, LossTransfer], ...]
+    """Objects that the source lost, each with its frame."""
     metrics: dict[str, list[NamedMetric]]
     """AP50 and RECALL of benign, paper and moved, for paired comparisons with other rows."""
 
@@ -241,7 +266,24 @@ class TransferRow:
         for name, share in self.shares.items():
             row |= {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
             row[f"{name}_of"] = self.counts[name][1]
-        return row | {"lost": self.counts[LOST][0], "phantoms": self.phantoms}
+        never_found = sum(not one.found for _, one in self.losses)
+        return row | {"lost": self.counts[LOST][0], "phantoms": self.phantoms, "never_found": never_found}
+
+    def failures_to_json(self) -> list[dict[str, Any]]:
+        """Return an object per object that the source lost."""
+        return [
+            {
+                "source": self.source.name,
+                "target": self.target.name,
+                "frame": frame,
+                "object": one.failure.index,
+                "kind": one.failure.error,
+                "grade": one.failure.grade,
+                "found": one.found,
+                "lost": one.lost if one.found else None,
+            }
+            for frame, one in self.losses
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return the flat row with the scores of all classes."""
@@ -292,6 +334,7 @@ def compute_transfer_row(pair: TransferCounts, draws: int, seed: int) -> Transfe
         shares={share.name: share for share in bootstrap_intervals(rates, frames, draws, rng)},
         counts={name: (sum(hits), sum(total)) for name, (hits, total) in shares.items()},
         phantoms=sum(frame.phantoms for frame in pair.frames),
+        losses=tuple((frame.identifier, one) for frame in pair.frames for one in frame.losses),
         metrics=metrics,
     )
 
@@ -401,7 +444,14 @@ def run_transfer(config: TransferConfig) -> AnalysisReport:
     pairs, failed = evaluate_pairs(runs, detectors, config)
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     rows = [compute_transfer_row(pair, draws, config.seed) for pair in pairs]
-    data = {"rows": [r.to_json() for r in rows], "headline": HEADLINE, "bootstrap": draws, "frames_failed": failed}
+    failures = [one for row in rows for one in row.failures_to_json()]
+    data = {
+        "rows": [r.to_json() for r in rows],
+        "failures": failures,
+        "headline": HEADLINE,
+        "bootstrap": draws,
+        "frames_failed": failed,
+    }
     report = build_transfer_report(out, rows, draws, failed, data)
     report.write()
     return report
@@ -461,6 +511,10 @@ _SHARES = {
     FRAMES: "frames",
 }
 _SIDES = ("source", "target")
+_MAX_LISTED = 40
+"""Certain failures that the table lists; transfer.json has all."""
+_TARGET = "the target"
+"""Column of what a target does."""
 _LABELS = "labels"
 """Column of the evaluation: photographs (benign), or counterexamples by label mode."""
 
@@ -484,7 +538,22 @@ def build_transfer_tables(rows: Sequence[TransferRow]) -> list[ReportTable]:
     return [
         ReportTable(f"{HEADLINE}, %", (*_SIDES, _LABELS, *score_columns), tuple(scores_rows)),
         ReportTable("transfer, %", (*_SIDES, *drop_columns, *_SHARES.values()), tuple(share_rows)),
+        _failure_table(rows),
     ]
+
+
+def _failure_table(rows: Sequence[TransferRow]) -> ReportTable:
+    """Build the table of the objects that sources lost for certain."""
+    is_certain = has_grade(Grade.CERTAIN)
+    lines = [
+        (row.source.name, row.target.name, frame, name_failure(one.failure), format_grade(one.failure), one.text)
+        for row in rows
+        for frame, one in row.losses
+        if is_certain(one.failure)
+    ]
+    listed = "" if len(lines) <= _MAX_LISTED else f", the first {_MAX_LISTED} of {len(lines)}"
+    columns = (*_SIDES, "frame", "failure", "grade", _TARGET)
+    return ReportTable(f"certain failures, each in its picture{listed}", columns, tuple(lines[:_MAX_LISTED]))
 
 
 def build_transfer_notes(rows: Sequence[TransferRow], draws: int) -> list[str]:
@@ -498,6 +567,8 @@ def build_transfer_notes(rows: Sequence[TransferRow], draws: int) -> list[str]:
         "the target loses, too; of certain, of others: the same for objects that the source lost for certain, and "
         "by threshold only. All lost: of all objects that the target detected in the photograph, those it loses. "
         "Frames: of those that fail the source, those that fail the target. All with moved labels.",
+        "Never found: the target does not detect the object in the photograph, so its failures do not count. One "
+        "picture decides here; the grade shared counts draws.",
         f"{thresholds}.",
     ]
 
@@ -514,16 +585,16 @@ def build_transfer_report(
         failed: Reasons by picture that could not be used.
         data: Contents of the JSON.
     """
-    scores, shares = build_transfer_tables(rows)
+    scores, shares, losses = build_transfer_tables(rows)
     return AnalysisReport(
         out=out,
         name="transfer",
         heading="Transfer",
         data=data,
         csv_tables={"transfer": [row.to_row() for row in rows]},
-        tables=[scores, replace(shares, rich_options={"show_lines": True})],
+        tables=[scores, replace(shares, rich_options={"show_lines": True}), *([losses] if losses.rows else [])],
         notes=build_transfer_notes(rows, draws),
-        text_columns=(*_SIDES, _LABELS),
+        text_columns=(*_SIDES, _LABELS, "frame", "failure", "grade", _TARGET),
         picture=partial(write_heatmap, rows=rows),
         failed=failed,
     )

@@ -428,7 +428,7 @@ class MinimalChangeSearch:
     occurs: Callable[[Tensor], bool]
     """Whether the failure occurs in the picture of a feasible theta: necessary, and cheap."""
     fails: Callable[[Tensor], bool]
-    """Whether the failure is kept at a feasible theta."""
+    """Whether the failure holds at a feasible theta."""
     size: Callable[[Tensor], float]
     """The norm to minimise."""
     points: int

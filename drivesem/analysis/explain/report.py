@@ -170,7 +170,7 @@ def build_explain_notes(draws: int) -> list[str]:
         f"{_NEEDED.capitalize()}, changes: the parameters and objects of the smallest change found that keeps the "
         "same object failing in the same kind. Size: relative to the whole change, in sign steps. Holds: draws "
         "that show the failure after it, the first of those of its certificate; from certain on, as large a share "
-        "as a certificate needs. A failure by threshold is kept in the picture only.",
+        "as a certificate needs. For a failure by threshold, only the picture counts.",
         f"Adds to loss: mean Shapley value over frames; of failing: the same of whether a failure occurs, over "
         f"failures{interval}. A part with a negative share works against the failure at its full size. Of "
         "gradient: share of |gradient x change| at the photograph. Alone suffices, occurs without it: failures "

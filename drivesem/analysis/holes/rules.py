@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,17 +20,18 @@ from drivesem.failures.failure_probability import FailureProbability
 from drivesem.failures.rules import (
     Flags,
     Floats,
-    IntervalRule,
     Intervals,
     contains,
     count_rule,
     description_length,
     fit_rule,
     fit_rule_list,
-    format_rule,
     overlap,
 )
 from drivesem.synth.compare import QUANTITIES, reference
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 _MIN_OVERLAP = 0.5
 """Overlap from which two rules of the same features are one hole."""
@@ -42,6 +43,34 @@ _KITTI_QUANTITIES = {
     "yaw_deg": ("yaw_rad", np.pi / 180),
 }
 """Features with a known distribution in KITTI: its name there, and the factor into its unit."""
+
+FEATURE_TEXT = {
+    "height_px": "height in the picture {} px",
+    "aspect": "width over height {}",
+    "across": "place in the picture, 0 left to 1 right: {}",
+    "lightness": "in the picture, 0 dark to 1 light: {}",
+    "contrast": "contrast in the picture, 0 flat to 0.5: {}",
+    "distance_m": "nearer to further: {} m",
+    "yaw_deg": "heading {} deg",
+    "moved_m": "moved by {} m",
+    "grown_percent": "grown by {} %",
+    "paint.lightness": "paint, -1 darker to 1 lighter: {}",
+    "paint.a": "paint, -1 greener to 1 redder: {}",
+    "paint.b": "paint, -1 bluer to 1 yellower: {}",
+    "paint.gloss": "paint, -1 matt to 1 glossy: {}",
+    "paint.dirt": "paint, -1 clean to 1 dirty: {}",
+    "weather.fog": "fog, 0 none to 1 dense: {}",
+    "weather.rain": "rain, 0 none to 1 strong: {}",
+    "weather.time_of_day": "time, 0 as photographed to 1 twilight: {}",
+    "weather.overcast": "sky, 0 as photographed to 1 overcast: {}",
+    "foliage.hue": "leaves, hue from -1 to 1: {}",
+    "foliage.lightness": "leaves, -1 darker to 1 lighter: {}",
+    "foliage.density": "leaves, -1 sparser to 1 denser: {}",
+    "sun.azimuth": "direction of the sun, -1 to 1: {}",
+    "sun.elevation": "sun, -1 lower to 1 higher: {}",
+    "sun.strength": "sun, -1 weaker to 1 stronger: {}",
+}
+"""Features for people; {} is an interval."""
 
 FailureKey = tuple[str, int]
 """Name of a frame, and number of an object."""
@@ -225,11 +254,32 @@ class RuleRecheck:
 
 
 @dataclass(frozen=True, slots=True)
+class HoleFailure:
+    """A certain failure, by name."""
+
+    frame: str
+    """Its frame."""
+    object: int
+    """Number of its object."""
+    kind: str
+    """Its kind."""
+    grade: str
+    """Its grade."""
+
+    @property
+    def text(self) -> str:
+        """Name it for people."""
+        return f"{self.frame}: object {self.object} {self.kind} ({self.grade})"
+
+
+@dataclass(frozen=True, slots=True)
 class Hole:
     """A region of features in which the detector loses objects."""
 
     where: Intervals
-    """The rule; empty if no feature separates the failures, and the whole neighbourhood is meant."""
+    """The rule; empty if none separates the failures, and the whole neighbourhood is meant. A rule separates them where
+    the failure rates inside and outside differ beyond their intervals.
+    """
     label: str
     """Class of the objects."""
     probability: float | None
@@ -246,7 +296,7 @@ class Hole:
     """Size: share of the neighbourhoods in which the object is lost."""
     kitti: dict[str, float]
     """Share of KITTI's vehicles inside the interval, by feature."""
-    failures: tuple[str, ...]
+    failures: tuple[HoleFailure, ...]
     """Failures that led to the hole."""
     frames: tuple[str, ...]
     """Their frames."""
@@ -273,23 +323,47 @@ class Hole:
                 "by": self.lost.by,
             },
             "kitti": self.kitti,
-            "failures": list(self.failures),
+            "failures": [asdict(failure) for failure in self.failures],
             "frames": list(self.frames),
         }
 
     @property
     def rule_text(self) -> str:
         """The rule for people."""
-        return format_rule(self.where)
+        if not self.where:
+            return f"no rule found; {100 * self.lost.low:.2g} to {100 * self.lost.high:.2g} % everywhere"
+        return describe_rule(self.where)
 
 
-def fit_rules(frames: Mapping[str, FrameHoles]) -> dict[FailureKey, FailureRule]:
-    """Fit a rule to each failure. frames: samples by frame."""
+def describe_rule(where: Intervals) -> str:
+    """Describe a rule for people: what each feature is, which way it goes, and its interval."""
+    texts = [FEATURE_TEXT[name].format(f"{low:.3g} to {high:.3g}") for name, (low, high) in where.items()]
+    return "; ".join(texts)
+
+
+def fit_rules(frames: Mapping[str, FrameHoles], progress: Progress | None = None) -> dict[FailureKey, FailureRule]:
+    """Fit a rule to each failure.
+
+    Args:
+        frames: Samples by frame.
+        progress: Shows how many failures and classes are done.
+    """
     failures = {(name, one.index): one for name, frame in frames.items() for one in frame.around}
-    rules = {key: FailureRule(fit_failure_rule(one), False) for key, one in failures.items()}
-    for label in dict.fromkeys(one.label for one in failures.values()):
+    labels = list(dict.fromkeys(one.label for one in failures.values()))
+    task = None if progress is None else progress.add_task("fitting rules", total=len(failures) + len(labels))
+
+    def advance() -> None:
+        if progress is not None and task is not None:
+            progress.advance(task)
+
+    rules: dict[FailureKey, FailureRule] = {}
+    for key, one in failures.items():
+        rules[key] = FailureRule(fit_failure_rule(one), False)
+        advance()
+    for label in labels:
         failures_of_class = {key: one for key, one in failures.items() if one.label == label}
         rules |= _fit_shared_rules(label, failures_of_class, rules, frames)
+        advance()
     return rules
 
 
@@ -378,14 +452,12 @@ def merge_holes(
     Returns:
         Holes, the largest first; a hole with the features of a larger one is listed after all others.
     """
-    groups: list[list[tuple[FailureKey, FailureWithRule]]] = []
-    # Shared rules first: similar ones join them.
-    for key, one in sorted(failures.items(), key=lambda item: not item[1].rule.pooled):
-        group = next((group for group in groups if _is_same_hole(group[0][1], one)), None)
-        if group is None:
-            groups.append([(key, one)])
-        else:
-            group.append((key, one))
+    tested = {
+        key: one if _separates(group) else replace(one, rule=FailureRule({}, False), fresh=_NO_SAMPLES)
+        for group in _group_by_rule(failures)
+        for key, one in group
+    }
+    groups = _group_by_rule(tested)
     holes = sorted((_build_hole(group, rechecks or {}) for group in groups), key=lambda h: -h.lost.probability)
     feature_sets: set[tuple[str, ...]] = set()
     first: list[Hole] = []
@@ -397,6 +469,47 @@ def merge_holes(
     return first + repeated
 
 
+_Group = list[tuple[FailureKey, FailureWithRule]]
+_NO_SAMPLES = FeatureSamples((), (), ())
+
+
+def _group_by_rule(failures: Mapping[FailureKey, FailureWithRule]) -> list[_Group]:
+    """Group failures with similar rules."""
+    groups: list[_Group] = []
+    # Shared rules first: similar ones join them.
+    for key, one in sorted(failures.items(), key=lambda item: not item[1].rule.pooled):
+        group = next((group for group in groups if _is_same_hole(group[0][1], one)), None)
+        if group is None:
+            groups.append([(key, one)])
+        else:
+            group.append((key, one))
+    return groups
+
+
+def _separates(group: _Group) -> bool:
+    """Whether failure rates inside a group's rule, of fresh samples, and outside of it differ beyond their intervals.
+    Without samples on either side nothing speaks against the rule.
+    """
+    members = [one for _, one in group]
+    where = _median_rule(members)
+    inside, outside = _count_inside(where, [one.fresh for one in members]), _count_outside(where, members)
+    return not (inside[1] and outside[1]) or wilson(*inside)[0] > wilson(*outside)[1]
+
+
+def _median_rule(members: Sequence[FailureWithRule]) -> Intervals:
+    """Return the rule of a group: its shared one, or the median bounds."""
+    rule = members[0].rule
+    if rule.pooled:
+        return rule.where
+    return {
+        name: (
+            float(np.median([one.rule.where[name][0] for one in members])),
+            float(np.median([one.rule.where[name][1] for one in members])),
+        )
+        for name in rule.where
+    }
+
+
 def _is_same_hole(one: FailureWithRule, other: FailureWithRule) -> bool:
     same = one.failure.label == other.failure.label and set(one.rule.where) == set(other.rule.where)
     return same and overlap(one.rule.where, other.rule.where) >= _MIN_OVERLAP
@@ -405,18 +518,9 @@ def _is_same_hole(one: FailureWithRule, other: FailureWithRule) -> bool:
 def _build_hole(
     group: Sequence[tuple[FailureKey, FailureWithRule]], rechecks: Mapping[FailureKey, FeatureSamples]
 ) -> Hole:
-    members, rule = [one for _, one in group], group[0][1].rule
-    where: Intervals = {
-        name: (
-            float(np.median([one.rule.where[name][0] for one in members])),
-            float(np.median([one.rule.where[name][1] for one in members])),
-        )
-        for name in rule.where
-    }
-    if rule.pooled:
-        where = rule.where
-    samples = [one.failure.samples for one in members if one.failure.samples.margins]
-    counts = [count_rule(where, some.columns(), some.failing) for some in samples]
+    members = [one for _, one in group]
+    where = _median_rule(members)
+    outside = _count_outside(where, members)
     fails, count = _count_inside(where, [one.fresh for one in members])
     rechecked = _count_inside(where, [rechecks[key] for key, _ in group if key in rechecks])
     low, high = wilson(fails, count) if count else (None, None)
@@ -427,12 +531,14 @@ def _build_hole(
         low=low,
         high=high,
         count=count,
-        outside=_rate_outside(counts),
+        outside=outside[0] / outside[1] if outside[1] else None,
         lost=_mean_probability([one.failure.lost for one in members]),
         kitti=kitti_shares(where),
-        failures=tuple(f"{frame}: objects[{index}]" for (frame, index), _ in group),
+        failures=tuple(
+            HoleFailure(frame, index, one.failure.error, one.failure.grade) for (frame, index), one in group
+        ),
         frames=tuple(dict.fromkeys(frame for (frame, _), _ in group)),
-        pooled=rule.pooled,
+        pooled=members[0].rule.pooled,
         recheck=RuleRecheck((fails, count), rechecked) if count and rechecked[1] else None,
     )
 
@@ -451,9 +557,11 @@ def _mean_probability(probabilities: Sequence[FailureProbability]) -> FailurePro
     return FailureProbability(probability, low, high, by, sum(one.extra_samples for one in probabilities))
 
 
-def _rate_outside(counts: Sequence[IntervalRule]) -> float | None:
-    count = sum(one.count_outside for one in counts)
-    return sum(one.failures_outside for one in counts) / count if count else None
+def _count_outside(where: Intervals, members: Sequence[FailureWithRule]) -> tuple[int, int]:
+    """Count failures and samples of the neighbourhoods outside a rule."""
+    samples = [one.failure.samples for one in members if one.failure.samples.margins]
+    counts = [count_rule(where, some.columns(), some.failing) for some in samples]
+    return sum(one.failures_outside for one in counts), sum(one.count_outside for one in counts)
 
 
 def kitti_shares(where: Mapping[str, tuple[float, float]]) -> dict[str, float]:

@@ -35,7 +35,7 @@ from drivesem.failures.failure_probability import UnitCubePoint, estimate_failur
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood, ObjectSample, SceneSampler
 from drivesem.failures.rules import Floats, Intervals, contains
 from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
-from drivesem.report.tables import AnalysisReport, Console, ReportTable, format_count
+from drivesem.report.tables import AnalysisReport, Console, ReportTable, format_count, progress_bar
 from drivesem.run.driver import FrameAnalyser, K, analyse_runs
 from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
 from drivesem.run.folder import (
@@ -99,7 +99,8 @@ def run_holes(config: HolesConfig) -> AnalysisReport:
     title = "sampling around failures of"
     frames, failed = analyse_runs(chosen, partial(HolesAnalyser, config), out / "runs", config, title)
     failures = {(name, one.index): one for name, frame in frames.items() for one in frame.around}
-    rules = fit_rules(frames)
+    with progress_bar(Console(stderr=True), hidden=not failures) as progress:
+        rules = fit_rules(frames, progress)
     passes = sum(frame.passes for frame in frames.values())
     stages = {"fresh": ExtraSamples.fresh(config.samples, config.fresh)}
     if config.recheck is not None:
@@ -349,11 +350,11 @@ def _tabulate_samples(features: Sequence[Mapping[str, float]], margins: Sequence
 _NO_FAILURES = "These runs have no certain failure of an object: nothing to sample around."
 _NOTES = (
     "Lost: share of fresh samples inside the rule in which the object is missed, with its 95 % Wilson interval. "
-    "Elsewhere: the same for samples outside the rule. Size: share of the whole neighbourhood, that is of what "
+    "Elsewhere: the same for samples outside the rule. A rule is printed only where both differ beyond their "
+    "intervals. Size: share of the whole neighbourhood, that is of what "
     "the run could change, in which the object is lost, inside the rule or not, with a 95 % interval; by subset "
     "simulation if losses are rare. In the neighbourhood of an object, all others stay as found.",
-    "Features: height_px, aspect (width over height) and across (0 left, 1 right) of the labelled box; lightness "
-    "and contrast of the picture inside it; distance_m; yaw_deg; codes of paint, weather and foliage. A rule "
+    "Height, width and place are those of the labelled box, lightness and contrast of the picture inside it. A rule "
     "names what separates failures best; the cause may be something that goes along with it.",
 )
 _RECHECK_NOTE = (
@@ -363,6 +364,8 @@ _RECHECK_NOTE = (
 )
 _MAX_PLOTTED = 12
 """Holes in the plot; the table has all."""
+_MAX_NAMED = 4
+"""Failures of a hole that the table names; holes.csv has all."""
 
 
 def build_holes_report(
@@ -384,13 +387,12 @@ def build_holes_report(
             "-" if hole.probability is None else _format_rate(hole.probability, hole.low, hole.high),
             "-" if hole.outside is None else f"{100 * hole.outside:.0f}",
             f"{100 * hole.lost.probability:.2g} [{100 * hole.lost.low:.2g}, {100 * hole.lost.high:.2g}]",
-            str(len(hole.failures)),
-            str(len(hole.frames)),
+            _name_failures(hole),
             *((_format_recheck(hole.recheck),) if rechecks else ()),
         )
         for hole in holes
     )
-    columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures", "frames")
+    columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures")
     columns += ("again, %",) if rechecks else ()
     hold = sum(recheck.holds for recheck in rechecks)
     recheck_notes = (_RECHECK_NOTE.format(hold=hold, count=len(rechecks)),) if rechecks else ()
@@ -403,10 +405,16 @@ def build_holes_report(
         csv_tables={"holes": [_csv_row(hole) for hole in holes]} if holes else {},
         tables=[ReportTable(title, columns, lines)],
         notes=(*_NOTES, *recheck_notes) if holes else (_NO_FAILURES,),
-        text_columns=("where", "class"),
+        text_columns=("where", "class", "failures"),
         picture=partial(plot_holes, holes=holes) if holes else None,
         failed=failed,
     )
+
+
+def _name_failures(hole: Hole) -> str:
+    """Name the first failures of a hole, and count the others."""
+    texts = [failure.text for failure in hole.failures[:_MAX_NAMED]]
+    return "\n".join(texts + ([f"and {more} more"] if (more := len(hole.failures) - _MAX_NAMED) > 0 else []))
 
 
 def _format_rate(rate: float, low: float | None, high: float | None) -> str:
@@ -437,7 +445,7 @@ def _csv_row(hole: Hole) -> dict[str, Any]:
         "size": hole.lost.probability,
         "size_low": hole.lost.low,
         "size_high": hole.lost.high,
-        "failures": "; ".join(hole.failures),
+        "failures": "; ".join(failure.text for failure in hole.failures),
     }
 
 
@@ -451,12 +459,18 @@ def plot_holes(path: Path, holes: Sequence[Hole]) -> None:
         figure = Figure(figsize=(8.0, 1.9 + 0.5 * len(plotted)), layout="constrained")
         axes = figure.add_subplot()
         inside, elsewhere = "fresh samples inside the rule, 95 % interval", "elsewhere in the neighbourhood"
+        everywhere = "no rule: anywhere in the neighbourhood, 95 % interval"
         for i, hole in enumerate(plotted):
-            if hole.probability is not None:
-                axes.barh([i], [100 * hole.probability], color=PLOT_COLOURS[1], height=0.6, label=inside)
-                inside = None  # one entry in the legend
-                ends = [100 * (hole.low or 0), 100 * (hole.high or 0)]
-                axes.plot(ends, [i] * 2, color="black", linewidth=1.2)
+            has_rule = hole.probability is not None
+            rate, low, high = (
+                (hole.probability, hole.low, hole.high)
+                if has_rule
+                else (hole.lost.probability, hole.lost.low, hole.lost.high)
+            )
+            colour, label = (PLOT_COLOURS[1], inside) if has_rule else (PLOT_COLOURS[2], everywhere)
+            axes.barh([i], [100 * (rate or 0)], color=colour, height=0.6, label=label)
+            inside, everywhere = (None, everywhere) if has_rule else (inside, None)  # one entry each in the legend
+            axes.plot([100 * (low or 0), 100 * (high or 0)], [i] * 2, color="black", linewidth=1.2)
             if hole.outside is not None:
                 rate = 100 * hole.outside
                 axes.plot([rate], [i], "D", color=PLOT_COLOURS[0], markersize=6, label=elsewhere, zorder=3)

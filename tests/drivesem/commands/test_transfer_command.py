@@ -119,9 +119,13 @@ def test_what_another_detector_loses(run: Path, monkeypatch: pytest.MonkeyPatch)
     assert row["transfer_rate_of"] == lost
     assert row["transfer_rate"] == (1.0 if lost else None)
     assert row["certain_rate_of"] + row["threshold_rate_of"] == lost
-    (high,) = transfer("--run", run, "--detectors", "onnx:some/blind.onnx", "--t-star", "0.6")["rows"]
+    data = transfer("--run", run, "--detectors", "onnx:some/blind.onnx", "--t-star", "0.6")
+    (high,) = data["rows"]
     assert high["lost_rate_of"] == 0
     assert high["lost_rate"] is None
+    # a detector that never found an object neither loses it nor agrees
+    assert high["never_found"] == lost == len(data["failures"])
+    assert {(one["found"], one["lost"]) for one in data["failures"]} == {(False, None)}
 
 
 def test_a_matrix_of_two_runs(run: Path, tmp_path: Path) -> None:

@@ -87,9 +87,7 @@ def test_what_each_adds():
 
 def test_drawn_orders_carry_errors_and_no_gradient_is_no_share():
     team = [player(str(i), i % 4) for i in range(7)]  # some stand for the same coordinate
-    found = compute_contributions(
-        team, THETA, evaluator(Counter()), None, 8, np.random.default_rng(0)
-    )
+    found = compute_contributions(team, THETA, evaluator(Counter()), None, 8, np.random.default_rng(0))
     assert sum(c.loss for c in found) == pytest.approx(0.6, abs=1e-6)
     assert all(c.loss_error is not None and c.gradient is None and c.gradient_share is None for c in found)
 

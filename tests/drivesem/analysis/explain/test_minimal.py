@@ -135,7 +135,9 @@ def test_what_only_occurs_in_the_picture_is_not_enough():
     """The scan follows the picture; the scale is the first from which the failure holds."""
     occurs, holds = (lambda theta: bool(theta[0] > 0.2)), (lambda theta: bool(theta[0] > 0.6))
     found = find_minimal_change(
-        torch.tensor([1.0, 0, 0, 0]), [], MinimalChangeSearch(lambda t: t, occurs, holds, lambda t: float(t.norm()), 16)
+        torch.tensor([1.0, 0, 0, 0]),
+        [],
+        MinimalChangeSearch(lambda t: t, occurs, holds, lambda t: float(t.norm()), 16),
     )
     assert found.scan.index(True) == 4
     assert 0.6 < found.scale < 0.6 + RESOLUTION

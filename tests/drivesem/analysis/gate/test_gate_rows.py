@@ -36,7 +36,8 @@ def pair(
     phantoms: tuple[int, int] = (0, 0),
 ) -> PairedSamples:
     """The new detector fails in the samples in which the old one does, and in more or in fewer."""
-    return PairedSamples(index, "Car", error, *(first(count, of) for count in (before, after, *phantoms)))
+    old, new, old_phantoms, new_phantoms = (first(count, of) for count in (before, after, *phantoms))
+    return PairedSamples(index, "Car", error, old, new, old_phantoms, new_phantoms)
 
 
 def rows(found, tolerance: float = 0.05):
