@@ -22,7 +22,7 @@ from drivesem.classify.analysis import FailureAnalyser, analyse_failures
 from drivesem.classify.scenes import SEEN_PX, VIEWS
 from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
-from drivesem.failures.rules import Floats, Intervals, fit_rule
+from drivesem.failures.rules import Floats, Intervals, fit_rule, rates_differ
 from drivesem.report.tables import AnalysisReport, ReportTable
 from scene_ir.io import round_to_8bit
 
@@ -75,8 +75,11 @@ class PoseFailureRegion:
         low, high = self.interval
         rate = f"{100 * self.fails / self.count:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
         place = " and ".join(intervals) or "any angle near"
-        error = f"misclassified, mostly as {self.predicted}"
-        return f"The {self.label} of {self.identifier} is {error}, in {rate} of poses with {place}"
+        error = f"The {self.label} of {self.identifier} is misclassified, mostly as {self.predicted}"
+        if self.where and not rates_differ((self.fails, self.count), (self.fails_outside, self.count_outside)):
+            low, high = wilson(self.fails_all, self.count_all)
+            return f"{error}; no rule found: in {100 * low:.0f} to {100 * high:.0f} % of all poses near"
+        return f"{error}, in {rate} of poses with {place}"
 
     def to_json(self) -> dict[str, Any]:
         """The region with its failure rate and description."""

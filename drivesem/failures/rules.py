@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drivesem.evaluation.resampling import wilson
+
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Intervals = dict[str, tuple[float, float]]
@@ -66,6 +68,13 @@ def contains(where: Mapping[str, tuple[float, float]], features: Mapping[str, Fl
 def format_rule(where: Mapping[str, tuple[float, float]]) -> str:
     """Format a rule as text."""
     return ", ".join(f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in where.items()) or "anywhere"
+
+
+def rates_differ(inside: tuple[int, int], outside: tuple[int, int]) -> bool:
+    """Whether failure rates inside and outside a rule differ beyond their 95 % Wilson intervals. Each is a pair of
+    failures and samples; without samples on either side nothing speaks against the rule.
+    """
+    return not (inside[1] and outside[1]) or wilson(*inside)[0] > wilson(*outside)[1]
 
 
 def fit_rule(

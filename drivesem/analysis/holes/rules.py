@@ -17,6 +17,7 @@ import numpy as np
 
 from drivesem.evaluation.resampling import newcombe, wilson
 from drivesem.failures.failure_probability import FailureProbability
+from drivesem.failures.grades import Kind
 from drivesem.failures.rules import (
     Flags,
     Floats,
@@ -27,7 +28,9 @@ from drivesem.failures.rules import (
     fit_rule,
     fit_rule_list,
     overlap,
+    rates_differ,
 )
+from drivesem.run.report.page import KINDS
 from drivesem.synth.compare import QUANTITIES, reference
 
 if TYPE_CHECKING:
@@ -261,6 +264,8 @@ class HoleFailure:
     """Its frame."""
     object: int
     """Number of its object."""
+    label: str
+    """Class of its object."""
     kind: str
     """Its kind."""
     grade: str
@@ -268,8 +273,8 @@ class HoleFailure:
 
     @property
     def text(self) -> str:
-        """Name it for people."""
-        return f"{self.frame}: object {self.object} {self.kind} ({self.grade})"
+        """Name it for people: `demo-000: Car missed, object 2 (certain)`."""
+        return f"{self.frame}: {self.label} {KINDS[Kind(self.kind)]}, object {self.object} ({self.grade})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -487,13 +492,11 @@ def _group_by_rule(failures: Mapping[FailureKey, FailureWithRule]) -> list[_Grou
 
 
 def _separates(group: _Group) -> bool:
-    """Whether failure rates inside a group's rule, of fresh samples, and outside of it differ beyond their intervals.
-    Without samples on either side nothing speaks against the rule.
-    """
+    """Whether failure rates inside a group's rule, of fresh samples, and outside of it differ."""
     members = [one for _, one in group]
     where = _median_rule(members)
     inside, outside = _count_inside(where, [one.fresh for one in members]), _count_outside(where, members)
-    return not (inside[1] and outside[1]) or wilson(*inside)[0] > wilson(*outside)[1]
+    return rates_differ(inside, outside)
 
 
 def _median_rule(members: Sequence[FailureWithRule]) -> Intervals:
@@ -535,7 +538,8 @@ def _build_hole(
         lost=_mean_probability([one.failure.lost for one in members]),
         kitti=kitti_shares(where),
         failures=tuple(
-            HoleFailure(frame, index, one.failure.error, one.failure.grade) for (frame, index), one in group
+            HoleFailure(frame, index, one.failure.label, one.failure.error, one.failure.grade)
+            for (frame, index), one in group
         ),
         frames=tuple(dict.fromkeys(frame for (frame, _), _ in group)),
         pooled=members[0].rule.pooled,

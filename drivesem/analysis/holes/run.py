@@ -384,7 +384,9 @@ def build_holes_report(
         (
             hole.rule_text,
             hole.label,
-            "-" if hole.probability is None else _format_rate(hole.probability, hole.low, hole.high),
+            _format_rate(hole.probability, hole.low, hole.high)
+            if hole.where and hole.probability is not None
+            else "-",
             "-" if hole.outside is None else f"{100 * hole.outside:.0f}",
             f"{100 * hole.lost.probability:.2g} [{100 * hole.lost.low:.2g}, {100 * hole.lost.high:.2g}]",
             _name_failures(hole),
@@ -461,7 +463,7 @@ def plot_holes(path: Path, holes: Sequence[Hole]) -> None:
         inside, elsewhere = "fresh samples inside the rule, 95 % interval", "elsewhere in the neighbourhood"
         everywhere = "no rule: anywhere in the neighbourhood, 95 % interval"
         for i, hole in enumerate(plotted):
-            has_rule = hole.probability is not None
+            has_rule = bool(hole.where) and hole.probability is not None
             rate, low, high = (
                 (hole.probability, hole.low, hole.high)
                 if has_rule

@@ -127,6 +127,14 @@ def _points(before: float | None, after: float | None) -> str:
     return _NONE if before is None or after is None else f"{100 * (before - after):.1f}"
 
 
+def _describe_drop(before: float | None, after: float | None) -> str:
+    """Describe a drop in points: `1.3 points lower`, or `unchanged`."""
+    points = _points(before, after)
+    if points in (_NONE, "0.0", "-0.0"):
+        return _NONE if points == _NONE else "unchanged"
+    return f"{points.removeprefix('-')} points {'higher' if points.startswith('-') else 'lower'}"
+
+
 def _totals(summary: RunSummary) -> tuple[int, int]:
     return sum(summary.lost_objects.values()), sum(summary.phantoms.values())
 
@@ -259,8 +267,8 @@ def _tiles(run: ReportedRun) -> list[_SummaryTile]:
         _SummaryTile(
             f"AP50 of {summary.headline}, %",
             f"{_percent(before)} → {_percent(moved)}",
-            f"on {format_count(summary.benign.headline.objects, summary.headline)}: {_points(before, moved)} points "
-            f"lower; {by_labels}" + (f"; {paper}" if paper else ""),
+            f"on {format_count(summary.benign.headline.objects, summary.headline)}: {_describe_drop(before, moved)}; "
+            f"{by_labels}" + (f"; {paper}" if paper else ""),
         ),
         _SummaryTile(
             "frames broken, by threshold",

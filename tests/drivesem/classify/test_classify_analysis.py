@@ -3,6 +3,7 @@
 import io
 import shutil
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -173,6 +174,10 @@ def test_the_sentence_of_a_region():
     assert region.sentence() == (
         "The bus of bus-0007-left is misclassified, mostly as train, in 94 % [80, 98] of poses with yaw "
         "from 31 to 44 degrees"
+    )
+    alike = replace(region, fails=16, fails_outside=18)
+    assert alike.sentence() == (
+        "The bus of bus-0007-left is misclassified, mostly as train; no rule found: in 21 to 43 % of all poses near"
     )
 
 

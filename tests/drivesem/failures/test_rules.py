@@ -16,9 +16,25 @@ from drivesem.failures.rules import (
     fit_rule,
     fit_rule_list,
     overlap,
+    rates_differ,
 )
 
 NAMES = ("height_px", "aspect", "across", "lightness", "distance_m", "yaw_deg")
+
+
+@pytest.mark.parametrize(
+    ("inside", "outside", "differ"),
+    [
+        ((28, 32), (10, 40), True),
+        ((19, 32), (19, 40), False),  # 59 % [42, 74], elsewhere 48
+        ((10, 32), (30, 40), False),  # failing less often is no rule
+        ((0, 0), (10, 40), True),
+    ],
+)
+def test_a_rule_needs_rates_that_differ_beyond_their_intervals(
+    inside: tuple[int, int], outside: tuple[int, int], differ: bool
+) -> None:
+    assert rates_differ(inside, outside) is differ
 
 
 def samples(count: int, seed: int) -> dict[str, Floats]:
