@@ -1,4 +1,5 @@
-"""The README's picture: one frame of a run before and after, with true and detected boxes.
+"""The README's picture: one frame of a run before and after, with true and detected boxes. Its caption is printed, and
+is the JPEG's comment: the README has the same text.
 
 python tools/example_picture.py runs/demo-color-weather-translate-rotate-climb-seed0 demo-003 docs/example.jpg
 """
@@ -9,21 +10,22 @@ import argparse
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
+from PIL import Image
 
+from drivesem.config.options import format_command_line
+from drivesem.run.folder import PRESENTATION, load_attack_config
 from drivesem.run.report import pictures
-from drivesem.run.results import load_frame
+from drivesem.run.results import Failure, FrameResult, load_frame
 from scene_ir import files
 
 JPEG_QUALITY = 88
 GAP_PX = 6
 
 
-def example(run: Path, name: str) -> pictures.Image:
+def draw_example(run: Path, result: FrameResult) -> pictures.Image:
     """The benign frame above the counterexample, (2 H + gap, W, 3) RGB, each with its labels and detections."""
-    folder = run / "frames" / name
-    result = load_frame(folder / "result.json")
+    folder = run / "frames" / result.identifier
     threshold = float(json.loads(files.read_text(run / "metrics.json"))["t_star"])
     before = pictures.draw_overlay(
         files.read_image(folder / "benign.png"), result.targets_benign, result.detections_benign, (), threshold
@@ -39,15 +41,38 @@ def example(run: Path, name: str) -> pictures.Image:
     return np.concatenate([before, gap, after])
 
 
+def write_caption(command: str, result: FrameResult) -> str:
+    """The caption: the command, the colours, and each failure with its grade and draws."""
+    failures = "; ".join(map(_describe, result.failures)) or "none"
+    return (
+        f"A generated street, frame {result.identifier} of `{command}`. Green: true boxes. Yellow: detections. Orange: "
+        f"missed objects. Failures: {failures}."
+    )
+
+
+def _describe(failure: Failure) -> str:
+    count, name = failure.count, failure.label.lower()
+    text = f"{name} {failure.index}" if failure.index is not None else f"a phantom {name}"
+    text += f" is {failure.grade or 'not graded'}"
+    if count is None or not count.before_draws:
+        return text
+    text += f", right in {count.before} of {count.before_draws} draws before the change"
+    return f"{text} and wrong in {count.after} of {count.after_draws} after it"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("frame")
     parser.add_argument("out", type=Path)
     arguments = parser.parse_args()
-    picture = example(arguments.run, arguments.frame)
-    encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    files.write_bytes(arguments.out, encoded.tobytes())
+    result = load_frame(arguments.run / "frames" / arguments.frame / "result.json")
+    attack = load_attack_config(arguments.run)
+    command = format_command_line("attack", attack, set(PRESENTATION) - {"limit"})
+    caption = write_caption(command, result)
+    picture = Image.fromarray(draw_example(arguments.run, result))
+    picture.save(arguments.out, "JPEG", quality=JPEG_QUALITY, comment=caption.encode())
+    print(caption)
 
 
 if __name__ == "__main__":

@@ -272,7 +272,8 @@ def compare_retrained(
         objects = int(at_any_score.objects.sum())
         ap50 = NamedMetric("AP50", (WeightedAveragePrecision(at_any_score, "coco"),))
         metrics.append((ap50, NamedMetric("recall at t*", (WeightedRecall(at_t_star),))))
-    compared = paired_differences(*metrics, frames, DRAWS, np.random.default_rng(seed))
+    first, second = metrics
+    compared = paired_differences(first, second, frames, DRAWS, np.random.default_rng(seed))
     return [RetrainVerdict(name, frames, objects, one) for one in compared]
 
 

@@ -109,7 +109,7 @@ def test_p_is_of_samples_in_which_one_fails_alone() -> None:
 
 def test_one_sample_is_no_evidence() -> None:
     compared = rows({"a": [pair(0, 1, of=1)]})
-    assert (compared[0].difference, compared[0].low) == (1, 1)
+    assert (compared[0].difference, compared[0].low) == (1, None)
     assert not any(row.grew for row in compared)
 
 
