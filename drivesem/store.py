@@ -272,14 +272,12 @@ class RemoteFolder:
         files.write_text(record, "".join(f"{mark} {name}\n" for name, mark in marks.items()))
 
 
-def _track_progress(names: Iterable[str]) -> Iterable[str]:
-    from rich.progress import track
-
-    from drivesem.report.tables import Console
+def _track_progress(names: Iterable[str]) -> Iterator[str]:
+    from drivesem.report.tables import Console, progress_bar
 
     names = list(names)
-    bar = Console(stderr=True)
-    return track(names, "copying from the store", console=bar, transient=True, disable=not names)
+    with progress_bar(Console(stderr=True), keep=False, hidden=not names) as progress:
+        yield from progress.track(names, description="copying from the store")
 
 
 def _read_versions(path: Path) -> dict[str, FileVersion | None]:

@@ -437,10 +437,12 @@ class GeneratorSamples(Sequence[Sample]):
 
 
 def load_attacked_frames(run: Path) -> list[AttackedFrame]:
-    """List the finished frames of a run of `drivesem attack` by name. Raises FormatError where there are none."""
-    found = [AttackedFrame(run, name) for name in list_frames(run)]
+    """List the finished frames of a run of `drivesem attack` in which there was something to attack. Raises
+    FormatError where there are none.
+    """
+    found = [frame for name in list_frames(run) if (frame := AttackedFrame(run, name)).result.attacked]
     if not found:
-        raise FormatError(str(run), "a run of drivesem attack with finished frames", "none")
+        raise FormatError(str(run), "a run of drivesem attack with attacked frames", "none")
     return found
 
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,11 @@ from drivesem.cli import main
 from drivesem.commands import view
 from drivesem.config.commands import ViewConfig
 from drivesem.config.parsing import parse
+from drivesem.run.finished import load_run
+from drivesem.run.results import dump_frame, load_frame
+from drivesem.training.frames import load_attacked_frames
 from drivesem.viewer import server as frames
+from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene
 
 Refused = Callable[..., str]
@@ -50,6 +55,18 @@ def test_a_run_shows_its_frames_to_its_detector(small_run: Path) -> None:
     assert viewer_frames.frames["demo-000"].folder == small_run / "frames" / "demo-000" / "scene"
     assert viewer_frames.detector.name == "squeezedet"
     assert viewer_frames.title == "a"
+
+
+def test_a_frame_without_anything_to_attack_did_not_withstand(small_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(small_run, run)
+    path = run / "frames" / "demo-000" / "result.json"
+    path.write_text(dump_frame(replace(load_frame(path), found_before=(), queries=0)))
+    assert frames.open_viewer_frames(ViewConfig(scene=str(run))).frames["demo-000"].words == "not attacked"
+    (row,) = load_run(run).rows()
+    assert (row["attacked"], row["found_before"], row["success_moved"]) == (False, 0, None)
+    with pytest.raises(FormatError, match="expected a run of drivesem attack with attacked frames"):
+        load_attacked_frames(run)
 
 
 def test_scenes_of_derender_are_no_run(two_scenes: Path) -> None:

@@ -92,7 +92,7 @@ def test_a_run_is_learned_from_and_attacked_again(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["--run", "nowhere"], "--run: expected a run's folder, with its config.yaml"),
-        (["--run", "run"], "expected a run of drivesem attack with finished frames, found none"),
+        (["--run", "run"], "expected a run of drivesem attack with attacked frames, found none"),
         (["--run", "other"], "--run: expected a run of drivesem attack, found other"),
         (["--run", "run", "--fraction", "1"], "--fraction: expected a fraction between 0 and 1"),
         (["--run", "run", "--validation", "0"], "--validation: expected a fraction between 0 and 1"),
