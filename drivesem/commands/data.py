@@ -129,7 +129,7 @@ def summarise_losses(written: WriteSummary) -> str:
     def join(counts: Mapping[str, int]) -> str:
         return ", ".join(f"{name} of {count}" for name, count in sorted(counts.items()))
 
-    parts = [f"lost: {join(written.lost)}" if written.lost else "nothing lost"]
+    parts = [f"left out: {join(written.lost)}" if written.lost else "nothing left out"]
     parts += [f"assumed: {join(written.assumed)}"] if written.assumed else []
     return f"{format_count(written.files, 'file')}; {'; '.join(parts)}"
 

@@ -31,10 +31,14 @@ _NEEDED = "needs"
 _TEXT_COLUMNS = ("parameter", "frame", "failure", "grade", _NEEDED, "changes", "holds")
 """Columns of text; the others hold numbers."""
 _RICH_OPTIONS: dict[str, Any] = {
-    "unbroken": ("parameter", "frame"),
+    "unbroken": ("parameter", "frame", "changes"),
     "box": box.SIMPLE_HEAD,
     "padding": (0, 1, 0, 0),
 }
+
+
+_ROUNDED = 0.005
+"""Shares that are printed as 0."""
 
 
 def minimal_picture(number: int) -> str:
@@ -113,7 +117,7 @@ def build_explain_tables(
         (
             row.name,
             _format_interval(row.loss, 1, 2),
-            _format_interval(row.fails, 100, 0),
+            _format_interval(row.fails, 100, 0) + (" against" if (row.fails.value or 0) < -_ROUNDED else ""),
             "-" if row.gradient_share is None else f"{100 * row.gradient_share:.0f}",
             *(f"{count} of {row.failures}" for count in (row.alone, row.without, row.needed)),
             _format_size(row.found, row.unit),
@@ -172,7 +176,7 @@ def build_explain_notes(draws: int) -> list[str]:
         "that show the failure after it, the first of those of its certificate; from certain on, as large a share "
         "as a certificate needs. For a failure by threshold, only the picture counts.",
         f"Adds to loss: mean Shapley value over frames; of failing: the same of whether a failure occurs, over "
-        f"failures{interval}. A part with a negative share works against the failure at its full size. Of "
+        f"failures{interval}. Against: at its full size, the part works against the failure, though a smaller amount may be needed. Of "
         "gradient: share of |gradient x change| at the photograph. Alone suffices, occurs without it: failures "
         "that occur after this parameter's part of the change only, and after all other parts. Largest change, "
         "sufficient: largest change of an object in the counterexample, and in the smallest changes that contain "

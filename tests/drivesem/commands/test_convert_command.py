@@ -53,7 +53,7 @@ def _labels(folder: Path) -> dict[str, list[list[str]]]:
 
 def test_kitti_to_coco_and_back(kitti: Path, tmp_path: Path):
     text = convert(kitti, "--to", "coco", "--out", tmp_path / "coco", "--copy-images")
-    assert "nothing lost" in text
+    assert "nothing left out" in text
     dataset = CocoDataset(tmp_path / "coco")
     ours, theirs = dataset.frame("000003"), KittiDataset(kitti).frame("000003")
     assert ours.labels is not None
@@ -62,7 +62,7 @@ def test_kitti_to_coco_and_back(kitti: Path, tmp_path: Path):
     assert torch.allclose(ours.labels.boxes_xyxy, theirs.labels.boxes_xyxy)
     assert ours.camera.matrix.tolist() == theirs.camera.matrix.tolist()
     assert len(ours.labels.ignore_xyxy) == 1
-    assert "nothing lost" in convert(
+    assert "nothing left out" in convert(
         tmp_path / "coco", "--to", "kitti", "--out", tmp_path / "back", "--copy-images"
     )
     back = tmp_path / "back/training"
@@ -83,12 +83,12 @@ def test_coco_keeps_its_ids_and_keys(tmp_path: Path):
         "categories": [{"id": 3, "name": "car"}, {"id": 18, "name": "dog"}],
     }  # fmt: skip
     (tmp_path / "a.json").write_text(json.dumps(content))
-    assert "nothing lost" in convert(tmp_path / "a.json", "--to", "coco", "--out", tmp_path / "b.json")
+    assert "nothing left out" in convert(tmp_path / "a.json", "--to", "coco", "--out", tmp_path / "b.json")
     written = json.loads((tmp_path / "b.json").read_text())
     assert written["annotations"] == content["annotations"]
     assert [(c["id"], c["name"]) for c in written["categories"]] == [(3, "car"), (18, "dog")]
     text = convert(tmp_path / "a.json", "--to", "yolo", "--out", tmp_path / "yolo")
-    assert "lost: area of the mask of 1, crowd of 1, segmentation of 1" in text
+    assert "left out: area of the mask of 1, crowd of 1, segmentation of 1" in text
     assert (tmp_path / "yolo/data.yaml").exists()
     text = convert(tmp_path / "a.json", "--to", "kitti", "--map", "dog=-", "--out", tmp_path / "kitti")
     assert "crowd of 1" in text
@@ -97,12 +97,12 @@ def test_coco_keeps_its_ids_and_keys(tmp_path: Path):
 
 def test_kitti_to_yolo_and_back(kitti: Path, tmp_path: Path):
     text = convert(kitti, "--to", "yolo", "--out", tmp_path / "yolo", "--copy-images")
-    assert "lost: 3D box of 3, alpha of 3, occlusion of 3, region of 1, truncation of 3" in text
+    assert "left out: 3D box of 3, alpha of 3, occlusion of 3, region of 1, truncation of 3" in text
     frame = YoloDataset(tmp_path / "yolo").frame("000003")
     assert frame.labels is not None
     assert frame.labels.kind == ("Car", "Van", "Pedestrian")
     text = convert(tmp_path / "yolo", "--from", "yolo", "--to", "kitti", "--out", tmp_path / "back")
-    assert "nothing lost; assumed: occlusion (3, unknown) of 3, truncation (0) of 3" in text
+    assert "nothing left out; assumed: occlusion (3, unknown) of 3, truncation (0) of 3" in text
     rows = _labels(tmp_path / "back")["000003.txt"]
     assert len(read_labels(tmp_path / "back/000003.txt").kind) == 3
     # boxes come back to the last decimal; what YOLO has no place for is unknown
@@ -128,11 +128,11 @@ def test_kitti_to_virtual_kitti_and_back(kitti: Path, tmp_path: Path, layout: st
     rows = next(iter(_labels(tmp_path / "back").values()))
     assert [row[8:15] for row in rows] == [line.split()[8:15] for line in LABELS.splitlines()[:3]]
     assert "model of 3" in text
-    assert "lost: names" not in text
+    assert "left out: names" not in text
     assert (tmp_path / "back/training/label_2" / f"{name}.txt").is_file()
     # and once more into its own layout: everything is there
     again = convert(tmp_path / "virtual", "--to", layout, "--out", tmp_path / "again", "--copy-images")
-    assert "nothing lost" in again
+    assert "nothing left out" in again
     for path in sorted((tmp_path / "virtual").rglob("*.txt")):
         relative = path.relative_to(tmp_path / "virtual")
         if "extrinsic" not in path.name and "intrinsic" not in path.name:
@@ -280,7 +280,7 @@ def test_a_file_with_splits_is_written_with_its_splits_names_and_attributes(two_
         (two_parts / f"images/{part}/day").mkdir()
         (two_parts / f"images/{part}/000001.jpg").rename(two_parts / f"images/{part}/day/1.jpg")
         source.write_text(json.dumps(content))
-    assert "nothing lost" in convert(two_parts, "--to", "coco", "--copy-images", "--out", tmp_path / "out")
+    assert "nothing left out" in convert(two_parts, "--to", "coco", "--copy-images", "--out", tmp_path / "out")
     for part in ("train", "val"):
         path = f"annotations/instances_{part}.json"
         written, content = (json.loads((root / path).read_text()) for root in (tmp_path / "out", two_parts))
@@ -358,7 +358,7 @@ def named_yolo(tmp_path: Path) -> Path:
 def test_names_splits_and_class_numbers_go_there_and_back(named_yolo: Path, tmp_path: Path, layout: str):
     text = convert(named_yolo, "--to", layout, "--copy-images", "--out", tmp_path / "there")
     assert text.startswith("yolo: 2 images, 3 boxes in 3 classes; splits: train 1, val 1\n")
-    assert "nothing lost" in text
+    assert "nothing left out" in text
     images = {"coco": ("images/train/day/a.JPG", "images/val/b.jpeg"), "kitti": ("day/a.JPG", "b.jpeg")}[layout]
     folder = tmp_path / "there" / ("training/image_2" if layout == "kitti" else "")
     assert all((folder / name).is_file() for name in images)
@@ -437,8 +437,8 @@ def test_splits_and_attributes_that_are_lost_are_counted(two_parts: Path, tmp_pa
     content["images"][0]["attributes"] = {"weather": "rainy"}
     source.write_text(json.dumps(content))
     text = convert(two_parts, "--to", "kitti", "--out", tmp_path / "out")
-    assert "lost: attributes of frames of 1" in text
+    assert "left out: attributes of frames of 1" in text
     assert sorted(path.name for path in (tmp_path / "out/training/label_2").rglob("*.txt")) == ["000001.txt"] * 2
     assert (tmp_path / "out/ImageSets/val.txt").read_text() == "val/000001\n"
     text = convert(source, "--to", "fiftyone", "--copy-images", "--out", tmp_path / "fiftyone")
-    assert "nothing lost" in text
+    assert "nothing left out" in text

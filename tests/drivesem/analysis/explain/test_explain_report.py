@@ -169,6 +169,15 @@ def test_whether_the_smallest_change_holds_in_words() -> None:
     assert build_explain_tables([exchanged], [])[0].rows[0][-1] == "the exchange causes it"
 
 
+def test_a_part_that_hinders_is_called_so() -> None:
+    frame = explanation("a")
+    hinders = [replace(c, fails=(-0.17,)) if c.name == "rotate" else c for c in frame.contributions]
+    frame = replace(frame, contributions=tuple(hinders))
+    _, by_parameter = build_explain_tables([frame], summarise_parameters([frame], 0, 0))
+    row = dict(zip(by_parameter.columns, by_parameter.rows[0], strict=True))
+    assert (row["of failing, %"], row["need it"]) == ("-17 against", "1 of 1")
+
+
 def test_one_frame_has_no_interval() -> None:
     (lone, _) = summarise_parameters([explanation("a")], 100, 0)
     assert (lone.loss.value, lone.loss.low, lone.fails.low) == (1.5, None, None)
