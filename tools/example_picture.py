@@ -16,6 +16,7 @@ from PIL import Image
 from drivesem.config.options import format_command_line
 from drivesem.run.folder import PRESENTATION, load_attack_config
 from drivesem.run.report import pictures
+from drivesem.run.report.page import name_failure
 from drivesem.run.results import Failure, FrameResult, load_frame
 from scene_ir import files
 
@@ -46,18 +47,16 @@ def write_caption(command: str, result: FrameResult) -> str:
     failures = "; ".join(map(_describe, result.failures)) or "none"
     return (
         f"A generated street, frame {result.identifier} of `{command}`. Green: true boxes. Yellow: detections. Orange: "
-        f"missed objects. Failures: {failures}."
+        f"missed objects. {failures}. Confirmed: in a second renderer's picture too; shared: by another detector too."
     )
 
 
 def _describe(failure: Failure) -> str:
-    count, name = failure.count, failure.label.lower()
-    text = f"{name} {failure.index}" if failure.index is not None else f"a phantom {name}"
-    text += f" is {failure.grade or 'not graded'}"
+    text, count = f"{name_failure(failure)}: {failure.grade or 'not graded'}", failure.count
     if count is None or not count.before_draws:
         return text
-    text += f", right in {count.before} of {count.before_draws} draws before the change"
-    return f"{text} and wrong in {count.after} of {count.after_draws} after it"
+    text += f" (right in {count.before} of {count.before_draws} random draws before the change"
+    return f"{text}, wrong in {count.after} of {count.after_draws} after it)"
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
+from PIL import Image
 
 from detectors.registry import load_detector, save_detector
 from drivesem.cli import main
@@ -164,6 +165,13 @@ def test_python_runs(page: Path, workplace: Path) -> None:
         if block.language == "python" and block.runs:
             padded = "\n" * (block.line - 1) + block.text  # so that a traceback names the page's line
             exec(compile(padded, str(page), "exec"), names)
+
+
+def test_the_readmes_caption_is_that_of_its_picture() -> None:
+    """`tools/example_picture.py` writes the caption into the picture."""
+    with Image.open(ROOT / "docs" / "example.jpg") as picture:
+        caption = picture.info["comment"].decode()
+    assert caption in " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
 
 
 GATE_PAGE = ROOT / "docs" / "guide" / "gate.md"
