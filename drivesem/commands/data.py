@@ -173,7 +173,7 @@ def export_command(config: ExportConfig) -> int:
     result = export_dataset(attack_run, out, config.to_format, config.grade, parse_class_map("--map", config.map))
     if config.json:
         print_json({"out": str(out), **asdict(result)})
-    sys.stderr.write(f"{summarise_losses(result)}\n")
+    sys.stderr.write(f"{summarise_losses(result)}; in {out}\n")
     return 0
 
 
