@@ -16,19 +16,20 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from scene_ir.render.compositor import Compositor
     from scene_ir.render.prepare import PreparedScene, VisibleSurfaces
     from scene_ir.types import Objects, SceneIR
 
-BASE_ERROR = 0.005
+BASE_ERROR = 0.0024
 """Error of every edit."""
 ERROR_WEIGHTS: Mapping[str, float] = {
-    "completed": 0.06,
-    "distorted": 0.05,
-    "displaced": 1.3,
-    "repainted": 0.04,
-    "mismatched": 0.2,
-    "unsupported": 0.08,
-    "uncovered": 0.03,
+    "completed": 0.0685,
+    "distorted": 0.0285,
+    "displaced": 1.1678,
+    "repainted": 0.0296,
+    "mismatched": 0.0815,
+    "unsupported": 0.1017,
+    "disturbed": 0.2055,
 }
 """Error per unit of each piece of evidence."""
 ERROR_SCALE = 0.1
@@ -43,6 +44,8 @@ _NOTHING, _OCCLUDER = -1, -2
 """Owners of a pixel that belongs to no object."""
 _SAME_DEPTH_M, _NEAREST_M = 1e-3, 0.1
 """Difference in depth within one surface, and least depth of a projected point."""
+_AROUND = 0.06
+"""Surroundings of an object, as a share of its height."""
 _LOWER_PART = 0.25
 """Lower part of an object, as a share of its height, that stands on the ground."""
 _REASONS: Mapping[str, str] = {
@@ -52,7 +55,7 @@ _REASONS: Mapping[str, str] = {
     "repainted": "it is repainted too much",
     "mismatched": "its mesh and its outline differ by {:.0%}",
     "unsupported": "{:.0%} of its lower part is cut off in the photograph",
-    "uncovered": "{:.0%} of it uncovers a background that is not in the photograph",
+    "disturbed": "the picture around it changes too much",
 }
 
 
@@ -76,8 +79,8 @@ class ObjectFidelity:
     """1 - IoU of its mesh and its opaque pixels in the photograph, where nothing hides it."""
     unsupported: float
     """Share of its mesh's lower part that the photograph does not show: cut off by the own car, or afloat."""
-    uncovered: float
-    """Share of its pixels in the photograph that now show an estimated background."""
+    disturbed: float
+    """Mean change of the colours around it, in [0, 1]: the estimated background where it stood, and its border."""
 
     @classmethod
     def from_evidence(cls, index: int, **evidence: float) -> ObjectFidelity:
@@ -143,7 +146,7 @@ def find_edited(objects: Objects) -> list[int]:
     return edited.nonzero()[:, 0].tolist()
 
 
-def measure_fidelity(prepared: PreparedScene, changed: SceneIR) -> tuple[EditedRegion, ...]:
+def measure_fidelity(prepared: Compositor, changed: SceneIR) -> tuple[EditedRegion, ...]:
     """Measure the fidelity of each edited object of a scene.
 
     Args:
@@ -161,7 +164,8 @@ def measure_fidelity(prepared: PreparedScene, changed: SceneIR) -> tuple[EditedR
     with torch.no_grad():
         photographed = at_photographed_pose(objects)
         rest, now = prepared.find_visible(photographed), prepared.find_visible(objects)
-        pixels = _count_photographed_pixels(prepared, rest) | _count_edited_pixels(prepared, rest, now)
+        pixels = _count_photographed_pixels(prepared, rest) | {"completed": _measure_completed(prepared, now)}
+        disturbed = _measure_disturbance(prepared, changed, rest, now, rows)
         before, after = (_bounds_xyxy(prepared, found, rows) for found in (rest, now))
     regions = []
     for row, old, new in zip(rows, before, after, strict=True):
@@ -174,6 +178,7 @@ def measure_fidelity(prepared: PreparedScene, changed: SceneIR) -> tuple[EditedR
             **{name: float(share[row]) for name, share in pixels.items()},
             distorted=turn_rad + abs(math.log(new_height_px / height_px)) + bend,
             displaced=shift_px / height_px * _depth_uncertainty(prepared.scene, row),
+            disturbed=disturbed[row],
             repainted=float(objects.texture_code[row].abs().max()),
         )
         regions.append(EditedRegion(fidelity, (old, new)))
@@ -246,16 +251,8 @@ def _count_photographed_pixels(prepared: PreparedScene, rest: VisibleSurfaces) -
     }
 
 
-def _count_edited_pixels(
-    prepared: PreparedScene, rest: VisibleSurfaces, now: VisibleSurfaces
-) -> dict[str, Tensor]:
-    """Evidence (N,) of an edit that is a share of pixels, by its name.
-
-    Args:
-        prepared: The photographed scene.
-        rest: Its surfaces.
-        now: Its surfaces after the edit.
-    """
+def _measure_completed(prepared: PreparedScene, now: VisibleSurfaces) -> Tensor:
+    """(N,) share of objects' visible pixels that is completed. now: surfaces after the edit."""
     import torch
 
     from scene_ir.render.reference import measure_completion
@@ -267,17 +264,46 @@ def _count_edited_pixels(
     nearest = depth.new_full((height * width,), torch.inf).scatter_reduce(0, mesh.pixel, depth, "amin")
     visible = mesh.hit & (depth <= nearest[mesh.pixel] + _SAME_DEPTH_M)
     drawn_px = _sum_by_owner(mesh.owner, drawn * visible, count).clamp(min=1.0)
-    photographed = _MeshPixels.from_surfaces(rest, width)
-    was_mesh = torch.zeros_like(nearest, dtype=torch.bool)
-    was_mesh[photographed.pixel[photographed.hit]] = True
-    owner_map = _map_owners(prepared.scene).flatten().to(depth.device)
-    own_pixel = (owner_map >= 0).nonzero()[:, 0]
-    owner = owner_map[own_pixel]
-    bare = was_mesh[own_pixel] & torch.isinf(nearest[own_pixel])
-    return {
-        "completed": _sum_by_owner(mesh.owner, completed * visible, count) / drawn_px,
-        "uncovered": _sum_by_owner(owner, bare, count) / _sum_by_owner(owner, None, count).clamp(min=1.0),
-    }
+    return _sum_by_owner(mesh.owner, completed * visible, count) / drawn_px
+
+
+def _measure_disturbance(
+    compositor: Compositor, changed: SceneIR, rest: VisibleSurfaces, now: VisibleSurfaces, rows: Sequence[int]
+) -> dict[int, float]:
+    """Mean change of the colours around edited objects, in the photographed weather, by object.
+
+    Args:
+        compositor: The photographed scene.
+        changed: The scene after the edit.
+        rest: Its surfaces before it.
+        now: Its surfaces after it.
+        rows: The edited objects.
+    """
+    import cv2
+    import numpy as np
+
+    scene, (height, width) = compositor.scene, compositor.frame_hw
+    environment = scene.environment
+    codes = {name: getattr(environment, name) for name in ("weather", "foliage", "light")}
+    picture = compositor.render(changed.with_environment(**codes)).image
+    change = (picture - scene.photograph).abs().mean(dim=0).cpu().numpy()
+    before, after = (_MeshPixels.from_surfaces(surfaces, width) for surfaces in (rest, now))
+    found = {}
+    for row in rows:
+        own = np.zeros(height * width, np.uint8)
+        own[after.pixel[after.hit & (after.owner == row)].cpu().numpy()] = 1
+        both = own.copy()
+        both[before.pixel[before.hit & (before.owner == row)].cpu().numpy()] = 1
+        y, x = np.divmod(np.flatnonzero(both), width)
+        if not len(y):
+            found[row] = 0.0
+            continue
+        reach = max(2, round(_AROUND * int(y.max() - y.min() + 1)))
+        window = tuple(slice(max(int(v.min()) - reach, 0), int(v.max()) + reach + 1) for v in (y, x))
+        near = cv2.dilate(both.reshape(height, width)[window], np.ones((2 * reach + 1,) * 2, np.uint8))
+        around = (near > 0) & (own.reshape(height, width)[window] == 0)
+        found[row] = float(change[window][around].mean()) if around.any() else 0.0
+    return found
 
 
 def _sum_by_owner(owner: Tensor, values: Tensor | None, count: int) -> Tensor:

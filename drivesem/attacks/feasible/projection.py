@@ -82,7 +82,7 @@ class FeasibleSet:
         for parameter, where in space.blocks.items():
             if space.specs[parameter].per_object:
                 for bound in (self._lower, self._upper):
-                    bound[where].reshape(space.count, -1)[list(self._held)] = 0
+                    bound[where].reshape(space.count, space.specs[parameter].size)[list(self._held)] = 0
         if space.count == 0:
             return
         self._translation = to_float64_array(objects.translation)

@@ -74,7 +74,7 @@ def test_small_move_is_trusted(scene: SceneIR, compositor: Compositor) -> None:
     assert found.is_trusted
     assert found.completed < 0.01
     assert found.mismatched < 0.05
-    assert 0.02 < found.uncovered < 0.2
+    assert 0.01 < found.disturbed < 0.2
 
 
 def test_other_side_is_not_in_the_photograph(scene: SceneIR, compositor: Compositor) -> None:
