@@ -176,7 +176,8 @@ def build_explain_notes(draws: int) -> list[str]:
         "that show the failure after it, the first of those of its certificate; from certain on, as large a share "
         "as a certificate needs. For a failure by threshold, only the picture counts.",
         f"Adds to loss: mean Shapley value over frames; of failing: the same of whether a failure occurs, over "
-        f"failures{interval}. Against: at its full size, the part works against the failure, though a smaller amount may be needed. Of "
+        f"failures{interval}. Against: at its full size, the part works against the failure, though a smaller "
+        "amount may be needed. Of "
         "gradient: share of |gradient x change| at the photograph. Alone suffices, occurs without it: failures "
         "that occur after this parameter's part of the change only, and after all other parts. Largest change, "
         "sufficient: largest change of an object in the counterexample, and in the smallest changes that contain "
