@@ -184,6 +184,7 @@ class DetectorStages:
         return padded.contiguous(memory_format=torch.channels_last)
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """A detector without a gradient: `Detector` without loss and t*. `decode` takes the output of `forward`."""
 

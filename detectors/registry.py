@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import nn
+from torch import Tensor, nn
 
 from detectors import ensemble, planted
 from detectors.base import Detector, DetectorError, Predictor, disable_tf32, prepare_for_inference
@@ -44,6 +45,10 @@ _MAX_ANCHORS = 1000
 """Anchors per cell: each is a candidate at every place of the image."""
 
 
+AnyDetector: TypeAlias = "str | Path | Predictor | nn.Module | Callable[[Tensor], Any]"
+"""A name or file, a detector, a torch module with known outputs, or a function of images."""
+
+
 def find_code_to_run(name_or_path: str | Path) -> str | None:
     """The module or file of code that loading this detector would run; None if there is only data."""
     name = str(name_or_path)
@@ -56,18 +61,33 @@ def find_code_to_run(name_or_path: str | Path) -> str | None:
 
 
 def load_predictor(
-    name_or_path: str | Path, device: str | torch.device = "cpu", tiling: str = "auto"
+    detector: AnyDetector,
+    device: str | torch.device = "cpu",
+    tiling: str = "auto",
+    classes: Sequence[str] | None = None,
 ) -> Predictor:
-    """Load a detector for prediction only.
+    """Load a detector for prediction only, or make one of a Python object.
 
     Args:
-        name_or_path: `onnx:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts.
-        device: Device of the weights; ONNX graphs run on the CPU.
+        detector: `onnx:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts; or an object: a detector, which
+            is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); or a
+            function from images (1, 3, H, W), RGB in [0, 1], to `boxes` (M, 4) px, `scores` (M,) and `labels` (M,)
+            in a dict, as torchvision's detectors return them.
+        device: Device of the weights; ONNX graphs run on the CPU. An object stays where it is.
         tiling: Of an ONNX graph, "auto" or "off" (see `detectors.adapters.onnx`).
+        classes: Class names that the labels of a function index, or of a torch module without a `spec`.
 
     Raises:
-        DetectorError: As `load_detector`; or an ONNX graph of unknown format, or no ONNX Runtime.
+        DetectorError: As `load_detector`; an ONNX graph of unknown format, or no ONNX Runtime; or an object that is
+            no detector.
     """
+    if not isinstance(detector, str | Path):
+        if isinstance(detector, Predictor):
+            return detector
+        from detectors.adapters.network import adapt_object
+
+        return adapt_object(detector, classes)
+    name_or_path = detector
     name = str(name_or_path)
     if name.startswith(planted.PREFIX):
         fault, inner = planted.parse_planted_name(name)

@@ -3,7 +3,7 @@
     import drivesem as ds
 
     scene = ds.derender("000008.png", labels="label_2/000008.txt", calib="calib/000008.txt")
-    result = ds.run_attack(scene, "squeezedet", params="translate,rotate,mesh")
+    result = ds.attack(scene, "squeezedet", params="translate,rotate,mesh")
     result.picture, result.theta, result.failures
     scene.edit("objects[1].translate=0.5m,0m", weather="fog").render()
 
@@ -18,29 +18,44 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from detectors.registry import load_predictor as load_detector
-    from drivesem.run.counterexample import Counterexample, run_attack
+    from drivesem.analysis.python import confirm, explain, gate, holes, report, transfer, verify
+    from drivesem.run.counterexample import Counterexample, attack
     from drivesem.run.finished import AttackRun, load_run
+    from drivesem.run.probes import Gradient, detect, gradient, margin
     from drivesem.scenes.scene import Frames, Scene, demo_scene, derender, load_scene, open_dataset
 
 __all__ = [
     "AttackRun",
     "Counterexample",
     "Frames",
+    "Gradient",
     "Scene",
+    "attack",
+    "confirm",
     "demo_scene",
     "derender",
+    "detect",
+    "explain",
+    "gate",
+    "gradient",
+    "holes",
     "load_detector",
     "load_run",
     "load_scene",
+    "margin",
     "open_dataset",
-    "run_attack",
+    "report",
+    "transfer",
+    "verify",
 ]
 __version__ = "0.1.0"
 
 _NAMES_BY_MODULE = {
     "detectors.registry": ("load_detector",),
-    "drivesem.run.counterexample": ("Counterexample", "run_attack"),
+    "drivesem.analysis.python": ("confirm", "explain", "gate", "holes", "report", "transfer", "verify"),
+    "drivesem.run.counterexample": ("Counterexample", "attack"),
     "drivesem.run.finished": ("AttackRun", "load_run"),
+    "drivesem.run.probes": ("Gradient", "detect", "gradient", "margin"),
     "drivesem.scenes.scene": ("Frames", "Scene", "demo_scene", "derender", "load_scene", "open_dataset"),
 }
 

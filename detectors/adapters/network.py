@@ -12,7 +12,7 @@ import pkgutil
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -32,7 +32,8 @@ from detectors.adapters.spec import (
     validate_settings,
     with_project_names,
 )
-from detectors.base import Detector, DetectorError, describe_error
+from detectors.base import Detector, DetectorError, Predictor, describe_error
+from detectors.types import Detections
 
 PROBE_HW = (128, 256)
 """Size of the first image for a network of any size, px: a multiple of all strides."""
@@ -289,9 +290,77 @@ def _to_detector(instance: Any, spec_name: str, name: str, spec: Path | None) ->
         raise DetectorError(
             f"{spec_name}: expected a Detector or a torch.nn.Module, found {type(instance).__name__}"
         )
-    settings = validate_settings(getattr(instance, "spec", {}), f"{spec_name}: spec")
-    settings |= load_spec(spec) if spec is not None else {}
-    return NetworkDetector(str(getattr(instance, "name", name)), instance.eval(), settings, where=spec_name)
+    return _adapt_module(instance, spec_name, name, {} if spec is None else load_spec(spec))
+
+
+def _adapt_module(module: nn.Module, where: str, name: str, settings: Mapping[str, Any]) -> NetworkDetector:
+    own = validate_settings(getattr(module, "spec", {}), f"{where}: spec")
+    return NetworkDetector(str(getattr(module, "name", name)), module.eval(), {**own, **settings}, where=where)
+
+
+def adapt_object(instance: Any, classes: Sequence[str] | str | None = None) -> Predictor:
+    """A torch module or a function as a detector; see `detectors.registry.load_predictor`.
+
+    Args:
+        instance: The object.
+        classes: Class names, or "coco" or "coco91"; None uses the module's `spec`.
+
+    Raises:
+        DetectorError: It is neither, or its outputs have no known format.
+    """
+    settings = {} if classes is None else validate_settings({"classes": classes}, "detector")
+    if isinstance(instance, nn.Module):
+        name = type(instance).__name__
+        return _adapt_module(instance, f"detector {name}", name, settings).requires_grad_(False)
+    if not callable(instance) or isinstance(instance, type):
+        expected = "a name, a file, a detector, a torch.nn.Module or a function of images"
+        raise DetectorError(f"detector: expected {expected}, found {type(instance).__name__} {instance!r:.80}")
+    if classes is None:
+        raise DetectorError(
+            "detector: expected class names for a function (load_detector(..., classes=[...])), found none"
+        )
+    return FunctionPredictor(getattr(instance, "__name__", "function"), instance, settings["classes"])
+
+
+class FunctionPredictor:
+    """A detector without a gradient, from a function of images that returns dicts as torchvision's detectors do."""
+
+    def __init__(self, name: str, function: Callable[[Tensor], Any], classes: Sequence[str]) -> None:
+        self.name, self.classes = name, with_project_names(classes)
+        self._function = function
+
+    @torch.no_grad()
+    def forward(self, images: Tensor) -> list[tuple[Mapping[str, Any], tuple[int, int]]]:
+        """The dict of each image, and the image's (height, width)."""
+        outputs = []
+        for image in images:
+            output = self._function(image[None])
+            output = output[0] if isinstance(output, list | tuple) and len(output) == 1 else output
+            if not isinstance(output, Mapping) or not {"boxes", "scores", "labels"} <= output.keys():
+                expected = "a dict with boxes, scores and labels for an image"
+                raise DetectorError(f"detector {self.name}: expected {expected}, found {type(output).__name__}")
+            outputs.append((output, (int(image.shape[1]), int(image.shape[2]))))
+        return outputs
+
+    def decode(self, raw: list[tuple[Mapping[str, Any], tuple[int, int]]]) -> list[Detections]:
+        """Check and clip the boxes, and sort them by score."""
+        return [self._to_detections(output, hw) for output, hw in raw]
+
+    def _to_detections(self, output: Mapping[str, Any], hw: tuple[int, int]) -> Detections:
+        boxes, scores = (torch.as_tensor(output[key]).float().cpu() for key in ("boxes", "scores"))
+        labels = torch.as_tensor(output["labels"]).long().cpu()
+        count = len(scores)
+        whole = bool(((labels >= 0) & (labels < len(self.classes))).all())
+        in_range = bool(((scores >= 0) & (scores <= 1)).all() and boxes.isfinite().all())
+        if boxes.numel() != 4 * count or labels.shape != (count,) or not (whole and in_range):
+            expected = f"boxes (M, 4) px, scores (M,) in [0, 1] and labels (M,) below {len(self.classes)}"
+            found = f"{tuple(boxes.shape)}, {tuple(scores.shape)} and {tuple(labels.shape)}, or other values"
+            raise DetectorError(f"detector {self.name}: expected {expected}, found {found}")
+        boxes = boxes.reshape(-1, 4)
+        limit = boxes.new_tensor([hw[1], hw[0], hw[1], hw[0]])
+        order = scores.argsort(descending=True, stable=True)
+        order = order[torch.tensor([bool(self.classes[i]) for i in labels[order].tolist()], dtype=torch.bool)]
+        return Detections(boxes[order].clamp_min(0).minimum(limit), labels[order], scores[order])
 
 
 def _find_class(where: str, name: str) -> Any:

@@ -276,6 +276,23 @@ class Perturbation:
     sun: Tensor | None = None
     """(3,), codes."""
 
+    @classmethod
+    def between(cls, photographed: SceneIR, scene: SceneIR) -> Perturbation:
+        """All changes from the photographed scene to a state of it, by `ground` parametrisation."""
+        before, now, environment = photographed.objects, scene.objects, scene.environment
+        flat = ground_axes(before.yaw, torch.ones_like(before.yaw), photographed.environment.ground)[..., [0, 2]]
+        moved_m = (flat @ (now.translation - before.translation)[:, [0, 2], None])[..., 0]
+        return cls(
+            color=now.texture_code,
+            weather=environment.weather,
+            foliage=environment.foliage,
+            translate=moved_m / before.size_lhw[:, :1],
+            rotate=(now.yaw - before.yaw)[:, None],
+            mesh=ffd.to_symmetric(now.ffd - before.ffd),
+            size=now.size_lhw[:, :1] / before.size_lhw[:, :1] - 1,
+            sun=environment.light.to(before.yaw),
+        )
+
 
 def parse_params(text: str) -> tuple[Parameter, ...]:
     """Parameters from "translate,rotate,mesh". Raises FormatError naming the unknown one and the known ones."""

@@ -8,6 +8,7 @@ from scene_ir.errors import make_printable
 
 _DETECTOR_ERROR = re.compile(r"(?:(.+?): )?expected (.+?), found (.+)", re.DOTALL)
 """The form of errors of `detectors`: field, expected, found."""
+_OPTION = re.compile(r"--([a-z][a-z-]*)")
 _WHOLE_DETECTOR = (None, "detector")
 """Fields of such errors about the detector itself, not a file or a part of it."""
 
@@ -43,6 +44,13 @@ class UsageError(ValueError):
         if where in _WHOLE_DETECTOR:
             return cls(field, f"{expected} ({wanted})", actual)
         return cls(f"{field}: {where}", wanted, actual)
+
+    def with_arguments(self) -> UsageError:
+        """The same error with options as Python's arguments: `--t-star` becomes t_star."""
+        field, expected = (
+            _OPTION.sub(lambda flag: flag[1].replace("-", "_"), t) for t in (self.field, self.expected)
+        )
+        return UsageError(field, expected, self.actual)
 
     def __reduce__(self) -> tuple[type[UsageError], tuple[str, str, str]]:
         """Pickle the parts, for errors that cross processes."""

@@ -23,7 +23,6 @@ from drivesem.attacks.space import (
     ParameterSpace,
     Perturbation,
     behind_camera,
-    ground_axes,
 )
 from drivesem.config.edits import FOLIAGE_CODES, SUN_CODES, WEATHER_CODES
 from scene_ir.errors import RangeError, make_printable
@@ -84,7 +83,7 @@ class SceneSliders:
         self.rest = scene.unperturbed()
         if len(scene.objects) and not scene.objects.source:
             raise RangeError("scene", "one that was made from a photograph", "meshes alone")
-        found = _perturbation_between(self.rest, scene)
+        found = Perturbation.between(self.rest, scene)
         budget = _widen_budget(budget, found)
         params = [p for p in Parameter if p is not Parameter.MESH and getattr(budget, p.value) > 0]
         self.space = ParameterSpace(self.rest, params, budget)
@@ -180,23 +179,6 @@ class SceneSliders:
                 self._places[name] = (i, factor)
                 title = name.rpartition(".")[2].replace("_", " ")
                 self.sliders[name] = Slider(name, title, unit, low, high, step, value, car, str(parameter))
-
-
-def _perturbation_between(rest: SceneIR, scene: SceneIR) -> Perturbation:
-    """Differences between a scene and the same scene as photographed, without shapes."""
-    there, here = rest.objects, scene.objects
-    flat = ground_axes(there.yaw, torch.ones_like(there.yaw), rest.environment.ground)[..., [0, 2]]
-    moved_m = (flat @ (here.translation - there.translation)[:, [0, 2], None])[..., 0]
-    environment = scene.environment
-    return Perturbation(
-        color=here.texture_code,
-        weather=environment.weather,
-        foliage=environment.foliage,
-        translate=moved_m / there.size_lhw[:, :1],
-        rotate=(here.yaw - there.yaw)[:, None],
-        size=here.size_lhw[:, :1] / there.size_lhw[:, :1] - 1,
-        sun=environment.light.to(there.yaw),
-    )
 
 
 def _widen_budget(budget: Budget, found: Perturbation) -> Budget:

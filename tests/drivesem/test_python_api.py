@@ -5,14 +5,18 @@ from __future__ import annotations
 import base64
 import doctest
 import importlib
+import inspect
 import json
+import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -20,13 +24,16 @@ import pytest
 import torch
 
 import drivesem as ds
+from detectors.base import Candidates
+from detectors.boxes import iou_matrix
+from detectors.types import Targets
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
 from drivesem.config.errors import UsageError
+from drivesem.config.options import FrameCommandConfig, SceneOptions
 from drivesem.failures.grades import Certificate, SecondOpinion
 from drivesem.run import attack as attack_run
 from drivesem.run.attack import AttackWorker
-from drivesem.run.counterexample import OPTIONS as ATTACK_OPTIONS
 from drivesem.run.results import Failure, load_frame
 from drivesem.scenes.scene import to_image_tensor
 from scene_ir.errors import FormatError, RangeError, SceneError
@@ -53,7 +60,7 @@ def scene() -> ds.Scene:
 
 @pytest.fixture(scope="module")
 def counterexample(scene: ds.Scene) -> ds.Counterexample:
-    return ds.run_attack(scene, "squeezedet", **OPTIONS)
+    return ds.attack(scene, "squeezedet", **OPTIONS)
 
 
 class Tags(HTMLParser):
@@ -107,22 +114,27 @@ def test_importing_is_quick_and_every_name_is_there() -> None:
         _ = ds.nothing  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_run_attack_stands_next_to_the_package() -> None:
-    from drivesem.attacks import space
+def test_the_signature_is_the_commands() -> None:
+    parameters = dict(inspect.signature(ds.attack).parameters)
+    assert list(parameters)[:2] == ["scene", "detector"]
+    of_a_data_set = {field.name for field in fields(FrameCommandConfig) + fields(SceneOptions)} - {
+        "device",
+        "seed",
+    }
+    others = {"detector", "like", "part", "grade", "whole", "incremental", "keep_mb", "parametrisation"}
+    settings = {field.name: field.default for field in fields(AttackConfig)}
+    wanted = {name: value for name, value in settings.items() if name not in of_a_data_set | others}
+    options = {
+        name: parameter.default for name, parameter in parameters.items() if name not in ("scene", "detector")
+    }
+    assert options == wanted
+    assert set(parameters) <= set(re.findall(r"^    (\w+): ", inspect.getdoc(ds.attack) or "", re.MULTILINE))
 
-    assert importlib.import_module("drivesem.attacks.space") is space
-    assert callable(ds.run_attack)
-    with pytest.raises(UsageError, match="attack: expected options among"):
-        ds.run_attack(None, nothing=1)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
-
-def test_options_are_the_commands() -> None:
-    assert {field.name for field in fields(AttackConfig)} > set(ATTACK_OPTIONS)
-
-
-def test_examples_in_docstrings() -> None:
-    for name in ("drivesem.scenes.scene", "drivesem.run.counterexample"):
-        module = importlib.import_module(name)
+def test_examples_in_docstrings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("scenes.scene", "run.counterexample", "run.probes", "analysis.python"):
+        module = importlib.import_module(f"drivesem.{name}")
         assert doctest.testmod(module, raise_on_error=True).attempted > 0
         assert "```pycon\n>>> import" in (module.__doc__ or "")  # else the site shows quotations
 
@@ -143,6 +155,111 @@ def test_a_scene_has_a_picture_and_a_description(scene: ds.Scene, tmp_path: Path
     (tmp_path / "else" / "file").touch()
     with pytest.raises(UsageError, match="folder: expected a new folder, or one of a scene"):
         scene.save(tmp_path / "else")
+
+
+def test_a_scene_says_what_is_changed(scene: ds.Scene) -> None:
+    assert repr(scene) == "Scene('demo-000', 1241x376 px, 6 vehicles)"
+    assert scene.theta == {}
+    assert np.allclose(scene.boxes(), scene.ir.objects.box2d.numpy(), atol=0.51)
+    changed = scene.edit("objects[1].translate=0m,0.5m", "objects[0].rotate=10deg", weather="fog")
+    assert repr(changed).endswith("6 vehicles, 4 changes)")
+    assert changed.theta == pytest.approx(
+        {
+            "weather.fog": 0.6,
+            "weather.overcast": 0.4,
+            "objects[1].translate.across": 0.5 / scene.rows()[1]["length_m"],
+            "objects[0].yaw": math.radians(10),
+        },
+        abs=1e-5,
+    )
+    assert changed.weather == pytest.approx({"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4})
+    moved = np.abs(changed.boxes() - scene.boxes()).max(axis=1) > 0.01
+    assert moved.tolist() == [True, True, False, False, False, False]
+
+
+def test_detections_margins_and_gradients(scene: ds.Scene) -> None:
+    detector = ds.load_detector("squeezedet")
+    of_scene, of_picture = ds.detect(detector, scene), ds.detect("squeezedet", scene.photograph)
+    assert torch.equal(of_scene.boxes_xyxy, of_picture.boxes_xyxy)
+    assert torch.equal(of_scene.scores, of_picture.scores)
+    best = {
+        row: float(of_scene.scores[iou_matrix(box[None], of_scene.boxes_xyxy)[0] >= 0.7].amax())
+        for row, box in enumerate(torch.from_numpy(scene.boxes()))
+        if row in (0, 3)
+    }
+    for row, score in best.items():
+        logit = math.log(score / (1 - score)) - math.log(detector.t_star / (1 - detector.t_star))
+        assert ds.margin(scene, detector, row) == pytest.approx(logit, abs=1e-3)
+    assert ds.margin(scene, detector, 0, t_star=0.999) < 0
+    with pytest.raises(UsageError, match="object: expected a row from 0 to 5, found 6"):
+        ds.margin(scene, detector, 6)
+
+
+@pytest.mark.parametrize("objective", ["objectness", lambda candidates, *_: -candidates.log_scores[:, 0].amax()])
+def test_gradients_are_central_differences(scene: ds.Scene, objective: Any) -> None:
+    state, step = scene.edit(weather="fog"), 1e-3
+    found = ds.gradient(state, "squeezedet", objective, params="weather,translate")
+    assert found.pixels.shape == (3, 376, 1241)
+    losses = [
+        ds.gradient(
+            state.edit(weather={**state.weather, "fog": fog}), "squeezedet", objective, params="weather"
+        ).loss
+        for fog in (0.6 + step, 0.6 - step)
+    ]
+    assert found.theta["weather.fog"] == pytest.approx((losses[0] - losses[1]) / (2 * step), rel=0.05, abs=0.02)
+
+
+def test_an_objective_of_ones_own(scene: ds.Scene, tmp_path: Path) -> None:
+    calls = []
+
+    def hide_the_first(candidates: Candidates, targets: Targets, t_star: float) -> torch.Tensor:
+        calls.append(t_star)
+        overlap = iou_matrix(targets.boxes_xyxy[:1], candidates.boxes_xyxy[:, 0])[0] > 0.5
+        return -candidates.log_scores[overlap, 0].amax()
+
+    options = {"params": "color,weather", "steps": 3, "confirm": False, "draws": 8}
+    found = ds.attack(scene, "squeezedet", objective=hide_the_first, **options)
+    assert len(calls) > 3
+    assert max(found.result.loss_trace) > found.result.loss_trace[0]
+    with pytest.raises(UsageError, match="objective: expected an objective by name"):
+        found.save(tmp_path / "run")
+    with pytest.raises(SceneError, match="objective: expected a function that returns a tensor"):
+        ds.attack(scene, "squeezedet", objective=lambda *_: 1.0, **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_functions_and_modules_are_detectors(scene: ds.Scene) -> None:
+    def one_box(images: torch.Tensor) -> dict[str, Any]:
+        assert images.shape == (1, 3, 376, 1241)
+        return {"boxes": [[-5.0, 10.0, 90.0, 60.0], [1.0, 2.0, 3.0, 4.0]], "scores": [0.5, 0.75], "labels": [0, 1]}
+
+    detector = ds.load_detector(one_box, classes=["Car", "Pedestrian"])
+    found = ds.detect(detector, scene)
+    assert found.boxes_xyxy.tolist() == [[1.0, 2.0, 3.0, 4.0], [0.0, 10.0, 90.0, 60.0]]
+    assert found.labels.tolist() == [1, 0]
+    assert ds.attack(scene, detector, params="weather", passes=24, confirm=False).result.objects == 6
+    assert ds.load_detector(Blobs()).classes == ("Car", "Pedestrian")
+    with pytest.raises(ValueError, match=r"detector Flat\w+: expected .*, found"):
+        ds.load_detector(torch.nn.Flatten())
+    with pytest.raises(ValueError, match="expected class names for a function"):
+        ds.attack(scene, one_box)
+    with pytest.raises(ValueError, match=r"detector one_box: expected boxes \(M, 4\) px"):
+        ds.detect(ds.load_detector(one_box, classes=["Car"]), scene)
+    for wrong in (scene.photograph, 3.5, None):
+        with pytest.raises(ValueError, match="detector: expected a name, a file, a detector"):
+            ds.load_detector(wrong)
+        with pytest.raises(ValueError, match="scene: expected a scene"):
+            ds.attack(wrong)
+
+
+class Blobs(torch.nn.Module):
+    """Boxes and probabilities of dark blobs."""
+
+    spec: ClassVar[dict[str, Any]] = {"classes": ["Car", "Pedestrian"], "multiple": 16}
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        dark = 0.5 - torch.nn.functional.avg_pool2d(images.mean(1), 16).flatten(1)
+        boxes = torch.tensor([0.0, 0.0, 32.0, 32.0]).expand(1, dark.shape[1], 4)
+        return boxes, torch.stack((dark, -dark), -1).sigmoid()
 
 
 def test_edits_are_the_commands(scene: ds.Scene, tmp_path: Path) -> None:
@@ -181,15 +298,41 @@ def test_an_attack_is_the_commands(counterexample: ds.Counterexample, small_run:
     assert counterexample.theta == {name: coordinate["value"] for name, coordinate in theta.items()}
     assert np.array_equal(counterexample.picture, read_image(written / "counterexample.png"))
     assert counterexample.result.failures == load_frame(written / "result.json").failures
-    counterexample.save(tmp_path / "frame")
-    names, saved = (
+    counterexample.save(tmp_path / "run")
+    saved = tmp_path / "run" / "frames" / "demo-000"
+    names, of_frame = (
         sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-        for folder in (written, tmp_path / "frame")
+        for folder in (written, saved)
     )
-    assert names == saved
+    assert names == of_frame
     for name in names:
         if name.name != "result.json":  # which holds the seconds
-            assert (tmp_path / "frame" / name).read_bytes() == (written / name).read_bytes(), name
+            assert (saved / name).read_bytes() == (written / name).read_bytes(), name
+
+
+def test_a_saved_counterexample_is_a_run(counterexample: ds.Counterexample, tmp_path: Path) -> None:
+    for _ in range(2):  # the second replaces the first
+        counterexample.save(tmp_path / "run")
+        run = ds.load_run(tmp_path / "run")
+        assert [frame.result.identifier for frame in run.frames] == ["demo-000"]
+    assert ds.verify(run).data["agree"] is True
+    assert ds.report(tmp_path / "run", out=tmp_path / "page.html") == tmp_path / "page.html"
+    assert "demo-000" in (tmp_path / "page.html").read_text()
+    (tmp_path / "run" / "frames" / "another").mkdir()
+    with pytest.raises(UsageError, match="folder: expected a new folder, or one of the frame demo-000 alone"):
+        counterexample.save(tmp_path / "run")
+
+
+def test_analyses_take_runs_and_folders(small_run: Path, tmp_path: Path) -> None:
+    confirmed = ds.confirm(ds.load_run(small_run), out=str(tmp_path / "confirm"), workers=1)
+    assert (tmp_path / "confirm" / "confirm.json").is_file()
+    assert confirmed.out == tmp_path / "confirm"
+    with pytest.raises(UsageError, match=r"run: expected a run .*, found int"):
+        ds.explain(7)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UsageError, match=r"speed: expected one of .*points"):
+        ds.explain(small_run, speed=1)
+    with pytest.raises(UsageError, match="points: expected at least 1, found 0"):
+        ds.explain(small_run, points=0)
 
 
 def test_a_counterexample_has_a_picture_and_a_description(
@@ -253,7 +396,7 @@ def test_names_are_escaped(counterexample: ds.Counterexample) -> None:
 
 def test_a_detector_that_is_loaded(scene: ds.Scene, counterexample: ds.Counterexample) -> None:
     detector = ds.load_detector("squeezedet")
-    assert ds.run_attack(scene.ir, detector, **OPTIONS).theta == counterexample.theta
+    assert ds.attack(scene.ir, detector, **OPTIONS).theta == counterexample.theta
 
 
 @pytest.mark.parametrize(
@@ -270,7 +413,7 @@ def test_a_detector_that_is_loaded(scene: ds.Scene, counterexample: ds.Counterex
 )
 def test_bad_options_name_the_argument(scene: ds.Scene, options: dict[str, object], line: str) -> None:
     with pytest.raises((UsageError, SceneError), match=line) as caught:
-        ds.run_attack(scene, **options)  # pyright: ignore[reportArgumentType]
+        ds.attack(scene, **options)  # pyright: ignore[reportArgumentType]
     assert "\n" not in str(caught.value)
     assert "--" not in str(caught.value).partition("expected")[0]
 
@@ -285,7 +428,7 @@ def test_bad_options_name_the_argument(scene: ds.Scene, options: dict[str, objec
 )
 def test_a_loaded_detector_excludes_loading_options(scene: ds.Scene, options: dict[str, str], line: str) -> None:
     with pytest.raises(UsageError, match=line):
-        ds.run_attack(scene, ds.load_detector("squeezedet"), **options)  # pyright: ignore[reportArgumentType]
+        ds.attack(scene, ds.load_detector("squeezedet"), **options)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_detector_without_gradient_gets_the_commands_method(
@@ -298,10 +441,10 @@ def test_a_detector_without_gradient_gets_the_commands_method(
     monkeypatch.setattr(attack_run, "load_predictor", lambda *_: Blinking())
     for detector in (Blinking(), "any"):
         with pytest.raises(ZeroDivisionError):
-            ds.run_attack(scene, detector, params="color", confirm=False)
+            ds.attack(scene, detector, params="color", confirm=False)
         every = "method: expected one of random, halton, cma-es, corners, climb for"
         with pytest.raises(UsageError, match=every):
-            ds.run_attack(scene, detector, params="color", confirm=False, method="apgd")
+            ds.attack(scene, detector, params="color", confirm=False, method="apgd")
     assert methods == ["climb", "climb"]
 
 
@@ -326,7 +469,7 @@ def test_frames_of_a_data_set(small_kitti: Path) -> None:
     assert frames[frames.names[0]].identifier == first.identifier
     with pytest.raises(RangeError, match="frame of"):
         _ = frames["nobody"]
-    with pytest.raises(RangeError, match="dataset: expected one of coco"):
+    with pytest.raises(RangeError, match="dataset: expected one of bdd100k, coco"):
         ds.open_dataset("lego", small_kitti)
 
 

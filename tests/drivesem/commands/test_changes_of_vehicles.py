@@ -62,7 +62,7 @@ def test_an_edit_keeps_the_change_and_reports_it(
 def test_the_same_from_python(monkeypatch: pytest.MonkeyPatch) -> None:
     worse = count(0, -1)
     monkeypatch.setattr(run_attack, "margin_objective", lambda *_: next(worse))
-    found = ds.run_attack(
+    found = ds.attack(
         ds.demo_scene(0), method="climb", budget="street", params="translate", passes=PASSES, changes="park",
         confirm=False,
     )  # fmt: skip
