@@ -68,9 +68,10 @@ def _print_retraining(rows: Sequence[RetrainRow], console: Console) -> None:
     table = Table(title="Car, %, on frames that were not trained on", title_justify="left")
     table.add_column("frames, labels")
     table.add_column("detector")
-    for title in ("AP50", "recall", "at t*", "broken"):
+    for title in ("AP50", "recall", "at t*", "frames broken"):
         table.add_column(title, justify="right")
     for row in rows:
-        numbers = (row.scores.ap50, row.scores.recall, row.scores.recall_at_t_star, row.broken)
-        table.add_row(f"{row.frames}, {row.labels}", row.detector, *(format_percent(number) for number in numbers))
+        numbers = (row.scores.ap50, row.scores.recall, row.scores.recall_at_t_star)
+        cells = (*map(format_percent, numbers), row.broken_text)
+        table.add_row(f"{row.frames}, {row.labels}", row.detector, *cells)
     console.print(table)

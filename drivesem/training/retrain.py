@@ -88,6 +88,11 @@ class RetrainRow:
     broken: float | None = None
     """Share of frames in which an attack succeeded; None where nothing was attacked."""
 
+    @property
+    def broken_text(self) -> str:
+        """Such as `40 % of 5`; "" where nothing was attacked."""
+        return "" if self.broken is None else f"{100 * self.broken:.0f} % of {self.count}"
+
     def to_json(self) -> dict[str, Any]:
         """Flatten the row to metrics by name."""
         row = {"set": self.frames, "labels": self.labels, "detector": self.detector, "frames": self.count}
@@ -215,7 +220,7 @@ def _verdicts(
         return compare_retrained(name, detectors, truths, found, config.seed)
 
     attacked = [frame for frame in held_out if frame.result.attacked]
-    verdicts = judge("photographs", held_out, "benign")
+    verdicts = judge("benign", held_out, "benign")
     if attacked:
         verdicts += judge("counterexamples of the run", attacked, "counterexample")
     if not fresh.is_dir():
@@ -401,9 +406,8 @@ def build_verdict_table(verdicts: Sequence[RetrainVerdict]) -> ReportTable:
 
 
 def _cells(row: RetrainRow) -> tuple[str, ...]:
-    share = "" if row.broken is None else f"{100 * row.broken:.0f} % of {row.count}"
     metrics = map(format_percent, row.scores.columns)
-    return row.frames, row.labels, row.detector, *metrics, str(row.scores.objects), share
+    return row.frames, row.labels, row.detector, *metrics, str(row.scores.objects), row.broken_text
 
 
 def load_start(name: str, device: str, setting: str = "--start") -> Detector:

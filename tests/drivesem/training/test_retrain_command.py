@@ -39,7 +39,7 @@ def test_the_verdict_on_recall_needs_frames(frames: int, before: float, after: f
     detectors: Any = [SimpleNamespace(name="d", classes=("Car",), t_star=0.5)] * 2
     truths = [[Targets(CAR, torch.tensor([0]), torch.tensor([False]))] * frames] * 2
     found = [[_detections(score)] * frames for score in (before, after)]
-    ap50, recall = compare_retrained("photographs", detectors, truths, found, 0)
+    ap50, recall = compare_retrained("benign", detectors, truths, found, 0)
     assert (recall.count, recall.objects, recall.verdict) == (frames, frames, verdict)
     assert recall.compared.difference == pytest.approx((after > 0.5) - (before > 0.5))
     assert recall.cells()[-2:] == (
@@ -65,10 +65,10 @@ def test_a_run_is_learned_from_and_attacked_again(tmp_path: Path) -> None:
     rows = {(row["set"], row["labels"], row["detector"]): row for row in data["rows"]}
     assert len(rows) == 8
     verdicts = {(row["set"], row["metric"]): row for row in data["verdicts"]}
-    sets = ("photographs", "counterexamples of the run", "counterexamples against each")
+    sets = ("benign", "counterexamples of the run", "counterexamples against each")
     assert set(verdicts) == {(name, metric) for name in sets for metric in ("AP50", "recall at t*")}
     assert {row["verdict"] for row in verdicts.values()} == {"too few to tell"}, "two frames prove nothing"
-    benign = verdicts["photographs", "recall at t*"]
+    benign = verdicts["benign", "recall at t*"]
     assert benign["frames"] == 2
     assert benign["before"] == pytest.approx(rows["benign", "paper", "before"]["recall_at_t_star"])
     assert benign["after"] == pytest.approx(rows["benign", "paper", "after"]["recall_at_t_star"])
