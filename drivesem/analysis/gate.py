@@ -634,7 +634,7 @@ def _build_table(title: str, rows: Sequence[GateRow], verb: str) -> ReportTable:
             f"{100 * row.before:.0f}",
             f"{100 * row.after:.0f}",
             _format_difference(row),
-            f"{row.p:.3f}",
+            "<0.001" if row.p < 0.0005 else f"{row.p:.3f}",
             str(row.samples),
             "grew" if row.grew else "",
         )
