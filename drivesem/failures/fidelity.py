@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from scene_ir.render.prepare import PreparedScene, VisibleSurfaces
     from scene_ir.types import Objects, SceneIR
 
-BASE_ERROR = 0.0024
+BASE_ERROR = 0.003
 """Error of every edit."""
 ERROR_WEIGHTS: Mapping[str, float] = {
-    "completed": 0.0685,
-    "distorted": 0.0285,
-    "displaced": 1.1678,
-    "repainted": 0.0296,
-    "mismatched": 0.0815,
-    "unsupported": 0.1017,
-    "disturbed": 0.2055,
+    "completed": 0.064,
+    "distorted": 0.029,
+    "displaced": 0.7856,
+    "repainted": 0.0271,
+    "mismatched": 0.1265,
+    "unsupported": 0.0862,
+    "disturbed": 0.2036,
 }
 """Error per unit of each piece of evidence."""
 ERROR_SCALE = 0.1
 """Error at which the score is 1 / e."""
-MIN_FIDELITY = 0.35
+MIN_FIDELITY = 0.62
 """Score from which a picture is trusted."""
 MIN_OVERLAP = 0.1
 """Share of a failure's box from which an edited object is a part of its picture."""

@@ -24,8 +24,8 @@ from drivesem.attacks.space import ground_axes
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.failures.fidelity import ERROR_SCALE, ERROR_WEIGHTS, measure_fidelity
-from drivesem.report.plots import write_scatter
-from drivesem.report.tables import AnalysisReport, ReportTable
+from drivesem.reporting.plots import write_scatter
+from drivesem.reporting.tables import AnalysisReport, ReportTable
 from drivesem.scenes.label_free import FIT_TO_LABELS, estimate_label_poses
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import VARIANTS, Plan, SynthFrame, SynthSettings, build_street, plan_frame, render_frame
