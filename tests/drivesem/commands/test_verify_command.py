@@ -24,6 +24,7 @@ from drivesem.run import attack as run_attack
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import rebuild_objective
 from drivesem.run.results import load_frame
+from drivesem.synth.demo import demo_scene
 from scene_ir import files
 from scene_ir.io import load_scene
 from tests.drivesem.invoke import invoke, refusal, run_json
@@ -39,8 +40,9 @@ def verify(run: Path, *words: object, code: int = 1) -> Any:
 
 
 class Drifting:
-    """A detector without gradient: sees one car, which is not there, further to the right the brighter it is."""
+    """A detector without gradient: the first car, and one that is not there, the further right the brighter it is."""
 
+    first = demo_scene(0, 0).objects.box2d[0]
     name, classes, t_star = "drifting", CLASSES, 0.5
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -48,8 +50,9 @@ class Drifting:
 
     def decode(self, raw: torch.Tensor) -> list[Detections]:
         lefts = (2000 * raw) % 300
-        boxes = [torch.stack([x, 0 * x, x + 20, 0 * x + 20])[None] for x in lefts]
-        return [Detections(box, torch.tensor([CLASSES.index("Car")]), torch.tensor([0.9])) for box in boxes]
+        car = CLASSES.index("Car")
+        boxes = [torch.stack([torch.stack([x, 0 * x, x + 20, 0 * x + 20]), self.first]) for x in lefts]
+        return [Detections(pair, torch.tensor([car, car]), torch.tensor([0.9, 0.8])) for pair in boxes]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -250,6 +253,7 @@ def test_a_success_that_is_none(run: Path) -> None:
         "success_moved",
         "success_moved by labels_moved.txt",
         "metrics.json: successes_moved",
+        *(f"metrics.json: broken.{name}" for name in ("count", "low", "high")),
         "result.json",
     }
     assert (found["success_moved"]["expected"], found["success_moved"]["found"]) == ("False", "True")
