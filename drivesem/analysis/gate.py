@@ -27,14 +27,14 @@ from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, LEVEL, PairedDifference, holm, paired_differences, ratio_metric
 from drivesem.failures.kinds import BACKGROUND_IOU, MATCH_IOU
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     DETECTED_COLOUR,
     TRUE_COLOUR,
     encode_jpeg_data_url,
     write_picture,
 )
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
-from drivesem.report.web import render_page
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting.web import render_page
 from drivesem.run.driver import FrameAnalyser, analyse_runs
 from drivesem.run.export import PACKAGE, GateSource, open_gate_package, write_lossy_frame
 from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
@@ -224,7 +224,7 @@ def _describe_scope(counts: Mapping[str, int]) -> str:
 
 def _find_close_ups(
     out: Path, runs: Sequence[AttackRun], pairs: Mapping[str, Sequence[PairedSamples]]
-) -> dict[str, CloseUp]:
+) -> dict[str, HolePictures]:
     """Return the close-ups by hole of the analysed frames."""
     close_ups = {}
     for number, run in enumerate(runs):
@@ -234,7 +234,7 @@ def _find_close_ups(
             folder = out / "runs" / str(number) / FRAMES / name
             for pair in pairs.get(prefix + name, ()):
                 paths = tuple(folder / f"{pair.index}-{side}.jpg" for side in _SIDES)
-                close_ups[_hole_name(prefix + name, pair)] = CloseUp(pair, paths)
+                close_ups[_hole_name(prefix + name, pair)] = HolePictures(pair, paths)
     return close_ups
 
 
@@ -468,7 +468,7 @@ def _sign_test(pairs: Sequence[PairedSamples]) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class CloseUp:
+class HolePictures:
     """Pictures of one certain failure."""
 
     pair: PairedSamples
@@ -491,7 +491,7 @@ class GateFacts:
     """Reasons by frame that could not be compared; if there are any, the gate is not passed."""
     allow_empty: bool = False
     """Whether a gate without certain failures is passed."""
-    close_ups: Mapping[str, CloseUp] = field(default_factory=dict)
+    close_ups: Mapping[str, HolePictures] = field(default_factory=dict)
     """Pictures by hole."""
     verb: str = "lost"
     """Past participle that names a failure."""
@@ -558,7 +558,7 @@ def build_gate_report(out: Path, rows: Sequence[GateRow], facts: GateFacts) -> A
     )
 
 
-def _describe_case(row: GateRow, verb: str, close_up: CloseUp | None) -> dict[str, Any]:
+def _describe_case(row: GateRow, verb: str, close_up: HolePictures | None) -> dict[str, Any]:
     """Values of a case on the page."""
     case = {"row": row, "name": _row_name(row), "text": _describe_row(row, verb), "images": []}
     if close_up is None or not all(path.is_file() for path in close_up.paths):
