@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 
 from drivesem.attacks.scene_edits import apply_changes
 from drivesem.attacks.space import ground_axes
@@ -204,18 +204,19 @@ def measure_error(true: Image, drawn: Image, region: Mask, height_px: float) -> 
 
     def reduce(picture: Image) -> Image:
         smooth = cv2.GaussianBlur(np.ascontiguousarray(picture[window]), (0, 0), sigma)
-        return cv2.resize(smooth.mean(axis=2), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(smooth.mean(axis=2), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        return np.asarray(small, np.float32)
 
     one, two = reduce(true), reduce(drawn)
     inside = cv2.resize(region[window].astype(np.float32), one.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
     return float(1 - _structural_similarity(one, two)[inside].mean()) / 2 if inside.any() else 0.0
 
 
-def _structural_similarity(one: Image, two: Image) -> Image:
+def _structural_similarity(one: Image, two: Image) -> NDArray[np.floating]:
     """SSIM (h, w) of two luminances, after Wang et al. (2004)."""
 
-    def mean(values: Image) -> Image:
-        return cv2.GaussianBlur(values, (0, 0), 1.5)
+    def mean(values: NDArray[np.floating]) -> Image:
+        return np.asarray(cv2.GaussianBlur(values, (0, 0), 1.5), np.float32)
 
     mean_one, mean_two = mean(one), mean(two)
     variances = mean(one * one) - mean_one**2 + mean(two * two) - mean_two**2
@@ -345,7 +346,7 @@ def _arrays(rows: Sequence[Mapping[str, Any]]) -> tuple[Floats, Floats]:
 def rank_correlation(rows: Sequence[Mapping[str, Any]], weights: Floats) -> float:
     """Spearman's correlation of predicted and true errors."""
     evidence, error = _arrays(rows)
-    return float(spearmanr(evidence @ weights, error).statistic)
+    return float(np.corrcoef(rankdata(evidence @ weights), rankdata(error))[0, 1])
 
 
 def choose_threshold(rows: Sequence[Mapping[str, Any]], weights: Floats) -> float:
@@ -369,6 +370,7 @@ def run_fidelity(config: FidelityConfig) -> AnalysisReport:
     evidence, error = _arrays(held_out)
     predicted, bad = evidence @ weights, error > BAD_ERROR
     rejected = predicted > threshold
+    both = int((bad & rejected).sum())
     names = ("error of every edit", *ERROR_WEIGHTS)
     data = {
         "streets": config.streets,
@@ -377,13 +379,8 @@ def run_fidelity(config: FidelityConfig) -> AnalysisReport:
         "rank_correlation": {"held_out": round(found, 4), "interval": [low, high]},
         "threshold": {"error": threshold, "fidelity": round(math.exp(-threshold / ERROR_SCALE), 4)},
         "bad_error": BAD_ERROR,
-        "held_out": {
-            "bad": int(bad.sum()),
-            "rejected": int(rejected.sum()),
-            "both": int((bad & rejected).sum()),
-        },
+        "held_out": {"bad": int(bad.sum()), "rejected": int(rejected.sum()), "both": both},
     }
-    both = data["held_out"]["both"]  # type: ignore[index]
     report = AnalysisReport(
         out=out,
         name="fidelity",

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from drivesem.attacks.feasible.projection import FeasibleSet
-from drivesem.attacks.space import ParameterSpace
+from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.failures.fidelity import (
     ERROR_WEIGHTS,
     EditedRegion,
@@ -114,10 +114,12 @@ def test_held_objects_stay(scene: SceneIR) -> None:
     space = ParameterSpace(scene, ("translate", "rotate", "weather"))
     feasible = FeasibleSet(space, held=[CAR])
     theta = feasible.project(space.theta0 + 0.1).theta
-    change = space.unflatten(theta)
-    assert not change.translate[CAR].any()
-    assert not change.rotate[CAR].any()
-    assert change.translate[CAR + 1].any()
+    translate, rotate = (space.block(theta, parameter) for parameter in (Parameter.TRANSLATE, Parameter.ROTATE))
+    assert translate is not None
+    assert rotate is not None
+    assert not translate[CAR].any()
+    assert not rotate[CAR].any()
+    assert translate[CAR + 1].any()
     assert f"objects[{CAR}]: fidelity" in feasible.violated_at_start
 
 

@@ -70,7 +70,7 @@ def test_error_grows_with_a_shift(shift_px: int, low: float, high: float) -> Non
 
 def test_own_car_is_in_front_of_the_street() -> None:
     cars = [OwnCar.draw(np.random.default_rng(seed), (60, 100)) for seed in range(20)]
-    there = [car.mask.any() for car in cars]
+    there = [bool(car.mask.any()) for car in cars]
     assert any(there)
     assert not all(there)
     car = cars[there.index(True)]
