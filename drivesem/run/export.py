@@ -26,8 +26,8 @@ from drivesem.data.label_table import WriteSummary, xyxy_to_coco
 from drivesem.failures.grades import Grade
 from drivesem.failures.second_renderer.geometry import PictureCamera
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
-from drivesem.report.drawing import write_picture
-from drivesem.report.tables import Console, progress_bar, rows_to_csv
+from drivesem.reporting.drawing import write_picture
+from drivesem.reporting.tables import Console, progress_bar, rows_to_csv
 from drivesem.run.conversion import ConversionSettings, convert_labels, provenance
 from drivesem.run.finished import METRICS, AttackRun, RunFrame
 from drivesem.run.folder import CONFIG, FRAMES, REFERENCED_FILES
@@ -280,7 +280,7 @@ def _unpack_frame(source: Path, folder: Path) -> RunFrame:
         with tarfile.open(fileobj=io.BytesIO(files.read_bytes(path)), mode="r:xz") as archive:
             for entry in archive:
                 size += entry.size
-                stream = archive.extractfile(entry)
+                stream = archive.extractfile(entry) if entry.isfile() else None  # no links
                 if stream is None or size > _MAX_UNPACKED_BYTES:
                     raise FormatError(str(path), f"files of at most {_MAX_UNPACKED_BYTES:,} bytes", entry.name)
                 files.write_bytes(files.resolve_inside(folder, entry.name), stream.read())
